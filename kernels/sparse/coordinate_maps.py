@@ -61,15 +61,7 @@ def find_row(key: wp.int64, slot_key: wp.array[wp.int64], slot_row: wp.array[int
 
 @wp.func
 def cell_key(cloud: wp.int64, x: int, y: int, z: int, level: int) -> wp.int64:
-    """Key of a cell of a level, or -1 where it lies beyond the grid.
-
-    Args:
-        cloud: Number of the cloud.
-        x: Cell counted from the grid's corner; so are ``y`` and ``z``.
-        y: See ``x``.
-        z: See ``x``.
-        level: How often the grid was halved.
-    """
+    """Key of a cell of a level, counted from the grid's corner, or -1 where it lies beyond the grid."""
     cells = _AXIS_CELLS >> level
     if x < 0 or y < 0 or z < 0 or x >= cells or y >= cells or z >= cells:
         return _NONE
@@ -99,23 +91,16 @@ def insert_rows_kernel(
 @wp.kernel
 def neighbour_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    level: int,
-    slot_key_in: wp.array[wp.int64],
-    slot_row_in: wp.array[int],
+    key_in: wp.array[wp.int64],  # [M] keys of the level
+    level: int,  # how often the grid was halved
+    slot_key_in: wp.array[wp.int64],  # hash table of the same keys
+    slot_row_in: wp.array[int],  # rows of its slots
     # Out:
-    table_out: wp.array2d[int],
+    table_out: wp.array2d[int],  # [M, 27] rows of the neighbours, filled with M before
 ):
     """Sites around each site: a submanifold 3x3x3 kernel, input = output + offset. Launch: [M].
 
     If i has j at an offset, j has i at the opposite one; so 13 look-ups fill 26 columns.
-
-    Args:
-        key_in: Keys of the level, shape [M].
-        level: How often the grid was halved.
-        slot_key_in: Hash table of the same keys.
-        slot_row_in: Rows of its slots.
-        table_out: Rows of the neighbours, shape [M, 27], filled with M before.
     """
     row = wp.tid()
     key = key_in[row]
@@ -136,24 +121,15 @@ def neighbour_kernel(
 @wp.kernel
 def beside_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    asked_in: wp.array[wp.bool],
-    other_in: wp.array[wp.bool],
-    slot_key_in: wp.array[wp.int64],
-    slot_row_in: wp.array[int],
+    key_in: wp.array[wp.int64],  # [M] keys of voxels
+    asked_in: wp.array[wp.bool],  # [M] which are asked about
+    other_in: wp.array[wp.bool],  # [M] which are the others
+    slot_key_in: wp.array[wp.int64],  # hash table of the keys
+    slot_row_in: wp.array[int],  # rows of its slots
     # Out:
-    beside_out: wp.array[wp.bool],
+    beside_out: wp.array[wp.bool],  # [M] false where not asked
 ):
-    """Tell of some voxels whether any of the 3x3x3 about each is one of others. Launch: [M].
-
-    Args:
-        key_in: Keys of voxels, shape [M].
-        asked_in: Which are asked about, shape [M].
-        other_in: Which are the others, shape [M].
-        slot_key_in: Hash table of the keys.
-        slot_row_in: Rows of its slots.
-        beside_out: False where not asked, shape [M].
-    """
+    """Tell of some voxels whether any of the 3x3x3 about each is one of others. Launch: [M]."""
     row = wp.tid()
     found = wp.int32(0)
     if asked_in[row]:
@@ -174,26 +150,18 @@ def beside_kernel(
 @wp.kernel
 def strided_kernel(
     # In:
-    fine_key_in: wp.array[wp.int64],
-    level: int,
-    slot_key_in: wp.array[wp.int64],
-    slot_row_in: wp.array[int],
-    reverse: int,
+    fine_key_in: wp.array[wp.int64],  # [F] keys of the fine level
+    level: int,  # how often the fine grid was halved
+    slot_key_in: wp.array[wp.int64],  # hash table of the keys of the coarse level
+    slot_row_in: wp.array[int],  # rows of its slots
+    reverse: int,  # 1 for the reverse map: coarse rows that read each fine site, by the same offsets
     # Out:
-    table_out: wp.array2d[int],
+    table_out: wp.array2d[int],  # [M, 27] fine rows, F before; reversed [F, 27] coarse rows, M before
 ):
     """Sites of a fine grid that each site of the next coarser one reads: input = 2 output + offset.
 
     An even coordinate is read at offset 0 only; an odd one at +1 from the cell it lies in and at -1
     from the next: at most eight look-ups for each fine site. Launch: [F].
-
-    Args:
-        fine_key_in: Keys of the fine level, shape [F].
-        level: How often the fine grid was halved.
-        slot_key_in: Hash table of the keys of the coarse level.
-        slot_row_in: Rows of its slots.
-        reverse: 1 for the reverse map: coarse rows that read each fine site, by the same offsets.
-        table_out: Fine rows, shape [M, 27], filled with F before; or coarse rows, [F, 27], filled with M.
     """
     row = wp.tid()
     key = fine_key_in[row]
@@ -221,19 +189,14 @@ def strided_kernel(
 @wp.kernel
 def window_kernel(
     # In:
-    fine_key_in: wp.array[wp.int64],
-    coarse_place_in: wp.array[int],
+    fine_key_in: wp.array[wp.int64],  # [F] keys of the fine level
+    coarse_place_in: wp.array[int],  # [F] place of each one's coarse cell, counted from 1
     # Out:
-    table_out: wp.array2d[int],
+    table_out: wp.array2d[int],  # [M, 8] fine rows, filled with F before; column 4 x + 2 y + z
 ):
     """Sites in the 2x2x2 window of each cell of the next coarser grid: input = 2 output + {0, 1}^3.
 
     Launch: [F].
-
-    Args:
-        fine_key_in: Keys of the fine level, shape [F].
-        coarse_place_in: Place of each one's coarse cell, counted from 1, shape [F].
-        table_out: Fine rows, shape [M, 8], filled with F before; column 4 x + 2 y + z.
     """
     row = wp.tid()
     table_out[coarse_place_in[row] - 1, int(fine_key_in[row] & wp.int64(7))] = row
@@ -242,19 +205,14 @@ def window_kernel(
 @wp.kernel
 def level_count_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    threads: int,
+    key_in: wp.array[wp.int64],  # [M] sorted keys, each once
+    threads: int,  # threads of the launch
     # In/Out:
-    count: wp.array[int],
+    count: wp.array[int],  # [AXIS_BITS] cells one level up, two, and so on, zeros before
 ):
     """Count the cells of every coarser level, before any is made. Launch: [threads].
 
     A cell of a level begins where a key differs from the one before in more than the level's bits.
-
-    Args:
-        key_in: Sorted keys, each once, shape [M].
-        threads: Threads of the launch.
-        count: Cells one level up, two, and so on, shape [AXIS_BITS], zeros before.
     """
     counts = _Counts()
     i = wp.tid()

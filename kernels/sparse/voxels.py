@@ -35,18 +35,12 @@ _SINGLES = wp.constant(wp.int64(0x249249249))
 
 @wp.struct
 class CloudNoise:
-    """Augmentation of point clouds.
+    """Augmentation of point clouds."""
 
-    jitter_probability: Share of clouds with jitter.
-    jitter_std: Standard deviation of the jitter of each coordinate of a point [m].
-    dropout_probability: Share of clouds that lose points, independently.
-    dropout_ratio: Lowest and highest probability with which a point of these is lost.
-    """
-
-    jitter_probability: float
-    jitter_std: float
-    dropout_probability: float
-    dropout_ratio: wp.vec2
+    jitter_probability: float  # share of clouds with jitter
+    jitter_std: float  # standard deviation of the jitter of each coordinate of a point [m]
+    dropout_probability: float  # share of clouds that lose points, independently
+    dropout_ratio: wp.vec2  # lowest and highest probability with which a point of these is lost
 
 
 @wp.func
@@ -78,23 +72,15 @@ def key_coordinates(key: wp.int64) -> wp.vec3i:
 @wp.kernel
 def draw_noise_kernel(
     # In:
-    noise_in: wp.array[CloudNoise],
+    noise_in: wp.array[CloudNoise],  # [1] what to draw
     # In/Out:
-    rng: wp.array[wp.uint32],
+    rng: wp.array[wp.uint32],  # [B] random stream of each cloud
     # Out:
-    jitter_out: wp.array[float],
-    dropout_out: wp.array[float],
-    stream_out: wp.array[wp.uint32],
+    jitter_out: wp.array[float],  # [B] standard deviation of the jitter [m]; 0 for none
+    dropout_out: wp.array[float],  # [B] probability with which a point is lost; 0 for none
+    stream_out: wp.array[wp.uint32],  # [B] seed of the cloud's points
 ):
-    """Draw the noise of each cloud from its own stream, so that no two clouds share it. Launch: [B].
-
-    Args:
-        noise_in: What to draw, shape [1].
-        rng: Random stream of each cloud, shape [B].
-        jitter_out: Standard deviation of the jitter [m], shape [B]; 0 for none.
-        dropout_out: Probability with which a point is lost, shape [B]; 0 for none.
-        stream_out: Seed of the cloud's points, shape [B].
-    """
+    """Draw the noise of each cloud from its own stream, so that no two clouds share it. Launch: [B]."""
     cloud = wp.tid()
     noise = noise_in[0]
     state = rng[cloud]
@@ -114,24 +100,15 @@ def draw_noise_kernel(
 @wp.kernel
 def voxel_key_kernel(
     # In:
-    points_in: wp.array2d[wp.vec3],
-    voxel_size: float,
-    jitter_in: wp.array[float],
-    dropout_in: wp.array[float],
-    stream_in: wp.array[wp.uint32],
+    points_in: wp.array2d[wp.vec3],  # [B, P] points [m]; what is not finite or out of the grid is no voxel
+    voxel_size: float,  # side of a voxel [m]
+    jitter_in: wp.array[float],  # [B] standard deviation of the jitter [m]; null for no noise at all
+    dropout_in: wp.array[float],  # [B] probability with which each cloud's points are lost, or null
+    stream_in: wp.array[wp.uint32],  # [B] seed of each cloud's points, or null
     # Out:
-    key_out: wp.array[wp.int64],
+    key_out: wp.array[wp.int64],  # [>= B P] keys; those of points that count for nothing name cloud B
 ):
-    """Key of the voxel of each point. Launch: [B, P].
-
-    Args:
-        points_in: Points [m], shape [B, P]; one that is not finite, or out of the grid, counts for nothing.
-        voxel_size: Side of a voxel [m].
-        jitter_in: Standard deviation of the jitter of each cloud [m], shape [B]; null for no noise at all.
-        dropout_in: Probability with which each cloud's points are lost, shape [B], or null.
-        stream_in: Seed of each cloud's points, shape [B], or null.
-        key_out: Keys, shape [>= B P]; those of points that count for nothing name cloud B.
-    """
+    """Key of the voxel of each point. Launch: [B, P]."""
     cloud, point = wp.tid()
     position = points_in[cloud, point]
     kept = wp.bool(True)
@@ -161,18 +138,12 @@ def voxel_key_kernel(
 @wp.kernel
 def point_group_kernel(
     # In:
-    end_in: wp.array[int],
-    points: int,
+    end_in: wp.array[int],  # [C] columns at which the groups end, one after the other
+    points: int,  # P
     # Out:
-    group_out: wp.array[int],
+    group_out: wp.array[int],  # [>= B P] groups, C for points after the last
 ):
-    """Group of each point by its column. Launch: [B, P].
-
-    Args:
-        end_in: Columns at which the groups end, one after the other, shape [C].
-        points: P.
-        group_out: Groups, C for points after the last, shape [>= B P].
-    """
+    """Group of each point by its column. Launch: [B, P]."""
     cloud, point = wp.tid()
     group = wp.int32(0)
     while group < end_in.shape[0] and point >= end_in[group]:
@@ -183,23 +154,16 @@ def point_group_kernel(
 @wp.kernel
 def voxel_mark_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    limit: wp.int64,
-    run_in: wp.array[int],
-    group_in: wp.array[int],
+    key_in: wp.array[wp.int64],  # [>= K] sorted keys of points
+    limit: wp.int64,  # keys from here on are ignored
+    run_in: wp.array[int],  # [K] place of each key among the voxels, counted from 1
+    group_in: wp.array[int],  # [>= K] group of each point, in the order of the keys
     # Out:
-    mark_out: wp.array2d[float],
+    mark_out: wp.array2d[float],  # [M, C] 1 where a voxel holds a point of the group; the others stay
 ):
     """Mark the voxel of each point with the point's group. Launch: [K].
 
     Points of a voxel write the same value, so their order does not matter.
-
-    Args:
-        key_in: Sorted keys of points, shape [>= K].
-        limit: Keys from here on are ignored.
-        run_in: Place of each key among the voxels, counted from 1, shape [K].
-        group_in: Group of each point, in the order of the keys, shape [>= K].
-        mark_out: 1 where a voxel holds a point of the group, shape [M, C]; the others stay.
     """
     i = wp.tid()
     if key_in[i] < limit and group_in[i] < mark_out.shape[1]:
@@ -209,20 +173,13 @@ def voxel_mark_kernel(
 @wp.kernel
 def run_start_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    limit: wp.int64,
-    shift: wp.int64,
+    key_in: wp.array[wp.int64],  # [>= K] sorted keys
+    limit: wp.int64,  # keys from here on are ignored
+    shift: wp.int64,  # bits by which keys are shifted to the right before they are compared
     # Out:
-    start_out: wp.array[int],
+    start_out: wp.array[int],  # [K] marks
 ):
-    """Mark where a run of equal sorted keys begins: 1 there, 0 elsewhere. Launch: [K].
-
-    Args:
-        key_in: Sorted keys, shape [>= K].
-        limit: Keys from here on are ignored.
-        shift: Bits by which keys are shifted to the right before they are compared.
-        start_out: Marks, shape [K].
-    """
+    """Mark where a run of equal sorted keys begins: 1 there, 0 elsewhere. Launch: [K]."""
     i = wp.tid()
     start_out[i] = 0
     if key_in[i] < limit and (i == 0 or key_in[i] >> shift != key_in[i - 1] >> shift):
@@ -232,22 +189,14 @@ def run_start_kernel(
 @wp.kernel
 def keep_starts_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    limit: wp.int64,
-    shift: wp.int64,
-    run_in: wp.array[int],
+    key_in: wp.array[wp.int64],  # [>= K] sorted keys
+    limit: wp.int64,  # keys from here on are ignored
+    shift: wp.int64,  # bits by which keys are shifted to the right
+    run_in: wp.array[int],  # [K] inclusive sum of the marks of :func:`run_start_kernel`
     # Out:
-    key_out: wp.array[wp.int64],
+    key_out: wp.array[wp.int64],  # [M] keys, each once, ascending
 ):
-    """Keep the (shifted) key of each run. Launch: [K].
-
-    Args:
-        key_in: Sorted keys, shape [>= K].
-        limit: Keys from here on are ignored.
-        shift: Bits by which keys are shifted to the right.
-        run_in: Inclusive sum of the marks of :func:`run_start_kernel`, shape [K].
-        key_out: Keys, each once, ascending, shape [M].
-    """
+    """Keep the (shifted) key of each run. Launch: [K]."""
     i = wp.tid()
     if key_in[i] < limit:
         run = run_in[i] - 1
@@ -258,18 +207,12 @@ def keep_starts_kernel(
 @wp.kernel
 def cloud_offset_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    cloud_shift: wp.int64,
+    key_in: wp.array[wp.int64],  # [M] sorted keys
+    cloud_shift: wp.int64,  # where the number of the cloud begins in a key
     # Out:
-    offset_out: wp.array[int],
+    offset_out: wp.array[int],  # [B + 1] rows
 ):
-    """Find the first voxel of each cloud among sorted keys; the last entry is their number. Launch: [B + 1].
-
-    Args:
-        key_in: Sorted keys, shape [M].
-        cloud_shift: Where the number of the cloud begins in a key.
-        offset_out: Rows, shape [B + 1].
-    """
+    """First voxel of each cloud among sorted keys, and the number of all. Launch: [B + 1]."""
     cloud = wp.tid()
     first = wp.int64(cloud) << cloud_shift
     low = wp.int32(0)
@@ -286,18 +229,12 @@ def cloud_offset_kernel(
 @wp.kernel
 def coordinates_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    level: int,
+    key_in: wp.array[wp.int64],  # [M] keys
+    level: int,  # how often the grid was halved: coordinates count cells of 2^level voxels
     # Out:
-    coordinate_out: wp.array2d[int],
+    coordinate_out: wp.array2d[int],  # [M, 4] rows; coordinates may be negative
 ):
-    """Write keys as rows (cloud, x, y, z). Launch: [M].
-
-    Args:
-        key_in: Keys, shape [M].
-        level: How often the grid was halved: coordinates count cells of 2^level voxels.
-        coordinate_out: Rows, shape [M, 4]; coordinates may be negative.
-    """
+    """Write keys as rows (cloud, x, y, z). Launch: [M]."""
     site = wp.tid()
     key = key_in[site]
     corner = _HALF_RANGE >> level
