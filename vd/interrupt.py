@@ -39,6 +39,7 @@ GONE = {
     "--from-scratch": "stage 2 begins from what --init names",
     "--ppo.optimizer": "Adam is the only one",
     "--agent": "name zero or random in place of a policy",
+    "--depth.focal-noise": "a calibrated camera knows its focal length",
     "--second-view": "symmetry-view selection gained too little (docs/lessons.md)",
 }
 """Flags of earlier versions that are no more, and what to do, or why."""

@@ -158,12 +158,3 @@ def delay_poses_kernel(
         p = p * -1.0
     # Along the chord: between two control steps a link turns 0.65 rad at most, and the arc is 1 mrad away.
     late_q_out[world, body] = wp.transform(position, wp.normalize(q * (1.0 - share) + p * share))
-
-
-@wp.kernel
-def next_count_kernel(
-    # In/Out:
-    frame: wp.array[int],
-):
-    """Number the next frame. Launch: [1]."""
-    frame[0] = frame[0] + 1

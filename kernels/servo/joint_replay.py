@@ -1,7 +1,7 @@
 """Replay recorded commands in the simulator, and sample its positions where the recording has them.
 
 Order in a physics step: :func:`replay_command_kernel`, the servo and the solver's step, then
-:func:`sample_position_kernel` and :func:`tick_kernel`. Every finger of every world follows its own
+:func:`sample_position_kernel`, and the step is counted. Every finger of every world follows its own
 trajectory: a track. W worlds, F fingers of three joints, D = 3F; S samples of all trajectories one
 after the other, J recorded joints. Times, delays and lost commands are those of
 :mod:`vd.kernels.servo.chains`.
@@ -172,12 +172,3 @@ def sample_position_kernel(
             waiting = wp.bool(False)
     read[world, joint] = upcoming
     squared_error[world, joint] = error
-
-
-@wp.kernel
-def tick_kernel(
-    # In/Out:
-    step: wp.array[wp.int32],
-):
-    """Count a physics step, shape [1]; on the device, so that a CUDA graph can be replayed."""
-    step[0] = step[0] + 1

@@ -10,6 +10,7 @@ weights of the kernel; where no site is, it holds the number of input sites, to 
 
 import warp as wp
 
+from vd.kernels.launch import launch
 from vd.kernels.sparse.voxels import AXIS_BITS, CLOUD_SHIFT, key_coordinates, spread_bits, unique_keys
 
 wp.set_module_options({"enable_backward": False})
@@ -235,15 +236,11 @@ def level_count_kernel(
 def level_counts(keys: wp.array) -> list[int]:
     """Numbers of sites that :func:`coarsen` would give, once, twice and so on, waiting for the device once.
 
-    Args:
-        keys: Keys of a level, sorted, each once [M].
-
-    Returns:
-        One number for each bit of a coordinate.
+    Of sorted keys, each once [M], one number for each bit of a coordinate.
     """
     counts = wp.zeros(AXIS_BITS, dtype=int, device=keys.device)
     threads = -(-keys.shape[0] // KEYS_PER_THREAD)
-    wp.launch(level_count_kernel, dim=threads, inputs=[keys, threads, counts], device=keys.device)
+    launch(level_count_kernel, threads, [keys, threads], [counts])
     return counts.numpy().tolist()
 
 
@@ -269,44 +266,22 @@ def hash_table(keys: wp.array) -> HashTable:
     slots = 1 << max(1, SLOTS_PER_SITE * keys.shape[0] - 1).bit_length()
     slot_key = wp.full(slots, -1, dtype=wp.int64, device=keys.device)
     slot_row = wp.empty(slots, dtype=int, device=keys.device)
-    wp.launch(
-        insert_rows_kernel, dim=keys.shape[0], inputs=[keys, slot_key], outputs=[slot_row], device=keys.device
-    )
+    launch(insert_rows_kernel, keys.shape, [keys, slot_key], [slot_row])
     return slot_key, slot_row
 
 
 def neighbour_table(keys: wp.array, level: int, slots: HashTable | None = None) -> wp.array:
-    """Map of a submanifold 3x3x3 convolution over sites of a level, shape [M, 27].
-
-    Args:
-        keys: Keys of the sites [M].
-        level: Level of the sites.
-        slots: Hash table of the keys, if there is one already.
-    """
+    """Map of a submanifold 3x3x3 convolution over sites of a level, shape [M, 27]; ``slots`` if known."""
     count = keys.shape[0]
     table = wp.full((count, KERNEL), count, dtype=int, device=keys.device)
-    slots = slots or hash_table(keys)
-    wp.launch(neighbour_kernel, dim=count, inputs=[keys, level, *slots], outputs=[table], device=keys.device)
+    launch(neighbour_kernel, count, [keys, level, *(slots or hash_table(keys))], [table])
     return table
 
 
-def beside(keys: wp.array, asked: wp.array, others: wp.array, slots: HashTable | None = None) -> wp.array:
-    """Which of the voxels asked about are among others or touch one, by a corner at least, bool [M].
-
-    Args:
-        keys: Keys of voxels, each once [M].
-        asked: Which are asked about, bool [M].
-        others: Which are the others, bool [M].
-        slots: Hash table of the keys, if there is one already.
-    """
-    touches = wp.empty(keys.shape[0], dtype=wp.bool, device=keys.device)
-    wp.launch(
-        beside_kernel,
-        dim=keys.shape[0],
-        inputs=[keys, asked, others, *(slots or hash_table(keys))],
-        outputs=[touches],
-        device=keys.device,
-    )
+def beside(keys: wp.array, asked: wp.array, others: wp.array) -> wp.array:
+    """Which of the voxels asked about are among others or touch one, by a corner at least, bool [M] each."""
+    touches = wp.empty(keys.shape, dtype=wp.bool, device=keys.device)
+    launch(beside_kernel, keys.shape, [keys, asked, others, *hash_table(keys)], [touches])
     return touches
 
 
@@ -327,24 +302,12 @@ def strided_table(
     """
     rows, none = (fine, coarse) if reverse else (coarse, fine)
     table = wp.full((rows.shape[0], KERNEL), none.shape[0], dtype=int, device=fine.device)
-    wp.launch(
-        strided_kernel,
-        dim=fine.shape[0],
-        inputs=[fine, level, *(slots or hash_table(coarse)), int(reverse)],
-        outputs=[table],
-        device=fine.device,
-    )
+    launch(strided_kernel, fine.shape, [fine, level, *(slots or hash_table(coarse)), int(reverse)], [table])
     return table
 
 
 def window_table(fine: wp.array, place: wp.array, outputs: int) -> wp.array:
-    """Map of a 2x2x2 pooling of stride 2, shape [outputs, 8].
-
-    Args:
-        fine: Keys of the input sites [F].
-        place: Place of each one's cell, from :func:`coarsen` [F].
-        outputs: Number of output sites.
-    """
+    """Map of a 2x2x2 pooling of stride 2 of sites [F], whose ``place`` :func:`coarsen` gave, [outputs, 8]."""
     table = wp.full((outputs, WINDOW), fine.shape[0], dtype=int, device=fine.device)
-    wp.launch(window_kernel, dim=fine.shape[0], inputs=[fine, place], outputs=[table], device=fine.device)
+    launch(window_kernel, fine.shape, [fine, place], [table])
     return table

@@ -7,10 +7,11 @@ bits that keeps the order, so that coarser grids need no further sort
 (:mod:`vd.kernels.sparse.coordinate_maps`).
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import warp as wp
 
+from vd.kernels.launch import launch
 from vd.kernels.rng import next_stream, uniform
 
 wp.set_module_options({"enable_backward": False})
@@ -244,38 +245,26 @@ def coordinates_kernel(
         coordinate_out[site, axis + 1] = cell[axis] - corner
 
 
-@dataclass(frozen=True)
-class NoiseDraw:
-    """Noise of the clouds of one batch, as :func:`draw_noise_kernel` draws it."""
+class NoiseDraw(NamedTuple):
+    """Noise of the clouds of one batch, as :func:`draw_noise_kernel` draws it, shape [B] each."""
 
     jitter: wp.array
-    """Standard deviation of the jitter [m], shape [B]."""
+    """Standard deviation of the jitter [m]."""
     dropout: wp.array
-    """Probability with which a point is lost, shape [B]."""
+    """Probability with which a point is lost."""
     stream: wp.array
-    """Seed of each cloud's points, shape [B]."""
+    """Seed of each cloud's points."""
 
 
 def draw_noise(noise: wp.array, rng: wp.array) -> NoiseDraw:
-    """Draw the noise of each cloud of a batch.
+    """Draw the noise of each cloud of a batch from its stream, which advances.
 
     Args:
         noise: One :class:`CloudNoise`, shape [1].
-        rng: Random stream of each cloud, shape [B]; advanced.
+        rng: Random stream of each cloud, shape [B].
     """
-    clouds, device = rng.shape[0], rng.device
-    draw = NoiseDraw(
-        wp.empty(clouds, dtype=float, device=device),
-        wp.empty(clouds, dtype=float, device=device),
-        wp.empty(clouds, dtype=wp.uint32, device=device),
-    )
-    wp.launch(
-        draw_noise_kernel,
-        dim=clouds,
-        inputs=[noise, rng],
-        outputs=[draw.jitter, draw.dropout, draw.stream],
-        device=device,
-    )
+    draw = NoiseDraw(*(wp.empty(rng.shape, dtype=t, device=rng.device) for t in (float, float, wp.uint32)))
+    launch(draw_noise_kernel, rng.shape, [noise, rng], draw)
     return draw
 
 
@@ -294,33 +283,23 @@ def unique_keys(
     Returns:
         The keys [M], and for each key given its place among them, counted from 1 [K].
     """
-    device = keys.device
-    run = wp.empty(count, dtype=int, device=device)
+    run = wp.empty(count, dtype=int, device=keys.device)
     if count == 0:
-        return wp.empty(0, dtype=wp.int64, device=device), run
-    wp.launch(
-        run_start_kernel,
-        dim=count,
-        inputs=[keys, wp.int64(limit), wp.int64(shift)],
-        outputs=[run],
-        device=device,
-    )
+        return wp.empty(0, dtype=wp.int64, device=keys.device), run
+    read = [keys, wp.int64(limit), wp.int64(shift)]
+    launch(run_start_kernel, count, read, [run])
     wp.utils.array_scan(run, run, inclusive=True)
     if kept is None:
         kept = int(run[count - 1 :].numpy()[0])
-    unique = wp.empty(kept, dtype=wp.int64, device=device)
-    wp.launch(
-        keep_starts_kernel,
-        dim=count,
-        inputs=[keys, wp.int64(limit), wp.int64(shift), run],
-        outputs=[unique],
-        device=device,
-    )
+    unique = wp.empty(kept, dtype=wp.int64, device=keys.device)
+    launch(keep_starts_kernel, count, [*read, run], [unique])
     return unique, run
 
 
-def voxelise(points: wp.array, voxel_size: float, noise: NoiseDraw | None = None) -> wp.array:
-    """Voxels of a batch of clouds: their keys, each once, ascending.
+def voxelise(
+    points: wp.array, voxel_size: float, noise: NoiseDraw | None = None, ends: wp.array | None = None
+) -> tuple[wp.array, wp.array]:
+    """Voxels of a batch of clouds, each once, ascending, and what the points in each are samples of.
 
     The order depends on the voxels alone, not on that of the points.
 
@@ -328,33 +307,14 @@ def voxelise(points: wp.array, voxel_size: float, noise: NoiseDraw | None = None
         points: Points [m], shape [B, P]; those that are not finite or out of the grid are left out.
         voxel_size: Side of a voxel [m].
         noise: Noise to add first; none by default.
-
-    Returns:
-        Keys, shape [M].
-
-    Raises:
-        ValueError: The voxel size is not positive, or there are too many points or clouds.
-    """
-    return voxelise_marked(points, voxel_size, None, noise)[0]
-
-
-def voxelise_marked(
-    points: wp.array, voxel_size: float, ends: wp.array | None, noise: NoiseDraw | None = None
-) -> tuple[wp.array, wp.array]:
-    """:func:`voxelise`, telling of what the points in each voxel are samples.
-
-    Args:
-        points: See :func:`voxelise`.
-        voxel_size: See :func:`voxelise`.
         ends: Columns of ``points`` at which groups end, one after the other, ascending, int32, shape [C];
             points after the last are of none; None marks nothing.
-        noise: See :func:`voxelise`.
 
     Returns:
         Keys, shape [M], and marks: 1 where a voxel holds a point of the group, else 0, float, shape [M, C].
 
     Raises:
-        ValueError: See :func:`voxelise`.
+        ValueError: The voxel size is not positive, or there are too many points or clouds.
     """
     clouds, per_cloud = points.shape
     count, device = clouds * per_cloud, points.device
@@ -363,58 +323,28 @@ def voxelise_marked(
     if clouds > MAX_CLOUDS or 2 * count >= 2**31:
         raise ValueError(f"{clouds} clouds of {per_cloud} points are too many at once; give fewer")
     keys = wp.empty(2 * count, dtype=wp.int64, device=device)  # the second half is for the sort
-    wp.launch(
-        voxel_key_kernel,
-        dim=(clouds, per_cloud),
-        inputs=[
-            points,
-            voxel_size,
-            noise and noise.jitter,
-            noise and noise.dropout,
-            noise and noise.stream,
-        ],
-        outputs=[keys],
-        device=device,
-    )
+    launch(voxel_key_kernel, points.shape, [points, voxel_size, *(noise or [None] * 3)], [keys])
     groups = wp.empty(2 * count, dtype=int, device=device)  # sorted along; of no meaning without ends
     if ends is not None:
-        wp.launch(
-            point_group_kernel,
-            dim=(clouds, per_cloud),
-            inputs=[ends, per_cloud],
-            outputs=[groups],
-            device=device,
-        )
+        launch(point_group_kernel, points.shape, [ends, per_cloud], [groups])
     wp.utils.radix_sort_pairs(keys, groups, count, end_bit=CLOUD_SHIFT + clouds.bit_length())
     limit = clouds << CLOUD_SHIFT
     voxels, run = unique_keys(keys, count, limit=limit)
     marks = wp.zeros((voxels.shape[0], 0 if ends is None else ends.shape[0]), dtype=float, device=device)
     if ends is not None:
-        wp.launch(
-            voxel_mark_kernel,
-            dim=count,
-            inputs=[keys, wp.int64(limit), run, groups],
-            outputs=[marks],
-            device=device,
-        )
+        launch(voxel_mark_kernel, count, [keys, wp.int64(limit), run, groups], [marks])
     return voxels, marks
 
 
 def cloud_offsets(keys: wp.array, clouds: int, level: int = 0) -> wp.array:
     """First voxel of each cloud, and the number of all, shape [B + 1], for sorted keys of a level."""
     offsets = wp.empty(clouds + 1, dtype=int, device=keys.device)
-    wp.launch(
-        cloud_offset_kernel,
-        dim=clouds + 1,
-        inputs=[keys, wp.int64(CLOUD_SHIFT - 3 * level)],
-        outputs=[offsets],
-        device=keys.device,
-    )
+    launch(cloud_offset_kernel, clouds + 1, [keys, wp.int64(CLOUD_SHIFT - 3 * level)], [offsets])
     return offsets
 
 
 def coordinates(keys: wp.array, level: int = 0) -> wp.array:
     """Rows (cloud, x, y, z) of keys of a level, shape [M, 4]."""
     rows = wp.empty((keys.shape[0], 4), dtype=int, device=keys.device)
-    wp.launch(coordinates_kernel, dim=keys.shape[0], inputs=[keys, level], outputs=[rows], device=keys.device)
+    launch(coordinates_kernel, keys.shape, [keys, level], [rows])
     return rows

@@ -27,21 +27,6 @@ def redraw_mask_kernel(
 
 
 @wp.kernel
-def write_gains_kernel(
-    # In:
-    kp_in: wp.array2d[float],
-    kd_in: wp.array2d[float],
-    # Out:
-    model_kp: wp.array2d[float],
-    model_kd: wp.array2d[float],
-):
-    """Copy gains, shape [N, D], into the first D columns of the model's. Launch [N, D]."""
-    world, joint = wp.tid()
-    model_kp[world, joint] = kp_in[world, joint]
-    model_kd[world, joint] = kd_in[world, joint]
-
-
-@wp.kernel
 def write_friction_kernel(
     # Model:
     shape_world: wp.array[wp.int32],  # [S] world of each shape
@@ -141,8 +126,8 @@ def copy_columns_kernel(
     # In:
     values_in: wp.array2d[float],  # [N, >= D] values
     # Out:
-    values_out: wp.array2d[float],  # [N, D] its first columns
+    values_out: wp.array2d[float],  # [N, >= D] the first D columns are written
 ):
-    """Copy the first columns of a wider array; copies of slices cannot be in a graph. Launch: [N, D]."""
+    """Copy the first columns of an array; copies of slices cannot be in a graph. Launch: [N, D]."""
     world, column = wp.tid()
     values_out[world, column] = values_in[world, column]

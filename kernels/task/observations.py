@@ -6,7 +6,7 @@ the paper's 19 G + 21 and the previous action.
 
 import warp as wp
 
-from vd.kernels.columns import read_quat, read_vec3, write_quat, write_vec3
+from vd.kernels.columns import consecutive, read_quat, read_vec3, write_quat, write_vec3
 from vd.kernels.rng import next_stream
 from vd.kernels.transforms import canonical, rotation_difference
 
@@ -32,11 +32,7 @@ def teacher_observation_slices(fingers: int) -> dict[str, slice]:
         "fingertips": FINGERTIP_VALUES * fingers,
         "previous_action": joints,
     }
-    slices, start = {}, 0
-    for name, size in sizes.items():
-        slices[name] = slice(start, start + size)
-        start += size
-    return slices
+    return consecutive(sizes)
 
 
 def teacher_observation_size(fingers: int) -> int:

@@ -8,7 +8,7 @@ from math import cos, pi, sin
 
 import warp as wp
 
-from vd.kernels.columns import read_quat, read_vec3, write_vec3
+from vd.kernels.columns import consecutive, read_quat, read_vec3, write_vec3
 from vd.kernels.task.observations import fingertip_pose
 
 wp.set_module_options({"enable_backward": False})
@@ -39,12 +39,7 @@ def extent_directions(fingers: int) -> list[tuple[float, float, float]]:
 def shape_observation_slices(fingers: int) -> dict[str, slice]:
     """Columns of each part of the shape's values, counted from the first of them."""
     directions = len(extent_directions(fingers))
-    sizes = {"surface": 3 * fingers, "extent": directions, "goal_extent": directions}
-    slices, start = {}, 0
-    for name, size in sizes.items():
-        slices[name] = slice(start, start + size)
-        start += size
-    return slices
+    return consecutive({"surface": 3 * fingers, "extent": directions, "goal_extent": directions})
 
 
 def shape_observation_size(fingers: int) -> int:
