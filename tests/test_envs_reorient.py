@@ -89,22 +89,6 @@ def test_the_table_costs_while_the_object_touches_it_and_height_above_it_pays():
     assert RewardCfg().table_contact == PAPER.reward.table_contact == -1.0
 
 
-<<<<<<< HEAD
-def test_height_above_the_table_pays_and_lying_on_it_does_not():
-    """A falling object has its lowest point above the table until it lies on it."""
-    env = make(reward=RewardCfg(lift=4.0))
-    column = env.reward_term_names.index("lift")
-    seen = []
-    for _ in range(24):
-        env.step(env.action)
-        seen.append(env.reward_terms.numpy()[:, column].copy())
-    # Surface points are a sample: the lowest of them may lie a little above the surface.
-    assert (seen[0] > 1.0).all() and (seen[-1] < 0.4).all()
-    assert env.reward.numpy() == pytest.approx(env.reward_terms.numpy().sum(axis=1), rel=1e-5)
-
-
-=======
->>>>>>> bench
 def test_tables_leave_their_share_of_worlds_in_time():
     """In a world that loses its table after 1.5 s the object, at rest until then, falls."""
     env = make(table=TableCfg(away_share=0.5, away_s=(1.5, 1.5)), num_envs=4, episode_s=2.5)

@@ -110,20 +110,7 @@ def test_mirrored_worlds_look_and_move_the_same():
     """With a cuboid, which is its own mirror image; a reflection in the plane of one finger."""
     cfg = dataclasses.replace(CFG, observation=ObservationCfg(shape="full", view="mirrored"))
     env = ReorientEnv(cfg, "cpu")
-<<<<<<< HEAD
-    rng = np.random.default_rng(3)
-    for action in rng.uniform(-1, 1, (30, WORLDS, 9)).astype(np.float32):
-        act(env, action)
-    look(env)
-    state, before = env.state_dict(), env.observation.numpy().copy()
-    action = rng.uniform(-1, 1, (WORLDS, 9)).astype(np.float32)
-    act(env, action)
-    after, kept = env.observation.numpy().copy(), env.done.numpy() == 0
-    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the environments are in different frames"
-
-=======
     state, before, action, after = moved(env)
->>>>>>> bench
     points = env.state.surface_points  # drawn at random, so that theirs is another cuboid
     surface = points.numpy().copy()
     tips = load_hand("dclaw3").tip_poses(np.zeros(9))

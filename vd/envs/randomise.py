@@ -10,9 +10,9 @@ from vd.envs.servo import gain_scales
 from vd.envs.task_state import TaskState
 from vd.kernels.servo.actuators import INERTIA, PAYLOAD_INERTIA
 from vd.kernels.task.environments import (
+    copy_columns_kernel,
     redraw_mask_kernel,
     write_friction_kernel,
-    write_gains_kernel,
     write_object_force_kernel,
 )
 from vd.kernels.task.observations import teacher_observation_size
@@ -225,12 +225,8 @@ class Randomiser:
         flags = newton.ModelFlags.SHAPE_PROPERTIES
         if state.sim.servo is None:  # which sets the gains itself, in every physics step
             flags |= newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES
-            state.launch(
-                write_gains_kernel,
-                [self.kp, self.kd],
-                [self._model_kp, self._model_kd],
-                dim=(state.num_envs, state.num_actions),
-            )
+            for gains, of_model in ((self.kp, self._model_kp), (self.kd, self._model_kd)):
+                state.launch(copy_columns_kernel, [gains], [of_model], dim=gains.shape)
         state.launch(
             write_friction_kernel,
             [
