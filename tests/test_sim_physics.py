@@ -9,9 +9,9 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.decompose import DecomposeSettings
 from vd.assets_usd.objects.geometry import Hull
 from vd.assets_usd.objects.sets import load_set
+from vd.assets_usd.objects.settings import ImportSettings
 from vd.bench.physics import SmallScene, pinch, rest
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
@@ -87,7 +87,7 @@ def sliced(cube, count):
 @pytest.mark.parametrize("hand", ["dclaw3", "dclaw4"])
 def test_an_object_of_as_many_parts_as_an_import_makes_fits_beside_a_hand(cube, hand):
     """MuJoCo's masks have 32 bits for who touches whom; parts of one object need none among themselves."""
-    item = sliced(cube, DecomposeSettings().max_hulls)
+    item = sliced(cube, ImportSettings().max_hulls)
     scene = build_scene(hand=load_hand(hand), objects=[item], num_envs=1, cfg=CFG, device="cpu")
     model = Simulator(scene, CFG).solver.mj_model
     meets = (model.geom_contype[:, None] & model.geom_conaffinity[None]) != 0
