@@ -13,7 +13,7 @@ from student_dummy import TINY, DummyTeacher, make_dagger, weights
 
 from vd.train.checkpoint import list_checkpoints
 from vd.train.cli import main
-from vd.train.ending import Interrupted, TrainingDivergedError
+from vd.train.loop import Interrupted, TrainingDivergedError
 from vd.train.metrics import read_progress
 from vd.train.student.losses import imitation_figures, imitation_loss, poses
 from vd.train.student.rollout import taken

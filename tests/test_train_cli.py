@@ -55,7 +55,7 @@ def test_paper_preset_is_the_paper():
         (1, 1, [], "gpu"),
         (1, 1, ["--device", "cpu"], "cpu-demo"),
         (2, 1, ["--device", "cuda:1"], "gpu"),
-        (2, 2, [], "multi-gpu"),
+        (2, 2, [], "gpu"),
     ],
 )
 def test_the_machine_decides_where_no_preset_is_named(monkeypatch, gpus, processes, flags, name):
@@ -165,6 +165,7 @@ def test_resume_starts_from_the_runs_own_configuration(tmp_path):
     saved = dataclasses.replace(
         PRESETS["gpu"](), run=dataclasses.replace(PRESETS["gpu"]().run, save_every=17)
     )
+    saved = dataclasses.replace(saved, preset="multi-gpu")  # as earlier versions wrote it
     (tmp_path / "config.json").write_text(json.dumps(to_dict(saved)))
     cfg = parse_teacher(["--out", str(tmp_path), "--resume", "--max-steps", "123"])
     assert cfg.resume == "latest" and cfg.run.save_every == 17 and cfg.run.max_steps == 123
@@ -174,6 +175,8 @@ def test_resume_starts_from_the_runs_own_configuration(tmp_path):
     assert parse_teacher([*auto, str(tmp_path)]).run.save_every == 17
     assert parse_teacher([*auto, str(tmp_path / "new")]).ppo == PRESETS["gpu"]().ppo
     assert parse_teacher(["--smoke", "--resume", "auto", "--out", str(tmp_path / "new")]).smoke
+    with pytest.raises(ValueError, match="--preset multi-gpu is none; gpu is the same"):
+        parse_teacher(["--preset", "multi-gpu"])
     with pytest.raises(FileNotFoundError, match="--out"):
         parse_teacher(["--out", str(tmp_path / "none"), "--resume"])
     (tmp_path / "config.json").write_text('{"ppo": {"epoch": 3}}')

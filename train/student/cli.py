@@ -1,9 +1,7 @@
 """Command line of the student: ``vd-train student``."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -13,6 +11,7 @@ from vd import interrupt
 from vd.train.flags import normalise, saved_config, value_of
 from vd.train.student.build import build_student
 from vd.train.student.config import PRESETS, PRETRAINING, STUDENT_NAME, Stage, StudentTrainCfg
+from vd.train.teacher import say_of_main
 
 HELP = """Train the student: imitate the teacher from point clouds.
 
@@ -54,12 +53,8 @@ def student_command(arguments: list[str], started: float) -> int:
     from vd.evaluate.agents import check_names
 
     check_names([] if cfg.teacher is None else [cfg.teacher], cfg.task.objects)
-    from vd.train.progress import BUILDING
-
-    main_process = os.environ.get("RANK", "0") == "0"
-    folder, say = cfg.run.out, partial(print, flush=True) if main_process else (lambda _: None)
-    say(BUILDING)
-    runner = build_student(cfg, started=started)
+    folder, say = cfg.run.out, say_of_main()
+    runner = build_student(cfg, started=started, say=say)
     if runner.iteration:
         say(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
         if runner.new_episodes:
