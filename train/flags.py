@@ -59,7 +59,8 @@ def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | No
 
     Raises:
         FileNotFoundError: ``--resume`` names a run without a configuration.
-        ValueError: There is no such preset, the run's configuration is not one of this version, or ``--init`` is no teacher.
+        ValueError: There is no such preset, the run's configuration is not one of this version, or ``--init``
+            is no teacher.
     """
     arguments = normalise(arguments, SHORT_FORMS)
     preset, init, resume = (value_of(arguments, flag) for flag in ("--preset", "--init", "--resume"))
