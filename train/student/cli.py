@@ -24,7 +24,7 @@ SHORT_FORMS = {name: f"task.{name}" for name in ("objects", "num-envs", "seed")}
 """Flags that are short for others."""
 
 
-def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
+def parse_student(flags: Sequence[str]) -> StudentTrainCfg:
     """The configuration that command-line flags ask for.
 
     The first pass finds where to start from (``--preset`` and ``--stage``, the run's own configuration with
@@ -34,7 +34,7 @@ def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
         FileNotFoundError: ``--resume`` or ``--init`` name what is not there.
         ValueError: What they name is not of this version.
     """
-    arguments = normalise(arguments, SHORT_FORMS)
+    arguments = normalise(flags, SHORT_FORMS)
     preset, stage = value_of(arguments, "--preset") or "gpu", value_of(arguments, "--stage") or "1"
     # The second pass refuses unknown names.
     number = cast(Stage, int(stage)) if stage in ("0", "1", "2") else 1
