@@ -10,7 +10,6 @@ import numpy as np
 import tyro
 
 from vd.files import atomic_path, check_file
-from vd.train.metrics import PROGRESS_FILE, read_progress
 
 SMOOTHING = 1 / 40
 """Share of a run over which the smooth line averages; the raw values stay visible behind it."""
@@ -50,6 +49,8 @@ class CurvesCfg:
 def curves_command(arguments: list[str], _started: float) -> int:
     """``vd-train curves``; the exit status."""
     cfg = tyro.cli(CurvesCfg, args=arguments, prog="vd-train curves")
+    from vd.train.metrics import PROGRESS_FILE  # loads torch
+
     files = [run / PROGRESS_FILE if run.is_dir() else run for run in cfg.runs]
     output = cfg.out or files[0].with_name("curves.png")
     check_file(output)
@@ -111,6 +112,8 @@ def _quantities(rows: list[dict[str, Any]], key: str) -> list[str]:
 
 def _read_runs(progress: Sequence[Path]) -> dict[str, list[dict[str, Any]]]:
     """Rows of runs by the name of their folder."""
+    from vd.train.metrics import read_progress
+
     runs = {}
     for path in progress:
         if not path.is_file():
