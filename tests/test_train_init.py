@@ -236,7 +236,7 @@ def test_values_that_come_last_cannot_become_others(tmp_path):
     state["task"]["observation"] = {"history": 5}
     save_checkpoint(path, state)
     runner = make_runner(tmp_path / "second", policy=NORMALISING)
-    with pytest.raises(ValueError, match=r"--env\.observation\.history 5 and this run 0"):
+    with pytest.raises(ValueError, match=r"--env\.observation\.history 5, and this run 0"):
         runner.begin_from(str(path))
 
 
