@@ -5,13 +5,14 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from vd import interrupt
+from vd.assets_usd.objects.settings import ImportSettings
 from vd.files import check_file, check_folder
 
 if TYPE_CHECKING:
@@ -62,28 +63,10 @@ class Import:
     """Mesh files, or folders to search for them."""
     out: Path | None = None
     """Folder to write to; by default a set in the asset cache, named after the folder of the meshes."""
-    units: Literal["auto", "mm", "cm", "m", "in"] = "auto"
-    """Unit of the meshes. auto: what the file declares (GLB, USD), else m, mm or cm, whichever needs the
-    least rescaling. Inches are never guessed."""
-    keep_size: bool = False
-    """Keep the real size, also of what does not fit the hand. The unit must be known."""
-    density: float | None = None
-    """Density that gives each object its mass [kg/m3]; plastic has about 1000, aluminium 2700, steel 7850."""
-    mass: float | None = None
-    """Mass of each object [kg]; without this and --density 0.1. Training draws masses of its own unless its
-    randomisation is off."""
+    settings: tyro.conf.OmitArgPrefixes[ImportSettings] = field(default_factory=ImportSettings)
+    """Unit, size, mass and parts of the objects."""
     jobs: int = 0
     """Meshes at a time; 0: one per core."""
-    max_hulls: int = 32
-    """Most convex parts per object. Eight are tried first, and more where these are off by more than 15 %."""
-    threshold: float = 0.08
-    """CoACD's concavity threshold, 0.01-1: smaller is finer and slower."""
-    mcts_iterations: int = 20
-    """CoACD's search effort; more is finer and slower."""
-    time_limit: float = 120.0
-    """Processor time [s] of one decomposition, after which a mesh falls back to a coarser one."""
-    licence: str = "unknown"
-    """Licence to record where no objects.csv (columns name, source) lies with the meshes."""
 
 
 @dataclass(frozen=True)
@@ -156,25 +139,11 @@ def run_objects(command: Objects) -> int:
 
 def run_import(command: Import) -> int:
     """Import meshes; returns 1 if any was refused."""
-    from vd.assets_usd.cache import assets_dir
-    from vd.assets_usd.objects.decompose import DecomposeSettings
     from vd.assets_usd.objects.importer import import_meshes
-    from vd.assets_usd.objects.meshes import Sizing
-    from vd.assets_usd.objects.plan import ImportSettings, default_set
+    from vd.assets_usd.objects.plan import default_set
 
     if not command.paths:
         raise ValueError("name the mesh files, or folders of them, to import")
-    settings = ImportSettings(
-        DecomposeSettings(
-            max_hulls=command.max_hulls,
-            threshold=command.threshold,
-            mcts_iterations=command.mcts_iterations,
-            time_limit_s=command.time_limit,
-        ),
-        licence=command.licence,
-        cache=str(assets_dir() / "decompositions"),
-        sizing=Sizing(command.units, command.keep_size, command.density, command.mass),
-    )
     out = command.out or default_set(command.paths)
     bar = _bar("importing")
     start = time.monotonic()
@@ -182,9 +151,9 @@ def run_import(command: Import) -> int:
         results = import_meshes(
             command.paths,
             out,
-            settings,
+            command.settings,
             jobs=command.jobs,
-            progress=lambda result, done, total: bar(result.name, done, total),
+            progress=lambda result, done, total: bar(result.job.name, done, total),
         )
     except KeyboardInterrupt:
         print(
@@ -203,9 +172,9 @@ def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
         f"{count['imported']} imported, {count['cached']} unchanged, {count['refused']} refused in "
         f"{seconds:.0f} s; {out}"
     ]
-    good = {r.name: r.model for r in results if r.model is not None}
+    good = {r.job.name: r.model for r in results if r.model is not None}
     if good:
-        size = sum(Path(r.target).stat().st_size for r in results if r.model is not None)
+        size = sum(Path(r.job.target).stat().st_size for r in results if r.model is not None)
         worst = sorted(good.values(), key=lambda model: -model.volume_error)
         named = ", ".join(f"{model.name} {model.volume_error:.1%}" for model in worst[:WORST_SHOWN])
         hulls = sum(len(model.hulls) for model in worst) / len(worst)
@@ -222,9 +191,10 @@ def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
             f"{len(worst)} scaled), mass {_span([model.mass_kg for model in worst])} kg"
         )
     lines += [f"warning {name}: {words}" for name, model in good.items() for words in model.warnings]
-    lines += [f"refused {r.source}: {r.reason}" for r in results if r.status == "refused"]
+    lines += [f"refused {r.job.source}: {r.reason}" for r in results if r.status == "refused"]
     lines += [
-        f"{r.name} stays in the set, although its mesh {r.source} is gone; remove {r.target} if it shall go"
+        f"{r.job.name} stays in the set, although its mesh {r.job.source} is gone; remove {r.job.target} if "
+        "it shall go"
         for r in results
         if r.status == "gone"
     ]

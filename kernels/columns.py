@@ -1,8 +1,16 @@
 """Vectors and quaternions in consecutive columns of a row: how joint states and observations are laid out."""
 
+from itertools import accumulate
+
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
+
+
+def consecutive(sizes: dict[str, int]) -> dict[str, slice]:
+    """Columns of parts of so many values each, one after the other from 0 on."""
+    ends = accumulate(sizes.values())
+    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
 
 @wp.func

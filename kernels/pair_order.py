@@ -18,23 +18,15 @@ NO_PAIR = 2**KEY_BITS - 1
 @wp.kernel
 def pair_key_kernel(
     # Model:
-    geom_type: wp.array[int],
+    geom_type: wp.array[int],  # [G] kind of each geom (``mjtGeom``), below :data:`KINDS`
     # In:
-    pair_count: wp.array[int],
-    pair_in: wp.array[wp.vec2i],
+    pair_count: wp.array[int],  # [1] number of pairs; it may be more than P
+    pair_in: wp.array[wp.vec2i],  # [P] the two geoms of each pair
     # Out:
-    key_out: wp.array[int],
-    order_out: wp.array[int],
+    key_out: wp.array[int],  # [>= P] key of each pair, :data:`NO_PAIR` behind the last
+    order_out: wp.array[int],  # [>= P] 0, 1, ...
 ):
-    """Keys to sort candidate pairs by, and their order as it is. Launch: [P].
-
-    Args:
-        geom_type: Kind of each geom (``mjtGeom``), below :data:`KINDS`, shape [G].
-        pair_count: Number of pairs, shape [1]; it may be more than P.
-        pair_in: The two geoms of each pair, shape [P].
-        key_out: Key of each pair, :data:`NO_PAIR` behind the last, shape [>= P].
-        order_out: 0, 1, ..., shape [>= P].
-    """
+    """Keys to sort candidate pairs by, and their order as it is. Launch: [P]."""
     pair = wp.tid()
     key = int(NO_PAIR)
     if pair < pair_count[0]:
@@ -47,28 +39,17 @@ def pair_key_kernel(
 @wp.kernel
 def reorder_pairs_kernel(
     # In:
-    pair_count: wp.array[int],
-    order_in: wp.array[int],
-    pair_in: wp.array[wp.vec2i],
-    pair_id_in: wp.array[wp.vec2i],
-    world_in: wp.array[int],
+    pair_count: wp.array[int],  # [1] number of pairs; it may be more than P
+    order_in: wp.array[int],  # [>= P] which pair comes at each place
+    pair_in: wp.array[wp.vec2i],  # [P] the two geoms of each pair
+    pair_id_in: wp.array[wp.vec2i],  # [P] what the solver knows each pair by
+    world_in: wp.array[int],  # [P] world of each pair
     # Out:
-    pair_out: wp.array[wp.vec2i],
-    pair_id_out: wp.array[wp.vec2i],
-    world_out: wp.array[int],
+    pair_out: wp.array[wp.vec2i],  # [P] geoms in the new order; what is behind the last pair stays
+    pair_id_out: wp.array[wp.vec2i],  # the same of what the solver knows them by
+    world_out: wp.array[int],  # the same of their worlds
 ):
-    """Put pairs into an order. Launch: [P].
-
-    Args:
-        pair_count: Number of pairs, shape [1]; it may be more than P.
-        order_in: Which pair comes at each place, shape [>= P].
-        pair_in: The two geoms of each pair, shape [P].
-        pair_id_in: What the solver knows each pair by, shape [P].
-        world_in: World of each pair, shape [P].
-        pair_out: Geoms in the new order, shape [P]; what is behind the last pair stays.
-        pair_id_out: The same of what the solver knows them by.
-        world_out: The same of their worlds.
-    """
+    """Put pairs into an order. Launch: [P]."""
     place = wp.tid()
     if place >= pair_count[0]:
         return

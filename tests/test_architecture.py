@@ -34,7 +34,7 @@ SHARED = (
     "vd.frame_maps",
 )
 """What camera policies share; no simulator."""
-DESCRIPTIONS = ("vd.envs.cfg", "vd.envs.symmetry_frames", "vd.sensors.cfg")
+DESCRIPTIONS = ("vd.envs.cfg", "vd.envs.shapes", "vd.envs.symmetry_frames", "vd.sensors.cfg")
 """What describes a task, and needs no simulator either."""
 # What each part may import of this project; the longest prefix of a module's name decides.
 ALLOWED: dict[str, tuple[str, ...]] = {

@@ -11,10 +11,10 @@ from vd.bench.hidden_plant import FULL_DUTY_RAD, OUTSIDE
 from vd.bench.hide import (
     ENCODER_COUNT,
     FULL_P_GAIN,
+    NOISE_FLOOR_RAD,
     Hiding,
     effect_parameters,
     hide,
-    noise_floor,
     parse_effect,
     simulate_hidden,
     truth_path,
@@ -29,7 +29,7 @@ from vd.kernels.servo.effects import EFFECTS
 
 def test_the_recording_tells_nothing_and_the_truth_lies_beside_it(tmp_path):
     out = tmp_path / "r"
-    hidden = hide("servo", {"backlash": {"width_rad": 0.05}}, out, seed=4)
+    hidden = hide(Hiding("servo", {"backlash": {"width_rad": 0.05}}, seed=4), out)
     text = (out / "recording.json").read_text() + " ".join(p.name for p in out.iterdir())
     assert not any(name in text for name in (*EFFECTS, *OUTSIDE, "seed", "truth"))
     truth = json.loads(truth_path(out).read_text())
@@ -66,7 +66,7 @@ def test_the_duty_cycle_is_the_controllers_output():
 
 @pytest.mark.parametrize("late", ["command_delay", "read_delay"])
 def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path):
-    hide("servo", {late: {"delay_s": 0.03}}, tmp_path / "r", seed=6, pwm=True)
+    hide(Hiding("servo", {late: {"delay_s": 0.03}}, seed=6, pwm=True), tmp_path / "r")
     recording = read_recording(tmp_path / "r")
     (chain,) = chains(recording)
     everything = tuple(range(len(recording.trajectories)))
@@ -90,18 +90,17 @@ def test_seeds_repeat_and_differ_alone_and_in_batches():
     assert one.truth["base"] != other.truth["base"]
 
 
-def test_the_noise_is_the_stated_floor():
-    quiet, noisy = (
-        simulate_hidden([Hiding("servo", seed=1, noise_rad=noise, jitter_s=0.0)])[0] for noise in (0.0, 3e-4)
-    )
-    slow = [i for i, t in enumerate(quiet.recording.trajectories) if t.excitation.startswith("sine")]
-    for hidden, noise in ((quiet, 0.0), (noisy, 3e-4)):
-        assert hidden.truth["noise_floor_rad"] == pytest.approx(noise_floor(noise))
-    differences = [noisy.recording.trajectories[i].position - quiet.recording.trajectories[i].position
-                   for i in slow]  # fmt: skip
-    both = np.concatenate(differences).std()
+def test_the_noise_is_the_stated_floor(monkeypatch):
+    def readings():
+        (hidden,) = simulate_hidden([Hiding("servo", seed=1)])
+        assert hidden.truth["noise_floor_rad"] == NOISE_FLOOR_RAD
+        motions = hidden.recording.trajectories
+        return np.concatenate([t.position for t in motions if t.excitation.startswith("sine")])
+
+    noisy = readings()
+    monkeypatch.setattr("vd.bench.hide.NOISE_RAD", 0.0)
     # Both are rounded, one is noisy: the variances of two roundings and of the noise, not quite independent.
-    assert noise_floor(3e-4) < both < np.sqrt(2.0) * noise_floor(3e-4)
+    assert NOISE_FLOOR_RAD < (noisy - readings()).std() < np.sqrt(2.0) * NOISE_FLOOR_RAD
 
 
 def test_a_finger_is_recorded_by_name():
@@ -170,7 +169,7 @@ def test_excitations_stay_within_the_joints_and_excite_one_each():
 
 
 def test_sizes_grow_and_stay_within_the_bounds():
-    for model in ("dclaw3", "servo", "pendulum"):
+    for model in ("dclaw3", "servo"):
         for name in showing(model):
             sizes = [sized_effect(name, size, model) for size in range(4)]
             assert sizes[0] != sizes[3]

@@ -34,7 +34,7 @@ def answer(plant, command, duration=2.0, rate=500.0, dt=4e-4, **run) -> tuple[np
     time = np.arange(int(duration * rate) + 1) / rate
     values = np.stack([np.broadcast_to(command(time), time.shape)] * len(plant.joints), axis=1)
     enabled = run.pop("enabled", np.ones(values.shape, dtype=bool))
-    return time, simulate([Run(plant, time, values, enabled, **run)], dt=dt)[0]
+    return time, simulate([Run(plant, time, values, enabled, **run)], dt=dt)[0].position
 
 
 def step(time):
@@ -65,10 +65,12 @@ SMALL = ("thermal_drift", "load_friction", "supply_sag", "torque_saturation")
 """Effects that show little at the size of the others."""
 
 
-def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect():
+def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect(monkeypatch):
     """They share no code; both are rounded to encoder counts, of 0.44 mrad root mean square."""
     names = [name for name in EFFECTS if name not in (COUPLING, "command_jitter")]
-    exact = {"noise_rad": 0.0, "jitter_s": 0.0, "base_spread": 0.0, "excitations": ("gain_ladder",)}
+    monkeypatch.setattr("vd.bench.hide.NOISE_RAD", 0.0)
+    monkeypatch.setattr("vd.bench.hide.STAMP_JITTER_S", 0.0)
+    exact = {"base_spread": 0.0, "excitations": ("gain_ladder",)}
     sizes = {name: effect_at(name, 3.0 if name in SMALL else 1.0) for name in names}
     hidden = simulate_hidden([Hiding("servo", {name: sizes[name]}, seed=1, **exact) for name in names])
     for name, made in zip(names, hidden, strict=True):
@@ -104,7 +106,7 @@ def test_a_motor_at_its_limit_acts_when_the_command_comes():
         time[1:] += shift * STEP_S
         command = np.where(np.arange(len(time)) < 20, 0.0, 0.8)[:, None]
         run = Run(servo(**limited), time, command, np.ones(command.shape, bool))
-        paths.append(simulate([run])[0][:, 0])
+        paths.append(simulate([run])[0].position[:, 0])
     assert np.ptp(paths[0]) > 0.5
     assert max(np.abs(path - paths[0]).max() for path in paths[1:]) < 2e-4
 
@@ -146,7 +148,7 @@ def test_the_time_step_does_not_show():
         runs.append(Run(plant, time, command, np.ones(command.shape, dtype=bool), seed=3))
     for name, coarse, fine in zip(names, simulate(runs), simulate(runs, dt=1e-4), strict=True):
         # Under half the noise floor of 0.5 mrad.
-        assert np.sqrt(np.mean((coarse - fine) ** 2)) < 2e-4, name
+        assert np.sqrt(np.mean((coarse.position - fine.position) ** 2)) < 2e-4, name
 
 
 FINGER = FingerBody(
@@ -192,9 +194,9 @@ def test_the_finger_moves_as_in_another_engine(payload):
     time = np.arange(100) * 5e-3
     off = np.zeros((100, 3), dtype=bool)
     conditions = {"payload_kg": payload}
-    (path,) = simulate([Run(plant, time, np.tile(start, (100, 1)), off, conditions)], dt=1e-4)
-    assert np.ptp(path, axis=0).min() > 0.1
-    np.testing.assert_allclose(path, np.array(expected), atol=2e-3)
+    (moved,) = simulate([Run(plant, time, np.tile(start, (100, 1)), off, conditions)], dt=1e-4)
+    assert np.ptp(moved.position, axis=0).min() > 0.1
+    np.testing.assert_allclose(moved.position, np.array(expected), atol=2e-3)
 
 
 def test_too_stiff_a_spring_is_refused():

@@ -5,7 +5,6 @@ import json
 
 import numpy as np
 import pytest
-import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.model import write_object
@@ -65,40 +64,29 @@ def test_the_same_seed_gives_the_same_rollout_on_the_cpu():
     assert not np.array_equal(first, run(make(**{**cfg, "seed": 4}), 30))
 
 
-def test_the_table_costs_while_the_object_touches_it():
+def test_the_table_costs_while_the_object_touches_it_and_height_above_it_pays():
     """Equation 7: c6 in every step of contact, none while the object falls or is held."""
-    env = make(reward=RewardCfg(table_contact=-3.0), table=TableCfg(lift_share=1.0))
-    column = env.reward_term_names.index("table_contact")
-    seen, heights = [], []
+    env = make(reward=RewardCfg(table_contact=-3.0, lift=4.0), table=TableCfg(lift_share=1.0))
+    column, lift = map(env.reward_term_names.index, ("table_contact", "lift"))
+    seen, paid, heights = [], [], []
     for _ in range(24):
         env.step(env.action)
         seen.append(env.reward_terms.numpy()[:, column].copy())
+        paid.append(env.reward_terms.numpy()[:, lift].copy())
         heights.append(env.object_pose_end.numpy()[:, 2].copy())
     seen, heights = np.array(seen), np.array(heights)
     falling = heights > heights[-1] + 0.02
     assert falling[0].all() and not falling[-1].any()
     assert (seen[falling] == 0.0).all() and (seen[-1] == -3.0).all()
-    terms = env.reward_terms.numpy()
-    assert env.reward.numpy() == pytest.approx(terms.sum(axis=1), rel=1e-5)
+    # Surface points are a sample: the lowest of them may lie a little above the surface.
+    assert (paid[0] > 1.0).all() and (paid[-1] < 0.4).all()
+    assert env.reward.numpy() == pytest.approx(env.reward_terms.numpy().sum(axis=1), rel=1e-5)
 
     env.sim.place_table(present=False)
     env.reset()
     env.step(env.action)
     assert (env.reward_terms.numpy()[:, column] == 0.0).all()
     assert RewardCfg().table_contact == PAPER.reward.table_contact == -1.0
-
-
-def test_height_above_the_table_pays_and_lying_on_it_does_not():
-    """A falling object has its lowest point above the table until it lies on it."""
-    env = make(reward=RewardCfg(lift=4.0))
-    column = env.reward_term_names.index("lift")
-    seen = []
-    for _ in range(24):
-        env.step(env.action)
-        seen.append(env.reward_terms.numpy()[:, column].copy())
-    # Surface points are a sample: the lowest of them may lie a little above the surface.
-    assert (seen[0] > 3.0).all() and (seen[-1] < 0.4).all()
-    assert env.reward.numpy() == pytest.approx(env.reward_terms.numpy().sum(axis=1), rel=1e-5)
 
 
 def test_tables_leave_their_share_of_worlds_in_time():
@@ -121,14 +109,6 @@ def test_tables_leave_their_share_of_worlds_in_time():
     assert (after[lost] < before[lost] - 0.02).all() and np.allclose(after[~lost], before[~lost], atol=2e-3)
 
 
-def test_environments_that_must_lift_are_those_that_lose_their_table_first():
-    cfg = ReorientCfg(num_envs=1000, table=TableCfg(away_share=0.3, away_s=(1.0, 3.0), lift_share=0.5))
-    steps, lift = table_steps(cfg), must_lift(cfg) == 1
-    away = steps < ALWAYS
-    assert away.sum() == 300 and steps[away].min() == 12 and steps[away].max() == 36
-    assert lift.sum() == 500 and lift[away].all()
-
-
 def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
     """Objects at rest on the table, each at its goal: half of the environments must lift theirs."""
     loose = SuccessCfg(rotation_rad=4.0, joint_speed_rad_s=0.0, action_norm=0.0)
@@ -142,11 +122,13 @@ def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
     assert (reached[~lift] > 0).all() and not reached[lift].any()
 
 
+ANYTHING = SuccessCfg(
+    rotation_rad=4.0, joint_speed_rad_s=0.0, object_speed_m_s=0.0, object_spin_rad_s=0.0, action_norm=0.0
+)
+
+
 def test_a_success_gives_a_new_goal_without_a_reset():
-    anything = SuccessCfg(
-        rotation_rad=4.0, joint_speed_rad_s=0.0, object_speed_m_s=0.0, object_spin_rad_s=0.0, action_norm=0.0
-    )
-    env = make(success=anything)
+    env = make(success=ANYTHING)
     before = env.goal_quat.numpy().copy()
     run(env, 3)
     assert (env.success.numpy() == 1).all() and (env.done.numpy() == 1).all()
@@ -158,10 +140,7 @@ def test_a_success_gives_a_new_goal_without_a_reset():
 
 
 def test_evaluation_stops_at_success():
-    anything = SuccessCfg(
-        rotation_rad=4.0, joint_speed_rad_s=0.0, object_speed_m_s=0.0, object_spin_rad_s=0.0, action_norm=0.0
-    )
-    env = make(success=anything, success_ends_episode=True)
+    env = make(success=ANYTHING, success_ends_episode=True)
     run(env, 1)
     assert (env.step_count.numpy() == 0).all()
     start = env.object_pose()[:, :3]
@@ -379,14 +358,10 @@ def tightening(**changes) -> CurriculumCfg:
             r"randomisation\.restitution is 0\.5 1",
         ),
         ({"randomisation": RandomisationCfg(observation_latency_s=(0.7, 0.7))}, "observation_latency_s"),
-        ({"randomisation": RandomisationCfg(force_s=0.0)}, r"randomisation\.force_s"),
         ({"observation": ObservationCfg(history=-1)}, r"observation\.history"),
         ({"table": TableCfg(away_share=0.3, away_s=(3.0, 1.0))}, r"table\.away_s"),
-        ({"table": TableCfg(away_share=3.0)}, r"table\.away_share"),
-        ({"fingertip": "wet"}, "fingertip = 'wet'"),
         ({"sim": SimCfg(physics_hz=100.0)}, r"sim\.physics_hz"),
         ({"curriculum": tightening(action_norm=0.0)}, r"curriculum\.tightening\.action_norm is 0"),
-        ({"curriculum": tightening(lower_at=0.6)}, r"curriculum\.tightening\.lower_at"),
         ({"curriculum": tightening(object_weight=0.1)}, r"give table\.lift_share"),
         ({"curriculum": tightening(rotation_rad=0.2)}, "raise the latter"),
     ],
@@ -394,16 +369,3 @@ def tightening(**changes) -> CurriculumCfg:
 def test_settings_that_cannot_work_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
         ReorientCfg(**changes).validate()
-
-
-def test_more_objects_than_environments_are_refused():
-    with pytest.raises(ValueError, match="fewer than the"):
-        make(objects=("symmetric",), num_envs=1)
-
-
-@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: graphs exist only there")
-def test_a_captured_step_equals_a_launched_one_in_what_is_deterministic():
-    env = make("cuda:0")
-    run(env, 4)
-    assert env._graph is not None
-    assert (env.step_count.numpy() == 4).all()

@@ -41,26 +41,52 @@ def run(env: ReorientEnv, steps: int, seed: int = 0) -> dict[str, np.ndarray]:
     return {"seen": np.array(seen), "reward": np.array(rewards), "state": np.array(states)}
 
 
-def late(latency_s: float, **changes) -> RandomisationCfg:
-    return dataclasses.replace(EXACT, observation_latency_s=(latency_s, latency_s), **changes)
+def late(latency_s: float, encoder_s: float = 0.0, **changes) -> RandomisationCfg:
+    late_s, encoder = (latency_s, latency_s), (encoder_s, encoder_s)
+    return dataclasses.replace(EXACT, observation_latency_s=late_s, encoder_latency_s=encoder, **changes)
 
 
-@pytest.mark.parametrize("steps_late", [0, 2])
-def test_the_policy_sees_what_was_true_a_latency_ago_and_is_paid_for_what_is_true(steps_late):
+@pytest.mark.parametrize(("object_late", "hand_late"), [(0, 0), (2, 0), (2, 2), (1, 3)])
+def test_object_and_hand_are_seen_as_old_as_each_is_and_what_is_true_is_paid(object_late, hand_late):
     observation = ObservationCfg(shape="full")
     present = run(make(observation=observation), 7)
-    then = run(make(observation=observation, randomisation=late(max(1e-9, steps_late * STEP_S))), 7)
+    random = late(max(1e-9, object_late * STEP_S), hand_late * STEP_S)
+    then = run(make(observation=observation, randomisation=random), 7)
     parts = teacher_observation_slices(3)
-    now = np.zeros(present["seen"].shape[2], dtype=bool)
+    ages = np.full(present["seen"].shape[2], object_late)
+    for name in ("joint_position", "joint_velocity", "fingertips"):
+        ages[parts[name]] = hand_late
     for name in ("goal_orientation", "previous_action"):  # known, not measured
-        now[parts[name]] = True
+        ages[parts[name]] = 0
+    if object_late != hand_late:  # a late object and other fingertips: what lies between them is of no state
+        ages[parts["previous_action"].stop :][:9] = -1
     for step in range(8):
-        np.testing.assert_array_equal(
-            then["seen"][step][:, ~now], present["seen"][max(0, step - steps_late)][:, ~now]
-        )
-        np.testing.assert_array_equal(then["seen"][step][:, now], present["seen"][step][:, now])
+        for age in set(ages) - {-1}:
+            np.testing.assert_array_equal(
+                then["seen"][step][:, ages == age], present["seen"][max(0, step - age)][:, ages == age]
+            )
     np.testing.assert_array_equal(then["reward"], present["reward"])
     assert np.ptp(present["state"], axis=0).max() > 0.05, "something moves"
+
+
+def test_the_nearest_surface_is_from_present_fingertips_to_the_late_object():
+    env = make(observation=ObservationCfg(shape="full"), randomisation=late(STEP_S))
+    joint_q, body_q = [], []
+    for step in range(5):
+        env.action.fill_(0.5 if step % 2 else -0.5)
+        env.step(env.action)
+        joint_q.append(env.sim.joint_q.numpy().copy())
+        body_q.append(env.sim.body_q.numpy().copy())
+    exact = make(observation=ObservationCfg(shape="full"))
+    exact.sim.joint_q.assign(joint_q[-2])
+    exact.sim.body_q.assign(body_q[-1])
+    exact.observe()
+    columns = slice(teacher_observation_slices(3)["previous_action"].stop, None)
+    exact.goal_quat.assign(env.goal_quat)
+    exact.observe()
+    np.testing.assert_allclose(
+        env.observation.numpy()[:, columns], exact.observation.numpy()[:, columns], atol=1e-5
+    )
 
 
 def test_a_latency_between_steps_is_that_of_the_nearest_physics_step():
@@ -76,17 +102,21 @@ def test_a_latency_between_steps_is_that_of_the_nearest_physics_step():
 def test_encoders_are_read_late_and_then_seen_late():
     effects = {"read_delay.delay_s": (STEP_S, STEP_S)}
     read = run(make(randomisation=dataclasses.replace(EXACT, effects=effects)), 6)["seen"]
-    seen = run(make(randomisation=late(STEP_S, effects=effects)), 6)["seen"]
+    seen = run(make(randomisation=late(0.0, STEP_S, effects=effects)), 6)["seen"]
     joints = teacher_observation_slices(3)["joint_position"]
     np.testing.assert_allclose(seen[2:, :, joints], read[1:-1, :, joints], atol=1e-6)
 
 
 def test_every_episode_draws_its_latency_and_forgets_the_one_before():
-    random = dataclasses.replace(EXACT, observation_latency_s=(0.02, 0.1), redraw_s=100.0)
+    random = dataclasses.replace(
+        EXACT, observation_latency_s=(0.02, 0.1), encoder_latency_s=(0.0, 0.04), redraw_s=100.0
+    )
     env = make(randomisation=random, episode_s=0.5, observation=ObservationCfg(history=3))
     env.step_count.assign(np.array([0, 4, 0], dtype=np.int32))
     before = env.observer.seen.latency.numpy().copy()
     assert len(set(before)) == WORLDS and before.min() >= 0.02 and before.max() <= 0.1
+    encoders = env.observer.seen.encoder_latency.numpy()
+    np.testing.assert_allclose(encoders / 0.04, (before - 0.02) / 0.08, atol=1e-5)
     for _ in range(2):
         env.action.fill_(0.7)
         env.step(env.action)
@@ -215,7 +245,7 @@ def test_the_critic_is_told_the_present_as_it_would_be_seen_at_once_and_without_
 
 def test_a_saved_memory_goes_on_exactly():
     changes = {
-        "randomisation": CONDITIONS["mixed"],
+        "randomisation": dataclasses.replace(CONDITIONS["mixed"], encoder_latency_s=(0.0, 0.02)),
         "observation": ObservationCfg(history=3, dynamics="critic", view="goal"),
     }
     first, second = make(**changes), make(**changes)
@@ -233,7 +263,7 @@ def test_a_saved_memory_goes_on_exactly():
 
 @pytest.mark.parametrize(
     ("force_s", "share", "sim"),
-    [(1.0 / 60.0, 0.2, SimCfg()), (1.0 / 60.0, 0.2, coarser(SimCfg())), (STEP_S, 1.0, SimCfg())],
+    [(1.0 / 60.0, 0.2, coarser(SimCfg())), (STEP_S, 1.0, SimCfg())],
 )
 def test_a_force_gives_its_impulse_in_the_time_it_acts(force_s, share, sim):
     random = dataclasses.replace(EXACT, force_probability=1.0, force_s=force_s)
@@ -257,3 +287,37 @@ def test_a_force_gives_its_impulse_in_the_time_it_acts(force_s, share, sim):
     steps = round(share * env.cfg.sim.substeps)
     np.testing.assert_allclose(gained[steps - 1], gained[-1], atol=1e-5)
     assert np.linalg.norm(gained[0], axis=1) == pytest.approx(15.0 * force_s / steps, rel=0.02)
+
+
+def test_an_object_is_believed_off_by_the_same_all_through_an_episode_and_anew_in_the_next():
+    wrong = (0.005, 0.1)
+    env = make(randomisation=dataclasses.replace(EXACT, object_pose_error=wrong), episode_s=0.5)
+    parts = teacher_observation_slices(3)
+    env.step_count.assign(np.array([0, 4, 0], dtype=np.int32))
+    errors = []
+    for _ in range(3):
+        seen, true = env.observation.numpy(), env.object_pose()
+        turn = (
+            Rotation.from_quat(seen[:, parts["object_orientation"]]) * Rotation.from_quat(true[:, 3:]).inv()
+        )
+        errors.append(np.hstack([seen[:, parts["object_position"]] - true[:, :3], turn.as_rotvec()]))
+        goal = Rotation.from_quat(env.goal_quat.numpy())
+        believed = Rotation.from_quat(seen[:, parts["relative_orientation"]]) * goal
+        off = believed * Rotation.from_quat(seen[:, parts["object_orientation"]]).inv()
+        np.testing.assert_allclose(off.magnitude(), 0.0, atol=1e-3)
+        env.action.fill_(0.7)
+        env.step(env.action)
+    for error in errors:
+        np.testing.assert_allclose(np.linalg.norm(error[:, :3], axis=1), wrong[0], rtol=1e-3)
+        np.testing.assert_allclose(np.linalg.norm(error[:, 3:], axis=1), wrong[1], rtol=1e-3)
+    np.testing.assert_allclose(errors[1], errors[0], atol=1e-5)
+    np.testing.assert_allclose(errors[2][[0, 2]], errors[0][[0, 2]], atol=1e-5)
+    assert np.abs(errors[2][1] - errors[0][1]).max() > 1e-3, "its episode ended"
+
+
+def test_a_centre_of_mass_beside_the_middle_reaches_the_solver():
+    env = make(randomisation=dataclasses.replace(EXACT, object_com_m=0.01))
+    centre = env.sim.solver.mjw_model.body_ipos.numpy()[:, -1]
+    assert np.linalg.norm(centre, axis=1) == pytest.approx(0.01, rel=1e-5)
+    assert len(np.unique(centre[:, 0])) == WORLDS
+    assert not make().sim.solver.mjw_model.body_ipos.numpy()[:, -1].any()

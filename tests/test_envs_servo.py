@@ -135,7 +135,8 @@ def test_effects_are_drawn_without_a_layer():
 
 def test_servos_are_drawn_anew_and_started_anew_with_their_world_alone(layer):
     path = layer(backlash={"width_rad": (0.03, 0.02, 0.05)}, command_delay={"delay_s": 0.1})
-    env = make(path, episode_s=0.5, randomisation=dataclasses.replace(SERVOS, redraw_s=0.1))
+    env = make(path, episode_s=0.5, randomisation=SERVOS)
+    gains = env.randomiser.kp.numpy().copy()
     env.step_count.assign(np.array([0, 3, 0, 0], dtype=np.int32))
     before = rows(env)
     run(env, 3)
@@ -144,6 +145,7 @@ def test_servos_are_drawn_anew_and_started_anew_with_their_world_alone(layer):
     after = rows(env)
     assert np.array_equal(before[others], after[others])
     assert (before[1, :, actuators.BACKLASH_WIDTH] != after[1, :, actuators.BACKLASH_WIDTH]).all()
+    assert np.array_equal(env.randomiser.kp.numpy(), gains), "which the solver holds, for longer"
     clock = env.sim.servo.state.numpy().reshape(WORLDS, 9, -1)[:, :, actuators.STATE_TIME]
     assert (clock[1] == 0.0).all() and clock[others] == pytest.approx(3 * env.cfg.sim.control_dt)
     # The command that was under way when the episode ended does not arrive in the next one.

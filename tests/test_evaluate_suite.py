@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import fields, replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -12,12 +13,15 @@ from vd.evaluate import suite_run
 from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.cli import main
+from vd.evaluate.conditions import Condition
 from vd.evaluate.result import Result
 from vd.evaluate.suite import (
     CLAIMS,
     CONDITIONS,
+    OWN_SETS,
     QUICK_OBJECTS,
     QUICK_S,
+    ROBUST,
     lost_at_once,
     seen_within,
     success_without_table,
@@ -133,7 +137,7 @@ def test_the_reduced_suite_ends_in_its_time_and_shows_what_it_has(tmp_path, aske
 def test_the_reduced_suite_takes_a_spread_of_objects(tmp_path):
     for index in range(QUICK_OBJECTS * 3):
         (tmp_path / f"{index:02}.usd").touch()
-    groups = suite_run.object_groups((f"training={tmp_path}",), quick=True)
+    groups = suite_run.object_groups((f"training={tmp_path}",), set(OWN_SETS), quick=True)
     assert [item[-6:] for item in groups["training"].sets] == [f"{i:02}.usd" for i in range(0, 18, 3)]
     assert f"{QUICK_OBJECTS} of the 18" in groups["training"].text
 
@@ -207,13 +211,45 @@ def test_the_papers_figures_stand_beside_ours(tmp_path, asked):
     assert references.tags.count("img") == 1
 
 
+def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monkeypatch):
+    whole = suite_run.compare
+
+    def spoiled(cfg, condition, stop_at):  # of everything but the nominal condition the first episode fails
+        whole(cfg, condition, stop_at)
+        result = Result.read(cfg.out / "eval.json")
+        if condition != "nominal":
+            rows = [
+                replace(row, episodes=(replace(row.episodes[0], fell=True, stopped=False), *row.episodes[1:]))
+                for row in result.rows
+            ]
+            replace(result, rows=tuple(rows)).write(cfg.out / "eval.json")
+
+    monkeypatch.setattr(suite_run, "compare", spoiled)
+    run(tmp_path, TEACHER, CAMERA, suite="robust", objects=("held-out=cube",))
+    of_state = {"observation-late", "all-late", "pose-error"}
+    names = [c.name for c in ROBUST]
+    assert set(names) == set(get_args(Condition)) and names[0] == "nominal"
+    assert {n for n, policy in asked if policy == CAMERA} == set(names) - of_state
+    assert {n for n, policy in asked if policy == TEACHER} == set(names)
+    table = json.loads((tmp_path / "out" / "robust.json").read_text())["figures"]
+    lines = [(name, policy) for name in names for policy in ("s", TEACHER)]
+    expected = [line for line in lines if line[1] == TEACHER or line[0] not in of_state]
+    assert [(row["condition"], row["policy"]) for row in table] == expected
+    assert len(table[0]) <= 7 and table[0]["points from nominal"] == "–"  # noqa: RUF001
+    cost = {float(row["points from nominal"].split()[0]) for row in table[2:]}
+    assert len(cost) <= 2 and min(cost) < 0.0
+    text, _ = read_page(tmp_path / "out" / "robust.html")
+    assert "Condition by condition" in text and "--condition off-centre" in text and "72.3 %" not in text
+
+
 def test_our_objects_stand_for_the_papers_where_none_are_given():
-    groups = suite_run.object_groups((), quick=False)
+    wanted = set(OWN_SETS)
+    groups = suite_run.object_groups((), wanted, quick=False)
     assert "validation" not in groups, "nothing stands in for it"
     assert groups["training"].sets == ("procedural-150-seed0",) and "our own" in groups["held-out"].text
     assert EvalCfg(suite="paper").agent_names == tuple(SHIPPED_POLICIES)
     with pytest.raises(ValueError, match="'table' is no group of the suite; training, validation, held-out"):
-        suite_run.object_groups(("table=cube",), quick=False)
+        suite_run.object_groups(("table=cube",), wanted, quick=False)
 
 
 @pytest.mark.parametrize(
@@ -266,9 +302,9 @@ def test_measures_count_what_they_say(found):
 @pytest.mark.slow
 def test_on_a_table_of_other_friction_and_in_the_air(tmp_path, monkeypatch, capsys):
     chosen = tuple(c for c in CONDITIONS if c.name in ("symmetric", "friction-0.05", "air"))
-    monkeypatch.setattr(suite_run, "CONDITIONS", chosen)
+    monkeypatch.setitem(suite_run.SUITES, "paper", chosen)
     flags = ["dclaw4-cube", "--suite", "paper", "--quick", "--jobs", "2", "--device", "cpu"]
-    assert main([*flags, "--objects", *OBJECTS, "--out", str(tmp_path), "--json"]) == 0
+    assert main([*flags, "--objects", *OBJECTS[1:], "--out", str(tmp_path), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert {row["condition"] for row in rows} == {c.name for c in chosen}
     friction, nominal = (

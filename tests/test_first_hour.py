@@ -60,7 +60,6 @@ def refused(line, said, folder, heavy):
     [
         "vd-eval bad.pt",
         "vd-play bad.pt",
-        "vd-bench student --networks bad.pt",
         "vd-bench sim --policy bad.pt",
     ],
 )

@@ -3,49 +3,29 @@
 import csv
 import dataclasses
 import json
-import re
 import shutil
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from gap_reports import BASE, FRICTION, JOINT, base_columns, rubbing_servo, servo_report
 
 from vd.assets_usd.hand_data import HandError
 from vd.assets_usd.hand_layer import read_bare_layer
-from vd.bench.hide import hide
 from vd.gap import cli, steps
 from vd.gap.chain import chains
-from vd.gap.close import counterparts, simulate_again, write_identified
+from vd.gap.close import simulate_again, write_identified
 from vd.gap.plan import discard_plan, plan, write_plan
 from vd.gap.recording import read_recording
-from vd.gap.result import (
-    Candidate,
-    Estimate,
-    Fit,
-    HeldOut,
-    JointGap,
-    NamedEffect,
-    Predictions,
-    Report,
-    Source,
-    TrajectoryError,
-)
-from vd.gap.rollout import Rollouts
+from vd.gap.result import Candidate, Report
 from vd.kernels.servo import actuators
-
-JOINT = "joint"
-FLOOR = 1e-3
-BASE = {"kp": 3.0, "kd": 0.3, "velocity_limit": 7.0, "inertia": 2e-3}
-FRICTION = 0.15
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """A bare servo with friction."""
-    folder = tmp_path_factory.mktemp("recordings") / "servo"
-    hide("servo", {"coulomb_friction": {"tau_c_nm": FRICTION}}, folder, seed=3, base_spread=0.0)
-    return folder
+    return rubbing_servo(tmp_path_factory.mktemp("recordings") / "servo")
 
 
 @pytest.mark.parametrize("command", ["run", "identify"])
@@ -62,71 +42,6 @@ def test_a_recording_that_cannot_be_used_is_refused_before_warp_is_imported(reco
     said = subprocess.run(arguments, capture_output=True, text=True, timeout=120).stderr
     assert "cut the file there" in said and table.name in said
     assert said.endswith("2 False\n") and not (tmp_path / "out").exists()
-
-
-def servo_curves(folder, rows):
-    """Curves of rows (baseline, identified), each {column: value} on the fitted base."""
-    found = read_recording(folder)
-    (chain,) = chains(found, None)
-    models = np.tile(chain.start_row, (2, 1, 1))
-    for model, values in zip(models, rows, strict=True):
-        for column, value in {**base_columns(), **values}.items():
-            model[0, column] = value
-    rollouts = Rollouts(chain, found)
-    predicted = rollouts.predict(models)
-    return Predictions(
-        time=rollouts.time,
-        trajectory=rollouts.sample_trajectory,
-        command=np.concatenate([t.command for t in found.trajectories]),
-        measured=rollouts.measured,
-        baseline=predicted[0].astype(float),
-        identified=predicted[1].astype(float),
-        joints=found.joints,
-        files=tuple(t.file for t in found.trajectories),
-    )
-
-
-def base_columns():
-    return {
-        actuators.KP: BASE["kp"],
-        actuators.KD: BASE["kd"],
-        actuators.VELOCITY_LIMIT: BASE["velocity_limit"],
-        actuators.INERTIA: BASE["inertia"],
-    }
-
-
-def servo_report(folder, *, verdict="effects", ambiguous=()):
-    """What a fit might say about the recording, and its curves."""
-    curves = servo_curves(folder, ({}, {actuators.COULOMB_TORQUE: FRICTION}))
-    before = float(np.sqrt(np.mean((curves.baseline - curves.measured) ** 2)))
-    after = float(np.sqrt(np.mean((curves.identified - curves.measured) ** 2)))
-    friction = NamedEffect(
-        "coulomb_friction", (JOINT,), 0.98, {"tau_c_nm": Estimate(FRICTION, (0.14, 0.16), "N m")}
-    )
-    decision = "named" if verdict == "effects" else "tied"
-    names = {"coulomb_friction": {"tau_c_nm": FRICTION}, "backlash": {"width_rad": 0.08}}
-    report = Report(
-        verdict=verdict,
-        noise_floor_rad=FLOOR,
-        baseline=Fit(before, {JOINT: before}, before, {JOINT: BASE}),
-        findings=(),
-        effects=(friction,) if verdict == "effects" else (),
-        ambiguous=ambiguous,
-        identified=Fit(after, {JOINT: after}, after, {JOINT: BASE}),
-        held_out=HeldOut(curves.files, before, after, 1.0 - after / before, (0.5, 0.9)),
-        next_experiment="",
-        seconds=1.0,
-        recording=Source(str(folder), "servo", (JOINT,), len(curves.files), len(curves.time), 40.0),
-        joints=(
-            JointGap(JOINT, FLOOR, before, (0.0, 1.0), after, (0.0, 1.0), verdict, "made up", ambiguous),
-        ),
-        evidence=tuple(
-            Candidate((JOINT,), 1, name, after, 0.8, (0.7, 0.9), decision, "made up", values)
-            for name, values in names.items()
-        ),
-        trajectories=tuple(TrajectoryError(file, file, JOINT, True, before, after) for file in curves.files),
-    )
-    return report, curves
 
 
 @pytest.fixture
@@ -194,21 +109,17 @@ def test_finished_steps_are_kept_until_something_changes(fitted, no_figures, rec
 
 def test_steps_go_on_from_what_the_one_before_wrote(fitted, no_figures, recording, tmp_path, capsys):
     out = str(tmp_path / "gap")
+    assert cli.main(["close", "--out", out]) == 1
+    assert "vd-gap run RECORDING" in capsys.readouterr().err
     assert cli.main(["explain", str(recording), "--out", out]) == 1
     assert "run vd-gap find --out" in capsys.readouterr().err
     assert cli.main(["find", str(recording), "--out", out, "--seed", "7"]) == 0
+    assert cli.main(["plan", "--out", out]) == 1
+    assert "run vd-gap explain" in capsys.readouterr().err
     for step in ("explain", "close", "report"):
         assert cli.main([step, "--out", out]) == 0, step
     assert fitted["find"] == 1
     assert "--seed 7" in Report.read(tmp_path / "gap" / "report.json").command
-
-
-def test_unusable_recordings_exit_with_2_and_a_message(tmp_path, capsys):
-    missing = tmp_path / "none"
-    assert cli.main(["run", str(missing), "--out", str(tmp_path / "gap")]) == 2
-    message = capsys.readouterr().err
-    assert str(missing) in message and "Traceback" not in message
-    assert not (tmp_path / "gap" / "report.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -223,11 +134,6 @@ def test_unusable_recordings_exit_with_2_and_a_message(tmp_path, capsys):
 def test_wrong_flags_are_named(recording, tmp_path, capsys, flags, message):
     assert cli.main(["run", str(recording), "--out", str(tmp_path / "gap"), *flags]) == 1
     assert message in capsys.readouterr().err
-
-
-def test_nothing_begun_says_how_to_begin(tmp_path, capsys):
-    assert cli.main(["close", "--out", str(tmp_path / "gap")]) == 1
-    assert "vd-gap run RECORDING" in capsys.readouterr().err
 
 
 def test_hide_writes_a_recording_and_the_truth(tmp_path, capsys):
@@ -258,33 +164,26 @@ def test_layer_of_a_bare_servo_reads_back_as_it_was_identified(recording, tmp_pa
     closing, again = simulate_again(report, layer, found, None, None, curves)
     np.testing.assert_allclose(again.identified, curves.identified, atol=1e-5)
     assert closing.identified_rmse_rad == pytest.approx(report.held_out.identified_rmse_rad, rel=1e-3)
-
-
-def test_effects_of_the_layer_that_was_started_from_stay(recording, tmp_path):
-    report, _ = servo_report(recording)
-    (chain,) = chains(read_recording(recording), None)
-    start = chain.start_row.copy()
-    start[0, actuators.COMMAND_DELAY] = 0.02
-    write_identified(report, tmp_path / "two.usda", read_recording(recording), None, {JOINT: start[0]})
-    rows, _ = read_bare_layer(tmp_path / "two.usda", (JOINT,))
+    start = chains(found, None)[0].start_row[0].copy()
+    start[actuators.COMMAND_DELAY] = 0.02
+    write_identified(report, layer, found, None, {JOINT: start})  # what was started from stays
+    rows, _ = read_bare_layer(layer, (JOINT,))
     assert rows[0, actuators.COMMAND_DELAY] == pytest.approx(0.02)
     assert rows[0, actuators.COULOMB_TORQUE] == pytest.approx(FRICTION)
-
-
-def test_layers_that_are_none_are_named(recording, tmp_path):
-    report, _ = servo_report(recording)
-    layer = tmp_path / "identified.usda"
-    with pytest.raises(HandError, match="no such hand layer"):
-        read_bare_layer(layer, (JOINT,))
-    layer.write_text("not USD")
-    with pytest.raises(HandError, match=re.escape(str(layer))):
-        read_bare_layer(layer, (JOINT,))
-    layer.write_text("#usda 1.0\n")
-    with pytest.raises(HandError, match="not an identified servo model"):
-        read_bare_layer(layer, (JOINT,))
-    write_identified(report, layer, read_recording(recording), None, {})
     with pytest.raises(HandError, match="no joint /servo/elbow"):
         read_bare_layer(layer, ("elbow",))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [(None, "no such hand layer"), ("not USD", "x.usda"), ("#usda 1.0\n", "not an identified servo model")],
+)
+def test_layers_that_are_none_are_named(tmp_path, text, message):
+    layer = tmp_path / "x.usda"
+    if text is not None:
+        layer.write_text(text)
+    with pytest.raises(HandError, match=message):
+        read_bare_layer(layer, (JOINT,))
 
 
 def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tmp_path):
@@ -315,17 +214,10 @@ def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tm
     assert not (tmp_path / "next_experiment.json").exists()
 
 
-def test_a_plan_needs_what_was_explained(fitted, recording, tmp_path, capsys):
-    out = str(tmp_path / "gap")
-    assert cli.main(["find", str(recording), "--out", out]) == 0
-    assert cli.main(["plan", "--out", out]) == 1
-    assert "run vd-gap explain" in capsys.readouterr().err
-
-
 def test_plan_does_not_explain_two_rivals_away_together(tmp_path):
     """Friction and a dead zone leave the same errors at one gain; at others they cannot both be right."""
     friction = 0.015
-    hide("servo", {"coulomb_friction": {"tau_c_nm": friction}}, tmp_path / "r", seed=3, base_spread=0.0)
+    rubbing_servo(tmp_path / "r", friction)
     names = ("coulomb_friction", "dead_zone")
     report, _ = servo_report(tmp_path / "r", verdict="ambiguous", ambiguous=(names,))
     values = ({"tau_c_nm": friction}, {"width_rad": 2.0 * friction / BASE["kp"]})
@@ -358,9 +250,3 @@ def test_plan_for_motions_that_show_too_little(recording):
     assert tuple(result.competing) == (JOINT,)
     assert "what these motions do not show" in result.sentence
     assert slow.trajectories[0].excitation not in {motion.name for motion in result.motions}
-
-
-def test_other_fingers_take_the_model_of_the_recorded_one():
-    joints = tuple(f"f{f}_j{j}" for f in range(3) for j in (1, 2, 3))
-    found = counterparts(joints, ("f1_j1", "f1_j3"))
-    assert found == {"f0_j1": "f1_j1", "f2_j1": "f1_j1", "f0_j3": "f1_j3", "f2_j3": "f1_j3"}

@@ -16,7 +16,7 @@ from vd.gap.fit_cache import FOLDER
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
 from vd.gap.words import verdict_sentence
-from vd.gap.workflow import explain, find
+from vd.gap.workflow import explain
 from vd.kernels.servo.effects import EFFECTS
 
 SMALL = ("command_delay", "coulomb_friction", "torque_saturation", "thermal_drift", "command_filter")
@@ -160,11 +160,6 @@ def test_a_cause_outside_the_table_is_unknown(cause: str, tmp_path: Path) -> Non
 def test_few_trajectories_are_under_excited(tmp_path: Path) -> None:
     report = analysed(recorded({servo.COULOMB_TORQUE: 0.05}).subset([0, 3]), tmp_path)
     assert report.verdict == "under_excited" and not report.effects
-
-
-def test_unknown_effects_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="slime"):
-        find(recorded({}), None, tmp_path, effects=("slime",))
 
 
 def test_the_evidence_has_every_effect_also_what_was_not_fitted(tmp_path: Path) -> None:

@@ -8,14 +8,13 @@ from gap_recordings import ENCODER_COUNT, TRUE, blank, problem_of, recorded, tru
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import candidates, chains
-from vd.gap.coordinates import coordinate
 from vd.gap.design import design
 from vd.gap.explanation import intervals
-from vd.gap.find import findings, phases
+from vd.gap.find import findings
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
-from vd.gap.statistics import covariance, noise_floor, resamples, rmse
+from vd.gap.statistics import covariance, noise_floor
 from vd.kernels.servo.effects import EFFECTS
 
 NEAR = {"kp": 3.0, "kd": 0.25, "velocity_limit": 7.0, "inertia": 2.5e-3}
@@ -82,15 +81,6 @@ def test_a_refined_fit_depends_less_on_the_step_and_a_wrong_model_leaves_structu
     assert products.sum() / count.sum() > 0.15 * problem.floor**2
 
 
-def test_another_search_finds_the_same() -> None:
-    problem = problem_of(recorded({servo.COULOMB_TORQUE: 0.1}))
-    scales = problem.scales(problem.rollouts.chain.start_row[0], 1e-2)
-    fit = fitted(problem, "coulomb_friction", coulomb_friction__tau_c_nm=0.08)
-    again, other = (problem.again(fit, scales, seed=seed) for seed in (1, 2))
-    assert again.rmse == pytest.approx(fit.rmse, rel=0.02)
-    assert other.values != again.values, "another seed is another search"
-
-
 def test_promise_ranks_the_hidden_effect_first() -> None:
     problem = problem_of(recorded({servo.COULOMB_TORQUE: 0.06}))
     fit = fitted(problem)
@@ -150,34 +140,11 @@ def test_intervals_widen_with_disagreement_between_trajectories() -> None:
     assert np.all(np.diag(white) >= 0.99 * 1e-6 * np.diag(np.linalg.inv(gram.sum(0))))
 
 
-def test_bootstrap_draws_whole_trajectories() -> None:
-    weights = resamples(7, np.random.default_rng(0), 500)
-    assert weights.shape == (500, 7)
-    assert np.all(weights.sum(1) == 7)
-    sse, count = np.arange(1.0, 8.0), np.full(7, 10.0)
-    spread = rmse(sse, count, weights)
-    assert spread.min() < rmse(sse, count) < spread.max()
-
-
 def test_what_the_baseline_fits_is_no_candidate() -> None:
     (bare,), (pendulum,) = chains(blank()), chains(blank(model="pendulum"))
     assert "gravity_load" in candidates(bare, tuple(EFFECTS))
     assert "gravity_load" not in candidates(pendulum, tuple(EFFECTS))
     assert not {"payload_inertia", "joint_coupling"} & {*candidates(bare, tuple(EFFECTS))}
-
-
-@pytest.mark.parametrize(
-    "key", ["kp", "command_delay.delay_s", "gravity_load.phase_rad", "torque_limit.tau_max_nm"]
-)
-def test_coordinates_invert_within_bounds(key: str) -> None:
-    problem = problem_of(blank())
-    c = coordinate(key, problem.scales(problem.rollouts.chain.start_row[0], 0.01))
-    for value in (0.011, 0.2):
-        assert float(c.value(c.inverse(value))) == pytest.approx(value)
-    assert c.lower <= c.inverse(1e9) == c.upper
-    x = np.array([c.lower, c.upper])
-    moved = x + c.step(x, np.ones(2))
-    assert np.all((moved >= c.lower) & (moved <= c.upper) & (moved != x))
 
 
 def test_findings_say_where_friction_shows() -> None:
@@ -189,12 +156,3 @@ def test_findings_say_where_friction_shows() -> None:
     assert all(f.signature["rms_rad"] > f.signature["noise_floor_rad"] for f in found)
     same = findings(recording, np.concatenate([t.position for t in recording.trajectories]), {"j": 1e-3})
     assert same == []
-
-
-def test_phases_of_a_step() -> None:
-    step = recorded({}).trajectories[0]
-    found = phases(step, 0, ENCODER_COUNT, 7.0)
-    assert found["onset"][(step.time > 0.32) & (step.time < 0.42)].all()
-    assert not found["onset"][step.time < 0.29].any()
-    assert found["hold"][(step.time > 1.3) & (step.time < 1.5)].all()
-    assert not found["hold"][(step.time > 0.32) & (step.time < 0.4)].any()

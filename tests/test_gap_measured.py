@@ -1,10 +1,8 @@
 """Acceptance on real recordings (``measured/`` of the shared folder): what they are known to say.
 
-Short lists of candidates and few joints by default; with ``VD_ACCEPTANCE=1`` every effect on every joint,
-which takes minutes.
+Short lists of candidates and few joints: all of them take minutes.
 """
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,13 +16,9 @@ from vd.gap.result import Report
 from vd.gap.statistics import held
 from vd.gap.workflow import explain
 
-whole = pytest.mark.skipif(not os.environ.get("VD_ACCEPTANCE"), reason="minutes long; set VD_ACCEPTANCE=1")
 FRICTION = ("coulomb_friction", "dead_zone", "backlash")
 LOAD = ("coulomb_friction", "gravity_load", "encoder_bias", "asymmetric_friction")
-LOSSES = (
-    *("load_friction", "torque_limit", "torque_saturation", "supply_sag"),
-    *("command_delay", "backlash"),
-)
+LOSSES = ("load_friction", "torque_saturation", "supply_sag", "command_delay", "backlash")
 MAE_RAD = 0.036
 """Goal for the pendulum at a gain that was left out [rad]."""
 
@@ -53,8 +47,11 @@ def names(report: Report, joint: str) -> set[str]:
 
 @pytest.fixture(scope="module")
 def pendulum(shared_dir, tmp_path_factory) -> Report:
+    """Three of its four motions, at all gains: the fourth takes ten times as long and shows nothing else."""
     recording = measured(shared_dir, "xl330_pendulum")
-    return explain(recording, None, tmp_path_factory.mktemp("xl330"), effects=LOSSES, workers=1)
+    quick = [i for i, t in enumerate(recording.trajectories) if t.excitation != "up_and_down"]
+    out = tmp_path_factory.mktemp("xl330")
+    return explain(recording.subset(quick), None, out, effects=LOSSES, workers=1)
 
 
 def test_losses_of_the_pendulum_are_load_friction_and_a_set(pendulum):
@@ -117,24 +114,3 @@ def test_gravity_is_named_on_the_elbow(arm, tmp_path):
     assert names(report, "Elbow") == {"gravity_load", "coulomb_friction"}
     (elbow,) = report.joints
     assert elbow.identified_rmse_rad < 0.3 * elbow.baseline_rmse_rad
-
-
-@whole
-def test_whole_arm(arm, tmp_path):
-    report = explain(arm, None, tmp_path)
-    smaller = [1.0 - j.identified_rmse_rad / j.baseline_rmse_rad for j in report.joints]
-    assert sum(share >= 0.4 for share in smaller) >= 5, smaller
-    assert "gravity_load" in names(report, "Pitch") & names(report, "Elbow")
-    assert "gravity_load" not in names(report, "Rotation")
-    rotation = next(joint for joint in report.joints if joint.joint == "Rotation")
-    assert set(FRICTION) in [set(members) for members in rotation.open_sets]
-
-
-@whole
-def test_whole_pendulum(shared_dir, tmp_path):
-    report = explain(measured(shared_dir, "xl330_pendulum"), None, tmp_path)
-    assert "load_friction" in names(report, "pendulum")
-    assert "torque_saturation" not in names(report, "pendulum")
-    assert report.held_out.identified_mae_rad < MAE_RAD
-    assert any("torque_saturation" in members for members in report.ambiguous)
-    assert not {"command_delay", "backlash", "supply_sag"} & names(report, "pendulum")

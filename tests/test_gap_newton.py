@@ -13,7 +13,7 @@ from vd.assets_usd.hands import load_hand
 from vd.gap import cli
 from vd.gap.chain import chains
 from vd.gap.excitations import JointRange, steps_and_sines
-from vd.gap.identify import identify, pack_tracks, write_drives
+from vd.gap.identify import identify, write_drives
 from vd.gap.newton import HandReplay, simulate_hand
 from vd.gap.recording import Recording, Trajectory, write_recording
 from vd.gap.rollout import Rollouts
@@ -123,19 +123,6 @@ def test_torque_off_lets_a_finger_hang():
     assert np.ptp(held[:, 1]) > 0.3 and np.abs(free[:, 1] - held[:, 1]).max() > 0.3
 
 
-def test_fingers_are_packed_into_the_same_worlds():
-    recording = motions("sine_0.50hz", ("f0_j1", "f0_j2", "f1_j1"), 0.3)
-    assert pack_tracks(recording, HAND, [0, 1]).tolist() == [[0, 2, -1], [1, -1, -1]]
-    with pytest.raises(ValueError, match="no trajectory excites finger 2"):
-        pack_tracks(recording, HAND, [0, 2])
-
-
-def test_unknown_joints_are_named():
-    recording = replace(motions("sine_0.50hz", ("f0_j1",), 0.3), joints=("elbow",) * 9)
-    with pytest.raises(ValueError, match="elbow"):
-        simulate_hand(recording, HAND, rows())
-
-
 def test_the_search_finds_the_gains_that_made_a_recording(tmp_path):
     """Two fingers, one joint each, searched together; the true gains are 40 % off the start."""
     joints, dt = ("f0_j1", "f1_j2"), 1.0 / 120.0
@@ -179,12 +166,6 @@ def test_the_search_finds_the_gains_that_made_a_recording(tmp_path):
     assert layered.servo[2, servo.KP] == HAND.servo[2, servo.KP]
 
 
-def test_a_bare_servo_is_no_hand_to_identify(tmp_path, capsys):
-    assert cli.main(["hide", "servo", "--out", str(tmp_path / "rec")]) == 0
-    assert cli.main(["identify", str(tmp_path / "rec"), "--out", str(tmp_path / "drives.usda")]) == 1
-    assert "a bare servo is no hand" in capsys.readouterr().err
-
-
 def test_identify_prints_the_drives_and_writes_the_layer(tmp_path, capsys):
     recording = motions("step_large", ("f0_j1",), 1.2)
     # A servo of any kind, a tenth of the way behind in each sample.
@@ -201,3 +182,6 @@ def test_identify_prints_the_drives_and_writes_the_layer(tmp_path, capsys):
     found = json.loads(captured.out)
     assert found["joints"] == ["f0_j1"] and len(found["kp"]) == 1
     assert load_hand("dclaw3", layer=layer).servo[0, servo.KP] == pytest.approx(found["kp"][0], rel=1e-5)
+    assert cli.main(["hide", "servo", "--out", str(tmp_path / "bare")]) == 0
+    assert cli.main(["identify", str(tmp_path / "bare"), "--out", str(layer)]) == 1
+    assert "a bare servo is no hand" in capsys.readouterr().err

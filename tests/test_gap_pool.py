@@ -1,13 +1,8 @@
 """Fits one by one, in processes, in threads that simulate together, and from what was kept of them."""
 
 import multiprocessing
-import os
 import pickle
-import signal
-import subprocess
-import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -68,54 +63,6 @@ def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
     assert batch.launches <= 2 + 3 * 3 + (2 * 3 - 1) + 1
 
 
-PARENT = """
-import time
-import multiprocessing
-from test_gap_pool import problem
-from vd.gap.worker_pool import WorkerPool
-
-if __name__ == "__main__":
-    problems, spec = problem({})
-    with WorkerPool(problems, workers=2) as pool:
-        row = problems.chains[0].start_row[0]
-        pool.run(spec, [("scales", {"row": row, "residual": left}) for left in (0.01, 0.02)])
-        print(*(child.pid for child in multiprocessing.active_children()), flush=True)
-        time.sleep(60.0)
-"""
-ENDING_S = 120.0
-"""Time for orphans to end."""
-
-
-def test_workers_end_with_whom_they_work_for(tmp_path: Path) -> None:
-    script = tmp_path / "parent.py"
-    script.write_text(PARENT)
-    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    with subprocess.Popen(
-        [sys.executable, script], stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path}
-    ) as parent:
-        assert parent.stdout is not None
-        lines = iter(parent.stdout)
-        workers = [int(pid) for pid in next(line for line in lines if line[:1].isdigit()).split()]
-        assert len(workers) == 2 and all(map(runs, workers))
-        parent.send_signal(signal.SIGKILL)
-        parent.wait()
-        end = time.monotonic() + ENDING_S
-        while any(map(runs, workers)) and time.monotonic() < end:
-            time.sleep(0.1)
-        left = [pid for pid in workers if runs(pid)]
-        for pid in left:
-            os.kill(pid, signal.SIGKILL)
-        assert not left
-
-
-def runs(pid: int) -> bool:
-    """Whether a process runs, and is not merely waiting for somebody to ask how it ended."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 def test_a_worker_that_is_killed_ends_the_run_with_what_to_change() -> None:
     problems, spec = problem({})
     others = multiprocessing.active_children()
@@ -126,20 +73,6 @@ def test_a_worker_that_is_killed_ends_the_run_with_what_to_change() -> None:
                 process.kill()
         with pytest.raises(ChildProcessError, match=r"one of 2 processes was killed.*memory"):
             pool.run(spec, [("scales", {"row": problems.chains[0].start_row[0], "residual": 0.03})])
-
-
-def test_a_failure_reaches_all_who_wait() -> None:
-    recording = recorded({})
-    (chain,) = chains(recording)
-    batch = LaunchBatch()
-    rollouts = Rollouts(chain, recording, batch=batch)
-    batch.join(1)
-    with pytest.raises(IndexError):
-        rollouts.predict(chain.start_row[None], [99])
-    batch.leave()
-    np.testing.assert_array_equal(
-        rollouts.predict(chain.start_row[None]), Rollouts(chain, recording).predict(chain.start_row[None])
-    )
 
 
 def test_whoever_stops_does_not_wait_for_the_other_joints() -> None:

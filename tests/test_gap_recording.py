@@ -40,19 +40,8 @@ def folder(tmp_path):
     return write_recording(example(), tmp_path / "recording")
 
 
-def edit_header(folder, **changes):
-    header = json.loads((folder / "recording.json").read_text())
-    for key, value in changes.items():
-        if value is None:
-            header.pop(key)
-        else:
-            header[key] = value
-    (folder / "recording.json").write_text(json.dumps(header))
-
-
 def edit_table(folder, change):
-    lines = (folder / "a.csv").read_text().splitlines()
-    rows = [line.split(",") for line in lines]
+    rows = [line.split(",") for line in (folder / "a.csv").read_text().splitlines()]
     rows = change(rows) or rows
     (folder / "a.csv").write_text("\n".join(",".join(row) for row in rows) + "\n")
 
@@ -72,7 +61,6 @@ def refused(folder, *words):
         read_recording(folder)
     for word in words:
         assert word in str(error.value)
-    return str(error.value)
 
 
 def test_what_is_written_is_read(tmp_path):
@@ -100,49 +88,27 @@ def test_commands_may_be_sent_at_other_times_than_the_stamps(tmp_path):
     np.testing.assert_allclose(read.sent, sent, atol=1e-6)
     np.testing.assert_array_equal(read.piece(50, 90).sent, read.sent[50:90])
     for column in ("t", "t_command"):
-        edit_table(folder, set_cells(column, lambda t: f"{5.0 + t:.6f}"))
-    np.testing.assert_allclose(read_recording(folder).trajectories[0].sent, sent, atol=1e-6)
+        edit_table(folder, set_cells(column, lambda t: f"{5.0 + t + 1e-5 * np.sin(50 * t):.6f}"))
+    (late,) = read_recording(folder).trajectories
+    assert late.time[0] == 0.0 and np.ptp(np.diff(late.time)) > 1e-6  # it need not be regular
+    np.testing.assert_allclose(late.sent, sent, atol=1.2e-5)
     edit_table(folder, set_cells("t_command", "5.1", [7]))
     refused(folder, "a.csv", "row 9", "'t_command'", "before")
-
-
-def test_time_starts_at_zero_and_need_not_be_regular(folder):
-    edit_table(folder, set_cells("t", lambda t: f"{5.0 + t + 1e-3 * np.sin(50 * t):.6f}"))
-    time = read_recording(folder).trajectories[0].time
-    assert time[0] == 0.0 and np.ptp(np.diff(time)) > 1e-4
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({"format": "vd-recording/9"}, ("format", "vd-recording/9", "vd-recording/1")),
-        ({"format": None}, ("format",)),
         ({"model": "dclaw7"}, ("unknown model 'dclaw7'", "dclaw3", "servo")),
-        ({"model": "mine.usda"}, ("mine.usda",)),
-        ({"model": 3}, ("model",)),
         ({"joints": ["f0_j1", "f9_j2"]}, ("unknown joint 'f9_j2'", "f2_j3")),
-        ({"joints": ["f0_j1", "f0_j1"]}, ("twice",)),
-        ({"joints": None}, ("joints",)),
         ({"encoder_resolution_rad": None}, ("encoder_resolution_rad", "0.001534")),
-        ({"encoder_resolution_rad": -1.0}, ("encoder_resolution_rad",)),
-        (
-            {"encoder_resolution_rad": 360.0 / 4096},
-            ("encoder_resolution_rad", "degrees", "71.5 counts a turn"),
-        ),
-        ({"encoder_resolution_rad": 10**400}, ("encoder_resolution_rad",)),
+        ({"encoder_resolution_rad": 360.0 / 4096}, ("degrees", "71.5 counts a turn")),
         ({"encoder_resolution_rad": 4096}, ("encoder_resolution_rad", "counts a turn")),
         ({"servo": {"kp_nm_rad": "stiff"}}, ("servo.kp_nm_rad", "'stiff'", "N m/rad")),
-        ({"servo": {"kp_nm_rad": {"f0_j1": 2.0, "f9_j1": 2.0}}}, ("servo.kp_nm_rad", "f0_j1, f0_j2")),
         ({"trajectories": []}, ("trajectories", "empty")),
-        ({"trajectories": [{"excitation": "x", "joints": ["f0_j1"]}]}, ("trajectories[0]", "file")),
         ({"trajectories": [{"file": "b.csv", "joints": ["f0_j1"]}]}, ("b.csv", "no such file")),
         ({"trajectories": [{"file": "../a.csv", "joints": ["f0_j1"]}]}, ("folder",)),
-        ({"trajectories": [{"file": "a.csv", "joints": ["f0_j3"]}]}, ("unknown joint 'f0_j3'",)),
-        ({"trajectories": [{"file": "a.csv", "joints": ["f0_j1"], "conditions": [1]}]}, ("conditions",)),
-        (
-            {"trajectories": [{"file": "a.csv", "joints": ["f0_j1"], "conditions": {"p_gain": "high"}}]},
-            ("trajectories[0]", "'p_gain'", "'high'", "number"),
-        ),
         (
             {"trajectories": [{"file": "a.csv", "joints": ["f0_j1"], "conditions": {"payload_kg": -0.2}}]},
             ("trajectories[0]", "'payload_kg'", "-0.2", "not negative"),
@@ -154,39 +120,32 @@ def test_time_starts_at_zero_and_need_not_be_regular(folder):
     ],
 )
 def test_a_header_that_cannot_be_used_is_refused(folder, changes, words):
-    edit_header(folder, **changes)
-    refused(folder, "recording.json" if "b.csv" not in words else "b.csv", *words)
+    header = json.loads((folder / "recording.json").read_text()) | changes
+    kept = {key: value for key, value in header.items() if value is not None}
+    (folder / "recording.json").write_text(json.dumps(kept))
+    refused(folder, *words)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda t: [row[:-1] for row in t], ("row 1", "no column 'position.f0_j2'")),
-        (lambda t: [[*row, *row[-1:]] for row in t], ("'position.f0_j2' twice",)),
         (lambda t: t[0].__setitem__(1, "command.f0_j9"), ("row 1", "unknown joint 'f0_j9'")),
-        (lambda t: t[0].__setitem__(0, "time"), ("no column 't'",)),
         (lambda t: [[";".join(row)] for row in t], ("no column 't'", "commas")),
         (lambda t: [t[0], ["s", *["rad"] * (len(t[0]) - 1)], *t[1:]], ("row 2", "'t'", "s is not a finite")),
         (set_cells("t", lambda t: f"{1e3 * t:.3f}"), ("'t'", "10 s between samples", "milliseconds")),
         (lambda t: t[:4], ("3 samples", "at least")),
-        (lambda t: t[:1], ("0 samples",)),
-        (lambda t: [[]], ("row 1 has no column 't'",)),
         (lambda t: [*t[:50], t[48], *t[50:]], ("row 51", "'t'", "runs backward")),
-        (lambda t: [*t[:50], t[49], *t[50:]], ("row 51", "'t'", "repeats")),
         (set_cells("position.f0_j1", "nan", [7]), ("row 8", "'position.f0_j1'", "nan")),
-        (set_cells("command.f0_j2", "", [9]), ("row 10", "'command.f0_j2'", "empty")),
-        (set_cells("position.f0_j2", "lost", [11]), ("row 12", "lost")),
         (lambda t: t[30].append("0"), ("row 31", "cells")),
         (set_cells("position.f0_j2", lambda q: f"{np.degrees(q):.6f}"), ("position.f0_j2", "degrees")),
-        (set_cells("command.f0_j1", lambda q: f"{np.degrees(q):.6f}"), ("command.f0_j1", "degrees")),
         (set_cells("position.f0_j2", lambda q: f"{-q:.6f}"), ("position.f0_j2", "sign")),
         (set_cells("position.f0_j1", "0.1"), ("position.f0_j1", "dead encoder")),
     ],
 )
 def test_a_table_that_cannot_be_used_is_refused(folder, change, words):
     edit_table(folder, change)
-    message = refused(folder, *words)
-    assert "a.csv" in message or "in every motion" in message or "degrees" in message
+    refused(folder, *words)
 
 
 def test_commands_that_never_move_are_refused(folder):
@@ -196,13 +155,10 @@ def test_commands_that_never_move_are_refused(folder):
     refused(folder, "no 'command.' column moves", "record")
 
 
-def test_a_joint_at_rest_and_a_servo_that_is_off_are_no_dead_encoders(tmp_path):
+def test_torque_is_on_or_off_and_a_servo_that_is_off_has_no_dead_encoder(tmp_path, folder):
     recording = example(enabled=np.zeros((SAMPLES, 2), dtype=bool))
     recording.trajectories[0].position[:, 0] = 0.1
     read_recording(write_recording(recording, tmp_path / "off"))
-
-
-def test_half_a_torque_is_neither_on_nor_off(folder):
     cells = ["enabled.f0_j1", "0", "0.5", *["1"] * (SAMPLES - 2)]
     edit_table(folder, lambda table: [[*row, cell] for row, cell in zip(table, cells, strict=True)])
     refused(folder, "a.csv", "row 3", "'enabled.f0_j1'", "0.5", "0 or 1")
@@ -236,21 +192,10 @@ def test_small_motions_in_degrees_show_in_the_encoder_counts(tmp_path):
     refused(write_recording(small, tmp_path / "r"), "degrees", "encoder_resolution_rad", "position.f0_j1")
 
 
-@pytest.mark.parametrize(
-    ("channel", "value", "remedy"),
-    [
-        ("pwm", 400.0, "full scale"),
-        ("voltage", 120.0, "write V"),
-        ("current", 180.0, "write A"),
-        ("temperature", 300.0, "write deg C"),
-        ("velocity", 400.0, "write rad/s"),
-    ],
-)
-def test_telemetry_out_of_range_is_refused(tmp_path, channel, value, remedy):
-    values = np.full((SAMPLES, 2), value)
-    refused(
-        write_recording(example(**{channel: values}), tmp_path / "r"), f"{channel}.f0_j1", "row 2", remedy
-    )
+def test_telemetry_out_of_range_is_refused(tmp_path):
+    for channel, value, remedy in (("pwm", 400.0, "full scale"), ("velocity", 400.0, "write rad/s")):
+        off = example(**{channel: np.full((SAMPLES, 2), value)})
+        refused(write_recording(off, tmp_path / channel), f"{channel}.f0_j1", "row 2", remedy)
 
 
 LAG_S = 0.08
@@ -285,13 +230,10 @@ SPEED = np.gradient(SOUND.position, AT_100_HZ, axis=0)
         ({"command": SOUND.position, "position": SOUND.command}, ("swapped", "before its command")),
         ({"position": np.roll(SOUND.command, -20, axis=0)}, ("200 ms before its command", "two clocks")),
         ({"position": SOUND.command}, ("position.joint", "copy of its command")),
-        ({"position": np.roll(SOUND.command, 1, axis=0)}, ("position.joint", "copy of its command")),
-        ({"position": np.degrees(SOUND.position)}, ("position.joint", "degrees")),
         ({"command_time": 1e3 * AT_100_HZ}, ("t_command", "1e+03 times as fast", "milliseconds")),
         ({"command_time": AT_100_HZ + 3.0}, ("t_command", "3 s off", "another clock")),
         ({"time": AT_100_HZ + 5.0 * (AT_100_HZ > 4.0)}, ("row 403", "'t'", "5.01 s without", "cut the file")),
         ({"velocity": SPEED * 30.0 / np.pi}, ("velocity.joint", "9.55 times", "rpm")),
-        ({"velocity": -SPEED}, ("velocity.joint", "-1 times")),
     ],
 )
 def test_a_recording_of_other_clocks_units_or_columns_is_refused_by_its_cause(tmp_path, change, words):
@@ -359,14 +301,9 @@ def test_large_effects_of_real_servos_are_no_faults_of_the_recording(tmp_path):
 
 def test_a_file_that_is_none_is_refused(tmp_path, folder):
     refused(tmp_path / "nowhere", "nowhere", "no such file")
-    table = (folder / "a.csv").read_text()
-    (folder / "a.csv").write_text("")
-    refused(folder, "a.csv", "empty")
-    (folder / "a.csv").write_text(table)
-    (folder / "recording.json").write_text("{")
-    refused(folder, "recording.json", "not JSON")
-    (folder / "recording.json").write_text("[1]")
-    refused(folder, "recording.json", "object")
+    for name, text, words in (("a.csv", "", "empty"), ("recording.json", "{", "not JSON")):
+        (folder / name).write_text(text)
+        refused(folder, name, words)
 
 
 @pytest.mark.parametrize(

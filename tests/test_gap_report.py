@@ -8,146 +8,47 @@ import re
 
 import numpy as np
 import pytest
+from gap_reports import FRICTION, JOINT, rubbing_servo, servo_report
 
 from vd.gap import words
 from vd.gap.report import write_report
 from vd.gap.result import (
     Alternative,
-    Candidate,
     Closing,
-    Estimate,
     Finding,
-    Fit,
-    HeldOut,
-    JointGap,
-    NamedEffect,
     Predictions,
     Report,
-    Source,
-    TrajectoryError,
     effect_values,
     parameter_columns,
 )
 from vd.kernels.servo import actuators
 from vd.kernels.servo.effects import EFFECTS
 
-JOINTS = ("f0_j1", "f0_j2", "f0_j3")
-FILES = ("steps_1.csv", "sine_0.50hz.csv", "sine_1.00hz.csv")
-FLOOR, DELAY, RATE, SECONDS = 1.5e-3, 0.04, 60.0, 12.0
-
-
-def answer(time, command, delay, rng=None, bandwidth=14.0):
-    """A first-order servo behind a delay, in closed loop with nothing."""
-    late = command[np.clip(np.searchsorted(time, time - delay, side="right") - 1, 0, None)]
-    position = np.zeros_like(late)
-    for i in range(1, len(time)):
-        step = time[i] - time[i - 1]
-        position[i] = position[i - 1] + (late[i] - position[i - 1]) * (1.0 - math.exp(-bandwidth * step))
-    return position if rng is None else position + rng.normal(0.0, FLOOR, len(time))
-
-
-def sample_curves():
-    """Curves of three joints under steps and sines, one of them with a delay."""
-    rng = np.random.default_rng(0)
-    time = np.arange(0.0, SECONDS, 1.0 / RATE)
-    columns = {name: [] for name in ("command", "measured", "baseline", "identified")}
-    for index in range(len(FILES)):
-        if index == 0:
-            command = 0.4 * np.sign(np.sin(2.0 * np.pi * 0.3 * time))
-        else:
-            command = 0.4 * np.sin(np.pi * index * time)
-        late = [DELAY if joint == JOINTS[1] else 0.0 for joint in JOINTS]
-        columns["command"].append(np.stack([command] * len(JOINTS), axis=1))
-        columns["measured"].append(np.stack([answer(time, command, d, rng) for d in late], axis=1))
-        columns["baseline"].append(np.stack([answer(time, command, 0.0)] * len(JOINTS), axis=1))
-        columns["identified"].append(np.stack([answer(time, command, d) for d in late], axis=1))
-    return Predictions(
-        time=np.tile(time, len(FILES)),
-        trajectory=np.repeat(np.arange(len(FILES)), len(time)),
-        **{name: np.concatenate(parts) for name, parts in columns.items()},
-        joints=JOINTS,
-        files=FILES,
-    )
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def sample_report(curves, **changes):
-    """A report of the curves with a named delay."""
-    before, after = curves.baseline - curves.measured, curves.identified - curves.measured
-    rows = {i: curves.trajectory == i for i in range(len(FILES))}
-    told = dict.fromkeys(JOINTS, ("no_gap", "the error is at the noise floor"))
-    told[JOINTS[1]] = ("effects", "a delay removes nearly all of it")
-    gap = [
-        JointGap(joint, FLOOR, rms(before[:, j]), (0.0, 1.0), rms(after[:, j]), (0.0, 1.0), *told[joint])
-        for j, joint in enumerate(JOINTS)
-    ]
-    tried = [
-        ("command_delay", 1, 0.93, "named", "largest gain"),
-        ("command_filter", 1, 0.6, "rejected", "worse than the delay by 7 mrad"),
-        ("backlash", 1, 0.01, "rejected", "gain covers 0"),
-        ("coulomb_friction", 2, 0.02, "rejected", "gain under 5 %"),
-    ]
-    evidence = [
-        Candidate((JOINTS[1],), number, name, 9e-3, gain, (gain - 0.1, gain + 0.1), decision, reason)
-        for name, number, gain, decision, reason in tried
-    ]
-    evidence.append(dataclasses.replace(evidence[0], gain=-0.1, decision="rejected", placebo=True))
-    delay = NamedEffect(
-        "command_delay",
-        (JOINTS[1],),
-        0.99,
-        {"delay_s": Estimate(0.0402, (0.0391, 0.0413), "s")},
-        (Alternative("command_filter", 9e-3, (5e-3, 9e-3)),),
-    )
-    base = {joint: {"kp": 3.0, "kd": 0.21, "velocity_limit": 7.1} for joint in JOINTS}
-    values = {
-        "verdict": "effects",
-        "noise_floor_rad": FLOOR,
-        "baseline": Fit(rms(before), {j: rms(before[:, i]) for i, j in enumerate(JOINTS)}, 0.01, base),
-        "findings": (
-            Finding(
-                JOINTS[1],
-                "the joint starts 40 ms after the simulation at every onset and reversal, the faster the "
-                "worse",
-                {"lag_s": 0.04},
-            ),
-        ),
-        "effects": (delay,),
-        "ambiguous": (),
-        "identified": Fit(rms(after), {j: rms(after[:, i]) for i, j in enumerate(JOINTS)}, 0.002, base),
-        "held_out": HeldOut(FILES, rms(before), rms(after), 1.0 - rms(after) / rms(before), (0.8, 0.95)),
-        "next_experiment": "",
-        "seconds": 41.0,
-        "recording": Source("recordings/finger", "dclaw3", JOINTS, 3, len(curves.time), 3 * SECONDS, "XL430"),
-        "hand": "dclaw3",
-        "joints": tuple(gap),
-        "evidence": tuple(evidence),
-        "trajectories": tuple(
-            TrajectoryError(
-                FILES[i], FILES[i][:-4], joint, True, rms(before[rows[i], j]), rms(after[rows[i], j])
-            )
-            for i in range(len(FILES))
-            for j, joint in enumerate(JOINTS)
-        ),
-        "closing": Closing("newton", "identified.usda", rms(before), rms(after), {JOINTS[1]: (0.02, 0.002)}),
-        "rollouts": 120000,
-        "rollouts_per_s": 4000.0,
-        "command": "vd-gap run recordings/finger --out gap",
-    }
-    return Report(**{**values, **changes})
-
 
 @pytest.fixture(scope="module")
-def curves():
-    return sample_curves()
+def made(tmp_path_factory):
+    """A report with a named friction, and its curves."""
+    report, curves = servo_report(rubbing_servo(tmp_path_factory.mktemp("recordings") / "servo"))
+    (friction,) = report.effects
+    rival = Alternative("backlash", 9e-3, (5e-3, 9e-3))
+    whole = dataclasses.replace(
+        report,
+        effects=(dataclasses.replace(friction, alternatives=(rival,)),),
+        findings=(Finding(JOINT, "joint: it sticks at every reversal", {"lag_s": 0.04}),),
+        closing=Closing("rollout", "identified.usda", 0.02, 0.002, {JOINT: (0.02, 0.002)}),
+        command="vd-gap run recordings/servo --out gap",
+    )
+    return whole, curves
 
 
-@pytest.fixture(scope="module")
-def report(curves):
-    return sample_report(curves)
+@pytest.fixture
+def report(made):
+    return made[0]
+
+
+@pytest.fixture
+def curves(made):
+    return made[1]
 
 
 CONTRACT = {
@@ -167,20 +68,18 @@ def test_json_has_the_keys_of_the_contract_and_comes_back_as_it_was(report, tmp_
     assert {"joint", "where", "signature"} == set(values["findings"][0])
     effect = values["effects"][0]
     assert {"name", "joints", "confidence", "parameters", "alternatives"} <= set(effect)
-    assert effect["parameters"]["delay_s"] == {"value": 0.0402, "ci95": [0.0391, 0.0413], "unit": "s"}
+    assert effect["parameters"]["tau_c_nm"] == {"value": FRICTION, "ci95": [0.14, 0.16], "unit": "N m"}
     assert {"name", "held_out_rmse_rad", "difference_ci95"} == set(effect["alternatives"][0])
     assert {"trajectories", "baseline_rmse_rad", "identified_rmse_rad", "reduction", "ci95"} <= set(
         values["held_out"]
     )
 
 
-def test_numbers_that_are_not_known_come_back_as_nan(curves, tmp_path):
-    report = sample_report(curves)
+def test_numbers_that_are_not_known_come_back_as_nan(report, tmp_path):
     report = dataclasses.replace(report, held_out=dataclasses.replace(report.held_out, ci95=(math.nan,) * 2))
     report.write(tmp_path / "report.json")
     read = Report.read(tmp_path / "report.json")
     assert all(math.isnan(x) for x in read.held_out.ci95)
-    assert read.hand == "dclaw3" and read.hand_layer is None
 
 
 @pytest.mark.parametrize(
@@ -219,14 +118,10 @@ def test_curves_come_back_and_are_checked(curves, tmp_path):
 
 
 def test_parameters_reach_their_columns(report):
-    columns = parameter_columns(report, JOINTS[1])
-    assert columns[actuators.COMMAND_DELAY] == 0.0402
-    assert columns[actuators.KP] == 3.0
-    assert actuators.COMMAND_DELAY not in parameter_columns(report, JOINTS[0])
-    assert effect_values(report.effects, JOINTS[1]) == {
-        "command_delay": {"delay_s": (0.0402, 0.0391, 0.0413)}
-    }
-    assert effect_values(report.effects, JOINTS[0]) == {}
+    columns = parameter_columns(report, JOINT)
+    assert columns[actuators.COULOMB_TORQUE] == FRICTION and columns[actuators.KP] == 3.0
+    assert effect_values(report.effects, JOINT) == {"coulomb_friction": {"tau_c_nm": (FRICTION, 0.14, 0.16)}}
+    assert effect_values(report.effects, "another") == {}
 
 
 def test_page_stands_alone_and_says_what_was_found(report, curves, tmp_path):
@@ -235,15 +130,16 @@ def test_page_stands_alone_and_says_what_was_found(report, curves, tmp_path):
     assert not re.findall(r'(?:src|href)="(?!data:)', page), "the page must not need another file"
     assert "http" not in re.sub(r"base64,[^\"]*", "", page)
     text = html.unescape(re.sub(r"<[^>]+>", " ", re.sub(r"base64,[^\"]*", "", page)))
-    assert "lacks command delay on f0_j2 (40.2 ms)" in text
-    assert "vd-gap run recordings/finger --out gap" in text
+    assert "lacks coulomb friction on joint (150 mN m)" in text
+    assert "vd-gap run recordings/servo --out gap" in text
     for row in report.evidence:
         assert row.reason in text
     for effect in EFFECTS.values():
         assert words.plain(effect.name) in text
         assert effect.meaning in text
     pngs = {path.name for path in files if path.suffix == ".png"}
-    assert {"gap.png", "overlay_f0_j2_sine_1.00hz.png", "residual_f0_j2.png", "evidence_f0_j2.png"} <= pngs
+    assert {"gap.png", f"residual_{JOINT}.png", f"evidence_{JOINT}.png"} <= pngs
+    assert any(name.startswith(f"overlay_{JOINT}") for name in pngs)
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in pngs)
 
 
@@ -259,9 +155,9 @@ OUTCOMES = {
 
 
 @pytest.mark.parametrize("verdict", OUTCOMES)
-def test_every_verdict_has_its_sentence_and_its_page(curves, tmp_path, verdict):
+def test_every_verdict_has_its_sentence_and_its_page(report, tmp_path, verdict):
     changes, sentence = OUTCOMES[verdict]
-    report = sample_report(curves, verdict=verdict, closing=None, **changes).validate()
+    report = dataclasses.replace(report, verdict=verdict, closing=None, **changes).validate()
     assert sentence in words.verdict_sentence(report)
     assert words.next_step(report)
     write_report(report, None, tmp_path)
@@ -271,9 +167,11 @@ def test_every_verdict_has_its_sentence_and_its_page(curves, tmp_path, verdict):
 
 
 def test_of_one_recorded_finger_the_layer_of_all_is_to_be_trained_with(report, tmp_path):
-    assert "pass identified.usda with --hand-layer" in words.next_step(report)
+    source = dataclasses.replace(report.recording, model="dclaw3")
     closing = dataclasses.replace(report.closing, whole_hand_layer="identified-all-fingers.usda")
-    one = dataclasses.replace(report, closing=closing, hand="dclaw3")
+    one = dataclasses.replace(report, recording=source, closing=closing, hand="dclaw3")
+    plain = dataclasses.replace(one, closing=report.closing)
+    assert "pass identified.usda with --hand-layer" in words.next_step(plain)
     assert "pass identified-all-fingers.usda with --hand-layer" in words.next_step(one)
     write_report(one, None, tmp_path)
     page = (tmp_path / "report.html").read_text()

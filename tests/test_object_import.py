@@ -18,21 +18,14 @@ from vd.assets_usd.objects import decompose as d
 from vd.assets_usd.objects import meshes as m
 from vd.assets_usd.objects.bodies import body_of, error_of_parts
 from vd.assets_usd.objects.geometry import Hull, hull_depth, mesh_volume, union_depth
-from vd.assets_usd.objects.importer import (
-    _keep_decomposition,
-    _kept_decomposition,
-    import_mesh,
-    import_meshes,
-)
+from vd.assets_usd.objects.importer import import_mesh, import_meshes
 from vd.assets_usd.objects.model import read_object
-from vd.assets_usd.objects.plan import (
-    ImportSettings,
-    plan_jobs,
-)
+from vd.assets_usd.objects.plan import plan_jobs
 from vd.assets_usd.objects.repair import repair_mesh
+from vd.assets_usd.objects.settings import ImportSettings
 from vd.paper import PAPER
 
-FAST = d.DecomposeSettings(threshold=0.05, mcts_iterations=20, time_limit_s=60.0)
+FAST = ImportSettings(threshold=0.05, mcts_iterations=20, time_limit=60.0)
 
 
 def l_shape() -> trimesh.Trimesh:
@@ -73,13 +66,17 @@ def imported(tmp_path_factory: pytest.TempPathFactory):
         rows = csv.writer(stream)
         rows.writerow(["name", "source", "split"])
         rows.writerow(["bracket", "our workshop (CC0-1.0)", "train"])
-    settings = ImportSettings(FAST, licence="MIT", cache=str(root / "cache"))
+    settings = replace(FAST, licence="MIT")
     seen = []
     results = import_meshes(
-        [folder, notes], root / "out", settings, jobs=2, progress=lambda r, i, n: seen.append((r.name, i, n))
+        [folder, notes],
+        root / "out",
+        settings,
+        jobs=2,
+        progress=lambda r, i, n: seen.append((r.job.name, i, n)),
     )
     assert [i for _, i, _ in seen] == list(range(1, len(results) + 1))
-    return folder, root / "out", settings, {r.name: r for r in results}
+    return folder, root / "out", settings, {r.job.name: r for r in results}
 
 
 REFUSALS = {
@@ -109,7 +106,6 @@ def test_hulls_are_convex_contain_the_mesh_and_keep_its_volume(imported):
         assert hull_depth(hull, hull.vertices).max() < 1e-6
     assert union_depth(model.hulls, model.surface_points.astype(float)).max() < 1e-3
     assert model.volume_error < 0.05
-    assert imported[3]["bracket"].decomposed
 
 
 def test_mass_properties_are_those_of_the_solid(imported):
@@ -133,7 +129,6 @@ def test_millimetres_are_recognised(imported):
     np.testing.assert_allclose(np.ptp(model.vertices, axis=0), [0.12, 0.06, 0.04], atol=1e-6)
     assert model.scale == pytest.approx(1e-3)
     assert any("taken as mm" in note for note in model.notes)
-    assert not imported[3]["brick_in_mm"].decomposed
     assert len(model.hulls) == 1 and len(model.hulls[0].vertices) == 8
 
 
@@ -147,27 +142,14 @@ def test_licence_and_source_come_from_the_sidecar(imported):
 def test_a_second_run_does_no_work(imported):
     folder, out, settings, first = imported
     before = {p: p.stat().st_mtime_ns for p in out.glob("*.usd")}
-    again = {r.name: r for r in import_meshes([folder], out, settings, jobs=2)}
+    again = {r.job.name: r for r in import_meshes([folder], out, settings, jobs=2)}
     assert {p: p.stat().st_mtime_ns for p in out.glob("*.usd")} == before
     for name in ("bracket", "clamp", "brick_in_mm"):
         assert again[name].status == "cached"
         assert len(again[name].model.hulls) == len(first[name].model.hulls)
-    # Nor is a mesh decomposed again where the object is not.
-    mesh = folder / "bracket.stl"
-    reused = import_meshes([mesh], out.parent / "again", settings)[0]
-    assert (reused.status, reused.decomposed) == ("imported", False)
-    finer = replace(settings, decompose=replace(FAST, seed=1))
-    assert import_meshes([mesh], out.parent / "again", finer)[0].decomposed
-
-
-@pytest.mark.parametrize("left", [0.0, 0.1, 0.9])
-def test_a_damaged_decomposition_is_as_none(left: float, tmp_path: Path):
-    box = trimesh.creation.box()
-    path = tmp_path / "kept.npz"
-    _keep_decomposition(path, d.Decomposition((Hull(box.vertices, box.faces),), "coacd", error=0.1))
-    assert _kept_decomposition(path).error == 0.1
-    os.truncate(path, int(left * path.stat().st_size))
-    assert _kept_decomposition(path) is None
+    # Settings that make another object do.
+    (finer,) = import_meshes([folder / "sub"], out, replace(settings, mass=0.2))
+    assert (finer.status, finer.model.mass_kg) == ("imported", 0.2)
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
@@ -324,8 +306,8 @@ def test_a_cavity_counts_in_mass_properties_and_is_said(tmp_path: Path, inward: 
     if inward:
         inner.invert()
     trimesh.util.concatenate([outer, inner]).export(tmp_path / "box.stl")
-    result = import_meshes([tmp_path / "box.stl"], tmp_path / "out", ImportSettings(FAST))[0]
-    model = read_object(Path(result.target))
+    result = import_meshes([tmp_path / "box.stl"], tmp_path / "out", FAST)[0]
+    model = read_object(Path(result.job.target))
     assert result.status == "imported" and model.warnings == result.model.warnings
     (warning,) = model.warnings
     assert ("closed cavity of 53 %" if hollow else "taken as solid") in warning
@@ -384,9 +366,11 @@ def test_parts_are_merged_where_that_fills_least():
 
 def test_a_ring_gets_more_parts_and_a_bracket_does_not(imported):
     ring = repair_mesh(trimesh.creation.annulus(0.05, 0.058, 0.02, sections=16))
-    settings = d.DecomposeSettings(mcts_iterations=5)
     found = d.best_decomposition(
-        ring.vertices, ring.faces, settings, error_of_parts(body_of(ring), ring.vertices)
+        ring.vertices,
+        ring.faces,
+        ImportSettings(mcts_iterations=5),
+        error_of_parts(body_of(ring), ring.vertices),
     )
     assert found.error <= d.GOOD_ERROR and found.fallback == ()
     assert 8 < len(found.hulls) <= 16
@@ -407,7 +391,7 @@ def waiting(vertices: np.ndarray, *_: object) -> list[np.ndarray]:
 
 def test_only_processor_time_makes_a_decomposition_fall_back(monkeypatch: pytest.MonkeyPatch):
     mesh = l_shape()
-    limits = replace(FAST, time_limit_s=1.0)
+    limits = replace(FAST, time_limit=1.0)
     monkeypatch.setattr(d, "_coacd_parts", stuck)
     result = d.decompose(mesh.vertices, mesh.faces, limits)
     assert result.method == "one hull" and len(result.hulls) == 1
@@ -424,8 +408,8 @@ def test_only_processor_time_makes_a_decomposition_fall_back(monkeypatch: pytest
 
 def test_a_fall_back_is_said_and_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     l_shape().export(tmp_path / "bracket.stl")
-    settings = ImportSettings(FAST, cache=str(tmp_path / "cache"))
-    (job,) = plan_jobs([tmp_path / "bracket.stl"], tmp_path, settings)
+    (job,) = plan_jobs([tmp_path / "bracket.stl"], tmp_path, "MIT")
+    settings = replace(FAST, licence="MIT")
     with monkeypatch.context() as patch:
         patch.setattr(d, "_coacd_parts", lambda *_: os._exit(11))
         fallen = import_mesh(job, settings).model

@@ -7,10 +7,10 @@ import trimesh
 
 from vd.assets_usd.objects import importer
 from vd.assets_usd.objects import meshes as m
-from vd.assets_usd.objects.decompose import DecomposeSettings
 from vd.assets_usd.objects.importer import import_meshes
 from vd.assets_usd.objects.model import read_object
-from vd.assets_usd.objects.plan import ImportSettings, default_set, find_meshes, object_name
+from vd.assets_usd.objects.plan import default_set, find_meshes, object_name
+from vd.assets_usd.objects.settings import ImportSettings
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_two_meshes_of_one_name_are_refused_whether_in_one_call_or_two(in_proces
     with pytest.raises(m.MeshError) as both:
         import_meshes([first, second], out)
     assert not out.exists()
-    assert import_meshes([first], out)[0].name == "mug"
+    assert import_meshes([first], out)[0].job.name == "mug"
     before = (out / "mug.usd").read_bytes()
     with pytest.raises(m.MeshError) as later:
         import_meshes([second], out)
@@ -88,7 +88,7 @@ def test_objects_whose_mesh_is_gone_stay(in_process: None, tmp_path: Path):
     old, new, out = brick(tmp_path / "old.stl"), brick(tmp_path / "new.stl"), tmp_path / "out"
     import_meshes([old], out)
     old.unlink()
-    result = {r.name: r.status for r in import_meshes([new], out)}
+    result = {r.job.name: r.status for r in import_meshes([new], out)}
     assert result == {"new": "imported", "old": "gone"}
     assert (out / "old.usd").is_file()
 
@@ -122,19 +122,29 @@ def test_a_default_set_has_the_objects_of_one_folder(
 
 
 @pytest.mark.parametrize(
-    ("sizing", "mass", "longest", "words"),
+    ("settings", "mass", "longest", "words"),
     [
-        (m.Sizing("in"), 0.1, 0.1524, "taken as in"),
-        (m.Sizing("mm", keep_size=True), 0.1, 0.006, "does not fit the hand at its real size of 0.006 m"),
-        (m.Sizing("in", keep_size=True, density=1000.0), 36e3 * 0.0254**3, 0.1524, "mean width 0.140 m"),
-        (m.Sizing("in", mass_kg=0.25), 0.25, 0.1524, "mass 0.25 kg as given"),
+        (ImportSettings("in"), 0.1, 0.1524, "taken as in"),
+        (
+            ImportSettings("mm", keep_size=True),
+            0.1,
+            0.006,
+            "does not fit the hand at its real size of 0.006 m",
+        ),
+        (
+            ImportSettings("in", keep_size=True, density=1000.0),
+            0.59,
+            0.1524,
+            "mean width 0.140 m",
+        ),
+        (ImportSettings("in", mass=0.25), 0.25, 0.1524, "mass 0.25 kg as given"),
     ],
 )
 def test_unit_size_and_mass(
-    sizing: m.Sizing, mass: float, longest: float, words: str, in_process: None, tmp_path: Path
+    settings: ImportSettings, mass: float, longest: float, words: str, in_process: None, tmp_path: Path
 ):
     mesh = brick(tmp_path / "block.stl", (6.0, 2.0, 1.0) if "mean" not in words else (6.0, 3.0, 2.0))
-    (result,) = import_meshes([mesh], tmp_path / "out", ImportSettings(sizing=sizing))
+    (result,) = import_meshes([mesh], tmp_path / "out", settings)
     model = read_object(tmp_path / "out" / "block.usd")
     assert model.longest_side == pytest.approx(longest, rel=1e-3)
     assert model.scale * 6.0 == pytest.approx(longest, rel=1e-3)
@@ -145,11 +155,11 @@ def test_unit_size_and_mass(
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (ImportSettings(sizing=m.Sizing("mm", density=2.7)), "--density 2.7.*water"),
-        (ImportSettings(sizing=m.Sizing("mm", density=1000.0, mass_kg=0.1)), "--density and --mass"),
-        (ImportSettings(sizing=m.Sizing("mm", mass_kg=-1.0)), "--mass -1"),
-        (ImportSettings(DecomposeSettings(max_hulls=0)), "--max-hulls 0: give 1 or more"),
-        (ImportSettings(DecomposeSettings(threshold=5.0)), "--threshold 5: give 0.01 to 1"),
+        (ImportSettings("mm", density=2.7), "--density 2.7.*water"),
+        (ImportSettings("mm", density=1000.0, mass=0.1), "--density and --mass"),
+        (ImportSettings("mm", mass=-1.0), "--mass -1"),
+        (ImportSettings(max_hulls=0), "--max-hulls 0: give 1 or more"),
+        (ImportSettings(threshold=5.0), "--threshold 5: give 0.01 to 1"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_before_anything_is_written(
@@ -163,13 +173,13 @@ def test_what_cannot_be_meant_is_refused_before_anything_is_written(
 def test_a_real_size_needs_a_unit_and_a_mass_a_material(tmp_path: Path):
     box = trimesh.creation.box((0.12, 0.06, 0.04)).vertices
     for declared in (None, 1.0):
-        sizing = m.Sizing(keep_size=True)
+        settings = ImportSettings(keep_size=True)
         if declared is None:
             with pytest.raises(m.MeshError, match=r"no unit.*--units mm"):
-                sizing.scale(box, declared)
+                m.scale_of(settings, box, declared)
         else:
-            assert sizing.scale(box, declared)[0] == 1.0
+            assert m.scale_of(settings, box, declared)[0] == 1.0
     nut = 0.012 * 0.012 * 0.005
-    assert "give --density or --mass" in m.Sizing().mass(nut)[2][0]
+    assert "give --density or --mass" in m.mass_of(ImportSettings(), nut)[2][0]
     with pytest.raises(m.MeshError, match="--mass is in kg"):
-        m.Sizing(mass_kg=5.0).mass(nut)
+        m.mass_of(ImportSettings(mass=5.0), nut)

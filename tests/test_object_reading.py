@@ -12,10 +12,10 @@ import trimesh
 from pxr import Gf, Usd, UsdGeom
 
 from vd.assets_usd.objects import procedural
-from vd.assets_usd.objects.meshes import MeshError
 from vd.assets_usd.objects.model import write_object
-from vd.assets_usd.objects.plan import ImportSettings, Job, find_meshes
+from vd.assets_usd.objects.plan import Job, find_meshes
 from vd.assets_usd.objects.reading import declared_unit, load_mesh, mesh_kind
+from vd.assets_usd.objects.settings import ImportSettings, MeshError
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
 CORNERS = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1\n"

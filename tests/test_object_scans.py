@@ -5,9 +5,9 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from vd.assets_usd.objects.geometry import mesh_volume, random_surface_points, surface_points
+from vd.assets_usd.objects.geometry import mesh_volume, random_surface_points
 from vd.assets_usd.objects.model import SURFACE_POINTS
-from vd.assets_usd.objects.scans import smooth, surface_of_scan
+from vd.assets_usd.objects.scans import surface_of_scan
 from vd.assets_usd.objects.sets import load_set
 from vd.evaluate.scanned import known_by_points, scan
 from vd.tracking.registration import Registration
@@ -49,21 +49,6 @@ def test_what_is_missing_is_closed():
     assert -1.1 * RADIUS_M < lowest < -0.55 * RADIUS_M
     seen = surface.vertices[surface.vertices[:, 2] > -0.5 * RADIUS_M]
     assert abs(np.linalg.norm(seen, axis=1) - RADIUS_M).max() < 0.003
-
-
-def test_smoothing_takes_noise_out():
-    cube = load_set(["cube"])[0]
-    exact = surface_points(cube.vertices, cube.faces, 1500)
-    noisy = exact + np.random.default_rng(0).normal(scale=0.002, size=exact.shape)
-    half = cube.longest_side / 2
-
-    def off_cube(points):
-        beyond = np.abs(points) - half
-        return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) - np.minimum(beyond.max(axis=1), 0.0)
-
-    before, after = off_cube(noisy), off_cube(smooth(noisy))
-    assert np.sqrt((after**2).mean()) < 0.65 * np.sqrt((before**2).mean())
-    assert np.quantile(after, 0.99) < 0.006
 
 
 def test_points_that_enclose_nothing_are_refused():

@@ -21,7 +21,7 @@ EXTENT = 8
 def make_sites(cells: np.ndarray, device: str) -> Sites:
     """Sites of cells [B, P, 3], integers."""
     points = wp.array(cells.astype(np.float32) + 0.5, dtype=wp.vec3, device=device)
-    return Sites(voxelise(points, 1.0), len(cells))
+    return Sites(voxelise(points, 1.0)[0], len(cells))
 
 
 def random_sites(device: str, *, clouds: int = 2, points: int = 120, seed: int = 0) -> Sites:
@@ -128,7 +128,7 @@ def test_global_pooling_keeps_clouds_apart_and_gives_zeros_for_an_empty_one(devi
     cells = np.zeros((3, 2, 3), np.float32)
     cells[2, 1] = 5.0
     cells[1] = np.nan
-    sites = Sites(voxelise(wp.array(cells, dtype=wp.vec3, device=device), 1.0), 3)
+    sites = Sites(voxelise(wp.array(cells, dtype=wp.vec3, device=device), 1.0)[0], 3)
     values = torch.tensor([[-1.0], [-4.0], [2.0]], device=sites.device, requires_grad=True)
     pooled = global_pool(values, sites)
     expected = torch.tensor([[-1.0, -1.0], [0.0, 0.0], [2.0, -1.0]], device=sites.device)
@@ -192,7 +192,7 @@ def test_fused_convolution_equals_a_double_precision_one(device, inner, outer, s
 
 def test_no_sites_flow_through(device):
     empty = wp.array(np.full((2, 3, 3), np.nan), dtype=wp.vec3, device=device)
-    sites = Sites(voxelise(empty, 1.0), 2)
+    sites = Sites(voxelise(empty, 1.0)[0], 2)
     conv = SparseConv3d(2, 3, stride=2).to(sites.device)
     values = features_of(sites, 2).requires_grad_()
     output = SparseMaxPool3d()(conv(values, sites), sites.coarser)

@@ -15,6 +15,7 @@ from vd.policy import TrainedPolicy
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg, validate
 from vd.train.distribution import BoundedStdGaussian
 from vd.train.metrics import GoalWindow, StepMeans, read_progress
+from vd.train.ppo import RUNAWAY_KL
 from vd.train.vec_env import ReorientVecEnv
 
 
@@ -119,6 +120,30 @@ def test_two_learning_rates_survive_the_adaptive_schedule(tmp_path):
     runner.learn(2)
     assert actor["lr"] == runner.alg.learning_rate < 2e-3
     assert critic["lr"] == 3e-3
+
+
+def test_an_update_that_runs_away_ends_with_its_epoch(tmp_path):
+    kls = {}
+    for schedule in ("adaptive", "fixed"):
+        ppo = dataclasses.replace(
+            SMALL_PPO, schedule=schedule, epochs=4, desired_kl=0.01, actor_learning_rate=0.05
+        )
+        runner = make_runner(tmp_path / schedule, ppo=ppo)
+        step, kls[schedule] = runner.alg._minibatch_step, []
+
+        def kept(rows, step=step, kls=kls[schedule]):
+            kls.append(step(rows))
+            return kls[-1]
+
+        runner.alg._minibatch_step = kept
+        runner.learn(1)
+        row = read_progress(tmp_path / schedule / "progress.jsonl")[-1]
+        kls[schedule] = [float(statistics[3]) for statistics in kls[schedule]]
+        assert row["loss/kl"] == pytest.approx(np.mean(kls[schedule]), rel=1e-5)
+    share = len(kls["fixed"]) // 4
+    epochs = [np.mean(kls["adaptive"][i : i + share]) for i in range(0, len(kls["adaptive"]), share)]
+    assert len(kls["adaptive"]) == share * len(epochs) < len(kls["fixed"])
+    assert epochs[-1] > RUNAWAY_KL * 0.01 >= max(epochs[:-1], default=0.0)
 
 
 def test_gradient_is_clipped_by_the_joint_norm(tmp_path):

@@ -18,6 +18,9 @@ KL_STEP = 1.5
 """Factor by which the adaptive schedule changes the actor's learning rate, once an update."""
 KL_BAND = 2.0
 """The rate is left alone while the KL divergence is within this factor of the wanted one."""
+RUNAWAY_KL = 4.0
+"""An update ends with the epoch whose KL divergence passes this many times the wanted one (ours): the rate is
+lowered from twice on, and takes three updates for as much; an update that diverged by 13 undid a training."""
 
 ACTION_BOUND = 1.0
 """The environment clips actions to this; a mean beyond it changes nothing but how far it is to come back."""
@@ -38,7 +41,8 @@ class TeacherPPO(PPO):
       adaptive schedule writes one rate into every group; here it moves the actor's only, since the KL
       divergence it follows says nothing about the critic. It moves once an update, by the divergence of
       the last epoch: rsl-rl moves it in every minibatch, and since the divergence within an update only
-      accumulates, one large first step there sends the rate to its lower bound for the rest of it;
+      accumulates, one large first step there sends the rate to its lower bound for the rest of it. An update
+      that runs away (:data:`RUNAWAY_KL`) ends early;
     * the gradient is clipped by the joint norm of actor and critic, as in the paper's code. The value
       coefficient acts through that norm alone, because Adam ignores the scale of a gradient;
     * samples are permuted in every epoch (rsl-rl repeats the same minibatches), and statistics stay on
@@ -117,28 +121,37 @@ class TeacherPPO(PPO):
         self.optimizer.param_groups[CRITIC_GROUP]["lr"] = critic
 
     def update(self) -> dict[str, float]:
-        """Run all epochs over the rollout.
+        """Run all epochs over the rollout, or those until the adaptive schedule sees the actor run away.
 
         Returns:
-            Means over the minibatches: ``surrogate``, ``value``, ``entropy``, ``kl`` (old to new policy),
-            ``clip_fraction``, ``grad_norm`` (before clipping), ``beyond_bound`` (share of mean
+            Means over the minibatches that were run: ``surrogate``, ``value``, ``entropy``, ``kl`` (old to
+            new policy), ``clip_fraction``, ``grad_norm`` (before clipping), ``beyond_bound`` (share of mean
             actions), and ``explained_variance`` of the returns by the values of the rollout.
         """
         group = self.optimizer.param_groups[ACTOR_GROUP]
         group["lr"] = self.learning_rate if self.actor_learns else 0.0
         self._take_samples()
-        steps = torch.stack([self._minibatch_step(rows) for rows in self.minibatches()])
+        watched = self.actor_learns and self.schedule == "adaptive"
+        divergence, steps = 0.0, []
+        for rows in self.minibatches():
+            steps.append(self._minibatch_step(rows))
+            if watched and len(steps) % self.num_mini_batches == 0:
+                divergence = self._divergence(steps[-self.num_mini_batches :])
+                if divergence > RUNAWAY_KL * self.desired_kl:
+                    break
         group["lr"] = self.learning_rate
+        if watched:
+            self._adapt_learning_rate(divergence)
         if self.actor_learns:
-            if self.schedule == "adaptive":
-                self._adapt_learning_rate(steps[-self.num_mini_batches :, STATISTICS.index("kl")].mean())
             self._update_normalisation(self.actor)
         self._update_normalisation(self.critic)
         returns, values = self.storage.returns, self.storage.values
         explained = 1.0 - (returns - values).var() / returns.var().clamp_min(1e-8)
         self.storage.clear()
         names = (*STATISTICS, "explained_variance")
-        return dict(zip(names, torch.cat((steps.mean(dim=0), explained[None])).tolist(), strict=True))
+        return dict(
+            zip(names, torch.cat((torch.stack(steps).mean(dim=0), explained[None])).tolist(), strict=True)
+        )
 
     @property
     def _minibatch_size(self) -> int:
@@ -225,13 +238,17 @@ class TeacherPPO(PPO):
             std.copy_(normaliser._std)
             normaliser._std = std
 
-    def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
-        """Move the actor's learning rate so that the KL divergence of an update nears ``desired_kl``."""
+    def _divergence(self, epoch: list[torch.Tensor]) -> float:
+        """Mean KL divergence of an epoch's minibatches; waits for the device."""
+        kl = torch.stack(epoch)[:, STATISTICS.index("kl")].mean()
         if self.is_multi_gpu:
             # Every rank sees the same mean and so takes the same decision.
             torch.distributed.all_reduce(kl)
             kl = kl / self.gpu_world_size
-        divergence = float(kl)
+        return float(kl)
+
+    def _adapt_learning_rate(self, divergence: float) -> None:
+        """Move the actor's learning rate so that the KL divergence of an update nears ``desired_kl``."""
         if divergence > self.desired_kl * KL_BAND:
             self.learning_rate = max(MIN_LEARNING_RATE, self.learning_rate / KL_STEP)
         elif 0.0 < divergence < self.desired_kl / KL_BAND:

@@ -44,6 +44,10 @@ GONE = {
     "--from-scratch": "stage 2 begins from what --init names",
     "--ppo.optimizer": "Adam is the only one",
     "--agent": "name zero or random in place of a policy",
+    "--allegro": "the comparison is in docs/results.md",
+    "--shard": "give each machine other --kinds",
+    "--collect": "give the same command again: it runs what is missing and prints the tables",
+    "--depth.focal-noise": "a calibrated camera knows its focal length",
     "--second-view": "symmetry-view selection gained too little (docs/lessons.md)",
 }
 """Flags of earlier versions that are no more, and what to do, or why."""

@@ -4,8 +4,9 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -20,10 +21,10 @@ from vd.assets_usd.objects.geometry import (
     sides_along_axes,
     simplify_hull,
 )
-from vd.assets_usd.objects.meshes import MeshError
+from vd.assets_usd.objects.settings import LEAST_THRESHOLD, ImportSettings, MeshError
 
-FINEST_THRESHOLD = 0.01
-"""CoACD takes no smaller one."""
+HULL_VERTICES = 32
+"""Most vertices of a part."""
 
 SLIVER_VOLUME = 1e-3
 """A part smaller than this share of all parts is dropped: it costs a collision shape and holds nothing."""
@@ -54,45 +55,6 @@ gives it a twentieth of a core at least."""
 
 
 @dataclass(frozen=True)
-class DecomposeSettings:
-    """Settings of the convex decomposition.
-
-    Attributes:
-        max_hulls: Most convex parts per object; 8 are tried first, and more where these are not good.
-        threshold: CoACD's concavity threshold (0.01-1; smaller is finer and slower).
-        mcts_iterations: CoACD's search effort; its default of 150 is several times slower.
-        max_hull_vertices: Most vertices per part.
-        time_limit_s: Processor time of one run of CoACD, after which a mesh falls back to a coarser
-            decomposition, on an idle machine as on a busy one.
-        seed: Seed of CoACD's search.
-    """
-
-    max_hulls: int = 32
-    threshold: float = 0.08
-    mcts_iterations: int = 20
-    max_hull_vertices: int = 32
-    time_limit_s: float = 120.0
-    seed: int = 0
-
-    def check(self) -> None:
-        """Refuse what CoACD, or a convex part, cannot have.
-
-        Raises:
-            MeshError: Names the option.
-        """
-        for option, value, least, most in (
-            ("--max-hulls", self.max_hulls, 1, np.inf),
-            ("--threshold", self.threshold, FINEST_THRESHOLD, 1.0),
-            ("--mcts-iterations", self.mcts_iterations, 1, np.inf),
-            ("--max-hull-vertices", self.max_hull_vertices, 4, np.inf),
-            ("--time-limit", self.time_limit_s, 1, np.inf),
-        ):
-            if not least <= value <= most:
-                up = f" to {most:g}" if np.isfinite(most) else " or more"
-                raise MeshError(f"{option} {value:g}: give {least:g}{up}")
-
-
-@dataclass(frozen=True)
 class Decomposition:
     """Convex parts and how they came about.
 
@@ -109,7 +71,9 @@ class Decomposition:
     error: float = 0.0
 
 
-def _coacd_parts(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings) -> list[np.ndarray]:
+def _coacd_parts(
+    vertices: np.ndarray, faces: np.ndarray, settings: ImportSettings, max_vertices: int
+) -> list[np.ndarray]:
     """Vertices of CoACD's parts."""
     import coacd
 
@@ -120,53 +84,23 @@ def _coacd_parts(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSet
         max_convex_hull=settings.max_hulls,
         preprocess_mode="auto",
         mcts_iterations=settings.mcts_iterations,
-        max_ch_vertex=settings.max_hull_vertices,
-        seed=settings.seed,
+        max_ch_vertex=max_vertices,
+        seed=0,
     )
     return [np.asarray(v, dtype=np.float64) for v, _ in parts]
 
 
-def _within_limits(
-    vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings
-) -> list[np.ndarray] | str:
+def _within_limits(seconds: float, *arguments: Any) -> list[np.ndarray] | str:
     """CoACD in this process, which its limit of processor time ends; the parts, or why there are none."""
-    seconds = int(time.process_time()) + max(1, round(settings.time_limit_s))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, resource.RLIM_INFINITY))
+    limit = int(time.process_time()) + max(1, round(seconds))
+    resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     os.environ["OMP_WAIT_POLICY"] = "passive"  # threads that wait for each other take no processor time
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
-        return _coacd_parts(vertices, faces, settings) or "CoACD returned no part"
+        return _coacd_parts(*arguments) or "CoACD returned no part"
     except Exception as error:  # the reason travels to the parent
         return f"{type(error).__name__}: {error}"
-
-
-def run_coacd(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings) -> list[np.ndarray] | str:
-    """CoACD in a child process.
-
-    Args:
-        vertices: [V, 3].
-        faces: [T, 3].
-        settings: Limits.
-
-    Returns:
-        The vertices of each part, or the reason why there are none.
-
-    Raises:
-        MeshError: The child hangs.
-    """
-    limit, hang = settings.time_limit_s, HANG_S * settings.time_limit_s
-    try:
-        return in_child(_within_limits, vertices, faces, settings, start="fork", limit_s=hang)
-    except ChildError as error:
-        if error.code is None:
-            raise MeshError(
-                f"CoACD hangs: no result within {hang:g} s, though allowed only {limit:g} s of processor "
-                "time; import it again"
-            ) from error
-        if error.code == -signal.SIGXCPU:
-            return f"no result after {limit:g} s of processor time (--time-limit)"
-        return f"CoACD ended with exit code {error.code}"
 
 
 def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ...]:
@@ -187,23 +121,38 @@ def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ..
     return tuple(kept)
 
 
-def decompose(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings) -> Decomposition:
-    """Split a mesh into convex parts: by CoACD, or its convex hull alone.
+def decompose(
+    vertices: np.ndarray, faces: np.ndarray, settings: ImportSettings, max_vertices: int = HULL_VERTICES
+) -> Decomposition:
+    """Split a mesh into convex parts: by CoACD in a child process, or its convex hull alone.
 
     Args:
         vertices: [V, 3], m.
         faces: [T, 3].
-        settings: Limits.
+        settings: Its limits.
+        max_vertices: Most vertices of a part.
 
     Raises:
         MeshError: CoACD hangs.
     """
-    parts = run_coacd(vertices, faces, settings)
-    hulls = () if isinstance(parts, str) else tidy_hulls(parts, settings.max_hull_vertices)
+    limit, hang = settings.time_limit, HANG_S * settings.time_limit
+    arguments = limit, vertices, faces, settings, max_vertices
+    try:
+        parts = in_child(_within_limits, *arguments, start="fork", limit_s=hang)
+        hulls = () if isinstance(parts, str) else tidy_hulls(parts, max_vertices)
+        why = parts if isinstance(parts, str) else "it gave only slivers"
+    except ChildError as error:
+        if error.code is None:
+            raise MeshError(
+                f"CoACD hangs: no result within {hang:g} s, though allowed only {limit:g} s of processor "
+                "time; import it again"
+            ) from error
+        hulls, why = (), f"CoACD ended with exit code {error.code}"
+        if error.code == -signal.SIGXCPU:
+            why = f"no result after {limit:g} s of processor time (--time-limit)"
     if hulls:
         return Decomposition(hulls, "coacd")
-    why = parts if isinstance(parts, str) else "it gave only slivers"
-    hull = simplify_hull(convex_hull(vertices), settings.max_hull_vertices)
+    hull = simplify_hull(convex_hull(vertices), max_vertices)
     return Decomposition(
         (hull,), "one hull", (f"coacd failed: {why}", "one convex hull stands for the whole mesh")
     )
@@ -218,30 +167,28 @@ def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:
     volume = {i: hull_volume(part) for i, part in corners.items()}
     together: dict[tuple[int, int], float] = {}
 
-    def pair(i: int, j: int) -> None:
-        together[i, j] = hull_volume(np.concatenate([corners[i], corners[j]]))
+    def pair(i: int, others: Iterable[int]) -> None:
+        for j in others:
+            together[i, j] = hull_volume(np.concatenate([corners[i], corners[j]]))
 
     for i in corners:
-        for j in range(i):
-            pair(i, j)
+        pair(i, range(i))
     while len(corners) > most:
         i, j = min(together, key=lambda key: together[key] - volume[key[0]] - volume[key[1]])
-        new = max(corners) + 1
+        new, others = max(corners) + 1, [k for k in corners if k not in (i, j)]
         volume[new] = together[i, j]
         both = np.concatenate([corners.pop(i), corners.pop(j)])
+        corners[new] = both[ConvexHull(both).vertices]
         for key in [key for key in together if i in key or j in key]:
             del together[key]
-        others = list(corners)
-        corners[new] = both[ConvexHull(both).vertices]
-        for other in others:
-            pair(new, other)
+        pair(new, others)
     return list(corners.values())
 
 
 def best_decomposition(
     vertices: np.ndarray,
     faces: np.ndarray,
-    settings: DecomposeSettings,
+    settings: ImportSettings,
     error_of: Callable[[Sequence[Hull]], float],
 ) -> Decomposition:
     """Few parts if these are good; else parts merged from a fine decomposition, as many as are needed.
@@ -260,18 +207,16 @@ def best_decomposition(
     first = replace(first, error=error_of(first.hulls))
     if first.error <= GOOD_ERROR or first.fallback:
         return first
-    threshold = max(FINE_THRESHOLD * settings.threshold, FINEST_THRESHOLD)
-    limits = replace(
-        settings, max_hulls=FINE_HULLS, threshold=threshold, max_hull_vertices=2 * settings.max_hull_vertices
-    )
-    fine = decompose(vertices, faces, limits)
+    threshold = max(FINE_THRESHOLD * settings.threshold, LEAST_THRESHOLD)
+    limits = replace(settings, max_hulls=FINE_HULLS, threshold=threshold)
+    fine = decompose(vertices, faces, limits, 2 * HULL_VERTICES)
     if fine.fallback:
         return replace(first, fallback=("no finer parts", *fine.fallback))
     found = [first]
     parts = [hull.vertices for hull in fine.hulls]
     for most in sorted((n for n in MERGED_HULLS if n <= settings.max_hulls), reverse=True):
         parts = merge_parts(parts, most)
-        hulls = tidy_hulls(parts, settings.max_hull_vertices)
+        hulls = tidy_hulls(parts, HULL_VERTICES)
         found.append(Decomposition(hulls, f"{fine.method}, merged", error=error_of(hulls)))
     enough = max(GOOD_ERROR, NEARLY * min(each.error for each in found))
     return min(

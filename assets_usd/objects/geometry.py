@@ -274,12 +274,6 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return moments, Rotation.from_matrix(axes).as_quat(canonical=True)
 
 
-def triangle_normals(corners: np.ndarray) -> np.ndarray:
-    """Unit normals [T, 3] of triangles [T, 3, 3]; zero of those without area."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-
-
 def triangle_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area of each triangle [T], m^2."""
     a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, i]] for i in range(3))

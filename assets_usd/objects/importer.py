@@ -7,9 +7,9 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -18,13 +18,14 @@ from vd.assets_usd.objects.children import ChildError, in_child
 from vd.assets_usd.objects.decompose import (
     GOOD_ERROR,
     HANG_S,
+    HULL_VERTICES,
     RUNS,
     Decomposition,
     best_decomposition,
     tidy_hulls,
 )
-from vd.assets_usd.objects.geometry import Hull, cluster_vertices, surface_points, triangle_areas
-from vd.assets_usd.objects.meshes import MeshError
+from vd.assets_usd.objects.geometry import cluster_vertices, surface_points, triangle_areas
+from vd.assets_usd.objects.meshes import mass_of, scale_of
 from vd.assets_usd.objects.model import (
     SURFACE_POINTS,
     ObjectError,
@@ -34,24 +35,15 @@ from vd.assets_usd.objects.model import (
     read_object,
     write_object,
 )
-from vd.assets_usd.objects.plan import (
-    ImportSettings,
-    Job,
-    check_target,
-    find_meshes,
-    gone_objects,
-    plan_jobs,
-)
+from vd.assets_usd.objects.plan import Job, check_target, find_meshes, gone_objects, plan_jobs
 from vd.assets_usd.objects.reading import declared_unit, load_mesh, mesh_kind
 from vd.assets_usd.objects.repair import repair_mesh
-from vd.files import atomic_path, make_folder
+from vd.assets_usd.objects.settings import ImportSettings, MeshError
+from vd.files import make_folder
 from vd.warp_quiet import quiet_warp
 
 IMPORT_VERSION = 5
 """Part of every content hash: raise it when the import computes something else."""
-
-DECOMPOSITION_VERSION = 4
-"""Part of the key of every cached decomposition: raise it when the parts of the same scaled mesh differ."""
 
 MAX_VISUAL_FACES = 3000
 """Faces of the visual mesh: files stay below 40 kB, and no picture here shows more."""
@@ -73,23 +65,17 @@ class ImportResult:
     """What became of one mesh.
 
     Attributes:
-        source: Mesh file.
-        name: Object name.
-        target: USD file of the object.
+        job: The mesh, and what was to be made of it.
         status: ``imported``, ``cached`` (nothing to do) or ``refused``; ``gone`` of an object whose mesh file
             is gone (it stays in the set).
         reason: Why it was refused.
         model: The object, if it was imported now or earlier.
-        decomposed: Whether CoACD ran.
     """
 
-    source: str
-    name: str
-    target: str
+    job: Job
     status: Literal["imported", "cached", "refused", "gone"]
     reason: str = ""
     model: ObjectModel | None = None
-    decomposed: bool = False
 
 
 def content_hash(job: Job, settings: ImportSettings) -> str:
@@ -100,29 +86,23 @@ def content_hash(job: Job, settings: ImportSettings) -> str:
 
         files = usd_files(files[0])
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files))
-    how = [asdict(settings.decompose), asdict(settings.sizing)]
-    facts = [IMPORT_VERSION, job.name, job.licence, job.provenance, job.split, how]
+    parts = {
+        "max_hulls": settings.max_hulls,
+        "threshold": settings.threshold,
+        "mcts_iterations": settings.mcts_iterations,
+        "max_hull_vertices": HULL_VERTICES,
+        "time_limit_s": settings.time_limit,
+        "seed": 0,
+    }
+    size = {
+        "units": settings.units,
+        "keep_size": settings.keep_size,
+        "density": settings.density,
+        "mass_kg": settings.mass,
+    }
+    facts = [IMPORT_VERSION, job.name, job.licence, job.provenance, job.split, [parts, size]]
     digest.update(json.dumps(facts, sort_keys=True).encode())
     return digest.hexdigest()
-
-
-def _kept_decomposition(path: Path) -> Decomposition | None:
-    """An earlier decomposition, None if there is none or it is damaged."""
-    try:
-        with np.load(path) as data:
-            hulls = tuple(Hull(data[f"vertices_{i}"], data[f"faces_{i}"]) for i in range(int(data["count"])))
-            return Decomposition(hulls, str(data["method"]), error=float(data["error"]))
-    except Exception:  # zip, NumPy and zlib have errors of their own
-        return None
-
-
-def _keep_decomposition(path: Path, parts: Decomposition) -> None:
-    """Keep a decomposition for a later import."""
-    arrays: dict[str, Any] = {"count": len(parts.hulls), "method": parts.method, "error": parts.error}
-    for i, hull in enumerate(parts.hulls):
-        arrays |= {f"vertices_{i}": hull.vertices, f"faces_{i}": hull.faces}
-    with atomic_path(path) as temporary:
-        np.savez(temporary, **arrays)
 
 
 def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
@@ -148,36 +128,36 @@ def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
 def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     """Import one mesh in this process (CoACD runs in a child). A mesh that is refused is a result."""
     try:
-        model, decomposed = _object_of(job, settings)
+        model = _object_of(job, settings)
         write_object(Path(job.target), model)
     except (MeshError, ObjectError, OSError) as error:
-        return ImportResult(job.source, job.name, job.target, "refused", str(error))
-    return ImportResult(job.source, job.name, job.target, "imported", model=model, decomposed=decomposed)
+        return ImportResult(job, "refused", str(error))
+    return ImportResult(job, "imported", model=model)
 
 
-def _object_of(job: Job, settings: ImportSettings) -> tuple[ObjectModel, bool]:
-    """The object of a mesh, and whether CoACD ran.
+def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
+    """The object of a mesh.
 
     Raises:
         MeshError: The mesh is refused; the message is the reason.
     """
-    mesh = repair_mesh(load_mesh(Path(job.source)))
-    scale, size_notes, size_warnings = settings.sizing.scale(mesh.vertices, declared_unit(Path(job.source)))
+    source = Path(job.source)
+    mesh = repair_mesh(load_mesh(source))
+    scale, size_notes, size_warnings = scale_of(settings, mesh.vertices, declared_unit(source))
     mesh = mesh.scaled(scale)
     body = body_of(mesh)
     if not body.solid.volume > 0.0:
         raise MeshError("degenerate: encloses no volume")
-    mass, mass_notes, mass_warnings = settings.sizing.mass(body.solid.volume)
+    mass, mass_notes, mass_warnings = mass_of(settings, body.solid.volume)
     error_of = error_of_parts(body, mesh.vertices)
-    decomposed = not 0 < len(mesh.pieces) <= settings.decompose.max_hulls
-    if decomposed:
-        parts, decomposed = _decomposition(mesh.vertices, mesh.faces, settings, error_of)
-    else:
-        hulls = tidy_hulls([p.vertices for p in mesh.pieces], settings.decompose.max_hull_vertices)
+    if 0 < len(mesh.pieces) <= settings.max_hulls:
+        hulls = tidy_hulls([p.vertices for p in mesh.pieces], HULL_VERTICES)
         parts = Decomposition(hulls, "convex pieces", error=error_of(hulls))
+    else:
+        parts = best_decomposition(mesh.vertices, mesh.faces, settings, error_of)
     offset = parts.error * body.volume / triangle_areas(mesh.vertices, mesh.faces).sum()
     made = _parts_warnings(parts, offset / np.ptp(mesh.vertices, axis=0).max())
-    model = build_model(
+    return build_model(
         job.name,
         *cluster_vertices(mesh.vertices, mesh.faces, MAX_VISUAL_FACES),
         parts.hulls,
@@ -192,31 +172,11 @@ def _object_of(job: Job, settings: ImportSettings) -> tuple[ObjectModel, bool]:
         scale=scale,
         volume_error=parts.error + cavity_share(mesh, body),
         volume_method=f"{parts.method}; volume in which parts and solid differ; solid: {body.method}",
+        # A fall-back forced by a limit may not be needed next time.
         content_hash="" if parts.fallback else content_hash(job, settings),
         notes=(*mesh.notes, *size_notes, *mass_notes),
         warnings=(*mesh.warnings, *body.warnings, *made, *size_warnings, *mass_warnings),
     )
-    return model, decomposed
-
-
-def _decomposition(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    settings: ImportSettings,
-    error_of: Callable[[Any], float],
-) -> tuple[Decomposition, bool]:
-    """The parts of a mesh, kept from an earlier import or made now, and whether they were made."""
-    key = hashlib.sha256(vertices.tobytes() + faces.tobytes())
-    key.update(json.dumps([DECOMPOSITION_VERSION, asdict(settings.decompose)], sort_keys=True).encode())
-    cache = Path(settings.cache) / f"{key.hexdigest()}.npz" if settings.cache else None
-    kept = None if cache is None else _kept_decomposition(cache)
-    if kept:
-        return kept, False
-    parts = best_decomposition(vertices, faces, settings.decompose, error_of)
-    # A fall-back forced by a limit may not be needed next time: only full results are kept.
-    if cache and not parts.fallback:
-        _keep_decomposition(cache, parts)
-    return parts, True
 
 
 def _import_quietly(job: Job, settings: ImportSettings) -> ImportResult:
@@ -227,12 +187,11 @@ def _import_quietly(job: Job, settings: ImportSettings) -> ImportResult:
 def _import_in_child(job: Job, settings: ImportSettings) -> ImportResult:
     """Import one mesh in a child of its own."""
     # A busy machine is no reason: processor time is limited, this only ends what hangs.
-    limit = RUNS * HANG_S * settings.decompose.time_limit_s + WORKER_OVERHEAD_S
+    limit = RUNS * HANG_S * settings.time_limit + WORKER_OVERHEAD_S
     try:
         return in_child(_import_quietly, job, settings, start="spawn", limit_s=limit)
     except ChildError as error:
-        reason = f"the import ended with {error}; what it said is above"
-        return ImportResult(job.source, job.name, job.target, "refused", reason)
+        return ImportResult(job, "refused", f"the import ended with {error}; what it said is above")
 
 
 def import_meshes(
@@ -245,8 +204,8 @@ def import_meshes(
 ) -> list[ImportResult]:
     """Import meshes, several at a time, each in a process of its own.
 
-    An object file whose content hash still holds is left alone, unless its mesh has moved, and finished
-    decompositions are kept, so that an interrupted import goes on where it stopped.
+    An object file whose content hash still holds is left alone, unless its mesh has moved, so that an
+    interrupted import goes on where it stopped.
 
     Args:
         paths: Files and folders.
@@ -264,15 +223,14 @@ def import_meshes(
         OutputError: The folder cannot be made.
     """
     settings = settings or ImportSettings()
-    settings.sizing.check()
-    settings.decompose.check()
+    settings.check()
     out = Path(out)
-    plan = plan_jobs(find_meshes([Path(p) for p in paths]), out, settings)
+    plan = plan_jobs(find_meshes([Path(p) for p in paths]), out, settings.licence)
     gone = gone_objects(out)
     results: dict[str, ImportResult] = {}
 
     def finish(result: ImportResult) -> None:
-        results[result.name] = result
+        results[result.job.name] = result
         if progress:
             progress(result, len(results), len(plan))
 
@@ -285,9 +243,13 @@ def import_meshes(
     _import_in_children(todo, settings, jobs or os.cpu_count() or 1, finish)
     if new and not any(out.iterdir()):  # all were refused
         out.rmdir()
-    written = {job.target for job in todo}
-    stale = [ImportResult(file, path.stem, str(path), "gone") for path, file in gone.items()]
-    return [*(results[job.name] for job in plan), *(r for r in stale if r.target not in written)]
+    written = {Path(job.target) for job in todo}
+    stale = [
+        ImportResult(Job(file, path.stem, str(path)), "gone")
+        for path, file in gone.items()
+        if path not in written
+    ]
+    return [*(results[job.name] for job in plan), *stale]
 
 
 def _without_work(job: Job, settings: ImportSettings, *, moved: bool) -> ImportResult | None:
@@ -298,15 +260,15 @@ def _without_work(job: Job, settings: ImportSettings, *, moved: bool) -> ImportR
     """
     target = Path(job.target)
     try:
-        settings.sizing.check_unit(declared_unit(Path(job.source)))
+        settings.check_unit(declared_unit(Path(job.source)))
         content = content_hash(job, settings)
     except MeshError as error:
-        return ImportResult(job.source, job.name, job.target, "refused", str(error))
+        return ImportResult(job, "refused", str(error))
     current = target.is_file() and read_hash(target) == content
     check_target(job, current)
     if not current or moved:
         return None
-    return ImportResult(job.source, job.name, job.target, "cached", model=read_object(target))
+    return ImportResult(job, "cached", model=read_object(target))
 
 
 def _import_in_children(

@@ -1,10 +1,10 @@
 """Foreign meshes: the size and weight they are given."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from vd.assets_usd.objects.settings import DENSITIES_KG_M3, ImportSettings, MeshError
 from vd.paper import PAPER
 
 LONGEST_SIDE_M = (0.095, 0.165)
@@ -30,13 +30,6 @@ UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 GUESSED_UNITS = ("m", "mm", "cm")
 """Units that are tried where none is known; the first that needs the least rescaling is taken. An inch is too
 near to others to be guessed."""
-
-DENSITIES_KG_M3 = (10.0, 23000.0)
-"""Least and largest density of an object: from foam to osmium. What is beyond is a mistaken unit."""
-
-
-class MeshError(ValueError):
-    """A mesh is refused; the message is the reason."""
 
 
 def mean_width(vertices: np.ndarray) -> float:
@@ -71,84 +64,44 @@ def scales_that_fit(sides: Sequence[float], width: float) -> tuple[float, float]
     return max(low / longest, THINNEST_M / shortest), min(high / longest, MEAN_WIDTH_M / width)
 
 
-@dataclass(frozen=True)
-class Sizing:
-    """What decides size and weight of imported objects.
+def scale_of(
+    settings: ImportSettings, vertices: np.ndarray, declared: float | None
+) -> tuple[float, list[str], list[str]]:
+    """Factor to metres for vertices [V, 3] in a file's unit (``declared``, m); notes and warnings.
 
-    Attributes:
-        units: Unit of the meshes, a key of ``UNITS_M``; ``auto`` takes what a file declares, else guesses.
-        keep_size: Keep the real size, also of what does not fit the hand.
-        density: Density that gives the mass [kg/m^3].
-        mass_kg: Mass of each object. With neither, it is the paper's nominal mass.
+    Raises:
+        MeshError: The size is to be kept and the unit is not known.
     """
+    settings.check_unit(declared)
+    sides, width = np.ptp(vertices, axis=0), mean_width(vertices)
+    unit = UNITS_M.get(settings.units, declared)
+    if not settings.keep_size or unit is None:
+        factor, note = choose_scale(sides, width, unit)
+        return factor, [note] if note else [], []
+    size = f"{sides.max() * unit:.3f} m"
+    problem = misfit(sides * unit, width * unit)
+    warnings = [f"does not fit the hand at its real size of {size}: {problem}"] if problem else []
+    return unit, [f"taken as {unit_name(unit)}, real size kept: {size}"], warnings
 
-    units: str = "auto"
-    keep_size: bool = False
-    density: float | None = None
-    mass_kg: float | None = None
 
-    def check(self) -> None:
-        """Refuse what cannot be meant.
+def mass_of(settings: ImportSettings, volume: float) -> tuple[float, list[str], list[str]]:
+    """Mass [kg] of a solid of a volume [m^3]; notes and warnings.
 
-        Raises:
-            MeshError: Names the option.
-        """
-        if self.density is not None and self.mass_kg is not None:
-            raise MeshError("--density and --mass both give the mass; leave one out")
-        low, high = DENSITIES_KG_M3
-        if self.density is not None and not low <= self.density <= high:
-            raise MeshError(
-                f"--density {self.density:g}: {low:g} to {high:g} kg/m3 are possible; water has 1000"
-            )
-        if self.mass_kg is not None and not 0.0 < self.mass_kg < np.inf:
-            raise MeshError(f"--mass {self.mass_kg:g}: give the mass in kg, above 0")
-
-    def check_unit(self, declared: float | None) -> None:
-        """Refuse to keep the size of a mesh whose unit (``declared``, m) is not known.
-
-        Raises:
-            MeshError: Its reason names the option.
-        """
-        if self.keep_size and self.units == "auto" and declared is None:
-            raise MeshError(
-                "its file declares no unit, so its real size is not known; add --units mm (cm, m, in)"
-            )
-
-    def scale(self, vertices: np.ndarray, declared: float | None) -> tuple[float, list[str], list[str]]:
-        """Factor to metres for vertices [V, 3] in a file's unit (``declared``, m); notes and warnings.
-
-        Raises:
-            MeshError: The size is to be kept and the unit is not known.
-        """
-        self.check_unit(declared)
-        sides, width = np.ptp(vertices, axis=0), mean_width(vertices)
-        unit = UNITS_M.get(self.units, declared)
-        if not self.keep_size or unit is None:
-            factor, note = choose_scale(sides, width, unit)
-            return factor, [note] if note else [], []
-        size = f"{sides.max() * unit:.3f} m"
-        problem = misfit(sides * unit, width * unit)
-        warnings = [f"does not fit the hand at its real size of {size}: {problem}"] if problem else []
-        return unit, [f"taken as {unit_name(unit)}, real size kept: {size}"], warnings
-
-    def mass(self, volume: float) -> tuple[float, list[str], list[str]]:
-        """Mass [kg] of a solid of a volume [m^3]; notes and warnings.
-
-        Raises:
-            MeshError: A mass was given that no material of this volume has.
-        """
-        if self.density is not None:
-            mass = self.density * volume
-            return mass, [f"mass {mass:.3g} kg by a density of {self.density:g} kg/m3"], []
-        mass = PAPER.materials.object_mass_kg if self.mass_kg is None else self.mass_kg
-        low, high = DENSITIES_KG_M3
-        density = mass / volume
-        what = f"a mass of {mass:g} kg makes {density:.3g} kg/m3, and {low:g} to {high:g} are possible"
-        if low <= density <= high:
-            return mass, [] if self.mass_kg is None else [f"mass {mass:g} kg as given"], []
-        if self.mass_kg is None:
-            return mass, [], [f"{what}; give --density or --mass"]
-        raise MeshError(f"{what}; --mass is in kg")
+    Raises:
+        MeshError: A mass was given that no material of this volume has.
+    """
+    if settings.density is not None:
+        mass = settings.density * volume
+        return mass, [f"mass {mass:.3g} kg by a density of {settings.density:g} kg/m3"], []
+    mass = PAPER.materials.object_mass_kg if settings.mass is None else settings.mass
+    low, high = DENSITIES_KG_M3
+    density = mass / volume
+    what = f"a mass of {mass:g} kg makes {density:.3g} kg/m3, and {low:g} to {high:g} are possible"
+    if low <= density <= high:
+        return mass, [] if settings.mass is None else [f"mass {mass:g} kg as given"], []
+    if settings.mass is None:
+        return mass, [], [f"{what}; give --density or --mass"]
+    raise MeshError(f"{what}; --mass is in kg")
 
 
 def unit_name(unit: float) -> str:

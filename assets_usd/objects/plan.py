@@ -4,14 +4,13 @@ import csv
 import os
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from vd.assets_usd.objects.decompose import DecomposeSettings
-from vd.assets_usd.objects.meshes import MeshError, Sizing
 from vd.assets_usd.objects.model import object_files, read_origin
 from vd.assets_usd.objects.reading import KINDS, MESH_SUFFIXES
 from vd.assets_usd.objects.sets import built_in_models, objects_dir
+from vd.assets_usd.objects.settings import MeshError
 
 GENERIC_WORDS = frozenset(
     re.findall(
@@ -26,23 +25,6 @@ and call the files alike (``003_cracker_box/google_16k/textured.obj``, ``Mug/mes
 
 CLASHES_SHOWN = 3
 """Files with one name that an error shows."""
-
-
-@dataclass(frozen=True)
-class ImportSettings:
-    """Settings of an import.
-
-    Attributes:
-        decompose: Convex decomposition.
-        licence: Licence recorded where no ``objects.csv`` names one.
-        cache: Folder of finished decompositions; none if empty.
-        sizing: Unit, size and mass.
-    """
-
-    decompose: DecomposeSettings = field(default_factory=DecomposeSettings)
-    licence: str = "unknown"
-    cache: str = ""
-    sizing: Sizing = field(default_factory=Sizing)
 
 
 @dataclass(frozen=True)
@@ -61,9 +43,9 @@ class Job:
     source: str
     name: str
     target: str
-    licence: str
-    provenance: str
-    split: str
+    licence: str = ""
+    provenance: str = ""
+    split: str = ""
 
 
 def prim_name(stem: str) -> str:
@@ -159,8 +141,8 @@ def read_sidecar(folder: Path) -> dict[str, dict[str, str]]:
     return {}
 
 
-def plan_jobs(meshes: Iterable[Path], out: Path, settings: ImportSettings) -> list[Job]:
-    """Name, target, licence and provenance of each mesh.
+def plan_jobs(meshes: Iterable[Path], out: Path, licence: str) -> list[Job]:
+    """What to make of each mesh; ``licence`` where no ``objects.csv`` names one.
 
     Raises:
         MeshError: Two meshes would have one name; the message has both, and the remedy.
@@ -179,18 +161,22 @@ def plan_jobs(meshes: Iterable[Path], out: Path, settings: ImportSettings) -> li
             + f"{more}\nName only the files that you want (such as FOLDER/*/textured.obj), rename one, "
             "or import one into another set (--out)"
         )
-    sidecars: dict[Path, dict[str, dict[str, str]]] = {}
+    sidecars = {folder: read_sidecar(folder) for folder in {mesh.parent for mesh in taken.values()}}
     jobs = []
     for name, mesh in taken.items():
-        if mesh.parent not in sidecars:
-            sidecars[mesh.parent] = read_sidecar(mesh.parent)
         row = sidecars[mesh.parent].get(mesh.stem, {})
         source = row.get("source") or ""
         bracket = re.search(r"\(([^)]*)\)", source)
-        licence = row.get("licence") or (bracket.group(1) if bracket else settings.licence)
-        provenance = f"{source}: {mesh.name}" if source else mesh.name
-        split = row.get("split") or ""
-        jobs.append(Job(str(mesh), name, str(out / f"{name}.usd"), licence, provenance, split))
+        jobs.append(
+            Job(
+                str(mesh),
+                name,
+                str(out / f"{name}.usd"),
+                licence=row.get("licence") or (bracket.group(1) if bracket else licence),
+                provenance=f"{source}: {mesh.name}" if source else mesh.name,
+                split=row.get("split") or "",
+            )
+        )
     return jobs
 
 

@@ -20,6 +20,12 @@ SIDES = 12
 """Sides of a cylinder: 24 vertices."""
 
 
+class Draw(np.random.Generator):
+    """A random generator whose call draws a uniform number: ``u(0.2, 0.4)``."""
+
+    __call__ = np.random.Generator.uniform
+
+
 def vec(*components: float) -> np.ndarray:
     """The components as an array."""
     return np.array(components, dtype=np.float64)

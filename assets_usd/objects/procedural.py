@@ -1,9 +1,4 @@
-"""Procedural object sets: our own shapes, deterministic from a seed, with exact convex parts.
-
-Each kind is a function from a generator to convex parts. x points forward, y to the left, z up; units are
-arbitrary. Parts overlap, so that an object is one piece, and at most eight are used, one collision shape
-each. A left-right mirror plane is welcome, as in real things; a rotational symmetry is drawn again.
-"""
+"""Procedural object sets: our own shapes, deterministic from a seed, with exact convex parts."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,11 +7,6 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.objects import kinds_abstract as abstract
-from vd.assets_usd.objects import kinds_animals as animals
-from vd.assets_usd.objects import kinds_goods as goods
-from vd.assets_usd.objects import kinds_held_out as held_out_kinds
-from vd.assets_usd.objects import kinds_vehicles as vehicles
 from vd.assets_usd.objects.geometry import (
     Hull,
     hull_depth,
@@ -26,30 +16,10 @@ from vd.assets_usd.objects.geometry import (
     union_depth,
     voxelise_hulls,
 )
+from vd.assets_usd.objects.kinds import HELD_OUT, TRAINING, Kind
 from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, mean_width, scales_that_fit
 from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectModel, build_model
-from vd.assets_usd.objects.primitives import box
-
-Maker = Callable[[np.random.Generator], list[Hull]]
-"""Draws one object of a kind."""
-
-TRAINING: dict[str, tuple[Maker, ...]] = {
-    "vehicles": (vehicles.car, vehicles.truck, vehicles.locomotive, vehicles.aeroplane, vehicles.boat),
-    "animals": (animals.quadruped, animals.bird, animals.fish, animals.dinosaur),
-    "shoes": (goods.sneaker, goods.boot, goods.heel_shoe),
-    "tools": (goods.hammer, goods.wrench, goods.drill, goods.axe, goods.pliers),
-    "letters": (abstract.letter, abstract.monogram),
-    "composites": (abstract.cluster, abstract.branch),
-}
-"""Kinds by training family."""
-
-HELD_OUT: dict[str, tuple[Maker, ...]] = {
-    "kitchen": (held_out_kinds.mug,),
-    "furniture": (held_out_kinds.chair,),
-    "figures": (held_out_kinds.robot,),
-    "cameras": (held_out_kinds.camera,),
-}
-"""Kinds by held-out family."""
+from vd.assets_usd.objects.primitives import Draw, box
 
 PROCEDURAL_VERSION = 4
 """Part of every content hash: raise it when a family draws something else."""
@@ -168,14 +138,7 @@ def model_of_parts(
     )
 
 
-def deformed(hulls: Sequence[Hull], rng: np.random.Generator) -> list[Hull]:
-    """Parts under one random stretch and shear, which keeps them convex and y a mirror axis."""
-    matrix = np.diag(np.exp(rng.uniform(-STRETCH, STRETCH, 3)))
-    matrix[0, 2] = rng.uniform(-SHEAR, SHEAR)
-    return [Hull(h.vertices @ matrix.T, h.faces) for h in hulls]
-
-
-def draw_object(name: str, make: Maker, seed: Sequence[int], **fields: Any) -> ObjectModel:
+def draw_object(name: str, make: Kind, seed: Sequence[int], **fields: Any) -> ObjectModel:
     """One object of a kind: the first draw that is one piece, fits the hand and has no rotational symmetry.
 
     Its longest side is uniform in ``LONGEST_SIDE_M``, as far as the object fits the hand at that size
@@ -190,10 +153,13 @@ def draw_object(name: str, make: Maker, seed: Sequence[int], **fields: Any) -> O
     Raises:
         RuntimeError: No valid draw (a mistake in the kind).
     """
-    rng = np.random.default_rng(seed)
+    u = Draw(np.random.PCG64(seed))
     for _ in range(ATTEMPTS):
-        hulls = deformed(make(rng), rng)
-        longest = float(rng.uniform(*LONGEST_SIDE_M))
+        # One random stretch and shear keeps parts convex and y a mirror axis.
+        hulls, matrix = list(make(u)), np.diag(np.exp(u(-STRETCH, STRETCH, 3)))
+        matrix[0, 2] = u(-SHEAR, SHEAR)
+        hulls = [Hull(hull.vertices @ matrix.T, hull.faces) for hull in hulls]
+        longest = float(u(*LONGEST_SIDE_M))
         if len(hulls) > MAX_PARTS or not is_connected(hulls):
             continue
         vertices = np.concatenate([hull.vertices for hull in hulls])
@@ -222,8 +188,7 @@ def procedural_set(
         held_out: Take the held-out families in place of the training ones.
         progress: Called with each name, the number done and the number of all.
     """
-    families = HELD_OUT if held_out else TRAINING
-    order = list(families.items())
+    order = list((HELD_OUT if held_out else TRAINING).items())
     models = []
     for i in range(count):
         family, kinds = order[i % len(order)]
@@ -246,39 +211,24 @@ def procedural_set(
     return models
 
 
-def cube_rotations() -> np.ndarray:
-    """The 24 rotations of a cube as quaternions xyzw, the identity first, [24, 4]."""
-    return _identity_first(Rotation.create_group("O"))
-
-
-def brick_rotations() -> np.ndarray:
-    """The 4 rotations of a cuboid with three different sides, xyzw, the identity first, [4, 4]."""
-    return _identity_first(Rotation.create_group("D2"))
-
-
-def _identity_first(group: Rotation) -> np.ndarray:
-    return group[np.argsort(group.magnitude(), kind="stable")].as_quat(canonical=True)
+def _block(name: str, sides: Sequence[float], group: str, version: str) -> ObjectModel:
+    """A box of sides [m] with its rotation group, the identity first."""
+    turns = Rotation.create_group(group)
+    return model_of_parts(
+        name,
+        [box((0, 0, 0), sides)],
+        family="symmetric",
+        source=f"procedural {name}",
+        symmetry=turns[np.argsort(turns.magnitude(), kind="stable")].as_quat(canonical=True),
+        content_hash=f"{name}-{PROCEDURAL_VERSION}-{version}",
+    )
 
 
 def cube(side: float = CUBE_SIDE_M) -> ObjectModel:
     """The cube, with its group of 24 rotations."""
-    return model_of_parts(
-        "cube",
-        [box((0, 0, 0), (side, side, side))],
-        family="symmetric",
-        source="procedural cube",
-        symmetry=cube_rotations(),
-        content_hash=f"cube-{PROCEDURAL_VERSION}-{side}",
-    )
+    return _block("cube", (side, side, side), "O", f"{side}")
 
 
 def cuboid(sides: Sequence[float] = CUBOID_SIDES_M) -> ObjectModel:
     """The cuboid, with its group of four rotations."""
-    return model_of_parts(
-        "cuboid",
-        [box((0, 0, 0), sides)],
-        family="symmetric",
-        source="procedural cuboid",
-        symmetry=brick_rotations(),
-        content_hash=f"cuboid-{PROCEDURAL_VERSION}-{list(sides)}",
-    )
+    return _block("cuboid", sides, "D2", f"{list(sides)}")

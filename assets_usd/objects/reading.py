@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.assets_usd.objects.meshes import MeshError
+from vd.assets_usd.objects.settings import MeshError
 
 KINDS = {
     ".obj": "obj",

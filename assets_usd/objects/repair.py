@@ -15,7 +15,7 @@ from vd.assets_usd.objects.geometry import (
     sides_along_axes,
     triangle_areas,
 )
-from vd.assets_usd.objects.meshes import MeshError
+from vd.assets_usd.objects.settings import MeshError
 
 CONVEX = 0.99
 """A closed piece that fills this share of its convex hull is taken as convex."""

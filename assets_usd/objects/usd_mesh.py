@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from vd.assets_usd.objects.meshes import MeshError
 from vd.assets_usd.objects.model import is_object
+from vd.assets_usd.objects.settings import MeshError
 
 _UNREAD = ("Cube", "Sphere", "Cylinder", "Capsule", "Cone", "PointInstancer", "NurbsPatch", "TetMesh")
 """Kinds of solid geometry that are not read."""

@@ -36,16 +36,9 @@ class TwinSide:
         if hand is None or hand.scene is None:
             return
         from vd.sensors.depth_camera import DepthCamera
-        from vd.sensors.surfaces import scene_surfaces
 
-        self._camera = DepthCamera(
-            scene_surfaces(hand.scene),
-            camera or hand.hand.camera,
-            hand.body_q,
-            cfg=DepthCameraCfg(points=0, sensor=sensor or DepthSensorCfg()),
-            camera_body=int(hand.scene.link_body[0]),
-            seed=seed,
-        )
+        cfg = DepthCameraCfg(points=0, sensor=sensor or DepthSensorCfg())
+        self._camera = DepthCamera.of_scene(hand.scene, hand.body_q, cfg, camera, seed=seed)
         self._camera.capture()  # loads kernels
 
     def serve(self) -> bool:

@@ -34,31 +34,19 @@ def last_not_above(value: int, world: int, start: int, end: int, sums: wp.array2
 @wp.kernel
 def crop_pixels_kernel(
     # Model:
-    views: wp.array[View],
-    lowest: float,
-    highest: float,
-    tile_columns: int,
+    views: wp.array[View],  # [N] camera of each world
+    lowest: float,  # least height of a point in the world frame [m]
+    highest: float,  # largest height [m]
+    tile_columns: int,  # tiles in a row of tiles
     # In:
-    camera_q_in: wp.array[wp.transform],
-    depth_in: wp.array3d[float],
+    camera_q_in: wp.array[wp.transform],  # [N] optical frames in the world frame
+    depth_in: wp.array3d[float],  # [N, H, W] depth [m], 0 for none
     # Out:
-    tile_pixels_out: wp.array2d[wp.uint32],
-    tile_first_out: wp.array2d[int],
-    row_count_out: wp.array2d[int],
+    tile_pixels_out: wp.array2d[wp.uint32],  # [N, T] bit k is set if the tile's pixel k is within the crop
+    tile_first_out: wp.array2d[int],  # [N, T] points before each tile in its row of tiles
+    row_count_out: wp.array2d[int],  # [N, T / tile_columns] points of each row of tiles
 ):
-    """Mark the pixels whose point lies within the crop. Launch: [N, T / tile_columns], the rows of tiles.
-
-    Args:
-        views: Camera of each world, shape [N].
-        lowest: Least height of a point in the world frame [m].
-        highest: Largest height [m].
-        tile_columns: Tiles in a row of tiles.
-        camera_q_in: Optical frames in the world frame, shape [N].
-        depth_in: Depth [m], 0 for none, shape [N, H, W].
-        tile_pixels_out: Bit k is set if the tile's pixel k is within the crop, shape [N, T].
-        tile_first_out: Points before each tile in its row of tiles, shape [N, T].
-        row_count_out: Points of each row of tiles, shape [N, T / tile_columns].
-    """
+    """Mark the pixels whose point lies within the crop. Launch: [N, T / tile_columns], the rows of tiles."""
     world, tile_row = wp.tid()
     view = views[world]
     camera_q = camera_q_in[world]
@@ -89,23 +77,15 @@ def crop_pixels_kernel(
 @wp.kernel
 def count_points_kernel(
     # Model:
-    capacity: int,
+    capacity: int,  # points of a cloud at most, K
     # In:
-    row_count_in: wp.array2d[int],
+    row_count_in: wp.array2d[int],  # [N, Y] points of each row of tiles
     # Out:
-    row_first_out: wp.array2d[int],
-    available_out: wp.array[int],
-    count_out: wp.array[int],
+    row_first_out: wp.array2d[int],  # [N, Y] points before each row of tiles
+    available_out: wp.array[int],  # [N] points within the crop
+    count_out: wp.array[int],  # [N] points of the cloud
 ):
-    """Number the points of each world. Launch: [N].
-
-    Args:
-        capacity: Points of a cloud at most, K.
-        row_count_in: Points of each row of tiles, shape [N, Y].
-        row_first_out: Points before each row of tiles, shape [N, Y].
-        available_out: Points within the crop, shape [N].
-        count_out: Points of the cloud, shape [N].
-    """
+    """Number the points of each world. Launch: [N]."""
     world = wp.tid()
     total = wp.int32(0)
     for tile_row in range(row_count_in.shape[1]):
@@ -118,35 +98,23 @@ def count_points_kernel(
 @wp.kernel
 def choose_points_kernel(
     # Model:
-    views: wp.array[View],
-    tile_columns: int,
+    views: wp.array[View],  # [N] camera of each world
+    tile_columns: int,  # tiles in a row of tiles
     # In:
-    extrinsics_in: wp.array[wp.transform],
-    rng_in: wp.array[wp.uint32],
-    depth_in: wp.array3d[float],
-    tile_pixels_in: wp.array2d[wp.uint32],
-    tile_first_in: wp.array2d[int],
-    row_first_in: wp.array2d[int],
-    available_in: wp.array[int],
+    extrinsics_in: wp.array[wp.transform],  # [N] optical frame in the hand's base
+    rng_in: wp.array[wp.uint32],  # [N] random state of each world; not advanced
+    depth_in: wp.array3d[float],  # [N, H, W] depth [m], 0 for none
+    tile_pixels_in: wp.array2d[wp.uint32],  # [N, T] pixels within the crop, a bit each
+    tile_first_in: wp.array2d[int],  # [N, T] points before each tile in its row of tiles
+    row_first_in: wp.array2d[int],  # [N, Y] points before each row of tiles
+    available_in: wp.array[int],  # [N] points within the crop
     # Out:
-    points_out: wp.array2d[wp.vec3],
+    points_out: wp.array2d[wp.vec3],  # [N, K] points in the frame of the camera's body [m]
 ):
     """Choose points at random, evenly over the image and each at most once. Launch: [N, K].
 
     With V points and room for K < V, thread k takes a random one of those from k V / K to (k + 1) V / K. With
     V <= K all are taken, in order, and the rows beyond are NaN.
-
-    Args:
-        views: Camera of each world, shape [N].
-        tile_columns: Tiles in a row of tiles.
-        extrinsics_in: Optical frame in the frame of the camera's body (the hand's base), shape [N].
-        rng_in: Random state of each world, shape [N]; not advanced.
-        depth_in: Depth [m], 0 for none, shape [N, H, W].
-        tile_pixels_in: Pixels within the crop, a bit each, shape [N, T].
-        tile_first_in: Points before each tile in its row of tiles, shape [N, T].
-        row_first_in: Points before each row of tiles, shape [N, Y].
-        available_in: Points within the crop, shape [N].
-        points_out: Points in the frame of the camera's body [m], shape [N, K].
     """
     world, k = wp.tid()
     capacity = points_out.shape[1]

@@ -17,31 +17,18 @@ SHADOW_NEAREST = wp.constant(0.2)
 
 @wp.struct
 class DepthSensorParams:
-    """A stereo depth camera. Zero switches an effect off.
+    """A stereo depth camera. Zero switches an effect off."""
 
-    depth_disparity: Focal length times baseline, depth times disparity [m pixel].
-    disparity_std: Standard deviation of the disparity [pixel].
-    disparity_step: Rounding of the disparity [pixel].
-    shadow: As depth_disparity, in pixels of the image; what the second imager, to the right, does not see has
-        no value.
-    edge_jump: Difference of depth to one of the four neighbours that makes a pixel an edge [m].
-    edge_dropout: Probability that an edge pixel has no value.
-    flying: Probability that an edge pixel lies somewhere between both surfaces.
-    dropout: Probability that any pixel has no value.
-    min_range: Depth below which there is no value [m].
-    max_range: Depth above which there is no value [m].
-    """
-
-    depth_disparity: float
-    disparity_std: float
-    disparity_step: float
-    shadow: float
-    edge_jump: float
-    edge_dropout: float
-    flying: float
-    dropout: float
-    min_range: float
-    max_range: float
+    depth_disparity: float  # focal length times baseline, depth times disparity [m pixel]
+    disparity_std: float  # standard deviation of the disparity [pixel]
+    disparity_step: float  # rounding of the disparity [pixel]
+    shadow: float  # as depth_disparity, in pixels of the image: what :func:`is_hidden` has no value
+    edge_jump: float  # difference of depth to one of the four neighbours that makes a pixel an edge [m]
+    edge_dropout: float  # probability that an edge pixel has no value
+    flying: float  # probability that an edge pixel lies somewhere between both surfaces
+    dropout: float  # probability that any pixel has no value
+    min_range: float  # depth below which there is no value [m]
+    max_range: float  # depth above which there is no value [m]
 
 
 @wp.func
@@ -76,21 +63,14 @@ def is_hidden(depth: wp.array3d[float], world: int, row: int, column: int, shado
 @wp.kernel
 def measure_depth_kernel(
     # Model:
-    params: wp.array[DepthSensorParams],
+    params: wp.array[DepthSensorParams],  # [N] settings of each world's sensor
     # In:
-    depth_in: wp.array3d[float],
-    rng_in: wp.array[wp.uint32],
+    depth_in: wp.array3d[float],  # [N, H, W] true depth [m], 0 for none
+    rng_in: wp.array[wp.uint32],  # [N] random state of each world; not advanced
     # Out:
-    measured_out: wp.array3d[float],
+    measured_out: wp.array3d[float],  # [N, H, W] measured depth [m], 0 for none
 ):
-    """Measured depth of every pixel. Launch: [N, H, W].
-
-    Args:
-        params: Settings of each world's sensor, shape [N].
-        depth_in: True depth [m], 0 for none, shape [N, H, W].
-        rng_in: Random state of each world, shape [N]; not advanced.
-        measured_out: Measured depth [m], 0 for none, shape [N, H, W].
-    """
+    """Measured depth of every pixel. Launch: [N, H, W]."""
     world, row, column = wp.tid()
     sensor = params[world]
     rng = wp.rand_init(int(rng_in[world]), row * depth_in.shape[2] + column)
@@ -135,18 +115,12 @@ def measure_depth_kernel(
 @wp.kernel
 def forget_poses_kernel(
     # In:
-    reset_in: wp.array[wp.int32],
-    body_q_in: wp.array2d[wp.transform],
+    reset_in: wp.array[wp.int32],  # [N] 1 where a world was reset
+    body_q_in: wp.array2d[wp.transform],  # [N, B] body poses in the world frame
     # Out:
-    history_out: wp.array3d[wp.transform],
+    history_out: wp.array3d[wp.transform],  # [L, N, B] poses of past frames
 ):
-    """Fill the past of the worlds that were reset with their present. Launch: [N, B].
-
-    Args:
-        reset_in: 1 where a world was reset, shape [N].
-        body_q_in: Body poses in the world frame, shape [N, B].
-        history_out: Poses of past frames, shape [L, N, B].
-    """
+    """Fill the past of the worlds that were reset with their present. Launch: [N, B]."""
     world, body = wp.tid()
     if reset_in[world] != 0:
         for slot in range(history_out.shape[0]):
@@ -156,24 +130,17 @@ def forget_poses_kernel(
 @wp.kernel
 def delay_poses_kernel(
     # In:
-    frame_in: wp.array[int],
-    delay_in: wp.array[float],
-    body_q_in: wp.array2d[wp.transform],
+    frame_in: wp.array[int],  # [1] number of the present frame
+    delay_in: wp.array[float],  # [N] age of the poses that are wanted [frame], 0 to L - 1
+    body_q_in: wp.array2d[wp.transform],  # [N, B] body poses in the world frame
     # In/Out:
-    history: wp.array3d[wp.transform],
+    history: wp.array3d[wp.transform],  # [L, N, B] poses of the last L frames, frame k in slot k mod L
     # Out:
-    late_q_out: wp.array2d[wp.transform],
+    late_q_out: wp.array2d[wp.transform],  # [N, B] body poses in the world frame at that time
 ):
     """Record the present poses and give those of some frames ago, interpolated in between. Launch: [N, B].
 
     An image drawn from the poses of a past frame is that frame's image, and poses take far less memory.
-
-    Args:
-        frame_in: Number of the present frame, shape [1].
-        delay_in: Age of the poses that are wanted [frame], 0 to L - 1, shape [N].
-        body_q_in: Body poses in the world frame, shape [N, B].
-        history: Poses of the last L frames, frame k in slot k mod L, shape [L, N, B].
-        late_q_out: Body poses in the world frame at that time, shape [N, B].
     """
     world, body = wp.tid()
     slots = history.shape[0]
@@ -191,12 +158,3 @@ def delay_poses_kernel(
         p = p * -1.0
     # Along the chord: between two control steps a link turns 0.65 rad at most, and the arc is 1 mrad away.
     late_q_out[world, body] = wp.transform(position, wp.normalize(q * (1.0 - share) + p * share))
-
-
-@wp.kernel
-def next_count_kernel(
-    # In/Out:
-    frame: wp.array[int],
-):
-    """Number the next frame. Launch: [1]."""
-    frame[0] = frame[0] + 1

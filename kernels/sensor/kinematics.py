@@ -11,42 +11,27 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Joints:
-    """Revolute joints of a tree, parents before their children.
+    """Revolute joints of a tree, parents before their children."""
 
-    parent: Parent link of each joint, a column of the poses [D].
-    child: Child link of each joint, a column of the poses [D].
-    axis: Unit axis in the joint frames [D].
-    parent_frame: Joint frame in the parent link [D].
-    child_frame: Joint frame in the child link [D].
-    """
-
-    parent: wp.array[int]
-    child: wp.array[int]
-    axis: wp.array[wp.vec3]
-    parent_frame: wp.array[wp.transform]
-    child_frame: wp.array[wp.transform]
+    parent: wp.array[int]  # [D] parent link of each joint, a column of the poses
+    child: wp.array[int]  # [D] child link of each joint, a column of the poses
+    axis: wp.array[wp.vec3]  # [D] unit axis in the joint frames
+    parent_frame: wp.array[wp.transform]  # [D] joint frame in the parent link
+    child_frame: wp.array[wp.transform]  # [D] joint frame in the child link
 
 
 @wp.kernel
 def forward_kinematics_kernel(
     # Model:
-    joints: Joints,
-    base_body: int,
-    base: wp.transform,
+    joints: Joints,  # the joints
+    base_body: int,  # column of the base
+    base: wp.transform,  # pose of the base in the frame in which poses are wanted
     # In:
-    joint_q_in: wp.array2d[float],
+    joint_q_in: wp.array2d[float],  # [N, >= D] joint positions [rad]
     # Out:
-    body_q_out: wp.array2d[wp.transform],
+    body_q_out: wp.array2d[wp.transform],  # [N, B] poses; columns of other bodies stay
 ):
-    """Poses of all links. Launch: [N].
-
-    Args:
-        joints: The joints.
-        base_body: Column of the base.
-        base: Pose of the base in the frame in which poses are wanted.
-        joint_q_in: Joint positions [rad], shape [N, >= D].
-        body_q_out: Poses, shape [N, B]; columns of other bodies stay.
-    """
+    """Poses of all links. Launch: [N]."""
     row = wp.tid()
     body_q_out[row, base_body] = base
     for joint in range(joints.parent.shape[0]):

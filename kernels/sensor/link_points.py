@@ -11,53 +11,35 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class CloudModel:
-    """What the points are sampled from; constant while the simulation runs.
+    """What the points are sampled from; constant while the simulation runs."""
 
-    hand_points: Samples of the hand, each in the frame of its link [H] [m].
-    hand_body: Link of each sample, an index within a world [H].
-    object_points: Samples of each object in its frame, unscaled [O, K] [m].
-    goal_points: Those by which its goal is shown [O, K] [m].
-    world_object: Object of each world [N].
-    world_scale: Size factor of each world's object [N].
-    base_body: The hand's base, an index within a world.
-    object_body: The object, an index within a world.
-    goal_position: Where the goal's cloud is shown, base frame [m].
-    """
-
-    hand_points: wp.array[wp.vec3]
-    hand_body: wp.array[int]
-    object_points: wp.array2d[wp.vec3]
-    goal_points: wp.array2d[wp.vec3]
-    world_object: wp.array[int]
-    world_scale: wp.array[float]
-    base_body: int
-    object_body: int
-    goal_position: wp.vec3
+    hand_points: wp.array[wp.vec3]  # [H] samples of the hand, each in the frame of its link [m]
+    hand_body: wp.array[int]  # [H] link of each sample, an index within a world
+    object_points: wp.array2d[wp.vec3]  # [O, K] samples of each object in its frame, unscaled [m]
+    goal_points: wp.array2d[wp.vec3]  # [O, K] those by which its goal is shown [m]
+    world_object: wp.array[int]  # [N] object of each world
+    world_scale: wp.array[float]  # [N] size factor of each world's object
+    base_body: int  # the hand's base, an index within a world
+    object_body: int  # the object, an index within a world
+    goal_position: wp.vec3  # where the goal's cloud is shown, base frame [m]
 
 
 @wp.kernel
 def link_points_kernel(
     # Model:
-    model: CloudModel,
+    model: CloudModel,  # the samples
     # In:
-    world_in: wp.array[int],
-    body_q_in: wp.array2d[wp.transform],
-    goal_quat_in: wp.array[wp.quat],
+    world_in: wp.array[int],  # [R] world of each row
+    body_q_in: wp.array2d[wp.transform],  # [R, B] body poses of each row in the world frame
+    goal_quat_in: wp.array[wp.quat],  # [R] wanted orientation of the object in the world frame
     # Out:
-    points_out: wp.array2d[wp.vec3],
+    points_out: wp.array2d[wp.vec3],  # [R, *] points in the base frame [m]; columns beyond the launch stay
 ):
     """Carry every sample into the hand's base frame: P' = P R^T + p. Launch: [R, K + H] or [R, K + H + K].
 
     Columns are the goal's samples, then the hand's, then the object's: the shorter launch leaves the
     object out, for a camera to see it instead. Links and object are posed as in the simulation; the
     goal's cloud is the object turned to the wanted orientation, at a fixed place beside the scene.
-
-    Args:
-        model: The samples.
-        world_in: World of each row, shape [R].
-        body_q_in: Body poses of each row in the world frame, shape [R, B].
-        goal_quat_in: Wanted orientation of the object in the world frame, shape [R].
-        points_out: Points in the base frame [m], shape [R, *]; columns beyond the launch stay.
     """
     row, column = wp.tid()
     world = world_in[row]

@@ -75,21 +75,14 @@ def box_depth(origin: wp.vec3, direction: wp.vec3, lower: wp.vec3, upper: wp.vec
 @wp.kernel
 def place_camera_kernel(
     # Model:
-    camera_body: int,
+    camera_body: int,  # body that carries the camera, an index within a world; negative for the world itself
     # In:
-    extrinsics_in: wp.array[wp.transform],
-    body_q_in: wp.array2d[wp.transform],
+    extrinsics_in: wp.array[wp.transform],  # [N] optical frame in the frame of that body
+    body_q_in: wp.array2d[wp.transform],  # [N, B] body poses in the world frame
     # Out:
-    camera_q_out: wp.array[wp.transform],
+    camera_q_out: wp.array[wp.transform],  # [N] optical frame in the world frame
 ):
-    """Pose of each world's optical frame in the world frame, shape [N]. Launch: [N].
-
-    Args:
-        camera_body: Body that carries the camera, an index within a world; negative for the world itself.
-        extrinsics_in: Optical frame in the frame of that body, shape [N].
-        body_q_in: Body poses in the world frame, shape [N, B].
-        camera_q_out: Optical frame in the world frame, shape [N].
-    """
+    """Pose of each world's optical frame in the world frame, shape [N]. Launch: [N]."""
     world = wp.tid()
     pose = extrinsics_in[world]
     if camera_body >= 0:
@@ -100,23 +93,15 @@ def place_camera_kernel(
 @wp.kernel
 def place_meshes_kernel(
     # Model:
-    shape_body: wp.array[int],
+    shape_body: wp.array[int],  # [S] body of each shape, an index within a world; negative for the world
     # In:
-    camera_q_in: wp.array[wp.transform],
-    body_q_in: wp.array2d[wp.transform],
+    camera_q_in: wp.array[wp.transform],  # [N] optical frames in the world frame
+    body_q_in: wp.array2d[wp.transform],  # [N, B] body poses in the world frame
     # Out:
-    rotation_out: wp.array2d[wp.mat33],
-    position_out: wp.array2d[wp.vec3],
+    rotation_out: wp.array2d[wp.mat33],  # [N, S] rotation from mesh to optical frame
+    position_out: wp.array2d[wp.vec3],  # [N, S] origin of the mesh frame in the optical frame [m]
 ):
-    """Place every mesh before its camera. Launch: [N, S].
-
-    Args:
-        shape_body: Body that carries each shape, an index within a world; negative for the world, shape [S].
-        camera_q_in: Optical frames in the world frame, shape [N].
-        body_q_in: Body poses in the world frame, shape [N, B].
-        rotation_out: Rotation from mesh to optical frame, shape [N, S].
-        position_out: Origin of the mesh frame in the optical frame [m], shape [N, S].
-    """
+    """Place every mesh before its camera. Launch: [N, S]."""
     world, shape = wp.tid()
     pose = wp.transform_inverse(camera_q_in[world])
     body = shape_body[shape]
@@ -143,35 +128,23 @@ def edge_normal(a: wp.vec3, b: wp.vec3, index_a: int, index_b: int) -> wp.vec3:
 @wp.kernel
 def cast_rays_kernel(
     # Model:
-    views: wp.array[View],
-    points: wp.array[wp.vec3],
-    triangles: wp.array[wp.vec3i],
-    mesh_first: wp.array[int],
-    slot_shape: wp.array[int],
-    slot_index: wp.array[int],
-    shape_mesh: wp.array2d[int],
-    shape_scale: wp.array2d[float],
+    views: wp.array[View],  # [N] camera of each world
+    points: wp.array[wp.vec3],  # [V] vertices of all meshes in their frames [m]
+    triangles: wp.array[wp.vec3i],  # [F] vertices of all triangles, mesh after mesh
+    mesh_first: wp.array[int],  # [M + 1] first triangle of each mesh, and the end of the last
+    slot_shape: wp.array[int],  # [K] shape of each thread
+    slot_index: wp.array[int],  # [K] each thread's triangle within the shape's mesh; there may be fewer
+    shape_mesh: wp.array2d[int],  # [N, S] mesh of each shape
+    shape_scale: wp.array2d[float],  # [N, S] size factor of each shape
     # In:
-    rotation_in: wp.array2d[wp.mat33],
-    position_in: wp.array2d[wp.vec3],
+    rotation_in: wp.array2d[wp.mat33],  # [N, S] rotation from mesh to optical frame
+    position_in: wp.array2d[wp.vec3],  # [N, S] origin of the mesh frame in the optical frame [m]
     # Out:
-    depth_bits: wp.array3d[wp.int32],
+    depth_bits: wp.array3d[wp.int32],  # [N, H, W] depth [m] as the bits of a float
 ):
     """Lower the depth of every pixel that a triangle covers. Launch: [N, K].
 
-    Args:
-        views: Camera of each world, shape [N].
-        points: Vertices of all meshes in their frames [m], shape [V].
-        triangles: Vertices of all triangles, mesh after mesh, shape [F].
-        mesh_first: First triangle of each mesh, and the end of the last, shape [M + 1].
-        slot_shape: Shape of each thread, shape [K].
-        slot_index: Number of each thread's triangle within the shape's mesh; there may be fewer, shape [K].
-        shape_mesh: Mesh of each shape, shape [N, S].
-        shape_scale: Size factor of each shape, shape [N, S].
-        rotation_in: Rotation from mesh to optical frame, shape [N, S].
-        position_in: Origin of the mesh frame in the optical frame [m], shape [N, S].
-        depth_bits: Depth [m] as the bits of a float, whose order as integers is that of positive floats, for
-            which devices have an atomic minimum; shape [N, H, W].
+    The bits of positive floats are in their order, and devices have an atomic minimum of integers.
     """
     world, slot = wp.tid()
     shape = slot_shape[slot]
@@ -243,27 +216,17 @@ def cast_rays_kernel(
 @wp.kernel
 def finish_depth_kernel(
     # Model:
-    views: wp.array[View],
-    table_lower: wp.vec3,
-    table_upper: wp.vec3,
-    lanes: int,
+    views: wp.array[View],  # [N] camera of each world
+    table_lower: wp.vec3,  # lower corner of the table in the world frame [m]
+    table_upper: wp.vec3,  # upper corner [m]
+    lanes: int,  # threads of a row
     # In:
-    table_in: wp.array[int],
-    camera_q_in: wp.array[wp.transform],
+    table_in: wp.array[int],  # [N] whether the table is there
+    camera_q_in: wp.array[wp.transform],  # [N] optical frames in the world frame
     # In/Out:
-    depth: wp.array3d[float],
+    depth: wp.array3d[float],  # [N, H, W] depth of the nearest mesh [m], then of anything
 ):
-    """Add the table, and write 0 where nothing is within the camera's range. Launch: [N, H, lanes].
-
-    Args:
-        views: Camera of each world, shape [N].
-        table_lower: Lower corner of the table in the world frame [m].
-        table_upper: Upper corner [m].
-        lanes: Threads of a row.
-        table_in: Whether the table is there, shape [N].
-        camera_q_in: Optical frames in the world frame, shape [N].
-        depth: Depth of the nearest mesh along the optical axis [m], then of anything, shape [N, H, W].
-    """
+    """Add the table, and write 0 where nothing is within the camera's range. Launch: [N, H, lanes]."""
     world, row, lane = wp.tid()
     view = views[world]
     camera_q = camera_q_in[world]

@@ -34,20 +34,13 @@ NEVER = wp.constant(1.0e9)
 
 @wp.struct
 class Eye:
-    """A camera and what it can tell.
+    """A camera and what it can tell."""
 
-    focal: Focal lengths [pixel].
-    centre: Principal point, from the top left corner of the image [pixel].
-    pose: Optical frame in the base frame.
-    cell: Side of a cell of the image [pixel].
-    margin: What is nearer than all that was seen in its cell by less than this may be there [m].
-    """
-
-    focal: wp.vec2
-    centre: wp.vec2
-    pose: wp.transform
-    cell: float
-    margin: float
+    focal: wp.vec2  # focal lengths [pixel]
+    centre: wp.vec2  # principal point, from the top left corner of the image [pixel]
+    pose: wp.transform  # optical frame in the base frame
+    cell: float  # side of a cell of the image [pixel]
+    margin: float  # what is nearer than all that was seen in its cell by less than this may be there [m]
 
 
 @wp.func
@@ -61,19 +54,13 @@ def cell_of(eye: Eye, seen: wp.vec3):
 @wp.kernel
 def nearness_kernel(
     # Model:
-    eye: Eye,
+    eye: Eye,  # the camera
     # In:
-    points_in: wp.array2d[wp.vec3],
+    points_in: wp.array2d[wp.vec3],  # [N, K] what it saw, base frame [m], NaN for none
     # In/Out:
-    nearness: wp.array3d[float],
+    nearness: wp.array3d[float],  # [N, Y, X] one over depth [1/m], zeros before; 0 where nothing was seen
 ):
-    """How near the nearest is that was seen in each cell of the image. Launch: [N, K].
-
-    Args:
-        eye: The camera.
-        points_in: What it saw, base frame [m], NaN for none, shape [N, K].
-        nearness: One over depth [1/m], shape [N, Y, X]; to be zero before, and zero where nothing was seen.
-    """
+    """How near the nearest is that was seen in each cell of the image. Launch: [N, K]."""
     world, k = wp.tid()
     place = wp.transform_point(wp.transform_inverse(eye.pose), points_in[world, k])
     if place[2] > 0.0:  # not so of NaN
@@ -141,33 +128,20 @@ def placed(
 @wp.kernel
 def start_poses_kernel(
     # Model:
-    shapes: Shapes,
-    eye: Eye,
-    rendered: int,
-    every: int,
+    shapes: Shapes,  # the shapes
+    eye: Eye,  # the camera
+    rendered: int,  # 1 where a camera saw the points, 0 where they are of all sides
+    every: int,  # look at every so many-th sample
     # In:
-    world_in: wp.array[int],
-    first_in: wp.array[int],
-    rotation_in: wp.array[wp.quat],
-    seen_in: wp.array2d[wp.vec3],
-    count_in: wp.array[int],
+    world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
+    first_in: wp.array[int],  # [M] which rotation is the first of each row, counted on and around
+    rotation_in: wp.array[wp.quat],  # [H] rotations
+    seen_in: wp.array2d[wp.vec3],  # [N, P] points seen of the object, base frame [m]
+    count_in: wp.array[int],  # [N] how many there are
     # Out:
-    pose_out: wp.array2d[wp.transform],
+    pose_out: wp.array2d[wp.transform],  # [M, C] object frame in the base frame
 ):
-    """Place the shape in given rotations, as :func:`placed` does. Launch: [M, C].
-
-    Args:
-        shapes: The shapes.
-        eye: The camera.
-        rendered: 1 where a camera saw the points, 0 where they are of all sides.
-        every: Look at every so many-th sample.
-        world_in: World of each row, shape [M]; a row of -1 is left out.
-        first_in: Which rotation is the first of each row, counted on and around, shape [M].
-        rotation_in: Rotations, shape [H].
-        seen_in: Points seen of the object, base frame [m], shape [N, P].
-        count_in: How many there are, shape [N].
-        pose_out: Object frame in the base frame, shape [M, C].
-    """
+    """Place the shape in given rotations, as :func:`placed` does. Launch: [M, C]."""
     row, c = wp.tid()
     world = world_in[row]
     if world < 0:
@@ -179,40 +153,25 @@ def start_poses_kernel(
 @wp.kernel
 def replace_poses_kernel(
     # Model:
-    shapes: Shapes,
-    eye: Eye,
-    rendered: int,
-    every: int,
+    shapes: Shapes,  # the shapes
+    eye: Eye,  # the camera
+    rendered: int,  # 1 where a camera saw the points, 0 where they are of all sides
+    every: int,  # look at every so many-th sample
     # In:
-    world_in: wp.array[int],
-    worse: float,
-    pose_in: wp.array2d[wp.transform],
-    misfit_in: wp.array2d[float],
-    cost_in: wp.array2d[float],
-    seen_in: wp.array2d[wp.vec3],
-    count_in: wp.array[int],
+    world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
+    worse: float,  # a pose fits as it did if its misfit is no more than so many times that before
+    pose_in: wp.array2d[wp.transform],  # [N, C] poses before, object frame in the base frame
+    misfit_in: wp.array2d[float],  # [N, C] their misfits, averaged over time [m^2]
+    cost_in: wp.array2d[float],  # [M, C] misfits of what became of them now [m^2]
+    seen_in: wp.array2d[wp.vec3],  # [N, P] points seen of the object, base frame [m]
+    count_in: wp.array[int],  # [N] how many there are
     # Out:
-    pose_out: wp.array2d[wp.transform],
-    cost_out: wp.array2d[float],
+    pose_out: wp.array2d[wp.transform],  # [M, C] poses
+    cost_out: wp.array2d[float],  # [M, C] NEVER where a pose fits as it did and none is written, else 0
 ):
     """Put poses where points are now, turned as they were: what falls is soon too far. Launch: [M, C].
 
     Only those that do not fit any more as they did.
-
-    Args:
-        shapes: The shapes.
-        eye: The camera.
-        rendered: 1 where a camera saw the points, 0 where they are of all sides.
-        every: Look at every so many-th sample.
-        world_in: World of each row, shape [M]; a row of -1 is left out.
-        worse: A pose fits as it did if its misfit is no more than so many times that before.
-        pose_in: Poses before, object frame in the base frame, shape [N, C].
-        misfit_in: Their misfits, averaged over time [m^2], shape [N, C].
-        cost_in: Misfits of what became of them now [m^2], shape [M, C].
-        seen_in: Points seen of the object, base frame [m], shape [N, P].
-        count_in: How many there are, shape [N].
-        pose_out: Poses, shape [M, C].
-        cost_out: NEVER where a pose fits as it did and none is written, else 0, shape [M, C].
     """
     row, c = wp.tid()
     world = world_in[row]
@@ -280,37 +239,22 @@ def improved(
 @wp.kernel
 def fit_poses_kernel(
     # Model:
-    shapes: Shapes,
-    eye: Eye,
-    far: float,
-    steps: int,
-    every: int,
-    every_sample: int,
+    shapes: Shapes,  # the shapes
+    eye: Eye,  # the camera
+    far: float,  # length at which distances are cut off [m]; from about there on points count less
+    steps: int,  # steps of each pose at most
+    every: int,  # look at every so many-th seen point
+    every_sample: int,  # look at every so many-th sample for what stands out
     # In:
-    world_in: wp.array[int],
-    seen_in: wp.array2d[wp.vec3],
-    count_in: wp.array[int],
-    nearness_in: wp.array3d[float],
+    world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
+    seen_in: wp.array2d[wp.vec3],  # [N, P] points seen of the object, base frame [m]
+    count_in: wp.array[int],  # [N] how many there are
+    nearness_in: wp.array3d[float],  # [N, Y, X] from ``nearness_kernel``; [N, 0, 0] without a camera
     # In/Out:
-    pose: wp.array2d[wp.transform],
-    misfit: wp.array2d[float],
+    pose: wp.array2d[wp.transform],  # [M, C] object frame in the base frame
+    misfit: wp.array2d[float],  # [M, C] both mean squares added [m^2]; NEVER where nothing is to be done
 ):
-    """Improve poses until they stay, and say how badly they fit. Launch: [M, C].
-
-    Args:
-        shapes: The shapes.
-        eye: The camera.
-        far: Length at which distances are cut off [m]; from about there on points count less.
-        steps: Steps of each pose at most.
-        every: Look at every so many-th seen point.
-        every_sample: Look at every so many-th sample for what stands out.
-        world_in: World of each row, shape [M]; a row of -1 is left out.
-        seen_in: Points seen of the object, base frame [m], shape [N, P].
-        count_in: How many there are, shape [N].
-        nearness_in: From ``nearness_kernel``, shape [N, Y, X]; [N, 0, 0] without a camera.
-        pose: Object frame in the base frame, shape [M, C].
-        misfit: Mean squares of both lengths, together [m^2], shape [M, C]; NEVER where nothing is to be done.
-    """
+    """Improve poses until they stay, and say how badly they fit. Launch: [M, C]."""
     row, c = wp.tid()
     world = world_in[row]
     if world < 0 or misfit[row, c] >= NEVER:
@@ -350,20 +294,13 @@ def fit_poses_kernel(
 @wp.kernel
 def take_better_kernel(
     # In:
-    world_in: wp.array[int],
-    known: int,
+    world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
+    known: int,  # attempts, K
     # In/Out:
-    pose: wp.array2d[wp.transform],
-    cost: wp.array2d[float],
+    pose: wp.array2d[wp.transform],  # [M, >= 2 K] poses: attempt k + K is another one at what k is
+    cost: wp.array2d[float],  # their misfits [m^2], likewise; NEVER of the second ones afterwards
 ):
-    """Of each two attempts at the same pose take the better one. Launch: [M, K].
-
-    Args:
-        world_in: World of each row, shape [M]; a row of -1 is left out.
-        known: K.
-        pose: Poses, shape [M, >= 2 K]: attempt k + K is another one at what k is.
-        cost: Their misfits [m^2], likewise; NEVER of the second ones afterwards.
-    """
+    """Of each two attempts at the same pose take the better one. Launch: [M, K]."""
     row, k = wp.tid()
     if world_in[row] < 0:
         return
@@ -377,17 +314,17 @@ def take_better_kernel(
 @wp.kernel
 def keep_poses_kernel(
     # Model:
-    apart: float,
-    stay: float,
-    share: float,
-    known: int,
+    apart: float,  # least angle between two kept poses [rad]
+    stay: float,  # factor on the misfit of the first pose when it is compared
+    share: float,  # share of the latest misfit in the average over time
+    known: int,  # how many of the found poses were kept before, 0 or K
     # In:
-    world_in: wp.array[int],
-    found_in: wp.array2d[wp.transform],
+    world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
+    found_in: wp.array2d[wp.transform],  # [M, C] found poses
     # In/Out:
-    cost: wp.array2d[float],
-    pose: wp.array2d[wp.transform],
-    misfit: wp.array2d[float],
+    cost: wp.array2d[float],  # [M, C] their misfits now; of no meaning after
+    pose: wp.array2d[wp.transform],  # [N, K] kept poses
+    misfit: wp.array2d[float],  # [N, K] their misfits, averaged over time; NEVER where none is left
 ):
     """Keep the best poses of each world that are not nearly the same. Launch: [M].
 
@@ -395,17 +332,6 @@ def keep_poses_kernel(
     The very first stays so unless another is better by a good deal: of a shape that looks the same from
     several sides any is as good, but not another one in each step. The kept poses are in the order of their
     misfits.
-
-    Args:
-        apart: Least angle between two kept poses [rad].
-        stay: Factor on the misfit of the first pose when it is compared.
-        share: Share of the latest misfit in the average over time.
-        known: How many of the found poses were kept before, 0 or K.
-        world_in: World of each row, shape [M]; a row of -1 is left out.
-        found_in: Found poses, shape [M, C].
-        cost: Their misfits now, shape [M, C]; of no meaning after.
-        pose: Kept poses, shape [N, K].
-        misfit: Their misfits, averaged over time; NEVER where none is left, shape [N, K].
     """
     row = wp.tid()
     world = world_in[row]

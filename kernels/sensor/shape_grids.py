@@ -13,37 +13,24 @@ ANYWHERE = wp.constant(1.0)
 
 @wp.struct
 class Shapes:
-    """Shapes that can be looked for, and which one each world holds.
+    """Shapes that can be looked for, and which one each world holds."""
 
-    samples: Surface samples in the object frame, unscaled [O, S] [m].
-    distance: Distance to the surface [O, E, E, E] [m], on grids about the origin; negative inside.
-    half: Half the side of each grid [O] [m].
-    world_shape: Shape of each world [N].
-    world_scale: Factor on its size [N].
-    """
-
-    samples: wp.array2d[wp.vec3]
-    distance: wp.array4d[float]
-    half: wp.array[float]
-    world_shape: wp.array[int]
-    world_scale: wp.array[float]
+    samples: wp.array2d[wp.vec3]  # [O, S] surface samples in the object frame, unscaled [m]
+    distance: wp.array4d[float]  # [O, E, E, E] distance to the surface on grids, < 0 inside [m]
+    half: wp.array[float]  # [O] half the side of each grid [m]
+    world_shape: wp.array[int]  # [N] shape of each world
+    world_scale: wp.array[float]  # [N] factor on its size
 
 
 @wp.kernel
 def off_mesh_kernel(
     # Model:
-    samples: wp.array2d[wp.vec3],
-    mesh: wp.array[wp.uint64],
+    samples: wp.array2d[wp.vec3],  # [O, S] surface samples in the object frame [m]
+    mesh: wp.array[wp.uint64],  # [O] mesh of each shape
     # Out:
-    distance_out: wp.array2d[float],
+    distance_out: wp.array2d[float],  # [O, S] distances [m]
 ):
-    """Distance of each sample from the mesh of its shape. Launch: [O, S].
-
-    Args:
-        samples: Surface samples in the object frame [m], shape [O, S].
-        mesh: Mesh of each shape, shape [O].
-        distance_out: Distances [m], shape [O, S].
-    """
+    """Distance of each sample from the mesh of its shape. Launch: [O, S]."""
     shape, sample = wp.tid()
     place = samples[shape, sample]
     found = wp.mesh_query_point_no_sign(mesh[shape], place, ANYWHERE)
@@ -55,23 +42,15 @@ def off_mesh_kernel(
 @wp.kernel
 def shape_distance_kernel(
     # Model:
-    samples: wp.array2d[wp.vec3],
-    mesh: wp.array[wp.uint64],
-    half: wp.array[float],
+    samples: wp.array2d[wp.vec3],  # [O, S] surface samples in the object frame [m]
+    mesh: wp.array[wp.uint64],  # [O] mesh of each shape, with winding numbers
+    half: wp.array[float],  # [O] half the side of each grid [m]
     # In:
-    meshed_in: wp.array[int],
+    meshed_in: wp.array[int],  # [O] 1 where the surface is the mesh, 0 where it is the samples
     # Out:
-    distance_out: wp.array4d[float],
+    distance_out: wp.array4d[float],  # [O, E, E, E] distances [m], negative inside of a mesh
 ):
-    """Distance from each point of a grid to the surface. Launch: [O, E, E, E].
-
-    Args:
-        samples: Surface samples in the object frame [m], shape [O, S].
-        mesh: Mesh of each shape, with winding numbers, shape [O].
-        half: Half the side of each grid [m], shape [O].
-        meshed_in: 1 where the surface is the mesh, 0 where it is the samples, shape [O].
-        distance_out: Distances [m], negative inside of a mesh, shape [O, E, E, E].
-    """
+    """Distance from each point of a grid to the surface. Launch: [O, E, E, E]."""
     shape, i, j, k = wp.tid()
     side = 2.0 * half[shape] / float(distance_out.shape[1] - 1)
     corner = wp.vec3(half[shape], half[shape], half[shape])

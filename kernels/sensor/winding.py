@@ -14,27 +14,19 @@ ACCURACY = wp.constant(2.0)
 @wp.kernel
 def winding_kernel(
     # Model:
-    samples: wp.array[wp.vec3],
-    areas: wp.array[wp.vec3],
-    width: float,
-    corner: wp.vec3,
-    pitch: float,
+    samples: wp.array[wp.vec3],  # [K] centres of the pieces [m]
+    areas: wp.array[wp.vec3],  # [K] outward normals of the pieces, as long as their areas [m^2]
+    width: float,  # least distance [m]
+    corner: wp.vec3,  # place of the first grid point [m]
+    pitch: float,  # distance between grid points [m]
     # Out:
-    winding_out: wp.array3d[float],
+    winding_out: wp.array3d[float],  # [X, Y, Z] winding numbers
 ):
     """Winding numbers of a surface at the points of a grid. Launch: [X, Y, Z].
 
     The solid angles of its pieces as a share of the full one: about 1 inside, 0 outside and a half on the
     surface (Gauss). A piece nearer than ``width`` counts as if it were that far away, where its solid angle
     would go to infinity.
-
-    Args:
-        samples: Centres of the pieces [m], shape [K].
-        areas: Outward normals of the pieces, as long as their areas [m^2], shape [K].
-        width: Least distance [m].
-        corner: Place of the first grid point [m].
-        pitch: Distance between grid points [m].
-        winding_out: Winding numbers, shape [X, Y, Z].
     """
     i, j, k = wp.tid()
     place = corner + pitch * wp.vec3(float(i), float(j), float(k))
@@ -49,23 +41,17 @@ def winding_kernel(
 @wp.kernel
 def inside_kernel(
     # Model:
-    mesh: wp.uint64,
-    level: float,
+    mesh: wp.uint64,  # the mesh
+    level: float,  # least winding number of the inside; a half for a closed mesh
     # In:
-    points: wp.array[wp.vec3],
+    points: wp.array[wp.vec3],  # [K] places in the mesh's frame
     # Out:
-    inside_out: wp.array[wp.bool],
+    inside_out: wp.array[wp.bool],  # [K] whether each is inside
 ):
     """Whether the generalised winding number of a mesh exceeds a level at points. Launch: [K].
 
     Far triangles count by clusters of the mesh's tree (Barill et al. 2018, Fast Winding Numbers for Soups and
     Clouds), as in Warp's query, which wants a mesh made with ``support_winding_number``.
-
-    Args:
-        mesh: The mesh.
-        level: Least winding number of the inside; a half for a closed mesh.
-        points: Places in the mesh's frame, shape [K].
-        inside_out: Whether each is inside, shape [K].
     """
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], FAR, ACCURACY, level)

@@ -80,24 +80,15 @@ SMALLEST_SPEED = 1.0e-3
 
 @wp.struct
 class Servo:
-    """What the servo asks of the joint in one time step.
+    """What the servo asks of the joint in one time step."""
 
-    reference: Position that the drive pulls to [rad].
-    stiffness: Stiffness of the drive [N m/rad].
-    damping: Damping of the drive [N m s/rad].
-    torque: Torque besides the drive's [N m].
-    friction: Bound of the dry friction torque [N m].
-    motor: Mean size of the motor's torque, which load friction follows [N m].
-    motor_damping: How that torque falls with speed, signed as it pulls [N m s/rad].
-    """
-
-    reference: float
-    stiffness: float
-    damping: float
-    torque: float
-    friction: float
-    motor: float
-    motor_damping: float
+    reference: float  # position that the drive pulls to [rad]
+    stiffness: float  # stiffness of the drive [N m/rad]
+    damping: float  # damping of the drive [N m s/rad]
+    torque: float  # torque besides the drive's [N m]
+    friction: float  # bound of the dry friction torque [N m]
+    motor: float  # mean size of the motor's torque, which load friction follows [N m]
+    motor_damping: float  # how that torque falls with speed, signed as it pulls [N m s/rad]
 
 
 @wp.func
@@ -153,17 +144,8 @@ def motor_torque(
     (exp(-rate t)), soft loss (tau_s tanh(tau / tau_s)), hard limit, and the torque-speed line
     tau_stall (1 - |speed| / omega_0), which bounds driving, not braking; beyond omega_0 nothing drives.
 
-    Args:
-        wanted: Torque wanted [N m].
-        speed: Joint velocity [rad/s].
-        time: Time since the joint was switched on [s].
-        effort: Largest torque of the drive [N m].
-        parameters: Parameter rows.
-        row: The joint's row.
-
-    Returns:
-        The torque [N m], its slope by the torque wanted, and how much of it the torque-speed line takes
-        per speed [N m s/rad].
+    Returns the torque [N m], its slope by the torque wanted, and how much of it the torque-speed line takes
+    per speed [N m s/rad]. ``effort`` is the largest torque of the drive [N m], ``time`` [s] since it is on.
     """
     torque = wanted
     slope = wp.float32(1.0)
@@ -212,16 +194,8 @@ def dry_friction(motor: float, speed: float, parameters: Any, row: int) -> wp.ve
     """Friction torque [N m]: Coulomb, Stribeck, load-dependent and asymmetric, added up.
 
     Friction F+ against positive motion and F- against negative motion is, in motion and at rest, a
-    bound of (F+ + F-) / 2 and a constant torque of -(F+ - F-) / 2; so no direction has to be guessed.
-
-    Args:
-        motor: Torque of the motor [N m], which the transmission carries; its size counts.
-        speed: Joint velocity [rad/s].
-        parameters: Parameter rows.
-        row: The joint's row.
-
-    Returns:
-        The bound and the constant torque.
+    bound of (F+ + F-) / 2 and a constant torque of -(F+ - F-) / 2; so no direction has to be guessed. Returns
+    both. Of the ``motor`` torque [N m], which the transmission carries, the size counts.
     """
     friction = parameters[row, COULOMB_TORQUE] + parameters[row, LOAD_FRICTION] * wp.abs(motor)
     sliding = parameters[row, STRIBECK_SLIDING]
@@ -283,27 +257,18 @@ def start_servo(command: float, position: float, row: int, state: wp.array2d[flo
 
 @wp.func
 def rest_play(
-    command: float,
-    position: float,
-    load: float,
-    power: float,
-    parameters: Any,
-    row: int,
-    state: wp.array2d[float],
+    command: float,  # command in force [rad]
+    position: float,  # position at which the joint rests [rad]
+    load: float,  # torque on the joint besides the drive's and :func:`drive_joint`'s own gravity load [N m]
+    power: float,  # as in :func:`drive_joint`; with the torque off the play stays at the command
+    parameters: Any,  # [R, PARAMETER_COLUMNS] parameter rows
+    row: int,  # the joint's row
+    state: wp.array2d[float],  # [R, STATE_COLUMNS] state rows; the play of the joint's row is written
 ):
     """Put the play where a joint at rest has it, which depends on how it came there.
 
     Dry friction aside, a joint rests where its drive carries its load; without friction and dead zone
     nothing but the play says how far that is from the command.
-
-    Args:
-        command: Command in force [rad].
-        position: Position at which the joint rests [rad].
-        load: Torque on the joint besides the drive's and :func:`drive_joint`'s own gravity load [N m].
-        power: As in :func:`drive_joint`; with the torque off the play stays at the command.
-        parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
-        row: The joint's row.
-        state: State rows, shape [R, STATE_COLUMNS]; the play of the joint's row is written.
     """
     stiffness = power * parameters[row, KP]
     if stiffness > 0.0:
@@ -316,15 +281,8 @@ def rest_play(
 def shape_command(command: float, dt: float, parameters: Any, row: int, state: wp.array2d[float]) -> float:
     """The reference that firmware and transmission make of a command: filter, profile, backlash.
 
-    Args:
-        command: Commanded position, constant over ``dt`` [rad].
-        dt: Duration [s]; a step in which a command arrives can be taken in two parts.
-        parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
-        row: The joint's row.
-        state: State rows, shape [R, STATE_COLUMNS]; the joint's row is advanced.
-
-    Returns:
-        The reference, its mean over ``dt`` [rad].
+    Returns its mean over ``dt`` [rad], for which the command is constant; a step in which a command arrives
+    can be taken in two parts. The joint's row of the state is advanced.
     """
     filtered = low_pass(state[row, STATE_FILTERED], command, parameters[row, FILTER_TAU], dt)
     state[row, STATE_FILTERED] = filtered[0]
@@ -343,37 +301,23 @@ def shape_command(command: float, dt: float, parameters: Any, row: int, state: w
 
 @wp.func
 def drive_joint(
-    reference: float,
-    before: float,
-    share: float,
-    position: float,
-    speed: float,
-    power: float,
-    dt: float,
-    effort: float,
-    parameters: Any,
-    row: int,
-    state: wp.array2d[float],
+    reference: float,  # mean over the step of :func:`shape_command` and what coupled joints add [rad]
+    before: float,  # its mean over the first ``share`` of the step, until a command arrived [rad]
+    share: float,  # that share of the step; 0 if no command arrived within it
+    position: float,  # true joint position [rad]
+    speed: float,  # joint velocity [rad/s]
+    power: float,  # factor on the controller's position and integral gains, 0 with the torque off
+    dt: float,  # time step [s]
+    effort: float,  # largest torque of the drive [N m]; ``NO_EFFORT_LIMIT`` where somebody else keeps it
+    parameters: Any,  # [R, PARAMETER_COLUMNS] parameter rows
+    row: int,  # the joint's row
+    state: wp.array2d[float],  # [R, STATE_COLUMNS] state rows; the joint's row is advanced
 ) -> Servo:
     """One time step of the control loop, the motor and the load of a joint.
 
-    Args:
-        reference: Result of :func:`shape_command`, and what coupled joints add to it, its mean over the
-            step [rad].
-        before: Its mean over the first ``share`` of the step, until a command arrived [rad]. What limits
-            the motor has to see the jump: the limit of a mean would let it act a part of a step early.
-        share: That share of the step; 0 if no command arrived within it.
-        position: True joint position [rad].
-        speed: Joint velocity [rad/s].
-        power: Factor on the controller's position and integral gains: 0 with the torque off, or a gain
-            that was set on purpose, which leaves the damping as it is. With the torque off the damping,
-            mostly back-EMF, goes too, since the terminals are open; friction stays, and of the damping
-            what is the gears' (``OFF_DAMPING``).
-        dt: Time step [s].
-        effort: Largest torque of the drive [N m]; ``NO_EFFORT_LIMIT`` where somebody else keeps it.
-        parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
-        row: The joint's row.
-        state: State rows, shape [R, STATE_COLUMNS]; the joint's row is advanced.
+    What limits the motor sees the jump of ``before``: the limit of a mean would let it act a part of a step
+    early. ``power`` leaves the damping as it is, but with the torque off the damping, mostly back-EMF, goes
+    too, since the terminals are open; friction stays, and of the damping the gears' (``OFF_DAMPING``).
     """
     result = Servo()
     time = state[row, STATE_TIME]

@@ -15,22 +15,14 @@ mat93 = wp.types.matrix(shape=(3 * MAX_JOINTS, 3), dtype=float)
 
 @wp.struct
 class Links:
-    """Bodies of a chain, in the base frame with all joints at zero; rows beyond its joints are zero.
+    """Bodies of a chain, in the base frame with all joints at zero; rows beyond its joints are zero."""
 
-    axis: Unit joint axes, one a row.
-    offset: From the joint before (the base, for the first) to the joint, one a row [m].
-    mass: Masses of the links after each joint [kg].
-    com: From the joint to the centre of mass, one a row [m].
-    inertia: About the centre of mass, three rows a link [kg m^2].
-    gravity: Acceleration of gravity [m/s^2].
-    """
-
-    axis: wp.mat33
-    offset: wp.mat33
-    mass: wp.vec3
-    com: wp.mat33
-    inertia: mat93
-    gravity: wp.vec3
+    axis: wp.mat33  # unit joint axes, one a row
+    offset: wp.mat33  # from the joint before (the base, for the first) to the joint, one a row [m]
+    mass: wp.vec3  # masses of the links after each joint [kg]
+    com: wp.mat33  # from the joint to the centre of mass, one a row [m]
+    inertia: mat93  # about the centre of mass, three rows a link [kg m^2]
+    gravity: wp.vec3  # acceleration of gravity [m/s^2]
 
 
 @wp.func

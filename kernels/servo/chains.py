@@ -65,22 +65,14 @@ Rows = wp.types.matrix(shape=(MAX_JOINTS, PARAMETER_COLUMNS), dtype=float)
 
 @wp.struct
 class Samples:
-    """Recorded trajectories, one after the other; S rows (time stamps) in all.
+    """Recorded trajectories, one after the other; S rows (time stamps) in all."""
 
-    step: Time stamp in whole steps [S]. A trajectory need not begin at 0: a piece of a longer one.
-    fraction: And the rest, in [0, 1] [S].
-    sent_step: When the command was sent, in whole steps [S].
-    sent_fraction: And the rest, in [0, 1] [S].
-    command: Commanded positions [S, n] [rad].
-    power: Factor on the controller's gains, 0 with the torque off [S, n].
-    """
-
-    step: wp.array[int]
-    fraction: wp.array[float]
-    sent_step: wp.array[int]
-    sent_fraction: wp.array[float]
-    command: wp.array2d[float]
-    power: wp.array2d[float]
+    step: wp.array[int]  # [S] time stamp in whole steps; that of a piece does not begin at 0
+    fraction: wp.array[float]  # [S] and the rest, in [0, 1]
+    sent_step: wp.array[int]  # [S] when the command was sent, in whole steps
+    sent_fraction: wp.array[float]  # [S] and the rest, in [0, 1]
+    command: wp.array2d[float]  # [S, n] commanded positions [rad]
+    power: wp.array2d[float]  # [S, n] factor on the controller's gains, 0 with the torque off
 
 
 @wp.func
@@ -129,17 +121,10 @@ def arrival(
 
 @wp.func
 def friction_impulses(wanted: wp.vec3, inverse: wp.mat33, bound: wp.vec3, before: wp.vec3, count: int):
-    """Velocities under dry friction.
+    """Velocities under dry friction: ``(speed, impulse)`` of ``wanted`` ones [rad/s] and ``bound`` [N m s].
 
-    Args:
-        wanted: Velocities without friction [rad/s].
-        inverse: Inverse of the effective mass matrix [1/(kg m^2)].
-        bound: Largest friction impulses [N m s].
-        before: Impulses of the step before, to start from [N m s].
-        count: Joints.
-
-    Returns:
-        ``(speed, impulse)``; joints whose impulse is within its bound stand still exactly.
+    ``inverse`` is that of the effective mass matrix; the search starts from the impulses ``before``. Joints
+    whose impulse is within its bound stand still exactly.
     """
     impulse = wp.vec3(0.0)
     for i in range(MAX_JOINTS):
@@ -173,14 +158,10 @@ def slip(speed: float, change: float):
 
 @wp.func
 def load_bounds(bound: wp.vec3, kick: float, motor: wp.vec3, loaded: wp.vec3, gained: wp.vec3):
-    """Friction impulses at the middle of a step, for those that follow the motor's torque.
+    """Friction impulses [N m s] at the middle of a step, where ``bound`` has those of its beginning.
 
-    Args:
-        bound: Largest friction impulses with the torques at the step's beginning [N m s].
-        kick: Duration of the step [s].
-        motor: Load friction that these bounds hold [N m].
-        loaded: How it falls with speed [N m s/rad].
-        gained: Change of speed over the step [rad/s].
+    Of the load friction ``motor`` [N m] in them, which falls by ``loaded`` [N m s/rad] with the speed
+    ``gained`` [rad/s] over the ``kick`` [s].
     """
     result = bound
     for j in range(MAX_JOINTS):
@@ -192,46 +173,26 @@ def load_bounds(bound: wp.vec3, kick: float, motor: wp.vec3, loaded: wp.vec3, ga
 @wp.kernel
 def rollout_kernel(
     # In:
-    samples: Samples,
-    first_sample: wp.array[int],
-    sample_count: wp.array[int],
-    first_output: wp.array[int],
-    stream: wp.array[int],
-    start: wp.array2d[float],
-    wanted: wp.array[int],
-    slot: wp.array[int],
-    lower: wp.array[float],
-    upper: wp.array[float],
-    effort: wp.array[float],
-    bodies: int,
-    links: Links,
-    parameters: wp.array2d[float],
-    dt: float,
+    samples: Samples,  # what was recorded
+    first_sample: wp.array[int],  # [R] row of ``samples`` where each rollout's trajectory begins
+    sample_count: wp.array[int],  # [R] rows of each trajectory
+    first_output: wp.array[int],  # [R] row of ``predicted`` where each rollout begins
+    stream: wp.array[int],  # [R] number of each trajectory's random stream
+    start: wp.array2d[float],  # [R, n] measured positions at the start, where the joints are at rest [rad]
+    wanted: wp.array[int],  # [R] joint whose positions are kept, in column 0; -1 for all, each in its own
+    slot: wp.array[int],  # [n] place of each joint in the finger, which is its column of the coupling
+    lower: wp.array[float],  # [n] lower stops [rad]
+    upper: wp.array[float],  # [n] upper stops [rad]
+    effort: wp.array[float],  # [n] largest torques of the drives [N m]
+    bodies: int,  # 1 if the links have mass, 0 if each joint is its own inertia
+    links: Links,  # the links, if they have mass
+    parameters: wp.array2d[float],  # [R n, PARAMETER_COLUMNS] parameter rows by rollout and joint
+    dt: float,  # time step [s]
     # Out:
-    state: wp.array3d[float],
-    predicted: wp.array2d[float],
+    state: wp.array3d[float],  # [R, n, STATE_COLUMNS] working memory
+    predicted: wp.array2d[float],  # [S', n] positions as the servo would have reported them or [S', 1] [rad]
 ):
-    """Simulate trajectories with parameter sets. Launch: [R].
-
-    Args:
-        samples: What was recorded.
-        first_sample: Row of ``samples`` where each rollout's trajectory begins, shape [R].
-        sample_count: Rows of each trajectory, shape [R].
-        first_output: Row of ``predicted`` where each rollout begins, shape [R].
-        stream: Number of each trajectory's random stream, shape [R].
-        start: Measured positions at the start, where the joints are at rest, shape [R, n] [rad].
-        wanted: Joint whose positions are kept, in column 0; -1 for all, each in its own, shape [R].
-        slot: Place of each joint in the finger, which is its column of the coupling, shape [n].
-        lower: Lower stops, shape [n] [rad].
-        upper: Upper stops, shape [n] [rad].
-        effort: Largest torques of the drives, shape [n] [N m].
-        bodies: 1 if the links have mass, 0 if each joint is its own inertia.
-        links: The links, if they have mass.
-        parameters: Parameter rows by rollout and joint, shape [R n, PARAMETER_COLUMNS].
-        dt: Time step [s].
-        state: Working memory, shape [R, n, STATE_COLUMNS].
-        predicted: Positions as the servo would have reported them, shape [S', n] or [S', 1] [rad].
-    """
+    """Simulate trajectories with parameter sets. Launch: [R]."""
     run = wp.tid()
     count = slot.shape[0]
     base_row = run * count

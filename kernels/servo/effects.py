@@ -12,41 +12,24 @@ import vd.kernels.servo.actuators as servo
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of a joint's servo model.
+    """One number of a joint's servo model."""
 
-    Attributes:
-        name: Name in USD, reports and on command lines.
-        unit: SI unit.
-        column: Column of the parameter row.
-        lower: Smallest value searched; an estimate at a bound is no estimate.
-        upper: Largest value searched.
-        typical: A size at which the effect matters in a hand's servo, where searches start.
-        neutral: Value at which it does nothing.
-        signed: Whether the negative range is searched too.
-    """
-
-    name: str
-    unit: str
-    column: int
-    lower: float
-    upper: float
-    typical: float
-    neutral: float = 0.0
-    signed: bool = False
+    name: str  # in USD, reports and on command lines
+    unit: str  # SI
+    column: int  # of the parameter row
+    lower: float  # smallest value searched; an estimate at a bound is no estimate
+    upper: float  # largest value searched
+    typical: float  # a size at which the effect matters in a hand's servo, where searches start
+    neutral: float = 0.0  # value at which it does nothing
+    signed: bool = False  # whether the negative range is searched too
 
 
 @dataclass(frozen=True)
 class Effect:
-    """A physical effect that the plain servo model lacks.
+    """A physical effect that the plain servo model lacks."""
 
-    Attributes:
-        name: Name in reports, USD and on command lines.
-        meaning: One line for people.
-        parameters: Its parameters.
-    """
-
-    name: str
-    meaning: str
+    name: str  # in USD, reports and on command lines
+    meaning: str  # one line for people
     parameters: tuple[Parameter, ...]
 
 
@@ -221,12 +204,7 @@ Stribeck friction, higher by the mean of both sides, and an offset that pulls by
 
 
 def equivalent(model: str, beside: Iterable[str] = ()) -> dict[str, tuple[str, ...]]:
-    """Effects that stand for others.
-
-    Args:
-        model: Model of the recording.
-        beside: Effects that are there as well.
-    """
+    """Effects that stand for others in a recording of a ``model`` with the effects ``beside``."""
     result = {**EQUIVALENT, **ON_A_PENDULUM} if model == "pendulum" else {**EQUIVALENT}
     for other in beside:
         for name, same in BESIDE.get(other, {}).items():

@@ -1,7 +1,7 @@
 """Replay recorded commands in the simulator, and sample its positions where the recording has them.
 
 Order in a physics step: :func:`replay_command_kernel`, the servo and the solver's step, then
-:func:`sample_position_kernel` and :func:`tick_kernel`. Every finger of every world follows its own
+:func:`sample_position_kernel`, and the step is counted. Every finger of every world follows its own
 trajectory: a track. W worlds, F fingers of three joints, D = 3F; S samples of all trajectories one
 after the other, J recorded joints. Times, delays and lost commands are those of
 :mod:`vd.kernels.servo.chains`.
@@ -18,42 +18,27 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Tracks:
-    """What each finger of each world follows.
+    """What each finger of each world follows."""
 
-    column: Recorded column of every hand joint, or -1 [D].
-    first: First sample of the track [W, F].
-    last: Sample after the last [W, F].
-    stream: Random stream of the track's trajectory [W, F].
-    """
-
-    column: wp.array[int]
-    first: wp.array2d[int]
-    last: wp.array2d[int]
-    stream: wp.array2d[int]
+    column: wp.array[int]  # [D] recorded column of every hand joint, or -1
+    first: wp.array2d[int]  # [W, F] first sample of the track
+    last: wp.array2d[int]  # [W, F] sample after the last
+    stream: wp.array2d[int]  # [W, F] random stream of the track's trajectory
 
 
 @wp.kernel
 def rest_play_kernel(
     # Model:
-    parameters: wp.array2d[float],
+    parameters: wp.array2d[float],  # [W D, PARAMETER_COLUMNS] parameter rows
     # In:
-    held_in: wp.array2d[float],
-    power_in: wp.array2d[float],
-    load_in: wp.array2d[float],
-    joint_q_in: wp.array2d[float],
+    held_in: wp.array2d[float],  # [W, D] commands in force [rad]
+    power_in: wp.array2d[float],  # [W, D] their power factors
+    load_in: wp.array2d[float],  # [W, D] torques of gravity on the joints [N m]
+    joint_q_in: wp.array2d[float],  # [W, *] joint positions [rad]
     # Out:
-    state_out: wp.array2d[float],
+    state_out: wp.array2d[float],  # [W D, STATE_COLUMNS] state rows
 ):
-    """Start the play of every servo where the joint rests. Launch: [W, D].
-
-    Args:
-        parameters: Parameter rows, shape [W D, PARAMETER_COLUMNS].
-        held_in: Commands in force [rad], shape [W, D].
-        power_in: Their power factors, shape [W, D].
-        load_in: Torques of gravity on the joints, shape [W, D] [N m].
-        joint_q_in: Joint positions [rad], shape [W, *].
-        state_out: State rows, shape [W D, STATE_COLUMNS].
-    """
+    """Start the play of every servo where the joint rests. Launch: [W, D]."""
     world, joint = wp.tid()
     row = world * held_in.shape[1] + joint
     power = power_in[world, joint]
@@ -69,41 +54,26 @@ def rest_play_kernel(
 @wp.kernel
 def replay_command_kernel(
     # Model:
-    parameters: wp.array2d[float],
-    samples: Samples,
-    tracks: Tracks,
+    parameters: wp.array2d[float],  # [W D, PARAMETER_COLUMNS] parameter rows
+    samples: Samples,  # the recording; columns are the recorded joints
+    tracks: Tracks,  # what each finger follows
     # In:
-    dt: float,
-    step_in: wp.array[wp.int32],
+    dt: float,  # physics time step [s]
+    step_in: wp.array[wp.int32],  # [1] number of the physics step
     # In/Out:
-    write: wp.array2d[wp.int32],
-    due_step: wp.array2d[wp.int32],
-    due_fraction: wp.array2d[float],
-    held: wp.array2d[float],
-    held_power: wp.array2d[float],
-    state: wp.array2d[float],
+    write: wp.array2d[wp.int32],  # [W, D] the next command
+    due_step: wp.array2d[wp.int32],  # [W, D] whole steps at which the one before arrived
+    due_fraction: wp.array2d[float],  # [W, D] and the rest
+    held: wp.array2d[float],  # [W, D] the command that arrived last [rad]
+    held_power: wp.array2d[float],  # [W, D] its power factor
+    state: wp.array2d[float],  # [W D, STATE_COLUMNS] state rows
     # Out:
-    reference_out: wp.array2d[float],
-    power_out: wp.array2d[float],
+    reference_out: wp.array2d[float],  # [W, D] mean references [rad]
+    power_out: wp.array2d[float],  # [W, D] mean power factors
 ):
     """The mean reference of each servo over the coming physics step. Launch: [W, D].
 
     As in :func:`vd.kernels.servo.joint_servo.receive_command_kernel`, commands that arrive divide the step.
-
-    Args:
-        parameters: Parameter rows, shape [W D, PARAMETER_COLUMNS].
-        samples: The recording; columns are the recorded joints.
-        tracks: What each finger follows.
-        dt: Physics time step [s].
-        step_in: Number of the physics step, shape [1].
-        write: The next command, shape [W, D].
-        due_step: Whole steps at which the one before arrived, shape [W, D].
-        due_fraction: And the rest, shape [W, D].
-        held: The command that arrived last [rad], shape [W, D].
-        held_power: Its power factor, shape [W, D].
-        state: State rows, shape [W D, STATE_COLUMNS].
-        reference_out: Mean references [rad], shape [W, D].
-        power_out: Mean power factors, shape [W, D].
     """
     world, joint = wp.tid()
     column = tracks.column[joint]
@@ -153,37 +123,24 @@ def replay_command_kernel(
 @wp.kernel
 def sample_position_kernel(
     # Model:
-    parameters: wp.array2d[float],
-    samples: Samples,
-    tracks: Tracks,
+    parameters: wp.array2d[float],  # [W D, PARAMETER_COLUMNS] parameter rows
+    samples: Samples,  # the recording; columns are the recorded joints
+    tracks: Tracks,  # what each finger follows
     # In:
-    position_in: wp.array2d[float],
-    dt: float,
-    step_in: wp.array[wp.int32],
-    joint_q_prev_in: wp.array2d[float],
-    joint_q_in: wp.array2d[float],
+    position_in: wp.array2d[float],  # [S, J] recorded positions [rad]
+    dt: float,  # physics time step [s]
+    step_in: wp.array[wp.int32],  # [1] number of the physics step
+    joint_q_prev_in: wp.array2d[float],  # [W, *] joint positions at the start of the step [rad]
+    joint_q_in: wp.array2d[float],  # [W, *] joint positions at its end [rad]
     # In/Out:
-    read: wp.array2d[wp.int32],
-    squared_error: wp.array2d[float],
+    read: wp.array2d[wp.int32],  # [W, D] the next sample to take
+    squared_error: wp.array2d[float],  # [W, D] sum of squared differences to the recording [rad^2]
     # Out:
-    position_out: wp.array3d[float],
+    position_out: wp.array3d[float],  # [W, T, D] predicted positions [rad]; T = 0: not kept
 ):
     """Positions as the recording would have them: linear in time, old by the read delay, biased.
 
     Launch: [W, D].
-
-    Args:
-        parameters: Parameter rows, shape [W D, PARAMETER_COLUMNS].
-        samples: The recording; columns are the recorded joints.
-        tracks: What each finger follows.
-        position_in: Recorded positions [rad], shape [S, J].
-        dt: Physics time step [s].
-        step_in: Number of the physics step, shape [1].
-        joint_q_prev_in: Joint positions at the start of the step [rad], shape [W, *].
-        joint_q_in: Joint positions at its end [rad], shape [W, *].
-        read: The next sample to take, shape [W, D].
-        squared_error: Sum of squared differences to the recording [rad^2], shape [W, D].
-        position_out: Predicted positions [rad], by sample of the track, shape [W, T, D]; T = 0: not kept.
     """
     world, joint = wp.tid()
     column = tracks.column[joint]
@@ -215,12 +172,3 @@ def sample_position_kernel(
             waiting = wp.bool(False)
     read[world, joint] = upcoming
     squared_error[world, joint] = error
-
-
-@wp.kernel
-def tick_kernel(
-    # In/Out:
-    step: wp.array[wp.int32],
-):
-    """Count a physics step, shape [1]; on the device, so that a CUDA graph can be replayed."""
-    step[0] = step[0] + 1

@@ -49,34 +49,23 @@ vec10 = wp.types.vector(length=10, dtype=float)
 @wp.kernel
 def send_command_kernel(
     # Model:
-    parameters: wp.array2d[float],
+    parameters: wp.array2d[float],  # [N D, PARAMETER_COLUMNS] parameter rows
     # In:
-    dt: float,
-    command_in: wp.array2d[float],
-    state_in: wp.array2d[float],
+    dt: float,  # physics time step [s]
+    command_in: wp.array2d[float],  # [N, *] commanded positions [rad]
+    state_in: wp.array2d[float],  # [N D, STATE_COLUMNS] state rows
     # In/Out:
-    rng: wp.array[wp.uint32],
-    transit_head: wp.array2d[wp.int32],
-    transit_count: wp.array2d[wp.int32],
-    transit_value: wp.array3d[float],
-    transit_time: wp.array3d[float],
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
+    transit_head: wp.array2d[wp.int32],  # [N, D] index of the oldest command in transit
+    transit_count: wp.array2d[wp.int32],  # [N, D] commands in transit
+    transit_value: wp.array3d[float],  # [N, D, K] commands in transit [rad], a ring
+    transit_time: wp.array3d[float],  # [N, D, K] when each arrives on the world's clock [s]
 ):
     """Send a command to every joint: it arrives after the delay and |N(0, sigma)| more, or never. Launch [N].
 
     The commands of a hand go out together, so its joints share one draw of the jitter and one of the
     loss. Commands arrive in the order in which they were sent. What a joint is told at a time acts from
     there on, which is the middle of a physics step: velocities are those between two positions.
-
-    Args:
-        parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
-        dt: Physics time step [s].
-        command_in: Commanded positions [rad], shape [N, *].
-        state_in: State rows, shape [N D, STATE_COLUMNS].
-        rng: Random stream of each world, shape [N].
-        transit_head: Index of the oldest command in transit, shape [N, D].
-        transit_count: Commands in transit, shape [N, D].
-        transit_value: Commands in transit [rad], a ring, shape [N, D, K].
-        transit_time: When each arrives on the world's clock [s], shape [N, D, K].
     """
     world = wp.tid()
     joints = transit_count.shape[1]
@@ -106,34 +95,23 @@ def send_command_kernel(
 @wp.kernel
 def receive_command_kernel(
     # Model:
-    parameters: wp.array2d[float],
+    parameters: wp.array2d[float],  # [N D, PARAMETER_COLUMNS] parameter rows
     # In:
-    dt: float,
+    dt: float,  # physics time step [s]
     # In/Out:
-    state: wp.array2d[float],
-    transit_head: wp.array2d[wp.int32],
-    transit_count: wp.array2d[wp.int32],
-    transit_value: wp.array3d[float],
-    transit_time: wp.array3d[float],
-    held: wp.array2d[float],
+    state: wp.array2d[float],  # [N D, STATE_COLUMNS] state rows
+    transit_head: wp.array2d[wp.int32],  # as in :func:`send_command_kernel`
+    transit_count: wp.array2d[wp.int32],  # as in :func:`send_command_kernel`
+    transit_value: wp.array3d[float],  # as in :func:`send_command_kernel`
+    transit_time: wp.array3d[float],  # as in :func:`send_command_kernel`
+    held: wp.array2d[float],  # [N, D] the command that arrived last [rad]
     # Out:
-    reference_out: wp.array2d[float],
+    reference_out: wp.array2d[float],  # [N, D] mean reference of the step [rad]
 ):
     """The reference that a joint has during the coming physics step. Launch: [N, D].
 
     A command that arrives within the step divides it, so that the motion is a smooth function of the
     delay; the reference is the mean over the step.
-
-    Args:
-        parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
-        dt: Physics time step [s].
-        state: State rows, shape [N D, STATE_COLUMNS].
-        transit_head: As in :func:`send_command_kernel`.
-        transit_count: As in :func:`send_command_kernel`.
-        transit_value: As in :func:`send_command_kernel`.
-        transit_time: As in :func:`send_command_kernel`.
-        held: The command that arrived last [rad], shape [N, D].
-        reference_out: Mean reference of the step [rad], shape [N, D].
     """
     world, joint = wp.tid()
     row = world * held.shape[1] + joint
@@ -162,25 +140,25 @@ def receive_command_kernel(
 @wp.kernel
 def drive_joint_kernel(
     # Model:
-    parameters: wp.array2d[float],
-    inverse_inertia: wp.array2d[float],
-    effort: wp.array2d[float],
+    parameters: wp.array2d[float],  # [N D, PARAMETER_COLUMNS] parameter rows
+    inverse_inertia: wp.array2d[float],  # [N, *] diagonal of the inverse inertia matrix [1/(kg m^2)]
+    effort: wp.array2d[float],  # [N, *] largest torques of the drives [N m], which the solver keeps
     # In:
-    dt: float,
-    reference_in: wp.array2d[float],
-    power_in: wp.array2d[float],
-    joint_q_in: wp.array2d[float],
-    joint_qd_in: wp.array2d[float],
+    dt: float,  # physics time step [s]
+    reference_in: wp.array2d[float],  # [N, D] mean reference of this step [rad]
+    power_in: wp.array2d[float],  # [N, D] factor on the controller's gains, 0 with the torque off
+    joint_q_in: wp.array2d[float],  # [N, *] joint positions [rad]
+    joint_qd_in: wp.array2d[float],  # [N, *] joint velocities [rad/s]
     # In/Out:
-    state: wp.array2d[float],
+    state: wp.array2d[float],  # [N D, STATE_COLUMNS] state rows
     # Out:
-    reference_out: wp.array2d[float],
-    joint_force_out: wp.array2d[float],
-    gain_out: wp.array2d[vec10],
-    bias_out: wp.array2d[vec10],
-    friction_out: wp.array2d[float],
-    friction_solref_out: wp.array2d[wp.vec2],
-    friction_solimp_out: wp.array2d[vec5],
+    reference_out: wp.array2d[float],  # [N, *] position to which the drive pulls [rad]
+    joint_force_out: wp.array2d[float],  # [N, *] torque besides the drive's [N m]
+    gain_out: wp.array2d[vec10],  # [N, D] MuJoCo's gain parameters of the actuators; (kp, ..)
+    bias_out: wp.array2d[vec10],  # [N, D] MuJoCo's bias parameters; (0, -kp, -kd, ..)
+    friction_out: wp.array2d[float],  # [N, *] MuJoCo's friction loss of the joints [N m]
+    friction_solref_out: wp.array2d[wp.vec2],  # [N, *] its solref, (stiffness, damping) negated
+    friction_solimp_out: wp.array2d[vec5],  # [N, *] its solimp
 ):
     """One time step of every servo, written to the solver's inputs. Launch: [N, D].
 
@@ -192,24 +170,6 @@ def drive_joint_kernel(
     Dry friction is the solver's friction loss. That constraint asks for the acceleration -b v; with
     b = 1/dt + kd/m a joint within the bound of its friction stops in one step, the implicit damping
     included. (The default b, of a time constant of 20 ms, and 1/dt alone both let it slide on.)
-
-    Args:
-        parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
-        inverse_inertia: Diagonal of the inverse inertia matrix [1/(kg m^2)], shape [N, *].
-        effort: Largest torques of the drives [N m], which the solver keeps, shape [N, *].
-        dt: Physics time step [s].
-        reference_in: Mean reference of this step [rad], shape [N, D].
-        power_in: Factor on the controller's gains, 0 with the torque off, shape [N, D].
-        joint_q_in: Joint positions [rad], shape [N, *].
-        joint_qd_in: Joint velocities [rad/s], shape [N, *].
-        state: State rows, shape [N D, STATE_COLUMNS].
-        reference_out: Position to which the drive pulls [rad], shape [N, *].
-        joint_force_out: Torque besides the drive's [N m], shape [N, *].
-        gain_out: MuJoCo's gain parameters of the actuators, shape [N, D]; (kp, ..).
-        bias_out: MuJoCo's bias parameters, shape [N, D]; (0, -kp, -kd, ..).
-        friction_out: MuJoCo's friction loss of the joints [N m], shape [N, *].
-        friction_solref_out: Its solref, in the direct form (stiffness, damping) negated, shape [N, *].
-        friction_solimp_out: Its solimp, shape [N, *].
     """
     world, joint = wp.tid()
     row = world * reference_in.shape[1] + joint
@@ -256,31 +216,21 @@ def drive_joint_kernel(
 @wp.kernel
 def finish_joint_kernel(
     # Model:
-    parameters: wp.array2d[float],
+    parameters: wp.array2d[float],  # [N D, PARAMETER_COLUMNS] parameter rows
     # In:
-    dt: float,
-    joint_q_prev_in: wp.array2d[float],
+    dt: float,  # physics time step [s]
+    joint_q_prev_in: wp.array2d[float],  # [N, *] joint positions before the step [rad]
     # In/Out:
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
-    history_index: wp.array2d[wp.int32],
+    joint_q: wp.array2d[float],  # [N, *] joint positions after the step [rad]
+    joint_qd: wp.array2d[float],  # [N, *] joint velocities after the step [rad/s]
+    history_index: wp.array2d[wp.int32],  # [N, D] where in ``history`` the newest position is
     # Out:
-    history: wp.array3d[float],
-    speed_history: wp.array3d[float],
+    history: wp.array3d[float],  # [N, D, R] past positions [rad], one a physics step, a ring
+    speed_history: wp.array3d[float],  # [N, D, R] past velocities [rad/s] likewise
 ):
     """Hold a joint to its velocity limit after a physics step, and remember its motion. Launch: [N, D].
 
     The limit acts as in :func:`vd.kernels.task.actions.limit_joint_velocity_kernel`, here per world.
-
-    Args:
-        parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
-        dt: Physics time step [s].
-        joint_q_prev_in: Joint positions before the step [rad], shape [N, *].
-        joint_q: Joint positions after the step [rad], shape [N, *].
-        joint_qd: Joint velocities after the step [rad/s], shape [N, *].
-        history_index: Where in ``history`` the newest position is, shape [N, D].
-        history: Past positions [rad], one a physics step, a ring, shape [N, D, R].
-        speed_history: Past velocities [rad/s] likewise, shape [N, D, R].
     """
     world, joint = wp.tid()
     speed = joint_qd[world, joint]
@@ -298,27 +248,17 @@ def finish_joint_kernel(
 @wp.kernel
 def measure_joint_kernel(
     # Model:
-    parameters: wp.array2d[float],
+    parameters: wp.array2d[float],  # [N D, PARAMETER_COLUMNS] parameter rows
     # In:
-    dt: float,
-    history_index_in: wp.array2d[wp.int32],
-    history_in: wp.array3d[float],
-    speed_history_in: wp.array3d[float],
+    dt: float,  # physics time step [s]
+    history_index_in: wp.array2d[wp.int32],  # [N, D] where in ``history_in`` the newest position is
+    history_in: wp.array3d[float],  # [N, D, R] past positions [rad], one a physics step, a ring
+    speed_history_in: wp.array3d[float],  # [N, D, R] past velocities [rad/s] likewise
     # Out:
-    measured_q_out: wp.array2d[float],
-    measured_qd_out: wp.array2d[float],
+    measured_q_out: wp.array2d[float],  # [N, D] measured positions [rad]
+    measured_qd_out: wp.array2d[float],  # [N, D] measured velocities [rad/s]
 ):
-    """What the servo reports: old by the read delay, positions off by the encoder's bias. Launch: [N, D].
-
-    Args:
-        parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
-        dt: Physics time step [s].
-        history_index_in: Where in ``history_in`` the newest position is, shape [N, D].
-        history_in: Past positions [rad], one a physics step, a ring, shape [N, D, R].
-        speed_history_in: Past velocities [rad/s] likewise, shape [N, D, R].
-        measured_q_out: Measured positions [rad], shape [N, D].
-        measured_qd_out: Measured velocities [rad/s], shape [N, D].
-    """
+    """What the servo reports: old by the read delay, positions off by the encoder's bias. Launch: [N, D]."""
     world, joint = wp.tid()
     row = world * measured_q_out.shape[1] + joint
     length = history_in.shape[2]
@@ -340,37 +280,22 @@ def measure_joint_kernel(
 @wp.kernel
 def reset_joint_kernel(
     # Model:
-    parameters: wp.array2d[float],
+    parameters: wp.array2d[float],  # [N D, PARAMETER_COLUMNS] parameter rows
     # In:
-    mask_in: wp.array[wp.int32],
-    command_in: wp.array2d[float],
-    joint_q_in: wp.array2d[float],
+    mask_in: wp.array[wp.int32],  # [N] 1 for the worlds to reset
+    command_in: wp.array2d[float],  # [N, *] the command that every servo has had so far [rad]
+    joint_q_in: wp.array2d[float],  # [N, *] joint positions [rad]
     # Out:
-    state_out: wp.array2d[float],
-    transit_head_out: wp.array2d[wp.int32],
-    transit_count_out: wp.array2d[wp.int32],
-    held_out: wp.array2d[float],
-    history_out: wp.array3d[float],
-    speed_history_out: wp.array3d[float],
-    measured_q_out: wp.array2d[float],
-    measured_qd_out: wp.array2d[float],
+    state_out: wp.array2d[float],  # [N D, STATE_COLUMNS] state rows
+    transit_head_out: wp.array2d[wp.int32],  # as in :func:`send_command_kernel`
+    transit_count_out: wp.array2d[wp.int32],  # as in :func:`send_command_kernel`
+    held_out: wp.array2d[float],  # [N, D] the command that arrived last [rad]
+    history_out: wp.array3d[float],  # [N, D, R] past positions [rad]
+    speed_history_out: wp.array3d[float],  # [N, D, R] past velocities [rad/s]
+    measured_q_out: wp.array2d[float],  # [N, D] measured positions [rad]
+    measured_qd_out: wp.array2d[float],  # [N, D] measured velocities [rad/s]
 ):
-    """Start the servos of chosen worlds: at rest, with one command since long ago. Launch: [N, D].
-
-    Args:
-        parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
-        mask_in: 1 for the worlds to reset, shape [N].
-        command_in: The command that every servo has had so far [rad], shape [N, *].
-        joint_q_in: Joint positions [rad], shape [N, *].
-        state_out: State rows, shape [N D, STATE_COLUMNS].
-        transit_head_out: As in :func:`send_command_kernel`.
-        transit_count_out: As in :func:`send_command_kernel`.
-        held_out: The command that arrived last [rad], shape [N, D].
-        history_out: Past positions [rad], shape [N, D, R].
-        speed_history_out: Past velocities [rad/s], shape [N, D, R].
-        measured_q_out: Measured positions [rad], shape [N, D].
-        measured_qd_out: Measured velocities [rad/s], shape [N, D].
-    """
+    """Start the servos of chosen worlds: at rest, with one command since long ago. Launch: [N, D]."""
     world, joint = wp.tid()
     if mask_in[world] == 0:
         return

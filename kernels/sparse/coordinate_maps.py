@@ -10,6 +10,7 @@ weights of the kernel; where no site is, it holds the number of input sites, to 
 
 import warp as wp
 
+from vd.kernels.launch import launch
 from vd.kernels.sparse.voxels import AXIS_BITS, CLOUD_SHIFT, key_coordinates, spread_bits, unique_keys
 
 wp.set_module_options({"enable_backward": False})
@@ -61,15 +62,7 @@ def find_row(key: wp.int64, slot_key: wp.array[wp.int64], slot_row: wp.array[int
 
 @wp.func
 def cell_key(cloud: wp.int64, x: int, y: int, z: int, level: int) -> wp.int64:
-    """Key of a cell of a level, or -1 where it lies beyond the grid.
-
-    Args:
-        cloud: Number of the cloud.
-        x: Cell counted from the grid's corner; so are ``y`` and ``z``.
-        y: See ``x``.
-        z: See ``x``.
-        level: How often the grid was halved.
-    """
+    """Key of a cell of a level, counted from the grid's corner, or -1 where it lies beyond the grid."""
     cells = _AXIS_CELLS >> level
     if x < 0 or y < 0 or z < 0 or x >= cells or y >= cells or z >= cells:
         return _NONE
@@ -99,23 +92,16 @@ def insert_rows_kernel(
 @wp.kernel
 def neighbour_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    level: int,
-    slot_key_in: wp.array[wp.int64],
-    slot_row_in: wp.array[int],
+    key_in: wp.array[wp.int64],  # [M] keys of the level
+    level: int,  # how often the grid was halved
+    slot_key_in: wp.array[wp.int64],  # hash table of the same keys
+    slot_row_in: wp.array[int],  # rows of its slots
     # Out:
-    table_out: wp.array2d[int],
+    table_out: wp.array2d[int],  # [M, 27] rows of the neighbours, filled with M before
 ):
     """Sites around each site: a submanifold 3x3x3 kernel, input = output + offset. Launch: [M].
 
     If i has j at an offset, j has i at the opposite one; so 13 look-ups fill 26 columns.
-
-    Args:
-        key_in: Keys of the level, shape [M].
-        level: How often the grid was halved.
-        slot_key_in: Hash table of the same keys.
-        slot_row_in: Rows of its slots.
-        table_out: Rows of the neighbours, shape [M, 27], filled with M before.
     """
     row = wp.tid()
     key = key_in[row]
@@ -136,24 +122,15 @@ def neighbour_kernel(
 @wp.kernel
 def beside_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    asked_in: wp.array[wp.bool],
-    other_in: wp.array[wp.bool],
-    slot_key_in: wp.array[wp.int64],
-    slot_row_in: wp.array[int],
+    key_in: wp.array[wp.int64],  # [M] keys of voxels
+    asked_in: wp.array[wp.bool],  # [M] which are asked about
+    other_in: wp.array[wp.bool],  # [M] which are the others
+    slot_key_in: wp.array[wp.int64],  # hash table of the keys
+    slot_row_in: wp.array[int],  # rows of its slots
     # Out:
-    beside_out: wp.array[wp.bool],
+    beside_out: wp.array[wp.bool],  # [M] false where not asked
 ):
-    """Tell of some voxels whether any of the 3x3x3 about each is one of others. Launch: [M].
-
-    Args:
-        key_in: Keys of voxels, shape [M].
-        asked_in: Which are asked about, shape [M].
-        other_in: Which are the others, shape [M].
-        slot_key_in: Hash table of the keys.
-        slot_row_in: Rows of its slots.
-        beside_out: False where not asked, shape [M].
-    """
+    """Tell of some voxels whether any of the 3x3x3 about each is one of others. Launch: [M]."""
     row = wp.tid()
     found = wp.int32(0)
     if asked_in[row]:
@@ -174,26 +151,18 @@ def beside_kernel(
 @wp.kernel
 def strided_kernel(
     # In:
-    fine_key_in: wp.array[wp.int64],
-    level: int,
-    slot_key_in: wp.array[wp.int64],
-    slot_row_in: wp.array[int],
-    reverse: int,
+    fine_key_in: wp.array[wp.int64],  # [F] keys of the fine level
+    level: int,  # how often the fine grid was halved
+    slot_key_in: wp.array[wp.int64],  # hash table of the keys of the coarse level
+    slot_row_in: wp.array[int],  # rows of its slots
+    reverse: int,  # 1 for the reverse map: coarse rows that read each fine site, by the same offsets
     # Out:
-    table_out: wp.array2d[int],
+    table_out: wp.array2d[int],  # [M, 27] fine rows, F before; reversed [F, 27] coarse rows, M before
 ):
     """Sites of a fine grid that each site of the next coarser one reads: input = 2 output + offset.
 
     An even coordinate is read at offset 0 only; an odd one at +1 from the cell it lies in and at -1
     from the next: at most eight look-ups for each fine site. Launch: [F].
-
-    Args:
-        fine_key_in: Keys of the fine level, shape [F].
-        level: How often the fine grid was halved.
-        slot_key_in: Hash table of the keys of the coarse level.
-        slot_row_in: Rows of its slots.
-        reverse: 1 for the reverse map: coarse rows that read each fine site, by the same offsets.
-        table_out: Fine rows, shape [M, 27], filled with F before; or coarse rows, [F, 27], filled with M.
     """
     row = wp.tid()
     key = fine_key_in[row]
@@ -221,19 +190,14 @@ def strided_kernel(
 @wp.kernel
 def window_kernel(
     # In:
-    fine_key_in: wp.array[wp.int64],
-    coarse_place_in: wp.array[int],
+    fine_key_in: wp.array[wp.int64],  # [F] keys of the fine level
+    coarse_place_in: wp.array[int],  # [F] place of each one's coarse cell, counted from 1
     # Out:
-    table_out: wp.array2d[int],
+    table_out: wp.array2d[int],  # [M, 8] fine rows, filled with F before; column 4 x + 2 y + z
 ):
     """Sites in the 2x2x2 window of each cell of the next coarser grid: input = 2 output + {0, 1}^3.
 
     Launch: [F].
-
-    Args:
-        fine_key_in: Keys of the fine level, shape [F].
-        coarse_place_in: Place of each one's coarse cell, counted from 1, shape [F].
-        table_out: Fine rows, shape [M, 8], filled with F before; column 4 x + 2 y + z.
     """
     row = wp.tid()
     table_out[coarse_place_in[row] - 1, int(fine_key_in[row] & wp.int64(7))] = row
@@ -242,19 +206,14 @@ def window_kernel(
 @wp.kernel
 def level_count_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    threads: int,
+    key_in: wp.array[wp.int64],  # [M] sorted keys, each once
+    threads: int,  # threads of the launch
     # In/Out:
-    count: wp.array[int],
+    count: wp.array[int],  # [AXIS_BITS] cells one level up, two, and so on, zeros before
 ):
     """Count the cells of every coarser level, before any is made. Launch: [threads].
 
     A cell of a level begins where a key differs from the one before in more than the level's bits.
-
-    Args:
-        key_in: Sorted keys, each once, shape [M].
-        threads: Threads of the launch.
-        count: Cells one level up, two, and so on, shape [AXIS_BITS], zeros before.
     """
     counts = _Counts()
     i = wp.tid()
@@ -277,15 +236,11 @@ def level_count_kernel(
 def level_counts(keys: wp.array) -> list[int]:
     """Numbers of sites that :func:`coarsen` would give, once, twice and so on, waiting for the device once.
 
-    Args:
-        keys: Keys of a level, sorted, each once [M].
-
-    Returns:
-        One number for each bit of a coordinate.
+    Of sorted keys, each once [M], one number for each bit of a coordinate.
     """
     counts = wp.zeros(AXIS_BITS, dtype=int, device=keys.device)
     threads = -(-keys.shape[0] // KEYS_PER_THREAD)
-    wp.launch(level_count_kernel, dim=threads, inputs=[keys, threads, counts], device=keys.device)
+    launch(level_count_kernel, threads, [keys, threads], [counts])
     return counts.numpy().tolist()
 
 
@@ -311,44 +266,22 @@ def hash_table(keys: wp.array) -> HashTable:
     slots = 1 << max(1, SLOTS_PER_SITE * keys.shape[0] - 1).bit_length()
     slot_key = wp.full(slots, -1, dtype=wp.int64, device=keys.device)
     slot_row = wp.empty(slots, dtype=int, device=keys.device)
-    wp.launch(
-        insert_rows_kernel, dim=keys.shape[0], inputs=[keys, slot_key], outputs=[slot_row], device=keys.device
-    )
+    launch(insert_rows_kernel, keys.shape, [keys, slot_key], [slot_row])
     return slot_key, slot_row
 
 
 def neighbour_table(keys: wp.array, level: int, slots: HashTable | None = None) -> wp.array:
-    """Map of a submanifold 3x3x3 convolution over sites of a level, shape [M, 27].
-
-    Args:
-        keys: Keys of the sites [M].
-        level: Level of the sites.
-        slots: Hash table of the keys, if there is one already.
-    """
+    """Map of a submanifold 3x3x3 convolution over sites of a level, shape [M, 27]; ``slots`` if known."""
     count = keys.shape[0]
     table = wp.full((count, KERNEL), count, dtype=int, device=keys.device)
-    slots = slots or hash_table(keys)
-    wp.launch(neighbour_kernel, dim=count, inputs=[keys, level, *slots], outputs=[table], device=keys.device)
+    launch(neighbour_kernel, count, [keys, level, *(slots or hash_table(keys))], [table])
     return table
 
 
-def beside(keys: wp.array, asked: wp.array, others: wp.array, slots: HashTable | None = None) -> wp.array:
-    """Which of the voxels asked about are among others or touch one, by a corner at least, bool [M].
-
-    Args:
-        keys: Keys of voxels, each once [M].
-        asked: Which are asked about, bool [M].
-        others: Which are the others, bool [M].
-        slots: Hash table of the keys, if there is one already.
-    """
-    touches = wp.empty(keys.shape[0], dtype=wp.bool, device=keys.device)
-    wp.launch(
-        beside_kernel,
-        dim=keys.shape[0],
-        inputs=[keys, asked, others, *(slots or hash_table(keys))],
-        outputs=[touches],
-        device=keys.device,
-    )
+def beside(keys: wp.array, asked: wp.array, others: wp.array) -> wp.array:
+    """Which of the voxels asked about are among others or touch one, by a corner at least, bool [M] each."""
+    touches = wp.empty(keys.shape, dtype=wp.bool, device=keys.device)
+    launch(beside_kernel, keys.shape, [keys, asked, others, *hash_table(keys)], [touches])
     return touches
 
 
@@ -369,24 +302,12 @@ def strided_table(
     """
     rows, none = (fine, coarse) if reverse else (coarse, fine)
     table = wp.full((rows.shape[0], KERNEL), none.shape[0], dtype=int, device=fine.device)
-    wp.launch(
-        strided_kernel,
-        dim=fine.shape[0],
-        inputs=[fine, level, *(slots or hash_table(coarse)), int(reverse)],
-        outputs=[table],
-        device=fine.device,
-    )
+    launch(strided_kernel, fine.shape, [fine, level, *(slots or hash_table(coarse)), int(reverse)], [table])
     return table
 
 
 def window_table(fine: wp.array, place: wp.array, outputs: int) -> wp.array:
-    """Map of a 2x2x2 pooling of stride 2, shape [outputs, 8].
-
-    Args:
-        fine: Keys of the input sites [F].
-        place: Place of each one's cell, from :func:`coarsen` [F].
-        outputs: Number of output sites.
-    """
+    """Map of a 2x2x2 pooling of stride 2 of sites [F], whose ``place`` :func:`coarsen` gave, [outputs, 8]."""
     table = wp.full((outputs, WINDOW), fine.shape[0], dtype=int, device=fine.device)
-    wp.launch(window_kernel, dim=fine.shape[0], inputs=[fine, place], outputs=[table], device=fine.device)
+    launch(window_kernel, fine.shape, [fine, place], [table])
     return table

@@ -7,10 +7,11 @@ bits that keeps the order, so that coarser grids need no further sort
 (:mod:`vd.kernels.sparse.coordinate_maps`).
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import warp as wp
 
+from vd.kernels.launch import launch
 from vd.kernels.rng import next_stream, uniform
 
 wp.set_module_options({"enable_backward": False})
@@ -35,18 +36,12 @@ _SINGLES = wp.constant(wp.int64(0x249249249))
 
 @wp.struct
 class CloudNoise:
-    """Augmentation of point clouds.
+    """Augmentation of point clouds."""
 
-    jitter_probability: Share of clouds with jitter.
-    jitter_std: Standard deviation of the jitter of each coordinate of a point [m].
-    dropout_probability: Share of clouds that lose points, independently.
-    dropout_ratio: Lowest and highest probability with which a point of these is lost.
-    """
-
-    jitter_probability: float
-    jitter_std: float
-    dropout_probability: float
-    dropout_ratio: wp.vec2
+    jitter_probability: float  # share of clouds with jitter
+    jitter_std: float  # standard deviation of the jitter of each coordinate of a point [m]
+    dropout_probability: float  # share of clouds that lose points, independently
+    dropout_ratio: wp.vec2  # lowest and highest probability with which a point of these is lost
 
 
 @wp.func
@@ -78,23 +73,15 @@ def key_coordinates(key: wp.int64) -> wp.vec3i:
 @wp.kernel
 def draw_noise_kernel(
     # In:
-    noise_in: wp.array[CloudNoise],
+    noise_in: wp.array[CloudNoise],  # [1] what to draw
     # In/Out:
-    rng: wp.array[wp.uint32],
+    rng: wp.array[wp.uint32],  # [B] random stream of each cloud
     # Out:
-    jitter_out: wp.array[float],
-    dropout_out: wp.array[float],
-    stream_out: wp.array[wp.uint32],
+    jitter_out: wp.array[float],  # [B] standard deviation of the jitter [m]; 0 for none
+    dropout_out: wp.array[float],  # [B] probability with which a point is lost; 0 for none
+    stream_out: wp.array[wp.uint32],  # [B] seed of the cloud's points
 ):
-    """Draw the noise of each cloud from its own stream, so that no two clouds share it. Launch: [B].
-
-    Args:
-        noise_in: What to draw, shape [1].
-        rng: Random stream of each cloud, shape [B].
-        jitter_out: Standard deviation of the jitter [m], shape [B]; 0 for none.
-        dropout_out: Probability with which a point is lost, shape [B]; 0 for none.
-        stream_out: Seed of the cloud's points, shape [B].
-    """
+    """Draw the noise of each cloud from its own stream, so that no two clouds share it. Launch: [B]."""
     cloud = wp.tid()
     noise = noise_in[0]
     state = rng[cloud]
@@ -114,24 +101,15 @@ def draw_noise_kernel(
 @wp.kernel
 def voxel_key_kernel(
     # In:
-    points_in: wp.array2d[wp.vec3],
-    voxel_size: float,
-    jitter_in: wp.array[float],
-    dropout_in: wp.array[float],
-    stream_in: wp.array[wp.uint32],
+    points_in: wp.array2d[wp.vec3],  # [B, P] points [m]; what is not finite or out of the grid is no voxel
+    voxel_size: float,  # side of a voxel [m]
+    jitter_in: wp.array[float],  # [B] standard deviation of the jitter [m]; null for no noise at all
+    dropout_in: wp.array[float],  # [B] probability with which each cloud's points are lost, or null
+    stream_in: wp.array[wp.uint32],  # [B] seed of each cloud's points, or null
     # Out:
-    key_out: wp.array[wp.int64],
+    key_out: wp.array[wp.int64],  # [>= B P] keys; those of points that count for nothing name cloud B
 ):
-    """Key of the voxel of each point. Launch: [B, P].
-
-    Args:
-        points_in: Points [m], shape [B, P]; one that is not finite, or out of the grid, counts for nothing.
-        voxel_size: Side of a voxel [m].
-        jitter_in: Standard deviation of the jitter of each cloud [m], shape [B]; null for no noise at all.
-        dropout_in: Probability with which each cloud's points are lost, shape [B], or null.
-        stream_in: Seed of each cloud's points, shape [B], or null.
-        key_out: Keys, shape [>= B P]; those of points that count for nothing name cloud B.
-    """
+    """Key of the voxel of each point. Launch: [B, P]."""
     cloud, point = wp.tid()
     position = points_in[cloud, point]
     kept = wp.bool(True)
@@ -161,18 +139,12 @@ def voxel_key_kernel(
 @wp.kernel
 def point_group_kernel(
     # In:
-    end_in: wp.array[int],
-    points: int,
+    end_in: wp.array[int],  # [C] columns at which the groups end, one after the other
+    points: int,  # P
     # Out:
-    group_out: wp.array[int],
+    group_out: wp.array[int],  # [>= B P] groups, C for points after the last
 ):
-    """Group of each point by its column. Launch: [B, P].
-
-    Args:
-        end_in: Columns at which the groups end, one after the other, shape [C].
-        points: P.
-        group_out: Groups, C for points after the last, shape [>= B P].
-    """
+    """Group of each point by its column. Launch: [B, P]."""
     cloud, point = wp.tid()
     group = wp.int32(0)
     while group < end_in.shape[0] and point >= end_in[group]:
@@ -183,23 +155,16 @@ def point_group_kernel(
 @wp.kernel
 def voxel_mark_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    limit: wp.int64,
-    run_in: wp.array[int],
-    group_in: wp.array[int],
+    key_in: wp.array[wp.int64],  # [>= K] sorted keys of points
+    limit: wp.int64,  # keys from here on are ignored
+    run_in: wp.array[int],  # [K] place of each key among the voxels, counted from 1
+    group_in: wp.array[int],  # [>= K] group of each point, in the order of the keys
     # Out:
-    mark_out: wp.array2d[float],
+    mark_out: wp.array2d[float],  # [M, C] 1 where a voxel holds a point of the group; the others stay
 ):
     """Mark the voxel of each point with the point's group. Launch: [K].
 
     Points of a voxel write the same value, so their order does not matter.
-
-    Args:
-        key_in: Sorted keys of points, shape [>= K].
-        limit: Keys from here on are ignored.
-        run_in: Place of each key among the voxels, counted from 1, shape [K].
-        group_in: Group of each point, in the order of the keys, shape [>= K].
-        mark_out: 1 where a voxel holds a point of the group, shape [M, C]; the others stay.
     """
     i = wp.tid()
     if key_in[i] < limit and group_in[i] < mark_out.shape[1]:
@@ -209,20 +174,13 @@ def voxel_mark_kernel(
 @wp.kernel
 def run_start_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    limit: wp.int64,
-    shift: wp.int64,
+    key_in: wp.array[wp.int64],  # [>= K] sorted keys
+    limit: wp.int64,  # keys from here on are ignored
+    shift: wp.int64,  # bits by which keys are shifted to the right before they are compared
     # Out:
-    start_out: wp.array[int],
+    start_out: wp.array[int],  # [K] marks
 ):
-    """Mark where a run of equal sorted keys begins: 1 there, 0 elsewhere. Launch: [K].
-
-    Args:
-        key_in: Sorted keys, shape [>= K].
-        limit: Keys from here on are ignored.
-        shift: Bits by which keys are shifted to the right before they are compared.
-        start_out: Marks, shape [K].
-    """
+    """Mark where a run of equal sorted keys begins: 1 there, 0 elsewhere. Launch: [K]."""
     i = wp.tid()
     start_out[i] = 0
     if key_in[i] < limit and (i == 0 or key_in[i] >> shift != key_in[i - 1] >> shift):
@@ -232,22 +190,14 @@ def run_start_kernel(
 @wp.kernel
 def keep_starts_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    limit: wp.int64,
-    shift: wp.int64,
-    run_in: wp.array[int],
+    key_in: wp.array[wp.int64],  # [>= K] sorted keys
+    limit: wp.int64,  # keys from here on are ignored
+    shift: wp.int64,  # bits by which keys are shifted to the right
+    run_in: wp.array[int],  # [K] inclusive sum of the marks of :func:`run_start_kernel`
     # Out:
-    key_out: wp.array[wp.int64],
+    key_out: wp.array[wp.int64],  # [M] keys, each once, ascending
 ):
-    """Keep the (shifted) key of each run. Launch: [K].
-
-    Args:
-        key_in: Sorted keys, shape [>= K].
-        limit: Keys from here on are ignored.
-        shift: Bits by which keys are shifted to the right.
-        run_in: Inclusive sum of the marks of :func:`run_start_kernel`, shape [K].
-        key_out: Keys, each once, ascending, shape [M].
-    """
+    """Keep the (shifted) key of each run. Launch: [K]."""
     i = wp.tid()
     if key_in[i] < limit:
         run = run_in[i] - 1
@@ -258,18 +208,12 @@ def keep_starts_kernel(
 @wp.kernel
 def cloud_offset_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    cloud_shift: wp.int64,
+    key_in: wp.array[wp.int64],  # [M] sorted keys
+    cloud_shift: wp.int64,  # where the number of the cloud begins in a key
     # Out:
-    offset_out: wp.array[int],
+    offset_out: wp.array[int],  # [B + 1] rows
 ):
-    """Find the first voxel of each cloud among sorted keys; the last entry is their number. Launch: [B + 1].
-
-    Args:
-        key_in: Sorted keys, shape [M].
-        cloud_shift: Where the number of the cloud begins in a key.
-        offset_out: Rows, shape [B + 1].
-    """
+    """First voxel of each cloud among sorted keys, and the number of all. Launch: [B + 1]."""
     cloud = wp.tid()
     first = wp.int64(cloud) << cloud_shift
     low = wp.int32(0)
@@ -286,18 +230,12 @@ def cloud_offset_kernel(
 @wp.kernel
 def coordinates_kernel(
     # In:
-    key_in: wp.array[wp.int64],
-    level: int,
+    key_in: wp.array[wp.int64],  # [M] keys
+    level: int,  # how often the grid was halved: coordinates count cells of 2^level voxels
     # Out:
-    coordinate_out: wp.array2d[int],
+    coordinate_out: wp.array2d[int],  # [M, 4] rows; coordinates may be negative
 ):
-    """Write keys as rows (cloud, x, y, z). Launch: [M].
-
-    Args:
-        key_in: Keys, shape [M].
-        level: How often the grid was halved: coordinates count cells of 2^level voxels.
-        coordinate_out: Rows, shape [M, 4]; coordinates may be negative.
-    """
+    """Write keys as rows (cloud, x, y, z). Launch: [M]."""
     site = wp.tid()
     key = key_in[site]
     corner = _HALF_RANGE >> level
@@ -307,38 +245,26 @@ def coordinates_kernel(
         coordinate_out[site, axis + 1] = cell[axis] - corner
 
 
-@dataclass(frozen=True)
-class NoiseDraw:
-    """Noise of the clouds of one batch, as :func:`draw_noise_kernel` draws it."""
+class NoiseDraw(NamedTuple):
+    """Noise of the clouds of one batch, as :func:`draw_noise_kernel` draws it, shape [B] each."""
 
     jitter: wp.array
-    """Standard deviation of the jitter [m], shape [B]."""
+    """Standard deviation of the jitter [m]."""
     dropout: wp.array
-    """Probability with which a point is lost, shape [B]."""
+    """Probability with which a point is lost."""
     stream: wp.array
-    """Seed of each cloud's points, shape [B]."""
+    """Seed of each cloud's points."""
 
 
 def draw_noise(noise: wp.array, rng: wp.array) -> NoiseDraw:
-    """Draw the noise of each cloud of a batch.
+    """Draw the noise of each cloud of a batch from its stream, which advances.
 
     Args:
         noise: One :class:`CloudNoise`, shape [1].
-        rng: Random stream of each cloud, shape [B]; advanced.
+        rng: Random stream of each cloud, shape [B].
     """
-    clouds, device = rng.shape[0], rng.device
-    draw = NoiseDraw(
-        wp.empty(clouds, dtype=float, device=device),
-        wp.empty(clouds, dtype=float, device=device),
-        wp.empty(clouds, dtype=wp.uint32, device=device),
-    )
-    wp.launch(
-        draw_noise_kernel,
-        dim=clouds,
-        inputs=[noise, rng],
-        outputs=[draw.jitter, draw.dropout, draw.stream],
-        device=device,
-    )
+    draw = NoiseDraw(*(wp.empty(rng.shape, dtype=t, device=rng.device) for t in (float, float, wp.uint32)))
+    launch(draw_noise_kernel, rng.shape, [noise, rng], draw)
     return draw
 
 
@@ -357,33 +283,23 @@ def unique_keys(
     Returns:
         The keys [M], and for each key given its place among them, counted from 1 [K].
     """
-    device = keys.device
-    run = wp.empty(count, dtype=int, device=device)
+    run = wp.empty(count, dtype=int, device=keys.device)
     if count == 0:
-        return wp.empty(0, dtype=wp.int64, device=device), run
-    wp.launch(
-        run_start_kernel,
-        dim=count,
-        inputs=[keys, wp.int64(limit), wp.int64(shift)],
-        outputs=[run],
-        device=device,
-    )
+        return wp.empty(0, dtype=wp.int64, device=keys.device), run
+    read = [keys, wp.int64(limit), wp.int64(shift)]
+    launch(run_start_kernel, count, read, [run])
     wp.utils.array_scan(run, run, inclusive=True)
     if kept is None:
         kept = int(run[count - 1 :].numpy()[0])
-    unique = wp.empty(kept, dtype=wp.int64, device=device)
-    wp.launch(
-        keep_starts_kernel,
-        dim=count,
-        inputs=[keys, wp.int64(limit), wp.int64(shift), run],
-        outputs=[unique],
-        device=device,
-    )
+    unique = wp.empty(kept, dtype=wp.int64, device=keys.device)
+    launch(keep_starts_kernel, count, [*read, run], [unique])
     return unique, run
 
 
-def voxelise(points: wp.array, voxel_size: float, noise: NoiseDraw | None = None) -> wp.array:
-    """Voxels of a batch of clouds: their keys, each once, ascending.
+def voxelise(
+    points: wp.array, voxel_size: float, noise: NoiseDraw | None = None, ends: wp.array | None = None
+) -> tuple[wp.array, wp.array]:
+    """Voxels of a batch of clouds, each once, ascending, and what the points in each are samples of.
 
     The order depends on the voxels alone, not on that of the points.
 
@@ -391,33 +307,14 @@ def voxelise(points: wp.array, voxel_size: float, noise: NoiseDraw | None = None
         points: Points [m], shape [B, P]; those that are not finite or out of the grid are left out.
         voxel_size: Side of a voxel [m].
         noise: Noise to add first; none by default.
-
-    Returns:
-        Keys, shape [M].
-
-    Raises:
-        ValueError: The voxel size is not positive, or there are too many points or clouds.
-    """
-    return voxelise_marked(points, voxel_size, None, noise)[0]
-
-
-def voxelise_marked(
-    points: wp.array, voxel_size: float, ends: wp.array | None, noise: NoiseDraw | None = None
-) -> tuple[wp.array, wp.array]:
-    """:func:`voxelise`, telling of what the points in each voxel are samples.
-
-    Args:
-        points: See :func:`voxelise`.
-        voxel_size: See :func:`voxelise`.
         ends: Columns of ``points`` at which groups end, one after the other, ascending, int32, shape [C];
             points after the last are of none; None marks nothing.
-        noise: See :func:`voxelise`.
 
     Returns:
         Keys, shape [M], and marks: 1 where a voxel holds a point of the group, else 0, float, shape [M, C].
 
     Raises:
-        ValueError: See :func:`voxelise`.
+        ValueError: The voxel size is not positive, or there are too many points or clouds.
     """
     clouds, per_cloud = points.shape
     count, device = clouds * per_cloud, points.device
@@ -426,58 +323,28 @@ def voxelise_marked(
     if clouds > MAX_CLOUDS or 2 * count >= 2**31:
         raise ValueError(f"{clouds} clouds of {per_cloud} points are too many at once; give fewer")
     keys = wp.empty(2 * count, dtype=wp.int64, device=device)  # the second half is for the sort
-    wp.launch(
-        voxel_key_kernel,
-        dim=(clouds, per_cloud),
-        inputs=[
-            points,
-            voxel_size,
-            noise and noise.jitter,
-            noise and noise.dropout,
-            noise and noise.stream,
-        ],
-        outputs=[keys],
-        device=device,
-    )
+    launch(voxel_key_kernel, points.shape, [points, voxel_size, *(noise or [None] * 3)], [keys])
     groups = wp.empty(2 * count, dtype=int, device=device)  # sorted along; of no meaning without ends
     if ends is not None:
-        wp.launch(
-            point_group_kernel,
-            dim=(clouds, per_cloud),
-            inputs=[ends, per_cloud],
-            outputs=[groups],
-            device=device,
-        )
+        launch(point_group_kernel, points.shape, [ends, per_cloud], [groups])
     wp.utils.radix_sort_pairs(keys, groups, count, end_bit=CLOUD_SHIFT + clouds.bit_length())
     limit = clouds << CLOUD_SHIFT
     voxels, run = unique_keys(keys, count, limit=limit)
     marks = wp.zeros((voxels.shape[0], 0 if ends is None else ends.shape[0]), dtype=float, device=device)
     if ends is not None:
-        wp.launch(
-            voxel_mark_kernel,
-            dim=count,
-            inputs=[keys, wp.int64(limit), run, groups],
-            outputs=[marks],
-            device=device,
-        )
+        launch(voxel_mark_kernel, count, [keys, wp.int64(limit), run, groups], [marks])
     return voxels, marks
 
 
 def cloud_offsets(keys: wp.array, clouds: int, level: int = 0) -> wp.array:
     """First voxel of each cloud, and the number of all, shape [B + 1], for sorted keys of a level."""
     offsets = wp.empty(clouds + 1, dtype=int, device=keys.device)
-    wp.launch(
-        cloud_offset_kernel,
-        dim=clouds + 1,
-        inputs=[keys, wp.int64(CLOUD_SHIFT - 3 * level)],
-        outputs=[offsets],
-        device=keys.device,
-    )
+    launch(cloud_offset_kernel, clouds + 1, [keys, wp.int64(CLOUD_SHIFT - 3 * level)], [offsets])
     return offsets
 
 
 def coordinates(keys: wp.array, level: int = 0) -> wp.array:
     """Rows (cloud, x, y, z) of keys of a level, shape [M, 4]."""
     rows = wp.empty((keys.shape[0], 4), dtype=int, device=keys.device)
-    wp.launch(coordinates_kernel, dim=keys.shape[0], inputs=[keys, level], outputs=[rows], device=keys.device)
+    launch(coordinates_kernel, keys.shape, [keys, level], [rows])
     return rows

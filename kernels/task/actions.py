@@ -14,49 +14,33 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ActionParams:
-    """Settings of the action; an array of length 1 in device memory.
+    """Settings of the action; an array of length 1 in device memory."""
 
-    alpha: Weight of the new action in the moving average, in (0, 1].
-    step_rad: Joint increment of a smoothed action of 1 [rad per control step].
-    noise_std: Standard deviation of the noise added to the action, in action units.
-    """
-
-    alpha: float
-    step_rad: float
-    noise_std: float
+    alpha: float  # weight of the new action in the moving average, in (0, 1]
+    step_rad: float  # joint increment of a smoothed action of 1 [rad per control step]
+    noise_std: float  # standard deviation of the noise added to the action, in action units
 
 
 @wp.kernel
 def apply_action_kernel(
     # Model:
-    joint_lower: wp.array[float],
-    joint_upper: wp.array[float],
-    params: wp.array[ActionParams],
+    joint_lower: wp.array[float],  # [D] lower joint limits [rad]
+    joint_upper: wp.array[float],  # [D] upper joint limits [rad]
+    params: wp.array[ActionParams],  # [1] settings
     # In:
-    action_in: wp.array2d[float],
-    action_offset_in: wp.array2d[float],
-    joint_q_in: wp.array2d[float],
+    action_in: wp.array2d[float],  # [N, D] action of the policy
+    action_offset_in: wp.array2d[float],  # [N, D] constant error of each actuator in action units
+    joint_q_in: wp.array2d[float],  # [N, *] joint positions as measured [rad]
     # In/Out:
-    smoothed: wp.array2d[float],
-    rng: wp.array[wp.uint32],
+    smoothed: wp.array2d[float],  # [N, D] moving average of the applied action
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    joint_target_out: wp.array2d[float],
+    joint_target_out: wp.array2d[float],  # [N, *] position targets [rad], D columns are written
 ):
     """Turn actions into joint position targets (paper, Methods, action space). Launch: [N].
 
     a = clip(action + N(0, noise_std) + offset, -1, 1); smoothed = alpha a + (1 - alpha) smoothed;
     target = clamp(q + smoothed step_rad, lower, upper), relative to the joint's present position.
-
-    Args:
-        joint_lower: Lower joint limits [rad], shape [D].
-        joint_upper: Upper joint limits [rad], shape [D].
-        params: Settings, shape [1].
-        action_in: Action of the policy, shape [N, D].
-        action_offset_in: Constant error of each actuator in action units, shape [N, D].
-        joint_q_in: Joint positions as measured [rad], shape [N, *].
-        smoothed: Moving average of the applied action, shape [N, D].
-        rng: Random stream of each world, shape [N].
-        joint_target_out: Joint position targets [rad], shape [N, *]; the first D columns are written.
     """
     world = wp.tid()
     settings = params[0]
@@ -77,26 +61,19 @@ def apply_action_kernel(
 @wp.kernel
 def limit_joint_velocity_kernel(
     # Model:
-    velocity_limit: wp.array[float],
+    velocity_limit: wp.array[float],  # [D] velocity limits [rad/s]
     # In:
-    dt: float,
-    joint_q_prev_in: wp.array2d[float],
+    dt: float,  # physics time step [s]
+    joint_q_prev_in: wp.array2d[float],  # [N, *] joint positions before the step [rad]
     # In/Out:
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
+    joint_q: wp.array2d[float],  # [N, *] joint positions after the step [rad]
+    joint_qd: wp.array2d[float],  # [N, *] joint velocities after the step [rad/s]
 ):
     """Hold hand joints to their velocity limits after one physics step. Launch: [N, D].
 
     Where norm(qd) > limit: qd = sign(qd) limit and q = q_prev + qd dt. The solver integrates
     q = q_prev + qd dt too, so the joint stops short on the way it was going and cannot leave its
     position limits by it. Other joints are untouched.
-
-    Args:
-        velocity_limit: Velocity limits [rad/s], shape [D].
-        dt: Physics time step [s].
-        joint_q_prev_in: Joint positions before the step [rad], shape [N, *].
-        joint_q: Joint positions after the step [rad], shape [N, *].
-        joint_qd: Joint velocities after the step [rad/s], shape [N, *].
     """
     world, joint = wp.tid()
     speed = joint_qd[world, joint]
@@ -110,28 +87,19 @@ def limit_joint_velocity_kernel(
 @wp.kernel
 def joint_effort_kernel(
     # Model:
-    effort_limit: wp.array[float],
-    kp_in: wp.array2d[float],
-    kd_in: wp.array2d[float],
+    effort_limit: wp.array[float],  # [D] torque limits [N m]
+    kp_in: wp.array2d[float],  # [N, D] stiffness [N m/rad]
+    kd_in: wp.array2d[float],  # [N, D] damping [N m s/rad]
     # In:
-    joint_target_in: wp.array2d[float],
-    joint_q_in: wp.array2d[float],
-    joint_qd_in: wp.array2d[float],
+    joint_target_in: wp.array2d[float],  # [N, *] position targets [rad]
+    joint_q_in: wp.array2d[float],  # [N, *] joint positions [rad]
+    joint_qd_in: wp.array2d[float],  # [N, *] joint velocities [rad/s]
     # Out:
-    effort_out: wp.array2d[float],
+    effort_out: wp.array2d[float],  # [N, D] joint torques [N m]
 ):
     """Torque of the position servo at the present state: clamp(kp (target - q) - kd qd, +-limit).
 
     Launch: [N, D].
-
-    Args:
-        effort_limit: Torque limits [N m], shape [D].
-        kp_in: Stiffness [N m/rad], shape [N, D].
-        kd_in: Damping [N m s/rad], shape [N, D].
-        joint_target_in: Position targets [rad], shape [N, *].
-        joint_q_in: Joint positions [rad], shape [N, *].
-        joint_qd_in: Joint velocities [rad/s], shape [N, *].
-        effort_out: Joint torques [N m], shape [N, D].
     """
     world, joint = wp.tid()
     error = joint_target_in[world, joint] - joint_q_in[world, joint]

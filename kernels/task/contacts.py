@@ -10,32 +10,21 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def pair_force_kernel(
     # In:
-    contact_count: wp.array[int],
-    contact_world: wp.array[int],
-    contact_geom: wp.array[wp.vec2i],
-    contact_row: wp.array2d[int],
-    row_force: wp.array2d[float],
-    geom_kind: wp.array2d[int],
-    kind_a: int,
-    kind_b: int,
+    contact_count: wp.array[int],  # [1] number of contacts in use over all worlds
+    contact_world: wp.array[int],  # [C] world of each contact
+    contact_geom: wp.array[wp.vec2i],  # [C] the two geoms of each contact
+    contact_row: wp.array2d[int],  # [C, R] constraint rows of each contact; -1 where it is not active
+    row_force: wp.array2d[float],  # [N, rows] force of each constraint row [N]
+    geom_kind: wp.array2d[int],  # [N, G] kind of each geom
+    kind_a: int,  # first kind
+    kind_b: int,  # second kind
     # In/Out:
-    force: wp.array[float],
+    force: wp.array[float],  # [N] summed normal force [N]
 ):
     """Add up the normal forces [N] between two kinds of geoms in every world.
 
-    One thread per contact slot. ``force`` must be zero before the launch.
-
-    Args:
-        contact_count: Number of contacts in use over all worlds, shape [1].
-        contact_world: World of each contact, shape [C].
-        contact_geom: The two geoms of each contact, shape [C].
-        contact_row: Constraint rows of each contact, of which the first is the normal's (the cone is
-            elliptic); -1 where the contact is not active, shape [C, R].
-        row_force: Force of each constraint row [N], shape [N, rows].
-        geom_kind: Kind of each geom, shape [N, G].
-        kind_a: First kind.
-        kind_b: Second kind.
-        force: Summed normal force [N], shape [N].
+    One thread per contact slot. ``force`` must be zero before the launch. The first row of a contact is the
+    normal's: the cone is elliptic.
     """
     contact = wp.tid()
     if contact >= contact_count[0]:
@@ -69,20 +58,20 @@ def damping_ratio(restitution: float, lowest: float) -> float:
 @wp.kernel
 def restitution_kernel(
     # Model:
-    nominal: wp.array2d[wp.vec2],
-    geom_kind: wp.array2d[int],
-    kind_table: int,
-    kind_hand: int,
-    object_column: int,
-    threshold: float,
-    lowest: float,
+    nominal: wp.array2d[wp.vec2],  # [N, G] references without restitution
+    geom_kind: wp.array2d[int],  # [N, G] kind of each geom
+    kind_table: int,  # kind of the table
+    kind_hand: int,  # kind of the hand's geoms
+    object_column: int,  # column of the object's linear velocity
+    threshold: float,  # speed of the object below which nothing bounces [m/s]
+    lowest: float,  # least damping ratio relative to the nominal
     # In:
-    joint_qd: wp.array2d[float],
-    hand_restitution: wp.array[float],
-    object_restitution: wp.array[float],
-    table_restitution: wp.array[float],
+    joint_qd: wp.array2d[float],  # [N, D + 6] velocities
+    hand_restitution: wp.array[float],  # [N] coefficient of restitution of the hand
+    object_restitution: wp.array[float],  # [N] the same of the object
+    table_restitution: wp.array[float],  # [N] the same of the table
     # Out:
-    solref_out: wp.array2d[wp.vec2],
+    solref_out: wp.array2d[wp.vec2],  # [N, G] references; geoms that are neither hand nor table keep theirs
 ):
     """Write each geom's contact reference so that a fast object bounces and a slow one does not.
 
@@ -92,20 +81,6 @@ def restitution_kernel(
     divided by as much as the time constant is multiplied with: the stiffness 1 / (time constant * ratio)^2
     stays. As for friction, hand and table carry the mean of their own and the object's restitution, because
     of two geoms that touch the solver takes the one with the higher priority: table over hand over object.
-
-    Args:
-        nominal: References without restitution, shape [N, G].
-        geom_kind: Kind of each geom, shape [N, G].
-        kind_table: Kind of the table.
-        kind_hand: Kind of the hand's geoms.
-        object_column: Column of the object's linear velocity.
-        threshold: Speed of the object below which nothing bounces [m/s].
-        lowest: Least damping ratio relative to the nominal.
-        joint_qd: Velocities, shape [N, D + 6].
-        hand_restitution: Coefficient of restitution of the hand, shape [N].
-        object_restitution: The same of the object, shape [N].
-        table_restitution: The same of the table, shape [N].
-        solref_out: References, shape [N, G]; geoms that are neither hand nor table keep theirs.
     """
     world, geom = wp.tid()
     kind = geom_kind[world, geom]

@@ -33,39 +33,23 @@ def dynamics_size(joints: int) -> int:
 @wp.kernel
 def dynamics_kernel(
     # Model:
-    nominal_kp: wp.array[float],
-    nominal_kd: wp.array[float],
-    nominal: wp.vec4,
-    column: int,
+    nominal_kp: wp.array[float],  # [D] stiffness before randomisation [N m/rad]
+    nominal_kd: wp.array[float],  # [D] damping before randomisation [N m s/rad]
+    nominal: wp.vec4,  # frictions of hand, object and table, mass [kg]; also their units
+    column: int,  # first column
     # In:
-    kp_in: wp.array2d[float],
-    kd_in: wp.array2d[float],
-    servo_in: wp.array2d[float],
-    hand_friction_in: wp.array[float],
-    object_friction_in: wp.array[float],
-    table_friction_in: wp.array[float],
-    object_mass_in: wp.array[float],
-    latency_in: wp.array[float],
+    kp_in: wp.array2d[float],  # [N, D] stiffness [N m/rad]
+    kd_in: wp.array2d[float],  # [N, D] damping [N m s/rad]
+    servo_in: wp.array2d[float],  # [N D, P] rows of servo parameters; no rows where there is no servo
+    hand_friction_in: wp.array[float],  # [N] friction coefficient of the hand
+    object_friction_in: wp.array[float],  # [N] that of the object
+    table_friction_in: wp.array[float],  # [N] that of the table
+    object_mass_in: wp.array[float],  # [N] mass of the object [kg]
+    latency_in: wp.array[float],  # [N] how late the world is seen [s]
     # Out:
-    observation_out: wp.array2d[float],
+    observation_out: wp.array2d[float],  # [N, *] observation in the world frame
 ):
-    """Write the drawn dynamics, channel by channel over the joints, then the scalars. Launch: [N].
-
-    Args:
-        nominal_kp: Stiffness before randomisation [N m/rad], shape [D].
-        nominal_kd: Damping before randomisation [N m s/rad], shape [D].
-        nominal: Frictions of hand, object and table, mass [kg]; also their units.
-        column: First column.
-        kp_in: Stiffness [N m/rad], shape [N, D].
-        kd_in: Damping [N m s/rad], shape [N, D].
-        servo_in: Rows of servo parameters, shape [N D, P]; no rows where there is no servo.
-        hand_friction_in: Friction coefficient of the hand, shape [N].
-        object_friction_in: That of the object, shape [N].
-        table_friction_in: That of the table, shape [N].
-        object_mass_in: Mass of the object [kg], shape [N].
-        latency_in: How late the world is seen [s], shape [N].
-        observation_out: Observation in the world frame, shape [N, *].
-    """
+    """Write the drawn dynamics, channel by channel over the joints, then the scalars. Launch: [N]."""
     world = wp.tid()
     joints = nominal_kp.shape[0]
     for joint in range(joints):

@@ -13,18 +13,12 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def collect_overflow_kernel(
     # In:
-    overflow_in: wp.array[wp.int32],
-    mask: int,
+    overflow_in: wp.array[wp.int32],  # [N] bit mask of the latest physics step
+    mask: int,  # bits that mean lost contacts or constraint rows
     # In/Out:
-    seen: wp.array[wp.int32],
+    seen: wp.array[wp.int32],  # [N] bits raised since the last clearing
 ):
-    """Remember every overflow bit of ``mask`` that any physics step raised.
-
-    Args:
-        overflow_in: Bit mask of the latest physics step, shape [N].
-        mask: Bits that mean lost contacts or constraint rows.
-        seen: Bits raised since the last clearing, shape [N].
-    """
+    """Remember every overflow bit of ``mask`` that any physics step raised."""
     world = wp.tid()
     bits = overflow_in[world] & mask
     if bits != 0:
@@ -34,37 +28,24 @@ def collect_overflow_kernel(
 @wp.kernel
 def guard_kernel(
     # In:
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
-    start_q: wp.array2d[float],
-    start_qd: wp.array2d[float],
-    target: wp.array2d[float],
-    max_speed: float,
+    joint_q: wp.array2d[float],  # [N, D + 7] positions after the step
+    joint_qd: wp.array2d[float],  # [N, D + 6] velocities after the step
+    start_q: wp.array2d[float],  # [N, D + 7] positions before the step
+    start_qd: wp.array2d[float],  # [N, D + 6] velocities before the step
+    target: wp.array2d[float],  # [N, T] joint targets of the step
+    max_speed: float,  # speed [m/s or rad/s] that no joint or object reaches
     # In/Out:
-    failures: wp.array[wp.int32],
-    dump_q: wp.array2d[float],
-    dump_qd: wp.array2d[float],
-    dump_target: wp.array2d[float],
+    failures: wp.array[wp.int32],  # [N] steps that failed so far
+    dump_q: wp.array2d[float],  # [N, D + 7] positions before the first step that failed
+    dump_qd: wp.array2d[float],  # [N, D + 6] velocities before it
+    dump_target: wp.array2d[float],  # [N, T] joint targets of it
     # Out:
-    failed_out: wp.array[wp.int32],
+    failed_out: wp.array[wp.int32],  # [N] 1 where this step failed
 ):
     """Flag worlds whose state is not finite or faster than ``max_speed``; keep the last good start.
 
     The dump of a world is overwritten every control step as long as it is good, and frozen at the
     start of the first control step that failed, so that this step can be replayed.
-
-    Args:
-        joint_q: Positions after the step, shape [N, D + 7].
-        joint_qd: Velocities after the step, shape [N, D + 6].
-        start_q: Positions before the step, shape [N, D + 7].
-        start_qd: Velocities before the step, shape [N, D + 6].
-        target: Joint targets of the step, shape [N, T].
-        max_speed: Speed [m/s or rad/s] that no joint or object reaches.
-        failures: Steps that failed so far, shape [N].
-        dump_q: Positions before the first step that failed, shape [N, D + 7].
-        dump_qd: Velocities before it, shape [N, D + 6].
-        dump_target: Joint targets of it, shape [N, T].
-        failed_out: 1 where this step failed, shape [N].
     """
     world = wp.tid()
     failed = wp.int32(0)
@@ -90,24 +71,15 @@ def guard_kernel(
 @wp.kernel
 def put_back_kernel(
     # In:
-    failed: wp.array[wp.int32],
-    start_q: wp.array2d[float],
-    last_step: int,
+    failed: wp.array[wp.int32],  # [N] 1 where this step failed
+    start_q: wp.array2d[float],  # [N, D + 7] positions before the step
+    last_step: int,  # control steps of an episode before its last one
     # Out:
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
-    step_count: wp.array[wp.int32],
+    joint_q: wp.array2d[float],  # [N, D + 7] positions; written where it failed, like those below
+    joint_qd: wp.array2d[float],  # [N, D + 6] velocities
+    step_count: wp.array[wp.int32],  # [N] control steps since the reset, this one not counted
 ):
-    """Put worlds that failed back to where the step began, at rest, in the last step of their episode.
-
-    Args:
-        failed: 1 where this step failed, shape [N].
-        start_q: Positions before the step, shape [N, D + 7].
-        last_step: Control steps of an episode before its last one.
-        joint_q: Positions, shape [N, D + 7]; written where it failed, like those below.
-        joint_qd: Velocities, shape [N, D + 6].
-        step_count: Control steps since the reset, this one not counted, shape [N].
-    """
+    """Put worlds that failed back to where the step began, at rest, in the last step of their episode."""
     world = wp.tid()
     if failed[world] == 0:
         return
@@ -121,24 +93,15 @@ def put_back_kernel(
 @wp.kernel
 def void_step_kernel(
     # In:
-    failed: wp.array[wp.int32],
+    failed: wp.array[wp.int32],  # [N] 1 where this step failed
     # Out:
-    reward: wp.array[float],
-    reward_terms: wp.array2d[float],
-    still: wp.array[wp.int32],
-    success: wp.array[wp.int32],
-    fell: wp.array[wp.int32],
+    reward: wp.array[float],  # [N] reward; written where it failed, like those below
+    reward_terms: wp.array2d[float],  # [N, T] its terms
+    still: wp.array[wp.int32],  # [N] 1 where all of success held but the rotation's threshold
+    success: wp.array[wp.int32],  # [N] 1 where the goal was reached
+    fell: wp.array[wp.int32],  # [N] 1 where the object was lost
 ):
-    """No reward, no success and no fall in worlds that failed, so that their episode only times out.
-
-    Args:
-        failed: 1 where this step failed, shape [N].
-        reward: Reward, shape [N]; written where it failed, like those below.
-        reward_terms: Its terms, shape [N, T].
-        still: 1 where all of success held but the rotation's threshold, shape [N].
-        success: 1 where the goal was reached, shape [N].
-        fell: 1 where the object was lost, shape [N].
-    """
+    """No reward, no success and no fall in worlds that failed, so that their episode only times out."""
     world = wp.tid()
     if failed[world] == 0:
         return

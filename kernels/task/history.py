@@ -43,35 +43,23 @@ def seen_rotation(world: int, column: int, observation: wp.array2d[float], goal:
 @wp.kernel
 def remember_kernel(
     # Model:
-    joints: int,
-    position_column: int,
-    rotation_column: int,
-    action_column: int,
-    frames: int,
+    joints: int,  # joints of the hand, D; their positions are observed in the first columns
+    position_column: int,  # column of the object's position
+    rotation_column: int,  # column of its rotation from the goal
+    action_column: int,  # column of the previous (smoothed) action
+    frames: int,  # rows of each world, K
     # In:
-    observation_in: wp.array2d[float],
-    goal_quat_in: wp.array[wp.quat],
+    observation_in: wp.array2d[float],  # [N, *] observation in the world frame
+    goal_quat_in: wp.array[wp.quat],  # [N] the goal as it was observed
     # In/Out:
-    head: wp.array[int],
-    count: wp.array[int],
+    head: wp.array[int],  # [N] row written last
+    count: wp.array[int],  # [N] rows that hold something
     # Out:
-    past_out: wp.array2d[float],
+    past_out: wp.array2d[float],  # [N K, 2 D + 7] past observations, world by world
 ):
     """Remember the present observation. Launch: [N].
 
     A row holds joint positions D and smoothed action D as observed, object position 3 and orientation 4.
-
-    Args:
-        joints: Joints of the hand, D; their positions are observed in the first columns.
-        position_column: Column of the object's position.
-        rotation_column: Column of its rotation from the goal.
-        action_column: Column of the previous (smoothed) action.
-        frames: Rows of each world, K.
-        observation_in: Observation in the world frame, shape [N, *].
-        goal_quat_in: The goal as it was observed, shape [N].
-        head: Row written last, shape [N].
-        count: Rows that hold something, shape [N].
-        past_out: Past observations, world by world, shape [N K, 2 D + 7].
     """
     world = wp.tid()
     slot = (head[world] + 1) % frames
@@ -89,16 +77,11 @@ def remember_kernel(
 @wp.kernel
 def forget_kernel(
     # In:
-    mask_in: wp.array[int],
+    mask_in: wp.array[int],  # [N] 1 where an episode begins
     # Out:
-    count_out: wp.array[int],
+    count_out: wp.array[int],  # [N] rows of the past that hold something
 ):
-    """Forget the past of the masked worlds. Launch: [N].
-
-    Args:
-        mask_in: 1 where an episode begins, shape [N].
-        count_out: Rows of the past that hold something, shape [N].
-    """
+    """Forget the past of the masked worlds. Launch: [N]."""
     world = wp.tid()
     if mask_in[world] != 0:
         count_out[world] = 0
@@ -107,35 +90,21 @@ def forget_kernel(
 @wp.kernel
 def history_kernel(
     # Model:
-    joints: int,
-    position_column: int,
-    rotation_column: int,
-    action_column: int,
-    frames: int,
-    column: int,
+    joints: int,  # joints of the hand, D
+    position_column: int,  # column of the object's position
+    rotation_column: int,  # column of its rotation from the goal
+    action_column: int,  # column of the previous (smoothed) action
+    frames: int,  # rows of each world, K
+    column: int,  # first column of the history
     # In:
-    goal_quat_in: wp.array[wp.quat],
-    head_in: wp.array[int],
-    count_in: wp.array[int],
-    past_in: wp.array2d[float],
+    goal_quat_in: wp.array[wp.quat],  # [N] the goal as it is observed
+    head_in: wp.array[int],  # [N] row written last
+    count_in: wp.array[int],  # [N] rows that hold something
+    past_in: wp.array2d[float],  # [N K, 2 D + 7] past observations
     # In/Out:
-    observation: wp.array2d[float],
+    observation: wp.array2d[float],  # [N, *] observation in the world frame, written from ``column`` on
 ):
-    """Write the past frames, newest first; before the first one the oldest repeats. Launch: [N, K].
-
-    Args:
-        joints: Joints of the hand, D.
-        position_column: Column of the object's position.
-        rotation_column: Column of its rotation from the goal.
-        action_column: Column of the previous (smoothed) action.
-        frames: Rows of each world, K.
-        column: First column of the history.
-        goal_quat_in: The goal as it is observed, shape [N].
-        head_in: Row written last, shape [N].
-        count_in: Rows that hold something, shape [N].
-        past_in: Past observations, shape [N K, 2 D + 7].
-        observation: Observation in the world frame, shape [N, *]; read before, written from ``column`` on.
-    """
+    """Write the past frames, newest first; before the first one the oldest repeats. Launch: [N, K]."""
     world, frame = wp.tid()
     out = column + frame * (2 * joints + wp.static(POSE_VALUES))
     filled = count_in[world]

@@ -2,6 +2,7 @@
 
 A row of the ring holds what observations are made of, in this order: joints as the encoders report them,
 their velocities, all positions, all velocities, and of each fingertip's link pose 7, velocity 6.
+The object comes from a camera, joints and fingertips from encoders: each have an age of their own.
 """
 
 import warp as wp
@@ -112,6 +113,7 @@ def begin_latency_kernel(
     slots: int,
     tip_body: wp.array[int],
     latency: wp.vec2,
+    encoder_latency: wp.vec2,
     # In:
     mask_in: wp.array[int],
     measured_q_in: wp.array2d[float],
@@ -124,15 +126,19 @@ def begin_latency_kernel(
     rng: wp.array[wp.uint32],
     # Out:
     latency_out: wp.array[float],
+    encoder_latency_out: wp.array[float],
     ring_out: wp.array2d[float],
 ):
-    """Draw the latency of an episode that begins; its past is its first state. Launch: [N].
+    """Draw the latencies of an episode that begins; its past is its first state. Launch: [N].
+
+    Both are at the same share of their ranges, so that the one that a critic is told says both.
 
     Args:
         joints: Joints of the hand, D.
         slots: Rows of each world, L.
         tip_body: Link of each fingertip, shape [G].
-        latency: Range of the draw [s].
+        latency: Range of the object's latency [s].
+        encoder_latency: Range of that of joints and fingertips [s].
         mask_in: 1 where an episode begins, shape [N].
         measured_q_in: As in :func:`record_state_kernel`, and the five after it.
         measured_qd_in: Likewise.
@@ -141,14 +147,16 @@ def begin_latency_kernel(
         body_q_in: Likewise.
         body_qd_in: Likewise.
         rng: Random stream of each world, shape [N].
-        latency_out: How late the world is seen [s], shape [N].
+        latency_out: How late the object is seen [s], shape [N].
+        encoder_latency_out: How late joints and fingertips are seen [s], shape [N].
         ring_out: Past states, shape [N L, C].
     """
     world = wp.tid()
     if mask_in[world] == 0:
         return
-    state, drawn = uniform(rng[world], latency)
-    latency_out[world] = drawn
+    state, share = uniform(rng[world], wp.vec2(0.0, 1.0))
+    latency_out[world] = wp.lerp(latency[0], latency[1], share)
+    encoder_latency_out[world] = wp.lerp(encoder_latency[0], encoder_latency[1], share)
     rng[world] = next_stream(state, world)
     for slot in range(slots):
         write_state(
@@ -166,6 +174,13 @@ def begin_latency_kernel(
         )
 
 
+@wp.func
+def aged_row(world: int, latency: float, physics_dt: float, slots: int, head: wp.array[int]) -> int:
+    """Row of a world's state at an age, to the nearest physics step."""
+    age = wp.clamp(int(wp.round(latency / physics_dt)), 0, slots - 1)
+    return world * slots + (head[world] - age + slots) % slots
+
+
 @wp.kernel
 def recall_state_kernel(
     # Model:
@@ -175,6 +190,7 @@ def recall_state_kernel(
     physics_dt: float,
     # In:
     latency_in: wp.array[float],
+    encoder_latency_in: wp.array[float],
     head_in: wp.array[int],
     ring_in: wp.array2d[float],
     # Out:
@@ -185,14 +201,15 @@ def recall_state_kernel(
     body_q_out: wp.array2d[wp.transform],
     body_qd_out: wp.array2d[wp.spatial_vector],
 ):
-    """The state as it was a latency ago, of the nearest physics step. Launch: [N].
+    """Object and hand as they were their latency ago, of the nearest physics step. Launch: [N].
 
     Args:
         joints: Joints of the hand, D.
         slots: Rows of each world, L.
         tip_body: Link of each fingertip, shape [G]; only their poses are written.
         physics_dt: Time between two rows [s].
-        latency_in: How late each world is seen [s], at most (L - 1) steps, shape [N].
+        latency_in: How late each object is seen [s], at most (L - 1) steps, shape [N].
+        encoder_latency_in: How late joints and fingertips are seen [s], likewise, shape [N].
         head_in: Slot written last, shape [N].
         ring_in: Past states, shape [N L, C].
         measured_q_out: As in :func:`record_state_kernel`, and the five after it.
@@ -203,17 +220,17 @@ def recall_state_kernel(
         body_qd_out: Likewise.
     """
     world = wp.tid()
-    age = wp.clamp(int(wp.round(latency_in[world] / physics_dt)), 0, slots - 1)
-    row = world * slots + (head_in[world] - age + slots) % slots
+    seen = aged_row(world, latency_in[world], physics_dt, slots, head_in)
+    row = aged_row(world, encoder_latency_in[world], physics_dt, slots, head_in)
     for i in range(joints):
         measured_q_out[world, i] = ring_in[row, i]
         measured_qd_out[world, i] = ring_in[row, joints + i]
     column = 2 * joints
     for i in range(joint_q_out.shape[1]):
-        joint_q_out[world, i] = ring_in[row, column + i]
+        joint_q_out[world, i] = ring_in[wp.where(i < joints, row, seen), column + i]
     column += joint_q_out.shape[1]
     for i in range(joint_qd_out.shape[1]):
-        joint_qd_out[world, i] = ring_in[row, column + i]
+        joint_qd_out[world, i] = ring_in[wp.where(i < joints, row, seen), column + i]
     column += joint_qd_out.shape[1]
     for finger in range(tip_body.shape[0]):
         body = tip_body[finger]

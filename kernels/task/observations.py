@@ -6,7 +6,7 @@ the paper's 19 G + 21 and the previous action.
 
 import warp as wp
 
-from vd.kernels.columns import read_quat, read_vec3, write_quat, write_vec3
+from vd.kernels.columns import consecutive, read_quat, read_vec3, write_quat, write_vec3
 from vd.kernels.rng import next_stream
 from vd.kernels.transforms import canonical, rotation_difference
 
@@ -32,11 +32,7 @@ def teacher_observation_slices(fingers: int) -> dict[str, slice]:
         "fingertips": FINGERTIP_VALUES * fingers,
         "previous_action": joints,
     }
-    slices, start = {}, 0
-    for name, size in sizes.items():
-        slices[name] = slice(start, start + size)
-        start += size
-    return slices
+    return consecutive(sizes)
 
 
 def teacher_observation_size(fingers: int) -> int:
@@ -46,20 +42,13 @@ def teacher_observation_size(fingers: int) -> int:
 
 @wp.struct
 class ObservationParams:
-    """Settings of the observation; an array of length 1 in device memory.
+    """Settings of the observation; an array of length 1 in device memory."""
 
-    velocity_scale: Factor on joint velocities and on the object's angular velocity.
-    noise_mean: Mean of the noise on measured values, in their units.
-    noise_std: Standard deviation of that noise, independent in every value and step.
-    file_axes: Whether orientations in the axes of the object's file are seen: 1, or 0 for zeros.
-    canonical: Whether orientations of object and goal, and the rotation between them, are canonical: 1 or 0.
-    """
-
-    velocity_scale: float
-    noise_mean: float
-    noise_std: float
-    file_axes: float
-    canonical: float
+    velocity_scale: float  # factor on joint velocities and on the object's angular velocity
+    noise_mean: float  # mean of the noise on measured values, in their units
+    noise_std: float  # standard deviation of that noise, independent in every value and step
+    file_axes: float  # whether orientations in the axes of the object's file are seen: 1, or 0 for zeros
+    canonical: float  # whether orientations and the rotation between them are canonical: 1 or 0
 
 
 @wp.func
@@ -71,21 +60,14 @@ def fingertip_pose(body_q: wp.transform, tip_offset: wp.transform) -> wp.transfo
 @wp.kernel
 def fingertip_kernel(
     # Model:
-    tip_body: wp.array[int],
-    tip_offset: wp.array[wp.transform],
+    tip_body: wp.array[int],  # [G] link of each fingertip, an index within a world
+    tip_offset: wp.array[wp.transform],  # [G] fingertip frame in the frame of its link
     # In:
-    body_q_in: wp.array2d[wp.transform],
+    body_q_in: wp.array2d[wp.transform],  # [N, B] link poses in the world frame
     # Out:
-    tip_pos_out: wp.array2d[wp.vec3],
+    tip_pos_out: wp.array2d[wp.vec3],  # [N, G] fingertip positions [m]
 ):
-    """Positions of the fingertips in the world frame. Launch: [N, G].
-
-    Args:
-        tip_body: Link of each fingertip, an index within a world, shape [G].
-        tip_offset: Fingertip frame in the frame of its link, shape [G].
-        body_q_in: Link poses in the world frame, shape [N, B].
-        tip_pos_out: Fingertip positions [m], shape [N, G].
-    """
+    """Positions of the fingertips in the world frame. Launch: [N, G]."""
     world, finger = wp.tid()
     tip = fingertip_pose(body_q_in[world, tip_body[finger]], tip_offset[finger])
     tip_pos_out[world, finger] = wp.transform_get_translation(tip)
@@ -94,26 +76,26 @@ def fingertip_kernel(
 @wp.kernel
 def teacher_observation_kernel(
     # Model:
-    joint_lower: wp.array[float],
-    joint_upper: wp.array[float],
-    tip_body: wp.array[int],
-    tip_offset: wp.array[wp.transform],
-    body_com: wp.array[wp.vec3],
-    params: wp.array[ObservationParams],
+    joint_lower: wp.array[float],  # [D] lower joint limits [rad]
+    joint_upper: wp.array[float],  # [D] upper joint limits [rad]
+    tip_body: wp.array[int],  # [G] link of each fingertip, an index within a world
+    tip_offset: wp.array[wp.transform],  # [G] fingertip frame in the frame of its link
+    body_com: wp.array[wp.vec3],  # [B] centre of mass of each link in its frame [m]
+    params: wp.array[ObservationParams],  # [1] settings
     # In:
-    measured_q_in: wp.array2d[float],
-    measured_qd_in: wp.array2d[float],
-    joint_q_in: wp.array2d[float],
-    joint_qd_in: wp.array2d[float],
-    body_q_in: wp.array2d[wp.transform],
-    body_qd_in: wp.array2d[wp.spatial_vector],
-    goal_quat_in: wp.array[wp.quat],
-    smoothed_in: wp.array2d[float],
-    observation_offset_in: wp.array2d[float],
+    measured_q_in: wp.array2d[float],  # [N, *] positions of the hand's joints as reported [rad]
+    measured_qd_in: wp.array2d[float],  # [N, *] velocities of the hand's joints likewise [rad/s]
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_qd_in: wp.array2d[float],  # [N, D + 6] velocities: joints, object [m/s], its spin [rad/s]
+    body_q_in: wp.array2d[wp.transform],  # [N, B] link poses in the world frame
+    body_qd_in: wp.array2d[wp.spatial_vector],  # [N, B] link velocities: of the centre of mass, angular
+    goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
+    smoothed_in: wp.array2d[float],  # [N, D] previous (smoothed) action
+    observation_offset_in: wp.array2d[float],  # [N, O] constant error of each measured value
     # In/Out:
-    rng: wp.array[wp.uint32],
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    observation_out: wp.array2d[float],
+    observation_out: wp.array2d[float],  # [N, O] observation
 ):
     """Observation of the teacher, columns as in :func:`teacher_observation_slices`. Launch: [N].
 
@@ -122,26 +104,6 @@ def teacher_observation_kernel(
     the previous action are known exactly and get neither. Without ``file_axes`` the orientations of object
     and goal are zeros, without noise. With ``canonical`` the three do not tell a quaternion q from -q, the
     same rotation (:func:`vd.kernels.transforms.canonical`, before noise).
-
-    Args:
-        joint_lower: Lower joint limits [rad], shape [D].
-        joint_upper: Upper joint limits [rad], shape [D].
-        tip_body: Link of each fingertip, an index within a world, shape [G].
-        tip_offset: Fingertip frame in the frame of its link, shape [G].
-        body_com: Centre of mass of each link in its frame [m], shape [B].
-        params: Settings, shape [1].
-        measured_q_in: Positions of the hand's joints as their encoders report them [rad], shape [N, *].
-        measured_qd_in: Velocities of the hand's joints likewise [rad/s], shape [N, *].
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        joint_qd_in: Hand joints [rad/s], object linear [m/s] and angular [rad/s] velocity, shape [N, D + 6].
-        body_q_in: Link poses in the world frame, shape [N, B].
-        body_qd_in: Link velocities in the world frame: linear of the centre of mass [m/s], angular
-            [rad/s], shape [N, B].
-        goal_quat_in: Wanted orientation of the object, shape [N].
-        smoothed_in: Previous (smoothed) action, shape [N, D].
-        observation_offset_in: Constant error of each measured value, shape [N, O].
-        rng: Random stream of each world, shape [N].
-        observation_out: Observation, shape [N, O].
     """
     world = wp.tid()
     settings = params[0]

@@ -13,77 +13,47 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class RandomisationParams:
-    """Ranges of the draws; an array of length 1 in device memory.
+    """Ranges of the draws; an array of length 1 in device memory."""
 
-    friction: Friction coefficient of the hand, and of the object.
-    table_friction: Friction coefficient of the table.
-    link_mass_scale: Factor on each link's mass.
-    object_mass: Mass of the object [kg].
-    action_offset_std: Standard deviation of the constant action error, in action units.
-    observation_offset_std: Standard deviation of the constant error of each observed value.
-    """
-
-    friction: wp.vec2
-    table_friction: wp.vec2
-    link_mass_scale: wp.vec2
-    object_mass: wp.vec2
-    action_offset_std: float
-    observation_offset_std: float
+    friction: wp.vec2  # friction coefficient of the hand, and of the object
+    table_friction: wp.vec2  # friction coefficient of the table
+    link_mass_scale: wp.vec2  # factor on each link's mass
+    object_mass: wp.vec2  # mass of the object [kg]
+    action_offset_std: float  # standard deviation of the constant action error, in action units
+    observation_offset_std: float  # standard deviation of the constant error of each observed value
 
 
 @wp.struct
 class ForceParams:
-    """Settings of the disturbance force; an array of length 1 in device memory.
+    """Settings of the disturbance force; an array of length 1 in device memory."""
 
-    probability: Probability of a new force in a control step.
-    force_per_mass: Magnitude of a new force per mass of the object, c_d [N/kg].
-    decay: Factor on the force in a step without a new one: 0 in the paper, 0.998 in the released code.
-    """
-
-    probability: float
-    force_per_mass: float
-    decay: float
+    probability: float  # probability of a new force in a control step
+    force_per_mass: float  # magnitude of a new force per mass of the object, c_d [N/kg]
+    decay: float  # factor in a step without a new one: 0 in the paper, 0.998 in the released code
 
 
 @wp.kernel
 def draw_dynamics_kernel(
     # Model:
-    nominal_kp: wp.array[float],
-    nominal_kd: wp.array[float],
-    kp_scale: wp.array[wp.vec2],
-    kd_scale: wp.array[wp.vec2],
-    params: wp.array[RandomisationParams],
+    nominal_kp: wp.array[float],  # [D] stiffness before randomisation [N m/rad]
+    nominal_kd: wp.array[float],  # [D] damping before randomisation [N m s/rad]
+    kp_scale: wp.array[wp.vec2],  # [D] range of the factor on the stiffness
+    kd_scale: wp.array[wp.vec2],  # [D] range of the factor on the damping
+    params: wp.array[RandomisationParams],  # [1] ranges
     # In:
-    mask_in: wp.array[int],
+    mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
     # In/Out:
-    rng: wp.array[wp.uint32],
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    kp_out: wp.array2d[float],
-    kd_out: wp.array2d[float],
-    hand_friction_out: wp.array[float],
-    object_friction_out: wp.array[float],
-    table_friction_out: wp.array[float],
-    action_offset_out: wp.array2d[float],
-    observation_offset_out: wp.array2d[float],
+    kp_out: wp.array2d[float],  # [N, D] stiffness [N m/rad], independent per joint
+    kd_out: wp.array2d[float],  # [N, D] damping [N m s/rad], independent per joint
+    hand_friction_out: wp.array[float],  # [N] friction coefficient of all hand shapes
+    object_friction_out: wp.array[float],  # [N] friction coefficient of the object
+    table_friction_out: wp.array[float],  # [N] friction coefficient of the table
+    action_offset_out: wp.array2d[float],  # [N, D] constant action error, action units
+    observation_offset_out: wp.array2d[float],  # [N, O] constant error of each observed value
 ):
-    """Draw gains, frictions and constant errors of the masked worlds (Table S3). Launch: [N].
-
-    Args:
-        nominal_kp: Stiffness before randomisation [N m/rad], shape [D].
-        nominal_kd: Damping before randomisation [N m s/rad], shape [D].
-        kp_scale: Range of the factor on the stiffness, shape [D].
-        kd_scale: Range of the factor on the damping, shape [D].
-        params: Ranges, shape [1].
-        mask_in: 1 where a world is drawn anew, shape [N].
-        rng: Random stream of each world, shape [N].
-        kp_out: Stiffness [N m/rad], independent per joint, shape [N, D].
-        kd_out: Damping [N m s/rad], independent per joint, shape [N, D].
-        hand_friction_out: Friction coefficient of all hand shapes, shape [N].
-        object_friction_out: Friction coefficient of the object, shape [N].
-        table_friction_out: Friction coefficient of the table, shape [N].
-        action_offset_out: Constant action error, action units, shape [N, D].
-        observation_offset_out: Constant error of each observed value, shape [N, O].
-    """
+    """Draw gains, frictions and constant errors of the masked worlds (Table S3). Launch: [N]."""
     world = wp.tid()
     if mask_in[world] == 0:
         return
@@ -110,28 +80,20 @@ def draw_dynamics_kernel(
 @wp.kernel
 def draw_servo_kernel(
     # Model:
-    ranges: wp.array2d[wp.vec2],
+    ranges: wp.array2d[wp.vec2],  # [D, P] range of each parameter of each joint; equal ends draw nothing
     # In:
-    mask_in: wp.array[int],
-    kp_in: wp.array2d[float],
-    kd_in: wp.array2d[float],
+    mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
+    kp_in: wp.array2d[float],  # [N, D] stiffness drawn for the world [N m/rad]
+    kd_in: wp.array2d[float],  # [N, D] damping drawn for the world [N m s/rad]
     # In/Out:
-    rng: wp.array[wp.uint32],
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    parameters_out: wp.array2d[float],
+    parameters_out: wp.array2d[float],  # [N D, P] rows of parameters (:mod:`vd.kernels.servo.actuators`)
 ):
     """Draw the servo model of the joints of the masked worlds, each number for itself. Launch: [N].
 
     But the delays of commands and of readings are of the bus that all joints share: each is drawn once, as
     the same share of every joint's range.
-
-    Args:
-        ranges: Range of each parameter of each joint, shape [D, P]; equal ends draw nothing.
-        mask_in: 1 where a world is drawn anew, shape [N].
-        kp_in: Stiffness drawn for the world [N m/rad], shape [N, D].
-        kd_in: Damping drawn for the world [N m s/rad], shape [N, D].
-        rng: Random stream of each world, shape [N].
-        parameters_out: Rows of parameters (:mod:`vd.kernels.servo.actuators`), shape [N D, P].
     """
     world = wp.tid()
     if mask_in[world] == 0:
@@ -161,26 +123,17 @@ def draw_servo_kernel(
 @wp.kernel
 def draw_restitution_kernel(
     # Model:
-    bounds: wp.vec2,
+    bounds: wp.vec2,  # range of each
     # In:
-    mask_in: wp.array[int],
+    mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
     # In/Out:
-    rng: wp.array[wp.uint32],
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    hand_out: wp.array[float],
-    object_out: wp.array[float],
-    table_out: wp.array[float],
+    hand_out: wp.array[float],  # [N] restitution of all hand shapes
+    object_out: wp.array[float],  # [N] restitution of the object
+    table_out: wp.array[float],  # [N] restitution of the table
 ):
-    """Draw the coefficients of restitution of the masked worlds (Table S3). Launch: [N].
-
-    Args:
-        bounds: Range of each.
-        mask_in: 1 where a world is drawn anew, shape [N].
-        rng: Random stream of each world, shape [N].
-        hand_out: Restitution of all hand shapes, shape [N].
-        object_out: Restitution of the object, shape [N].
-        table_out: Restitution of the table, shape [N].
-    """
+    """Draw the coefficients of restitution of the masked worlds (Table S3). Launch: [N]."""
     world = wp.tid()
     if mask_in[world] == 0:
         return
@@ -197,24 +150,16 @@ def draw_restitution_kernel(
 @wp.kernel
 def draw_masses_kernel(
     # Model:
-    params: wp.array[RandomisationParams],
+    params: wp.array[RandomisationParams],  # [1] ranges
     # In:
-    mask_in: wp.array[int],
+    mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
     # In/Out:
-    rng: wp.array[wp.uint32],
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    link_mass_scale_out: wp.array2d[float],
-    object_mass_out: wp.array[float],
+    link_mass_scale_out: wp.array2d[float],  # [N, L] factor on each link's mass
+    object_mass_out: wp.array[float],  # [N] mass of the object [kg]
 ):
-    """Draw link and object masses of the masked worlds (Table S3). Launch: [N].
-
-    Args:
-        params: Ranges, shape [1].
-        mask_in: 1 where a world is drawn anew, shape [N].
-        rng: Random stream of each world, shape [N].
-        link_mass_scale_out: Factor on each link's mass, shape [N, L].
-        object_mass_out: Mass of the object [kg], shape [N].
-    """
+    """Draw link and object masses of the masked worlds (Table S3). Launch: [N]."""
     world = wp.tid()
     if mask_in[world] == 0:
         return
@@ -231,22 +176,16 @@ def draw_masses_kernel(
 @wp.kernel
 def disturbance_force_kernel(
     # Model:
-    object_mass: wp.array[float],
-    params: wp.array[ForceParams],
+    object_mass: wp.array[float],  # [N] mass of the object [kg]
+    params: wp.array[ForceParams],  # [1] settings
     # In/Out:
-    force: wp.array[wp.vec3],
-    rng: wp.array[wp.uint32],
+    force: wp.array[wp.vec3],  # [N] force at the object's centre of mass, world frame [N]
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
 ):
     """Disturbance force on the object for one control step (Supplementary Methods). Launch: [N].
 
     With the given probability a new force of magnitude c_d m in a uniform random direction; otherwise
     the old one times ``decay``.
-
-    Args:
-        object_mass: Mass of the object [kg], shape [N].
-        params: Settings, shape [1].
-        force: Force at the object's centre of mass, world frame [N], shape [N].
-        rng: Random stream of each world, shape [N].
     """
     world = wp.tid()
     settings = params[0]

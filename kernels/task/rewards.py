@@ -30,63 +30,45 @@ FINGERTIP_MEAN = 1
 
 @wp.struct
 class RewardParams:
-    """Coefficients of the reward; an array of length 1 in device memory.
+    """Coefficients of the reward; an array of length 1 in device memory."""
 
-    success: c1, on reaching the goal (eq. 1).
-    rotation: c2, on 1 / (error + rotation_epsilon) (eq. 2) [rad].
-    rotation_epsilon: epsilon_theta [rad].
-    fingertip: c3, on the distance of fingertips to the object (eq. 3) [1/m^2, or 1/m].
-    fingertip_form: FINGERTIP_SQUARED_SUM or FINGERTIP_MEAN.
-    energy: c4, on the mechanical power of the joints (eq. 4) [1/W].
-    energy_clip: Largest power counted [W]; none if <= 0.
-    fall: c5, on losing the object (eq. 5).
-    table_contact: c6, on touching the table (eq. 7).
-    table_contact_force: Force on the table above which the object touches it [N].
-    fingertip_height: c7, on each fingertip above height_limit (eq. 8).
-    height_limit: World z above which a fingertip is too high [m].
-    progress: Coefficient on the decrease of the rotation error since the last step [1/rad]; not in the paper.
-    lift: Coefficient on the object's clearance over ``lift_height``, at most 1; not in the paper.
-    lift_height: Clearance of the object's lowest point from which more is worth nothing [m].
-    scale: Factor on the sum of all terms.
-    """
-
-    success: float
-    rotation: float
-    rotation_epsilon: float
-    fingertip: float
-    fingertip_form: int
-    energy: float
-    energy_clip: float
-    fall: float
-    table_contact: float
-    table_contact_force: float
-    fingertip_height: float
-    height_limit: float
-    progress: float
-    lift: float
-    lift_height: float
-    scale: float
+    success: float  # c1, on reaching the goal (eq. 1)
+    rotation: float  # c2, on 1 / (error + rotation_epsilon) (eq. 2) [rad]
+    rotation_epsilon: float  # epsilon_theta [rad]
+    fingertip: float  # c3, on the distance of fingertips to the object (eq. 3) [1/m^2, or 1/m]
+    fingertip_form: int  # FINGERTIP_SQUARED_SUM or FINGERTIP_MEAN
+    energy: float  # c4, on the mechanical power of the joints (eq. 4) [1/W]
+    energy_clip: float  # largest power counted [W]; none if <= 0
+    fall: float  # c5, on losing the object (eq. 5)
+    table_contact: float  # c6, on touching the table (eq. 7)
+    table_contact_force: float  # force on the table above which the object touches it [N]
+    fingertip_height: float  # c7, on each fingertip above height_limit (eq. 8)
+    height_limit: float  # world z above which a fingertip is too high [m]
+    progress: float  # coefficient on the decrease of the rotation error [1/rad]; not in the paper
+    lift: float  # coefficient on the object's clearance over ``lift_height``, at most 1; not in the paper
+    lift_height: float  # clearance of the object's lowest point from which more is worth nothing [m]
+    scale: float  # factor on the sum of all terms
 
 
 @wp.kernel
 def reward_kernel(
     # Model:
-    params: wp.array[RewardParams],
+    params: wp.array[RewardParams],  # [1] coefficients
     # In:
-    joint_q_in: wp.array2d[float],
-    joint_qd_in: wp.array2d[float],
-    tip_pos_in: wp.array2d[wp.vec3],
-    effort_in: wp.array2d[float],
-    table_force_in: wp.array[float],
-    clearance_in: wp.array[float],
-    rotation_error_in: wp.array[float],
-    success_in: wp.array[int],
-    fell_in: wp.array[int],
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_qd_in: wp.array2d[float],  # [N, D + 6] velocities: joints, object [m/s], its spin [rad/s]
+    tip_pos_in: wp.array2d[wp.vec3],  # [N, G] fingertip positions, world frame [m]
+    effort_in: wp.array2d[float],  # [N, D] joint torques [N m]
+    table_force_in: wp.array[float],  # [N] magnitude of the object's force on the table [N]
+    clearance_in: wp.array[float],  # [N] height of the object's lowest point above the table's top [m]
+    rotation_error_in: wp.array[float],  # [N] angle between object and goal [rad]
+    success_in: wp.array[int],  # [N] 1 where the goal is reached
+    fell_in: wp.array[int],  # [N] 1 where the object is lost
     # In/Out:
-    previous_error: wp.array[float],
+    previous_error: wp.array[float],  # [N] rotation error of the last step [rad]
     # Out:
-    reward_out: wp.array[float],
-    terms_out: wp.array2d[float],
+    reward_out: wp.array[float],  # [N] reward
+    terms_out: wp.array2d[float],  # [N, 9] terms with their coefficients, without scale, columns REWARD_TERMS
 ):
     """Reward of the state after a control step. Launch: [N], after the success kernel.
 
@@ -95,21 +77,6 @@ def reward_kernel(
     + c7 sum_i [tip_i.z > height_limit] + progress (previous_error - error)
     + lift clamp(clearance / lift_height, 0, 1)).
     ``previous_error`` becomes the present error; the reset kernel starts it anew with each goal.
-
-    Args:
-        params: Coefficients, shape [1].
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        joint_qd_in: Hand joints [rad/s], object linear [m/s] and angular [rad/s] velocity, shape [N, D + 6].
-        tip_pos_in: Fingertip positions, world frame [m], shape [N, G].
-        effort_in: Joint torques [N m], shape [N, D].
-        table_force_in: Magnitude of the object's force on the table [N], shape [N].
-        clearance_in: Height of the object's lowest point above the table's top [m], shape [N].
-        rotation_error_in: Angle between object and goal [rad], shape [N].
-        success_in: 1 where the goal is reached, shape [N].
-        fell_in: 1 where the object is lost, shape [N].
-        previous_error: Rotation error of the last step [rad], shape [N].
-        reward_out: Reward, shape [N].
-        terms_out: Terms with their coefficients, without scale, columns REWARD_TERMS, shape [N, 9].
     """
     world = wp.tid()
     weights = params[0]

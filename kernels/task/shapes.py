@@ -8,7 +8,7 @@ from math import cos, pi, sin
 
 import warp as wp
 
-from vd.kernels.columns import read_quat, read_vec3, write_vec3
+from vd.kernels.columns import consecutive, read_quat, read_vec3, write_vec3
 from vd.kernels.task.observations import fingertip_pose
 
 wp.set_module_options({"enable_backward": False})
@@ -39,12 +39,7 @@ def extent_directions(fingers: int) -> list[tuple[float, float, float]]:
 def shape_observation_slices(fingers: int) -> dict[str, slice]:
     """Columns of each part of the shape's values, counted from the first of them."""
     directions = len(extent_directions(fingers))
-    sizes = {"surface": 3 * fingers, "extent": directions, "goal_extent": directions}
-    slices, start = {}, 0
-    for name, size in sizes.items():
-        slices[name] = slice(start, start + size)
-        start += size
-    return slices
+    return consecutive({"surface": 3 * fingers, "extent": directions, "goal_extent": directions})
 
 
 def shape_observation_size(fingers: int) -> int:
@@ -55,33 +50,20 @@ def shape_observation_size(fingers: int) -> int:
 @wp.kernel
 def surface_kernel(
     # Model:
-    points: wp.array2d[wp.vec3],
-    world_object: wp.array[int],
-    world_scale: wp.array[float],
-    tip_body: wp.array[int],
-    tip_offset: wp.array[wp.transform],
-    object_column: int,
-    first_column: int,
+    points: wp.array2d[wp.vec3],  # [K, P] surface points of each object, object frame [m]
+    world_object: wp.array[int],  # [N] object of each world
+    world_scale: wp.array[float],  # [N] factor on the object's size in each world
+    tip_body: wp.array[int],  # [G] link of each fingertip, an index within a world
+    tip_offset: wp.array[wp.transform],  # [G] fingertip frame in the frame of its link
+    object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
+    first_column: int,  # column of the first value
     # In:
-    joint_q_in: wp.array2d[float],
-    body_q_in: wp.array2d[wp.transform],
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    body_q_in: wp.array2d[wp.transform],  # [N, B] link poses in the world frame
     # Out:
-    observation_out: wp.array2d[float],
+    observation_out: wp.array2d[float],  # [N, O] world vectors [SHAPE_UNIT_M], three columns a finger
 ):
-    """Vector from each fingertip to the nearest point of the object's surface. Launch: [N, G].
-
-    Args:
-        points: Surface points of each object, object frame [m], shape [K, P].
-        world_object: Object of each world, shape [N].
-        world_scale: Factor on the object's size in each world, shape [N].
-        tip_body: Link of each fingertip, an index within a world, shape [G].
-        tip_offset: Fingertip frame in the frame of its link, shape [G].
-        object_column: Column of the object's position in ``joint_q_in``; its quaternion follows.
-        first_column: Column of the first value.
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        body_q_in: Link poses in the world frame, shape [N, B].
-        observation_out: Vectors in the world frame [SHAPE_UNIT_M], three columns a finger, shape [N, O].
-    """
+    """Vector from each fingertip to the nearest point of the object's surface. Launch: [N, G]."""
     world, finger = wp.tid()
     shape = world_object[world]
     scale = world_scale[world]
@@ -113,34 +95,22 @@ def extent(
 @wp.kernel
 def extent_kernel(
     # Model:
-    points: wp.array2d[wp.vec3],
-    world_object: wp.array[int],
-    world_scale: wp.array[float],
-    directions: wp.array[wp.vec3],
-    object_column: int,
-    first_column: int,
+    points: wp.array2d[wp.vec3],  # [K, P] surface points of each object, object frame [m]
+    world_object: wp.array[int],  # [N] object of each world
+    world_scale: wp.array[float],  # [N] factor on the object's size in each world
+    directions: wp.array[wp.vec3],  # [E] unit vectors in the world frame
+    object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
+    first_column: int,  # column of the first value
     # In:
-    joint_q_in: wp.array2d[float],
-    goal_quat_in: wp.array[wp.quat],
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
     # Out:
-    observation_out: wp.array2d[float],
+    observation_out: wp.array2d[float],  # [N, O] E columns now and E at the goal
 ):
     """How far the object extends from its origin along world directions. Launch: [N, 2, E].
 
     The support function max_p direction . (q p) of the surface points, once with the present orientation q
-    and once with the goal's.
-
-    Args:
-        points: Surface points of each object, object frame [m], shape [K, P].
-        world_object: Object of each world, shape [N].
-        world_scale: Factor on the object's size in each world, shape [N].
-        directions: Unit vectors in the world frame, shape [E].
-        object_column: Column of the object's position in ``joint_q_in``; its quaternion follows.
-        first_column: Column of the first value.
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        goal_quat_in: Wanted orientation of the object, shape [N].
-        observation_out: (Extent - EXTENT_CENTRE_M) / SHAPE_UNIT_M, E columns now and E at the goal,
-            shape [N, O].
+    and once with the goal's; written as (extent - EXTENT_CENTRE_M) / SHAPE_UNIT_M.
     """
     world, goal, index = wp.tid()
     shape = world_object[world]
@@ -155,27 +125,17 @@ def extent_kernel(
 @wp.kernel
 def clearance_kernel(
     # Model:
-    points: wp.array2d[wp.vec3],
-    world_object: wp.array[int],
-    world_scale: wp.array[float],
-    object_column: int,
-    table_top: float,
+    points: wp.array2d[wp.vec3],  # [K, P] surface points of each object, object frame [m]
+    world_object: wp.array[int],  # [N] object of each world
+    world_scale: wp.array[float],  # [N] factor on the object's size in each world
+    object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
+    table_top: float,  # height of the table's top, world frame [m]
     # In:
-    joint_q_in: wp.array2d[float],
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
     # Out:
-    clearance_out: wp.array[float],
+    clearance_out: wp.array[float],  # [N] height [m], negative below the top
 ):
-    """Height of the object's lowest point above the table's top, whether it is there or not. Launch: [N].
-
-    Args:
-        points: Surface points of each object, object frame [m], shape [K, P].
-        world_object: Object of each world, shape [N].
-        world_scale: Factor on the object's size in each world, shape [N].
-        object_column: Column of the object's position in ``joint_q_in``; its quaternion follows.
-        table_top: Height of the table's top, world frame [m].
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        clearance_out: Height [m], negative below the top, shape [N].
-    """
+    """Height of the object's lowest point above the table's top, whether it is there or not. Launch: [N]."""
     world = wp.tid()
     orientation = read_quat(world, object_column + 3, joint_q_in)
     down = wp.vec3(0.0, 0.0, -1.0)

@@ -17,25 +17,16 @@ class SuccessParams:
 
     A stillness threshold (joint_speed to action_norm) or fall_distance that is <= 0 asks for nothing;
     infinity does so too.
-
-    rotation: Largest rotation error [rad]; always asked for.
-    joint_speed: Largest norm of the joint velocities [rad/s].
-    object_speed: Largest speed of the object [m/s].
-    object_spin: Largest angular speed of the object [rad/s].
-    action_norm: Largest norm of the smoothed action.
-    table_contact_force: Force on the table above which the object touches it [N].
-    fall_distance: Distance of the object from fall_center at which it is lost [m].
-    fall_center: Centre of the space in which the object is held, world frame [m].
     """
 
-    rotation: float
-    joint_speed: float
-    object_speed: float
-    object_spin: float
-    action_norm: float
-    table_contact_force: float
-    fall_distance: float
-    fall_center: wp.vec3
+    rotation: float  # largest rotation error [rad]; always asked for
+    joint_speed: float  # largest norm of the joint velocities [rad/s]
+    object_speed: float  # largest speed of the object [m/s]
+    object_spin: float  # largest angular speed of the object [rad/s]
+    action_norm: float  # largest norm of the smoothed action
+    table_contact_force: float  # force on the table above which the object touches it [N]
+    fall_distance: float  # distance of the object from fall_center at which it is lost [m]
+    fall_center: wp.vec3  # centre of the space in which the object is held, world frame [m]
 
 
 @wp.func
@@ -47,37 +38,24 @@ def within(value: float, limit: float) -> bool:
 @wp.kernel
 def success_kernel(
     # Model:
-    params: wp.array[SuccessParams],
+    params: wp.array[SuccessParams],  # [1] thresholds
     # In:
-    joint_q_in: wp.array2d[float],
-    joint_qd_in: wp.array2d[float],
-    goal_quat_in: wp.array[wp.quat],
-    smoothed_in: wp.array2d[float],
-    table_force_in: wp.array[float],
-    must_lift_in: wp.array[int],
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_qd_in: wp.array2d[float],  # [N, D + 6] velocities: joints, object [m/s], its spin [rad/s]
+    goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
+    smoothed_in: wp.array2d[float],  # [N, D] smoothed action
+    table_force_in: wp.array[float],  # [N] magnitude of the object's force on the table [N]
+    must_lift_in: wp.array[int],  # [N] 1 where the object must not touch the table for success
     # Out:
-    rotation_error_out: wp.array[float],
-    still_out: wp.array[int],
-    success_out: wp.array[int],
-    fell_out: wp.array[int],
+    rotation_error_out: wp.array[float],  # [N] angle between object and goal [rad]
+    still_out: wp.array[int],  # [N] 1 where all of success holds but the rotation's threshold
+    success_out: wp.array[int],  # [N] 1 where the goal is reached
+    fell_out: wp.array[int],  # [N] 1 where the object is lost
 ):
     """Success and fall of the state after a control step. Launch: [N].
 
     Success: the rotation error and all speeds are at most their thresholds, without contact with the table
     where that is asked for. Fall: the object's distance from fall_center is at least fall_distance.
-
-    Args:
-        params: Thresholds, shape [1].
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        joint_qd_in: Hand joints [rad/s], object linear [m/s] and angular [rad/s] velocity, shape [N, D + 6].
-        goal_quat_in: Wanted orientation of the object, shape [N].
-        smoothed_in: Smoothed action, shape [N, D].
-        table_force_in: Magnitude of the object's force on the table [N], shape [N].
-        must_lift_in: 1 where the object must not touch the table for success, shape [N].
-        rotation_error_out: Angle between object and goal [rad], shape [N].
-        still_out: 1 where all of success holds but the rotation's threshold, shape [N].
-        success_out: 1 where the goal is reached, shape [N].
-        fell_out: 1 where the object is lost, shape [N].
     """
     world = wp.tid()
     limits = params[0]

@@ -17,29 +17,20 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def choose_frame_kernel(
     # Model:
-    sector: wp.array[wp.vec3],
-    object_column: int,
+    sector: wp.array[wp.vec3],  # [V] the fixed direction as each frame turns it back
+    object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
     # In:
-    reset_in: wp.array[int],
-    new_goal_in: wp.array[int],
-    joint_q_in: wp.array2d[float],
-    goal_quat_in: wp.array[wp.quat],
+    reset_in: wp.array[int],  # [N] 1 where the world was reset
+    new_goal_in: wp.array[int],  # [N] 1 where only the goal is new
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
     # In/Out:
-    frame: wp.array[int],
+    frame: wp.array[int],  # [N] symmetry frame of each environment
 ):
     """Choose the frame of every environment that has a new goal, and keep it until the next. Launch: [N].
 
     It is the frame that turns the axis of the rotation to the goal nearest to one fixed direction. Chosen
     once for a goal: an axis of small rotations wanders, and fingers would change their parts with it.
-
-    Args:
-        sector: The fixed direction as each frame turns it back, shape [V].
-        object_column: Column of the object's position in ``joint_q_in``; its quaternion follows.
-        reset_in: 1 where the world was reset, shape [N].
-        new_goal_in: 1 where only the goal is new, shape [N].
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        goal_quat_in: Wanted orientation of the object, shape [N].
-        frame: Symmetry frame of each environment, shape [N].
     """
     world = wp.tid()
     if reset_in[world] == 0 and new_goal_in[world] == 0:
@@ -58,25 +49,16 @@ def choose_frame_kernel(
 @wp.kernel
 def frame_observation_kernel(
     # Model:
-    source: wp.array3d[int],
-    factor: wp.array3d[float],
-    offset: wp.array2d[float],
+    source: wp.array3d[int],  # [V, O, T] values of the world frame that make each value of a frame
+    factor: wp.array3d[float],  # [V, O, T] their factors
+    offset: wp.array2d[float],  # [V, O] what is added to their sum
     # In:
-    frame_in: wp.array[int],
-    world_in: wp.array2d[float],
+    frame_in: wp.array[int],  # [N] symmetry frame of each environment
+    world_in: wp.array2d[float],  # [N, O] observation in the world frame
     # Out:
-    observation_out: wp.array2d[float],
+    observation_out: wp.array2d[float],  # [N, O] observation in the frame
 ):
-    """Observations as the frames show them. Launch: [N, O].
-
-    Args:
-        source: Values of the world frame that make each value of a frame, shape [V, O, T].
-        factor: Their factors, shape [V, O, T].
-        offset: What is added to their sum, shape [V, O].
-        frame_in: Symmetry frame of each environment, shape [N].
-        world_in: Observation in the world frame, shape [N, O].
-        observation_out: Observation in the frame, shape [N, O].
-    """
+    """Observations as the frames show them. Launch: [N, O]."""
     world, column = wp.tid()
     k = frame_in[world]
     value = offset[k, column]
@@ -88,23 +70,15 @@ def frame_observation_kernel(
 @wp.kernel
 def world_action_kernel(
     # Model:
-    source: wp.array2d[int],
-    sign: wp.array2d[float],
+    source: wp.array2d[int],  # [V, D] joint of the frame that is each joint of the world
+    sign: wp.array2d[float],  # [V, D] -1 where that joint turns the other way, else 1
     # In:
-    frame_in: wp.array[int],
-    action_in: wp.array2d[float],
+    frame_in: wp.array[int],  # [N] symmetry frame of each environment
+    action_in: wp.array2d[float],  # [N, D] action in the frame
     # Out:
-    action_out: wp.array2d[float],
+    action_out: wp.array2d[float],  # [N, D] action in the world; not ``action_in``
 ):
-    """Actions of frames, by the fingers' names in the world. Launch: [N, D].
-
-    Args:
-        source: Joint of the frame that is each joint of the world, shape [V, D].
-        sign: -1 where that joint turns the other way, else 1, shape [V, D].
-        frame_in: Symmetry frame of each environment, shape [N].
-        action_in: Action in the frame, shape [N, D].
-        action_out: Action in the world, shape [N, D]; not ``action_in``.
-    """
+    """Actions of frames, by the fingers' names in the world. Launch: [N, D]."""
     world, joint = wp.tid()
     k = frame_in[world]
     action_out[world, joint] = sign[k, joint] * action_in[world, source[k, joint]]

@@ -95,9 +95,6 @@ def total(out, position, speed):
     return spring - out[..., DAMPING] * speed + out[..., TORQUE]
 
 
-# --- The plain model ---
-
-
 @EXAMPLES
 @given(
     numbers=st.tuples(*[floats(-2, 2, width=32)] * 3),
@@ -139,11 +136,6 @@ def test_the_table_names_every_column_once():
         assert p.neutral >= 0.0, p
 
 
-# --- The command ---
-
-
-# --- The motor ---
-
 MOTOR = {
     "SUPPLY_SAG": lambda wanted, p, v, t: wanted / (1 + p * abs(wanted)),
     "THERMAL_RATE": lambda wanted, p, v, t: wanted * np.exp(-p * t),
@@ -166,9 +158,3 @@ def test_a_loss_of_the_motor_is_its_formula(device, stage, size, error, speed, s
     expected = MOTOR[stage](wanted, size, speed, (steps - 1) * DT)
     assert total(out, 0.0, speed)[0, -1] == pytest.approx(expected, rel=1e-3, abs=1e-5)
     assert out[0, -1, DAMPING] >= 0.0 and out[0, -1, STIFFNESS] >= 0.0
-
-
-# --- Friction ---
-
-
-# --- The load ---

@@ -54,22 +54,12 @@ def test_commands_act_at_irregular_stamps(device):
 def test_jitter_delays_by_half_a_normal_on_average_and_is_smooth_in_its_size(device):
     time = np.arange(0, 20.0, 0.25)
     command = np.where(np.arange(len(time)) % 2 == 0, 0.0, 1.0)
-    fine = np.arange(0, 20.0, 0.005)
-    held = command[np.searchsorted(time, fine + 1e-9, side="right") - 1]
-    # Writes with every sample would each have their draw; only those that change the command are sent.
     sigma = 0.03
     rows = rows_of({}, {servo.JITTER_SIGMA: sigma}, {servo.JITTER_SIGMA: 1.001 * sigma})
     many = roll(device, rows, time, np.tile(command[None, :, None], (50, 1, 1)), np.zeros((50, 1)))[..., 0]
     plain, jittered, nudged = many
-    assert held.shape == fine.shape
     # Mean position at the next stamp, linearised: the delay of each command moves the answer back.
-    shifted = roll(
-        device,
-        rows_of({servo.COMMAND_DELAY: sigma * np.sqrt(2 / np.pi)}),
-        time,
-        command[None, :, None],
-        np.zeros((1, 1)),
-    )[0, 0, :, 0]
+    shifted = one_joint(device, rows_of({servo.COMMAND_DELAY: sigma * np.sqrt(2 / np.pi)}), time, command)[0]
     np.testing.assert_allclose(jittered.mean(axis=0)[10:], shifted[10:], atol=0.015)
     assert np.abs(jittered - plain).max() > 0.03
     assert not np.allclose(jittered[0], jittered[1], atol=1e-3), "trajectories share their draws"

@@ -38,7 +38,7 @@ def grids(draw):
 
 def sites(cells, device, level):
     """Keys and rows (cloud, x, y, z) of a level."""
-    keys = voxelise(device_array(cells + 0.5, wp.vec3, device), 1.0)
+    keys, _ = voxelise(device_array(cells + 0.5, wp.vec3, device), 1.0)
     for _ in range(level):
         keys, _ = coarsen(keys)
     return keys, coordinates(keys, level).numpy()

@@ -19,9 +19,9 @@ from scipy import stats
 from scipy.spatial.transform import Rotation, Slerp
 
 from vd.kernels.sensor.depth_sensor import DepthSensorParams, delay_poses_kernel, measure_depth_kernel
-from vd.sensors.cfg import D415
+from vd.sensors.cfg import BASELINE_M, FOCAL_PX
 
-FB = D415.focal_px * D415.baseline_m
+FB = FOCAL_PX * BASELINE_M
 MAX_RANGE = 1.5
 OFF = {
     "depth_disparity": FB,

@@ -14,7 +14,6 @@ from vd.kernels.sparse.voxels import (
     draw_noise,
     voxel_key_kernel,
     voxelise,
-    voxelise_marked,
 )
 
 SIZE = 0.005
@@ -48,7 +47,7 @@ def expected_voxels(points, size):
 
 
 def voxels(points, device, size=1.0, noise=None):
-    keys = voxelise(device_array(points, wp.vec3, device), size, noise)
+    keys, _ = voxelise(device_array(points, wp.vec3, device), size, noise)
     return coordinates(keys).numpy(), keys
 
 
@@ -67,9 +66,8 @@ def test_voxels_are_the_set_of_floors(device, points):
 @given(points=clouds(), data=st.data())
 def test_marks_name_the_groups_whose_points_a_voxel_holds(device, points, data):
     ends = sorted(data.draw(st.lists(st.integers(0, points.shape[1]), min_size=1, max_size=3)))
-    keys, marks = voxelise_marked(
-        device_array(points, wp.vec3, device), 1.0, device_array(np.array(ends, np.int32), int, device)
-    )
+    groups = device_array(np.array(ends, np.int32), int, device)
+    keys, marks = voxelise(device_array(points, wp.vec3, device), 1.0, ends=groups)
     rows = [tuple(row) for row in coordinates(keys).numpy()]
     np.testing.assert_array_equal(keys.numpy(), voxels(points, device)[1].numpy())
     expected = np.zeros((len(rows), len(ends)))

@@ -1,4 +1,4 @@
-"""``vd-bench``: measure speed, physics, depth, student and gap workflow; rates are ratios within one run."""
+"""``vd-bench``: measure speed, physics, depth camera and gap workflow; rates are ratios within one run."""
 
 import dataclasses
 import json
@@ -42,50 +42,30 @@ class SimCommand:
     """Warp device; auto is the first GPU, or else the CPU."""
     policy: str = "dclaw4-table"
     """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
-    allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Also step Newton's own Allegro example with as many environments; it downloads its hand (17.8 MB)."""
     json: Path | None = None
     """Write the rows to this file as JSON."""
 
     def run(self) -> int:
         """Measure and print."""
-        from vd.evaluate.agents import open_teacher
+        from vd.evaluate.agents import open_teacher, trained_task
 
         device = resolve_device(self.device)
         teacher = open_teacher(self.policy, device)
         if teacher is None:
             raise ValueError(f"--policy {self.policy} has no network; give a teacher")
         quiet_warp()
-        report((self._row(envs, device, teacher) for envs in self.envs), device, self.json)
+        from vd.bench.sim import measure
+
+        task = dataclasses.replace(trained_task(teacher), objects=self.objects)
+        tasks = (dataclasses.replace(task, num_envs=envs) for envs in self.envs)
+        rows = (measure(cfg, device, teacher=teacher) for cfg in tasks)
+        report(map(dataclasses.asdict, rows), device, self.json)
         return 0
-
-    def _row(self, envs: int, device: str, teacher: Any) -> dict[str, Any]:
-        from vd.bench.allegro import allegro_rate
-        from vd.bench.sim import measure, teacher_task
-
-        cfg = teacher_task(teacher, self.objects, envs)
-        row: dict[str, Any] = dataclasses.asdict(measure(cfg, device, teacher=teacher))
-        if not self.allegro:
-            return row
-        try:
-            beside = allegro_rate(envs, device)
-        except RuntimeError as error:
-            return row | {"allegro": str(error)}
-        ratio = row["physics_only"] * cfg.sim.substeps / beside.physics_steps_s
-        return row | {
-            "allegro_physics_steps_s": beside.physics_steps_s,
-            "allegro_dt_s": beside.dt_s,
-            "physics_steps_over_allegro": ratio,
-        }
-
-
-RESTITUTIONS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-"""Coefficients asked for when the map to rebounds is measured."""
 
 
 @dataclass(frozen=True)
 class PhysicsCommand:
-    """Contact quality: objects at rest, a pinched cube, sliding against Coulomb's law, a bouncing ball."""
+    """Contact quality: objects at rest, a pinched cube."""
 
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets to drop on the table."""
@@ -100,23 +80,18 @@ class PhysicsCommand:
         """Measure and print."""
         quiet_warp()
         from vd.assets_usd.objects.sets import load_set
-        from vd.bench.physics import bounce, pinch, rest, slide
+        from vd.bench.physics import pinch, rest
         from vd.sim.cfg import SimCfg
 
         cfg = SimCfg()
         results = rest(load_set(list(self.objects)), cfg, device=self.device, seed=self.seed)
         moving = [r for r in results if not r.rests]
-        measured, coulomb = slide(cfg, device=self.device)
         row = {
             "objects": len(results),
             "at_rest_share": 1.0 - len(moving) / len(results),
             "deepest_contact_m": max(r.penetration for r in results),
             "moving": [dataclasses.asdict(r) for r in moving],
             "pinch": dataclasses.asdict(pinch(load_set("cube")[0], cfg, device=self.device)),
-            "slide_m": measured,
-            "slide_coulomb_m": coulomb,
-            "slide_bouncing_m": slide(cfg, device=self.device, restitution=1.0)[0],
-            "bounce": [dataclasses.asdict(bounce(cfg, e, device=self.device)) for e in RESTITUTIONS],
         }
         report([row], self.device, self.json)
         return 0
@@ -152,54 +127,6 @@ class DepthCommand:
 
 
 @dataclass(frozen=True)
-class StudentCommand:
-    """Latency of a camera policy's control step on the CPU."""
-
-    networks: tuple[str, ...] = ("lean", "dclaw4-tracking")
-    """Camera policies, installed ones by name, or their files; or presets of students."""
-    objects: tuple[str, ...] = ("procedural-150-seed0",)
-    """Object sets, of which the first object lies on the table."""
-    hand: str = "dclaw4"
-    """Hand of a preset."""
-    threads: int = 2
-    """Threads of torch."""
-    calls: int = 300
-    """Control steps to time."""
-    seed: int = 0
-    """Of poses and weights."""
-    json: Path | None = None
-    """Write the rows to this file as JSON."""
-
-    def run(self) -> int:
-        """Measure and print."""
-        from vd.evaluate.agents import find_policy, open_policy
-        from vd.vision.cfg import PRESETS
-
-        for name in (name for name in self.networks if name not in PRESETS):
-            try:
-                find_policy(name)
-            except FileNotFoundError as error:
-                raise ValueError(
-                    f"--networks {name}: no such preset or policy; choose of {', '.join(PRESETS)}, or give "
-                    "a camera policy"
-                ) from error
-            open_policy(name, "cpu")  # a file that cannot be used is told before anything slow
-        quiet_warp()
-        from vd.assets_usd.objects.sets import load_set
-        from vd.bench.student import measure_latency
-
-        objects = load_set(list(self.objects))
-        rows = (
-            measure_latency(
-                objects, name, hand=self.hand, threads=self.threads, calls=self.calls, seed=self.seed
-            )
-            for name in self.networks
-        )
-        report(map(dataclasses.asdict, rows), "cpu", self.json)
-        return 0
-
-
-@dataclass(frozen=True)
 class ReplayCommand:
     """Replay the control step in which a state left the finite numbers, physics step by physics step."""
 
@@ -210,6 +137,8 @@ class ReplayCommand:
 
     def run(self) -> int:
         """Replay and print."""
+        if not self.dump.is_file():
+            raise ValueError(f"there is no file {self.dump}; give the dump that the stopped run has named")
         quiet_warp()
         from vd.sim.replay import replay
 
@@ -222,14 +151,14 @@ class ReplayCommand:
 class GapCommand:
     """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
 
-    One result file per case: run it again to go on. Give --shard on each machine, bring the files together,
-    and --collect makes the figures.
+    One result file per case: run it again to go on. Several machines take different kinds; once their files
+    are together, a run of all kinds prints the tables.
     """
 
     out: Path = Path("runs/gap-battery")
-    """Folder of the results, their figures (summary.json) and tables (summary.md)."""
+    """Folder of the results and their tables (summary.md)."""
     model: str = "dclaw3"
-    """dclaw3 or dclaw4 (one finger), or servo or pendulum, which are quick."""
+    """dclaw3 or dclaw4 (one finger), or servo, which is quick."""
     kinds: tuple[str, ...] = ("single", "none", "pair", "outside")
     """Kinds of cases."""
     effects: tuple[str, ...] = ()
@@ -237,31 +166,24 @@ class GapCommand:
     sizes: tuple[int, ...] = (0, 1, 2, 3)
     """Sizes of single effects: gaps of about 1.5, 3, 6 and 12 noise floors."""
     seeds: int = 5
-    """Recordings of each effect and size."""
+    """Recordings of each effect and size; 40 times as many with nothing hidden, or only another stiffness,
+    damping or mass."""
     first_seed: int = 0
-    """Seed of the first recording: other seeds than those that the method was tuned on."""
-    nothing: int = 200
-    """Recordings with nothing hidden, or only other stiffness, damping and mass."""
-    pairs: int | None = None
-    """Pairs of effects, drawn at random; all by default."""
-    shard: str = "1/1"
-    """Part i/n of the cases, for n machines."""
+    """Seed of the first recording: others than those that the method was tuned on."""
+    cases: int | None = None
+    """Run this many of the cases, a fair sample; all by default."""
     jobs: int = 1
     """Cases at a time, one process and one thread each."""
-    limit_s: float = 1800.0
-    """Longest time of a case [s]; one that takes longer has failed."""
     device: str = "cpu"
     """Warp device."""
-    collect: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Run nothing; figures of the results that are there."""
     keep: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Keep recordings and analyses."""
 
     def run(self) -> int:
         """Run the cases, then write and print the tables."""
-        from vd.bench.gap import battery, collect, parse_shard, run_battery
-        from vd.bench.gap_score import markdown, summary
-        from vd.files import write_json, write_text
+        from vd.bench.gap import battery, run_battery
+        from vd.bench.gap_score import markdown
+        from vd.files import write_text
 
         cases = battery(
             self.model,
@@ -270,25 +192,9 @@ class GapCommand:
             sizes=self.sizes,
             seeds=self.seeds,
             first_seed=self.first_seed,
-            nothing=self.nothing,
-            pairs=self.pairs,
-        )
-        if not self.collect:
-            device = resolve_device(self.device)
-            shard = parse_shard(self.shard)
-            run_battery(
-                cases,
-                self.out,
-                shard=shard,
-                jobs=max(self.jobs, 1),
-                device=device,
-                keep=self.keep,
-                limit_s=self.limit_s,
-            )
-        results = collect(self.out)
-        if not results:
-            raise ValueError(f"{self.out} holds no results; run the battery without --collect first")
-        write_json(self.out / "summary.json", summary(results))
+        )[: self.cases]
+        device = resolve_device(self.device)
+        results = run_battery(cases, self.out, jobs=max(self.jobs, 1), device=device, keep=self.keep)
         write_text(self.out / "summary.md", markdown(results))
         print(markdown(results))
         return 0
@@ -298,7 +204,6 @@ Command = (
     Annotated[SimCommand, tyro.conf.subcommand("sim")]
     | Annotated[PhysicsCommand, tyro.conf.subcommand("physics")]
     | Annotated[DepthCommand, tyro.conf.subcommand("depth")]
-    | Annotated[StudentCommand, tyro.conf.subcommand("student")]
     | Annotated[GapCommand, tyro.conf.subcommand("gap")]
     | Annotated[ReplayCommand, tyro.conf.subcommand("replay")]
 )
@@ -307,6 +212,10 @@ Command = (
 @interrupt.command("vd-bench")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-bench``; returns the exit status."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["student"]:
+        print("vd-bench: 'student' is no more: vd-deploy POLICY --twin tells its times", file=sys.stderr)
+        return interrupt.USAGE_ERROR
     command = tyro.cli(Command, args=arguments, prog="vd-bench", description=__doc__)
     if isinstance(command, GapCommand):
         check_folder(command.out)

@@ -19,7 +19,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.bench.sim import captured, seconds_per_call
 from vd.paper import PAPER
-from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import Scene, build_scene
@@ -55,8 +55,6 @@ class DepthRow:
     """Ours, depth images alone."""
     clouds: float
     """Ours with a cloud of each image."""
-    with_sensor: float
-    """Ours with a cloud and every error of the sensor."""
     images_over_newton: float
     """Ours over Newton's, images alone."""
     points: float
@@ -159,11 +157,7 @@ def measure(
     camera = scene.hand.camera
 
     rates = []
-    for cfg in (
-        DepthCameraCfg(points=0),
-        DepthCameraCfg(),
-        DepthCameraCfg(sensor=DepthSensorCfg.realistic()),
-    ):
+    for cfg in (DepthCameraCfg(points=0), DepthCameraCfg()):
         ours = DepthCamera.of_scene(scene, body_q, cfg)
         ours.capture()
         rates.append(rate(envs, captured(ours.capture, device), device))
@@ -187,7 +181,6 @@ def measure(
         newton=newton_rate,
         images=rates[0],
         clouds=rates[1],
-        with_sensor=rates[2],
         images_over_newton=rates[0] / newton_rate,
         points=points,
         different=float(np.mean(np.abs(reference - depth) > SAME_DEPTH_M)),

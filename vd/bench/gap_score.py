@@ -2,8 +2,9 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ import numpy as np
 from vd.bench.gap_sizes import sized_effect
 from vd.bench.hidden_plant import CABLE, COGGING, WARMING
 from vd.bench.hide import Hiding
-from vd.gap.recording import BARE_MODELS
 from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 
 KINDS = ("single", "none", "pair", "outside")
@@ -76,7 +76,7 @@ class Case:
 
 
 def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, Any]:
-    """Compare a report (``vd-gap-report/1``) with the truth.
+    """Compare a report (``vd-gap-report/1``), in the truth's unit of torque, with the truth.
 
     Returns:
         The case; verdict; names and sets given; which are right and wrong; gaps in noise floors; relative
@@ -117,7 +117,7 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
         "gap": _ratio(report["baseline"]["rmse_rad"], floor),
         "left": _ratio(held_out["identified_rmse_rad"], floor),
         "shrunk": _ratio(held_out["baseline_rmse_rad"], held_out["identified_rmse_rad"]),
-        "parameters": _parameters(case, report, truth),
+        "parameters": _parameters(report, truth),
         "seconds": report["seconds"],
     }
 
@@ -126,16 +126,15 @@ def _ratio(a: float | None, b: float | None) -> float | None:
     return a / b if a is not None and b else None
 
 
-def _parameters(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _parameters(report: Mapping[str, Any], truth: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Relative error and coverage of every parameter of every effect named rightly, joint by joint."""
     rows = []
     for effect in report["effects"]:
         hidden = truth["effects"].get(effect["name"])
         if hidden is None or effect["name"] not in EFFECTS:
             continue
-        units = {p.name: p.unit for p in EFFECTS[effect["name"]].parameters}
         for joint, (key, estimate) in itertools.product(effect["joints"], effect["parameters"].items()):
-            true = hidden["parameters"][key][joint] * _torque_unit(case, report, truth, joint, units[key])
+            true = hidden["parameters"][key][joint]
             low, high = estimate["ci95"]
             if not true or estimate["value"] is None:
                 continue  # a parameter that is not hidden has no relative error
@@ -150,22 +149,6 @@ def _parameters(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any])
     return rows
 
 
-def _torque_unit(
-    case: Case, report: Mapping[str, Any], truth: Mapping[str, Any], joint: str, unit: str
-) -> float:
-    """True torques in the report's unit of torque.
-
-    Of a bare servo every torque is known up to one factor only, and the fit holds the stiffness at its
-    nominal value; the other torques follow.
-    """
-    if case.model not in BARE_MODELS or not ("N m" in unit or "kg" in unit):
-        return 1.0
-    factor = report["identified"]["parameters"][joint].get("kp", math.nan) / truth["base"]["kp"][joint]
-    if not math.isfinite(factor):
-        return 1.0
-    return 1.0 / factor if unit == "1/(N m)" else factor
-
-
 def said(result: Mapping[str, Any]) -> str:
     """The names and sets of a result in a few words."""
     sets = [" or ".join(group) for group in result["sets"]]
@@ -178,72 +161,100 @@ class Figure:
 
     Attributes:
         what: In words.
-        goal: Bound, in words.
-        value: Measured; None if no case says anything.
-        cases: Cases behind it.
-        reached: Whether the value is within the bound.
+        value: Share of cases in [0, 1], or a median; None if no case says anything.
+        cases: Values behind it.
+        least: Goal: at least this; None: no bound.
+        most: Goal: at most this; None: no bound.
         share: Whether the value is a share of cases.
     """
 
     what: str
-    goal: str
     value: float | None
     cases: int
-    reached: bool | None
+    least: float | None = None
+    most: float | None = None
     share: bool = False
 
     @property
-    def text(self) -> str:
-        """The value, a share in percent."""
-        if self.value is None:
-            return "-"
-        return f"{100 * self.value:.1f} %" if self.share else f"{self.value:.3g}"
+    def reached(self) -> bool | None:
+        """Whether the value is within its bounds; None without bounds or value."""
+        if self.value is None or self.least is self.most is None:
+            return None
+        low = -math.inf if self.least is None else self.least
+        return low <= self.value <= (math.inf if self.most is None else self.most)
+
+    def row(self) -> str:
+        """A row of a table."""
+
+        def text(value: float | None) -> str:
+            return "-" if value is None else f"{100 * value:.1f} %" if self.share else f"{value:.3g}"
+
+        goal = [f"{sign} {text(bound)}" for sign, bound in ((">=", self.least), ("<=", self.most))
+                if bound is not None]  # fmt: skip
+        reached = {True: "yes", False: "no", None: ""}[self.reached]
+        return f"| {self.what} | {', '.join(goal)} | {text(self.value)} | {self.cases} | {reached} |"
 
 
-def figures(results: Iterable[Mapping[str, Any]]) -> list[Figure]:
+Results = Sequence[Mapping[str, Any]]
+
+
+def figures(results: Results) -> list[Figure]:
     """The goals' figures over all results, failed cases counted against them."""
-    everything = list(results)
+    single, none, pair, outside = ([r for r in results if r["case"]["kind"] == kind] for kind in KINDS)
+    single = [r for r in single if "error" in r or (r["gap"] or 0.0) >= CLEAR_GAP]
+    good = [r for r in single if "error" not in r]
+    parameters = [row for r in good if r["case"]["effects"][0] in r["named"] for row in r["parameters"]]
 
-    def of(kind: str) -> list[Mapping[str, Any]]:
-        return [r for r in everything if r["case"]["kind"] == kind]
+    def values(key: str, among: Results = good) -> list[float]:
+        return [r[key] for r in among if r.get(key) is not None]
 
-    def clear(result: Mapping[str, Any]) -> bool:
-        return "error" in result or (result["gap"] or 0.0) >= CLEAR_GAP
-
-    single = [r for r in of("single") if clear(r)]
-    named = [r for r in single if "error" not in r and r["case"]["effects"][0] in r["named"]]
-    parameters = [row for r in named for row in r["parameters"]]
-    none, pair, outside = of("none"), of("pair"), of("outside")
-    both = [r for r in pair if shows(r)]
     return [
-        _share("first name right", ">= 95 %", single, _first_right, least=0.95),
-        _share("right, or in the named set", ">= 99 %", single, lambda r: not r["missed"], least=0.99),
-        _median("size of the set", "1", [_set_size(r) for r in single if "error" not in r], most=1.0),
-        _share("single: a wrong name", "", single, lambda r: bool(r["false"])),
-        _share("nothing hidden: a false name", "<= 2 %", none, lambda r: bool(r["false"]), most=0.02),
-        _share("nothing hidden: any name at all (mass included)", "", none, lambda r: bool(r["named"])),
-        _share("two hidden: both named", ">= 80 %", pair, _all_named, least=0.8),
-        _share("two hidden: one or both, none wrong", ">= 98 %", pair, _one_and_none_wrong, least=0.98),
-        _share("both show: both named", ">= 80 %", both, _all_named, least=0.8),
-        _share("both show: one or both, none wrong", ">= 98 %", both, _one_and_none_wrong, least=0.98),
-        _share("outside: unknown or neighbours", ">= 90 %", outside, _unknown_or_near, least=0.9),
-        _share("outside: a confident wrong name", "<= 2 %", outside, lambda r: bool(r["false"]), most=0.02),
-        _median("relative error of parameters", "<= 0.1", [row["error"] for row in parameters], most=0.1),
-        _between("95 % intervals that cover", "90-98 %", [row["covered"] for row in parameters], 0.9, 0.98),
-        _median("held-out gap: times smaller", ">= 5", _values(single, "shrunk"), least=5.0),
-        _median("held-out gap: noise floors left", "<= 1.3", _values(single, "left"), most=1.3),
-        _median("seconds a recording", "", _values(everything, "seconds")),
-        _share("cases that failed to run", "0", everything, lambda r: False, most=0.0, error=True),
+        _share("first name right", single, _first_right, least=0.95),
+        _share("right, or in the named set", single, lambda r: not r["missed"], least=0.99),
+        _median("size of the set", [_set_size(r) for r in good], most=1.0),
+        _share("single: a wrong name", single, _any_false),
+        _share("nothing hidden: a false name", none, _any_false, most=0.02),
+        _share("nothing hidden: any name at all (mass included)", none, lambda r: bool(r["named"])),
+        _share("two hidden: both named", pair, _all_named, least=0.8),
+        _share("two hidden: one or both, none wrong", pair, _one_and_none_wrong, least=0.98),
+        _share("outside: unknown or neighbours", outside, _unknown_or_near, least=0.9),
+        _share("outside: a confident wrong name", outside, _any_false, most=0.02),
+        _median("relative error of parameters", [row["error"] for row in parameters], most=0.1),
+        _rate("95 % intervals that cover", [row["covered"] for row in parameters], least=0.9, most=0.98),
+        _median("held-out gap: times smaller", values("shrunk"), least=5.0),
+        _median("held-out gap: noise floors left", values("left"), most=1.3),
+        _median("seconds a recording", values("seconds", results)),
+        _rate("cases that failed to run", ["error" in r for r in results], most=0.0),
     ]
 
 
-def _values(results: Iterable[Mapping[str, Any]], key: str) -> list[float]:
-    return [r[key] for r in results if r.get(key) is not None]
+def _rate(
+    what: str, hits: Sequence[bool], *, least: float | None = None, most: float | None = None
+) -> Figure:
+    return Figure(what, float(np.mean(hits)) if hits else None, len(hits), least, most, share=True)
 
 
-def shows(result: Mapping[str, Any]) -> bool:
-    """Whether each effect of a pair leaves a clear gap beside the other; unknown counts as that."""
-    return all(gap >= CLEAR_GAP for gap in result.get("beside", {}).values())
+def _share(
+    what: str,
+    results: Results,
+    says: Callable[[Mapping[str, Any]], bool],
+    *,
+    least: float | None = None,
+    most: float | None = None,
+) -> Figure:
+    """Share of cases; one that failed counts against the goal."""
+    hits = [most is not None if "error" in r else says(r) for r in results]
+    return _rate(what, hits, least=least, most=most)
+
+
+def _median(
+    what: str, values: Sequence[float], *, least: float | None = None, most: float | None = None
+) -> Figure:
+    return Figure(what, float(np.median(values)) if values else None, len(values), least, most)
+
+
+def _any_false(result: Mapping[str, Any]) -> bool:
+    return bool(result["false"])
 
 
 def _first_right(result: Mapping[str, Any]) -> bool:
@@ -254,7 +265,7 @@ def _first_right(result: Mapping[str, Any]) -> bool:
 
 def _conventional(result: Mapping[str, Any]) -> bool:
     """What is hidden is named by the effect that stands for it, and by nothing else."""
-    return bool(result.get("by_convention")) and len(result["named"]) == len(result["case"]["effects"])
+    return bool(result["by_convention"]) and len(result["named"]) == len(result["case"]["effects"])
 
 
 def _set_size(result: Mapping[str, Any]) -> float:
@@ -267,7 +278,7 @@ def _set_size(result: Mapping[str, Any]) -> float:
 
 def _found(result: Mapping[str, Any]) -> set[str]:
     """Hidden effects that are named, by convention too."""
-    return set(result["case"]["effects"]) & {*result["named"], *result.get("by_convention", ())}
+    return set(result["case"]["effects"]) & {*result["named"], *result["by_convention"]}
 
 
 def _all_named(result: Mapping[str, Any]) -> bool:
@@ -285,116 +296,23 @@ def _unknown_or_near(result: Mapping[str, Any]) -> bool:
     return not result["false"] and (result["verdict"] in ("unknown", "no_gap", "under_excited") or sets_near)
 
 
-def _figure(
-    what: str, goal: str, value: float | None, cases: int, least: float | None, most: float | None
-) -> Figure:
-    if value is None or (least is None and most is None):
-        return Figure(what, goal, value, cases, None)
-    low = -math.inf if least is None else least
-    high = math.inf if most is None else most
-    return Figure(what, goal, value, cases, low <= value <= high)
-
-
-def _share(
-    what: str,
-    goal: str,
-    results: Sequence[Mapping[str, Any]],
-    says: Callable[[Mapping[str, Any]], bool],
-    *,
-    least: float | None = None,
-    most: float | None = None,
-    error: bool | None = None,
-) -> Figure:
-    """Share of cases; one that failed counts against the goal unless ``error`` says how it counts."""
-    failed = error if error is not None else most is not None
-    hits = [failed if "error" in r else says(r) for r in results]
-    value = float(np.mean(hits)) if hits else None
-    return replace(_figure(what, goal, value, len(hits), least, most), share=True)
-
-
-def _between(what: str, goal: str, values: Sequence[bool], least: float, most: float) -> Figure:
-    share = float(np.mean(values)) if values else None
-    return replace(_figure(what, goal, share, len(values), least, most), share=True)
-
-
-def _median(
-    what: str, goal: str, values: Sequence[float], *, least: float | None = None, most: float | None = None
-) -> Figure:
-    return _figure(what, goal, float(np.median(values)) if values else None, len(values), least, most)
-
-
-def by_effect(results: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Single effects: what came of each at each size."""
+def markdown(results: Results) -> str:
+    """The figures as tables: the goals first, then what came of every effect at each size."""
+    lines = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
+    lines += [figure.row() for figure in figures(results)]
+    lines += ["", "| hidden | size | gap / floor | cases | named | answers |", "|---|---|---|---|---|---|"]
     groups: dict[tuple[str, int], list[Mapping[str, Any]]] = {}
     for result in results:
         case = result["case"]
         if case["kind"] in ("single", "outside"):
             groups.setdefault((case["effects"][0], case["size"]), []).append(result)
-    rows = []
     for (name, size), group in sorted(groups.items()):
         good = [r for r in group if "error" not in r]
-        answers = [said(r) if r["named"] or r["sets"] else r["verdict"] for r in good]
-        rows.append(
-            {
-                "effect": name,
-                "size": size,
-                "cases": len(group),
-                "failed": len(group) - len(good),
-                "gap": float(np.median(gaps)) if (gaps := _values(good, "gap")) else None,
-                "named": sum(name in _found(r) for r in good),
-                "in_set": sum(any(name in s for s in r["sets"]) and name not in _found(r) for r in good),
-                "wrong": sum(bool(r["false"]) for r in good),
-                "answers": {answer: answers.count(answer) for answer in dict.fromkeys(answers)},
-            }
-        )
-    return rows
-
-
-def missed_pairs(results: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Pairs of which not both were named, or another was: what each shows beside the other, the answer."""
-    rows = []
-    for result in sorted(results, key=lambda r: (r["case"]["effects"], r["case"]["size"])):
-        case = result["case"]
-        if case["kind"] != "pair" or "error" in result or (_all_named(result) and not result["false"]):
-            continue
-        gaps = result.get("beside", {})
-        rows.append(
-            {
-                "effects": [(name, gaps.get(name)) for name in case["effects"]],
-                "size": case["size"],
-                "answer": said(result) if result["named"] or result["sets"] else result["verdict"],
-                "wrong": result["false"],
-            }
-        )
-    return rows
-
-
-def markdown(results: Sequence[Mapping[str, Any]]) -> str:
-    """The figures as tables: the goals first, then every effect, then the pairs that were missed."""
-    lines = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
-    for figure in figures(results):
-        reached = {True: "yes", False: "no", None: ""}[figure.reached]
-        lines.append(f"| {figure.what} | {figure.goal} | {figure.text} | {figure.cases} | {reached} |")
-    lines += ["", "| hidden | size | gap / floor | named | in a set | wrong | of | answers |"]
-    lines += ["|---|---|---|---|---|---|---|---|"]
-    for row in by_effect(results):
-        answers = "; ".join(f"{count} x {answer}" for answer, count in row["answers"].items())
-        gap = "-" if row["gap"] is None else f"{row['gap']:.1f}"
-        counts = " | ".join(str(row[key]) for key in ("named", "in_set", "wrong", "cases"))
-        lines.append(f"| `{row['effect']}` | {row['size']} | {gap} | {counts} | {answers} |")
-    if missed := missed_pairs(results):
-        lines += ["", "| pair (gap beside the other) | size | answer | wrong |", "|---|---|---|---|"]
-    for row in missed:
-        shown = [(name, "" if gap is None else f" ({gap:.1f})") for name, gap in row["effects"]]
-        both = ", ".join(f"`{name}`{gap}" for name, gap in shown)
-        lines.append(f"| {both} | {row['size']} | {row['answer']} | {', '.join(row['wrong'])} |")
+        answers = Counter(said(r) if r["named"] or r["sets"] else r["verdict"] for r in good)
+        if failed := len(group) - len(good):
+            answers["failed"] = failed
+        told = "; ".join(f"{count} x {answer}" for answer, count in answers.items())
+        gap = f"{np.median([r['gap'] or 0.0 for r in good]):.1f}" if good else "-"
+        named = sum(name in _found(r) for r in good)
+        lines.append(f"| `{name}` | {size} | {gap} | {len(group)} | {named} | {told} |")
     return "\n".join(lines) + "\n"
-
-
-def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Figures and effects for ``summary.json``."""
-    return {
-        "cases": len(results),
-        "figures": [asdict(figure) for figure in figures(results)],
-        "effects": by_effect(results),
-    }

@@ -90,46 +90,42 @@ class Run:
     seed: int = 0
 
 
-def simulate(runs: Sequence[Run], *, dt: float = STEP_S) -> list[np.ndarray]:
-    """What an ideal sensor would record: effects on reading included, noise and counts not.
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What an ideal sensor would record at the stamps of a run: noise and counts not included.
+
+    Attributes:
+        position: With the effects on reading [T, J] [rad].
+        duty: Duty cycle in [-1, 1] [T, J]: a position servo's controller's output, of the error that it sees,
+            less what it ignores, plus what it has integrated. The damping is the motor's own, and a late
+            reading is one of position.
+    """
+
+    position: np.ndarray
+    duty: np.ndarray
+
+
+def simulate(runs: Sequence[Run], *, dt: float = STEP_S) -> list[Motion]:
+    """Simulate runs together.
 
     Args:
         runs: Trajectories; all plants have the same number of joints, and all have a finger or none.
         dt: Time step [s].
 
-    Returns:
-        Positions at the stamps of each run [T, J] [rad].
-
     Raises:
-        ValueError: An effect or parameter is unknown, or too stiff for the time step.
+        ValueError: An effect is too stiff for the time step.
     """
-    return [position for position, _ in _record(runs, dt, duties=False)]
-
-
-def simulate_with_duty(runs: Sequence[Run], *, dt: float = STEP_S) -> list[tuple[np.ndarray, np.ndarray]]:
-    """As :func:`simulate`, and the duty cycles [T, J] in [-1, 1] that the controllers have at the stamps.
-
-    A position servo's duty cycle is its controller's output: the error that it sees, less what it ignores,
-    plus what it has integrated. The damping is the motor's own. A reading that is late is one of position.
-    """
-    return _record(runs, dt, duties=True)
-
-
-def _record(runs: Sequence[Run], dt: float, *, duties: bool) -> list[tuple[np.ndarray, np.ndarray]]:
     batch = _Batch(runs, dt)
-    asked = np.empty((batch.steps, *batch.kp.shape)) if duties else None
-    path = batch.integrate(batch.references(), asked)
+    path, asked = batch.integrate(batch.references())
     grid = np.arange(path.shape[0]) * dt
     delay, bias = batch.of("read_delay", "delay_s"), batch.of("encoder_bias", "bias_rad")
     recorded = []
     for b, run in enumerate(runs):
         columns = [np.interp(run.time - delay[b, j], grid, path[:, b, j]) for j in range(batch.count)]
-        duty = np.zeros((0, batch.count))
-        if asked is not None:
-            # The step after the stamp: a command is written before the servo is read.
-            step = np.minimum(np.ceil(run.time / dt).astype(int), batch.steps - 1)
-            duty = np.clip(asked[step, b] / FULL_DUTY_RAD, -1.0, 1.0)
-        recorded.append((np.stack(columns, axis=1) + bias[b], duty))
+        # The step after the stamp: a command is written before the servo is read.
+        step = np.minimum(np.ceil(run.time / dt).astype(int), batch.steps - 1)
+        duty = np.clip(asked[step, b] / FULL_DUTY_RAD, -1.0, 1.0)
+        recorded.append(Motion(np.stack(columns, axis=1) + bias[b], duty))
     return recorded
 
 
@@ -228,13 +224,10 @@ class _Batch:
             on[:, b] = run.enabled[np.maximum(np.searchsorted(run.time, grid, side="right") - 1, 0)]
         return on
 
-    def integrate(self, reference: np.ndarray, asked: np.ndarray | None = None) -> np.ndarray:
-        """Positions [K + 1, B, J] from rest at the equilibrium of the first reference.
+    def integrate(self, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [K + 1, B, J] from rest at the equilibrium of the first of the :meth:`references`.
 
-        Args:
-            reference: Result of :meth:`references`.
-            asked: Filled with what the controllers ask for in each step, as an error at full gain
-                [K, B, J] [rad], if given.
+        Also what the controllers ask for in each step, as an error at full gain [K, B, J] [rad].
         """
         dt, half = self.dt, 0.5 * self.dt
         switch = self._switch()
@@ -252,6 +245,7 @@ class _Batch:
         v, wound = np.zeros_like(q), np.zeros_like(q)
         path = np.empty((self.steps + 1, *q.shape))
         path[0] = q
+        asked = np.empty((self.steps, *q.shape))
         loads.start(q)
         # Open terminals carry no current: the damping of a servo that is off, mostly back-EMF, is gone.
         on, stiffness, damping = first, self.kp * self.gain * first, self.kd * (first > 0.0)
@@ -272,8 +266,7 @@ class _Batch:
             if creeping:
                 wound = wound + dt * (error.mean(axis=0) if motor.bends else error) * (on > 0.0)
                 wanted = wanted + self.gain * on * integral_gain * wound
-            if asked is not None:
-                asked[k] = (wanted.mean(axis=0) if motor.bends else wanted) / self.kp
+            asked[k] = (wanted.mean(axis=0) if motor.bends else wanted) / self.kp
             torque, slope, carried = motor(wanted - damping * v, v, k * dt)
             load = loads(middle, v)
             new = self._speed(middle, v, torque + load, 0.5 * slope * damping, loads, carried, v, k * dt)
@@ -286,7 +279,7 @@ class _Batch:
             v = np.minimum(np.maximum(v, -self.limit), self.limit)
             q = middle + half * v
             path[k + 1] = q
-        return path
+        return path, asked
 
     def _speed(
         self,

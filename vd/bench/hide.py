@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vd.bench.hidden_finger import FingerBody
-from vd.bench.hidden_plant import OUTSIDE, Plant, Run, simulate, simulate_with_duty
+from vd.bench.hidden_plant import OUTSIDE, Motion, Plant, Run, simulate
 from vd.files import write_json
 from vd.gap.excitations import Excitation, JointRange, excitation_set
 from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording, Trajectory, write_recording
@@ -23,6 +23,8 @@ ENCODER_COUNT = 2.0 * math.pi / 4096
 """Twelve bits a turn, as of Dynamixel X and Feetech STS servos [rad]."""
 NOISE_RAD = 3.0e-4
 """Standard deviation of the reading before it is rounded to counts [rad]."""
+NOISE_FLOOR_RAD = math.hypot(NOISE_RAD, ENCODER_COUNT / math.sqrt(12.0))
+"""Standard deviation of a reading about the true position: noise, and rounding to counts [rad]."""
 STAMP_JITTER_S = 1.0e-3
 """Standard deviation of the sampling instants about the regular ones [s]; the stamps tell them."""
 SHORTEST_PERIOD_S = 1.0e-3
@@ -34,8 +36,8 @@ PAUSE_S = 2.0
 """Between two trajectories of a session."""
 FULL_P_GAIN = 400.0
 """P gain, in the units of Dynamixel X servos, at which the stiffness is the plant's."""
-PLANAR_TOLERANCE = 1.0e-6
-"""Distance [m] from the link's axis that the closed form of the finger ignores."""
+FINGERS = ("dclaw3", "dclaw4")
+"""Hands of whose fingers there is a closed form: a swing about x, two bends about y, links along z."""
 CHUNK = 48
 """Trajectories simulated together: enough to amortise Python, few enough for memory."""
 
@@ -52,6 +54,9 @@ INERTIA_SPREAD = math.log(2.0)
 COUPLING = "joint_coupling"
 """The effect that takes more than one joint."""
 
+BASE = ("kp", "kd", "velocity_limit", "inertia", "gravity_torque")
+"""Base parameters of a plant that the truth tells."""
+
 Effects = Mapping[str, Mapping[str, float]]
 
 
@@ -66,8 +71,6 @@ class Hiding:
         joints: Joints recorded; empty: the first finger, or the one joint of a bare model.
         effect_joints: Joints that have the effect; absent or empty: all.
         excitations: Sets of :data:`vd.gap.excitations.MENU`.
-        noise_rad: Noise of readings before rounding [rad].
-        jitter_s: Jitter of the sampling instants [s].
         base_spread: Spread of stiffness, damping and speed limit about the hand's; 0: exactly the hand's.
         mass_spread: Spread of the finger's masses and inertias about the hand's.
         pwm: Record the duty cycle as well.
@@ -79,8 +82,6 @@ class Hiding:
     joints: tuple[str, ...] = ()
     effect_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     excitations: tuple[str, ...] = ("steps_and_sines",)
-    noise_rad: float = NOISE_RAD
-    jitter_s: float = STAMP_JITTER_S
     base_spread: float = BASE_SPREAD
     mass_spread: float = 0.0
     pwm: bool = False
@@ -139,36 +140,16 @@ def effect_parameters(name: str) -> dict[str, float]:
     raise ValueError(f"unknown effect {name!r}; choose from {', '.join((*EFFECTS, *OUTSIDE))}")
 
 
-def hide(
-    model: str,
-    effects: Effects,
-    out: str | Path,
-    *,
-    seed: int = 0,
-    **options: Any,
-) -> Hidden:
-    """Write a recording in which effects are hidden, and the truth beside it as ``OUT.truth.json``.
-
-    Args:
-        model: A hand's name, ``servo`` or ``pendulum``.
-        effects: Name to parameter to value; absent parameters take typical values.
-        out: Folder to write.
-        seed: Of everything random.
-        options: Further fields of :class:`Hiding`.
+def hide(hiding: Hiding, out: str | Path) -> Hidden:
+    """Write a recording in which effects are hidden to ``out``, and the truth beside it, ``OUT.truth.json``.
 
     Raises:
         ValueError: An unknown model, joint, effect, parameter or excitation.
     """
-    (hidden,) = simulate_hidden([Hiding(model=model, effects=effects, seed=seed, **options)])
-    write_hidden(hidden, out)
-    return hidden
-
-
-def write_hidden(hidden: Hidden, out: str | Path) -> None:
-    """Write the recording to the folder ``out`` and the truth to ``OUT.truth.json`` beside it."""
-    out = Path(out)
-    write_recording(hidden.recording, out)
+    (hidden,) = simulate_hidden([hiding])
+    write_recording(hidden.recording, Path(out))
     write_json(truth_path(out), hidden.truth)
+    return hidden
 
 
 def truth_path(out: str | Path) -> Path:
@@ -190,23 +171,12 @@ def simulate_hidden(hidings: Sequence[Hiding]) -> list[Hidden]:
     runs = [run for session in sessions for run in session.runs]
     # Long trajectories with long ones: a batch runs as long as its longest.
     order = sorted(range(len(runs)), key=lambda i: runs[i].time[-1])
-    positions: dict[int, np.ndarray] = {}
-    duties: dict[int, np.ndarray] = {}
+    moved: dict[int, Motion] = {}
     for start in range(0, len(order), CHUNK):
         part = order[start : start + CHUNK]
-        chosen = [runs[i] for i in part]
-        if any(hiding.pwm for hiding in hidings):
-            for i, (position, duty) in zip(part, simulate_with_duty(chosen), strict=True):
-                positions[i], duties[i] = position, duty
-        else:
-            positions.update(zip(part, simulate(chosen), strict=True))
-    results, first = [], 0
-    for session in sessions:
-        own = range(first, first + len(session.runs))
-        told = [duties[i] for i in own] if session.hiding.pwm else None
-        results.append(session.finish([positions[i] for i in own], told))
-        first += len(session.runs)
-    return results
+        moved.update(zip(part, simulate([runs[i] for i in part]), strict=True))
+    motions = (moved[i] for i in range(len(runs)))
+    return [session.finish([next(motions) for _ in session.runs]) for session in sessions]
 
 
 class _Session:
@@ -229,19 +199,19 @@ class _Session:
 
     def _stamps(self, motion: Excitation) -> np.ndarray:
         """The instants at which commands are written and positions read [T] [s], from 0."""
-        time = motion.time + self.rng.normal(0.0, self.hiding.jitter_s, len(motion.time))
+        time = motion.time + self.rng.normal(0.0, STAMP_JITTER_S, len(motion.time))
         time[0] = 0.0
         # Late ones push the next; as many digits as are written, so that readers see the same stamps.
         for i in range(1, len(time)):
             time[i] = max(time[i], time[i - 1] + SHORTEST_PERIOD_S)
         return np.round(time, 6)
 
-    def finish(self, positions: Sequence[np.ndarray], duties: Sequence[np.ndarray] | None = None) -> Hidden:
+    def finish(self, moved: Sequence[Motion]) -> Hidden:
         """Add noise and rounding; the recording and the truth."""
         hiding = self.hiding
         trajectories = []
-        for i, (motion, run, position) in enumerate(zip(self.motions, self.runs, positions, strict=True)):
-            noisy = position + self.rng.normal(0.0, hiding.noise_rad, position.shape)
+        for i, (motion, run, own) in enumerate(zip(self.motions, self.runs, moved, strict=True)):
+            noisy = own.position + self.rng.normal(0.0, NOISE_RAD, own.position.shape)
             trajectories.append(
                 Trajectory(
                     file=f"{i:03d}_{motion.joints[0]}_{motion.name}.csv",
@@ -252,7 +222,7 @@ class _Session:
                     command=motion.command,
                     position=np.round(noisy / ENCODER_COUNT) * ENCODER_COUNT,
                     enabled=motion.enabled,
-                    pwm=None if duties is None else np.round(duties[i] * PWM_COUNTS) / PWM_COUNTS,
+                    pwm=np.round(own.duty * PWM_COUNTS) / PWM_COUNTS if hiding.pwm else None,
                 )
             )
         servo: dict[str, Any] = {"model": "test rig", "p_gain": self.plant.full_gain}
@@ -262,7 +232,7 @@ class _Session:
             Path(),
             hiding.model,
             self.plant.joints,
-            servo if duties is None else {**servo, "pwm_full_scale": PWM_COUNTS},
+            {**servo, "pwm_full_scale": PWM_COUNTS} if hiding.pwm else servo,
             ENCODER_COUNT,
             tuple(trajectories),
         )
@@ -274,15 +244,9 @@ class _Session:
             "format": "vd-hidden/1",
             "model": hiding.model,
             "seed": hiding.seed,
-            "noise_floor_rad": noise_floor(hiding.noise_rad),
+            "noise_floor_rad": NOISE_FLOOR_RAD,
             "mass_spread": hiding.mass_spread,
-            "base": {
-                "kp": _by_joint(plant, plant.kp),
-                "kd": _by_joint(plant, plant.kd),
-                "velocity_limit": _by_joint(plant, plant.velocity_limit),
-                "inertia": _by_joint(plant, plant.inertia),
-                "gravity_torque": _by_joint(plant, plant.gravity_torque),
-            },
+            "base": {name: _by_joint(plant, getattr(plant, name)) for name in BASE},
             "effects": {
                 name: {
                     "joints": list(_effect_joints(hiding, name, plant.joints)),
@@ -291,11 +255,6 @@ class _Session:
                 for name, parameters in plant.effects.items()
             },
         }
-
-
-def noise_floor(noise_rad: float = NOISE_RAD, count_rad: float = ENCODER_COUNT) -> float:
-    """Standard deviation of a reading about the true position [rad]: noise, and rounding to counts."""
-    return math.hypot(noise_rad, count_rad / math.sqrt(12.0))
 
 
 def _by_joint(plant: Plant, values: np.ndarray) -> dict[str, float]:
@@ -363,27 +322,18 @@ def _spread(rng: np.random.Generator, width: float, shape: tuple[int, ...]) -> n
 def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
     from vd.assets_usd.hands import load_hand
 
+    if hiding.model not in FINGERS:
+        raise ValueError(f"model {hiding.model!r}: choose {', '.join((*FINGERS, *BARE_MODELS))}")
     hand = load_hand(hiding.model)
-    joints = hiding.joints or hand.joint_names[:3]
-    if len(joints) != 3 or any(j not in hand.joint_names for j in joints):
-        raise ValueError(f"joints {', '.join(joints)}: name the three joints of a finger of {hiding.model}")
-    index = [hand.joint_names.index(joint) for joint in joints]
-    if index != list(range(index[0], index[0] + 3)) or index[0] % 3:
+    joints = tuple(hiding.joints or hand.joint_names[:3])
+    fingers = [tuple(hand.joint_names[i : i + 3]) for i in range(0, hand.num_joints, 3)]
+    if joints not in fingers:
         raise ValueError(f"joints {', '.join(joints)}: name the three joints of one finger, in order")
+    finger = fingers.index(joints)
+    index = [3 * finger, 3 * finger + 1, 3 * finger + 2]
     links = [int(hand.joint_child[i]) for i in index]
     com, inertia = hand.link_com[links], hand.link_inertia[links]
-    frames = hand.joint_parent_frame[index[1:]]
-    tip = hand.tip_frame[index[0] // 3]
-    axes = np.eye(3)[[0, 1, 1]]
-    across = np.abs(np.concatenate([com[:, :2].ravel(), frames[:, :2].ravel(), tip[:2]])).max()
-    turned = np.abs(frames[:, 3:6]).max()
-    tilted = np.abs(inertia - np.einsum("lii,ij->lij", inertia, np.eye(3))).max() / inertia.max()
-    straight = (hand.joint_axis[index] == axes).all() and max(across, turned) < PLANAR_TOLERANCE
-    if not straight or tilted > PLANAR_TOLERANCE * 1e3:
-        raise ValueError(
-            f"{hiding.model}: hidden recordings need fingers of the D'Claw's kind (swing about x, bends "
-            "about y, links along z); use dclaw3, dclaw4, servo or pendulum"
-        )
+    frames, tip = hand.joint_parent_frame[index[1:]], hand.tip_frame[finger]
     near = _spread(rng, hiding.base_spread, (3, 3))
     heavy = _spread(rng, hiding.mass_spread, (3,))
     body = FingerBody(
@@ -394,9 +344,9 @@ def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
         spacing=float(frames[1, 2]),
         tip=float(tip[2]),
     )
-    reach = JointRange(tuple(joints), hand.lower[index], hand.upper[index], FULL_P_GAIN)
+    reach = JointRange(joints, hand.lower[index], hand.upper[index], FULL_P_GAIN)
     return reach, Plant(
-        joints=tuple(joints),
+        joints=joints,
         kp=hand.kp[index] * near[0],
         kd=hand.kd[index] * near[1],
         velocity_limit=hand.velocity_limit[index] * near[2],

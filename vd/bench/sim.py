@@ -5,7 +5,6 @@ resets and randomisation; with a policy adds its network. States come from a tea
 contact, in the task of its training.
 """
 
-import dataclasses
 import gc
 import importlib
 import pkgutil
@@ -74,16 +73,6 @@ def captured(function: Any, device: str) -> Any:
     return lambda: wp.capture_launch(capture.graph)
 
 
-def teacher_policy(env: ReorientEnv, policy: "TrainedPolicy") -> Callable[[], None]:
-    """A teacher's mean actions, as a call that writes them where the next step reads them."""
-    observation, action = wp.to_torch(env.observation), wp.to_torch(env.action)
-
-    def act() -> None:
-        action.copy_(policy.act(observation).clamp(-1.0, 1.0))
-
-    return act
-
-
 def own_share(env: ReorientEnv) -> float:
     """Share of our kernels in the device time of one control step on a GPU, by a timer around every launch.
 
@@ -136,7 +125,12 @@ def measure(
     # Before the policy, whose network and matrix workspace are no part of the simulation.
     memory = (before - free_memory(device)) / 1e9 if on_gpu else 0.0
     env.set_stage(Stage())  # a teacher has learned the task as it is configured
-    policy = teacher_policy(env, teacher)
+    observation, action = wp.to_torch(env.observation), wp.to_torch(env.action)
+
+    def policy() -> None:
+        """The teacher's mean actions, where the next step reads them."""
+        action.copy_(teacher.act(observation).clamp(-1.0, 1.0))
+
     for _ in range(WARM_UP_STEPS):
         policy()
         env.step(env.action)
@@ -172,14 +166,3 @@ def free_memory(device: str) -> int:
     wp.set_mempool_release_threshold(device, 0)
     wp.synchronize_device(device)
     return int(wp.get_device(device).free_memory)
-
-
-def teacher_task(policy: "TrainedPolicy", objects: tuple[str, ...], envs: int) -> ReorientCfg:
-    """The task a teacher was trained in, on these objects.
-
-    Raises:
-        ValueError: It is not one of this version.
-    """
-    from vd.evaluate.agents import trained_task
-
-    return dataclasses.replace(trained_task(policy), objects=objects, num_envs=envs)

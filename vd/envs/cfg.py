@@ -9,7 +9,7 @@ from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
 MAX_LATENCY_S = 0.5
-"""Largest latency of observations that can be drawn [s] (ours): environments keep all of it in memory."""
+"""Largest latency of what is seen that can be drawn [s] (ours): environments keep all of it in memory."""
 View = Literal["world", "goal", "mirrored"]
 """What a policy sees its goals in, see :attr:`ObservationCfg.view`."""
 
@@ -276,6 +276,8 @@ class RandomisationCfg:
     """Object sizes are this many even steps of ``object_scale``: every size is a set of compiled meshes."""
     object_mass_kg: tuple[float, float] = PAPER.randomisation.object_mass_kg
     """Masses of the object [kg]."""
+    object_com_m: float = 0.0
+    """Ours: how far the object's centre of mass is from where its file has it [m], to a side drawn once."""
     action_noise_std: float = PAPER.randomisation.action_noise_std
     """Standard deviation of the noise of each action, drawn anew in every control step; 1 is
     action.scale_rad_s."""
@@ -297,14 +299,20 @@ class RandomisationCfg:
     force_decay: float = 0.0
     """What remains of a force in the next control step: 0 in the paper, 0.998 in the released code."""
     effects: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Effects of servos to draw for every joint, by name and parameter: command_delay.delay_s 0 0.04 draws a
-    delay of up to 40 ms. They replace what a hand layer says about the same parameter. Delays are of the bus:
-    all joints of an environment have the same share of their range."""
+    """Effects of servos to draw for every joint in each episode, by name and parameter: command_delay.delay_s
+    0 0.04 draws a delay of up to 40 ms. They replace what a hand layer says about the same parameter. Delays
+    are of the bus: all joints of an environment have the same share of their range."""
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
-    """How old the state is that the policy sees [s], drawn for each episode, to the nearest physics step.
-    Rewards and success are of the true state."""
+    """How old the object's state is that the policy sees [s], drawn for each episode, to the nearest physics
+    step: a camera and its loop. Rewards and success are of the true state."""
+    encoder_latency_s: tuple[float, float] = (0.0, 0.0)
+    """How old joints and fingertips are that the policy sees [s]; a loop reads them when its step begins.
+    Drawn at the same share of its range as the object's."""
+    object_pose_error: tuple[float, float] = (0.0, 0.0)
+    """Ours: by how much the observed pose of the object is wrong [m] [rad], alike all through an episode."""
     redraw_s: float = PAPER.randomisation.redraw_s
-    """Gains and frictions are drawn anew at the first reset after this time [s]."""
+    """Gains, contact frictions and constant errors are drawn anew at the first reset after this time [s]: the
+    solver takes them once a second. Servos (``effects``) and latency are drawn at every reset."""
 
     @property
     def bounces(self) -> bool:
@@ -320,12 +328,12 @@ class RandomisationCfg:
         low, high = self.restitution
         if not 0.0 <= low <= high <= 1.0:
             raise ValueError(f"randomisation.restitution is {low:g} {high:g}; it has to rise within 0 and 1")
-        low, high = self.observation_latency_s
-        if not 0.0 <= low <= high <= MAX_LATENCY_S:
-            raise ValueError(
-                f"randomisation.observation_latency_s is {low:g} {high:g}; it has to rise within 0 and "
-                f"{MAX_LATENCY_S:g}"
-            )
+        for name in ("observation_latency_s", "encoder_latency_s"):
+            low, high = getattr(self, name)
+            if not 0.0 <= low <= high <= MAX_LATENCY_S:
+                raise ValueError(
+                    f"randomisation.{name} is {low:g} {high:g}; it has to rise within 0 and {MAX_LATENCY_S:g}"
+                )
         if self.force_s <= 0.0:
             raise ValueError(f"randomisation.force_s is {self.force_s:g}; it has to be positive")
         from vd.envs.effects import check_effects  # needs Warp, which settings alone do not

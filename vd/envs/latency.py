@@ -1,4 +1,4 @@
-"""The state as a policy sees it: of the present, or as old as the latency that its episode has drawn."""
+"""The state as a policy sees it: of the present, or as old as the latencies that its episode has drawn."""
 
 import math
 from typing import Any
@@ -21,7 +21,8 @@ class SeenState:
         state: The task.
 
     Attributes:
-        latency: How late each environment is seen in its episode [s], shape [N].
+        latency: How late each object is seen in its episode [s], shape [N].
+        encoder_latency: How late joints and fingertips are [s], shape [N].
         arrays: Joint positions and velocities as the encoders report them, positions and velocities of hand
             and object, poses and velocities of the links (of fingertips alone where they are late).
     """
@@ -30,15 +31,17 @@ class SeenState:
         self._state = state
         sim, n, device = state.sim, state.num_envs, state.device
         random = state.cfg.randomisation
-        self.is_late = random.enabled and random.observation_latency_s[1] > 0.0
+        longest = max(random.observation_latency_s[1], random.encoder_latency_s[1])
+        self.is_late = random.enabled and longest > 0.0
         self.latency = wp.zeros(n, dtype=float, device=device)
+        self.encoder_latency = wp.zeros(n, dtype=float, device=device)
         present = [state.measured_q, state.measured_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
         self.arrays: list[Any] = present
         if not self.is_late:
             return
         self.arrays = [wp.zeros_like(array) for array in present]
         d, f = state.num_actions, state.num_fingers
-        slots = math.ceil(random.observation_latency_s[1] / state.cfg.sim.physics_dt) + 1
+        slots = math.ceil(longest / state.cfg.sim.physics_dt) + 1
         columns = ring_columns(d, sim.joint_q.shape[1], sim.joint_qd.shape[1], f)
         self._ring = wp.zeros((n * slots, columns), dtype=float, device=device)
         self._head = wp.zeros(n, dtype=wp.int32, device=device)
@@ -51,30 +54,35 @@ class SeenState:
         state.launch(record_state_kernel, [*self._model, *now], [self._head, self._ring])
 
     def begin(self, mask: wp.array) -> None:
-        """Draw the latency of the environments of ``mask`` [N], whose past is their present state."""
+        """Draw the latencies of the environments of ``mask`` [N], whose past is their present state."""
         if not self.is_late:
             return
         state, sim = self._state, self._state.sim
         measured = self._measured(sim.joint_q, sim.joint_qd)
         now = [*measured, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
+        random = state.cfg.randomisation
+        ranges = [wp.vec2(*random.observation_latency_s), wp.vec2(*random.encoder_latency_s)]
         state.launch(
             begin_latency_kernel,
-            [*self._model, wp.vec2(*state.cfg.randomisation.observation_latency_s), mask, *now, state.rng],
-            [self.latency, self._ring],
+            [*self._model, *ranges, mask, *now, state.rng],
+            [self.latency, self.encoder_latency, self._ring],
         )
 
     def recall(self) -> None:
         """Refresh :attr:`arrays`."""
         if self.is_late:
             state = self._state
-            inputs = [*self._model, state.cfg.sim.physics_dt, self.latency, self._head, self._ring]
+            ages = [self.latency, self.encoder_latency]
+            inputs = [*self._model, state.cfg.sim.physics_dt, *ages, self._head, self._ring]
             state.launch(recall_state_kernel, inputs, self.arrays)
 
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint, by name."""
         if not self.is_late:
             return {}
-        return {"latency": self.latency, "latency_ring": self._ring, "latency_head": self._head}
+        here = {"latency": self.latency, "latency_ring": self._ring, "latency_head": self._head}
+        late = self._state.cfg.randomisation.encoder_latency_s[1] > 0.0
+        return here | ({"encoder_latency": self.encoder_latency} if late else {})
 
     def _measured(self, joint_q: wp.array, joint_qd: wp.array) -> tuple[wp.array, wp.array]:
         servo = self._state.sim.servo

@@ -7,6 +7,7 @@ import warp as wp
 
 from vd.envs.latency import SeenState
 from vd.envs.parts import actor_size, observation_parts
+from vd.envs.pose_error import PoseError
 from vd.envs.randomise import Randomiser
 from vd.envs.shapes import ShapeObserver
 from vd.envs.symmetry import ChosenFrames
@@ -37,6 +38,7 @@ class Observer:
         self.parts = observation_parts(cfg, state.num_fingers)
         self.num_observations = actor_size(self.parts)
         self.seen = SeenState(state)
+        self._pose_error = PoseError(state)
         width = max(columns.stop for columns in self.parts.values())
 
         zeros = state.zeros
@@ -45,7 +47,10 @@ class Observer:
         self.symmetry_frames = ChosenFrames(state, self.all_values) if cfg.view != "world" else None
         if self.symmetry_frames is not None:
             self.world_values = self.symmetry_frames.observation
-        self.shapes = ShapeObserver(state) if shapes else None
+        self.shapes: ShapeObserver | None = None
+        if shapes:
+            items = state.surface_points, state.world_object, state.world_scale
+            self.shapes = ShapeObserver(*items, state.fingers.tip_body, state.fingers.tip_offset)
         slices = teacher_observation_slices(state.num_fingers)
         self._pose_columns = [slices["object_position"].start, slices["relative_orientation"].start]
         self._action_column = slices["previous_action"].start
@@ -74,6 +79,7 @@ class Observer:
     def begin(self, mask: wp.array) -> None:
         """Begin the episodes of the environments of ``mask`` [N], after their state was reset."""
         self.seen.begin(mask)
+        self._pose_error.begin(mask)
         if self._frames:
             self._state.launch(forget_kernel, [mask], [self._count])
 
@@ -91,7 +97,7 @@ class Observer:
         state = self._state
         self.seen.recall()
         noise = state.parameters.observation, self._drawn.observation_offset, state.rng
-        self._observe_state(self.seen.arrays, noise, self.world_values)
+        self._observe_state(self._pose_error.apply(self.seen.arrays), noise, self.world_values)
         if "present" in self.parts:
             sim = state.sim
             true = [sim.joint_q, sim.joint_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
@@ -130,7 +136,9 @@ class Observer:
         )
         if "shape" in self.parts:
             assert self.shapes is not None
-            self.shapes.launch(seen, out)
+            _, _, joint_q, _, body_q, _ = seen
+            first = self.parts["shape"].start
+            self.shapes.observe(joint_q, state.num_actions, body_q, state.goal_quat, out, first)
 
     @property
     def _remembered(self) -> list[int]:
@@ -181,4 +189,5 @@ class Observer:
         past = {"history": self._past, "history_head": self._head, "history_count": self._count}
         past |= {"history_next": self.world_values}  # remembered when the next step begins
         chosen = {} if self.symmetry_frames is None else {"view": self.symmetry_frames.chosen}
-        return chosen | self.seen.stateful() | (past if self._frames else {})
+        kept = self.seen.stateful() | self._pose_error.stateful()
+        return chosen | kept | (past if self._frames else {})

@@ -1,6 +1,7 @@
 """Which columns of an observation hold what, and which of them the actor reads."""
 
 from vd.envs.cfg import ObservationCfg
+from vd.kernels.columns import consecutive
 from vd.kernels.task.dynamics import dynamics_size
 from vd.kernels.task.history import frame_size
 from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
@@ -24,12 +25,7 @@ def observation_parts(cfg: ObservationCfg, fingers: int) -> dict[str, slice]:
         "dynamics": dynamics_size(joints) if told else 0,
         "present": state + shape if told else 0,
     }
-    parts, start = {}, 0
-    for name, size in sizes.items():
-        if size:
-            parts[name] = slice(start, start + size)
-            start += size
-    return parts
+    return consecutive({name: size for name, size in sizes.items() if size})
 
 
 def actor_size(parts: dict[str, slice]) -> int:

@@ -10,9 +10,9 @@ from vd.envs.servo import gain_scales
 from vd.envs.task_state import TaskState
 from vd.kernels.servo.actuators import INERTIA, PAYLOAD_INERTIA
 from vd.kernels.task.environments import (
+    copy_columns_kernel,
     redraw_mask_kernel,
     write_friction_kernel,
-    write_gains_kernel,
     write_object_force_kernel,
 )
 from vd.kernels.task.observations import teacher_observation_size
@@ -31,7 +31,7 @@ PUSH_INTERVAL_S = 1.0
 
 
 class Randomiser:
-    """Masses once at start-up; gains, servos, frictions and constant errors at resets; forces every step.
+    """Masses once at start-up; servos at resets, frictions and the like at some; forces every step.
 
     With randomisation off the same arrays hold the nominal values.
     """
@@ -82,7 +82,7 @@ class Randomiser:
         self._draw_masses()
 
     def _draw_masses(self) -> None:
-        """Draw link and object masses; inertias scale with them."""
+        """Draw link and object masses, with which inertias scale, and where the objects' centres are."""
         state = self._state
         n, model = state.num_envs, state.sim.model
         link_scale = wp.ones((n, len(state.scene.link_body)), dtype=float, device=state.device)
@@ -107,29 +107,30 @@ class Randomiser:
             (model.body_inv_inertia, inverse[:, None, None]),
         ):
             array.assign((array.numpy() * scale).astype(np.float32))
+        shift = state.cfg.randomisation.object_com_m
+        if self.enabled and shift > 0.0:
+            direction = np.random.default_rng(state.cfg.seed).normal(size=(n, 3))
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            centre = model.body_com.numpy().reshape(n, -1, 3)
+            centre[:, state.scene.object_body] += shift * direction
+            model.body_com.assign(centre.reshape(-1, 3))
         state.sim.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def redraw(self, reset: wp.array) -> None:
-        """Draw anew for the environments of ``reset`` whose dynamics are old enough."""
+        """Draw servos for the environments of ``reset``, and what the solver holds where it is old enough."""
         if not self.enabled:
             return
         self._state.launch(redraw_mask_kernel, [reset, self._interval, self._age], [self._due])
-        self.draw(self._due)
+        self._draw_dynamics(self._due)
+        self._draw_servos(reset)
 
     def draw(self, mask: wp.array) -> None:
-        """Draw gains, servos, frictions, restitution and constant errors where ``mask`` [N] is set."""
-        state = self._state
+        """Draw all but the masses where ``mask`` [N] is set."""
         self._draw_dynamics(mask)
-        if state.sim.restitution is not None:
-            drawn = state.sim.restitution
-            state.launch(
-                draw_restitution_kernel,
-                [wp.vec2(*state.cfg.randomisation.restitution), mask, state.rng],
-                [drawn.hand, drawn.object, drawn.table],
-            )
+        self._draw_servos(mask)
 
     def _draw_dynamics(self, mask: wp.array) -> None:
-        """Draw gains, frictions, constant errors and servos."""
+        """Draw gains, frictions, restitution and constant errors."""
         state = self._state
         ranges = self._kp_scale, self._kd_scale, state.parameters.randomisation
         state.launch(
@@ -145,6 +146,17 @@ class Randomiser:
                 self.observation_offset,
             ],
         )
+        if state.sim.restitution is not None:
+            drawn = state.sim.restitution
+            state.launch(
+                draw_restitution_kernel,
+                [wp.vec2(*state.cfg.randomisation.restitution), mask, state.rng],
+                [drawn.hand, drawn.object, drawn.table],
+            )
+
+    def _draw_servos(self, mask: wp.array) -> None:
+        """Draw delays, friction, backlash and the like: the servos read them in every physics step."""
+        state = self._state
         if state.sim.servo is not None:
             state.launch(
                 draw_servo_kernel,
@@ -213,12 +225,8 @@ class Randomiser:
         flags = newton.ModelFlags.SHAPE_PROPERTIES
         if state.sim.servo is None:  # which sets the gains itself, in every physics step
             flags |= newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES
-            state.launch(
-                write_gains_kernel,
-                [self.kp, self.kd],
-                [self._model_kp, self._model_kd],
-                dim=(state.num_envs, state.num_actions),
-            )
+            for gains, of_model in ((self.kp, self._model_kp), (self.kd, self._model_kd)):
+                state.launch(copy_columns_kernel, [gains], [of_model], dim=gains.shape)
         state.launch(
             write_friction_kernel,
             [

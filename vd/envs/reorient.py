@@ -17,6 +17,7 @@ from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.setup import SETTLE_S, rest_poses, table_steps
+from vd.envs.starts import FreeStarts
 from vd.envs.state import load_arrays, save_state, saved_stage
 from vd.envs.task_state import build_task
 from vd.kernels.task.actions import apply_action_kernel
@@ -146,7 +147,9 @@ class ReorientEnv:
         self._env_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
-        self._reset_q = wp.array(np.tile(PAPER.scene.reset_joint_rad, f), dtype=float, device=self.device)
+        reset_q = np.tile(PAPER.scene.reset_joint_rad, f)
+        self._reset_q = wp.array(reset_q, dtype=float, device=self.device)
+        self._free_starts = FreeStarts(self.state, reset_q)
 
     def _find_rest_poses(self) -> wp.array:
         """Drop every object a few times and keep where it came to lie, shape [N, K]."""
@@ -279,7 +282,7 @@ class ReorientEnv:
             sim.put_back(self.step_count, self.max_episode_steps - 1)
         self.fingers.measure(self.randomiser.kp, self.randomiser.kd)
         if self._lifts and self.observer.shapes is not None:
-            self.observer.shapes.measure_clearance(self.clearance)
+            self.observer.shapes.measure_clearance(sim.joint_q, self.num_actions, self.clearance)
         self._judge()
         self._end_episodes()
         self._launch(record_step_kernel, [sim.joint_q, self.num_actions], [self.object_pose_end])
@@ -372,6 +375,7 @@ class ReorientEnv:
                 self._env_mask,
             ],
         )
+        self._free_starts.move(self._reset)
         if self.symmetry_frames is not None:
             self.symmetry_frames.choose(self._reset, self._new_goal)
         # The solver warm-starts from the last accelerations, which mean nothing after a reset.

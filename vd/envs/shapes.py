@@ -1,13 +1,12 @@
-"""The shapes of the objects: their points on the device, what a teacher sees of them, how high they are."""
+"""Shapes of objects on the device: what a teacher sees of them, and how high they are; without a simulator.
 
-from collections.abc import Sequence
+N environments, D joints, F fingers, B bodies. World frame: z up; metres, quaternions xyzw.
+"""
+
 from typing import Any
 
-import numpy as np
 import warp as wp
 
-from vd.envs.task_state import TaskState
-from vd.kernels.task.observations import teacher_observation_size
 from vd.kernels.task.shapes import (
     ORIENTATIONS,
     clearance_kernel,
@@ -20,73 +19,61 @@ from vd.paper import PAPER
 
 
 class ShapeObserver:
-    """Writes the columns of ``vd.kernels.task.shapes`` behind the state, and how high the objects are.
+    """Writes the values of ``vd.kernels.task.shapes``, and how high the objects are.
 
     Args:
-        state: The task.
+        points: Samples of each object's surface in its frame, unscaled [m], shape [K, P].
+        world_object: Object of each environment, shape [N].
+        world_scale: Factor on its size, shape [N].
+        tip_body: Link of each fingertip, shape [F].
+        tip_offset: Fingertip frames in the frames of their links, shape [F].
     """
 
-    def __init__(self, state: TaskState):
-        self._state = state
-        device = state.device
-        points = np.stack([item.surface_points for item in state.objects])
-        self._points = wp.array(points, dtype=wp.vec3, device=device)
-        self._object = wp.array(state.scene.world_object, dtype=wp.int32, device=device)
-        self._scale = wp.array(state.scene.world_scale, dtype=float, device=device)
-        self._directions = wp.array(extent_directions(state.num_fingers), dtype=wp.vec3, device=device)
-        first = teacher_observation_size(state.num_fingers)
-        slices = shape_observation_slices(state.num_fingers)
-        self._surface_column = first + slices["surface"].start
-        self._extent_column = first + slices["extent"].start
+    def __init__(
+        self,
+        points: wp.array,
+        world_object: wp.array,
+        world_scale: wp.array,
+        tip_body: wp.array,
+        tip_offset: wp.array,
+    ):
+        device = self._device = points.device
+        self._shapes = [points, world_object, world_scale]
+        self._tips, fingers = [tip_body, tip_offset], len(tip_body)
+        self._directions = wp.array(extent_directions(fingers), dtype=wp.vec3, device=device)
+        self._slices = shape_observation_slices(fingers)
+        self._surface_dim = len(world_object), fingers
+        self._extent_dim = len(world_object), ORIENTATIONS, len(self._directions)
 
-    def measure_clearance(self, out: wp.array) -> None:
-        """Write the heights of the objects' lowest points above the table [m] into ``out``, shape [N]."""
-        state = self._state
-        state.launch(
-            clearance_kernel,
-            [
-                self._points,
-                self._object,
-                self._scale,
-                state.num_actions,
-                PAPER.scene.table_top_m,
-                state.sim.joint_q,
-            ],
-            [out],
-        )
+    def measure_clearance(self, joint_q: wp.array, column: int, out: wp.array) -> None:
+        """Write the heights of the objects' lowest points above the table [m] into ``out``, shape [N].
 
-    def launch(self, seen: Sequence[Any], out: wp.array) -> None:
-        """Write the values of a state (``SeenState.arrays``), and of the goal, to ``out``, shape [N, *]."""
-        state = self._state
-        _, _, joint_q, _, body_q, _ = seen
-        state.launch(
-            surface_kernel,
-            [
-                self._points,
-                self._object,
-                self._scale,
-                state.fingers.tip_body,
-                state.fingers.tip_offset,
-                state.num_actions,
-                self._surface_column,
-                joint_q,
-                body_q,
-            ],
-            [out],
-            dim=(state.num_envs, state.num_fingers),
-        )
-        state.launch(
-            extent_kernel,
-            [
-                self._points,
-                self._object,
-                self._scale,
-                self._directions,
-                state.num_actions,
-                self._extent_column,
-                joint_q,
-                state.goal_quat,
-            ],
-            [out],
-            dim=(state.num_envs, ORIENTATIONS, len(self._directions)),
-        )
+        Args:
+            joint_q: Coordinates, shape [N, *].
+            column: Column of ``joint_q`` at which the object's pose begins.
+            out: Heights.
+        """
+        table = PAPER.scene.table_top_m
+        self._launch(clearance_kernel, len(out), [*self._shapes, column, table, joint_q], out)
+
+    def observe(
+        self, joint_q: wp.array, column: int, body_q: wp.array, goal: wp.array, out: wp.array, first: int = 0
+    ) -> None:
+        """Write what is seen of the shapes.
+
+        Args:
+            joint_q: Coordinates, shape [N, *].
+            column: Column of ``joint_q`` at which the object's pose begins.
+            body_q: Poses of the bodies, shape [N, B].
+            goal: Wanted orientations, shape [N].
+            out: Observation, shape [N, *].
+            first: Column of ``out`` at which the shape's values begin.
+        """
+        begin = {name: first + columns.start for name, columns in self._slices.items()}
+        surface = [*self._shapes, *self._tips, column, begin["surface"], joint_q, body_q]
+        self._launch(surface_kernel, self._surface_dim, surface, out)
+        extent = [*self._shapes, self._directions, column, begin["extent"], joint_q, goal]
+        self._launch(extent_kernel, self._extent_dim, extent, out)
+
+    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list[Any], out: wp.array) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[out], device=self._device)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
@@ -49,6 +50,12 @@ class TaskState:
     """1 where success asks that the object does not touch the table, shape [N]."""
     rng: wp.array
     """Random stream of each environment, shape [N]."""
+    surface_points: wp.array
+    """Samples of each object's surface in its frame, unscaled [m], shape [K, P]."""
+    world_object: wp.array
+    """Object of each environment, shape [N]."""
+    world_scale: wp.array
+    """Factor on its size, shape [N]."""
 
     def zeros(self, *shape: int, dtype: Any = float) -> wp.array:
         """An array of zeros on the task's device."""
@@ -122,4 +129,9 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
         goal_quat=goal,
         must_lift=wp.array(must_lift(cfg), dtype=wp.int32, device=device),
         rng=rng,
+        surface_points=wp.array(
+            np.stack([item.surface_points for item in objects]), dtype=wp.vec3, device=device
+        ),
+        world_object=wp.array(scene.world_object, dtype=wp.int32, device=device),
+        world_scale=wp.array(scene.world_scale, dtype=float, device=device),
     )

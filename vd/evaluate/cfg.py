@@ -52,13 +52,14 @@ class EvalCfg:
     row, at the first step at which all success criteria of training hold, stillness included.
 
     --suite paper runs all of the paper's evaluations in simulation and writes paper.json and paper.html, its
-    figures beside ours. What is finished is not repeated by the next call.
+    figures beside ours. --suite robust changes one thing after the other and writes robust.json and
+    robust.html. What is finished is not repeated by the next call.
     """
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = ()
-    suite: Literal["paper"] | None = None
-    """Run the paper's evaluations, on the installed policies if none is named. --objects training=FOLDER
-    held-out=FOLDER names the objects; without, our procedural sets stand for them."""
+    suite: Literal["paper", "robust"] | None = None
+    """Run the paper's evaluations, or those of every --condition, on the installed policies if none is named.
+    --objects training=FOLDER held-out=FOLDER names objects; without, our procedural sets stand for them."""
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
     """Of the suite only a part, with few objects and episodes: minutes on two CPU cores."""
     jobs: int = 1
@@ -98,8 +99,9 @@ class EvalCfg:
     """Randomise dynamics and add noise and disturbances as in training."""
     condition: Condition | None = None
     """Evaluate in a named condition, whatever the training: nominal; s3, Table S3; hard, the same with forces
-    that last a control step; mixed, Table S3 with friction, backlash, late commands and observations;
-    observation-late and command-late, 83 ms and nothing else."""
+    that last a control step; mixed, Table S3 with friction, backlash, late commands and a late object;
+    observation-late (the object), all-late (joints too) and command-late, 83 ms and nothing else; the others
+    change one thing, which the page of --suite robust names."""
     num_envs: int | None = None
     """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a GPU (1024
     with camera policies)."""

@@ -46,13 +46,11 @@ def _evaluate(cfg: EvalCfg) -> int:
 
 def _run_suite(cfg: EvalCfg) -> int:
     from vd.evaluate.page import terminal_text
-    from vd.evaluate.suite_run import OUT_OF_TIME, PAGE_FILE, RESULT_FILE, run_suite
+    from vd.evaluate.suite_run import OUT_OF_TIME, run_suite
 
     result = run_suite(cfg)
-    if cfg.json:
-        print((cfg.out / RESULT_FILE).read_text())
-    else:
-        print(f"{terminal_text(result)}\n{cfg.out / RESULT_FILE}\n{cfg.out / PAGE_FILE}")
+    written, page = (cfg.out / f"{cfg.suite}{suffix}" for suffix in (".json", ".html"))
+    print(written.read_text() if cfg.json else f"{terminal_text(result)}\n{written}\n{page}")
     for condition, policy, why in result.missing:
         print(f"vd-eval: {condition} of {policy}: {why}", file=sys.stderr)
     return int(any(why != OUT_OF_TIME for _, _, why in result.missing))

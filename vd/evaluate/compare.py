@@ -18,6 +18,7 @@ from vd.evaluate.agents import (
     task_for,
 )
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
+from vd.evaluate.conditions import in_condition
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -121,6 +122,8 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         hand_layer=cfg.hand_layer,
         condition=cfg.randomisation,
     )
+    if cfg.condition is not None:
+        task = in_condition(task, cfg.condition)
     if cfg.table_friction is not None:
         task = replace(task, table_friction=cfg.table_friction)
     if cfg.randomised:

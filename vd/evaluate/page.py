@@ -94,6 +94,7 @@ def write_page(
     figures: tuple[Sequence[str], Sequence[Sequence[str]]] | None = None,
     notes: Sequence[str] = (),
     conditions: Sequence[Sequence[str]] = (),
+    of_paper: bool = False,
 ) -> None:
     """Write the page.
 
@@ -102,9 +103,10 @@ def write_page(
         path: Of the page.
         title: By default the policies.
         lead: By default what was asked.
-        figures: Of a suite: the paper's figures beside ours, header and rows.
+        figures: Of a suite: its table, header and rows.
         notes: Of a suite: what has to be said of its objects.
-        conditions: Of a suite: name, place in the paper and flags of each.
+        conditions: Of a suite: name, place in the paper or what is changed, and flags of each.
+        of_paper: Whether the figures are the paper's beside ours.
     """
     short = labels(result.policies)
     shown = [shown_name(short[name]) for name in result.policies]
@@ -129,6 +131,7 @@ def write_page(
         if conditions
         else [(_heading(r, short), _object_cells(r)) for r in result.rows if r.headline],
         conditions=conditions,
+        of_paper=of_paper,
         protocol=[] if conditions else _protocol(result, short),
         software=result.software,
         units={row.overall.unit for row in result.rows},

@@ -9,7 +9,6 @@ from vd.assets_usd.hand_data import CameraModel
 from vd.senses import Senses
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
-from vd.sensors.surfaces import scene_surfaces
 
 
 class EnvironmentSenses:
@@ -27,14 +26,9 @@ class EnvironmentSenses:
         env.acts_in_frame = False  # who sees by a camera acts in the world, whatever its teacher does
         self.camera: DepthCamera | None = None
         if model is not None:
-            self.camera = DepthCamera(
-                scene_surfaces(scene),
-                model,
-                env.sim.body_q,
-                cfg=depth,
-                camera_body=int(scene.link_body[0]),
-                frame_s=env.cfg.sim.control_dt,
-                seed=seed,
+            frame_s = env.cfg.sim.control_dt
+            self.camera = DepthCamera.of_scene(
+                scene, env.sim.body_q, depth, model, frame_s=frame_s, seed=seed
             )
         self._steps = wp.to_torch(env.step_count)
 

@@ -1,6 +1,6 @@
-"""The paper's evaluations in simulation: what is run (CONDITIONS), and what the paper says of it (CLAIMS).
+"""Suites: the paper's evaluations in simulation, with what the paper says of them (CLAIMS), and robustness.
 
-:mod:`vd.evaluate.suite_run` runs the list.
+:mod:`vd.evaluate.suite_run` runs the lists.
 """
 
 from collections.abc import Callable
@@ -10,12 +10,14 @@ from typing import Literal
 
 import numpy as np
 
+from vd.evaluate import conditions
 from vd.evaluate.goals import Goals
 from vd.evaluate.result import Row, StoppedBy
 from vd.evaluate.statistics import Interval, choose_unit, rate_intervals
 from vd.evaluate.trace import air_table_steps
 from vd.paper import PAPER
 
+Suite = Literal["paper", "robust"]
 Group = Literal["training", "validation", "held-out", "symmetric"]
 
 OWN_SETS: dict[Group, str | None] = {
@@ -47,11 +49,13 @@ class Condition:
         objects: Group of objects.
         episodes: Starts and goals of every object.
         camera_episodes: The same for a camera policy, whose clouds and fits take most of the time.
-        paper: Where the paper shows the same.
+        paper: Where the paper shows the same, or what is changed.
         in_air: The table is taken away.
         table_friction: Of the table; None: nominal.
         goals: What camera policies know shapes and goals by; others have the mesh's alone.
         quick: Part of the reduced suite.
+        condition: What is drawn; None: nothing.
+        by_camera: Whether camera policies meet it too.
     """
 
     name: str
@@ -63,6 +67,8 @@ class Condition:
     table_friction: float | None = None
     goals: Goals = "mesh"
     quick: bool = True
+    condition: conditions.Condition | None = None
+    by_camera: bool = True
 
     @property
     def flags(self) -> str:
@@ -71,6 +77,7 @@ class Condition:
         flags += ["--in-air"] if self.in_air else []
         flags += [] if self.table_friction is None else [f"--table-friction {self.table_friction:g}"]
         flags += [] if self.goals == "mesh" else [f"--goals {self.goals}"]
+        flags += [] if self.condition is None else [f"--condition {self.condition}"]
         return " ".join(flags)
 
 
@@ -101,7 +108,43 @@ CONDITIONS = (
     Condition("air-training", "training", 20, 4, "Figures S12 to S14", in_air=True, quick=False),
     Condition("scanned-goals", "held-out", 100, 24, "Figure 5", goals="scan"),
 )
-"""What the suite runs, in this order."""
+"""What the paper's suite runs, in this order."""
+
+_FRICTION = PAPER.randomisation.friction
+_VARIED: dict[conditions.Condition, str] = {
+    "nominal": "nothing",
+    "s3": "all of Table S3",
+    "hard": "Table S3, forces last a control step",
+    "mixed": "Table S3, friction, backlash, late commands, late object",
+    "observation-late": f"object seen {conditions.STEP_LATE_S:.3f} s late",
+    "all-late": f"object and joints seen {conditions.STEP_LATE_S:.3f} s late",
+    "command-late": f"commands {conditions.STEP_LATE_S:.3f} s late",
+    "joint-friction": f"friction of {conditions.FRICTION_NM:g} N m in every joint",
+    "light": f"objects of {conditions.MASS_KG[0]:g} kg",
+    "heavy": f"objects of {conditions.MASS_KG[1]:g} kg",
+    "slippery": f"friction of hand and object {_FRICTION[0]:g}",
+    "grippy": f"friction of hand and object {_FRICTION[1]:g}",
+    "off-centre": f"centre of mass {conditions.OFF_CENTRE_M:g} m off",
+    "soft-tips": "soft fingertips",
+    "stiff-contacts": "contacts twice as stiff, physics steps half as long",
+    "pose-error": f"object seen {conditions.POSE_ERROR[0]:g} m and {conditions.POSE_ERROR[1]:g} rad off",
+}
+ROBUST = tuple(
+    Condition(
+        name,
+        "held-out",
+        20,
+        4,
+        changed,
+        condition=name,
+        quick=name in ("nominal", "s3", "mixed"),
+        by_camera=name
+        not in ("observation-late", "pose-error"),  # it looks for itself, as late as images are
+    )
+    for name, changed in _VARIED.items()
+)
+"""What ``--suite robust`` runs: one thing changed in each, but in the first four."""
+SUITES: dict[Suite, tuple[Condition, ...]] = {"paper": CONDITIONS, "robust": ROBUST}
 
 
 @dataclass(frozen=True)

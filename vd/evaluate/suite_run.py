@@ -21,15 +21,15 @@ from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.compare import compare
 from vd.evaluate.page import NOTHING, labels, number, shown_name, write_page
 from vd.evaluate.result import SUCCESS, Result
-from vd.evaluate.statistics import Interval
+from vd.evaluate.statistics import Interval, paired_difference
 from vd.evaluate.suite import (
     CLAIMS,
-    CONDITIONS,
     OWN_SETS,
     QUICK_CAMERA_EPISODES,
     QUICK_EPISODES,
     QUICK_OBJECTS,
     QUICK_S,
+    SUITES,
     Claim,
     Condition,
     Group,
@@ -40,7 +40,7 @@ from vd.workers import run_tasks
 
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
-RESULT_FILE, PAGE_FILE = "paper.json", "paper.html"
+ROBUST_HEADER = ("condition", "changed", "policy", "success", "points from nominal", "within 0.1 rad", "lost")
 LOG_FILE = "log.txt"
 """Progress of an evaluation that ran beside others."""
 OUT_OF_TIME = "out of time; the same command goes on from here"
@@ -99,8 +99,10 @@ def run_suite(cfg: EvalCfg) -> Result:
     """
     begun = time.monotonic()
     stop_at = begun + QUICK_S if cfg.quick else math.inf
-    groups = object_groups(cfg.objects, quick=cfg.quick)
-    conditions = tuple(c for c in CONDITIONS if (c.quick or not cfg.quick) and c.objects in groups)
+    assert cfg.suite is not None
+    suite = SUITES[cfg.suite]
+    groups = object_groups(cfg.objects, {c.objects for c in suite}, quick=cfg.quick)
+    conditions = tuple(c for c in suite if (c.quick or not cfg.quick) and c.objects in groups)
     tasks = make_tasks(cfg, conditions, groups)
     found = {(task.condition, task.policy): task.there() for task in tasks}
     missing = {key: NOT_RUN for key, result in found.items() if result is None}
@@ -186,6 +188,8 @@ def make_tasks(cfg: EvalCfg, conditions: tuple[Condition, ...], groups: dict[Gro
         for name in cfg.agent_names:
             if condition.goals != "mesh" and not camera[name]:  # a teacher's goals are orientations
                 continue
+            if camera[name] and not condition.by_camera:
+                continue
             one = settings(cfg, condition, name, groups[condition.objects], camera=camera[name])
             one = replace(one, out=cfg.out / condition.name / short[name].replace("/", "-"))
             tasks.append(Task(condition.name, name, one, prints[name]))
@@ -209,23 +213,25 @@ def settings(cfg: EvalCfg, condition: Condition, policy: str, objects: Objects, 
         in_air=condition.in_air,
         table_friction=condition.table_friction,
         goals=condition.goals,
+        condition=condition.condition,
     )
 
 
-def object_groups(objects: tuple[str, ...], *, quick: bool) -> dict[Group, Objects]:
-    """The objects of each group: those given as ``GROUP=SET``, our procedural ones for the others.
+def object_groups(objects: tuple[str, ...], wanted: set[Group], *, quick: bool) -> dict[Group, Objects]:
+    """The objects of each wanted group: those given as ``GROUP=SET``, our procedural ones for the others.
 
     Raises:
-        ValueError: There is no such group.
+        ValueError: No such group is wanted.
     """
     from vd.assets_usd.objects.model import object_files
     from vd.assets_usd.objects.sets import set_folder
 
     given = parse_groups(objects)
-    if unknown := [name for name in given if name not in OWN_SETS]:
-        raise ValueError(f"--objects: '{unknown[0]}' is no group of the suite; {', '.join(OWN_SETS)} are")
+    own_sets = {group: own for group, own in OWN_SETS.items() if group in wanted}
+    if unknown := [name for name in given if name not in own_sets]:
+        raise ValueError(f"--objects: '{unknown[0]}' is no group of the suite; {', '.join(own_sets)} are")
     groups: dict[Group, Objects] = {}
-    for group, own in OWN_SETS.items():
+    for group, own in own_sets.items():
         if group not in given and own is None:
             continue
         sets = given.get(group) or (str(own),)
@@ -264,23 +270,55 @@ def _write(
     result: Result, cfg: EvalCfg, conditions: tuple[Condition, ...], groups: dict[Group, Objects]
 ) -> None:
     """The page and its figures, of what there is."""
-    figures = paper_figures(result, conditions)
-    write_json(cfg.out / RESULT_FILE, result.summary() | {"quick": cfg.quick, "figures": figures})
     short = labels(result.policies)
-    table = [
-        [row["figure"], row["condition"], row["paper"] or NOTHING, *row["ours"].values()] for row in figures
-    ]
+    title, of = "The paper's evaluations", " beside the paper"
+    header: tuple[str, ...] = ("figure", "condition", "paper", *short.values())
+    if cfg.suite == "paper":
+        figures = paper_figures(result, conditions)
+        table = [
+            [row["figure"], row["condition"], row["paper"] or NOTHING, *row["ours"].values()]
+            for row in figures
+        ]
+    else:
+        title, of, header = "Robustness", "", ROBUST_HEADER
+        table = robust_table(result, conditions, short)
+        figures = [dict(zip(header, row, strict=True)) for row in table]
+    write_json(cfg.out / f"{cfg.suite}.json", result.summary() | {"quick": cfg.quick, "figures": figures})
     notes = [f"Objects, {group}: {objects.text}." for group, objects in groups.items()]
     notes += ["Held-out objects judge, and nothing is chosen on them."]
     write_page(
         result,
-        cfg.out / PAGE_FILE,
-        title="The paper's evaluations",
-        lead=f"{', '.join(short.values())} beside the paper{', the reduced suite' if cfg.quick else ''}",
-        figures=(("figure", "condition", "paper", *short.values()), table),
+        cfg.out / f"{cfg.suite}.html",
+        title=title,
+        lead=f"{', '.join(short.values())}{of}{', the reduced suite' if cfg.quick else ''}",
+        figures=(header, table),
         notes=notes,
         conditions=[(c.name, c.paper, c.flags) for c in conditions],
+        of_paper=cfg.suite == "paper",
     )
+
+
+def robust_table(result: Result, conditions: tuple[Condition, ...], short: dict[str, str]) -> list[list[str]]:
+    """A line for each condition and policy: what it changes, and how much success it costs."""
+    found = {
+        (condition, row.policy): row
+        for (condition, _), rows in result.headlines().items()
+        for row in rows.values()
+    }
+    table = []
+    for condition in conditions:
+        for policy in result.policies:
+            row, nominal = found.get((condition.name, policy)), found.get((conditions[0].name, policy))
+            if row is None:
+                continue
+            change = NOTHING
+            if nominal not in (None, row):
+                d = paired_difference(row.successes, nominal.successes, row.overall.unit)
+                change = f"{100 * d.value:+.1f} ({100 * d.low:+.1f} to {100 * d.high:+.1f})"
+            rates = (row.overall.outcomes["success"], row.precise, row.overall.outcomes["object falls"])
+            success, precise, lost = (share_text(r.value, r.low, r.high) for r in rates)
+            table.append([condition.name, condition.paper, short[policy], success, change, precise, lost])
+    return table
 
 
 def paper_figures(result: Result, conditions: tuple[Condition, ...]) -> list[dict[str, Any]]:

@@ -180,22 +180,22 @@ class Hide:
 
     def run(self) -> int:
         """Write the recording."""
-        from vd.bench.hide import hide, parse_effect, truth_path
+        from vd.bench.hide import Hiding, hide, parse_effect, truth_path
 
         if (self.out / "recording.json").exists() and not truth_path(self.out).exists():
             raise ValueError(
                 f"--out {self.out} holds a recording in which nothing was hidden; name another folder"
             )
         parsed = [parse_effect(text) for text in self.effect]
-        hidden = hide(
+        hiding = Hiding(
             self.model,
             {name: values for name, values, _ in parsed},
-            self.out,
-            seed=self.seed,
+            self.seed,
             effect_joints={name: joints for name, _, joints in parsed if joints},
             excitations=self.excitations,
             pwm=self.pwm,
         )
+        hidden = hide(hiding, self.out)
         if self.json:
             print(json.dumps(hidden.truth, indent=1))
         else:

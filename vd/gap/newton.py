@@ -20,6 +20,7 @@ from vd.assets_usd.hand_model import HandModel
 from vd.gap.chain import DOWN_IN_BASE, GRAVITY_M_S2
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import STREAM_BITS
+from vd.kernels.launch import count_kernel, launch
 from vd.kernels.servo.actuators import BACKLASH_WIDTH, ENCODER_BIAS
 from vd.kernels.servo.chains import Samples
 from vd.kernels.servo.joint_replay import (
@@ -27,7 +28,6 @@ from vd.kernels.servo.joint_replay import (
     replay_command_kernel,
     rest_play_kernel,
     sample_position_kernel,
-    tick_kernel,
 )
 from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
@@ -255,7 +255,7 @@ class HandReplay:
                 outputs=[self.positions],
                 device=self.device,
             )
-            wp.launch(tick_kernel, dim=1, inputs=[self._step], device=self.device)
+            launch(count_kernel, 1, [], [self._step])
 
 
 def gravity_load(hand: HandModel, q: np.ndarray) -> np.ndarray:

@@ -177,7 +177,8 @@ class WorkerPool:
         """Where the time went, in words."""
         parts = sorted(self.spent.items(), key=lambda item: -item[1][1])
         times = [f"{name} {seconds:.1f} s ({rolls})" for name, (rolls, seconds) in parts if seconds > SHORT_S]
-        return f"{self.simulated} motions simulated; summed over workers: {', '.join(times)}"
+        summed = f"; summed over workers: {', '.join(times)}" if times else ""
+        return f"{self.simulated} motions simulated{summed}"
 
     def run(self, spec: JointSpec, calls: Sequence[Call]) -> list[Any]:
         """Results of the calls, in order; of a call that was made before, the same. For several threads."""

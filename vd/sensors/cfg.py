@@ -6,21 +6,9 @@ from typing import Any, ClassVar
 from vd.config import Dropped
 from vd.paper import PAPER
 
-
-@dataclass(frozen=True)
-class StereoImager:
-    """What of a stereo camera sets the errors of its depth."""
-
-    baseline_m: float
-    """Distance between the two imagers [m]."""
-    focal_px: float
-    """Focal length of an imager [pixel], at the resolution at which disparities are found."""
-
-
-D415 = StereoImager(baseline_m=0.055, focal_px=1024.2)
-"""Intel RealSense D415: baseline 55 mm (D400 series data sheet); 1280 pixels over the camera's 64 degrees."""
-
-
+BASELINE_M, FOCAL_PX = 0.055, 1024.2
+"""Distance of the imagers of an Intel RealSense D415 [m] (D400 series data sheet), and their focal length
+[pixel] where disparities are found: 1280 pixels over 64 degrees."""
 LATENCY_S = (1.0 / 30.0, 2.0 / 30.0)
 """Age of images at 30 Hz, as vd-deploy asks for [s]: one period to take and send, and up to one until it is
 read (an assumption; the data sheet gives none)."""
@@ -33,8 +21,7 @@ half a metre away, as of 20 views of one finger."""
 class DepthSensorCfg:
     """Errors of a stereo depth camera. All are off: zero."""
 
-    imager: StereoImager = D415
-    """Camera whose disparities are noisy and rounded."""
+    RETIRED: ClassVar[dict[str, Any]] = {"imager": {"baseline_m": BASELINE_M, "focal_px": FOCAL_PX}}
     disparity_std_px: float = 0.0
     """Noise of the disparity [pixel]; in depth it is z^2 / (focal length * baseline) times that. Real cameras
     of this kind: 0.05 to 0.1."""
@@ -75,22 +62,16 @@ class DepthSensorCfg:
     @property
     def enabled(self) -> bool:
         """Whether anything is measured otherwise than it is."""
-        return (
-            self.uses_edges
-            or self.shadow
-            or any(
-                value > 0.0
-                for value in (self.disparity_std_px, self.disparity_step_px, self.dropout, self.min_range_m)
-            )
-        )
+        errors = self.disparity_std_px, self.disparity_step_px, self.dropout, self.min_range_m
+        return self.uses_edges or self.shadow or any(value > 0.0 for value in errors)
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         for name in ("disparity_std_px", "disparity_step_px", "min_range_m"):
             if getattr(self, name) < 0.0:
                 raise ValueError(f"sensor.{name} = {getattr(self, name)}; it must not be negative")
-        if self.imager.baseline_m <= 0.0 or self.imager.focal_px <= 0.0 or self.edge_jump_m <= 0.0:
-            raise ValueError("sensor.imager and sensor.edge_jump_m must be positive")
+        if self.edge_jump_m <= 0.0:
+            raise ValueError(f"sensor.edge_jump_m = {self.edge_jump_m}; it must be positive")
         if min(self.edge_dropout, self.flying, self.dropout) < 0.0 or self.dropout > 1.0:
             raise ValueError("sensor.edge_dropout, flying and dropout are shares: choose them in [0, 1]")
         if self.edge_dropout + self.flying > 1.0:
@@ -104,7 +85,7 @@ class DepthSensorCfg:
 class DepthCameraCfg:
     """A depth camera on the hand's base in every environment."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"method": Dropped("raster"), "block": 1}
+    RETIRED: ClassVar[dict[str, Any]] = {"method": Dropped("raster"), "block": 1, "focal_noise": 0.0}
     points: int = PAPER.camera.points
     """Points of a cloud at most; 0 makes no clouds."""
     crop_m: tuple[float, float] = PAPER.camera.crop_m
@@ -114,8 +95,6 @@ class DepthCameraCfg:
     know."""
     rotation_noise_rad: float = 0.0
     """Standard deviation of its orientation about each axis [rad], likewise."""
-    focal_noise: float = 0.0
-    """Standard deviation of the focal length, relative to it."""
     latency_s: tuple[float, float] = (0.0, 0.0)
     """Range of the images' age [s], drawn evenly for each environment."""
     sensor: DepthSensorCfg = field(default_factory=DepthSensorCfg)
@@ -140,5 +119,5 @@ class DepthCameraCfg:
             raise ValueError(f"crop_m = {self.crop_m}; name the lower height first")
         if not 0.0 <= self.latency_s[0] <= self.latency_s[1]:
             raise ValueError(f"latency_s = {self.latency_s}; name two times, none negative, the least first")
-        if min(self.position_noise_m, self.rotation_noise_rad, self.focal_noise) < 0.0:
-            raise ValueError("position_noise_m, rotation_noise_rad and focal_noise must not be negative")
+        if min(self.position_noise_m, self.rotation_noise_rad) < 0.0:
+            raise ValueError("position_noise_m and rotation_noise_rad must not be negative")

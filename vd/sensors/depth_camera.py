@@ -6,12 +6,14 @@ real depth cameras report it. Quaternions are xyzw.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CameraModel
+from vd.kernels.launch import count_kernel, launch
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.sensor.depth_cloud import next_frame_kernel
 from vd.kernels.sensor.depth_sensor import (
@@ -19,7 +21,6 @@ from vd.kernels.sensor.depth_sensor import (
     delay_poses_kernel,
     forget_poses_kernel,
     measure_depth_kernel,
-    next_count_kernel,
 )
 from vd.kernels.sensor.raycast import (
     NO_HIT,
@@ -29,7 +30,7 @@ from vd.kernels.sensor.raycast import (
     place_meshes_kernel,
 )
 from vd.paper import PAPER
-from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.cfg import BASELINE_M, FOCAL_PX, DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_cloud import DepthCloud, make_views
 from vd.sensors.surfaces import SurfaceSet, scene_surfaces
 from vd.sim.scene import Scene
@@ -101,8 +102,8 @@ class DepthCamera:
         def empty(*shape: int, dtype: type = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        focal_scale = 1.0 + cfg.focal_noise * np.asarray(generator.standard_normal(n))
-        self.views = make_views(camera, focal_scale, device)
+        generator.standard_normal(n)  # keeps the viewpoints that a seed has had
+        self.views = make_views(camera, n, device)
         """Focal lengths, principal point [pixel] and range [m] of each camera, shape [N]."""
         self.extrinsics = wp.array(_extrinsics(camera, generator, cfg, n), dtype=wp.transform, device=device)
         """Optical frame of each camera in the frame of the body that carries it, shape [N]."""
@@ -125,7 +126,7 @@ class DepthCamera:
         """Measured depth [m], 0 for none; the same array as ``true_depth`` if the sensor is perfect."""
         self.rng = wp.empty(n, dtype=wp.uint32, device=device)
         """Random state of each world, shape [N]."""
-        wp.launch(init_rng_kernel, dim=n, inputs=[seed], outputs=[self.rng], device=device)
+        launch(init_rng_kernel, n, [seed], [self.rng])
 
         self._rotation, self._position = empty(n, shapes, dtype=wp.mat33), empty(n, shapes, dtype=wp.vec3)
         self._depth_bits = self.true_depth.view(wp.int32)
@@ -143,28 +144,16 @@ class DepthCamera:
         scene: Scene,
         body_q: wp.array,
         cfg: DepthCameraCfg | None = None,
-        *,
-        frame_s: float = 1.0 / PAPER.scene.control_hz,
-        seed: int = 0,
+        camera: CameraModel | None = None,
+        **settings: Any,
     ) -> "DepthCamera":
-        """The camera of the hand's USD in every world of a scene.
+        """The camera of the hand's USD, or another on its base, in every world of a scene.
 
-        Args:
-            scene: The worlds; their model needs no visual shapes.
-            body_q: Body poses, shape [N, B] (``Simulator.body_q``).
-            cfg: Settings.
-            frame_s: Time between captures [s].
-            seed: Of viewpoints, latencies and sensor errors.
+        The rest is as for the class; the scene's model needs no visual shapes.
         """
-        return cls(
-            scene_surfaces(scene),
-            scene.hand.camera,
-            body_q,
-            cfg=cfg,
-            camera_body=int(scene.link_body[0]),
-            frame_s=frame_s,
-            seed=seed,
-        )
+        body = int(scene.link_body[0])
+        camera = camera or scene.hand.camera
+        return cls(scene_surfaces(scene), camera, body_q, cfg=cfg, camera_body=body, **settings)
 
     def reset(self, mask: wp.array | None = None) -> None:
         """Forget the past of worlds, so that no late image shows what was before their reset.
@@ -176,7 +165,7 @@ class DepthCamera:
             return
         if mask is None:
             mask = wp.ones(self.num_envs, dtype=wp.int32, device=self.device)
-        self._launch(forget_poses_kernel, self.body_q.shape, [mask, self.body_q], [self._history])
+        launch(forget_poses_kernel, self.body_q.shape, [mask, self.body_q], [self._history])
 
     def stateful(self) -> dict[str, wp.array]:
         """What another camera of the same settings and seed needs to go on as this one would."""
@@ -189,15 +178,15 @@ class DepthCamera:
         """Take an image in every world and make its cloud. Launches only; nothing reaches the host."""
         n, surfaces = self.num_envs, self.surfaces
         body_q = self._late_poses()
-        self._launch(place_camera_kernel, n, [self._camera_body, self.extrinsics, body_q], [self.camera_q])
-        self._launch(
+        launch(place_camera_kernel, n, [self._camera_body, self.extrinsics, body_q], [self.camera_q])
+        launch(
             place_meshes_kernel,
             self._rotation.shape,
             [surfaces.shape_body, self.camera_q, body_q],
             [self._rotation, self._position],
         )
         self.true_depth.fill_(NO_HIT)
-        self._launch(
+        launch(
             cast_rays_kernel,
             (n, len(surfaces.slot_shape)),
             [
@@ -214,14 +203,14 @@ class DepthCamera:
             ],
             [self._depth_bits],
         )
-        self._launch(
+        launch(
             finish_depth_kernel,
             (n, self.height, self._lanes),
             [self.views, *self._table, self._lanes, self.table, self.camera_q],
             [self.true_depth],
         )
         if self.depth is not self.true_depth:
-            self._launch(
+            launch(
                 measure_depth_kernel,
                 self.depth.shape,
                 [self.sensors, self.true_depth, self.rng],
@@ -230,24 +219,21 @@ class DepthCamera:
         if self.cfg.points:
             if self._believed is not self.extrinsics:
                 believed = [self._camera_body, self._believed, body_q]
-                self._launch(place_camera_kernel, n, believed, [self._believed_q])
+                launch(place_camera_kernel, n, believed, [self._believed_q])
             self._cloud.make(self.depth, self.views, self._believed_q, self._believed, self.rng)
-        self._launch(next_frame_kernel, n, [self.rng], [])
-
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        launch(next_frame_kernel, n, [], [self.rng])
 
     def _late_poses(self) -> wp.array:
         """Body poses that this capture shows."""
         if self._history is None:
             return self.body_q
-        self._launch(
+        launch(
             delay_poses_kernel,
             self.body_q.shape,
-            [self._frame, self.delay, self.body_q, self._history],
-            [self._late_q],
+            [self._frame, self.delay, self.body_q],
+            [self._history, self._late_q],
         )
-        self._launch(next_count_kernel, 1, [self._frame], [])
+        launch(count_kernel, 1, [], [self._frame])
         return self._late_q
 
 
@@ -277,9 +263,9 @@ def _believed(camera: CameraModel, cfg: DepthCameraCfg, extrinsics: wp.array) ->
 
 def _sensor(cfg: DepthSensorCfg, camera: CameraModel) -> DepthSensorParams:
     params = DepthSensorParams()
-    params.depth_disparity = cfg.imager.focal_px * cfg.imager.baseline_m
+    params.depth_disparity = FOCAL_PX * BASELINE_M
     params.disparity_std, params.disparity_step = cfg.disparity_std_px, cfg.disparity_step_px
-    params.shadow = camera.fx * cfg.imager.baseline_m if cfg.shadow else 0.0
+    params.shadow = camera.fx * BASELINE_M if cfg.shadow else 0.0
     params.edge_jump = cfg.edge_jump_m if cfg.uses_edges else 0.0
     params.edge_dropout, params.flying, params.dropout = cfg.edge_dropout, cfg.flying, cfg.dropout
     params.min_range, params.max_range = cfg.min_range_m, camera.far

@@ -1,12 +1,12 @@
 """Point clouds from depth images: those of simulated cameras, or of a real one."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
 from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, compose
+from vd.kernels.launch import launch
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.sensor.depth_cloud import (
     TILE_COLUMNS,
@@ -20,16 +20,12 @@ from vd.kernels.sensor.raycast import View
 from vd.paper import PAPER
 
 
-def make_views(camera: CameraModel, focal_scale: Sequence[float] | np.ndarray, device: str) -> wp.array:
-    """The intrinsics of N cameras, whose focal lengths are ``focal_scale`` [N] times the camera's."""
-    views = []
-    for scale in focal_scale:
-        view = View()
-        view.fx, view.fy = camera.fx * float(scale), camera.fy * float(scale)
-        view.cx, view.cy = camera.cx, camera.cy
-        view.near, view.far = camera.near, camera.far
-        views.append(view)
-    return wp.array(views, dtype=View, device=device)
+def make_views(camera: CameraModel, count: int, device: str) -> wp.array:
+    """The intrinsics of so many equal cameras."""
+    view = View()
+    view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
+    view.near, view.far = camera.near, camera.far
+    return wp.array([view] * count, dtype=View, device=device)
 
 
 class DepthCloud:
@@ -45,16 +41,7 @@ class DepthCloud:
         crop_m: tuple[float, float] = PAPER.camera.crop_m,
         device: str = "cpu",
     ):
-        """Allocate N clouds.
-
-        Args:
-            height: Rows of the image.
-            width: Columns of the image.
-            num_envs: N.
-            points: K, points of a cloud at most.
-            crop_m: Least and largest height of a point in the world frame [m].
-            device: Warp device.
-        """
+        """Allocate N clouds of at most K ``points`` with heights in the world frame within ``crop_m`` [m]."""
         self.crop_m = crop_m
         self._tile_rows = math.ceil(height / int(TILE_ROWS))
         self._tile_columns = math.ceil(width / int(TILE_COLUMNS))
@@ -71,10 +58,7 @@ class DepthCloud:
         """Pixels within the crop, of which the points were chosen, shape [N]."""
         self._tile_pixels = empty(num_envs, tiles, dtype=wp.uint32)
         self._tile_first = empty(num_envs, tiles)
-        self._row_count, self._row_first = (
-            empty(num_envs, self._tile_rows),
-            empty(num_envs, self._tile_rows),
-        )
+        self._row_count, self._row_first = (empty(num_envs, self._tile_rows) for _ in range(2))
 
     def make(
         self, depth: wp.array, views: wp.array, camera_q: wp.array, extrinsics: wp.array, rng: wp.array
@@ -88,37 +72,24 @@ class DepthCloud:
             extrinsics: Optical frames in the frame in which the points are wanted, shape [N].
             rng: Random state of each world, shape [N]; not advanced.
         """
-        worlds, device = len(self.count), depth.device
-        wp.launch(
+        marked = [self._tile_pixels, self._tile_first]
+        launch(
             crop_pixels_kernel,
-            dim=(worlds, self._tile_rows),
-            inputs=[views, *self.crop_m, self._tile_columns, camera_q, depth],
-            outputs=[self._tile_pixels, self._tile_first, self._row_count],
-            device=device,
+            self._row_count.shape,
+            [views, *self.crop_m, self._tile_columns, camera_q, depth],
+            [*marked, self._row_count],
         )
-        wp.launch(
+        launch(
             count_points_kernel,
-            dim=worlds,
-            inputs=[self.points.shape[1], self._row_count],
-            outputs=[self._row_first, self.available, self.count],
-            device=device,
+            len(self.count),
+            [self.points.shape[1], self._row_count],
+            [self._row_first, self.available, self.count],
         )
-        wp.launch(
+        launch(
             choose_points_kernel,
-            dim=self.points.shape,
-            inputs=[
-                views,
-                self._tile_columns,
-                extrinsics,
-                rng,
-                depth,
-                self._tile_pixels,
-                self._tile_first,
-                self._row_first,
-                self.available,
-            ],
-            outputs=[self.points],
-            device=device,
+            self.points.shape,
+            [views, self._tile_columns, extrinsics, rng, depth, *marked, self._row_first, self.available],
+            [self.points],
         )
 
 
@@ -134,25 +105,20 @@ class CameraCloud:
         device: str = "cpu",
         seed: int = 0,
     ):
-        """Prepare the cloud.
+        """Prepare a cloud of at most K ``points`` within heights ``crop_m`` [m]; ``seed`` is of their choice.
 
-        Args:
-            camera: The camera; its pose is that in the hand's base.
-            points: K, points at most.
-            crop_m: Least and largest height over the table [m].
-            device: Warp device.
-            seed: Of the choice of points.
+        The camera's pose is that in the hand's base.
         """
         self.cloud = DepthCloud(camera.height, camera.width, 1, points=points, crop_m=crop_m, device=device)
         self.depth = wp.zeros((1, camera.height, camera.width), dtype=float, device=device)
         """The image [m], 0 for none, shape [1, H, W]."""
-        self._views = make_views(camera, [1.0], device)
+        self._views = make_views(camera, 1, device)
         extrinsics = np.concatenate([camera.position, camera.quaternion])
         in_world = compose(np.array(BASE_IN_WORLD), extrinsics)
         self._extrinsics = wp.array(extrinsics[None], dtype=wp.transform, device=device)
         self._camera_q = wp.array(in_world[None], dtype=wp.transform, device=device)
         self._rng = wp.empty(1, dtype=wp.uint32, device=device)
-        wp.launch(init_rng_kernel, dim=1, inputs=[seed], outputs=[self._rng], device=device)
+        launch(init_rng_kernel, 1, [seed], [self._rng])
 
     def make(self, depth: np.ndarray) -> tuple[wp.array, wp.array]:
         """Make the cloud of an image.
@@ -173,5 +139,5 @@ class CameraCloud:
             )
         self.depth.assign(np.asarray(depth, dtype=np.float32)[None])
         self.cloud.make(self.depth, self._views, self._camera_q, self._extrinsics, self._rng)
-        wp.launch(next_frame_kernel, dim=1, inputs=[self._rng], device=self._rng.device)
+        launch(next_frame_kernel, 1, [], [self._rng])
         return self.cloud.points, self.cloud.count

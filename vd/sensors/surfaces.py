@@ -6,9 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hand_visuals import read_surfaces
-from vd.assets_usd.objects.model import ObjectModel
 from vd.sim.scene import Scene
 
 
@@ -79,39 +77,7 @@ class SurfaceSet:
 
 def scene_surfaces(scene: Scene) -> SurfaceSet:
     """What a camera sees of a scene but the table: the hand's links, and the object as its last shape."""
-    return hand_surfaces(
-        scene.hand,
-        scene.objects,
-        link_body=scene.link_body,
-        object_body=scene.object_body,
-        world_object=scene.world_object,
-        world_scale=scene.world_scale,
-        device=str(scene.model.device),
-    )
-
-
-def hand_surfaces(
-    hand: HandModel,
-    objects: Sequence[ObjectModel],
-    *,
-    link_body: np.ndarray,
-    object_body: int,
-    world_object: np.ndarray,
-    world_scale: np.ndarray,
-    device: str,
-) -> SurfaceSet:
-    """A hand's links, and an object as the last shape, in each of N worlds.
-
-    Args:
-        hand: The hand.
-        objects: The objects.
-        link_body: Body of each link of the hand, an index within a world, shape [L].
-        object_body: Body of the object, an index within a world.
-        world_object: Object of each world, shape [N].
-        world_scale: Size factor of each world's object, shape [N].
-        device: Warp device.
-    """
-    parts = read_surfaces(hand)
+    parts = read_surfaces(scene.hand)
     meshes: list[Surface] = []
     known: dict[bytes, int] = {}
 
@@ -123,9 +89,10 @@ def hand_surfaces(
         return known[key]
 
     links = [index(part.vertices, part.faces) for part in parts]
-    places = np.array([index(item.vertices, item.faces) for item in objects])
-    shape_mesh = np.column_stack([np.tile(links, (len(world_object), 1)), places[world_object]])
+    places = np.array([index(item.vertices, item.faces) for item in scene.objects])
+    shape_mesh = np.column_stack([np.tile(links, (scene.num_envs, 1)), places[scene.world_object]])
     shape_scale = np.ones(shape_mesh.shape)
-    shape_scale[:, -1] = world_scale
-    bodies = [*(link_body[part.link] for part in parts), object_body]
+    shape_scale[:, -1] = scene.world_scale
+    bodies = [*(scene.link_body[part.link] for part in parts), scene.object_body]
+    device = str(scene.model.device)
     return SurfaceSet(meshes, np.array(bodies), shape_mesh, shape_scale, device=device)

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from vd.kernels.launch import launch
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.servo.actuators import (
     COMMAND_DELAY,
@@ -95,6 +96,7 @@ class JointServo:
         """Parameter rows, shape [N D, P]. May be written on the device (then :meth:`push_inertia`)."""
         self.state = zeros(n * d, STATE_COLUMNS)
         """State rows, shape [N D, STATE_COLUMNS]."""
+        self._dim = n, d
         self.power = wp.ones((n, d), dtype=float, device=self.device)
         """Factor on the controllers' gains; 0 switches the torque off, shape [N, D]."""
         self.reference = zeros(n, d)
@@ -108,18 +110,13 @@ class JointServo:
         longest = bounds[COMMAND_DELAY] + MAX_JITTER_SIGMAS * bounds[JITTER_SIGMA]
         capacity = math.ceil(longest / control_dt) + 2
         past = math.ceil(bounds[READ_DELAY] / physics_dt) + 2
-        self._transit = (
-            zeros(n, d, dtype=wp.int32),
-            zeros(n, d, dtype=wp.int32),
-            zeros(n, d, capacity),
-            zeros(n, d, capacity),
-        )
+        self._queue = [zeros(n, d, dtype=wp.int32), zeros(n, d, dtype=wp.int32)]
+        self._transit = [*self._queue, zeros(n, d, capacity), zeros(n, d, capacity)]
         self._held = zeros(n, d)
         self._history_index = zeros(n, d, dtype=wp.int32)
-        self._history = zeros(n, d, past)
-        self._speed_history = zeros(n, d, past)
+        self._past = [zeros(n, d, past), zeros(n, d, past)]
         self._rng = zeros(n, dtype=wp.uint32)
-        wp.launch(init_rng_kernel, dim=n, inputs=[seed], outputs=[self._rng], device=self.device)
+        launch(init_rng_kernel, n, [seed], [self._rng])
 
         model = solver.mjw_model
         self._inverse_inertia = model.dof_invweight0
@@ -168,7 +165,7 @@ class JointServo:
 
     def push_inertia(self) -> None:
         """Hand the rows' inertia to the solver; all else in the rows acts at once, by itself."""
-        self._launch(joint_inertia_kernel, [self.parameters], [self._armature])
+        launch(joint_inertia_kernel, self._dim, [self.parameters], [self._armature])
         self._solver.notify_model_changed(newton.ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES)
 
     def reset(self, mask: wp.array, *, command: wp.array2d | None = None) -> None:
@@ -180,72 +177,51 @@ class JointServo:
             mask: 1 for the worlds to reset, int32, shape [N].
             command: The command they have had so far [rad], shape [N, *]; the positions by default.
         """
-        head, count = self._transit[:2]
-        self._launch(
+        command = self._joint_q if command is None else command
+        measured = [*self._past, self.measured_q, self.measured_qd]
+        launch(
             reset_joint_kernel,
-            [self.parameters, mask, self._joint_q if command is None else command, self._joint_q],
-            [
-                self.state,
-                head,
-                count,
-                self._held,
-                self._history,
-                self._speed_history,
-                self.measured_q,
-                self.measured_qd,
-            ],
+            self._dim,
+            [self.parameters, mask, command, self._joint_q],
+            [self.state, *self._queue, self._held, *measured],
         )
 
     def send(self, command: wp.array2d) -> None:
         """Send a command [rad], shape [N, *], once per control step."""
-        wp.launch(
-            send_command_kernel,
-            dim=self.num_envs,
-            inputs=[self.parameters, self.dt, command, self.state, self._rng, *self._transit],
-            device=self.device,
-        )
+        inputs = [self.parameters, self.dt, command, self.state]
+        launch(send_command_kernel, self.num_envs, inputs, [self._rng, *self._transit])
 
     def receive(self) -> None:
         """Find the references of the coming physics step from the commands sent."""
-        inputs = [self.parameters, self.dt, self.state, *self._transit, self._held]
-        self._launch(receive_command_kernel, inputs, [self.reference])
+        changed = [self.state, *self._transit, self._held, self.reference]
+        launch(receive_command_kernel, self._dim, [self.parameters, self.dt], changed)
 
     def drive(self, joint_q: wp.array2d, joint_qd: wp.array2d) -> None:
         """Advance the servos by one physics step under ``reference`` and set the solver's drives.
 
-        Args:
-            joint_q: Joint positions at the start of the step [rad], shape [N, *].
-            joint_qd: Joint velocities [rad/s], shape [N, *].
+        Positions [rad] and velocities [rad/s] are those at the start of the step, shape [N, *].
         """
         model = [self.parameters, self._inverse_inertia, self._effort]
-        inputs = [self.dt, self.reference, self.power, joint_q, joint_qd, self.state]
-        self._launch(drive_joint_kernel, [*model, *inputs], self._outputs)
+        inputs = [self.dt, self.reference, self.power, joint_q, joint_qd]
+        launch(drive_joint_kernel, self._dim, [*model, *inputs], [self.state, *self._outputs])
 
     def finish(self, previous_q: wp.array2d, joint_q: wp.array2d, joint_qd: wp.array2d) -> None:
-        """Apply the velocity limits to the state after a physics step, and remember the positions.
+        """Apply the velocity limits to the state after a physics step, and remember it.
 
-        Args:
-            previous_q: Joint positions before the step [rad], shape [N, *].
-            joint_q: Joint positions after it, shape [N, *].
-            joint_qd: Joint velocities after it [rad/s], shape [N, *].
+        Positions before and after the step [rad] and velocities after it [rad/s], shape [N, *].
         """
-        self._launch(
-            finish_joint_kernel,
-            [self.parameters, self.dt, previous_q, joint_q, joint_qd, self._history_index],
-            [self._history, self._speed_history],
-        )
+        changed = [joint_q, joint_qd, self._history_index, *self._past]
+        launch(finish_joint_kernel, self._dim, [self.parameters, self.dt, previous_q], changed)
 
     def measure(self) -> None:
         """Refresh ``measured_q`` and ``measured_qd``, once per control step."""
-        self._launch(
-            measure_joint_kernel,
-            [self.parameters, self.dt, self._history_index, self._history, self._speed_history],
-            [self.measured_q, self.measured_qd],
-        )
+        inputs = [self.parameters, self.dt, self._history_index, *self._past]
+        launch(measure_joint_kernel, self._dim, inputs, [self.measured_q, self.measured_qd])
 
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint, by name."""
         head, count, value, time = self._transit
+        position, speed = self._past
         return {
             "servo_parameters": self.parameters,
             "servo_state": self.state,
@@ -255,13 +231,9 @@ class JointServo:
             "servo_transit_count": count,
             "servo_transit_value": value,
             "servo_transit_time": time,
-            "servo_history": self._history,
+            "servo_history": position,
             "servo_history_index": self._history_index,
-            "servo_speed_history": self._speed_history,
+            "servo_speed_history": speed,
             "servo_measured_q": self.measured_q,
             "servo_measured_qd": self.measured_qd,
         }
-
-    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        dim = (self.num_envs, self.num_joints)
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -11,6 +11,7 @@ import warp as wp
 from mujoco_warp import Data
 from mujoco_warp._src import collision_driver
 
+from vd.kernels.launch import launch
 from vd.kernels.pair_order import KEY_BITS, KINDS, pair_key_kernel, reorder_pairs_kernel
 
 _in_order_found = collision_driver._narrowphase
@@ -21,10 +22,10 @@ class PairOrder:
 
     def __init__(self, data: Data):
         """Make room for all pairs that the data has room for."""
-        self._most, self._device = data.naconmax, data.geom_xpos.device
+        self._most = data.naconmax
 
         def room(count: int, dtype: type) -> wp.array:
-            return wp.zeros(count, dtype=dtype, device=self._device)
+            return wp.zeros(count, dtype=dtype, device=data.geom_xpos.device)
 
         # Sorting needs as much room again.
         self._key, self._order = room(2 * self._most, wp.int32), room(2 * self._most, wp.int32)
@@ -33,29 +34,13 @@ class PairOrder:
 
     def sort(self, model: Any, data: Data, found: Any) -> None:
         """Put the pairs that the broad phase ``found`` into order; its arrays are replaced."""
-        wp.launch(
-            pair_key_kernel,
-            dim=self._most,
-            inputs=[model.geom_type, data.ncollision, found.collision_pair],
-            outputs=[self._key, self._order],
-            device=self._device,
-        )
+        listed = [model.geom_type, data.ncollision, found.collision_pair]
+        launch(pair_key_kernel, self._most, listed, [self._key, self._order])
         wp.utils.radix_sort_pairs(self._key, self._order, self._most, end_bit=KEY_BITS)
-        wp.launch(
-            reorder_pairs_kernel,
-            dim=self._most,
-            inputs=[
-                data.ncollision,
-                self._order,
-                found.collision_pair,
-                found.collision_pairid,
-                found.collision_worldid,
-            ],
-            outputs=[self._pair, self._pair_id, self._world],
-            device=self._device,
-        )
-        found.collision_pair, found.collision_pairid = self._pair, self._pair_id
-        found.collision_worldid = self._world
+        pairs = [found.collision_pair, found.collision_pairid, found.collision_worldid]
+        ordered = [self._pair, self._pair_id, self._world]
+        launch(reorder_pairs_kernel, self._most, [data.ncollision, self._order, *pairs], ordered)
+        found.collision_pair, found.collision_pairid, found.collision_worldid = ordered
 
 
 def sort_pairs(model: Any, data: Data) -> None:

@@ -2,7 +2,7 @@
 
 MuJoCo's contacts are damped springs, not impulses. A spring of damping ratio z throws back with
 e = exp(-pi z / sqrt(1 - z^2)) of the speed; here z is lowered at equal stiffness, so that an object at rest
-sinks in as before. Two limits, both measured by ``vd-bench physics``:
+sinks in as before. Two limits (``tests/test_sim_physics.py``):
 
 * z is at least :data:`LOWEST_RATIO`. A contact lasts six physics steps, and with less damping sampling alone
   could add energy.
@@ -19,6 +19,7 @@ Coulomb's distance with coefficients of 1, and for 0.97 times with 0.6, as witho
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from vd.kernels.launch import launch
 from vd.kernels.task.contacts import restitution_kernel
 from vd.sim.scene import SHAPE_HAND, SHAPE_TABLE
 
@@ -42,35 +43,19 @@ class Restitution:
         self._solref = solver.mjw_model.geom_solref
         self._nominal = wp.clone(self._solref)
         self._geom_kind, self._object_column = geom_kind, object_column
-        n = len(geom_kind)
-        self._device = geom_kind.device
-        self.hand = wp.zeros(n, dtype=float, device=self._device)
-        """Coefficient of restitution of the hand, shape [N]."""
-        self.object = wp.zeros(n, dtype=float, device=self._device)
-        """Coefficient of restitution of the object, shape [N]."""
-        self.table = wp.zeros(n, dtype=float, device=self._device)
-        """Coefficient of restitution of the table, shape [N]."""
+        self.hand, self.object, self.table = (
+            wp.zeros(len(geom_kind), dtype=float, device=geom_kind.device) for _ in range(3)
+        )
+        """Coefficients of restitution, shape [N] each."""
 
     def apply(self, joint_qd: wp.array2d) -> None:
         """Set the contacts of the next physics step from the velocities before it, shape [N, D + 6]."""
-        wp.launch(
+        kinds = [self._geom_kind, SHAPE_TABLE, SHAPE_HAND, self._object_column]
+        launch(
             restitution_kernel,
-            dim=self._geom_kind.shape,
-            inputs=[
-                self._nominal,
-                self._geom_kind,
-                SHAPE_TABLE,
-                SHAPE_HAND,
-                self._object_column,
-                BOUNCE_THRESHOLD,
-                LOWEST_RATIO,
-                joint_qd,
-                self.hand,
-                self.object,
-                self.table,
-            ],
-            outputs=[self._solref],
-            device=self._device,
+            self._geom_kind.shape,
+            [self._nominal, *kinds, BOUNCE_THRESHOLD, LOWEST_RATIO, joint_qd, *self.stateful().values()],
+            [self._solref],
         )
 
     def stateful(self) -> dict[str, wp.array]:

@@ -285,36 +285,27 @@ def build_scene(
             add_object(world, item, cfg, scale=float(scale), visuals=visuals)
             scene.replicate(world, int(copies))
     model = scene.finalize(device=device)
-    return describe(model, hand, list(objects), world_object, world_scale)
-
-
-def describe(
-    model: newton.Model,
-    hand: HandModel,
-    objects: list[ObjectModel],
-    world_object: np.ndarray,
-    world_scale: np.ndarray,
-) -> Scene:
-    """Find the hand's links, the object and the kinds of shapes in a finalized model."""
-    bodies = model.body_count // len(world_object)
+    bodies = model.body_count // num_envs
     names = [label.rsplit("/", 1)[-1] for label in model.body_label[:bodies]]
-    shape_body = model.shape_body.numpy()
     object_body = names.index(OBJECT_LABEL)
-    kind = np.full(model.shape_count, SHAPE_OTHER, dtype=np.int32)
-    collides = (model.shape_flags.numpy() & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0
-    on_object = (shape_body >= 0) & (shape_body % bodies == object_body)
-    is_table = np.array([label.rsplit("/", 1)[-1] == TABLE_LABEL for label in model.shape_label])
-    kind[collides & ~on_object & ~is_table] = SHAPE_HAND
-    kind[collides & on_object] = SHAPE_OBJECT
-    kind[collides & is_table] = SHAPE_TABLE
     return Scene(
         model=model,
         hand=hand,
-        objects=objects,
+        objects=list(objects),
         world_object=world_object,
         world_scale=world_scale,
         bodies_per_world=bodies,
         link_body=np.array([names.index(link) for link in hand.link_names], dtype=np.int32),
         object_body=object_body,
-        shape_kind=kind,
+        shape_kind=shape_kinds(model, bodies, object_body),
     )
+
+
+def shape_kinds(model: newton.Model, bodies: int, object_body: int) -> np.ndarray:
+    """SHAPE_* of the shapes of a model with so many bodies a world, shape [S]."""
+    shape_body = model.shape_body.numpy()
+    on_object = (shape_body >= 0) & (shape_body % bodies == object_body)
+    is_table = [label.rsplit("/", 1)[-1] == TABLE_LABEL for label in model.shape_label]
+    kind = np.where(on_object, SHAPE_OBJECT, np.where(is_table, SHAPE_TABLE, SHAPE_HAND))
+    collides = (model.shape_flags.numpy() & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0
+    return np.where(collides, kind, SHAPE_OTHER).astype(np.int32)

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from vd.kernels.launch import launch
 from vd.kernels.task.actions import limit_joint_velocity_kernel
 from vd.kernels.task.contacts import pair_force_kernel
 from vd.kernels.task.environments import place_table_kernel
@@ -190,16 +191,18 @@ class Simulator:
         if self.servo is not None:
             self.servo.measure()
         self._table_contact()
-        self._launch(
+        launch(
             guard_kernel,
+            self.num_envs,
             [self.joint_q, self.joint_qd, self._start_q, self._start_qd, self.target, MAX_SPEED],
             [self.failures, *self.failed_from.values(), self.failed],
         )
 
     def put_back(self, step_count: wp.array, last_step: int) -> None:
         """Put worlds of which this step failed back to its begin, as :func:`put_back_kernel` says."""
-        self._launch(
+        launch(
             put_back_kernel,
+            self.num_envs,
             [self.failed, self._start_q, last_step],
             [self.joint_q, self.joint_qd, step_count],
         )
@@ -230,44 +233,29 @@ class Simulator:
         """The solver's share of a control step, nothing of ours (for benchmarks)."""
         self._physics_steps(ours=False)
 
-    def _launch(
-        self, kernel: wp.Kernel, inputs: list, outputs: list, *, dim: int | tuple[int, ...] = 0
-    ) -> None:
-        """Launch a kernel, for every environment unless ``dim`` is given."""
-        wp.launch(kernel, dim=dim or self.num_envs, inputs=inputs, outputs=outputs, device=self.device)
-
     def _limit_and_collect(self, previous_q: wp.array2d, q: wp.array2d, qd: wp.array2d) -> None:
         # The solver knows no joint velocity limits.
         if self.servo is not None:
             self.servo.finish(previous_q, q, qd)
         else:
-            self._launch(
-                limit_joint_velocity_kernel,
-                [self.velocity_limit, self.cfg.physics_dt, previous_q],
-                [q, qd],
-                dim=(self.num_envs, len(self.velocity_limit)),
-            )
-        self._launch(
-            collect_overflow_kernel, [self._observables.overflow, self._overflow_mask], [self.overflow]
-        )
+            dim = self.num_envs, len(self.velocity_limit)
+            limits = [self.velocity_limit, self.cfg.physics_dt, previous_q]
+            launch(limit_joint_velocity_kernel, dim, limits, [q, qd])
+        raised = [self._observables.overflow, self._overflow_mask]
+        launch(collect_overflow_kernel, self.num_envs, raised, [self.overflow])
 
     def _table_contact(self) -> None:
         data = self.solver.mjw_data
+        contact = data.contact
         self.table_force.zero_()
-        self._launch(
+        launch(
             pair_force_kernel,
+            data.naconmax,
             [
-                data.nacon,
-                data.contact.worldid,
-                data.contact.geom,
-                data.contact.efc_address,
-                data.efc.force,
-                self._geom_kind,
-                SHAPE_TABLE,
-                SHAPE_OBJECT,
+                *(data.nacon, contact.worldid, contact.geom, contact.efc_address, data.efc.force),
+                *(self._geom_kind, SHAPE_TABLE, SHAPE_OBJECT),
             ],
             [self.table_force],
-            dim=data.naconmax,
         )
 
     def place_table(self, *, present: bool) -> None:
@@ -286,11 +274,11 @@ class Simulator:
             step_count: Control steps since the world's reset, shape [N].
             last_step: Control steps for which each table stays, shape [N].
         """
-        self._launch(
+        launch(
             place_table_kernel,
+            self._geom_kind.shape,
             [self._geom_kind, SHAPE_TABLE, step_count, last_step, PAPER.scene.table_top_m, AWAY_M],
             [self.solver.mjw_data.geom_xpos],
-            dim=self._geom_kind.shape,
         )
 
     def forward_kinematics(self) -> None:

@@ -4,7 +4,7 @@ import torch
 import warp as wp
 
 from vd.kernels.sparse.coordinate_maps import beside
-from vd.kernels.sparse.voxels import coordinates, voxelise_marked
+from vd.kernels.sparse.voxels import coordinates, voxelise
 
 
 def object_points(
@@ -25,7 +25,7 @@ def object_points(
         Centres [m], zeros where a cloud has fewer, shape [N, M', 3] with M' <= M, and how many there are,
         int32 [N]. Waits for the device.
     """
-    keys, marks = voxelise_marked(points, voxel_m, hand)
+    keys, marks = voxelise(points, voxel_m, ends=hand)
     of_hand = wp.to_torch(marks)[:, 0] > 0
     free = ~of_hand
     touches = wp.to_torch(beside(keys, wp.from_torch(free), wp.from_torch(of_hand)))

@@ -16,15 +16,8 @@ import warp as wp
 from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.clouds import HandKinematics, SceneClouds
+from vd.envs.shapes import ShapeObserver
 from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
-from vd.kernels.task.shapes import (
-    ORIENTATIONS,
-    extent_directions,
-    extent_kernel,
-    shape_observation_size,
-    shape_observation_slices,
-    surface_kernel,
-)
 from vd.paper import PAPER
 from vd.quaternions import canonical, product, relative_rotation, rotated, rotation_distance
 from vd.senses import Senses
@@ -101,10 +94,13 @@ class Observer:
         self._columns = teacher_observation_slices(hand.num_fingers)
         self._size, state = num_observations, teacher_observation_size(hand.num_fingers)
         self._columns["shape"] = slice(state, num_observations)
-        surfaces = np.stack([item.surface_points for item in objects])
-        self._shapes = [array(surfaces, wp.vec3), array(world_object, wp.int32), array(world_scale, float)]
-        self._tips = [array(hand.tip_link, wp.int32), array(hand.tip_frame, wp.transform)]
-        self._directions = array(extent_directions(hand.num_fingers), wp.vec3)
+        self._shapes = ShapeObserver(
+            array(np.stack([item.surface_points for item in objects]), wp.vec3),
+            array(world_object, wp.int32),
+            array(world_scale, float),
+            array(hand.tip_link, wp.int32),
+            array(hand.tip_frame, wp.transform),
+        )
         known = torch.ones(num_observations, device=place)
         for name in UNSEEN:
             known[self._columns[name]] = 0.0
@@ -138,9 +134,11 @@ class Observer:
             "fingertips": self._fingertips(senses.joint_q, senses.joint_qd),
             "previous_action": senses.action,
         }
-        if self._columns["shape"].start < self._size:
-            parts["shape"] = self._shape(found, goal)
         observation = torch.zeros((len(angle), self._size), device=angle.device)
+        if (first := self._columns["shape"].start) < self._size:
+            pose = wp.from_torch(torch.cat([found.position, found.orientation], dim=1))
+            wanted = wp.from_torch(goal.contiguous(), dtype=wp.quat)
+            self._shapes.observe(pose, 0, self._links, wanted, wp.from_torch(observation), first)
         for name, values in parts.items():
             observation[:, self._columns[name]] = values
         return observation, angle
@@ -168,19 +166,3 @@ class Observer:
         )
         before.copy_(pose)
         return found
-
-    def _shape(self, found: Found, goal_quat: torch.Tensor) -> torch.Tensor:
-        """The shape's values, as the environment computes those of true poses."""
-        fingers, envs = self._hand.num_fingers, len(found.orientation)
-        values = torch.empty((envs, shape_observation_size(fingers)), device=self._base.device)
-        slices = shape_observation_slices(fingers)
-        pose = wp.from_torch(torch.cat([found.position, found.orientation], dim=1))
-        goal, out = wp.from_torch(goal_quat.contiguous(), dtype=wp.quat), wp.from_torch(values)
-        surface = [*self._shapes, *self._tips, 0, slices["surface"].start, pose, self._links]
-        self._launch(surface_kernel, (envs, fingers), surface, out)
-        extent = [*self._shapes, self._directions, 0, slices["extent"].start, pose, goal]
-        self._launch(extent_kernel, (envs, ORIENTATIONS, len(self._directions)), extent, out)
-        return values
-
-    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list[Any], output: wp.array) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[output], device=self._device)

@@ -105,7 +105,6 @@ class Registration:
         world_scale: np.ndarray,
         camera: CameraModel | None,
         device: str,
-        grid: int = GRID,
     ):
         """Measure the shapes.
 
@@ -115,7 +114,6 @@ class Registration:
             world_scale: Size factor of each environment's object, shape [N].
             camera: What sees it, posed in the base frame; None where points are of all sides.
             device: Warp device.
-            grid: Grid points along a side of a shape's distances.
         """
         self.device, envs = device, len(world_object)
         place = torch.device(wp.device_to_torch(device))
@@ -127,7 +125,7 @@ class Registration:
         self._shapes = shapes = Shapes()
         shapes.samples = array(samples, wp.vec3)
         shapes.half = array(np.abs(samples).max(axis=(1, 2)) + BEYOND_M, float)
-        shapes.distance = wp.empty((len(objects), grid, grid, grid), dtype=float, device=device)
+        shapes.distance = wp.empty((len(objects), GRID, GRID, GRID), dtype=float, device=device)
         shapes.world_shape, shapes.world_scale = array(world_object, wp.int32), array(world_scale, float)
         meshes = [
             wp.Mesh(

@@ -27,8 +27,6 @@ surface was [m]: a depth camera's points are off by 2 to 3 mm, and a hundredth i
 imported training meshes 72 have a symmetry then, with half of the distance 28, with twice 83."""
 DENSE = 2000
 """Points of the surface that this is measured on: the share is then known to 0.4 % (two standard errors)."""
-GRID = 32
-"""Grid points along a side of the distances on which rotations are looked for (:mod:`.registration`)."""
 STEPS, EVERY = 12, 2
 """Steps of each rotation that is tried, and every so many-th sample they look at."""
 APART_RAD = 0.12
@@ -125,7 +123,6 @@ def _search(items: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
         world_scale=np.ones(len(items)),
         camera=None,
         device=device,
-        grid=GRID,
     )
     # Samples are in an order in which any leading part of them is evenly spread.
     place = wp.device_to_torch(device)

@@ -4,7 +4,7 @@ import torch
 import warp as wp
 
 from vd.kernels.rng import init_rng_kernel
-from vd.kernels.sparse.voxels import CloudNoise, draw_noise, voxelise, voxelise_marked
+from vd.kernels.sparse.voxels import CloudNoise, draw_noise, voxelise
 from vd.paper import PAPER
 from vd.vision.cfg import NoiseCfg
 from vd.vision.sites import Sites
@@ -75,8 +75,8 @@ class Voxeliser:
                 )
             draw = draw_noise(self._noise, self.rng[:clouds])
         if not ends:
-            return Sites(voxelise(points, self.voxel_m, draw), clouds)
+            return Sites(voxelise(points, self.voxel_m, draw)[0], clouds)
         if ends not in self._ends:
             self._ends[ends] = wp.array(ends, dtype=wp.int32, device=self.device)
-        keys, marks = voxelise_marked(points, self.voxel_m, self._ends[ends], draw)
+        keys, marks = voxelise(points, self.voxel_m, draw, self._ends[ends])
         return Sites(keys, clouds, marks=wp.to_torch(marks))

@@ -1,0 +1,146 @@
+"""Starts of the object in which no finger is inside it: the nearest of a few places beside the one drawn.
+
+The orientation stays. Places are tried side by side, each by how deep the samples of the object's surface are
+in the shapes of the hand as it stands after a reset. World frame (z up), metres, quaternions xyzw.
+"""
+
+from math import cos, pi, sin
+
+import warp as wp
+
+from vd.kernels.columns import read_quat, read_vec3, write_vec3
+
+wp.set_module_options({"enable_backward": False})
+
+PLACE_STEP_M = 0.015
+"""Distance of places from each other [m]: smaller ones need more of them to come out of a finger."""
+RINGS, RING_PLACES, LEVELS = 2, 6, 4
+"""Places of a level: below the start, and rings of six around; levels go down, away from the palm."""
+APART_M = 0.004
+"""Distance from the hand at which a sample counts as outside [m]: half of that between samples. Of 13 meshes
+none of 325 starts is then more than 1 mm inside, at 3 mm one in a hundred is."""
+IN_TABLE_M = 0.001
+"""How deep a sample may be in the table [m]: objects at rest sink in a little."""
+CHUNKS = 8
+"""Threads that share the samples of an object at one place."""
+
+
+def start_places() -> list[tuple[float, float, float]]:
+    """Displacements from the start as drawn [m], itself first, the nearer ones before the farther."""
+    places = []
+    for level in range(LEVELS):
+        down = -PLACE_STEP_M * level
+        places.append((0.0, 0.0, down))
+        for ring in range(1, RINGS + 1):
+            angles = [2.0 * pi * (i + 0.5 * ring) / RING_PLACES for i in range(RING_PLACES)]
+            radius = PLACE_STEP_M * ring
+            places += [(radius * cos(angle), radius * sin(angle), down) for angle in angles]
+    return sorted(places, key=lambda place: round(sum(x * x for x in place), 9))
+
+
+@wp.struct
+class OpenHand:
+    """S shapes of the hand as it stands after a reset: boxes with rounded edges, which capsules are too.
+
+    pose: Pose of each shape, shape [S].
+    half: Half extents without the rounding [m], shape [S].
+    radius: Radius of the rounding [m], shape [S].
+    reach: Distance from its centre within which a sample counts as inside, at most [m], shape [S].
+    """
+
+    pose: wp.array[wp.transform]
+    half: wp.array[wp.vec3]
+    radius: wp.array[float]
+    reach: wp.array[float]
+
+
+@wp.func
+def depth_in_box(point: wp.vec3, half: wp.vec3, radius: float) -> float:
+    """Depth of a point in a rounded box about the origin, negative outside [m]."""
+    beyond = wp.vec3(wp.abs(point[0]), wp.abs(point[1]), wp.abs(point[2])) - half
+    outside = wp.vec3(wp.max(beyond[0], 0.0), wp.max(beyond[1], 0.0), wp.max(beyond[2], 0.0))
+    return radius - wp.length(outside) - wp.min(wp.max(beyond), 0.0)
+
+
+@wp.kernel
+def start_depth_kernel(
+    # Model:
+    hand: OpenHand,
+    points: wp.array2d[wp.vec3],
+    world_object: wp.array[int],
+    world_scale: wp.array[float],
+    places: wp.array[wp.vec3],
+    table_top: float,
+    object_column: int,
+    # In:
+    reset_in: wp.array[int],
+    joint_q_in: wp.array2d[float],
+    # In/Out:
+    depth: wp.array2d[float],
+):
+    """How deep the object would start in hand or table at each place. Launch: [N, C, CHUNKS].
+
+    Args:
+        hand: The hand after a reset.
+        points: Surface points of each object, object frame [m], shape [K, P].
+        world_object: Object of each world, shape [N].
+        world_scale: Factor on the object's size in each world, shape [N].
+        places: Displacements of the object [m], shape [C].
+        table_top: Height of the table's top [m].
+        object_column: Column of the object's position in ``joint_q_in``; its quaternion follows.
+        reset_in: 1 where the world is reset; others are left as they are, shape [N].
+        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
+        depth: Depth of the deepest sample beyond what is allowed [m], 0 where none is; raised from what it
+            is, shape [N, C].
+    """
+    world, place, chunk = wp.tid()
+    if reset_in[world] == 0:
+        return
+    position = read_vec3(world, object_column, joint_q_in) + places[place]
+    orientation = read_quat(world, object_column + 3, joint_q_in)
+    shape = world_object[world]
+    scale = world_scale[world]
+    deepest = wp.float32(0.0)
+    for i in range(chunk, points.shape[1], wp.static(CHUNKS)):
+        point = position + wp.quat_rotate(orientation, scale * points[shape, i])
+        deepest = wp.max(deepest, table_top - point[2] - wp.static(IN_TABLE_M))
+        for s in range(hand.radius.shape[0]):
+            away = point - wp.transform_get_translation(hand.pose[s])
+            if wp.length_sq(away) < hand.reach[s] * hand.reach[s]:
+                local = wp.quat_rotate_inv(wp.transform_get_rotation(hand.pose[s]), away)
+                inside = depth_in_box(local, hand.half[s], hand.radius[s])
+                deepest = wp.max(deepest, inside + wp.static(APART_M))
+    if deepest > 0.0:
+        wp.atomic_max(depth, world, place, deepest)
+
+
+@wp.kernel
+def move_start_kernel(
+    # Model:
+    places: wp.array[wp.vec3],
+    object_column: int,
+    # In:
+    reset_in: wp.array[int],
+    # In/Out:
+    depth: wp.array2d[float],
+    joint_q: wp.array2d[float],
+):
+    """Move the object to the place of least depth, of several the first. Launch: [N].
+
+    Args:
+        places: Displacements of the object [m], shape [C].
+        object_column: Column of the object's position in ``joint_q``.
+        reset_in: 1 where the world is reset; others are left as they are, shape [N].
+        depth: Depth at each place [m], which becomes 0 for the next reset, shape [N, C].
+        joint_q: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
+    """
+    world = wp.tid()
+    if reset_in[world] == 0:
+        return
+    best = wp.int32(0)
+    for place in range(1, places.shape[0]):
+        if depth[world, place] < depth[world, best]:
+            best = place
+    for place in range(places.shape[0]):
+        depth[world, place] = 0.0
+    write_vec3(world, object_column, read_vec3(world, object_column, joint_q) + places[best], joint_q)

@@ -1,0 +1,42 @@
+"""Errors of the object's pose in what is observed."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import warp as wp
+
+from vd.envs.task_state import TaskState
+from vd.kernels.task.pose_error import draw_pose_error_kernel, mistake_pose_kernel
+
+
+class PoseError:
+    """The same error of the object's pose all through an episode; nothing where there is to be none.
+
+    Args:
+        state: The task.
+    """
+
+    def __init__(self, state: TaskState):
+        self._state, random = state, state.cfg.randomisation
+        self._size = wp.vec2(*random.object_pose_error) if random.enabled else wp.vec2()
+        self.is_wrong = max(self._size) > 0.0
+        if self.is_wrong:
+            self._error = state.zeros(state.num_envs, dtype=wp.transform)
+            self._believed = wp.zeros_like(state.sim.joint_q)
+
+    def begin(self, mask: wp.array) -> None:
+        """Draw the errors of the environments of ``mask`` [N]."""
+        if self.is_wrong:
+            self._state.launch(draw_pose_error_kernel, [self._size, mask, self._state.rng], [self._error])
+
+    def apply(self, seen: Sequence[Any]) -> Sequence[Any]:
+        """What is seen (``SeenState.arrays``), with the errors. Device work only."""
+        if not self.is_wrong:
+            return seen
+        measured_q, measured_qd, joint_q, *others = seen
+        self._state.launch(mistake_pose_kernel, [self._error, joint_q], [self._believed])
+        return [measured_q, measured_qd, self._believed, *others]
+
+    def stateful(self) -> dict[str, wp.array]:
+        """Arrays to save with a checkpoint, by name."""
+        return {"pose_error": self._error} if self.is_wrong else {}
