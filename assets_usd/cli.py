@@ -218,23 +218,19 @@ def run_show(command: Show) -> int:
 
 
 @interrupt.command("vd-assets")
-def main() -> None:
-    """Entry point of ``vd-assets``."""
+def main() -> int:
+    """Run ``vd-assets``; returns the exit status."""
     command = tyro.cli(Command, prog="vd-assets", description=__doc__)
-    try:
-        if isinstance(command, Show):
-            check_file(command.out)
-        elif command.out is not None:
-            check_folder(command.out)
-        if isinstance(command, Hand):
-            sys.exit(run_hand(command))
-        if isinstance(command, Objects):
-            sys.exit(run_objects(command))
-        sys.exit(run_import(command) if isinstance(command, Import) else run_show(command))
-    except (ValueError, OSError) as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    if isinstance(command, Show):
+        check_file(command.out)
+    elif command.out is not None:
+        check_folder(command.out)
+    if isinstance(command, Hand):
+        return run_hand(command)
+    if isinstance(command, Objects):
+        return run_objects(command)
+    return run_import(command) if isinstance(command, Import) else run_show(command)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from vd import interrupt
 
-OK, FAILED = 0, 1
+OK, FAILED = 0, interrupt.FAILED
 """Exit statuses: done, or not, with the reason; after a signal 128 and its number."""
 
 
@@ -82,12 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     module = importlib.import_module(f"vd.deploy.{COMMANDS[name][0]}")
     options_of = getattr(module, f"{name.capitalize()}Cfg")
     options = tyro.cli(options_of, args=arguments, prog=f"vd-deploy {name}", description=module.__doc__)
-    try:
-        return int(getattr(module, name)(options))
-    except (ValueError, OSError, RuntimeError) as error:  # BusError and StoppedError among them
-        print(f"vd-deploy: {error}", file=sys.stderr)
-        asked = int(getattr(error, "signal", 0))  # a moving hand is stopped first
-        return 128 + asked if asked else FAILED
+    return int(getattr(module, name)(options))
 
 
 if __name__ == "__main__":

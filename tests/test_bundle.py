@@ -230,8 +230,8 @@ def test_commands(tmp_path, capsys):
     out, run = tmp_path / "bundle", tmp_path / "run"
     assert train(["bundle", "dclaw3-tracking", str(out)]) == 0
     assert "tracking for dclaw3, 9 joints" in capsys.readouterr().out
-    assert train(["bundle", TEACHER, str(out), "--json"]) == 0, "the bundle of before is replaced"
-    assert json.loads(capsys.readouterr().out)["kind"] == "teacher"
+    assert train(["bundle", TEACHER, str(out)]) == 0, "the bundle of before is replaced"
+    assert json.loads((out / "contract.json").read_text())["kind"] == "teacher"
     assert is_bundle(out) and sorted(p.name for p in out.iterdir()) == [
         "contract.json",
         "golden.safetensors",

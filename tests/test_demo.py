@@ -21,7 +21,7 @@ from vd.evaluate.result import Result
 from vd.gap.report import write_report
 from vd.hand_log import JOINT_CHANNELS
 from vd.train import demo
-from vd.train.demo import Demo, FailureError, Part, main
+from vd.train.demo import Demo, Part, main
 from vd.train.metrics import PROGRESS_FILE
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -164,7 +164,7 @@ def test_a_part_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch, 
 
     def fail(demo, part):
         seen.append(demo.page.read_text())
-        raise FailureError("vd-x <y> ended with status 1: no such motor")
+        raise RuntimeError("vd-x <y> ended with status 1: no such motor")
 
     for name in ("camera", "gap", "twin", "training"):
         monkeypatch.setattr(Demo, name, fail)
@@ -185,7 +185,7 @@ def test_an_interrupted_demo_leaves_the_page_with_what_is_there(played, tmp_path
 
 
 def test_a_command_that_fails_says_which_and_why(tmp_path):
-    with pytest.raises(FailureError, match=r"(?s)vd-play nosuch .*with status 1: .*no policy at nosuch"):
+    with pytest.raises(RuntimeError, match=r"(?s)vd-play nosuch .*with status 1: .*no policy at nosuch"):
         Part("x", "X", tmp_path).run(["vd-play", "nosuch", "--video", tmp_path / "x.mp4"])
 
 

@@ -58,6 +58,18 @@ def test_a_flag_of_an_earlier_version_is_refused_with_its_name_of_today(capsys):
     assert "--run-dir is --out now" in said and "--num-worlds is --num-envs now" in said
 
 
+def test_an_error_is_one_line_and_with_vd_debug_the_place_in_the_code(monkeypatch, capsys):
+    @interrupt.command("vd-some")
+    def fails() -> None:
+        raise ValueError("--flag is 3")
+
+    for debug, shown in (("", False), ("1", True)):
+        monkeypatch.setenv("VD_DEBUG", debug)
+        assert fails() == interrupt.FAILED
+        said = capsys.readouterr().err
+        assert said.endswith("vd-some: --flag is 3\n") and ("test_interrupt.py" in said) == shown
+
+
 def test_what_a_command_forks_ends_by_the_signal_itself():
     """A pool ends its workers with SIGTERM; they have nothing to say about it."""
 

@@ -13,7 +13,7 @@ from student_dummy import TINY, DummyTeacher, make_dagger, weights
 
 from vd.train.checkpoint import list_checkpoints
 from vd.train.cli import main
-from vd.train.ending import Interrupted, TrainingDivergedError
+from vd.train.loop import Interrupted, TrainingDivergedError
 from vd.train.metrics import read_progress
 from vd.train.student.losses import imitation_figures, imitation_loss, poses
 from vd.train.student.rollout import taken
@@ -30,13 +30,6 @@ def test_the_losses_fall_on_one_rollout():
         last = dagger.update([rollout])
     assert last["loss/imitation"] < first["loss/imitation"] - 1.0
     assert last["loss/distance"] < 0.3 * first["loss/distance"]
-
-
-def test_the_student_acts_more_and_more_like_the_teacher(tmp_path):
-    runner = make_dagger(tmp_path, envs=16, epochs=4)
-    runner.learn(16)
-    errors = [row["student/action_error"] for row in read_progress(tmp_path / "progress.jsonl")]
-    assert np.mean(errors[-3:]) < 0.6 * np.mean(errors[:3])
 
 
 @pytest.mark.parametrize("kind", ["likelihood", "squared"])
@@ -210,14 +203,6 @@ def test_poses_are_read_from_frames_and_learned(monkeypatch):
     again._load_learner(dagger._learner())
     for one, two in zip(*(d.heads["pose"].parameters() for d in (again, dagger)), strict=True):
         assert torch.equal(one, two)
-
-
-def test_squared_errors_let_the_student_act_by_its_mean():
-    one, two = (make_dagger(imitation="squared") for _ in range(2))
-    torch.manual_seed(1)
-    first = one.collect().frames["action"]
-    torch.manual_seed(2)
-    assert torch.equal(first, two.collect().frames["action"])
 
 
 def test_labels_are_clipped_where_asked_for():

@@ -158,14 +158,11 @@ def stage(tmp_path):
     return write
 
 
-def test_presets_are_valid_and_the_papers_has_its_numbers():
+def test_presets_are_valid_and_bad_settings_named():
     for preset in PRESETS.values():
         for number in (0, 1, 2):
             preset(number).validate()
-    first, second = (PRESETS["paper"](number) for number in (1, 2))
-    assert (first.task.num_envs, first.dagger.minibatch_envs) == (400, 40)
-    assert (second.task.num_envs, second.dagger.minibatch_envs) == (260, 20)
-    assert (first.dagger.rollout_steps, first.dagger.epochs, first.dagger.imitation) == (80, 4, "likelihood")
+    first = PRESETS["paper"](1)
     with pytest.raises(ValueError, match="--camera is for --stage 2"):
         replace(first, camera=(0.0,) * 7).validate()
     with pytest.raises(ValueError, match=r"--dagger\.epochs is 0"):

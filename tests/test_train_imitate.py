@@ -10,8 +10,7 @@ from train_dummy import SMALL_PPO, DummyEnv, make_runner
 from vd.policy import load_policy
 from vd.train.checkpoint import find_checkpoint
 from vd.train.cli import main
-from vd.train.config import PolicyCfg, PpoCfg
-from vd.train.imitate import IMITATED, resumed_imitation
+from vd.train.config import PolicyCfg
 from vd.train.metrics import read_progress
 
 NETWORK = PolicyCfg(hidden=(32, 32), distribution="state-dependent", initial_std=0.2, std_range=(0.05, 0.5))
@@ -108,9 +107,8 @@ def test_ppo_goes_on_from_there_with_its_own_rates_and_small_first_steps(taught,
 
 
 def test_a_run_that_was_stopped_on_the_way_goes_on_imitating_the_same(taught, tmp_path):
-    def runner():
-        env = LateEnv(num_envs=32)
-        return make_runner(tmp_path, env=env, policy=NETWORK, ppo=IMITATING, save_every=1)
+    def runner(ppo=IMITATING):
+        return make_runner(tmp_path, env=LateEnv(num_envs=32), policy=NETWORK, ppo=ppo, save_every=1)
 
     first = runner()
     first.begin_from(str(taught))
@@ -122,16 +120,14 @@ def test_a_run_that_was_stopped_on_the_way_goes_on_imitating_the_same(taught, tm
         assert torch.equal(value, again.imitation.teacher.state_dict()[name]), name
     again.learn(1)
     assert read_progress(tmp_path / "progress.jsonl")[-1]["loss/imitation"] > 0.0
-
-
-def test_a_run_that_goes_on_without_imitating_has_none():
-    """Its share that is left was divided by no iterations."""
-    assert resumed_imitation(None, PpoCfg(imitation_iterations=0), 3, {IMITATED: {}}) is None
+    without = runner(replace(IMITATING, imitation_iterations=0))
+    without.load(str(find_checkpoint(tmp_path, "latest")))
+    assert without.imitation is None
 
 
 def test_it_is_refused_without_a_policy_or_without_the_present(taught, tmp_path, capsys):
     flags = ["--ppo.imitation-iterations", "5", "--out", str(tmp_path / "run"), "--device", "cpu"]
-    assert main(["teacher", "--preset", "cube", *flags]) == 1
+    assert main(["teacher", "--preset", "gpu", *flags]) == 1
     assert "--ppo.imitation-iterations imitates the policy that --init names" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
     runner = make_runner(tmp_path, env=PromptEnv(num_envs=4), policy=NETWORK, ppo=IMITATING)

@@ -236,7 +236,7 @@ def test_values_that_come_last_cannot_become_others(tmp_path):
     state["task"]["observation"] = {"history": 5}
     save_checkpoint(path, state)
     runner = make_runner(tmp_path / "second", policy=NORMALISING)
-    with pytest.raises(ValueError, match=r"--env\.observation\.history 5 and this run 0"):
+    with pytest.raises(ValueError, match=r"--env\.observation\.history 5, and this run 0"):
         runner.begin_from(str(path))
 
 
@@ -264,16 +264,16 @@ def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
     for field in ("hidden", "distribution", "normalise_observations"):
         wanted = state["policy"][field]
         assert getattr(cfg.policy, field) == (tuple(wanted) if isinstance(wanted, list) else wanted)
-    assert parse_teacher(["--init", name, "--preset", "cube"]).env == PRESETS["cube"]().env
+    assert parse_teacher(["--init", name, "--preset", "gpu"]).env == PRESETS["gpu"]().env
 
 
 def test_without_a_preset_the_learner_is_the_policys_if_it_says(tmp_path):
     path = _export(tmp_path / "first")
     state = load_checkpoint(path)
-    state["task"] = to_dict(PRESETS["cube"]().env)
+    state["task"] = to_dict(PRESETS["gpu"]().env)
     save_checkpoint(path, state)
     cfg = parse_teacher(["--init", str(path)])
-    assert cfg.ppo == LEARNED and cfg.policy == NORMALISING and cfg.env == PRESETS["cube"]().env
+    assert cfg.ppo == LEARNED and cfg.policy == NORMALISING and cfg.env == PRESETS["gpu"]().env
     state["task"]["wind"] = 3.0
     save_checkpoint(path, state)
     with pytest.raises(ValueError, match=r"task has no field wind.*add --preset"):

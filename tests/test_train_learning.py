@@ -234,11 +234,16 @@ def test_step_means_and_window_ratios():
         (PpoCfg(actor_learning_rate=float("nan")), PolicyCfg(), "--ppo.actor-learning-rate"),
         (PpoCfg(), PolicyCfg(initial_std=2.0, std_range=(0.1, 1.0)), "--policy.std-range"),
         (PpoCfg(), PolicyCfg(hidden=(64, 0)), "--policy.hidden"),
+        (PpoCfg(), dataclasses.replace(SMALL_POLICY, quiet_std=0.03), "--policy.quiet-std"),
+        (PpoCfg(), dataclasses.replace(SMALL_POLICY, quiet_std=0.0), "--policy.quiet-std"),
+        (PpoCfg(), PolicyCfg(quiet_std=1e-7), "--policy.quiet-std"),
     ],
 )
 def test_bad_settings_are_named(ppo, policy, flag):
     with pytest.raises(ValueError, match=flag):
         validate(ppo, policy, RunCfg())
+    with pytest.raises(ValueError, match="--keep-every is 150; give a multiple of --save-every 100"):
+        validate(PpoCfg(), PolicyCfg(), RunCfg(keep_every=150))
 
 
 @pytest.mark.parametrize("distribution", ["state-dependent", "gaussian"])

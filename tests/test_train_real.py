@@ -13,42 +13,44 @@ import pytest
 import torch
 
 from vd.evaluate.agents import trained_task
+from vd.evaluate.cli import main as evaluate
 from vd.policy import load_policy
 from vd.sim.cfg import SimCfg, coarser
 from vd.train.checkpoint import checkpoint_path
-from vd.train.cli import build_teacher, main
+from vd.train.cli import main
 from vd.train.metrics import PROGRESS_FILE, read_progress
 from vd.train.presets import smoke
 from vd.train.runner import TeacherRunner
+from vd.train.teacher import build_teacher
 
 TIMING = ("elapsed_s", "steps_per_s", "collect_s", "learn_s")
 
 
-def _train(run_dir: Path, iterations: int, resume: str | None = None) -> TeacherRunner:
+def _train(run_dir: Path, iterations: int, observation=None, **begin) -> TeacherRunner:
     """A few iterations of a few environments on the CPU, with randomisation and curriculum on."""
     cfg = smoke()
     task = replace(
         cfg.env,
         num_envs=8,
+        observation=observation or cfg.env.observation,
         start=replace(cfg.env.start, poses=2),
         randomisation=replace(cfg.env.randomisation, enabled=True),
         curriculum=replace(cfg.env.curriculum, enabled=True, raise_at=0.0, lower_at=0.0),
     )
-    cfg = replace(
-        cfg,
-        resume=resume,
-        run=replace(cfg.run, out=run_dir, max_minutes=None),
-        ppo=replace(cfg.ppo, rollout_steps=4, minibatch_size=16),
-        env=task,
-    )
-    runner = build_teacher(cfg)
-    runner.learn(iterations)
+    run = replace(cfg.run, out=run_dir, max_minutes=None, coarse_physics=True)
+    ppo = replace(cfg.ppo, rollout_steps=4, minibatch_size=16)
+    runner = build_teacher(replace(cfg, run=run, ppo=ppo, env=task, **begin))
+    if iterations:
+        runner.learn(iterations)
     return runner
 
 
 @pytest.mark.slow
-def test_a_resumed_run_equals_one_that_never_stopped(tmp_path):
+def test_a_run_goes_on_bit_for_bit_and_another_sees_more_from_there(tmp_path):
+    """It learns in coarser physics; what it learned is judged in the default, also under faults."""
     whole = _train(tmp_path / "whole", 4)
+    assert whole.env.env.cfg.sim == coarser(SimCfg()) != SimCfg()
+    assert trained_task(load_policy(tmp_path / "whole" / "policy.pt")).sim == SimCfg()
     resumed = _train(tmp_path / "part", 2, resume=str(checkpoint_path(tmp_path / "whole", 2)))
     for one, two in ((whole.alg.actor, resumed.alg.actor), (whole.alg.critic, resumed.alg.critic)):
         weights, again = one.state_dict(), two.state_dict()
@@ -63,51 +65,20 @@ def test_a_resumed_run_equals_one_that_never_stopped(tmp_path):
     assert rows[0][2:] == rows[1]
     assert rows[1][-1]["task/difficulty"] > 0.0
 
-
-def test_what_is_learned_in_coarser_physics_is_judged_in_the_default(tmp_path):
-    cfg = smoke()
-    cfg = replace(
-        cfg,
-        run=replace(cfg.run, out=tmp_path, max_minutes=None, coarse_physics=True),
-        ppo=replace(cfg.ppo, rollout_steps=4, minibatch_size=16),
-        env=replace(cfg.env, num_envs=4),
-    )
-    runner = build_teacher(cfg)
-    assert runner.env.env.cfg.sim == coarser(SimCfg()) != SimCfg()
-    runner.learn(1)
-    assert trained_task(load_policy(tmp_path / "policy.pt")).sim == SimCfg()
-
-
-@pytest.mark.slow
-def test_a_blind_run_goes_on_with_shape_and_memory_and_its_policy_is_evaluated(tmp_path):
-    import numpy as np
-    import warp as wp
-
-    from vd.evaluate.cli import main as evaluate
-
-    flags = ["teacher", "--smoke", "--num-envs", "4", "--max-steps", "32", "--out"]
-    assert main([*flags, str(tmp_path / "blind"), "--save-every", "1"]) == 0
-    checkpoint = checkpoint_path(tmp_path / "blind", 1)
-    cfg = smoke()
-    observation = replace(cfg.env.observation, shape="full", history=2, dynamics="critic")
-    cfg = replace(
-        cfg,
-        init=checkpoint,
-        run=replace(cfg.run, out=tmp_path / "seeing"),
-        env=replace(cfg.env, num_envs=4, observation=observation),
-    )
-    runner = build_teacher(cfg)
-    before, simulation = load_policy(checkpoint).num_observations, runner.env.env
-    told = simulation.privileged.shape[1]
-    assert runner.new_inputs == simulation.num_observations + told - before > told > 0
-    observation = runner.env.get_observations()
-    blind = load_policy(checkpoint).act(observation["policy"][:, :before])
+    blind = load_policy(checkpoint_path(tmp_path / "part", 4))
+    seen = replace(smoke().env.observation, shape="full", history=2, dynamics="critic")
+    seeing = _train(tmp_path / "seeing", 0, init=str(checkpoint_path(tmp_path / "part", 4)), observation=seen)
+    told = seeing.env.env.privileged.shape[1]
+    before = blind.num_observations
+    assert seeing.new_inputs == seeing.env.env.num_observations + told - before > told > 0
+    observation = seeing.env.get_observations()
     with torch.no_grad():
-        assert torch.allclose(runner.alg.actor(observation), blind, atol=1e-5)
-    runner.learn(1)
+        acted = seeing.alg.actor(observation)
+    assert torch.allclose(acted, blind.act(observation["policy"][:, :before]), atol=1e-5)
+    seeing.learn(1)
     policy = load_policy(tmp_path / "seeing" / "policy.pt")
     assert policy.task["observation"]["shape"] == "full" and policy.task["observation"]["history"] == 2
-    assert np.isfinite(policy.act(wp.to_torch(runner.env.env.observation)).numpy()).all()
+    assert torch.isfinite(policy.act(seeing.env.get_observations()["policy"])).all()
     arguments = ["--episodes", "1", "--num-envs", "1", "--episode-s", "0.5", "--device", "cpu"]
     arguments += ["--condition", "mixed", "--out"]
     assert evaluate([str(tmp_path / "seeing"), *arguments, str(tmp_path / "eval")]) == 0

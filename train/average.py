@@ -64,9 +64,10 @@ def average_policies(policies: Sequence[str], output: Path) -> None:
     states = [policy_export(load_checkpoint(path, flag="vd-train average")) for path in paths]
     first = states[0]
     for name, state in zip(policies, states, strict=True):
-        theirs, ours = state["policy"], first["policy"]
         different = [
-            f"policy.{key} {ours.get(key)}, there {v}" for key, v in theirs.items() if ours.get(key) != v
+            f"policy.{key} {first['policy'].get(key)}, there {value}"
+            for key, value in state["policy"].items()
+            if first["policy"].get(key) != value
         ]
         different += [w.replace(", here ", ", there ") for w in unlike(first["task"], state["task"])]
         if different:
@@ -74,14 +75,17 @@ def average_policies(policies: Sequence[str], output: Path) -> None:
                 f"{name} is no policy to take a mean with {policies[0]} of ({'; '.join(different)}); give "
                 "policies of runs that went on from the same one"
             )
-    mean = {key: value for key, value in first.items() if key not in NETWORKS}
+    # A critic that not all have is left out. Counts, which are no weights, are those of the first.
+    mean = dict(first)
     for network in NETWORKS:
-        if all(network in state for state in states):
-            mean[network] = {  # counts, which are no weights, are those of the first
-                name: torch.stack([state[network][name] for state in states]).mean(dim=0)
-                if value.is_floating_point()
-                else value
-                for name, value in first[network].items()
-            }
+        if not all(network in state for state in states):
+            mean.pop(network, None)
+            continue
+        mean[network] = {
+            name: torch.stack([state[network][name] for state in states]).mean(dim=0)
+            if value.is_floating_point()
+            else value
+            for name, value in first[network].items()
+        }
     mean["env_steps"] = max(state["env_steps"] for state in states)
     save_checkpoint(output, mean)

@@ -1,4 +1,7 @@
-"""Beginning a run with the networks of another: of a checkpoint, or of an exported policy."""
+"""Beginning a run with the networks of another: of a checkpoint, or of an exported policy.
+
+Networks may have read less than the run observes: inputs that are new begin without effect.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -8,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 from vd.config import from_dict, to_dict
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from vd.policy import PolicySpec
     from vd.train.presets import TeacherCfg
 
@@ -16,8 +21,14 @@ CRITIC_WARMUP = 50
 to 8 steps later, 4.5 in the mean, so an error of states that last shrinks by gamma^4.5 a time: to a tenth."""
 MOMENTS_WARMUP = 3
 """Iterations of it where only the optimiser is missing: about a hundred steps, for Adam's second moment."""
-NETWORK = ("hidden", "distribution", "normalise_observations")
-"""Settings of ``PolicyCfg`` that a network's shape decides."""
+REMEDY = "give the policy's settings, or leave --preset out, which takes them over"
+NEW_INPUTS = {
+    "mlp.0.weight": 0.0,
+    "obs_normalizer._mean": 0.0,
+    "obs_normalizer._var": 1.0,
+    "obs_normalizer._std": 1.0,
+}
+"""What reads or normalises the inputs, and what it has for new ones."""
 _SENSES = ("hand", "fingertip", "hand_layer", "sim", "action", "observation")
 """Parts of a task that say what a policy's observations and actions mean."""
 
@@ -79,13 +90,7 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
             "was trained with"
         ) from error
     run = replace(base.run, out=Path("runs") / f"from-{Path(name).stem}")
-    return replace(
-        base,
-        run=run,
-        ppo=ppo,
-        policy=policy,
-        env=env,
-    )
+    return replace(base, run=run, ppo=ppo, policy=policy, env=env)
 
 
 def warmup_iterations(state: Mapping[str, Any]) -> int:
@@ -97,16 +102,53 @@ def warmup_iterations(state: Mapping[str, Any]) -> int:
     return int(state.get("critic_warmup", 0))  # what its own run still lacked
 
 
-def completed(state: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """An exported policy as a checkpoint: what it lacks is that of a run which begins.
+def widen(state: dict[str, Any], actor: "nn.Module", critic: "nn.Module") -> tuple[dict[str, Any], int]:
+    """A checkpoint or policy with the networks of a run that observes more, acting as before.
+
+    Of a network that reads more nothing is taken over of the optimiser: its moments are of another shape.
+
+    Args:
+        state: The checkpoint, not changed. Critic and optimiser may be missing, as in an exported policy.
+        actor: The actor it is for, which reads at least as much as that of the checkpoint.
+        critic: The critic it is for.
+
+    Returns:
+        The checkpoint, and how many inputs are new, of the network with the most of them.
+    """
+    from torch.nn.functional import pad
+
+    from vd.policy import policy_export
+
+    widened, most = {}, 0
+    for key, network in (("actor_state_dict", actor), ("critic_state_dict", critic)):
+        if key not in state:
+            continue
+        weights, own = dict(state[key]), network.state_dict()
+        for name in weights.keys() & NEW_INPUTS.keys():
+            extra = own[name].shape[-1] - weights[name].shape[-1]
+            weights[name] = pad(weights[name], (0, extra), value=NEW_INPUTS[name])
+            most = max(most, extra)
+        widened[key] = weights
+    kept = policy_export(state) if most else state
+    return kept | {key: weights for key, weights in widened.items() if key in kept}, most
+
+
+def completed(
+    state: dict[str, Any], own: dict[str, Any], stage: tuple[float, float] | None = None
+) -> dict[str, Any]:
+    """What a run begins from as a checkpoint: what it lacks is that of the run.
 
     The critic reads what the actor reads, so where it is missing it begins with the actor's normalisation.
     A policy without a stage of the curriculum has come to the end of it.
 
     Args:
-        state: The policy, widened for the run; a whole checkpoint passes unchanged.
+        state: A checkpoint, or a policy, widened for the run.
         own: Networks, optimiser and window of the run: ``critic_state_dict``, ``optimizer_state_dict``,
             ``window``.
+        stage: Difficulty and tightness to begin at, rather than those of the file.
+
+    Raises:
+        ValueError: The stage is not within 0 and 1.
     """
     if "critic_state_dict" not in state:
         critic = own["critic_state_dict"]
@@ -117,31 +159,24 @@ def completed(state: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
         }
         # One that reads more begins with a normalisation of its own.
         state = state | {"critic_state_dict": critic | (normaliser if len(normaliser) == 4 else {})}
-    if "optimizer_state_dict" in state:
+    if "optimizer_state_dict" not in state:
+        tightening = state["task"].get("curriculum", {}).get("tightening", {}).get("enabled", False)
+        reached = state.get("stage", {"difficulty": 1.0, "tightness": 1.0, "tightening": tightening})
+        state = state | {
+            "optimizer_state_dict": own["optimizer_state_dict"],
+            "elapsed_s": 0.0,
+            "best": None,
+            "window": own["window"],
+            "ranks": [{"env": reached}],
+            "infos": None,
+        }
+    if stage is None:
         return state
-    tightening = state["task"].get("curriculum", {}).get("tightening", {}).get("enabled", False)
-    stage = state.get("stage", {"difficulty": 1.0, "tightness": 1.0, "tightening": tightening})
-    return state | {
-        "optimizer_state_dict": own["optimizer_state_dict"],
-        "elapsed_s": 0.0,
-        "best": None,
-        "window": own["window"],
-        "ranks": [{"env": stage}],
-        "infos": None,
-    }
-
-
-def at_stage(state: dict[str, Any], stage: tuple[float, float]) -> dict[str, Any]:
-    """A checkpoint whose curriculum has come to another difficulty and tightness.
-
-    Raises:
-        ValueError: They are not within 0 and 1.
-    """
-    if not all(0.0 <= value <= 1.0 for value in stage):
-        raise ValueError(
-            f"--init-stage is {stage[0]:g} {stage[1]:g}; difficulty and tightness lie within 0 and 1"
-        )
     difficulty, tightness = stage
+    if not (0.0 <= difficulty <= 1.0 and 0.0 <= tightness <= 1.0):
+        raise ValueError(
+            f"--init-stage is {difficulty:g} {tightness:g}; difficulty and tightness lie within 0 and 1"
+        )
     moved = {"difficulty": difficulty, "tightness": tightness, "tightening": True}
     return state | {"ranks": [rank | {"env": rank["env"] | moved} for rank in state["ranks"]]}
 
@@ -155,26 +190,9 @@ def fitting(
     told something would read other values, and begins anew.
 
     Raises:
-        ValueError: Another hand, or an actor of another shape.
+        ValueError: Another hand, or an actor of another shape; with the remedy.
     """
-    from vd.policy import policy_export
-
-    _check_fit(state, spec, task, path)
-    told = state["task"].get("observation", {}).get("dynamics", "none") != "none"
-    if not told or _history(state["task"]) == _history(task):
-        return state
-    return {key: value for key, value in policy_export(state).items() if key != "critic_state_dict"}
-
-
-def _check_fit(
-    state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, Any], path: str | Path
-) -> None:
-    """Refuse networks that a run cannot take over, with the remedy.
-
-    Raises:
-        ValueError: Another hand, or networks of another shape.
-    """
-    from vd.policy import PolicySpec
+    from vd.policy import PolicySpec, policy_export
 
     found = from_dict(PolicySpec, state["policy"], where="policy")
     hand, here = state["task"].get("hand"), task.get("hand")
@@ -183,23 +201,22 @@ def _check_fit(
             f"--init: {path} moves {found.num_actions} joints of {hand}, and this run's hand, {here}, has "
             f"{spec.num_actions}; give --hand {hand}"
         )
-    remedy = "give the policy's settings, or leave --preset out, which takes them over"
-    for name in ("activation", *NETWORK):
-        theirs, ours = getattr(found, name), getattr(spec, name)
-        if theirs != ours:
-            flag = f"--policy.{name.replace('_', '-')}"
-            raise ValueError(f"--init: {path} has {flag} {theirs}, and this run {ours}; {remedy}")
-    before, now = _history(state["task"]), _history(task)
-    if before not in (0, now):
-        raise ValueError(
-            f"--init: {path} observes --env.observation.history {before} and this run {now}; only a policy "
-            f"without history can go on with one: {remedy}"
-        )
+    theirs, ours = ({"history": t.get("observation", {}).get("history", 0)} for t in (state["task"], task))
+    for name in ("activation", "hidden", "distribution", "normalise_observations"):
+        theirs[name], ours[name] = getattr(found, name), getattr(spec, name)
+    different = [name for name in ours if theirs[name] != ours[name] and (name != "history" or theirs[name])]
+    for name in different:
+        flag = f"--{'env.observation' if name == 'history' else 'policy'}.{name.replace('_', '-')}"
+        raise ValueError(f"--init: {path} has {flag} {theirs[name]}, and this run {ours[name]}; {REMEDY}")
     if found.num_observations > spec.num_observations:
         raise ValueError(
             f"--init: {path} reads {found.num_observations} values and this run observes "
-            f"{spec.num_observations}, but a run can only go on with more: {remedy}"
+            f"{spec.num_observations}, but a run can only go on with more: {REMEDY}"
         )
+    told = state["task"].get("observation", {}).get("dynamics", "none") != "none"
+    if told and theirs["history"] != ours["history"]:
+        return {key: value for key, value in policy_export(state).items() if key != "critic_state_dict"}
+    return state
 
 
 def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
@@ -216,11 +233,6 @@ def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
     )
     before = {k: default[k] for k in now if k in default} | before
     return [f"{k} {before[k]}, here {now[k]}" for k in before if k in now and before[k] != now[k]]
-
-
-def _history(task: Mapping[str, Any]) -> int:
-    """Past steps that a policy of a task reads, which files of before the history do not name."""
-    return task.get("observation", {}).get("history", 0)
 
 
 def _leaves(values: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:

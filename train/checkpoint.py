@@ -20,8 +20,8 @@ AUTO = "auto"
 _NEEDED = {"actor": ("policy", "task", "iter", "env_steps"), "student": ("spec", "task", "iter", "env_steps")}
 """What belongs to the weights of a teacher or a student. Other projects' files have an actor too."""
 _ARRAY = "__numpy__"
-# Key in the environment's state under which that of its environments lies.
 _WORLDS = "arrays"
+"""Key in the environment's state under which that of its environments lies."""
 
 
 def checkpoint_path(run_dir: Path, iteration: int) -> Path:
@@ -48,8 +48,7 @@ def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") ->
         FileNotFoundError: There is none; the message says what is there.
         ValueError: None is sound.
     """
-    folder = run_dir / CHECKPOINT_FOLDER
-    best = folder / BEST_NAME
+    best = run_dir / CHECKPOINT_FOLDER / BEST_NAME
     files = [*([best] if best.is_file() else []), *list_checkpoints(run_dir)]
     if which is None and files:
         raise FileExistsError(
@@ -57,20 +56,18 @@ def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") ->
         )
     if which is None or (which == AUTO and not files):
         return None
-    if which in (AUTO, "latest"):
-        if not files:
-            raise FileNotFoundError(f"--resume: no checkpoint in {folder}; leave --resume out to start")
+    if which in (AUTO, "latest") and files:
         return _newest_sound(files, network)
-    path = best if which == "best" else Path(which)
+    path = best if which in ("best", "latest") else Path(which)
     if not path.is_file():
-        found = ", ".join(p.name for p in files) or "none"
+        found = ", ".join(p.name for p in files) or "none; leave --resume out to start"
         raise FileNotFoundError(f"--resume: no file {path}; checkpoints of {run_dir}: {found}")
     return path
 
 
 def _newest_sound(files: list[Path], network: str) -> Path:
     """The last of ``files`` that can be read; those after it are named on stderr."""
-    reasons = []
+    reasons: list[str] = []
     for path in reversed(files):
         try:
             load_checkpoint(path, network=network)

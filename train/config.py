@@ -8,13 +8,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from vd.config import Dropped, Renamed
 from vd.paper import PAPER
-
-if TYPE_CHECKING:
-    from vd.train.distributed import Processes
 
 ACTIVATION = "elu"
 """Activation of the hidden layers, as in the paper (MLP 512-256-256 ELU)."""
@@ -129,36 +126,26 @@ class RunCfg:
         Raises:
             ValueError: The flag, its value and what it has to be.
         """
-        require_positive(self, "--", "max_steps", "max_minutes", "save_every", "keep_every")
+        require(self, "--", "positive", "max_steps max_minutes save_every keep_every")
         if self.keep_every is not None and self.keep_every % self.save_every:
             raise ValueError(
                 f"--keep-every is {self.keep_every}; give a multiple of --save-every {self.save_every}"
             )
 
 
-def require_positive(cfg: Any, prefix: str, *names: str, or_zero: bool = False) -> None:
-    """Refuse fields that are not positive; those that are ``None`` are not set.
+def require(
+    cfg: Any, prefix: str, what: Literal["positive", "zero or positive", "in [0, 1]"], names: str
+) -> None:
+    """Refuse fields, named with spaces between, that are not ``what``; those that are ``None`` are not set.
 
     Raises:
         ValueError: The flag, its value and what it has to be.
     """
-    for name in names:
+    for name in names.split():
         value = getattr(cfg, name)
-        if value is not None and not (value > 0 or (or_zero and value == 0)):
-            wanted = "zero or positive" if or_zero else "positive"
-            raise ValueError(f"{prefix}{name.replace('_', '-')} is {value}; it has to be {wanted}")
-
-
-def require_share(cfg: Any, prefix: str, *names: str) -> None:
-    """Refuse fields outside of [0, 1].
-
-    Raises:
-        ValueError: The flag and its value.
-    """
-    for name in names:
-        value = getattr(cfg, name)
-        if not 0.0 <= value <= 1.0:
-            raise ValueError(f"{prefix}{name.replace('_', '-')} is {value}; it has to be in [0, 1]")
+        good = value is None or value > 0 or (what != "positive" and value == 0)
+        if not good or (what == "in [0, 1]" and value > 1):
+            raise ValueError(f"{prefix}{name.replace('_', '-')} is {value}; it has to be {what}")
 
 
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:
@@ -173,10 +160,10 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
         ValueError: The flag, its value and what it has to be.
     """
     run.validate()
-    require_positive(ppo, "--ppo.", "rollout_steps", "minibatch_size", "epochs", "clip", "grad_norm")
-    require_positive(ppo, "--ppo.", "actor_learning_rate", "critic_learning_rate", "desired_kl")
-    require_positive(ppo, "--ppo.", "imitation_iterations", "bound_coefficient", or_zero=True)
-    require_share(ppo, "--ppo.", "gamma", "gae_lambda")
+    require(ppo, "--ppo.", "positive", "rollout_steps minibatch_size epochs clip grad_norm")
+    require(ppo, "--ppo.", "positive", "actor_learning_rate critic_learning_rate desired_kl")
+    require(ppo, "--ppo.", "zero or positive", "imitation_iterations bound_coefficient")
+    require(ppo, "--ppo.", "in [0, 1]", "gamma gae_lambda")
     if not min(policy.hidden, default=0) > 0:
         raise ValueError(f"--policy.hidden is {policy.hidden}; widths have to be positive")
     low, high = policy.std_range
@@ -195,7 +182,7 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
 
 
 def rsl_rl_config(
-    ppo: PpoCfg, policy: PolicyCfg, num_envs: int, groups: Sequence[str], processes: "Processes"
+    ppo: PpoCfg, policy: PolicyCfg, num_envs: int, groups: Sequence[str], rank: int, world_size: int
 ) -> dict[str, Any]:
     """The dictionary that rsl-rl builds algorithm and models from.
 
@@ -204,7 +191,8 @@ def rsl_rl_config(
         policy: Network settings.
         num_envs: Environments.
         groups: Groups of observations; the actor reads the first, the critic all.
-        processes: Place of this process in the run.
+        rank: Number of this process.
+        world_size: Processes of the run.
     """
     from vd.train.distribution import BoundedStdGaussian, FreeStdGaussian  # imports torch
     from vd.train.ppo import TeacherPPO
@@ -220,9 +208,8 @@ def rsl_rl_config(
         "activation": ACTIVATION,
         "obs_normalization": policy.normalise_observations,
     }
-    several = {"global_rank": processes.rank, "world_size": processes.world_size}
     return {
-        "multi_gpu": several if processes.world_size > 1 else None,
+        "multi_gpu": {"global_rank": rank, "world_size": world_size} if world_size > 1 else None,
         "num_steps_per_env": ppo.rollout_steps,
         "obs_groups": {"actor": [groups[0]], "critic": list(groups)},
         "actor": network | {"distribution_cfg": distribution},

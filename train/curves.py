@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import tyro
 
-from vd.files import atomic_path
-from vd.train.metrics import read_progress
+from vd.files import atomic_path, check_file
 
 SMOOTHING = 1 / 40
 """Share of a run over which the smooth line averages; the raw values stay visible behind it."""
@@ -33,6 +34,29 @@ PANELS = (
     ("control steps (stage 0: clouds) per second", "steps_per_s", 1.0),
 )
 """Title, quantity and factor of each panel, as far as a run has them; of a group (``/``) the first run's."""
+
+
+@dataclass
+class CurvesCfg:
+    """Draw success, reward, terms, difficulty, error, std, falls and speed of runs against control steps."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs, or progress.jsonl files."""
+    out: Path | None = None
+    """PNG to write; curves.png beside the first run's progress by default."""
+
+
+def curves_command(arguments: list[str], _started: float) -> int:
+    """``vd-train curves``; the exit status."""
+    cfg = tyro.cli(CurvesCfg, args=arguments, prog="vd-train curves")
+    from vd.train.metrics import PROGRESS_FILE  # loads torch
+
+    files = [run / PROGRESS_FILE if run.is_dir() else run for run in cfg.runs]
+    output = cfg.out or files[0].with_name("curves.png")
+    check_file(output)
+    plot_curves(files, output)
+    print(output)
+    return 0
 
 
 def plot_curves(progress: Sequence[Path], output: Path) -> None:
@@ -88,6 +112,8 @@ def _quantities(rows: list[dict[str, Any]], key: str) -> list[str]:
 
 def _read_runs(progress: Sequence[Path]) -> dict[str, list[dict[str, Any]]]:
     """Rows of runs by the name of their folder."""
+    from vd.train.metrics import read_progress
+
     runs = {}
     for path in progress:
         if not path.is_file():

@@ -45,10 +45,6 @@ REASON_LINES = 4
 """Last lines of a command's output that tell why it failed."""
 
 
-class FailureError(RuntimeError):
-    """A command failed; the message says which and why."""
-
-
 @dataclass
 class DemoCfg:
     """Show what the project is for, on the machine at hand: one page, written as its parts finish."""
@@ -89,7 +85,7 @@ class Part:
                 status is a failure.
 
         Raises:
-            FailureError: One failed; the others are ended.
+            RuntimeError: One failed; the others are ended.
         """
         running, until = [], None if seconds is None else time.monotonic() + seconds
         try:
@@ -114,7 +110,7 @@ class Part:
                     continue
                 if status != 0 and seconds is None:
                     reason = "\n".join(log.read_text(errors="replace").split("\n")[-REASON_LINES - 1 :])
-                    raise FailureError(f"{' '.join(line)} ended with status {status}: {reason.strip()}")
+                    raise RuntimeError(f"{' '.join(line)} ended with status {status}: {reason.strip()}")
         finally:
             for process, _, _ in running:
                 process.terminate()  # nothing to one that has ended; another saves first
@@ -142,8 +138,8 @@ class Demo:
         """Time so far [min]."""
         return (time.monotonic() - self.started) / 60.0
 
-    def run(self) -> int:
-        """All parts; returns the exit status.
+    def run(self) -> None:
+        """All parts.
 
         Raises:
             KeyboardInterrupt: Interrupted; the page says so and has what is there.
@@ -166,7 +162,6 @@ class Demo:
                 print(f"  failed: {part.error}", file=sys.stderr, flush=True)
             part.seconds = time.monotonic() - began
             self.write(running=part is not self.parts[-1])
-        return int(any(part.state == "failed" for part in self.parts))
 
     def write(self, *, running: bool) -> None:
         """Write the page; one of a demo that is ``running`` is read again by the browser."""
@@ -195,7 +190,7 @@ class Demo:
             for one in (*row.per_object, row.overall)
         ]
         shown = {"policy": CAMERA_POLICY, "meshes": self.cfg.meshes, "film": film, "rows": lines}
-        return shown | {"tolerance_rad": tolerance, "page": self.link(out / "eval.html")}
+        return shown | {"tolerance_rad": tolerance, "page": f"{part.name}/eval.html"}
 
     def gap(self, part: Part) -> dict[str, Any]:
         """An effect hidden in a simulated servo, found and closed."""
@@ -208,7 +203,7 @@ class Demo:
 
         verdict = verdict_sentence(Report.read(analysis / "report.json"))
         pictures = sorted(analysis.glob("overlay_*.png"), key=lambda path: path.stat().st_mtime)
-        page = self.link(analysis / "report.html")
+        page = f"{part.name}/analysis/report.html"
         return {"hidden": HIDDEN, "verdict": verdict, "picture": pictures[0], "page": page}
 
     def twin(self, part: Part) -> dict[str, Any]:
@@ -224,7 +219,7 @@ class Demo:
         late = f"{sent[len(sent) // 2]:.0f}, at most {sent[-1]:.0f}"
         row = (len(sent), f"{run.columns['missed'][-1]:.0f}", late, stops)
         film, name = log / "run.mp4", run.run["object"]["name"]
-        return {"film": film, "row": row, "object": name, "page": self.link(log / "run.html")}
+        return {"film": film, "row": row, "object": name, "page": f"{part.name}/log/run.html"}
 
     def training(self, part: Part) -> dict[str, Any]:
         """A small training, with its curve."""
@@ -244,10 +239,6 @@ class Demo:
         shown = {"film": film, "curves": curves, "low": min(goals), "last": goals[-1]}
         return shown | {"steps": rows[-1]["env_steps"]}
 
-    def link(self, path: Path) -> str:
-        """A file as the page names it."""
-        return path.relative_to(self.cfg.out).as_posix()
-
 
 def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:
     """Import the smallest meshes for a while.
@@ -256,7 +247,7 @@ def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:
         The set, and one of its objects.
 
     Raises:
-        FailureError: None was imported.
+        RuntimeError: None was imported.
     """
     from vd.assets_usd.objects.model import object_files
     from vd.assets_usd.objects.plan import find_meshes
@@ -268,19 +259,17 @@ def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:
     found = object_files(out) if out.is_dir() else []
     if not found:
         names = ", ".join(path.name for path in chosen)
-        raise FailureError(
+        raise RuntimeError(
             f"none of {names} was imported within {IMPORT_S:.0f} s; the files in {part.folder} say why. "
             f"By hand, without haste: vd-assets import {meshes}"
         )
     return str(out), str(found[0])
 
 
-def check(cfg: DemoCfg) -> None:
-    """Refuse settings that cannot be used.
-
-    Raises:
-        ValueError: The flag and the remedy.
-    """
+@interrupt.command("demo")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the demo; returns the exit status: 1 if a part failed."""
+    cfg = tyro.cli(DemoCfg, args=arguments, prog="python -m vd.train.demo")
     if cfg.minutes <= 0.0:
         raise ValueError(f"--minutes is {cfg.minutes}; it has to be positive")
     check_names([CAMERA_POLICY], [])
@@ -291,23 +280,13 @@ def check(cfg: DemoCfg) -> None:
         from vd.assets_usd.objects.plan import find_meshes
 
         find_meshes([cfg.meshes])  # refuses a folder without any
-
-
-@interrupt.command("demo")
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the demo; returns the exit status: 1 if a part failed."""
-    cfg = tyro.cli(DemoCfg, args=arguments, prog="python -m vd.train.demo")
     demo = Demo(cfg)
-    try:
-        check(cfg)
-        status = demo.run()
-    except (ValueError, OSError) as error:
-        print(f"demo: {error}", file=sys.stderr)
-        return 1
+    demo.run()
     print(f"\n{demo.page} is ready after {demo.minutes:.1f} min; open it in a browser")
-    if failed := [part.title for part in demo.parts if part.state == "failed"]:
+    failed = [part.title for part in demo.parts if part.state == "failed"]
+    if failed:
         print(f"demo: failed: {', '.join(failed)}", file=sys.stderr)
-    return status
+    return int(bool(failed))
 
 
 if __name__ == "__main__":

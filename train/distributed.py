@@ -7,9 +7,7 @@ import os
 import sys
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import timedelta
-from typing import NoReturn
 
 import torch
 from torch.distributed import PrefixStore
@@ -26,30 +24,20 @@ REPORT_AFTER_S = 90.0
 """An iteration that takes this long is reported, before the others' wait in a collective ends."""
 
 
-@dataclass(frozen=True)
-class Processes:
-    """Place of this process in the run.
-
-    Attributes:
-        rank: Number among all processes; 0 logs and saves.
-        world_size: Processes of the run.
-    """
-
-    rank: int = 0
-    world_size: int = 1
-
-
-def join_processes(device: str) -> Processes:
+def join_processes(device: str) -> tuple[int, int]:
     """Meet the other processes that ``torchrun`` started, if it did; NCCL on GPUs, gloo on CPUs.
 
     Args:
         device: Torch device of this process.
 
+    Returns:
+        Number of this process, of which 0 logs and saves, and how many there are.
+
     Raises:
         ValueError: The device is not the GPU that belongs to this process.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return Processes()
+        return 0, 1
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
     cuda = device.startswith("cuda")
     if cuda and device != f"cuda:{local_rank}":
@@ -74,7 +62,7 @@ def join_processes(device: str) -> Processes:
         world_size=world_size,
         timeout=COLLECTIVE_TIMEOUT,
     )
-    return Processes(rank, world_size)
+    return rank, world_size
 
 
 def watch_iteration() -> None:
@@ -103,20 +91,15 @@ def ending_together(*agreed: type[BaseException]) -> Iterator[None]:
     except agreed:
         raise
     except BaseException as error:
-        _abandon(error)
+        rank = os.environ.get("RANK", "0")
+        print(f"vd-train: process {rank} failed and ends the run; --resume goes on with it", file=sys.stderr)
+        if isinstance(error, OutputError):
+            print(error, file=sys.stderr)
+        else:
+            traceback.print_exc()
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(1)  # no clean-up that could wait for other processes
     finally:
         faulthandler.cancel_dump_traceback_later()
-
-
-def _abandon(error: BaseException) -> NoReturn:
-    """Print the error and end without any clean-up that could wait for other processes."""
-    rank = os.environ.get("RANK", "0")
-    print(f"vd-train: process {rank} failed and ends the run; --resume goes on with it", file=sys.stderr)
-    if isinstance(error, OutputError):
-        print(error, file=sys.stderr)
-    else:
-        traceback.print_exception(error)
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            stream.flush()
-    os._exit(1)

@@ -7,15 +7,26 @@ from rsl_rl.modules.distribution import GaussianDistribution, HeteroscedasticGau
 from torch.distributions import Normal
 
 
-class FreeStdGaussian(GaussianDistribution):
-    """rsl-rl's Gaussian of one std per action, with :func:`draw`."""
+class _Drawn:
+    """Samples the same numbers as ``torch.normal``, which looks whether every std is positive.
+
+    So it waits for the device, at every control step.
+    """
+
+    mean: torch.Tensor
+    std: torch.Tensor
 
     def sample(self) -> torch.Tensor:
         """One draw for every state."""
-        return draw(self.mean, self.std)
+        with torch.no_grad():
+            return torch.randn_like(self.mean) * self.std + self.mean
 
 
-class BoundedStdGaussian(HeteroscedasticGaussianDistribution):
+class FreeStdGaussian(_Drawn, GaussianDistribution):
+    """rsl-rl's Gaussian of one std per action."""
+
+
+class BoundedStdGaussian(_Drawn, HeteroscedasticGaussianDistribution):
     """Gaussian with ``log std = low + (high - low) * sigmoid(x)``, ``x`` from the network.
 
     rsl-rl's own state-dependent Gaussian clamps ``log std``: outside the range the gradient is zero, so a
@@ -55,10 +66,6 @@ class BoundedStdGaussian(HeteroscedasticGaussianDistribution):
         low, high = self.log_floor, self._log_ceiling
         self._distribution = Normal(mean, torch.exp(low + (high - low) * torch.sigmoid(raw)))
 
-    def sample(self) -> torch.Tensor:
-        """One draw for every state."""
-        return draw(self.mean, self.std)
-
     def init_mlp_weights(self, mlp: torch.nn.Module) -> None:
         """Make the standard deviation ``init_std`` everywhere: zero weights, and the bias that gives it."""
         low, high = (math.log(bound) for bound in self.std_range)
@@ -66,12 +73,3 @@ class BoundedStdGaussian(HeteroscedasticGaussianDistribution):
         head = mlp[-2]  # the linear layer before the reshape to [2, D]
         torch.nn.init.zeros_(head.weight[self.output_dim :])
         torch.nn.init.constant_(head.bias[self.output_dim :], math.log(share / (1.0 - share)))
-
-
-def draw(mean: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
-    """Normal numbers of these means and standard deviations, the same as ``torch.normal`` gives.
-
-    ``torch.normal`` looks whether every std is positive, and so waits for the device at every control step.
-    """
-    with torch.no_grad():
-        return torch.randn_like(mean) * std + mean

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from vd.device import resolve_device
 from vd.evaluate.agents import check_names
 from vd.files import write_json
 from vd.train.begin import settings_of
-from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
+from vd.train.presets import GONE, PRESETS, TeacherCfg, for_hand, smoke
 
 if TYPE_CHECKING:
     from vd.train.student.config import StudentTrainCfg
@@ -27,7 +26,7 @@ CONFIG_NAME = "config.json"
 TEACHER_HELP = """Train the teacher: PPO on the simulator's state.
 
 Flags start from --preset, or with --resume from the run's config.json. Without either the machine decides:
-gpu, under torchrun multi-gpu, and cpu-demo where there is no GPU. Short forms: --hand, --hand-layer,
+gpu, and cpu-demo where there is no GPU. Short forms: --hand, --hand-layer,
 --objects, --num-envs and --seed stand for --env.hand and so on, --randomise for --env.randomisation.enabled.
 Ctrl-C saves. --help-all lists the flags of physics, reward, success and of the ranges of Table S3 too."""
 
@@ -60,11 +59,16 @@ def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | No
 
     Raises:
         FileNotFoundError: ``--resume`` names a run without a configuration.
-        ValueError: The run's configuration is not one of this version, or ``--init`` is no teacher.
+        ValueError: There is no such preset, the run's configuration is not one of this version, or ``--init``
+            is no teacher.
     """
     arguments = normalise(arguments, SHORT_FORMS)
     preset, init, resume = (value_of(arguments, flag) for flag in ("--preset", "--init", "--resume"))
-    saved = resume is not None and _has_config(arguments)
+    out = value_of(arguments, "--out")
+    saved = resume is not None and out is not None and (Path(out) / CONFIG_NAME).is_file()
+    if preset is not None and preset not in PRESETS:
+        instead = GONE.get(preset, f"one of {', '.join(PRESETS)}")
+        raise ValueError(f"--preset {preset} is none; {instead}")
     if "--smoke" in arguments:
         start = smoke()
     elif preset is None and init is not None:
@@ -76,8 +80,8 @@ def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | No
         start = PRESETS[preset]()
         if say is not None:
             say(f"preset {preset}, since none is named: {reason}")
-    else:  # the second pass refuses an unknown name
-        start = PRESETS.get(preset or "gpu", PRESETS["gpu"])()
+    else:
+        start = PRESETS[preset or "gpu"]()
     if init is None:
         start = for_hand(start, value_of(arguments, "--env.hand"))
     base = (saved_config(arguments, start) or start) if resume is not None else start
@@ -95,9 +99,7 @@ def machine_preset(device: str | None) -> tuple[str, str]:
             "there is no GPU. It learns an easier task, turns of one object about the vertical, in minutes; "
             "the whole task is --preset gpu"
         )
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        return "multi-gpu", "the recipe that learns, on several GPUs; Ctrl-C or --max-minutes ends it"
-    return "gpu", "the recipe that learns, on one GPU; Ctrl-C or --max-minutes ends it"
+    return "gpu", "the recipe that learns; Ctrl-C or --max-minutes ends it"
 
 
 def normalise(arguments: Sequence[str], short_forms: Mapping[str, str]) -> list[str]:
@@ -154,12 +156,6 @@ def _without(kind: type, hidden: Collection[str], where: str = "") -> type:
         else:
             shown[field.name] = annotations[field.name]
     return type(kind.__name__, (kind,), {"__annotations__": shown, "__doc__": kind.__doc__})
-
-
-def _has_config(arguments: list[str]) -> bool:
-    """Whether the run's folder is named and has a configuration."""
-    folder = value_of(arguments, "--out")
-    return folder is not None and (Path(folder) / CONFIG_NAME).is_file()
 
 
 def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:

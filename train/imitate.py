@@ -96,25 +96,12 @@ def begin_imitation(
         ValueError: The policy reads other things than those.
     """
     read = state["policy"]["num_observations"]
-    if not ppo.imitation_iterations:
-        return None
-    if present != read:
+    if ppo.imitation_iterations and present != read:
         raise ValueError(
             f"--ppo.imitation-iterations: {path} reads {read} values, and the critic is told {present} of "
             "the present; give --env.observation.dynamics critic, and --init a policy of state and shape"
         )
-    return Imitation(learner, present)
-
-
-def resumed_imitation(
-    learner: TeacherPPO, ppo: PpoCfg, present: int, state: Mapping[str, Any]
-) -> Imitation | None:
-    """The imitation that a checkpoint was in; None: it was over, or there was none, or it is turned off."""
-    if IMITATED not in state or not ppo.imitation_iterations:
-        return None
-    imitation = Imitation(learner, present)
-    imitation.teacher.load_state_dict(state[IMITATED])
-    return imitation
+    return Imitation(learner, present) if ppo.imitation_iterations else None
 
 
 def _distribution(actor: MLPModel, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -2,12 +2,17 @@
 
 import contextlib
 import math
+import signal
 import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
+from torch import nn
 
+from vd import interrupt
 from vd.train.checkpoint import (
     CHECKPOINT_FOLDER,
     checkpoint_path,
@@ -18,9 +23,30 @@ from vd.train.checkpoint import (
 )
 from vd.train.config import RunCfg
 from vd.train.distributed import ending_together, join_processes, watch_iteration
-from vd.train.ending import EndRequest, Interrupted, TrainingDivergedError
 from vd.train.metrics import ProgressFile
 from vd.train.progress import ProgressLines
+
+
+class Interrupted(Exception):  # noqa: N818  # not an error: the run was asked to stop and has saved
+    """Ctrl-C or SIGTERM; the run is saved."""
+
+
+class TrainingDivergedError(RuntimeError):
+    """Observations, rewards, losses or parameters are no longer finite."""
+
+
+def check_update(losses: Mapping[str, float], networks: nn.Module, remedy: str) -> None:
+    """Stop when a loss, a gradient or a parameter is not finite; one wait for the device.
+
+    Raises:
+        TrainingDivergedError: It names what is not, and the remedy.
+    """
+    bad = [name for name, value in losses.items() if not math.isfinite(value)]
+    # A sum is finite only if all its terms are.
+    if not math.isfinite(float(torch.stack([p.detach().sum() for p in networks.parameters()]).sum())):
+        bad.append("parameters")
+    if bad:
+        raise TrainingDivergedError(f"{', '.join(bad)} not finite after the update; {remedy}")
 
 
 class TrainingLoop:
@@ -42,25 +68,26 @@ class TrainingLoop:
     """
 
     def __init__(self, run: RunCfg, *, device: str, deadline: float | None = None) -> None:
-        self.run, self.device, self.processes = run, device, join_processes(device)
+        self.run, self.device = run, device
+        self.rank, self.world_size = join_processes(device)
         self.iteration, self.env_steps, self._elapsed_s = 0, 0, 0.0
         self.new_episodes = ""
-        self._end = EndRequest(deadline, device=device, distributed=self.is_distributed)
+        self._deadline, self._signal = deadline, 0
 
     @property
     def is_distributed(self) -> bool:
         """Whether there are other processes."""
-        return self.processes.world_size > 1
+        return self.world_size > 1
 
     @property
     def is_main(self) -> bool:
         """Whether this process logs and saves."""
-        return self.processes.rank == 0
+        return self.rank == 0
 
     @property
     def steps_per_iteration(self) -> int:
         """Control steps of an iteration, all environments and processes together."""
-        return self._samples() * self.processes.world_size
+        return self._samples() * self.world_size
 
     @property
     def total_iterations(self) -> int:
@@ -81,26 +108,27 @@ class TrainingLoop:
         first = saved = self.iteration
         total = self.total_iterations if iterations is None else first + iterations
         self._begin()
-        progress = ProgressLines(total, enabled=self.is_main)
+        lines, started = ProgressLines(total, enabled=self.is_main), time.monotonic()
         with contextlib.ExitStack() as stack:
             log: ProgressFile | None = None
             if self.is_main:
                 log = ProgressFile(self.run.out, tensorboard=self.run.tensorboard, done=first)
                 stack.callback(log.close)
-            stack.enter_context(self._end.signals(progress.note))
-            stack.enter_context(progress)
+            stack.enter_context(self._signals(lines))
+            stack.enter_context(lines)
             while self.iteration < total and (row := self._row()) is not None:
                 if log is not None:
                     log.write(row)
-                progress.update(row, self._end.time_left(self.iteration - first, total - self.iteration))
+                pace = (time.monotonic() - started) / (self.iteration - first)
+                lines.update(row, self._time_left(pace * (total - self.iteration)))
                 if self.iteration % self.run.save_every == 0:
                     self.save()
                     saved = self.iteration
-                if self._end.due():
+                if self._end_due():
                     break
             if saved < self.iteration or self.iteration == 0:
                 self.save()
-        if self._end.signal:
+        if self._signal:
             raise Interrupted
 
     def save(self) -> None:
@@ -161,16 +189,44 @@ class TrainingLoop:
             **figures,
         }
 
+    @contextlib.contextmanager
+    def _signals(self, lines: ProgressLines) -> Iterator[None]:
+        """Turn Ctrl-C and SIGTERM into a request to stop; a second one stops at once, without saving."""
+
+        def request(number: int, _frame: FrameType | None) -> None:
+            if self._signal:
+                raise KeyboardInterrupt
+            self._signal = number
+            interrupt.note(number)
+            lines.note("stopping: saving a checkpoint (again to stop at once, without saving)")
+
+        with interrupt.handled(request, signal.SIGINT, signal.SIGTERM):
+            yield
+
+    def _end_due(self) -> bool:
+        """Whether a signal or the deadline asks for the end; all processes agree."""
+        late = self._time_left(math.inf) <= 0.0
+        if self.is_distributed:
+            wishes = torch.tensor([float(self._signal), float(late)], device=self.device)
+            torch.distributed.all_reduce(wishes, op=torch.distributed.ReduceOp.MAX)
+            self._signal, late = int(wishes[0]), bool(wishes[1])
+            interrupt.note(self._signal)
+        return bool(self._signal) or late
+
+    def _time_left(self, most: float) -> float:
+        """Time to the deadline, at most ``most`` [s]."""
+        return most if self._deadline is None else min(most, self._deadline - time.monotonic())
+
     def _stopping(self) -> bool:
         """Whether to cut a rollout short: not with other processes, which all do the same collectives."""
-        return bool(self._end.signal) and not self.is_distributed
+        return bool(self._signal) and not self.is_distributed
 
     def _state(self) -> dict[str, Any]:
         """Everything a checkpoint holds."""
         mine = {"random": random_state(self.device)} | self._own_state()
         ranks: list[Any] = [mine]
         if self.is_distributed:
-            ranks = [None] * self.processes.world_size
+            ranks = [None] * self.world_size
             torch.distributed.all_gather_object(ranks, mine)
         counters = {"iter": self.iteration, "env_steps": self.env_steps, "elapsed_s": self._elapsed_s}
         return self._shared_state() | counters | {"ranks": ranks}
@@ -179,14 +235,14 @@ class TrainingLoop:
         """Take over counters, environments and random state, all but the first only if they fit this run."""
         self.iteration, self.env_steps = state["iter"], state["env_steps"]
         self._elapsed_s = state["elapsed_s"]
-        ranks, count = state["ranks"], self.processes.world_size
+        ranks, count = state["ranks"], self.world_size
         self.new_episodes = (
             f"it is of {len(ranks)} processes, this run has {count}" if len(ranks) != count else ""
         ) or self._misfit(ranks)
         if self.new_episodes:
             self._start_anew(ranks)
             return
-        mine = ranks[self.processes.rank]
+        mine = ranks[self.rank]
         self._load_own_state(mine)
         set_random_state(mine["random"], self.device)
 
@@ -222,7 +278,6 @@ class TrainingLoop:
 
     def _close(self) -> None:
         """Release the environments."""
-        raise NotImplementedError
 
     def _start_anew(self, ranks: list[dict[str, Any]]) -> None:
         """Begin new episodes, since the environments of the checkpoint do not fit."""

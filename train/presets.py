@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
@@ -22,8 +22,6 @@ from vd.envs.cfg import (
 from vd.paper import PAPER
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 
-PresetName = Literal["paper", "cpu-demo", "cube", "gpu", "multi-gpu"]
-
 TRAINING_SET = ("procedural-150-seed0",)
 """Objects of the paper's task: as many as the paper trained on, and authored on first use."""
 
@@ -33,7 +31,7 @@ class TeacherCfg:
     """Train the teacher: PPO on the simulator's state."""
 
     RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None, "second_view": Dropped(False)}
-    preset: PresetName = "paper"
+    preset: Annotated[str, tyro.conf.arg(metavar="{paper,gpu,cpu-demo}")] = "paper"
     """Settings to start from; every other flag overrides one of them. By default what learns on this
     machine."""
     resume: str | None = None
@@ -98,7 +96,7 @@ SHORT_ROLLOUTS = PpoCfg(
 
 
 def gpu() -> TeacherCfg:
-    """One GPU: the paper's task, by the recipe that learns.
+    """One GPU or each of several: the paper's task, by the recipe that learns.
 
     What measurements chose, beside the paper's value where that differs (docs/lessons.md). Four fingers did
     better with ``--ppo.desired-kl 0.03``.
@@ -158,36 +156,6 @@ def gpu() -> TeacherCfg:
     )
 
 
-def cube() -> TeacherCfg:
-    """The first thing to learn on one GPU: near goals of a cube on the table, nothing randomised."""
-    return TeacherCfg(
-        preset="cube",
-        run=RunCfg(out=Path("runs/cube")),
-        ppo=replace(SHORT_ROLLOUTS, minibatch_size=8192),
-        # As measured: a std that is the same in all states.
-        policy=PolicyCfg(
-            distribution="gaussian", initial_std=0.8, std_range=(0.02, 1.5), normalise_observations=True
-        ),
-        env=ReorientCfg(
-            objects=("cube",),
-            num_envs=8192,
-            failures_per_million=1.0,
-            observation=ObservationCfg(canonical=True),
-            reward=TOWARDS_GOAL,
-            start=StartCfg(at_rest=True),
-            goal=GoalCfg(max_angle_rad=1.0),
-            curriculum=CurriculumCfg(enabled=True, raise_at=0.5, lower_at=0.25),
-            randomisation=RandomisationCfg(enabled=False),
-        ),
-    )
-
-
-def multi_gpu() -> TeacherCfg:
-    """The gpu preset on every GPU of a torchrun: environments and minibatches are per GPU."""
-    cfg = gpu()
-    return replace(cfg, preset="multi-gpu", run=replace(cfg.run, out=Path("runs/multi-gpu")))
-
-
 def cpu_demo() -> TeacherCfg:
     """Minutes on two cores, on an easier task: from rest, goals about the vertical, no stillness test."""
     return TeacherCfg(
@@ -230,11 +198,12 @@ def cpu_demo() -> TeacherCfg:
 PRESETS: dict[str, Callable[[], TeacherCfg]] = {
     "paper": paper,
     "cpu-demo": cpu_demo,
-    "cube": cube,
     "gpu": gpu,
-    "multi-gpu": multi_gpu,
 }
 """Presets by name."""
+
+GONE = {"multi-gpu": "gpu is the same, under torchrun too", "cube": "give --preset gpu --objects cube"}
+"""Presets of earlier versions, and what to take; their runs go on by their own configuration."""
 
 
 SMOKE_RUN = Path("runs/smoke")

@@ -5,8 +5,6 @@ from collections.abc import Mapping
 from datetime import timedelta
 from typing import Any
 
-BUILDING = "building the environments (the first start compiles the kernels: a minute or two) ..."
-FIRST = "first iteration ..."
 INTERVAL_S = 10.0
 """Between two prints."""
 FIGURES = {
@@ -24,35 +22,8 @@ FIGURES = {
 """What the first line says of an iteration, as far as its row has it."""
 
 
-def summary(row: Mapping[str, Any], total: int, left_s: float) -> str:
-    """The main figures of an iteration in one line.
-
-    Args:
-        row: A row of ``progress.jsonl``.
-        total: Iterations of the whole run.
-        left_s: Estimated time left [s].
-    """
-    parts = [
-        f"iteration {row['iteration']}/{total}",
-        f"{row['env_steps']:,} steps, {row['steps_per_s']:,.0f}/s",
-        *(text.format(row[key]) for key, text in FIGURES.items() if row.get(key) is not None),
-        f"left {timedelta(seconds=max(0, round(left_s)))}",
-    ]
-    return " | ".join(parts)
-
-
-def details(row: Mapping[str, Any]) -> str:
-    """The terms of the reward of an iteration, mean per control step, or else its losses."""
-    for group in ("reward/", "loss/"):
-        terms = {k.removeprefix(group): v for k, v in row.items() if k.startswith(group) and v is not None}
-        terms.pop("total", None)
-        if terms:
-            return f"{group[:-1]}: " + "  ".join(f"{name} {value:+.3f}" for name, value in terms.items())
-    return ""
-
-
 class ProgressLines:
-    """Prints the latest iteration now and then; a context manager.
+    """Prints the first, the latest and the last iteration; a context manager.
 
     Args:
         total: Iterations of the whole run.
@@ -61,28 +32,40 @@ class ProgressLines:
 
     def __init__(self, total: int, *, enabled: bool = True) -> None:
         self._total, self._enabled = total, enabled
-        self._printed, self._waiting = -INTERVAL_S, FIRST
+        self._printed_s, self._waiting = -INTERVAL_S, ""
 
     def __enter__(self) -> "ProgressLines":
-        self._print()
-        self._printed = -INTERVAL_S
+        self.note("first iteration ...")
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._print()
+        if self._waiting:
+            self.note(self._waiting)
 
-    def update(self, row: dict[str, Any], left_s: float) -> None:
-        """Take an iteration."""
-        self._waiting = f"{summary(row, self._total, left_s)}\n  {details(row)}"
-        if time.monotonic() - self._printed >= INTERVAL_S:
-            self._print()
+    def update(self, row: Mapping[str, Any], left_s: float) -> None:
+        """Take an iteration, a row of ``progress.jsonl``, and the estimated time left [s]."""
+        parts = [
+            f"iteration {row['iteration']}/{self._total}",
+            f"{row['env_steps']:,} steps, {row['steps_per_s']:,.0f}/s",
+            *(text.format(row[key]) for key, text in FIGURES.items() if row.get(key) is not None),
+            f"left {timedelta(seconds=max(0, round(left_s)))}",
+        ]
+        self._waiting = f"{' | '.join(parts)}\n  {_terms(row)}"
+        if time.monotonic() - self._printed_s >= INTERVAL_S:
+            self.note(self._waiting)
+            self._printed_s, self._waiting = time.monotonic(), ""
 
     def note(self, message: str) -> None:
         """Print a message."""
         if self._enabled:
             print(message, flush=True)
 
-    def _print(self) -> None:
-        if self._waiting:
-            self.note(self._waiting)
-        self._printed, self._waiting = time.monotonic(), ""
+
+def _terms(row: Mapping[str, Any]) -> str:
+    """The terms of the reward of an iteration, mean per control step, or else its losses."""
+    for group in ("reward/", "loss/"):
+        terms = {k.removeprefix(group): v for k, v in row.items() if k.startswith(group) and v is not None}
+        terms.pop("total", None)
+        if terms:
+            return f"{group[:-1]}: " + "  ".join(f"{name} {value:+.3f}" for name, value in terms.items())
+    return ""

@@ -14,7 +14,7 @@ from torch import nn
 from vd.config import to_dict
 from vd.envs.curriculum import blend
 from vd.policy import PolicySpec, policy_export
-from vd.train.begin import at_stage, completed, fitting, unlike, warmup_iterations
+from vd.train.begin import completed, fitting, unlike, warmup_iterations, widen
 from vd.train.checkpoint import (
     BEST_NAME,
     load_checkpoint,
@@ -23,13 +23,11 @@ from vd.train.checkpoint import (
     without_worlds,
 )
 from vd.train.config import ACTIVATION, PolicyCfg, PpoCfg, RunCfg, rsl_rl_config, validate
-from vd.train.ending import TrainingDivergedError, check_update
-from vd.train.imitate import IMITATED, Imitation, begin_imitation, resumed_imitation
-from vd.train.loop import TrainingLoop
+from vd.train.imitate import IMITATED, Imitation, begin_imitation
+from vd.train.loop import TrainingDivergedError, TrainingLoop, check_update
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.ppo import TeacherPPO
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv, all_values
-from vd.train.widen import widen
 
 POLICY_NAME = "policy.pt"
 """The best policy so far, in the run's folder: what vd-eval, vd-play and deployment read."""
@@ -72,7 +70,9 @@ class TeacherRunner(TrainingLoop):
         super().__init__(run, device=device, deadline=deadline)
         self.env, self.ppo, self.policy_cfg, self.task = env, ppo, policy, task
         observations = env.get_observations()
-        config = rsl_rl_config(ppo, policy, env.num_envs, tuple(observations.keys()), self.processes)
+        config = rsl_rl_config(
+            ppo, policy, env.num_envs, tuple(observations.keys()), self.rank, self.world_size
+        )
         with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints its models while it builds them
             self.alg: TeacherPPO = TeacherPPO.construct_algorithm(observations, env, config, device)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
@@ -123,24 +123,15 @@ class TeacherRunner(TrainingLoop):
         found = load_checkpoint(Path(path), self.device, flag="--init")
         found = fitting(found, self._spec(), self.task, path)
         self.unlike = unlike(found["task"], self.task)
-        state, self.new_inputs = widen(found, self.alg.actor, self.alg.critic)
-        state = without_worlds(completed(state, self.alg.save() | {"window": self._window.state_dict()}))
-        if stage is not None:
-            state = at_stage(state, stage)
-        self._take(state, path)
+        found, self.new_inputs = widen(found, self.alg.actor, self.alg.critic)
+        own = self.alg.save() | {"window": self._window.state_dict()}
+        self._take(without_worlds(completed(found, own, stage)), path)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.begun = True
-        self.imitation = begin_imitation(self.alg, self.ppo, self.env.num_present, found, path)
+        self.imitation = begin_imitation(self.alg, self.ppo, self.env.env.num_present, found, path)
         imitating = self.imitation is not None
         self.critic_warmup = self.ppo.imitation_iterations if imitating else warmup_iterations(found)
         self._best, self._window = None, self._new_window()
-
-    def set_std_floor(self) -> None:
-        """Let the least std of the actions fall as stillness tightens (``PolicyCfg.quiet_std``)."""
-        quiet = self.policy_cfg.quiet_std
-        if quiet is not None:
-            floor = blend(self.policy_cfg.std_range[0], quiet, self.env.tightness)
-            self.alg.actor.distribution.set_floor(floor)
 
     def save(self) -> None:
         """Write checkpoint and policy; the policy is that of the best checkpoint.
@@ -175,14 +166,17 @@ class TeacherRunner(TrainingLoop):
 
     def _iterate(self) -> dict[str, Any] | None:
         start = time.perf_counter()
-        self.set_std_floor()
+        quiet = self.policy_cfg.quiet_std
+        if quiet is not None:  # the least std falls as stillness tightens
+            floor = blend(self.policy_cfg.std_range[0], quiet, self.env.env.stage.tightness)
+            self.alg.actor.distribution.set_floor(floor)
         if not self._collect():
             return None
         action_std = float(self.alg.get_policy().output_std.mean())
         collected = time.perf_counter()
         losses = self._update()
         learned = time.perf_counter()
-        means = self._means.read(self.processes.world_size)
+        means = self._means.read(self.world_size)
         figures: dict[str, Any] = {
             "collect_s": round(collected - start, 4),
             "learn_s": round(learned - collected, 4),
@@ -242,7 +236,7 @@ class TeacherRunner(TrainingLoop):
         envs = bad[name].any(dim=0).nonzero().flatten()
         remedy = f"the networks gave them: {LOWER_RATES}"
         if name in ("observations", "rewards"):
-            self.env.check()  # says more, if the simulation is the cause
+            self.env.env.check()  # says more, if the simulation is the cause
             remedy = "the simulation gave them: raise --env.sim.physics-hz or lower --env.action.scale-rad-s"
         raise TrainingDivergedError(
             f"{name} not finite in {len(envs)} environments (first: {envs[:8].tolist()}); {remedy}"
@@ -279,7 +273,7 @@ class TeacherRunner(TrainingLoop):
         return self.alg.save() | state
 
     def _own_state(self) -> dict[str, Any]:
-        return {"env": self.env.state_dict()}
+        return {"env": self.env.env.state_dict()}
 
     def _take(self, state: dict[str, Any], path: str | Path) -> None:
         """Take over what was read from ``path``."""
@@ -291,7 +285,10 @@ class TeacherRunner(TrainingLoop):
                 f"trained with (its run folder's config.json), or start anew ({error})"
             ) from error
         self.critic_warmup = state.get("critic_warmup", 0)
-        self.imitation = resumed_imitation(self.alg, self.ppo, self.env.num_present, state)
+        self.imitation = None
+        if IMITATED in state and self.ppo.imitation_iterations:
+            self.imitation = Imitation(self.alg, self.env.env.num_present)
+            self.imitation.teacher.load_state_dict(state[IMITATED])
         self._best = tuple(state["best"]) if state["best"] is not None else None
         self._window.load_state_dict(state["window"])
         self._restore(state)
@@ -309,7 +306,7 @@ class TeacherRunner(TrainingLoop):
         self.env.start_anew(ranks[0]["env"])
 
     def _load_own_state(self, state: dict[str, Any]) -> None:
-        self.env.load_state_dict(state["env"])
+        self.env.env.load_state_dict(state["env"])
 
     def _close(self) -> None:
-        self.env.close()
+        self.env.env.close()

@@ -1,6 +1,5 @@
 """``vd-train tracker``: let a teacher act by a camera, and choose when it stops; nothing is learned."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from vd.paper import PAPER
 if TYPE_CHECKING:
     from vd.evaluate.trace import Trace
     from vd.stopping import Calibration
-    from vd.tracking.policy import TrackingPolicy, TrackingSpec
+    from vd.tracking.policy import TrackingPolicy
 
 
 @dataclass
@@ -57,29 +56,48 @@ class TrackerCfg:
     """Of starts, goals and sensor errors."""
     device: str = "auto"
     """cpu, cuda:0, ... or auto."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the outcome as JSON."""
 
 
 def tracker_command(arguments: Sequence[str], _started: float) -> int:
-    """``vd-train tracker``; the exit status."""
+    """``vd-train tracker``; the exit status.
+
+    One rule is for the tolerance, one for that of the paper's precise variant, from the same episodes.
+
+    Raises:
+        ValueError: The teacher is none, or observes what no camera shows, or no rule stops any episode within
+            the tolerance.
+    """
     cfg = tyro.cli(TrackerCfg, args=arguments, prog="vd-train tracker")
     check_file(cfg.out)
-
-    from vd.evaluate.agents import check_names
+    from vd.evaluate.agents import check_names, open_teacher, policy_name
 
     check_names([cfg.teacher], cfg.objects)
-    from vd.config import to_dict
-    from vd.tracking.policy import tracking_export
+    print("running the episodes ...", flush=True)
+    from vd.device import resolve_device
+    from vd.tracking.policy import TrackingPolicy, TrackingSpec, tracking_export
     from vd.train.checkpoint import save_checkpoint
+    from vd.warp_quiet import quiet_warp
 
-    if not cfg.json:
-        print("running the episodes ...", flush=True)
-    policy, found, precise = make_tracker(cfg)
-    save_checkpoint(cfg.out, tracking_export(policy))
-    if cfg.json:
-        print(json.dumps(to_dict(found) | {"precise": precise and to_dict(precise)}, indent=1))
-        return 0
+    quiet_warp()
+    device = resolve_device(cfg.device)
+    teacher = open_teacher(cfg.teacher, device)
+    if teacher is None:
+        raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
+    spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
+    trace = _episodes(cfg, TrackingPolicy(teacher, spec), device)
+    found = calibrate_trace(trace, tolerance_rad=cfg.tolerance_rad)
+    try:
+        precise = calibrate_trace(trace, tolerance_rad=PAPER.success.precise_rad)
+    except ValueError:  # of a policy that never came so near there is nothing to learn
+        precise = None
+    spec = replace(
+        spec,
+        stopping=found.rule,
+        tolerance_rad=cfg.tolerance_rad,
+        precise=None if precise is None else precise.rule,
+        calibrated_on=_conditions(cfg, found.episodes),
+    )
+    save_checkpoint(cfg.out, tracking_export(TrackingPolicy(teacher, spec)))
     for result in (found, precise):
         if result is None:
             print(f"{cfg.out}: no rule stops any within {PAPER.success.precise_rad:g} rad: none for it")
@@ -91,40 +109,6 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
             f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} came that near"
         )
     return 0
-
-
-def make_tracker(cfg: TrackerCfg) -> tuple["TrackingPolicy", "Calibration", "Calibration | None"]:
-    """A tracking policy with its stopping rules.
-
-    One is for the tolerance, one for that of the paper's precise variant, from the same episodes.
-
-    Returns:
-        The policy, and what either rule gave; None for the precise one where no rule stops any episode so
-        near its goal.
-
-    Raises:
-        ValueError: The teacher is none, or observes what no camera shows, or no
-            rule stops any episode within the tolerance.
-    """
-    from vd.device import resolve_device
-    from vd.evaluate.agents import open_teacher, policy_name
-    from vd.tracking.policy import TrackingPolicy, TrackingSpec
-    from vd.warp_quiet import quiet_warp
-
-    quiet_warp()
-    device = resolve_device(cfg.device)
-    teacher = open_teacher(cfg.teacher, device)
-    if teacher is None:
-        raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
-    spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
-    policy = TrackingPolicy(teacher, spec)
-    trace = _episodes(cfg, policy, device)
-    found = calibrate_trace(trace, tolerance_rad=cfg.tolerance_rad)
-    try:
-        precise = calibrate_trace(trace, tolerance_rad=PAPER.success.precise_rad)
-    except ValueError:  # of a policy that never came so near there is nothing to learn
-        precise = None
-    return TrackingPolicy(teacher, _with_rules(spec, cfg, found, precise)), found, precise
 
 
 def calibrate_trace(trace: "Trace", *, tolerance_rad: float = PAPER.success.rotation_rad) -> "Calibration":
@@ -182,19 +166,10 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
     return trace
 
 
-def _with_rules(
-    spec: "TrackingSpec", cfg: TrackerCfg, found: "Calibration", precise: "Calibration | None"
-) -> "TrackingSpec":
-    """A description with the rules that were found, and what on."""
-    parts = [f"{', '.join(Path(item).name for item in cfg.objects)}: {found.episodes} episodes"]
+def _conditions(cfg: TrackerCfg, episodes: int) -> str:
+    """On what rules were found."""
+    parts = [f"{', '.join(Path(item).name for item in cfg.objects)}: {episodes} episodes"]
     parts += [] if cfg.goals == "mesh" else [f"goals by {cfg.goals}"]
     parts += ["in the air"] if cfg.in_air else []
     parts += [] if cfg.sensor_errors else ["without sensor errors"]
-    parts += [f"tolerance {cfg.tolerance_rad:g} rad", f"seed {cfg.seed}"]
-    return replace(
-        spec,
-        stopping=found.rule,
-        tolerance_rad=cfg.tolerance_rad,
-        precise=None if precise is None else precise.rule,
-        calibrated_on=", ".join(parts),
-    )
+    return ", ".join([*parts, f"tolerance {cfg.tolerance_rad:g} rad", f"seed {cfg.seed}"])

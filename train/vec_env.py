@@ -37,9 +37,9 @@ class ReorientVecEnv(VecEnv):
         env: The environment, already reset.
 
     Attributes:
+        env: The same, for what rsl-rl knows nothing of.
         num_envs: Environments N.
         num_actions: Actions D.
-        num_present: Values of the present state and shape, the last of those that the critic alone reads.
         max_episode_length: Control steps of an episode.
         device: Torch device of every tensor.
         cfg: The environment's configuration as a dictionary.
@@ -49,7 +49,6 @@ class ReorientVecEnv(VecEnv):
         self.env = env
         self.num_envs = env.num_envs
         self.num_actions = env.num_actions
-        self.num_present = env.num_present
         self.max_episode_length = env.max_episode_steps
         self.device = str(wp.device_to_torch(env.device))
         self.cfg: dict[str, Any] = to_dict(env.cfg)
@@ -131,10 +130,6 @@ class ReorientVecEnv(VecEnv):
             {"time_outs": timed_out.float(), "log": log},
         )
 
-    def check(self) -> None:
-        """Let the environment raise on NaN or on a contact capacity that overflowed. Copies to the host."""
-        self.env.check()
-
     def end_iteration(self) -> dict[str, float]:
         """Once an iteration: check the simulation, move the curriculum.
 
@@ -157,19 +152,6 @@ class ReorientVecEnv(VecEnv):
             "task/failed_steps": float(self.env.failed_steps()),
         }
 
-    @property
-    def tightness(self) -> float:
-        """How tight stillness is at present, 0 to 1 (:class:`vd.envs.cfg.TighteningCfg`)."""
-        return self.env.stage.tightness
-
-    def state_dict(self) -> dict[str, Any]:
-        """Simulation, episodes, curriculum and random state of the environment (arrays and plain values)."""
-        return self.env.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave."""
-        self.env.load_state_dict(state)
-
     def start_anew(self, state: dict[str, Any]) -> None:
         """Begin new episodes in all environments.
 
@@ -178,10 +160,6 @@ class ReorientVecEnv(VecEnv):
         """
         self.env.set_stage(saved_stage(state, self.env.cfg.curriculum))
         self.env.reset()
-
-    def close(self) -> None:
-        """Release the simulation."""
-        self.env.close()
 
 
 def all_values(observations: TensorDict) -> torch.Tensor:

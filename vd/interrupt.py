@@ -1,6 +1,7 @@
-"""What all commands do: say at once that they start, and end by a signal with 128 and its number.
+"""What all commands do: say at once that they start, report an error in a line, and end by a signal.
 
-That is 130 after Ctrl-C, 143 after SIGTERM, and 129 once the terminal is gone.
+The exit status is then 128 and the signal's number: 130 after Ctrl-C, 143 after SIGTERM, and 129 once the
+terminal is gone.
 """
 
 import functools
@@ -9,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +19,9 @@ from typing import Any, ParamSpec
 
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status after Ctrl-C."""
+
+FAILED = 1
+"""Exit status after an error that is the user's to mend."""
 
 USAGE_ERROR = 2
 """Exit status after a flag that does not exist."""
@@ -66,6 +71,8 @@ def note(number: int) -> None:
 def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
     """Have the entry point of a command start and end as all commands do.
 
+    ``VD_DEBUG=1`` in the environment adds to an error where in the code it arose.
+
     Args:
         name: What the command is called.
     """
@@ -90,6 +97,12 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
                 except SystemExit as end:
                     end.code = _status(end.code)
                     raise
+                except (ValueError, OSError, RuntimeError) as error:
+                    if os.environ.get("VD_DEBUG"):
+                        traceback.print_exc()
+                    print(f"{name}: {error}", file=sys.stderr)
+                    asked = int(getattr(error, "signal", 0))  # a moving hand is stopped first
+                    return 128 + asked if asked else FAILED
                 except KeyboardInterrupt as error:
                     print(f"\n{name}: stopped", file=sys.stderr)
                     return 128 + _last if isinstance(error, Terminated) else INTERRUPTED

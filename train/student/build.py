@@ -1,6 +1,7 @@
 """From a configuration to a runner: teacher, environments, network, and where a student begins."""
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from vd.files import check_folder
 from vd.paper import PAPER
 from vd.train.flags import write_config
 from vd.train.student.config import PRETRAINING, RENDERED, StudentTrainCfg
+from vd.train.teacher import BUILDING
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -47,12 +49,15 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
     return replace(task, randomisation=exact, observation=replace(task.observation, view="world"))
 
 
-def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Pretrainer | Dagger":
+def build_student(
+    cfg: StudentTrainCfg, *, started: float | None = None, say: Callable[[str], object] = print
+) -> "Pretrainer | Dagger":
     """Build environments, student and learner as ``cfg`` says, save the configuration, and resume if asked.
 
     Args:
         cfg: Configuration.
         started: ``time.monotonic()`` from which ``max_minutes`` counts; now by default.
+        say: Is told when the slow part begins, and what begins anew.
 
     Raises:
         FileExistsError: The run folder holds another run and ``resume`` is not set.
@@ -72,6 +77,7 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Pre
         )
     if cfg.stage == RENDERED and cfg.init is None and checkpoint is None:
         raise ValueError("--stage 2 begins from a student of an earlier stage; give it as --init")
+    say(BUILDING)
 
     import torch
 
@@ -93,8 +99,8 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Pre
     student = Student(cfg.network, teacher.num_actions).to(device)
     if cfg.init is not None and checkpoint is None:
         anew = begin_from(cfg.init, student, device)
-        if anew and rank == 0:
-            print(f"of {cfg.init} these do not fit, and begin anew: {', '.join(anew)}")
+        if anew:
+            say(f"of {cfg.init} these do not fit, and begin anew: {', '.join(anew)}")
     torch.manual_seed(cfg.task.seed + rank)
     own_task = replace(task, seed=cfg.task.seed + rank)
     kept: dict[str, Any] = {

@@ -1,9 +1,7 @@
 """Command line of the student: ``vd-train student``."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -13,6 +11,7 @@ from vd import interrupt
 from vd.train.flags import normalise, saved_config, value_of
 from vd.train.student.build import build_student
 from vd.train.student.config import PRESETS, PRETRAINING, STUDENT_NAME, Stage, StudentTrainCfg
+from vd.train.teacher import say_of_main
 
 HELP = """Train the student: imitate the teacher from point clouds.
 
@@ -25,7 +24,7 @@ SHORT_FORMS = {name: f"task.{name}" for name in ("objects", "num-envs", "seed")}
 """Flags that are short for others."""
 
 
-def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
+def parse_student(flags: Sequence[str]) -> StudentTrainCfg:
     """The configuration that command-line flags ask for.
 
     The first pass finds where to start from (``--preset`` and ``--stage``, the run's own configuration with
@@ -35,7 +34,7 @@ def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
         FileNotFoundError: ``--resume`` or ``--init`` name what is not there.
         ValueError: What they name is not of this version.
     """
-    arguments = normalise(arguments, SHORT_FORMS)
+    arguments = normalise(flags, SHORT_FORMS)
     preset, stage = value_of(arguments, "--preset") or "gpu", value_of(arguments, "--stage") or "1"
     # The second pass refuses unknown names.
     number = cast(Stage, int(stage)) if stage in ("0", "1", "2") else 1
@@ -54,12 +53,8 @@ def student_command(arguments: list[str], started: float) -> int:
     from vd.evaluate.agents import check_names
 
     check_names([] if cfg.teacher is None else [cfg.teacher], cfg.task.objects)
-    from vd.train.progress import BUILDING
-
-    main_process = os.environ.get("RANK", "0") == "0"
-    folder, say = cfg.run.out, partial(print, flush=True) if main_process else (lambda _: None)
-    say(BUILDING)
-    runner = build_student(cfg, started=started)
+    folder, say = cfg.run.out, say_of_main()
+    runner = build_student(cfg, started=started, say=say)
     if runner.iteration:
         say(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
         if runner.new_episodes:

@@ -10,7 +10,7 @@ import tyro
 from vd.config import Dropped, Renamed
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
-from vd.train.config import RunCfg, require_positive, require_share
+from vd.train.config import RunCfg, require
 from vd.vision.cfg import LEAN, PAPER_NETWORK, SMALL, NoiseCfg, StudentCfg
 
 Stage = Literal[0, 1, 2]
@@ -87,13 +87,11 @@ class DaggerCfg:
         Raises:
             ValueError: The flag, its value and what it has to be.
         """
-        where = "--dagger."
-        require_positive(self, where, "rollout_steps", "minibatch_envs", "epochs", "keep_rollouts")
-        require_positive(self, where, "learning_rate", "grad_norm")
-        require_positive(self, where, "distance_weight", "pose_weight", or_zero=True)
-        require_positive(self, where, "warmup_steps", "decay_after_steps", or_zero=True)
-        require_positive(self, where, "teacher_share_iterations", or_zero=True)
-        require_share(self, where, "teacher_share", "teacher_share_last")
+        positive = "rollout_steps minibatch_envs epochs keep_rollouts learning_rate grad_norm"
+        or_zero = "distance_weight pose_weight warmup_steps decay_after_steps teacher_share_iterations"
+        require(self, "--dagger.", "positive", positive)
+        require(self, "--dagger.", "zero or positive", or_zero)
+        require(self, "--dagger.", "in [0, 1]", "teacher_share teacher_share_last")
 
 
 @dataclass
@@ -129,8 +127,8 @@ class PretrainCfg:
         Raises:
             ValueError: The flag, its value and what it has to be.
         """
-        require_positive(self, "--pretrain.", "batch", "steps", "learning_rate")
-        require_positive(self, "--pretrain.", "decay_after_steps", or_zero=True)
+        require(self, "--pretrain.", "positive", "batch steps learning_rate")
+        require(self, "--pretrain.", "zero or positive", "decay_after_steps")
 
 
 @dataclass
@@ -190,7 +188,7 @@ class StudentTrainCfg:
         self.run.validate()
         self.dagger.validate()
         self.pretrain.validate()
-        require_positive(self.task, "--", "num_envs")
+        require(self.task, "--", "positive", "num_envs")
         if self.camera is not None and self.stage != RENDERED:
             raise ValueError("--camera is for --stage 2; the other stages see complete clouds")
         self.network.validate()

@@ -15,7 +15,7 @@ from torch import nn
 from vd.frame_maps import FrameMaps
 from vd.policy import Policy
 from vd.train.config import RunCfg
-from vd.train.ending import TrainingDivergedError, check_update
+from vd.train.loop import TrainingDivergedError, check_update
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import DaggerCfg
 from vd.train.student.losses import POSE_VALUES, imitation_figures, imitation_loss, poses
@@ -102,7 +102,7 @@ class Dagger(StudentRunner):
         rollout = self.collect()
         if rollout is None:
             return None
-        means = self._means.read(self.processes.world_size) | self._read(self._figures)
+        means = self._means.read(self.world_size) | self._read(self._figures)
         collected = time.perf_counter()
         self._kept.append(rollout)
         losses = self.update(list(self._kept))
@@ -223,14 +223,14 @@ class Dagger(StudentRunner):
         if sum(rollout.num_bytes for rollout in kept) > CHECKPOINT_ROLLOUT_BYTES:
             kept = []
         return {
-            "env": self.env.state_dict(),
+            "env": self.env.env.state_dict(),
             "view": self.view.state_dict(),
             "hidden": self._hidden.cpu(),
             "rollouts": [rollout.state_dict() for rollout in kept],
         }
 
     def _load_own_state(self, state: dict[str, Any]) -> None:
-        self.env.load_state_dict(state["env"])
+        self.env.env.load_state_dict(state["env"])
         self.view.load_state_dict(state["view"])
         self._hidden = state["hidden"].to(self.device)
         self._kept.clear()
@@ -243,7 +243,7 @@ class Dagger(StudentRunner):
         return f"it is of {max(envs)} environments a process, this run has {self.env.num_envs}"
 
     def _close(self) -> None:
-        self.env.close()
+        self.env.env.close()
 
     def _record(self, frames: dict[str, torch.Tensor], frame: dict[str, torch.Tensor], step: int) -> None:
         """Write the frame of a step [N, ...] into those of the rollout [T, N, ...]."""
@@ -274,5 +274,5 @@ class Dagger(StudentRunner):
         finite = torch.stack([torch.isfinite(tensor).all() for tensor in tensors.values()]).tolist()
         bad = [name for name, good in zip(tensors, finite, strict=True) if not good]
         if bad:
-            self.env.check()  # says more, if the simulation is the cause
+            self.env.env.check()  # says more, if the simulation is the cause
             raise TrainingDivergedError(f"{', '.join(bad)} not finite in the rollout; {LOWER_RATES}")

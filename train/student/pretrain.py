@@ -19,7 +19,7 @@ from vd.paper import PAPER
 from vd.quaternions import relative_rotation, rotation_distance
 from vd.sim.scene import hand_mount
 from vd.train.config import RunCfg
-from vd.train.ending import check_update
+from vd.train.loop import check_update
 from vd.train.student.config import PretrainCfg
 from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
 from vd.train.student.runner import StudentRunner, scheduled
@@ -218,9 +218,6 @@ class Pretrainer(StudentRunner):
         if batches == {self.cfg.batch}:
             return ""
         return f"it is of batches of {max(batches)} clouds, this run has {self.cfg.batch}"
-
-    def _close(self) -> None:
-        """Nothing to release."""
 
     def _step(self) -> dict[str, torch.Tensor]:
         losses, figures = self.losses(*self.scenes.draw())

@@ -92,7 +92,7 @@ class StudentRunner(TrainingLoop):
             gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
             flat = nn.utils.parameters_to_vector(gradients)
             torch.distributed.all_reduce(flat)
-            nn.utils.vector_to_parameters(flat / self.processes.world_size, gradients)
+            nn.utils.vector_to_parameters(flat / self.world_size, gradients)
         norm = nn.utils.clip_grad_norm_(parameters, grad_norm)
         self.optimizer.step()
         return norm.detach()
@@ -102,7 +102,7 @@ class StudentRunner(TrainingLoop):
         values = torch.stack(tuple(figures.values()))
         if self.is_distributed:
             torch.distributed.all_reduce(values)
-            values /= self.processes.world_size
+            values /= self.world_size
         return dict(zip(figures, values.tolist(), strict=True))
 
     def _share_statistics(self) -> None:

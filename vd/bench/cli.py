@@ -217,15 +217,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("vd-bench: 'student' is no more: vd-deploy POLICY --twin tells its times", file=sys.stderr)
         return interrupt.USAGE_ERROR
     command = tyro.cli(Command, args=arguments, prog="vd-bench", description=__doc__)
-    try:
-        if isinstance(command, GapCommand):
-            check_folder(command.out)
-        elif not isinstance(command, ReplayCommand) and command.json is not None:
-            check_file(command.json)
-        return command.run()
-    except (ValueError, OSError) as error:
-        print(f"vd-bench: {error}", file=sys.stderr)
-        return 1
+    if isinstance(command, GapCommand):
+        check_folder(command.out)
+    elif not isinstance(command, ReplayCommand) and command.json is not None:
+        check_file(command.json)
+    return command.run()
 
 
 if __name__ == "__main__":

@@ -24,9 +24,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if cfg.suite is None:
             check_file(cfg.out / "eval.json")
         return _evaluate(cfg) if cfg.suite is None else _run_suite(cfg)
-    except (ValueError, OSError, RuntimeError) as error:
-        print(f"vd-eval: {error}", file=sys.stderr)
-        return 1
     except KeyboardInterrupt:
         hint = "; the same command goes on from here" if cfg.suite else ""
         print(f"\nvd-eval: interrupted{hint}", file=sys.stderr)

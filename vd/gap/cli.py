@@ -17,7 +17,7 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
 
-OK, FAILED, UNUSABLE = 0, 1, 2
+OK, UNUSABLE = 0, 2
 """Exit statuses: a verdict was reached, something else is wrong, the recording cannot be used."""
 
 RecordingPath = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
@@ -305,9 +305,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except RecordingError as error:
         print(f"vd-gap: this recording cannot be used: {error}", file=sys.stderr)
         return UNUSABLE
-    except (ValueError, OSError) as error:
-        print(f"vd-gap: {error}", file=sys.stderr)
-        return FAILED
     except KeyboardInterrupt:
         print("vd-gap: stopped; the same command goes on with the step it was in", file=sys.stderr)
         return interrupt.INTERRUPTED

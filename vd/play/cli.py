@@ -122,27 +122,23 @@ class PlayCfg:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-play``; returns the exit status."""
     cfg = tyro.cli(PlayCfg, args=arguments, prog="vd-play")
-    try:
-        cfg.validate()
-        if cfg.video is not None:
-            check_file(cfg.video)
-        if is_log(cfg.agent_name):
-            quiet_warp()
-            return replay(cfg)
-        check_names([cfg.agent_name], cfg.objects, cfg.hand)
-        print(
-            f"vd-play: {cfg.agent_name}; building the scene (the first start compiles kernels: minutes)",
-            flush=True,
-        )
+    cfg.validate()
+    if cfg.video is not None:
+        check_file(cfg.video)
+    if is_log(cfg.agent_name):
         quiet_warp()
-        if cfg.video is not None:
-            frames = record_video(cfg, cfg.video)
-            print(f"{cfg.video} ({frames} frames)")
-        else:
-            serve(cfg)
-    except (ValueError, OSError, RuntimeError) as error:
-        print(f"vd-play: {error}", file=sys.stderr)
-        return 1
+        return replay(cfg)
+    check_names([cfg.agent_name], cfg.objects, cfg.hand)
+    print(
+        f"vd-play: {cfg.agent_name}; building the scene (the first start compiles kernels: minutes)",
+        flush=True,
+    )
+    quiet_warp()
+    if cfg.video is not None:
+        frames = record_video(cfg, cfg.video)
+        print(f"{cfg.video} ({frames} frames)")
+    else:
+        serve(cfg)
     return 0
 
 

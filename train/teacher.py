@@ -1,0 +1,139 @@
+"""``vd-train teacher``: from a configuration to a run."""
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from vd import interrupt
+from vd.config import to_dict
+from vd.device import resolve_device
+from vd.files import check_folder
+from vd.train.begin import find_start
+from vd.train.flags import parse_teacher, write_config
+from vd.train.presets import SMOKE_RUN, TeacherCfg
+from vd.warp_quiet import quiet_warp
+
+if TYPE_CHECKING:
+    from vd.train.runner import TeacherRunner
+
+BUILDING = "building the environments (the first start compiles the kernels: a minute or two) ..."
+
+
+def build_teacher(
+    cfg: TeacherCfg, *, started: float | None = None, say: Callable[[str], object] = print
+) -> "TeacherRunner":
+    """Build environment and learner as ``cfg`` says, save the resolved configuration, and resume if asked.
+
+    Args:
+        cfg: Configuration.
+        started: ``time.monotonic()`` from which ``max_minutes`` counts; now by default.
+        say: Is told when the slow part begins.
+
+    Raises:
+        FileExistsError: The run folder holds another run and ``resume`` is not set.
+        FileNotFoundError: There is nothing to resume or to begin from.
+    """
+    from vd.train.checkpoint import find_checkpoint, load_checkpoint
+
+    check_folder(cfg.run.out)
+    rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
+    checkpoint = find_checkpoint(cfg.run.out, cfg.resume)
+    init = find_start(cfg.init) if checkpoint is None and cfg.init is not None else None
+    if init is not None:
+        load_checkpoint(init, flag="--init")  # a damaged one is refused before anything is built
+    if cfg.init is None and cfg.init_stage is not None:
+        raise ValueError("--init-stage says where a run with --init begins; leave it out, or give --init")
+    if cfg.init is None and cfg.ppo.imitation_iterations:
+        raise ValueError("--ppo.imitation-iterations imitates the policy that --init names; give --init too")
+    say(BUILDING)
+
+    import torch
+
+    # A line for each of some hundred kernels would scroll the progress away.
+    quiet_warp()
+    from vd.envs.reorient import ReorientEnv
+    from vd.sim.cfg import coarser
+    from vd.train.runner import TeacherRunner
+    from vd.train.vec_env import ReorientVecEnv
+
+    # Actions of different processes have to differ; parameters are broadcast from the first.
+    torch.manual_seed(cfg.env.seed + rank)
+    # TF32 halves the update on a GPU; the simulator is not touched by it.
+    torch.set_float32_matmul_precision("high")
+    physics = coarser(cfg.env.sim) if cfg.run.coarse_physics else cfg.env.sim
+    simulation = ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank, sim=physics), device)
+    simulation.dump_dir = cfg.run.out
+    runner = TeacherRunner(
+        ReorientVecEnv(simulation),
+        cfg.ppo,
+        cfg.policy,
+        cfg.run,
+        task=to_dict(cfg.env),
+        device=device,
+        deadline=cfg.run.deadline(started),
+    )
+    if checkpoint is not None:
+        runner.load(checkpoint)
+    elif init is not None:
+        runner.begin_from(init, cfg.init_stage)
+    if rank == 0:
+        # After all that can refuse: settings that a run cannot have must not take the place of its own.
+        write_config(cfg)
+    return runner
+
+
+def teacher_command(arguments: list[str], started: float) -> int:
+    """``vd-train teacher``; the exit status."""
+    say = say_of_main()
+    cfg = parse_teacher(arguments, say=say)
+    if not cfg.smoke or cfg.run.out != SMOKE_RUN:
+        return _train(cfg, say, started)
+    with TemporaryDirectory(prefix="vd-smoke-") as folder:  # nobody needs what is in it, twice least of all
+        return _train(replace(cfg, run=replace(cfg.run, out=Path(folder))), say, started)
+
+
+def say_of_main() -> Callable[[str], None]:
+    """Prints at once, in the first process; nothing in the others."""
+    return partial(print, flush=True) if os.environ.get("RANK", "0") == "0" else lambda _: None
+
+
+def _train(cfg: TeacherCfg, say: Callable[[str], None], started: float) -> int:
+    folder = cfg.run.out
+    runner = build_teacher(cfg, started=started, say=say)
+    for line in _beginning(cfg, runner) if runner.iteration else []:
+        say(line)
+    if not runner.run_to_end():
+        if not cfg.smoke:
+            say(f"saved in {folder}; go on with: vd-train teacher --out {folder} --resume")
+        return interrupt.INTERRUPTED
+    from vd.train.runner import POLICY_NAME  # loads torch, which the first message should not wait for
+
+    if cfg.smoke:
+        say(f"done: everything runs. {runner.env_steps} steps are a test, and the policy is of no use")
+    elif not (folder / POLICY_NAME).exists():
+        say(
+            f"done: nothing was trained, so {folder} has no {POLICY_NAME}: the {runner.env_steps} steps "
+            f"done before are more than --max-steps {cfg.run.max_steps}; raise it"
+        )
+    else:
+        say(f"done: {folder}/{POLICY_NAME} is the best policy, vd-train curves {folder} draws the curves")
+    return 0
+
+
+def _beginning(cfg: TeacherCfg, runner: "TeacherRunner") -> Iterator[str]:
+    """What a run that does not begin from nothing begins with."""
+    how = f"begins from {cfg.init}" if runner.begun else "resumed"
+    yield f"{how} after iteration {runner.iteration} of {runner.total_iterations}"
+    if runner.new_episodes and not runner.begun:
+        yield f"episodes start anew, the checkpoint does not fit the environments: {runner.new_episodes}"
+    if runner.new_inputs:
+        yield f"{runner.new_inputs} observed values are new to the networks and start without effect"
+    if runner.critic_warmup:
+        actor = "stays as it is" if runner.imitation is None else "imitates what it began from"
+        yield f"the critic learns alone for {runner.critic_warmup} iterations, the actor {actor}"
+    for difference in runner.unlike:
+        yield f"the policy was trained with other observations or actions: {difference}"
