@@ -22,7 +22,7 @@ from vd.train.student.pretrain import (
     Pretrainer,
     RandomScenes,
 )
-from vd.train.student.rotations import angle_between, multiply, random_rotations, two_columns
+from vd.vision.rotations import angle_between, multiply, random_rotations, two_columns
 from vd.vision.cfg import EncoderCfg, NoiseCfg, StudentCfg
 from vd.vision.network import Student
 from vd.vision.saved import StudentSpec

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import torch
 
 from vd.quaternions import relative_rotation
-from vd.train.student.rotations import two_columns
+from vd.vision.rotations import two_columns
 from vd.vision.network import StudentOutput
 from vd.vision.sight import OBJECT
 

@@ -1,6 +1,6 @@
 """Configuration of the student: noise of its clouds, and its network with presets."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal
 
 from vd.config import Dropped, Renamed
@@ -150,3 +150,41 @@ SMALL = StudentCfg(
 
 PRESETS = {"paper": PAPER_NETWORK, "lean": LEAN, "small": SMALL}
 """Networks by name."""
+
+
+@dataclass(frozen=True)
+class AlignmentCfg:
+    """Sizes of the network that turns a goal's cloud onto a seen one (:mod:`vd.vision.alignment`)."""
+
+    width: int = 128
+    """Numbers of a token."""
+    layers: int = 4
+    """Layers of attention among the tokens of both clouds."""
+    heads: int = 4
+    """Heads of each; they divide the width."""
+    tokens: int = 96
+    """Patches of a cloud. The larger network that was tried has 128, 6 layers and a width of 192."""
+    neighbours: int = 16
+    """Points of a patch: of some hundred they reach about 2 cm."""
+    patch: int = 64
+    """Width of what reads the points of a patch."""
+
+    def validate(self) -> None:
+        """Raise ``ValueError`` for what cannot be built, naming the field."""
+        for field_ in fields(self):
+            if getattr(self, field_.name) < 1:
+                raise ValueError(f"--align.network.{field_.name} must be positive")
+        if self.width % self.heads:
+            raise ValueError(f"--align.network.heads = {self.heads} must divide the width {self.width}")
+
+
+@dataclass(frozen=True)
+class SearchCfg:
+    """How rotations are searched for with that network."""
+
+    passes: int = 2
+    """Passes that each of the 24 starts of a first look takes."""
+    kept: int = 2
+    """Hypotheses kept from look to look: the best, and others that may turn out better."""
+    restart_looks: int = 3
+    """Looks after which the last hypothesis begins anew elsewhere: a start has come as near as it will."""

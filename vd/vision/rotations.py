@@ -1,6 +1,10 @@
 """Rotations as quaternions xyzw, and as two columns of their matrix for networks to predict (Zhou 2019)."""
 
+import math
+
+import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import nn
 
 from vd.quaternions import relative_rotation
@@ -46,10 +50,20 @@ def matrices(columns: torch.Tensor) -> torch.Tensor:
     return torch.stack((first, second, torch.linalg.cross(first, second)), dim=-1)
 
 
+def turn_angle(matrix: torch.Tensor) -> torch.Tensor:
+    """Angles [..] in [0, pi] [rad] of rotation matrices [.., 3, 3]; exact for small ones, as acos is not."""
+    half = (matrix - torch.eye(3, device=matrix.device)).square().sum((-1, -2)).sqrt() / math.sqrt(8.0)
+    return 2.0 * torch.asin(half.clamp(max=1.0))
+
+
 def angle_between(columns: torch.Tensor, others: torch.Tensor | None = None) -> torch.Tensor:
     """Angles [..] [rad] between rotations, each two columns [.., 6]; to no rotation without ``others``."""
     matrix = matrices(columns)
-    if others is not None:
-        matrix = matrix.transpose(-1, -2) @ matrices(others)
-    trace = matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.acos((0.5 * (trace - 1.0)).clamp(-1.0, 1.0))
+    return turn_angle(matrix if others is None else matrix.transpose(-1, -2) @ matrices(others))
+
+
+def cube_rotations(device: torch.device | str) -> torch.Tensor:
+    """The 24 rotations of a cube onto itself, matrices [24, 3, 3], the identity first."""
+    group = Rotation.create_group("O").as_matrix()
+    order = sorted(group, key=lambda matrix: -matrix.trace())
+    return torch.tensor(np.array(order), dtype=torch.float32, device=device)

@@ -1,0 +1,215 @@
+"""How a goal's cloud has to be turned to lie on what a camera sees of an object, learned.
+
+A transformer reads patches of both clouds together, and predicts by how much the goal is still to be turned.
+From far off that is ambiguous, from near it is not: so many starts are improved by several passes, and the
+one with the least predicted error is kept.
+
+B clouds, P points of a cloud, T tokens, E the width; N objects, H hypotheses. Clouds are in metres, in axes
+that goal and object share (the world's); a rotation turns the goal onto the object: seen ~ R goal + offset.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from vd.vision.cfg import AlignmentCfg, SearchCfg
+from vd.vision.rotations import cube_rotations, matrices
+
+PATCH_M = 0.03
+"""Unit of places within a patch [m]: about its size."""
+CLOUD_M = 0.08
+"""Unit of places within a cloud, and of offsets [m]: half the length of the largest objects."""
+WAVES = (1.5, 3.0, 6.0, 12.0)
+"""Frequencies at which a token knows its place [rad per CLOUD_M]: half a wave is from 17 to 2 cm."""
+PAIRS_AT_ONCE = 4096
+"""Pairs of clouds compared at a time: what the tokens of more take counts in gigabytes."""
+GOAL, SEEN = 0, 1
+"""Kinds of clouds."""
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What is predicted of pairs of clouds."""
+
+    rotation: torch.Tensor
+    """By how much the goal is still to be turned, matrices [B, 3, 3]."""
+    offset: torch.Tensor
+    """Where the goal's mean lies on the object, from the mean of what is seen [m] [B, 3]."""
+    error: torch.Tensor
+    """Angle by which that rotation is expected to be wrong [rad] [B]."""
+
+
+class Patches(nn.Module):
+    """Tokens of a cloud: the neighbourhoods of its first T points, and where they are."""
+
+    def __init__(self, cfg: AlignmentCfg):
+        super().__init__()
+        self.cfg, inner = cfg, 2 * cfg.patch
+        self.points = nn.Sequential(nn.Linear(3, cfg.patch), nn.GELU(), nn.Linear(cfg.patch, inner))
+        self.patch = nn.Linear(inner, cfg.width)
+        self.place = nn.Linear(3 * (1 + 2 * len(WAVES)), cfg.width)
+
+    def forward(self, cloud: torch.Tensor) -> torch.Tensor:
+        """Tokens [B, T, E] of clouds about their means [m] [B, P, 3], whose points are in no order."""
+        centres = cloud[:, : self.cfg.tokens]
+        with torch.no_grad():
+            near = torch.cdist(centres, cloud).topk(self.cfg.neighbours, largest=False, sorted=False).indices
+        rows = torch.arange(len(cloud), device=cloud.device)[:, None, None]
+        read = self.points((cloud[rows, near] - centres[:, :, None]) / PATCH_M)
+        place = centres / CLOUD_M
+        waves = [wave(place * scale) for scale in WAVES for wave in (torch.sin, torch.cos)]
+        return self.patch(read.max(dim=2).values) + self.place(torch.cat([place, *waves], dim=-1))
+
+
+class Layer(nn.Module):
+    """Attention and two products, each added to what comes in."""
+
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.norms = nn.ModuleList([nn.LayerNorm(width), nn.LayerNorm(width)])
+        self.mix, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.inner = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        """Tokens [B, T, E] that have read each other."""
+        mixed = self.mix(self.norms[0](tokens)).unflatten(-1, (3, self.heads, -1))
+        query, key, value = mixed.permute(2, 0, 3, 1, 4)
+        read = functional.scaled_dot_product_attention(query, key, value)
+        tokens = tokens + self.out(read.transpose(1, 2).flatten(2))
+        return tokens + self.inner(self.norms[1](tokens))
+
+
+class AlignmentNetwork(nn.Module):
+    """Compares a goal's cloud with a seen one.
+
+    Args:
+        cfg: Its sizes.
+    """
+
+    def __init__(self, cfg: AlignmentCfg):
+        super().__init__()
+        self.cfg = cfg
+        self.patches = Patches(cfg)
+        self.kinds = nn.Parameter(0.02 * torch.randn(2, cfg.width))
+        self.summary = nn.Parameter(0.02 * torch.randn(1, 1, cfg.width))
+        self.layers = nn.ModuleList(Layer(cfg.width, cfg.heads) for _ in range(cfg.layers))
+        self.norm = nn.LayerNorm(cfg.width)
+        self.heads = nn.ModuleDict(
+            {
+                name: nn.Sequential(
+                    nn.Linear(cfg.width, 2 * cfg.width), nn.GELU(), nn.Linear(2 * cfg.width, n)
+                )
+                for name, n in {"rotation": 6, "offset": 3, "error": 1}.items()
+            }
+        )
+
+    def encode(self, cloud: torch.Tensor, kind: int) -> torch.Tensor:
+        """Tokens [B, T, E] of clouds about their means [m] [B, P, 3], of goals or of what is seen."""
+        return self.patches(cloud) + self.kinds[kind]
+
+    def compare(self, goal: torch.Tensor, seen: torch.Tensor) -> Residual:
+        """What is predicted from the tokens of goals and of what is seen, [B, T, E] each."""
+        tokens = torch.cat([self.summary.expand(len(goal), -1, -1), goal, seen], dim=1)
+        for layer in self.layers:
+            tokens = layer(tokens)
+        summary = self.norm(tokens[:, 0])
+        found = {name: head(summary).float() for name, head in self.heads.items()}
+        return Residual(
+            matrices(found["rotation"]),
+            CLOUD_M * found["offset"],
+            functional.softplus(found["error"]).squeeze(-1),
+        )
+
+    def forward(self, goal: torch.Tensor, seen: torch.Tensor) -> Residual:
+        """What is predicted of clouds about their means [m] [B, P, 3]."""
+        return self.compare(self.encode(goal, GOAL), self.encode(seen, SEEN))
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Where the goal's cloud lies on the object."""
+
+    rotation: torch.Tensor
+    """From the goal to the object, matrices [N, 3, 3]."""
+    position: torch.Tensor
+    """Where the goal's mean lies on the object, in the frame of what is seen [m] [N, 3]."""
+    error: torch.Tensor
+    """Angle by which the rotation is expected to be wrong [rad] [N]."""
+
+
+class Aligner:
+    """Finds the rotation from goals to objects, and follows it from look to look.
+
+    A first look begins from the 24 rotations of a cube: none is farther than 1.1 rad from one of them. Later
+    looks improve what is kept.
+
+    Args:
+        network: The trained network.
+        count: N.
+        search: How hypotheses are handled.
+    """
+
+    def __init__(self, network: AlignmentNetwork, count: int, search: SearchCfg | None = None):
+        self.network, self._cfg = network, search or SearchCfg()
+        device = network.summary.device
+        self._starts = cube_rotations(device)
+        self._kept = torch.eye(3, device=device).repeat(count, self._cfg.kept, 1, 1)  # the best first
+        self._looks = torch.zeros(count, dtype=torch.long, device=device)
+
+    def reset(self, rows: torch.Tensor) -> None:
+        """Forget what is known of objects, a mask or indices: the goal is another, or the object."""
+        self._looks[rows] = 0
+
+    @torch.no_grad()
+    def look(self, goal: torch.Tensor, seen: torch.Tensor) -> Alignment:
+        """Compare once.
+
+        Args:
+            goal: Goals' clouds [m] [N, P, 3].
+            seen: What is seen of the objects [m] [N, P', 3], points in no order.
+        """
+        mean = seen.mean(dim=1)
+        goal = goal - goal.mean(dim=1, keepdim=True)
+        tokens = self.network.encode(seen - mean[:, None], SEEN)
+        new = self._looks == 0
+        if bool(new.any()):
+            starts = self._starts.expand(int(new.sum()), -1, -1, -1)
+            for _ in range(self._cfg.passes):
+                starts, _, error = self._improve(goal[new], tokens[new], starts)
+            best = error.topk(self._cfg.kept, dim=1, largest=False).indices
+            self._kept[new] = starts.take_along_dim(best[:, :, None, None], dim=1)
+        self._restart(~new)
+        found, offset, error = self._improve(goal, tokens, self._kept)
+        order = error.argsort(dim=1)
+        self._kept = found.take_along_dim(order[:, :, None, None], dim=1)
+        self._looks += 1
+        offset = offset.take_along_dim(order[:, :1, None], dim=1)[:, 0]
+        return Alignment(self._kept[:, 0].clone(), mean + offset, error.amin(dim=1))
+
+    def _restart(self, known: torch.Tensor) -> None:
+        """Now and then, begin anew with the last hypothesis, at a start relative to the best."""
+        if self._cfg.kept < 2:
+            return
+        due = known & (self._looks % self._cfg.restart_looks == 0)
+        turn = (self._looks // self._cfg.restart_looks) % (len(self._starts) - 1) + 1  # not the best itself
+        anew = self._starts[turn] @ self._kept[:, 0]
+        self._kept[:, -1] = torch.where(due[:, None, None], anew, self._kept[:, -1])
+
+    def _improve(
+        self, goal: torch.Tensor, seen: torch.Tensor, rotations: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """One pass over hypotheses [N, H, 3, 3]: better ones, their offsets [N, H, 3] and errors [N, H]."""
+        count, hypotheses = rotations.shape[:2]
+        flat = rotations.flatten(0, 1)
+        row = torch.arange(count, device=goal.device).repeat_interleave(hypotheses)
+        parts = []
+        for some in torch.arange(len(row), device=goal.device).split(PAIRS_AT_ONCE):
+            turned = goal[row[some]] @ flat[some].transpose(-1, -2)
+            parts.append(self.network.compare(self.network.encode(turned, GOAL), seen[row[some]]))
+        better = torch.cat([part.rotation for part in parts]) @ flat
+        offset, error = torch.cat([p.offset for p in parts]), torch.cat([p.error for p in parts])
+        shape = (count, hypotheses)
+        return better.unflatten(0, shape), offset.unflatten(0, shape), error.unflatten(0, shape)
