@@ -11,14 +11,14 @@ from vd.envs.cfg import ReorientCfg
 from vd.files import check_folder
 from vd.paper import PAPER
 from vd.train.flags import write_config
-from vd.train.student.config import PRETRAINING, RENDERED, StudentTrainCfg
+from vd.train.student.config import ALIGNING, RENDERED, StudentTrainCfg
 from vd.train.teacher import BUILDING
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
+    from vd.train.student.align import AlignTrainer
     from vd.train.student.dagger import Dagger
-    from vd.train.student.pretrain import Pretrainer
     from vd.vision.network import Student
 
 
@@ -51,7 +51,7 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
 
 def build_student(
     cfg: StudentTrainCfg, *, started: float | None = None, say: Callable[[str], object] = print
-) -> "Pretrainer | Dagger":
+) -> "AlignTrainer | Dagger":
     """Build environments, student and learner as ``cfg`` says, save the configuration, and resume if asked.
 
     Args:
@@ -83,10 +83,8 @@ def build_student(
 
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
-    from vd.evaluate.agents import find_policy, policy_name
+    from vd.evaluate.agents import find_policy
     from vd.policy import load_policy
-    from vd.vision.network import Student
-    from vd.vision.saved import StudentSpec
     from vd.workers import one_thread_without_gpu
 
     rank = int(os.environ.get("RANK", "0"))
@@ -96,34 +94,13 @@ def build_student(
     # The network is the same in all processes, what they draw is not.
     torch.manual_seed(cfg.task.seed)
     torch.set_float32_matmul_precision("high")
-    student = Student(cfg.network, teacher.num_actions).to(device)
-    if cfg.init is not None and checkpoint is None:
-        anew = begin_from(cfg.init, student, device)
-        if anew:
-            say(f"of {cfg.init} these do not fit, and begin anew: {', '.join(anew)}")
-    torch.manual_seed(cfg.task.seed + rank)
+    kept: dict[str, Any] = {"task": to_dict(task), "device": device, "deadline": cfg.run.deadline(started)}
     own_task = replace(task, seed=cfg.task.seed + rank)
-    kept: dict[str, Any] = {
-        "spec": StudentSpec(
-            network=cfg.network,
-            num_actions=teacher.num_actions,
-            stage=cfg.stage,
-            teacher=policy_name(str(cfg.teacher)),
-            camera=cfg.camera,
-        ),
-        "task": to_dict(task),
-        "depth": to_dict(cfg.depth),
-        "device": device,
-        "deadline": cfg.run.deadline(started),
-    }
-    runner: Pretrainer | Dagger
-    if cfg.stage == PRETRAINING:
-        runner = _pretrainer(cfg, own_task, student, kept)
+    runner: AlignTrainer | Dagger
+    if cfg.stage == ALIGNING:
+        runner = _aligner(cfg, own_task, kept)
     else:
-        runner = _dagger(cfg, own_task, student, teacher, kept)
-        if checkpoint is None and not cfg.dagger.reset:  # or all episodes would time out at once
-            steps = runner.env.episode_length_buf
-            runner.env.episode_length_buf = torch.randint_like(steps, runner.env.max_episode_length)
+        runner = _imitation(cfg, own_task, teacher, begins=checkpoint is None, say=say, kept=kept)
     if checkpoint is not None:
         runner.load(checkpoint)
     if rank == 0:
@@ -148,7 +125,7 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
 
     state = read_student(path, device)
     spec = saved_spec(state, path)
-    acts = spec.stage != PRETRAINING
+    acts = spec.stage != ALIGNING
     if acts and spec.num_actions != student.num_actions:
         raise ValueError(
             f"{path} moves {spec.num_actions} joints, the teacher {student.num_actions}; "
@@ -163,26 +140,61 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
     return anew
 
 
-def _pretrainer(
-    cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", kept: dict[str, Any]
-) -> "Pretrainer":
+def _aligner(cfg: StudentTrainCfg, task: ReorientCfg, kept: dict[str, Any]) -> "AlignTrainer":
+    import torch
+
     from vd.assets_usd.hands import load_hand
     from vd.assets_usd.objects.sets import load_set
-    from vd.envs.setup import object_scales
-    from vd.train.student.pretrain import Pretrainer, RandomScenes
+    from vd.train.student.align import AlignTrainer, make_scenes
+    from vd.train.student.views import Hands
+    from vd.vision.alignment import AlignmentNetwork
+    from vd.vision.saved import AlignmentSpec
 
-    objects = load_set(list(task.objects))
-    scenes = RandomScenes(
-        load_hand(task.hand, task.fingertip, task.hand_layer),
-        objects,
-        cfg.network,
-        scales=object_scales(task.randomisation),
-        noise=cfg.noise,
-        batch=cfg.pretrain.batch,
-        seed=task.seed,
-        device=kept["device"],
+    chosen, device = cfg.align, kept["device"]
+    network = AlignmentNetwork(chosen.network).to(device)
+    torch.manual_seed(task.seed)
+    hand = load_hand(task.hand, task.fingertip, task.hand_layer)
+    hands = Hands(hand, chosen.hands, camera=cfg.camera, device=device)
+    held_out = load_set(list(chosen.validation)) if chosen.validation else []
+    scenes = make_scenes(load_set(list(task.objects)), held_out, hands, chosen)
+    spec = AlignmentSpec(network=chosen.network, points=chosen.points, hand=task.hand, camera=cfg.camera)
+    return AlignTrainer(scenes, network, chosen, cfg.run, spec=spec, depth={}, **kept)
+
+
+def _imitation(
+    cfg: StudentTrainCfg,
+    task: ReorientCfg,
+    teacher: "TrainedPolicy",
+    *,
+    begins: bool,
+    say: Callable[[str], object],
+    kept: dict[str, Any],
+) -> "Dagger":
+    """Stages 1 and 2; ``begins``: not resumed. The random state is as the network's has to be."""
+    import torch
+
+    from vd.evaluate.agents import policy_name
+    from vd.vision.network import Student
+    from vd.vision.saved import StudentSpec
+
+    student = Student(cfg.network, teacher.num_actions).to(kept["device"])
+    if cfg.init is not None and begins:
+        anew = begin_from(cfg.init, student, kept["device"])
+        if anew:
+            say(f"of {cfg.init} these do not fit, and begin anew: {', '.join(anew)}")
+    torch.manual_seed(task.seed)
+    spec = StudentSpec(
+        network=cfg.network,
+        num_actions=teacher.num_actions,
+        stage=cfg.stage,
+        teacher=policy_name(str(cfg.teacher)),
+        camera=cfg.camera,
     )
-    return Pretrainer(scenes, student, len(objects), cfg.pretrain, cfg.run, **kept)
+    runner = _dagger(cfg, task, student, teacher, kept | {"spec": spec, "depth": to_dict(cfg.depth)})
+    if begins and not cfg.dagger.reset:  # or all episodes would time out at once
+        steps = runner.env.episode_length_buf
+        runner.env.episode_length_buf = torch.randint_like(steps, runner.env.max_episode_length)
+    return runner
 
 
 def _dagger(

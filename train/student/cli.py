@@ -10,17 +10,26 @@ import tyro
 from vd import interrupt
 from vd.train.flags import normalise, saved_config, value_of
 from vd.train.student.build import build_student
-from vd.train.student.config import PRESETS, PRETRAINING, STUDENT_NAME, Stage, StudentTrainCfg
+from vd.train.student.config import (
+    ALIGNING,
+    ALIGNMENT_NAME,
+    PRESETS,
+    STUDENT_NAME,
+    Stage,
+    StudentTrainCfg,
+)
 from vd.train.teacher import say_of_main
 
 HELP = """Train the student: imitate the teacher from point clouds.
 
-Stage 0 pre-trains the encoder on random scenes, stage 1 imitates on complete synthetic clouds, stage 2 on
-those of a depth camera. Flags start from --preset and --stage, or with --resume from the run's config.json;
-the network from --init. Short forms: --objects, --num-envs and --seed stand for --task.objects and so on.
-Ctrl-C saves."""
+Stage 0 learns to turn a goal's cloud onto what a camera sees, stage 1 imitates on complete synthetic clouds,
+stage 2 on those of a depth camera. Flags start from --preset and --stage, or with --resume from
+the run's config.json; the network from --init. Short forms: --objects, --num-envs and --seed stand for --task.objects and so on,
+--validate for --align.validation. Ctrl-C saves."""
 
-SHORT_FORMS = {name: f"task.{name}" for name in ("objects", "num-envs", "seed")}
+SHORT_FORMS = {name: f"task.{name}" for name in ("objects", "num-envs", "seed")} | {
+    "validate": "align.validation"
+}
 """Flags that are short for others."""
 
 
@@ -52,7 +61,7 @@ def student_command(arguments: list[str], started: float) -> int:
 
     from vd.evaluate.agents import check_names
 
-    check_names([] if cfg.teacher is None else [cfg.teacher], cfg.task.objects)
+    check_names([] if cfg.teacher is None else [cfg.teacher], (*cfg.task.objects, *cfg.align.validation))
     folder, say = cfg.run.out, say_of_main()
     runner = build_student(cfg, started=started, say=say)
     if runner.iteration:
@@ -64,7 +73,8 @@ def student_command(arguments: list[str], started: float) -> int:
     if not runner.run_to_end():
         say(f"saved in {folder}; go on with: vd-train student --out {folder} --resume")
         return interrupt.INTERRUPTED
-    say(f"done: {folder}/{STUDENT_NAME} is the student, vd-train curves {folder} draws the curves")
+    name, what = (ALIGNMENT_NAME, "network") if cfg.stage == ALIGNING else (STUDENT_NAME, "student")
+    say(f"done: {folder}/{name} is the {what}, vd-train curves {folder} draws the curves")
     return 0
 
 
@@ -83,7 +93,7 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
     camera = None if spec.camera is None or base.stage != 2 else spec.camera
     assert camera is None or len(camera) == 7
     network = spec.network
-    if spec.stage == PRETRAINING:
+    if spec.stage == ALIGNING:
         network = replace(base.network, encoder=network.encoder, voxel_m=network.voxel_m)
     return replace(
         base, init=path, network=network, camera=camera, teacher=base.teacher or spec.teacher or None

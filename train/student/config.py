@@ -11,13 +11,15 @@ from vd.config import Dropped, Renamed
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.train.config import RunCfg, require
-from vd.vision.cfg import LEAN, PAPER_NETWORK, SMALL, NoiseCfg, StudentCfg
+from vd.vision.cfg import LEAN, PAPER_NETWORK, SMALL, AlignmentCfg, NoiseCfg, SearchCfg, StudentCfg
 
 Stage = Literal[0, 1, 2]
 PresetName = Literal["gpu", "paper", "cpu-demo"]
 
-PRETRAINING, SYNTHETIC, RENDERED = 0, 1, 2
-"""Stages: random scenes without simulation; complete clouds; clouds of a depth camera."""
+ALIGNING, SYNTHETIC, RENDERED = 0, 1, 2
+"""Stages: alignment of clouds without simulation; complete clouds; clouds of a depth camera."""
+ALIGNMENT_NAME = "alignment.pt"
+"""The network of a stage 0, in its folder."""
 STUDENT_NAME = "student.pt"
 """The student of a run, in its folder: what later stages start from, without optimiser and environments."""
 RUNS = Path("runs/student")
@@ -95,31 +97,42 @@ class DaggerCfg:
 
 
 @dataclass
-class PretrainCfg:
-    """Stage 0: random joints, objects, poses and goals, without simulation."""
+class AlignCfg:
+    """Stage 0: turning a goal's cloud onto what a camera sees, learned from shapes without simulation."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "amsgrad": Dropped(False),
-        "grad_norm": PAPER.dagger.grad_norm,
-        "distance": "6d",
-        "embedding": "single",
-        "category_weight": 1.0,
-        "distance_weight": 1.0,
-        "joint_weight": 1.0,
-        "near_share": Dropped(0.5),
-        "match_weight": Dropped(0.0),
-        "rendered_share": 0.0,
-    }
-    batch: int = 1024
-    """Clouds of an optimiser step on one GPU."""
+    batch: int = 768
+    """Pairs of clouds of an optimiser step on one GPU."""
     steps: int = 50
     """Optimiser steps of an iteration."""
-    learning_rate: float = 1e-3
-    """Of AdamW, until the decay."""
-    decay_after_steps: int = 1000
-    """Optimiser steps after which the learning rate falls as 1 / sqrt(steps); 0: never."""
+    learning_rate: float = 6e-4
+    """Of AdamW, after the warm-up; it falls to nearly 0 along a cosine until --max-steps or --max-minutes."""
+    warmup_steps: int = 300
+    """Optimiser steps over which the learning rate rises from 0, linearly."""
     precision: Literal["fp32", "bf16"] = "fp32"
-    """Of the encoder's products."""
+    """Of the network's products."""
+    compile: bool = False
+    """Compile the network first, which takes a minute and a C compiler; then steps are shorter."""
+    shapes: int = 40_000
+    """Shapes in memory, half made and half deformed objects; 0.6 GB. With 159 the errors of shapes that were
+    not learned from are half as large again."""
+    fresh_shapes: int = 256
+    """Of these, how many are replaced in each iteration."""
+    hands: int = 1024
+    """Random postures of the hand that hide shapes; 0.15 GB."""
+    points: int = 512
+    """Points of each cloud."""
+    near_share: float = 0.5
+    """Share of pairs that are less than 0.9 rad apart, as in later passes; others are anywhere."""
+    scan_share: float = 0.25
+    """Share of goals as from scans: 4 mm of noise, and a fifth of the surface missing."""
+    validation: tuple[str, ...] = ()
+    """Object sets to measure on, names or folders, that are not learned from; besides made shapes."""
+    validate_every: int = 20
+    """Iterations from one measurement to the next."""
+    views: int = 64
+    """Views of each object that is measured on."""
+    network: AlignmentCfg = field(default_factory=AlignmentCfg)
+    search: SearchCfg = field(default_factory=SearchCfg)
 
     def validate(self) -> None:
         """Refuse settings that cannot train.
@@ -127,8 +140,16 @@ class PretrainCfg:
         Raises:
             ValueError: The flag, its value and what it has to be.
         """
-        require(self, "--pretrain.", "positive", "batch steps learning_rate")
-        require(self, "--pretrain.", "zero or positive", "decay_after_steps")
+        positive = "batch steps learning_rate shapes hands points validate_every views"
+        require(self, "--align.", "positive", positive)
+        require(self, "--align.", "zero or positive", "warmup_steps fresh_shapes")
+        require(self, "--align.", "in [0, 1]", "near_share scan_share")
+        self.network.validate()
+        if self.points < max(self.network.tokens, self.network.neighbours):
+            raise ValueError(
+                f"--align.points is {self.points}; it has to be at least the tokens and neighbours of "
+                "--align.network"
+            )
 
 
 @dataclass
@@ -153,12 +174,21 @@ class StudentTaskCfg:
 class StudentTrainCfg:
     """Train the student."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"from_scratch": Dropped(False)}
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "from_scratch": Dropped(False),
+        "pretrain": {
+            "batch": Dropped(1024),
+            "steps": Dropped(50),
+            "learning_rate": Dropped(1e-3),
+            "decay_after_steps": Dropped(1000),
+            "precision": Dropped("bf16"),
+        },
+    }
     preset: PresetName = "gpu"
     """Settings to start from; every other flag overrides one of them."""
     stage: Stage = 1
-    """0: pre-train the encoder on random scenes; 1: imitate on complete synthetic clouds; 2: on clouds of a
-    depth camera and of the hand's own joints."""
+    """0: learn to turn a goal's cloud onto a seen one; 1: imitate on complete synthetic clouds; 2: on clouds
+    of a depth camera and of the hand's own joints."""
     teacher: str | None = None
     """Policy to imitate, also the source of hand and task: a policy.pt, a run's folder, or the name of an
     installed one."""
@@ -169,11 +199,11 @@ class StudentTrainCfg:
     """Go on from a checkpoint of --out: latest (a bare --resume), a file, or auto: the latest, and a new
     run where there is none."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
-    """Pose of the optical frame (x right, y down, z forward) in the hand's base frame, for stage 2: position
-    [m] and quaternion xyzw; the hand's own camera by default."""
+    """Pose of the optical frame (x right, y down, z forward) in the hand's base frame, for stages 0 and 2:
+    position [m] and quaternion xyzw; the hand's own camera by default."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     dagger: DaggerCfg = field(default_factory=DaggerCfg)
-    pretrain: PretrainCfg = field(default_factory=PretrainCfg)
+    align: AlignCfg = field(default_factory=AlignCfg)
     task: StudentTaskCfg = field(default_factory=StudentTaskCfg)
     network: StudentCfg = field(default_factory=StudentCfg)
     noise: NoiseCfg = field(default_factory=NoiseCfg)
@@ -187,10 +217,12 @@ class StudentTrainCfg:
         """
         self.run.validate()
         self.dagger.validate()
-        self.pretrain.validate()
+        self.align.validate()
         require(self.task, "--", "positive", "num_envs")
-        if self.camera is not None and self.stage != RENDERED:
-            raise ValueError("--camera is for --stage 2; the other stages see complete clouds")
+        if self.camera is not None and self.stage == SYNTHETIC:
+            raise ValueError("--camera is for --stage 0 and 2; stage 1 sees complete clouds")
+        if self.init is not None and self.stage == ALIGNING:
+            raise ValueError("--init is for --stage 1 and 2; go on with a stage 0 by --resume")
         self.network.validate()
         self.noise.validate()
         self.depth.validate()
@@ -245,7 +277,7 @@ def gpu(stage: Stage) -> StudentTrainCfg:
         preset="gpu",
         dagger=replace(dagger, minibatch_envs=80, decay_after_steps=2000, keep_rollouts=10, precision="bf16"),
         task=replace(start.task, num_envs=GPU_WORLDS),
-        pretrain=PretrainCfg(precision="bf16"),
+        align=AlignCfg(precision="bf16"),
         network=LEAN,
     )
 
@@ -260,7 +292,9 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
             out=RUNS / f"cpu-stage{stage}", device="cpu", save_every=5, max_minutes=7.0, max_steps=16_000
         ),
         dagger=replace(SHORT_ROLLOUTS, minibatch_envs=4, epochs=4, keep_rollouts=50),
-        pretrain=PretrainCfg(batch=64, steps=10, decay_after_steps=0),
+        align=AlignCfg(
+            batch=64, steps=5, shapes=256, fresh_shapes=8, hands=32, points=256, validate_every=10, views=4
+        ),
         task=StudentTaskCfg(num_envs=16),
         network=SMALL,
         depth=DepthCameraCfg(points=2000),

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 import torch
 
 from vd.quaternions import relative_rotation
-from vd.vision.rotations import two_columns
 from vd.vision.network import StudentOutput
+from vd.vision.rotations import two_columns
 from vd.vision.sight import OBJECT
 
 POSE_SCALE_M = 0.05

@@ -1,4 +1,4 @@
-"""What imitation and pre-training share: the training loop of a student, its checkpoints and its file."""
+"""What imitation and alignment share: the training loop of a network, its checkpoints and its file."""
 
 import math
 from pathlib import Path
@@ -12,13 +12,12 @@ from vd.train.checkpoint import load_checkpoint, save_checkpoint
 from vd.train.config import RunCfg
 from vd.train.loop import TrainingLoop
 from vd.train.student.config import STUDENT_NAME
-from vd.vision.network import Student
-from vd.vision.saved import StudentSpec, student_export
+from vd.vision.saved import AlignmentSpec, StudentSpec, student_export
 from vd.vision.sites import Sites
 
 
 class StudentRunner(TrainingLoop):
-    """Trains a student.
+    """Trains a student, or the network of alignment.
 
     The latest student is the one that is kept: imitation learns from ever new rollouts and does not overfit
     one, and its success rate is too noisy to choose by.
@@ -37,12 +36,12 @@ class StudentRunner(TrainingLoop):
 
     def __init__(
         self,
-        student: Student,
+        student: nn.Module,
         heads: dict[str, nn.Module],
         run: RunCfg,
         *,
         amsgrad: bool = False,
-        spec: StudentSpec,
+        spec: StudentSpec | AlignmentSpec,
         task: dict[str, Any],
         depth: dict[str, Any],
         device: str,

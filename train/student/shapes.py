@@ -129,7 +129,7 @@ class Bodies:
 def _superquadric(x: torch.Tensor, exponents: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """The implicit function of points in units of half axes [K, P, 3], and the direction of its gradient.
 
-    It is 1 on the surface. Of x and y the larger is taken out of the powers, which would leave single precision.
+    It is 1 on the surface. Of x and y the larger is taken out of powers, which would leave single precision.
     """
     along, around = 2.0 / exponents[:, :1], 2.0 / exponents[:, 1:]
     size = x.abs().clamp_min(1e-6)

@@ -210,6 +210,7 @@ class Aligner:
             turned = goal[row[some]] @ flat[some].transpose(-1, -2)
             parts.append(self.network.compare(self.network.encode(turned, GOAL), seen[row[some]]))
         better = torch.cat([part.rotation for part in parts]) @ flat
+        better = matrices(torch.cat([better[..., 0], better[..., 1]], dim=-1))  # still rotations after many
         offset, error = torch.cat([p.offset for p in parts]), torch.cat([p.error for p in parts])
         shape = (count, hypotheses)
         return better.unflatten(0, shape), offset.unflatten(0, shape), error.unflatten(0, shape)

@@ -7,10 +7,12 @@ from typing import Any
 from vd.config import from_dict
 from vd.policy import holds, read_state
 from vd.stopping import StoppingRules
-from vd.vision.cfg import StudentCfg
+from vd.vision.alignment import AlignmentNetwork
+from vd.vision.cfg import AlignmentCfg, StudentCfg
 from vd.vision.network import Student
 
 STUDENT_FORMAT = "visual-dexterity student 1"
+ALIGNMENT_FORMAT = "visual-dexterity alignment 1"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +46,49 @@ class SavedStudent:
     """Iterations it was trained for."""
     env_steps: int
     """Control steps it was trained for (clouds in stage 0)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignmentSpec:
+    """Everything about a network of alignment but its weights."""
+
+    network: AlignmentCfg
+    """Its sizes."""
+    points: int
+    """Points of the clouds it learned from; others do, it reads patches of them."""
+    hand: str
+    """The hand that hid them."""
+    camera: tuple[float, ...] | None = None
+    """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the hand's."""
+
+
+def alignment_export(state: dict[str, Any]) -> dict[str, Any]:
+    """The part of a checkpoint of stage 0 that :func:`load_alignment` needs."""
+    weights = {name: value.detach().cpu() for name, value in state["student_state_dict"].items()}
+    kept = {key: state[key] for key in ("spec", "iter", "env_steps")}
+    return {"format": ALIGNMENT_FORMAT, **kept, "alignment_state_dict": weights}
+
+
+def load_alignment(path: str | Path, device: str = "cpu") -> tuple[AlignmentNetwork, AlignmentSpec]:
+    """Rebuild the network of an ``alignment.pt``, in evaluation mode and without gradients.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is damaged, or of another kind or version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no network at {path}; give the alignment.pt of a stage 0")
+    state = read_state(path, device, remedy="copy it again, or give another file of its run")
+    if state.get("format") != ALIGNMENT_FORMAT:
+        raise ValueError(f"{path} holds no network of alignment; give the alignment.pt of a stage 0")
+    try:
+        spec = from_dict(AlignmentSpec, state["spec"], where="spec")
+        network = AlignmentNetwork(spec.network).to(device)
+        network.load_state_dict(state["alignment_state_dict"])
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{path}: {error}; it was written by another version") from error
+    return network.eval().requires_grad_(False), spec
 
 
 def is_student(path: Path) -> bool:
