@@ -223,7 +223,7 @@ class AlignTrainer(StudentRunner):
 
     @torch.no_grad()
     def measure(self) -> dict[str, torch.Tensor]:
-        """Figures of shapes that are not learned from, of first looks at whole goals; processes share the views.
+        """Figures of first looks at whole goals of shapes not learned from; processes share the views.
 
         Medians are means of the processes' medians.
         """

@@ -24,8 +24,8 @@ HELP = """Train the student: imitate the teacher from point clouds.
 
 Stage 0 learns to turn a goal's cloud onto what a camera sees, stage 1 imitates on complete synthetic clouds,
 stage 2 on those of a depth camera. Flags start from --preset and --stage, or with --resume from
-the run's config.json; the network from --init. Short forms: --objects, --num-envs and --seed stand for --task.objects and so on,
---validate for --align.validation. Ctrl-C saves."""
+the run's config.json; the network from --init. Short forms: --objects, --num-envs and --seed stand for
+--task.objects and so on, --validate for --align.validation. Ctrl-C saves."""
 
 SHORT_FORMS = {name: f"task.{name}" for name in ("objects", "num-envs", "seed")} | {
     "validate": "align.validation"

@@ -44,6 +44,8 @@ SCAN_STD_M, SCAN_MISSING = 0.004, 0.2
 """Noise of goals from scans, and the share of the surface that they lack on one side."""
 NEAR_RAD = 0.9
 """Near starts are up to this far off: nearer than the rotations of a cube leave gaps, as later passes are."""
+TRIED_HANDS, TRIED_POINTS = 8, 64
+"""Of so many hands the one that touches most of so many points holds a shape: few random ones are near it."""
 POSTURES_AT_ONCE = 128
 """Hands whose points are made at a time."""
 
@@ -128,6 +130,12 @@ class Hands:
         """Which points [B, P, 3] are neither behind nor beside the hands ``rows`` [B]; [B, P]."""
         each = rows[:, None]
         return (depth < self._depth[each, cell]) & ~self._near[each, self._voxel(points)]
+
+    def holding(self, points: torch.Tensor) -> torch.Tensor:
+        """For shapes with points [B, P, 3] hands that are about them, at random [B]."""
+        rows = torch.randint(self.count, (len(points), TRIED_HANDS), device=points.device)
+        touched = self._near[rows[:, :, None], self._voxel(points[:, None, :TRIED_POINTS])].sum(dim=-1)
+        return rows.take_along_dim(touched.argmax(dim=1, keepdim=True), dim=1).squeeze(1)
 
     def _voxel(self, points: torch.Tensor) -> torch.Tensor:
         """Voxels of points [B, P]; the last is outside."""
@@ -242,8 +250,7 @@ def draw_pairs(
     place = hands.box[0] + (hands.box[1] - hands.box[0]) * uniform(0.0, 1.0, batch, 3, device=device)
     rest = shapes[:, count:]
     posed = torch.cat([rest[..., :3] @ held + place[:, None], rest[..., 3:] @ held], dim=-1)
-    rows = torch.randint(hands.count, (batch,), device=device)
-    seen = camera_points(hands, rows, posed, count)
+    seen = camera_points(hands, hands.holding(posed[..., :3]), posed, count)
     goal = goal_points(shapes[:, :count, :3], count, scans)
     middle, mean = goal.mean(dim=1, keepdim=True), seen.mean(dim=1)
     return Pairs(
