@@ -1,0 +1,211 @@
+"""Alignment of clouds: rotations, the search with a network that is right when near, training, files."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.sets import load_set
+from vd.quaternions import relative_rotation, rotation_distance
+from vd.train.checkpoint import list_checkpoints, save_checkpoint
+from vd.train.config import RunCfg
+from vd.train.student.align import AlignTrainer, alignment_losses, make_scenes
+from vd.train.student.config import AlignCfg
+from vd.train.student.views import Hands
+from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
+from vd.vision.cfg import AlignmentCfg, SearchCfg
+from vd.vision.rotations import (
+    angle_between,
+    cube_rotations,
+    matrices,
+    multiply,
+    random_rotations,
+    turn_angle,
+    two_columns,
+)
+from vd.vision.saved import AlignmentSpec, load_alignment
+
+CPU = torch.device("cpu")
+TINY = AlignmentCfg(width=16, layers=1, heads=2, tokens=12, neighbours=6, patch=8)
+QUICK = AlignCfg(
+    batch=16,
+    steps=2,
+    learning_rate=3e-3,
+    warmup_steps=0,
+    shapes=16,
+    fresh_shapes=2,
+    hands=4,
+    points=48,
+    validate_every=2,
+    views=1,
+    network=TINY,
+)
+
+
+def test_rotations_agree_with_scipys():
+    torch.manual_seed(0)
+    a, b = (random_rotations(50, CPU) for _ in range(2))
+    first, second = Rotation.from_quat(a.numpy()), Rotation.from_quat(b.numpy())
+    between = first * second.inv()
+    np.testing.assert_allclose(rotation_distance(a, b), between.magnitude(), atol=1e-5)
+    difference = Rotation.from_quat(relative_rotation(a, b).numpy())
+    assert (difference * between.inv()).magnitude().max() < 1e-5
+    assert (Rotation.from_quat(multiply(a, b).numpy()) * (first * second).inv()).magnitude().max() < 1e-5
+    columns = two_columns(relative_rotation(a, b))
+    np.testing.assert_allclose(matrices(columns), between.as_matrix(), atol=1e-5)
+    np.testing.assert_allclose(angle_between(columns), between.magnitude(), atol=2e-3)
+    apart = angle_between(two_columns(a), two_columns(b))
+    np.testing.assert_allclose(apart, (first.inv() * second).magnitude(), atol=2e-3)
+    small = torch.tensor(Rotation.from_rotvec([[1e-3, 0.0, 0.0]]).as_matrix(), dtype=torch.float32)
+    assert float(turn_angle(small)) == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_no_rotation_is_far_from_the_starts():
+    starts = cube_rotations(CPU)
+    torch.testing.assert_close(starts[0], torch.eye(3))
+    torch.manual_seed(0)
+    anywhere = matrices(two_columns(random_rotations(2000, CPU)))
+    apart = turn_angle(starts.transpose(-1, -2) @ anywhere[:, None]).amin(dim=1)
+    assert 0.9 < apart.max() < 1.1
+
+
+class NearSighted(torch.nn.Module):
+    """Right by half of what is left where the goal is near the truth; else it errs, and knows that it does.
+
+    The goal's cloud is the three axes, so that its tokens say how it is turned.
+    """
+
+    def __init__(self, truth):
+        super().__init__()
+        self.truth, self.summary = truth, torch.zeros(1)
+
+    def encode(self, cloud, kind):
+        """The cloud itself, or the number of its pair."""
+        return cloud if kind == 0 else cloud[:, :1, :1]
+
+    def compare(self, goal, seen):
+        """What is left, halved."""
+        turned = goal - goal[:, 3:]
+        turned = torch.nn.functional.normalize(turned[:, :3], dim=-1).transpose(-1, -2)
+        wanted = self.truth[seen[:, 0, 0].round().long()]
+        left = wanted @ turned.transpose(-1, -2)
+        angle = turn_angle(left)
+        half = torch.tensor((Rotation.from_matrix(left.numpy()) ** 0.5).as_matrix(), dtype=torch.float32)
+        wrong = torch.tensor(Rotation.random(len(left), random_state=0).as_matrix(), dtype=torch.float32)
+        found = torch.where((angle < 1.2)[:, None, None], half, wrong)
+        return Residual(found, torch.full((len(left), 3), 0.01), turn_angle(found.transpose(-1, -2) @ left))
+
+
+def clouds(rows):
+    """Goals whose tokens say how they are turned, and seen clouds whose first token is their number."""
+    axes = torch.cat([torch.eye(3), torch.zeros(1, 3)])
+    seen = torch.zeros(len(rows), 2, 3)
+    seen[:, 0, 0], seen[:, 1, 0] = rows, -rows
+    return axes.expand(len(rows), 4, 3), seen
+
+
+def test_a_first_look_finds_any_rotation_and_later_ones_improve_it():
+    truth = torch.tensor(Rotation.random(12, random_state=1).as_matrix(), dtype=torch.float32)
+    aligner = Aligner(NearSighted(truth), 12)
+    goal, seen = clouds(torch.arange(12.0))
+    errors = [turn_angle(aligner.look(goal, seen).rotation.transpose(-1, -2) @ truth) for _ in range(4)]
+    assert errors[0].max() < 0.2 and errors[3].max() < 0.05
+    found = aligner.look(goal, seen + 0.1)
+    torch.testing.assert_close(found.position, torch.full((12, 3), 0.11))
+
+
+def test_another_hypothesis_takes_over_and_a_reset_begins_anew():
+    truth = torch.tensor(Rotation.random(2, random_state=2).as_matrix(), dtype=torch.float32)
+    network = NearSighted(truth)
+    aligner = Aligner(network, 2, SearchCfg(restart_looks=2))
+    goal, seen = clouds(torch.arange(2.0))
+    aligner.look(goal, seen)
+    network.truth = truth @ Rotation.from_euler("x", 2.0).as_matrix().astype(np.float32)  # it was wrong
+    aligner.reset(torch.tensor([True, False]))
+    first = turn_angle(aligner.look(goal, seen).rotation.transpose(-1, -2) @ network.truth)
+    assert first[0] < 0.2 and first[1] > 0.5
+    for _ in range(60):
+        later = turn_angle(aligner.look(goal, seen).rotation.transpose(-1, -2) @ network.truth)
+    assert later.max() < 0.05
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    torch.manual_seed(0)
+    hands = Hands(load_hand("dclaw3"), QUICK.hands, device="cpu")
+    return make_scenes(load_set(["cube", "cuboid"]), load_set(["cuboid"]), hands, QUICK)
+
+
+def trainer(scenes, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000):
+    torch.manual_seed(seed)
+    return AlignTrainer(
+        scenes,
+        AlignmentNetwork(cfg.network),
+        cfg,
+        RunCfg(out=out, device="cpu", save_every=1, tensorboard=False, max_steps=steps),
+        spec=AlignmentSpec(network=cfg.network, points=cfg.points, hand="dclaw3"),
+        task={},
+        depth={},
+        device="cpu",
+    )
+
+
+def test_losses_are_least_at_the_truth_and_fall(scenes):
+    runner = trainer(scenes)
+    pairs = runner.pairs()
+    right = Residual(pairs.rotation, pairs.offset, torch.zeros(QUICK.batch))
+    losses, error = alignment_losses(right, pairs)
+    assert float(sum(losses.values())) < 2e-3 and error.max() < 2e-3
+    first = sum(alignment_losses(runner.network(pairs.goal, pairs.seen), pairs)[0].values()).item()
+    for _ in range(60):
+        runner.optimizer.zero_grad()
+        loss = sum(alignment_losses(runner.network(pairs.goal, pairs.seen), pairs)[0].values())
+        loss.backward()
+        runner.optimizer.step()
+    assert loss.item() < 0.8 * first
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in runner.network.parameters())
+
+
+def test_a_run_measures_goes_on_and_leaves_a_network(scenes, tmp_path):
+    runner = trainer(scenes, out=tmp_path, steps=96)
+    runner.learn(2)
+    again = trainer(scenes, seed=5, out=tmp_path, steps=96)
+    again.load(list_checkpoints(tmp_path)[-1])
+    for name, value in runner.network.state_dict().items():
+        assert torch.equal(value, again.network.state_dict()[name])
+    assert again.iteration == 2 and again.total_iterations == 3
+    figures = again.measure()
+    for name in ("made", "validation"):
+        assert 0.0 <= figures[f"{name}/within_0.1"] <= figures[f"{name}/within_0.4"] <= 1.0
+        assert 0.0 < figures[f"{name}/rotation_error"] <= np.pi and figures[f"{name}/offset_error"] > 0.0
+    network, spec = load_alignment(tmp_path / "alignment.pt")
+    assert spec.hand == "dclaw3" and spec.network == TINY
+    pairs = again.pairs()
+    runner.network.eval()
+    expected = runner.network(pairs.goal, pairs.seen)
+    torch.testing.assert_close(network(pairs.goal, pairs.seen).rotation, expected.rotation)
+
+
+def test_shapes_are_renewed_from_the_oldest(scenes):
+    bank = scenes.bank
+    before = bank._shapes.clone()
+    bank.renew(3)
+    bank.renew(4)
+    same = (bank._shapes == before).flatten(1).all(dim=1)
+    assert int((~same).sum()) == 7
+
+
+def test_other_files_and_sizes_are_refused(tmp_path):
+    save_checkpoint(tmp_path / "student.pt", {"format": "visual-dexterity student 1"})
+    with pytest.raises(ValueError, match="no network of alignment"):
+        load_alignment(tmp_path / "student.pt")
+    with pytest.raises(FileNotFoundError, match="stage 0"):
+        load_alignment(tmp_path / "none.pt")
+    with pytest.raises(ValueError, match=r"--align\.points is 4"):
+        replace(QUICK, points=4).validate()
+    with pytest.raises(ValueError, match="must divide"):
+        replace(QUICK, network=replace(TINY, heads=3)).validate()
