@@ -163,7 +163,7 @@ def test_presets_are_valid_and_bad_settings_named():
         for number in (0, 1, 2):
             preset(number).validate()
     first = PRESETS["paper"](1)
-    with pytest.raises(ValueError, match="--camera is for --stage 2"):
+    with pytest.raises(ValueError, match="--camera is for --stage 0 and 2"):
         replace(first, camera=(0.0,) * 7).validate()
     with pytest.raises(ValueError, match=r"--dagger\.epochs is 0"):
         replace(first, dagger=replace(first.dagger, epochs=0)).validate()
