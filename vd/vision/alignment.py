@@ -26,7 +26,7 @@ WAVES = (1.5, 3.0, 6.0, 12.0)
 PAIRS_AT_ONCE = 4096
 """Pairs of clouds compared at a time: what the tokens of more take counts in gigabytes."""
 GOAL, SEEN = 0, 1
-"""Kinds of clouds."""
+"""Kinds of clouds, in the order in which they are given."""
 
 
 @dataclass(frozen=True)
@@ -47,20 +47,24 @@ class Patches(nn.Module):
     def __init__(self, cfg: AlignmentCfg):
         super().__init__()
         self.cfg, inner = cfg, 2 * cfg.patch
-        self.points = nn.Sequential(nn.Linear(3, cfg.patch), nn.GELU(), nn.Linear(cfg.patch, inner))
+        self.points = nn.Sequential(nn.Linear(3, cfg.patch), nn.ReLU(), nn.Linear(cfg.patch, inner))
         self.patch = nn.Linear(inner, cfg.width)
         self.place = nn.Linear(3 * (1 + 2 * len(WAVES)), cfg.width)
 
-    def forward(self, cloud: torch.Tensor) -> torch.Tensor:
-        """Tokens [B, T, E] of clouds about their means [m] [B, P, 3], whose points are in no order."""
+    @torch.no_grad()
+    def neighbours(self, cloud: torch.Tensor) -> torch.Tensor:
+        """Points of each patch of clouds [B, P, 3], indices [B, T, K]; they stay when a cloud is turned."""
+        apart = torch.cdist(cloud[:, : self.cfg.tokens], cloud)
+        return apart.topk(self.cfg.neighbours, largest=False, sorted=False).indices
+
+    def forward(self, cloud: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
+        """Tokens [B, T, E] of clouds about their means [m] [B, P, 3], in no order, and their neighbours."""
         centres = cloud[:, : self.cfg.tokens]
-        with torch.no_grad():
-            near = torch.cdist(centres, cloud).topk(self.cfg.neighbours, largest=False, sorted=False).indices
         rows = torch.arange(len(cloud), device=cloud.device)[:, None, None]
         read = self.points((cloud[rows, near] - centres[:, :, None]) / PATCH_M)
         place = centres / CLOUD_M
         waves = [wave(place * scale) for scale in WAVES for wave in (torch.sin, torch.cos)]
-        return self.patch(read.max(dim=2).values) + self.place(torch.cat([place, *waves], dim=-1))
+        return self.patch(read.amax(dim=2)) + self.place(torch.cat([place, *waves], dim=-1))
 
 
 class Layer(nn.Module):
@@ -73,12 +77,12 @@ class Layer(nn.Module):
         self.mix, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
         self.inner = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
 
-    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
-        """Tokens [B, T, E] that have read each other."""
+    def forward(self, tokens: torch.Tensor, first: int | None = None) -> torch.Tensor:
+        """Tokens [B, T, E] that have read each other; the ``first`` ones alone, or all."""
         mixed = self.mix(self.norms[0](tokens)).unflatten(-1, (3, self.heads, -1))
         query, key, value = mixed.permute(2, 0, 3, 1, 4)
-        read = functional.scaled_dot_product_attention(query, key, value)
-        tokens = tokens + self.out(read.transpose(1, 2).flatten(2))
+        read = functional.scaled_dot_product_attention(query[:, :, :first], key, value)
+        tokens = tokens[:, :first] + self.out(read.transpose(1, 2).flatten(2))
         return tokens + self.inner(self.norms[1](tokens))
 
 
@@ -106,16 +110,21 @@ class AlignmentNetwork(nn.Module):
             }
         )
 
-    def encode(self, cloud: torch.Tensor, kind: int) -> torch.Tensor:
+    def neighbours(self, cloud: torch.Tensor) -> torch.Tensor:
+        """Points of each patch of clouds [B, P, 3], indices [B, T, K]."""
+        return self.patches.neighbours(cloud)
+
+    def encode(self, cloud: torch.Tensor, kind: int, near: torch.Tensor) -> torch.Tensor:
         """Tokens [B, T, E] of clouds about their means [m] [B, P, 3], of goals or of what is seen."""
-        return self.patches(cloud) + self.kinds[kind]
+        return self.patches(cloud, near) + self.kinds[kind]
 
     def compare(self, goal: torch.Tensor, seen: torch.Tensor) -> Residual:
         """What is predicted from the tokens of goals and of what is seen, [B, T, E] each."""
         tokens = torch.cat([self.summary.expand(len(goal), -1, -1), goal, seen], dim=1)
-        for layer in self.layers:
+        *before, last = self.layers
+        for layer in before:
             tokens = layer(tokens)
-        summary = self.norm(tokens[:, 0])
+        summary = self.norm(last(tokens, first=1)[:, 0])
         found = {name: head(summary).float() for name, head in self.heads.items()}
         return Residual(
             matrices(found["rotation"]),
@@ -125,7 +134,8 @@ class AlignmentNetwork(nn.Module):
 
     def forward(self, goal: torch.Tensor, seen: torch.Tensor) -> Residual:
         """What is predicted of clouds about their means [m] [B, P, 3]."""
-        return self.compare(self.encode(goal, GOAL), self.encode(seen, SEEN))
+        tokens = [self.encode(cloud, i, self.neighbours(cloud)) for i, cloud in enumerate((goal, seen))]
+        return self.compare(*tokens)
 
 
 @dataclass(frozen=True)
@@ -173,16 +183,19 @@ class Aligner:
         """
         mean = seen.mean(dim=1)
         goal = goal - goal.mean(dim=1, keepdim=True)
-        tokens = self.network.encode(seen - mean[:, None], SEEN)
+        seen = seen - mean[:, None]
+        tokens = self.network.encode(seen, SEEN, self.network.neighbours(seen))
+        goals = (goal, self.network.neighbours(goal))
         new = self._looks == 0
         if bool(new.any()):
             starts = self._starts.expand(int(new.sum()), -1, -1, -1)
             for _ in range(self._cfg.passes):
-                starts, _, error = self._improve(goal[new], tokens[new], starts)
+                some = (goal[new], goals[1][new])
+                starts, _, error = self._improve(some, tokens[new], starts)
             best = error.topk(self._cfg.kept, dim=1, largest=False).indices
             self._kept[new] = starts.take_along_dim(best[:, :, None, None], dim=1)
         self._restart(~new)
-        found, offset, error = self._improve(goal, tokens, self._kept)
+        found, offset, error = self._improve(goals, tokens, self._kept)
         order = error.argsort(dim=1)
         self._kept = found.take_along_dim(order[:, :, None, None], dim=1)
         self._looks += 1
@@ -199,16 +212,19 @@ class Aligner:
         self._kept[:, -1] = torch.where(due[:, None, None], anew, self._kept[:, -1])
 
     def _improve(
-        self, goal: torch.Tensor, seen: torch.Tensor, rotations: torch.Tensor
+        self, goals: tuple[torch.Tensor, torch.Tensor], seen: torch.Tensor, rotations: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """One pass over hypotheses [N, H, 3, 3]: better ones, their offsets [N, H, 3] and errors [N, H]."""
+        goal, near = goals
         count, hypotheses = rotations.shape[:2]
         flat = rotations.flatten(0, 1)
         row = torch.arange(count, device=goal.device).repeat_interleave(hypotheses)
         parts = []
         for some in torch.arange(len(row), device=goal.device).split(PAIRS_AT_ONCE):
             turned = goal[row[some]] @ flat[some].transpose(-1, -2)
-            parts.append(self.network.compare(self.network.encode(turned, GOAL), seen[row[some]]))
+            parts.append(
+                self.network.compare(self.network.encode(turned, GOAL, near[row[some]]), seen[row[some]])
+            )
         better = torch.cat([part.rotation for part in parts]) @ flat
         better = matrices(torch.cat([better[..., 0], better[..., 1]], dim=-1))  # still rotations after many
         offset, error = torch.cat([p.offset for p in parts]), torch.cat([p.error for p in parts])
