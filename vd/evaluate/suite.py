@@ -139,7 +139,7 @@ ROBUST = tuple(
         condition=name,
         quick=name in ("nominal", "s3", "mixed"),
         by_camera=name
-        not in ("observation-late", "pose-error"),  # it looks for itself, as late as images are
+        not in ("observation-late", "all-late", "pose-error"),  # it looks for itself, as late as images are
     )
     for name, changed in _VARIED.items()
 )
