@@ -129,10 +129,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         quiet_warp()
         return replay(cfg)
     check_names([cfg.agent_name], cfg.objects, cfg.hand)
-    print(
-        f"vd-play: {cfg.agent_name}; building the scene (the first start compiles kernels: minutes)",
-        flush=True,
-    )
     quiet_warp()
     if cfg.video is not None:
         frames = record_video(cfg, cfg.video)
@@ -259,6 +255,10 @@ def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
     """Environment with at least one environment for each object, and what acts in it."""
     from vd.evaluate.agents import task_for
 
+    print(
+        f"vd-play: {cfg.agent_name}; building the scene (the first start compiles kernels: minutes)",
+        flush=True,
+    )
     device = resolve_device(cfg.device)
     if device == "cpu":
         compile_side_by_side()
