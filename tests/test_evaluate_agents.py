@@ -108,12 +108,12 @@ def test_a_missing_layer_is_named_by_both_commands(tmp_path, capsys):
 
 def test_conditions_replace_what_a_policy_was_trained_in_and_nobody_tells_a_critic():
     trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
-    trained.task["observation"] = {"dynamics": "critic", "history": 2}
+    trained.task["observation"] = {"dynamics": "critic", "history": 0, "canonical": True}
     for condition in CONDITIONS.values():
         task = task_of(trained, condition=condition)
         task.validate()
         assert task.randomisation == condition
-        assert task.observation.dynamics == "none" and task.observation.history == 2
+        assert task.observation.dynamics == "none" and task.observation.canonical
     assert not CONDITIONS["nominal"].enabled and CONDITIONS["mixed"].observation_latency_s == (0.0, 0.12)
     assert CONDITIONS["hard"].force_s == 5.0 * CONDITIONS["s3"].force_s
 
