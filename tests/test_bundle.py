@@ -179,13 +179,6 @@ def test_a_contract_of_other_conventions_is_refused(teacher_bundle, hand, field,
         check_hand(read_contract(teacher_bundle), hand, teacher_bundle)
 
 
-def test_what_a_robots_loop_does_not_observe_is_refused(tmp_path):
-    policy = load_policy(SHIPPED_POLICIES[TEACHER])
-    policy.task["observation"]["history"] = 5
-    with pytest.raises(ContractError, match="does not remember yet"):
-        write_bundle(policy, tmp_path / "teacher")
-
-
 def test_damage_is_named(teacher_bundle):
     weights = teacher_bundle / "weights.safetensors"
     data = bytearray(weights.read_bytes())

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 import tyro
+from gap_reports import rubbing_servo, servo_report
 from test_evaluate_trace import compared
-from test_gap_report import sample_curves, sample_report
 from test_page import PNG
 
 from vd.assets_usd.hands import load_hand
@@ -38,7 +38,8 @@ def leave_evaluation(line: list[str]) -> None:
 
 
 def leave_report(line: list[str]) -> None:
-    write_report(sample_report(sample_curves()), sample_curves(), option(line, "--out"))
+    out = option(line, "--out")
+    write_report(*servo_report(rubbing_servo(out.with_name("recorded"))), out)
 
 
 def leave_flight(line: list[str]) -> None:

@@ -358,7 +358,6 @@ def tightening(**changes) -> CurriculumCfg:
             r"randomisation\.restitution is 0\.5 1",
         ),
         ({"randomisation": RandomisationCfg(observation_latency_s=(0.7, 0.7))}, "observation_latency_s"),
-        ({"observation": ObservationCfg(history=-1)}, r"observation\.history"),
         ({"table": TableCfg(away_share=0.3, away_s=(3.0, 1.0))}, r"table\.away_s"),
         ({"sim": SimCfg(physics_hz=100.0)}, r"sim\.physics_hz"),
         ({"curriculum": tightening(action_norm=0.0)}, r"curriculum\.tightening\.action_norm is 0"),

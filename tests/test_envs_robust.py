@@ -1,4 +1,4 @@
-"""Time, memory and what is told: states seen late, past steps, drawn dynamics, and how long a force acts."""
+"""Time, memory and what is told: states seen late, drawn dynamics, and how long a force acts."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.conditions import CONDITIONS, EXACT
 from vd.kernels.servo import actuators
-from vd.kernels.task import dynamics, history
+from vd.kernels.task import dynamics
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.sim.cfg import SimCfg, coarser
 
@@ -111,7 +111,7 @@ def test_every_episode_draws_its_latency_and_forgets_the_one_before():
     random = dataclasses.replace(
         EXACT, observation_latency_s=(0.02, 0.1), encoder_latency_s=(0.0, 0.04), redraw_s=100.0
     )
-    env = make(randomisation=random, episode_s=0.5, observation=ObservationCfg(history=3))
+    env = make(randomisation=random, episode_s=0.5)
     env.step_count.assign(np.array([0, 4, 0], dtype=np.int32))
     before = env.observer.seen.latency.numpy().copy()
     assert len(set(before)) == WORLDS and before.min() >= 0.02 and before.max() <= 0.1
@@ -124,62 +124,9 @@ def test_every_episode_draws_its_latency_and_forgets_the_one_before():
     after = env.observer.seen.latency.numpy()
     assert after[1] != before[1] and np.array_equal(after[[0, 2]], before[[0, 2]])
     seen = env.observation.numpy()
-    start = make(observation=ObservationCfg(history=3)).observation.numpy()
+    start = make().observation.numpy()
     joints = teacher_observation_slices(3)["joint_position"]
     np.testing.assert_allclose(seen[1, joints], start[1, joints], atol=1e-6)
-    frames = seen[:, env.observer.parts["history"]]
-    assert not frames[1].any() and frames[[0, 2]].any(axis=1).all()
-
-
-def expected_frames(seen: np.ndarray, step: int, count: int, parts: dict[str, slice]) -> np.ndarray:
-    """The history as the observations themselves tell it, [N, K, H]."""
-
-    def rotation(observation: np.ndarray) -> Rotation:
-        return Rotation.from_quat(observation[:, parts["relative_orientation"]])
-
-    frames = []
-    for back in range(1, count + 1):
-        past, now = seen[max(0, step - back)], seen[step]
-        turn = (rotation(past) * rotation(now).inv()).as_quat(canonical=True)
-        frames.append(
-            np.concatenate(
-                [
-                    (past - now)[:, parts["joint_position"]] / history.JOINT_UNIT,
-                    past[:, parts["previous_action"]],
-                    (past - now)[:, parts["object_position"]] / history.POSITION_UNIT_M,
-                    2.0 * turn[:, :3] / history.ROTATION_UNIT_RAD,
-                ],
-                axis=1,
-            )
-        )
-    return np.stack(frames, axis=1)
-
-
-@pytest.mark.parametrize("view", ["world", "goal", "mirrored"])
-def test_the_history_is_what_was_observed_in_any_view(view):
-    observation = ObservationCfg(history=4, view=view, file_axes=False)
-    random = dataclasses.replace(late(0.5 * STEP_S), observation_noise_std=0.002)
-    env = make(observation=observation, randomisation=random)
-    seen = run(env, 7)["seen"]
-    if view != "world":
-        assert env.symmetry_frames.chosen.numpy().any(), "worlds are seen turned"
-    columns = env.observer.parts["history"]
-    for step in range(len(seen)):
-        got = seen[step][:, columns].reshape(WORLDS, 4, -1)
-        wanted = expected_frames(seen, step, 4, teacher_observation_slices(3))
-        if step == 0:  # nothing is known of before
-            assert not np.delete(got, np.s_[9:18], axis=2).any()
-        else:
-            np.testing.assert_allclose(got, wanted, atol=2e-4)
-
-
-def test_a_new_goal_leaves_the_history_as_it_was():
-    env = make(observation=ObservationCfg(history=3, file_axes=False))
-    run(env, 4)
-    frames = env.observation.numpy()[:, env.observer.parts["history"]].copy()
-    env.goal_quat.assign(Rotation.random(WORLDS, rng=np.random.default_rng(9)).as_quat().astype(np.float32))
-    env.observe()
-    np.testing.assert_allclose(env.observation.numpy()[:, env.observer.parts["history"]], frames, atol=2e-4)
 
 
 def told(env: ReorientEnv, name: str) -> np.ndarray:
@@ -232,10 +179,10 @@ def test_only_the_critic_is_told_and_nothing_varies_where_nothing_is_drawn():
 
 @pytest.mark.parametrize("view", ["world", "goal", "mirrored"])
 def test_the_critic_is_told_the_present_as_it_would_be_seen_at_once_and_without_noise(view):
-    seen = ObservationCfg(shape="full", view=view, history=2)
+    seen = ObservationCfg(shape="full", view=view)
     random = late(STEP_S, observation_noise_std=0.1)
     env = make(randomisation=random, observation=dataclasses.replace(seen, dynamics="critic"))
-    exact = make(observation=dataclasses.replace(seen, history=0))
+    exact = make(observation=seen)
     run(env, 5)
     out = run(exact, 5)["seen"][-1]
     assert env.num_present == exact.num_observations
@@ -243,10 +190,10 @@ def test_the_critic_is_told_the_present_as_it_would_be_seen_at_once_and_without_
     assert np.abs(env.observation.numpy()[:, : env.num_present] - out).max() > 0.1
 
 
-def test_a_saved_memory_goes_on_exactly():
+def test_a_saved_past_goes_on_exactly():
     changes = {
         "randomisation": dataclasses.replace(CONDITIONS["mixed"], encoder_latency_s=(0.0, 0.02)),
-        "observation": ObservationCfg(history=3, dynamics="critic", view="goal"),
+        "observation": ObservationCfg(dynamics="critic", view="goal"),
     }
     first, second = make(**changes), make(**changes)
     run(first, 4)

@@ -70,6 +70,18 @@ def test_an_unknown_policy_is_refused_with_the_names_there_are(capsys):
     assert "dclaw4-cube" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("policy", ["dclaw4-table", "dclaw4-tracking"])
+def test_another_hand_is_refused_before_anything_is_built(policy, tmp_path, capsys, monkeypatch):
+    from vd.envs import reorient
+    from vd.play.cli import main as play
+
+    monkeypatch.setattr(reorient, "ReorientEnv", lambda *_: pytest.fail("the scene is built"))
+    for command, flags in ((main, ["--out", str(tmp_path)]), (play, ["--video", str(tmp_path / "m.mp4")])):
+        assert command([policy, "--hand", "dclaw3", "--device", "cpu", *flags]) == 1
+        error = capsys.readouterr().err
+        assert f"{policy} moves 12 joints, the hand dclaw3 has 9" in error and "--hand dclaw4" in error
+
+
 def test_start_goals_and_layer_are_as_trained_unless_asked_otherwise():
     trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
     assert task_of(trained).start.at_rest and not task_of(None).start.at_rest
@@ -96,12 +108,12 @@ def test_a_missing_layer_is_named_by_both_commands(tmp_path, capsys):
 
 def test_conditions_replace_what_a_policy_was_trained_in_and_nobody_tells_a_critic():
     trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
-    trained.task["observation"] = {"dynamics": "critic", "history": 2}
+    trained.task["observation"] = {"dynamics": "critic", "history": 0, "canonical": True}
     for condition in CONDITIONS.values():
         task = task_of(trained, condition=condition)
         task.validate()
         assert task.randomisation == condition
-        assert task.observation.dynamics == "none" and task.observation.history == 2
+        assert task.observation.dynamics == "none" and task.observation.canonical
     assert not CONDITIONS["nominal"].enabled and CONDITIONS["mixed"].observation_latency_s == (0.0, 0.12)
     assert CONDITIONS["hard"].force_s == 5.0 * CONDITIONS["s3"].force_s
 

@@ -134,6 +134,17 @@ def test_authored_objects_are_not_written_over_others(tmp_path: Path, example: p
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before and mine in before
 
 
+def test_a_folder_of_meshes_does_not_hide_the_set_of_its_name(
+    tmp_path: Path, cache: Path, example: procedural.ObjectModel, monkeypatch: pytest.MonkeyPatch
+):
+    sets.write_set(cache / "objects" / "meshes", [example])
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "a.stl").touch()
+    sets.check_sets(["meshes"])
+    assert [model.name for model in load_set("meshes")] == [example.name]
+
+
 def test_unknown_set_says_what_there_is(tmp_path: Path, cache: Path, example: procedural.ObjectModel):
     sets.write_set(cache / "objects" / "shelf", [example])
     with pytest.raises(ObjectError) as error:
@@ -143,6 +154,8 @@ def test_unknown_set_says_what_there_is(tmp_path: Path, cache: Path, example: pr
     (tmp_path / "empty").mkdir()
     with pytest.raises(ObjectError, match=r"empty: no object file"):
         load_set(tmp_path / "empty")
+    with pytest.raises(ObjectError, match=r"empty: no object file"):
+        sets.check_sets([tmp_path / "empty"])
     with pytest.raises(ObjectError, match="cube is also in"):
         load_set(["cube", "symmetric"])
     with pytest.raises(ObjectError, match="no object set was named"):

@@ -109,13 +109,13 @@ def test_a_default_set_has_the_objects_of_one_folder(
     kits = [brick(tmp_path / place / "kit" / "meshes" / f"{place}.stl") for place in ("here", "there")]
     first, second = (kit.parent for kit in kits)
     out = default_set([first])
-    assert out == default_set(kits[:1] * 2).parent / "kit" and default_set(kits[:1]).name == "here"
+    assert out == default_set(kits[:1] * 2).parent / "meshes" and default_set(kits[:1]).name == "here"
     import_meshes([first], out)
     assert default_set([first]) == out
     with pytest.raises(m.MeshError) as error:
         default_set([second])
     assert all(word in str(error.value) for word in (str(out), str(kits[0]), "--out"))
-    for path in ("cube.stl", "procedural-7-seed3/meshes/a.stl"):
+    for path in ("cube.stl", "procedural-7-seed3/a.stl"):
         reserved = brick(tmp_path / path)
         with pytest.raises(m.MeshError, match="built-in object set; say where with --out"):
             default_set([reserved if path == "cube.stl" else reserved.parent])

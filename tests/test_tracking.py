@@ -176,13 +176,6 @@ def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_ca
     assert (teacher.act(seen) - teacher.act(told)).abs().max() > 1e-3
 
 
-def test_a_teacher_that_observes_what_no_camera_shows_is_refused():
-    policy = load_policy(find_policy("dclaw3-table"))
-    policy.task["observation"]["history"] = 5
-    with pytest.raises(ValueError, match="knows the present state alone"):
-        TrackingPolicy(policy, TrackingSpec())
-
-
 @pytest.mark.parametrize("name", TRACKERS)
 def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
     path = SHIPPED_POLICIES[name]

@@ -67,7 +67,7 @@ def taught(tmp_path_factory):
     return folder / "policy.pt"
 
 
-def test_an_actor_that_sees_late_comes_to_what_its_teacher_does_by_its_history(taught, tmp_path):
+def test_an_actor_that_sees_late_comes_to_what_its_teacher_does(taught, tmp_path):
     runner = make_runner(tmp_path, env=LateEnv(num_envs=32), policy=NETWORK, ppo=IMITATING)
     runner.begin_from(str(taught))
     assert runner.critic_warmup == 60 and runner.new_inputs == 8, "2, and 6 of the critic"
@@ -85,7 +85,7 @@ def test_an_actor_that_sees_late_comes_to_what_its_teacher_does_by_its_history(t
     rows = read_progress(tmp_path / "progress.jsonl")
     losses = [row["loss/imitation"] for row in rows]
     assert losses[-1] < 0.4 * losses[0] and apart() < 0.5 * before, (losses[0], losses[-1], before, apart())
-    assert runner.alg.actor.state_dict()["mlp.0.weight"][:, 5:].abs().max() > 0.05, "the history is used"
+    assert runner.alg.actor.state_dict()["mlp.0.weight"][:, 5:].abs().max() > 0.05, "the new inputs are used"
     for name, value in runner.imitation.teacher.state_dict().items():
         assert torch.equal(value, frozen[name]), name
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
@@ -198,45 +197,13 @@ def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it
     assert _same(_state(runner.alg.critic), _state(again.alg.critic)) == list(_state(again.alg.critic))
 
 
-class Remembering(Telling):
-    """The same, whose actor reads the target once more."""
-
-    num_observations = 7
-
-    def _observe(self) -> None:
-        target, marker = self._target, np.zeros((self.num_envs, 1), np.float32)
-        self.observation.assign(np.hstack([target, np.abs(target), marker, target]))
-        self.privileged.assign(2.0 * target)
-
-
-def test_a_critic_that_was_told_begins_anew_where_the_actor_gets_a_history(tmp_path):
-    told = {"observation": {"history": 0, "dynamics": "critic"}}
-    runner = make_runner(tmp_path / "told", env=Telling(num_envs=16), policy=NORMALISING, ppo=LEARNED)
-    runner.task |= told
-    runner.learn(3)
-    path, plain = find_checkpoint(tmp_path / "told", "latest"), load_policy(tmp_path / "told" / "policy.pt")
-    later = make_runner(tmp_path / "on", env=Remembering(num_envs=16), policy=NORMALISING, ppo=LEARNED)
-    later.task |= {"observation": {"history": 1, "dynamics": "critic"}}
-    later.begin_from(str(path))
-    assert later.new_inputs == 2 and later.critic_warmup == CRITIC_WARMUP, "the critic is new"
-    observation = later.env.get_observations()
-    with torch.no_grad():
-        actions = later.alg.actor(observation)
-    assert torch.allclose(actions, plain.act(observation["policy"][:, :5]), atol=1e-6)
-    again = make_runner(tmp_path / "same", env=Telling(num_envs=16), policy=NORMALISING, ppo=LEARNED)
-    again.task |= told
-    again.begin_from(str(path))
-    assert again.critic_warmup == 0
-    assert _same(_state(runner.alg.critic), _state(again.alg.critic)) == list(_state(again.alg.critic))
-
-
-def test_values_that_come_last_cannot_become_others(tmp_path):
+def test_a_policy_that_remembers_is_refused(tmp_path):
     path = _export(tmp_path / "first")
     state = load_checkpoint(path)
     state["task"]["observation"] = {"history": 5}
     save_checkpoint(path, state)
     runner = make_runner(tmp_path / "second", policy=NORMALISING)
-    with pytest.raises(ValueError, match=r"--env\.observation\.history 5, and this run 0"):
+    with pytest.raises(ValueError, match=r"--init: .*observation\.history is 5, and this version has only 0"):
         runner.begin_from(str(path))
 
 

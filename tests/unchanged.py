@@ -57,6 +57,7 @@ GONE = (
     "soft, aimed",
     "dclaw3-table, again by its critic",
     "view either",
+    "history and dynamics",
     "dclaw3-procedural",
     "policy dclaw3-procedural",
 )
@@ -124,8 +125,8 @@ def tasks() -> dict[str, Any]:
     found |= {f"condition {name}": replace(table, randomisation=drawn) for name, drawn in CONDITIONS.items()}
     for view, base in (("world", table), ("mirrored", table)):
         found[f"view {view} {base.hand}"] = replace(base, observation=replace(base.observation, view=view))
-    known = replace(table.observation, history=3, dynamics="critic", file_axes=False)
-    found["history and dynamics"] = replace(found["condition mixed"], observation=known)
+    known = replace(table.observation, dynamics="critic", file_axes=False)
+    found["dynamics"] = replace(found["condition mixed"], observation=known)
     found["soft"] = replace(four, fingertip="soft")
     loose = replace(table.success, rotation_rad=0.8, joint_speed_rad_s=0, object_speed_m_s=0, action_norm=0)
     fixed = replace(table.curriculum, enabled=False, tightening=type(table.curriculum.tightening)())

@@ -181,18 +181,17 @@ def completed(
     return state | {"ranks": [rank | {"env": rank["env"] | moved} for rank in state["ranks"]]}
 
 
-def fitting(
-    state: dict[str, Any], spec: "PolicySpec", task: Mapping[str, Any], path: str | Path
-) -> dict[str, Any]:
-    """The part of a file that a run can take over.
-
-    What a critic is told comes after the actor's history. So where a run adds a history, a critic that was
-    told something would read other values, and begins anew.
+def check_fit(
+    state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, Any], path: str | Path
+) -> None:
+    """Refuse what a run cannot go on with.
 
     Raises:
-        ValueError: Another hand, or an actor of another shape; with the remedy.
+        ValueError: Another hand, an actor of another shape, or one that observes what is no more; with the
+            remedy.
     """
-    from vd.policy import PolicySpec, policy_export
+    from vd.envs.cfg import ObservationCfg
+    from vd.policy import PolicySpec
 
     found = from_dict(PolicySpec, state["policy"], where="policy")
     hand, here = state["task"].get("hand"), task.get("hand")
@@ -201,22 +200,17 @@ def fitting(
             f"--init: {path} moves {found.num_actions} joints of {hand}, and this run's hand, {here}, has "
             f"{spec.num_actions}; give --hand {hand}"
         )
-    theirs, ours = ({"history": t.get("observation", {}).get("history", 0)} for t in (state["task"], task))
+    from_dict(ObservationCfg, state["task"].get("observation", {}), where=f"--init: {path}: task.observation")
     for name in ("activation", "hidden", "distribution", "normalise_observations"):
-        theirs[name], ours[name] = getattr(found, name), getattr(spec, name)
-    different = [name for name in ours if theirs[name] != ours[name] and (name != "history" or theirs[name])]
-    for name in different:
-        flag = f"--{'env.observation' if name == 'history' else 'policy'}.{name.replace('_', '-')}"
-        raise ValueError(f"--init: {path} has {flag} {theirs[name]}, and this run {ours[name]}; {REMEDY}")
+        theirs, ours = getattr(found, name), getattr(spec, name)
+        if theirs != ours:
+            flag = f"--policy.{name.replace('_', '-')}"
+            raise ValueError(f"--init: {path} has {flag} {theirs}, and this run {ours}; {REMEDY}")
     if found.num_observations > spec.num_observations:
         raise ValueError(
             f"--init: {path} reads {found.num_observations} values and this run observes "
             f"{spec.num_observations}, but a run can only go on with more: {REMEDY}"
         )
-    told = state["task"].get("observation", {}).get("dynamics", "none") != "none"
-    if told and theirs["history"] != ours["history"]:
-        return {key: value for key, value in policy_export(state).items() if key != "critic_state_dict"}
-    return state
 
 
 def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:

@@ -1,7 +1,6 @@
 """Imitation before PPO: an actor that sees late learns from what it was when it saw the present state.
 
-The new inputs of an actor that goes on (its history) begin without effect, and PPO hardly moves them. So
-while the critic learns alone, the actor repeats what the policy that it began from would do in the present
+While the critic learns alone, the actor repeats what the policy that it began from would do in the present
 state, in the states that it comes to itself (DAgger, Ross et al. 2011).
 """
 

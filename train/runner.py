@@ -14,7 +14,7 @@ from torch import nn
 from vd.config import to_dict
 from vd.envs.curriculum import blend
 from vd.policy import PolicySpec, policy_export
-from vd.train.begin import completed, fitting, unlike, warmup_iterations, widen
+from vd.train.begin import check_fit, completed, unlike, warmup_iterations, widen
 from vd.train.checkpoint import (
     BEST_NAME,
     load_checkpoint,
@@ -121,7 +121,7 @@ class TeacherRunner(TrainingLoop):
             ValueError: The file is damaged, of another hand or of another network.
         """
         found = load_checkpoint(Path(path), self.device, flag="--init")
-        found = fitting(found, self._spec(), self.task, path)
+        check_fit(found, self._spec(), self.task, path)
         self.unlike = unlike(found["task"], self.task)
         found, self.new_inputs = widen(found, self.alg.actor, self.alg.critic)
         own = self.alg.save() | {"window": self._window.state_dict()}

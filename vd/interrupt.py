@@ -42,6 +42,7 @@ RENAMED = {
 """Flags of earlier versions, and what they are called in all commands."""
 GONE = {
     "--from-scratch": "stage 2 begins from what --init names",
+    "--env.observation.history": "a memory of past steps cost 2 points (docs/results.md#robustness)",
     "--ppo.optimizer": "Adam is the only one",
     "--agent": "name zero or random in place of a policy",
     "--allegro": "the comparison is in docs/results.md",

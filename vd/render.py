@@ -24,8 +24,8 @@ from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import TABLE_LABEL, add_object, build_hand, hand_mount, new_builder, show_table
 
-# Packed as the renderer packs its bytes: A B G R.
-BACKGROUND = 0xFFEBE1D8
+# Packed as the renderer packs its bytes: A B G R. Signed, or its kernel compiles with warnings.
+BACKGROUND = 0xFFEBE1D8 - (1 << 32)
 GOAL_COLOR = (0.35, 0.68, 0.42)
 GHOST_OPACITY = 0.7
 # Light direction in the camera's right, forward (level) and up: from the upper left behind the viewer, and

@@ -59,7 +59,9 @@ def in_child(
     try:
         if not receiver.poll(limit_s):
             raise ChildError(None)
-        return receiver.recv()
+        answer = receiver.recv()
+        child.join(ENDING_S)  # it tidies up by itself
+        return answer
     except EOFError:
         child.join()
         raise ChildError(child.exitcode) from None

@@ -225,7 +225,8 @@ def default_set(paths: Sequence[Path]) -> Path:
         MeshError: The name is that of a built-in set, or the set holds objects from elsewhere.
     """
     above = Path(os.path.commonpath([absolute(path) for path in paths]))
-    name = object_name(above) if above.is_file() else _folder_name(above)
+    plain = re.sub(r"[^\w.-]+", "_", above.name).strip(".") or "objects"
+    name = object_name(above) if above.is_file() else plain
     folder = objects_dir() / name
     other = f"say where with --out, such as --out {objects_dir() / f'my-{name}'}"
     if built_in_models(name) is not None:
@@ -235,10 +236,3 @@ def default_set(paths: Sequence[Path]) -> Path:
         if origin and origin[1] and not Path(origin[1]).is_relative_to(above):
             raise MeshError(f"the set {folder} holds objects from elsewhere ({origin[1]}); {other}")
     return folder
-
-
-def _folder_name(folder: Path) -> str:
-    """Name of the nearest folder that says something, as it is."""
-    names = [part.name for part in (folder, *folder.parents) if part.name]
-    name = next((name for name in names if not says_nothing(name)), folder.name or "objects")
-    return re.sub(r"[^\w.-]+", "_", name).strip(".") or "objects"

@@ -77,12 +77,34 @@ def check_sets(names_or_paths: Iterable[str | Path]) -> None:
     """Refuse what :func:`load_set` would not find, without reading or making it.
 
     Raises:
-        ObjectError: An entry is neither a path nor a set; the message lists the sets there are.
+        ObjectError: An entry is neither a path nor a set, or a folder holds no object.
     """
     for entry in names_or_paths:
-        name, built_in = str(entry), entry in BUILT_IN or _PROCEDURAL.fullmatch(str(entry))
-        if not built_in and not Path(entry).expanduser().exists() and not _is_there(name):
-            raise _no_such_set(name)
+        if not _is_built_in(str(entry)) and _named_path(entry) is None and not _is_there(str(entry)):
+            raise _no_such_set(str(entry))
+
+
+def _is_built_in(name: str) -> bool:
+    """Whether it is the name of a built-in set; a folder that happens to have one is left alone."""
+    return name in BUILT_IN or _PROCEDURAL.fullmatch(name) is not None
+
+
+def _named_path(entry: str | Path) -> Path | None:
+    """The file or folder of objects that an entry names, if it is no set's name.
+
+    Raises:
+        ObjectError: The folder holds no object, and no set in the cache has its name.
+    """
+    path = Path(entry).expanduser()
+    if path.is_file():
+        return path
+    if not path.is_dir() or (isinstance(entry, str) and _is_built_in(entry)):
+        return None
+    if object_files(path):
+        return path
+    if not _is_there(str(entry)):  # a folder of meshes, beside the set that was imported from it
+        raise ObjectError(f"{path}: no object file (*.usd); make some of its meshes: vd-assets import {path}")
+    return None
 
 
 def _is_plain(name: str) -> bool:
@@ -162,16 +184,8 @@ def load_set(names_or_paths: str | Path | Iterable[str | Path]) -> list[ObjectMo
         raise ObjectError("no object set was named; for example: cube, procedural-150-seed0, or a folder")
     files: list[Path] = []
     for entry in entries:
-        path = Path(entry).expanduser()
-        if path.is_file():
-            files.append(path)
-            continue
-        reserved = isinstance(entry, str) and _is_plain(entry) and built_in_models(entry) is not None
-        folder = path if path.is_dir() and not reserved else set_folder(str(entry))
-        found = object_files(folder)
-        if not found:
-            raise ObjectError(f"{folder}: no object file (*.usd); make some with: vd-assets import MESHES")
-        files += found
+        path = _named_path(entry) or set_folder(str(entry))
+        files += [path] if path.is_file() else object_files(path)
     models = [read_object(p) for p in dict.fromkeys(files)]
     seen: dict[str, Path] = {}
     for model, path in zip(models, dict.fromkeys(files), strict=True):

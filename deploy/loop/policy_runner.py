@@ -1,6 +1,6 @@
 """Policies in the control loop: from what is sensed to an action and the distance to the goal."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import check_bundle, is_saved_student, is_tracking_policy, open_policy, trained_task
+from vd.evaluate.agents import check_fits, is_saved_student, is_tracking_policy, open_policy, trained_task
 from vd.evaluate.student import RENDERED
 from vd.paper import PAPER
 from vd.senses import Senses
@@ -220,10 +220,7 @@ def load_runner(
         if name != ZERO:
             raise ValueError(f"{name} is not for a hand; give a bundle, a policy's file, or {ZERO}")
         return PolicyRunner(ReorientCfg(hand=hand_name), StoppingRule())
-    moves = policy.spec.num_actions if student else policy.num_actions
-    if moves != hand.num_joints:
-        raise ValueError(f"{name} moves {moves} joints, the hand {hand.name} has {hand.num_joints}")
-    check_bundle(name, replace(trained_task(policy), hand=hand_name))
+    check_fits(name, policy, hand_name)
     if student:
         return StudentRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     if is_tracking_policy(policy):

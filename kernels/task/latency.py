@@ -58,36 +58,22 @@ def write_state(
 @wp.kernel
 def record_state_kernel(
     # Model:
-    joints: int,
-    slots: int,
-    tip_body: wp.array[int],
+    joints: int,  # joints of the hand, D
+    slots: int,  # rows of each world, L
+    tip_body: wp.array[int],  # [G] link of each fingertip, an index within a world
     # In:
-    measured_q_in: wp.array2d[float],
-    measured_qd_in: wp.array2d[float],
-    joint_q_in: wp.array2d[float],
-    joint_qd_in: wp.array2d[float],
-    body_q_in: wp.array2d[wp.transform],
-    body_qd_in: wp.array2d[wp.spatial_vector],
+    measured_q_in: wp.array2d[float],  # [N, *] hand joints as their encoders report them [rad]
+    measured_qd_in: wp.array2d[float],  # [N, *] velocities likewise [rad/s]
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_qd_in: wp.array2d[float],  # [N, D + 6] hand joints [rad/s], object linear and angular velocity
+    body_q_in: wp.array2d[wp.transform],  # [N, B] link poses in the world frame
+    body_qd_in: wp.array2d[wp.spatial_vector],  # [N, B] link velocities in the world frame
     # In/Out:
-    head: wp.array[int],
+    head: wp.array[int],  # [N] slot written last
     # Out:
-    ring_out: wp.array2d[float],
+    ring_out: wp.array2d[float],  # [N L, C] past states, world by world
 ):
-    """Remember the state after a physics step. Launch: [N].
-
-    Args:
-        joints: Joints of the hand, D.
-        slots: Rows of each world, L.
-        tip_body: Link of each fingertip, an index within a world, shape [G].
-        measured_q_in: Positions of the hand's joints as their encoders report them [rad], shape [N, *].
-        measured_qd_in: Velocities likewise [rad/s], shape [N, *].
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        joint_qd_in: Hand joints [rad/s], object linear and angular velocity, shape [N, D + 6].
-        body_q_in: Link poses in the world frame, shape [N, B].
-        body_qd_in: Link velocities in the world frame, shape [N, B].
-        head: Slot written last, shape [N].
-        ring_out: Past states, world by world, shape [N L, C].
-    """
+    """Remember the state after a physics step. Launch: [N]."""
     world = wp.tid()
     slot = (head[world] + 1) % slots
     head[world] = slot
@@ -109,47 +95,29 @@ def record_state_kernel(
 @wp.kernel
 def begin_latency_kernel(
     # Model:
-    joints: int,
-    slots: int,
-    tip_body: wp.array[int],
-    latency: wp.vec2,
-    encoder_latency: wp.vec2,
+    joints: int,  # joints of the hand, D
+    slots: int,  # rows of each world, L
+    tip_body: wp.array[int],  # [G] link of each fingertip
+    latency: wp.vec2,  # range of the object's latency [s]
+    encoder_latency: wp.vec2,  # range of that of joints and fingertips [s]
     # In:
-    mask_in: wp.array[int],
-    measured_q_in: wp.array2d[float],
-    measured_qd_in: wp.array2d[float],
-    joint_q_in: wp.array2d[float],
-    joint_qd_in: wp.array2d[float],
-    body_q_in: wp.array2d[wp.transform],
-    body_qd_in: wp.array2d[wp.spatial_vector],
+    mask_in: wp.array[int],  # [N] 1 where an episode begins
+    measured_q_in: wp.array2d[float],  # as in :func:`record_state_kernel`, and the five after it
+    measured_qd_in: wp.array2d[float],  # likewise
+    joint_q_in: wp.array2d[float],  # likewise
+    joint_qd_in: wp.array2d[float],  # likewise
+    body_q_in: wp.array2d[wp.transform],  # likewise
+    body_qd_in: wp.array2d[wp.spatial_vector],  # likewise
     # In/Out:
-    rng: wp.array[wp.uint32],
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    latency_out: wp.array[float],
-    encoder_latency_out: wp.array[float],
-    ring_out: wp.array2d[float],
+    latency_out: wp.array[float],  # [N] how late the object is seen [s]
+    encoder_latency_out: wp.array[float],  # [N] how late joints and fingertips are seen [s]
+    ring_out: wp.array2d[float],  # [N L, C] past states
 ):
     """Draw the latencies of an episode that begins; its past is its first state. Launch: [N].
 
     Both are at the same share of their ranges, so that the one that a critic is told says both.
-
-    Args:
-        joints: Joints of the hand, D.
-        slots: Rows of each world, L.
-        tip_body: Link of each fingertip, shape [G].
-        latency: Range of the object's latency [s].
-        encoder_latency: Range of that of joints and fingertips [s].
-        mask_in: 1 where an episode begins, shape [N].
-        measured_q_in: As in :func:`record_state_kernel`, and the five after it.
-        measured_qd_in: Likewise.
-        joint_q_in: Likewise.
-        joint_qd_in: Likewise.
-        body_q_in: Likewise.
-        body_qd_in: Likewise.
-        rng: Random stream of each world, shape [N].
-        latency_out: How late the object is seen [s], shape [N].
-        encoder_latency_out: How late joints and fingertips are seen [s], shape [N].
-        ring_out: Past states, shape [N L, C].
     """
     world = wp.tid()
     if mask_in[world] == 0:
@@ -184,41 +152,24 @@ def aged_row(world: int, latency: float, physics_dt: float, slots: int, head: wp
 @wp.kernel
 def recall_state_kernel(
     # Model:
-    joints: int,
-    slots: int,
-    tip_body: wp.array[int],
-    physics_dt: float,
+    joints: int,  # joints of the hand, D
+    slots: int,  # rows of each world, L
+    tip_body: wp.array[int],  # [G] link of each fingertip; only their poses are written
+    physics_dt: float,  # time between two rows [s]
     # In:
-    latency_in: wp.array[float],
-    encoder_latency_in: wp.array[float],
-    head_in: wp.array[int],
-    ring_in: wp.array2d[float],
+    latency_in: wp.array[float],  # [N] how late each object is seen [s], at most (L - 1) steps
+    encoder_latency_in: wp.array[float],  # [N] how late joints and fingertips are seen [s], likewise
+    head_in: wp.array[int],  # [N] slot written last
+    ring_in: wp.array2d[float],  # [N L, C] past states
     # Out:
-    measured_q_out: wp.array2d[float],
-    measured_qd_out: wp.array2d[float],
-    joint_q_out: wp.array2d[float],
-    joint_qd_out: wp.array2d[float],
-    body_q_out: wp.array2d[wp.transform],
-    body_qd_out: wp.array2d[wp.spatial_vector],
+    measured_q_out: wp.array2d[float],  # as in :func:`record_state_kernel`, and the five after it
+    measured_qd_out: wp.array2d[float],  # likewise
+    joint_q_out: wp.array2d[float],  # likewise
+    joint_qd_out: wp.array2d[float],  # likewise
+    body_q_out: wp.array2d[wp.transform],  # likewise
+    body_qd_out: wp.array2d[wp.spatial_vector],  # likewise
 ):
-    """Object and hand as they were their latency ago, of the nearest physics step. Launch: [N].
-
-    Args:
-        joints: Joints of the hand, D.
-        slots: Rows of each world, L.
-        tip_body: Link of each fingertip, shape [G]; only their poses are written.
-        physics_dt: Time between two rows [s].
-        latency_in: How late each object is seen [s], at most (L - 1) steps, shape [N].
-        encoder_latency_in: How late joints and fingertips are seen [s], likewise, shape [N].
-        head_in: Slot written last, shape [N].
-        ring_in: Past states, shape [N L, C].
-        measured_q_out: As in :func:`record_state_kernel`, and the five after it.
-        measured_qd_out: Likewise.
-        joint_q_out: Likewise.
-        joint_qd_out: Likewise.
-        body_q_out: Likewise.
-        body_qd_out: Likewise.
-    """
+    """Object and hand as they were their latency ago, of the nearest physics step. Launch: [N]."""
     world = wp.tid()
     seen = aged_row(world, latency_in[world], physics_dt, slots, head_in)
     row = aged_row(world, encoder_latency_in[world], physics_dt, slots, head_in)

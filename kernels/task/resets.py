@@ -22,63 +22,41 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StartParams:
-    """Where the object starts; an array of length 1 in device memory.
+    """Where the object starts; an array of length 1 in device memory."""
 
-    position: Mean start position of the object, world frame [m].
-    noise: Half width of the uniform noise on each axis of it [m].
-    """
-
-    position: wp.vec3
-    noise: float
+    position: wp.vec3  # mean start position of the object, world frame [m]
+    noise: float  # half width of the uniform noise on each axis of it [m]
 
 
 @wp.struct
 class GoalParams:
-    """How goals are drawn; an array of length 1 in device memory.
+    """How goals are drawn; an array of length 1 in device memory."""
 
-    max_angle: Largest angle between the object's orientation and its goal [rad]; all of SO(3) at >= pi.
-    about_vertical: 1 if goals only turn the object about the vertical, uniform in the angle; 0 for any axis.
-    """
-
-    max_angle: float
-    about_vertical: int
+    max_angle: float  # largest angle between object and goal [rad]; all of SO(3) at >= pi
+    about_vertical: int  # 1 if goals only turn it about the vertical, uniform in the angle; 0: any axis
 
 
 @wp.kernel
 def episode_kernel(
     # In:
-    success_in: wp.array[int],
-    fell_in: wp.array[int],
-    max_steps: int,
-    hold: int,
+    success_in: wp.array[int],  # [N] 1 where the goal is reached
+    fell_in: wp.array[int],  # [N] 1 where the object is lost
+    max_steps: int,  # length of an episode [control steps]
+    hold: int,  # 0: after a success the episode goes on with a new goal (training); 1: it ends (evaluation)
     # In/Out:
-    step_count: wp.array[int],
-    goal_steps: wp.array[int],
-    counts: wp.array[float],
+    step_count: wp.array[int],  # [N] control steps since the reset
+    goal_steps: wp.array[int],  # [N] control steps since the goal was given
+    counts: wp.array[float],  # [3] goals ended, goals reached, objects lost, of all worlds; added to
     # Out:
-    timed_out_out: wp.array[int],
-    done_out: wp.array[int],
-    reset_out: wp.array[int],
-    new_goal_out: wp.array[int],
+    timed_out_out: wp.array[int],  # [N] 1 where the episode ends only by its length
+    done_out: wp.array[int],  # [N] 1 where the return ends for the learner: success, fall or time-out
+    reset_out: wp.array[int],  # [N] 1 where the world is to be reset
+    new_goal_out: wp.array[int],  # [N] 1 where only the goal is to be drawn anew
 ):
     """Count the step and decide what ends with it. Launch: [N].
 
     The learner bootstraps values where ``timed_out`` is 1, so that is 0 where the last step also
     succeeded or fell: those are real ends.
-
-    Args:
-        success_in: 1 where the goal is reached, shape [N].
-        fell_in: 1 where the object is lost, shape [N].
-        max_steps: Length of an episode [control steps].
-        hold: 0: a success gives a new goal and the episode goes on (training); 1: it ends the episode
-            (evaluation).
-        step_count: Control steps since the reset, shape [N].
-        goal_steps: Control steps since the goal was given, shape [N].
-        counts: Goals ended, goals reached and objects lost, over all environments, shape [3]; added to.
-        timed_out_out: 1 where the episode ends only by its length, shape [N].
-        done_out: 1 where the return ends for the learner: success, fall or time-out, shape [N].
-        reset_out: 1 where the world is to be reset, shape [N].
-        new_goal_out: 1 where only the goal is to be drawn anew, shape [N].
     """
     world = wp.tid()
     success = success_in[world] != 0
@@ -104,28 +82,28 @@ def episode_kernel(
 @wp.kernel
 def reset_kernel(
     # Model:
-    reset_q: wp.array[float],
-    start_params: wp.array[StartParams],
-    goal_params: wp.array[GoalParams],
-    rest_poses: wp.array2d[wp.transform],
+    reset_q: wp.array[float],  # [D] hand joints after a reset [rad]
+    start_params: wp.array[StartParams],  # [1] start of the object
+    goal_params: wp.array[GoalParams],  # [1] draw of the goal
+    rest_poses: wp.array2d[wp.transform],  # [N, K] poses at rest of each world's object; K = 0: none
     # In:
-    reset_in: wp.array[int],
-    new_goal_in: wp.array[int],
-    start_quat_in: wp.array[wp.quat],
-    use_start_quat: int,
-    given_goal_in: wp.array[wp.quat],
-    use_given_goal: int,
+    reset_in: wp.array[int],  # [N] 1 where the world is reset
+    new_goal_in: wp.array[int],  # [N] 1 where only the goal is drawn anew
+    start_quat_in: wp.array[wp.quat],  # [N] start orientation; [0] if ``use_start_quat`` is 0
+    use_start_quat: int,  # whether ``start_quat_in`` takes the place of the random orientation
+    given_goal_in: wp.array[wp.quat],  # [N] goal orientation; [0] if ``use_given_goal`` is 0
+    use_given_goal: int,  # whether ``given_goal_in`` takes the place of the random goal
     # In/Out:
-    joint_q: wp.array2d[float],
-    rng: wp.array[wp.uint32],
+    joint_q: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    joint_qd_out: wp.array2d[float],
-    smoothed_out: wp.array2d[float],
-    step_count_out: wp.array[int],
-    goal_steps_out: wp.array[int],
-    goal_quat_out: wp.array[wp.quat],
-    previous_error_out: wp.array[float],
-    env_mask_out: wp.array[wp.bool],
+    joint_qd_out: wp.array2d[float],  # [N, D + 6] velocities
+    smoothed_out: wp.array2d[float],  # [N, D] smoothed action
+    step_count_out: wp.array[int],  # [N] control steps since the reset
+    goal_steps_out: wp.array[int],  # [N] control steps since the goal was given
+    goal_quat_out: wp.array[wp.quat],  # [N] goal orientation
+    previous_error_out: wp.array[float],  # [N] rotation error to the new goal [rad]
+    env_mask_out: wp.array[wp.bool],  # [N + 1] who is reset, for Newton; the last, of no world, stays
 ):
     """Reset the worlds of one mask; draw a goal for those of either mask. Launch: [N].
 
@@ -136,28 +114,6 @@ def reset_kernel(
     vertical only); the smoothed action starts at zero with each goal. A goal that is drawn is less than half
     a turn from the object's quaternion, not from the other one of its orientation; of a given one the sign is
     chosen so.
-
-    Args:
-        reset_q: Hand joints after a reset [rad], shape [D].
-        start_params: Start of the object, shape [1].
-        goal_params: Draw of the goal, shape [1].
-        rest_poses: Poses in which each world's object lies at rest, world frame, shape [N, K]; K = 0: none.
-        reset_in: 1 where the world is reset, shape [N].
-        new_goal_in: 1 where only the goal is drawn anew, shape [N].
-        start_quat_in: Start orientation of the object, read if ``use_start_quat`` is not 0, shape [N] or [0].
-        use_start_quat: Whether ``start_quat_in`` takes the place of the random orientation.
-        given_goal_in: Goal orientation, read if ``use_given_goal`` is not 0, shape [N] or [0].
-        use_given_goal: Whether ``given_goal_in`` takes the place of the random goal.
-        joint_q: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        rng: Random stream of each world, shape [N].
-        joint_qd_out: Velocities, shape [N, D + 6].
-        smoothed_out: Smoothed action, shape [N, D].
-        step_count_out: Control steps since the reset, shape [N].
-        goal_steps_out: Control steps since the goal was given, shape [N].
-        goal_quat_out: Goal orientation, shape [N].
-        previous_error_out: Rotation error to the new goal [rad], shape [N].
-        env_mask_out: Whether each environment is reset, as Newton wants it, shape [N + 1]; the last entry, of
-            what is in no environment, stays.
     """
     world = wp.tid()
     reset = reset_in[world] != 0
@@ -210,22 +166,14 @@ def reset_kernel(
 @wp.kernel
 def give_goal_kernel(
     # In:
-    given_goal_in: wp.array[wp.quat],
-    joint_q_in: wp.array2d[float],
-    object_column: int,
+    given_goal_in: wp.array[wp.quat],  # [N] wanted orientations
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    object_column: int,  # column of the object's quaternion
     # Out:
-    goal_quat_out: wp.array[wp.quat],
-    goal_steps_out: wp.array[int],
+    goal_quat_out: wp.array[wp.quat],  # [N] goal orientation with the sign that :func:`reset_kernel` gives it
+    goal_steps_out: wp.array[int],  # [N] control steps since the goal was given: 0
 ):
-    """Give goals from outside to worlds as they are. Launch: [N].
-
-    Args:
-        given_goal_in: Wanted orientations, shape [N].
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        object_column: Column of the object's quaternion.
-        goal_quat_out: Goal orientation with the sign that :func:`reset_kernel` gives it, shape [N].
-        goal_steps_out: Control steps since the goal was given: 0, shape [N].
-    """
+    """Give goals from outside to worlds as they are. Launch: [N]."""
     world = wp.tid()
     orientation = read_quat(world, object_column, joint_q_in)
     goal_quat_out[world] = goal_beside(given_goal_in[world], orientation)

@@ -264,11 +264,6 @@ def derive_interface(
 
 def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
     seen = task.observation
-    if seen.history:
-        raise ContractError(
-            f"observation.history is {seen.history}: a robot's loop does not remember yet; bundle a policy "
-            "without"
-        )
     slices = teacher_observation_slices(hand.num_fingers)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}
     if seen.shape != "none":

@@ -79,7 +79,7 @@ class SuccessCfg:
 class ObservationCfg:
     """What the teacher sees besides the paper's state."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"goal_time": False}
+    RETIRED: ClassVar[dict[str, Any]] = {"goal_time": False, "history": 0}
     shape: Literal["none", "full"] = "none"
     """none: nothing of the object's shape, as in the paper. full: the vector from each fingertip to the
     nearest point of the surface, and how far the object extends in 9 directions for each finger, up and
@@ -97,17 +97,9 @@ class ObservationCfg:
     canonical: bool = False
     """Of the two quaternions of a rotation see always the same, of object, goal and the rotation between
     them. On in all presets; off where a policy's file does not say: those policies have learned the signs."""
-    history: int = 0
-    """Ours: past control steps that are remembered, each with joint positions, action, and the object's way
-    and rotation since (kernels/task/history.py): they tell how late and stiff the hand is."""
     dynamics: Literal["none", "critic"] = "none"
     """Ours, privileged: whether the critic is told what was drawn (gains, delay, friction and backlash of
     joints, frictions, mass, latency), and the present state and shape, without noise."""
-
-    def validate(self) -> None:
-        """Raise ValueError naming the field and the remedy."""
-        if self.history < 0:
-            raise ValueError(f"observation.history is {self.history}; it is a number of steps, 0 for none")
 
     def num_frames(self, fingers: int) -> int:
         """Symmetry frames of a hand of so many fingers; 0: it sees the world as it is."""
@@ -395,7 +387,6 @@ class ReorientCfg:
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         self.sim.validate()
-        self.observation.validate()
         self.randomisation.validate()
         self.curriculum.validate()
         self.table.validate()

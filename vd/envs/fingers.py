@@ -3,6 +3,7 @@
 import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
+from vd.kernels.launch import launch
 from vd.kernels.task.actions import joint_effort_kernel
 from vd.kernels.task.environments import copy_columns_kernel
 from vd.kernels.task.observations import fingertip_kernel
@@ -40,36 +41,13 @@ class Fingers:
             kp: Joint stiffness [N m/rad], shape [N, D].
             kd: Joint damping [N m s/rad], shape [N, D].
         """
-        wp.launch(
-            fingertip_kernel,
-            dim=self.tip_pos.shape,
-            inputs=[self.tip_body, self.tip_offset, self._sim.body_q],
-            outputs=[self.tip_pos],
-            device=self.tip_pos.device,
-        )
         sim = self._sim
+        tips = [self.tip_body, self.tip_offset, sim.body_q]
+        launch(fingertip_kernel, self.tip_pos.shape, tips, [self.tip_pos])
         if sim.servo is not None:
             # Only the servo knows what it had in the last physics step: a late command, a limited torque.
             torque = sim.solver.mjw_data.qfrc_actuator
-            wp.launch(
-                copy_columns_kernel,
-                dim=self.effort.shape,
-                inputs=[torque],
-                outputs=[self.effort],
-                device=self.effort.device,
-            )
+            launch(copy_columns_kernel, self.effort.shape, [torque], [self.effort])
             return
-        wp.launch(
-            joint_effort_kernel,
-            dim=self.effort.shape,
-            inputs=[
-                self._effort_limit,
-                kp,
-                kd,
-                sim.target,
-                sim.joint_q,
-                sim.joint_qd,
-            ],
-            outputs=[self.effort],
-            device=self.effort.device,
-        )
+        joints = [self._effort_limit, kp, kd, sim.target, sim.joint_q, sim.joint_qd]
+        launch(joint_effort_kernel, self.effort.shape, joints, [self.effort])

@@ -1,4 +1,4 @@
-"""What the policy observes: state, shape, memory, and what a critic or a teacher is told."""
+"""What the policy observes: state, shape, and what a critic or a teacher is told."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,6 @@ from vd.envs.shapes import ShapeObserver
 from vd.envs.symmetry import ChosenFrames
 from vd.envs.task_state import TaskState
 from vd.kernels.task.dynamics import dynamics_kernel
-from vd.kernels.task.history import forget_kernel, history_kernel, remember_kernel
 from vd.kernels.task.observations import teacher_observation_kernel, teacher_observation_slices
 from vd.paper import PAPER
 
@@ -52,11 +51,6 @@ class Observer:
             items = state.surface_points, state.world_object, state.world_scale
             self.shapes = ShapeObserver(*items, state.fingers.tip_body, state.fingers.tip_offset)
         slices = teacher_observation_slices(state.num_fingers)
-        self._pose_columns = [slices["object_position"].start, slices["relative_orientation"].start]
-        self._action_column = slices["previous_action"].start
-        self._frames = frames = cfg.history
-        self._head, self._count = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
-        self._past = zeros(n * frames, 2 * state.num_actions + 7)
         self._body_com = wp.clone(state.sim.model.body_com[: state.scene.bodies_per_world])
         hand, materials = state.hand, PAPER.materials
         self._gains = [wp.array(gain, dtype=float, device=device) for gain in (hand.kp, hand.kd)]
@@ -80,17 +74,6 @@ class Observer:
         """Begin the episodes of the environments of ``mask`` [N], after their state was reset."""
         self.seen.begin(mask)
         self._pose_error.begin(mask)
-        if self._frames:
-            self._state.launch(forget_kernel, [mask], [self._count])
-
-    def remember(self) -> None:
-        """Keep the present observation for the history, once a control step and before it."""
-        if self._frames:
-            self._state.launch(
-                remember_kernel,
-                [*self._remembered, self._frames, self.world_values, self._state.goal_quat],
-                [self._head, self._count, self._past],
-            )
 
     def observe(self) -> None:
         """Write the observation of the present state. Device work only."""
@@ -102,7 +85,6 @@ class Observer:
             sim = state.sim
             true = [sim.joint_q, sim.joint_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
             self._observe_state(true, self._exact, self.world_values[:, self.parts["present"].start :])
-        self._observe_history()
         self._tell()
         if self.symmetry_frames is not None:
             self.symmetry_frames.observe()
@@ -140,27 +122,6 @@ class Observer:
             first = self.parts["shape"].start
             self.shapes.observe(joint_q, state.num_actions, body_q, state.goal_quat, out, first)
 
-    @property
-    def _remembered(self) -> list[int]:
-        return [self._state.num_actions, *self._pose_columns, self._action_column]
-
-    def _observe_history(self) -> None:
-        if self._frames:
-            self._state.launch(
-                history_kernel,
-                [
-                    *self._remembered,
-                    self._frames,
-                    self.parts["history"].start,
-                    self._state.goal_quat,
-                    self._head,
-                    self._count,
-                    self._past,
-                ],
-                [self.world_values],
-                dim=(self._state.num_envs, self._frames),
-            )
-
     def _tell(self) -> None:
         """Write what was drawn."""
         if "dynamics" not in self.parts:
@@ -186,8 +147,5 @@ class Observer:
 
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint, by name."""
-        past = {"history": self._past, "history_head": self._head, "history_count": self._count}
-        past |= {"history_next": self.world_values}  # remembered when the next step begins
         chosen = {} if self.symmetry_frames is None else {"view": self.symmetry_frames.chosen}
-        kept = self.seen.stateful() | self._pose_error.stateful()
-        return chosen | kept | (past if self._frames else {})
+        return chosen | self.seen.stateful() | self._pose_error.stateful()

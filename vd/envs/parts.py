@@ -3,7 +3,6 @@
 from vd.envs.cfg import ObservationCfg
 from vd.kernels.columns import consecutive
 from vd.kernels.task.dynamics import dynamics_size
-from vd.kernels.task.history import frame_size
 from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 
@@ -11,8 +10,8 @@ from vd.kernels.task.shapes import shape_observation_size
 def observation_parts(cfg: ObservationCfg, fingers: int) -> dict[str, slice]:
     """Columns of the parts of an observation, in order, those included that only the critic reads.
 
-    state, shape, history (frame by frame), dynamics, present (state and shape without latency and noise);
-    parts that are off are missing.
+    state, shape, dynamics, present (state and shape without latency and noise); parts that are off are
+    missing.
     """
     joints = teacher_observation_slices(fingers)["joint_position"].stop
     told = cfg.dynamics != "none"
@@ -21,7 +20,6 @@ def observation_parts(cfg: ObservationCfg, fingers: int) -> dict[str, slice]:
     sizes = {
         "state": state,
         "shape": shape,
-        "history": cfg.history * frame_size(joints),
         "dynamics": dynamics_size(joints) if told else 0,
         "present": state + shape if told else 0,
     }

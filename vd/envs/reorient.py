@@ -77,8 +77,8 @@ class ReorientEnv:
         """Writes what is observed."""
         self.num_observations = self.observer.num_observations
         self.observation, self.privileged = self.observer.split(self.observer.all_values)
-        """Teacher observation, fresh after resets and new goals, shape [N, O]: state, shape and
-        history; and what the critic alone is told, shape [N, P]."""
+        """Teacher observation, fresh after resets and new goals, shape [N, O]: state and shape;
+        and what the critic alone is told, shape [N, P]."""
         present = self.observer.parts.get("present", slice(0, 0))
         self.num_present = present.stop - present.start
         """Values of the present state and shape, the last of ``privileged``; 0 where none are told."""
@@ -272,7 +272,6 @@ class ReorientEnv:
     def launch_step(self) -> None:
         """Launch every kernel of a control step; :meth:`step` replays them as one graph."""
         sim = self.sim
-        self.observer.remember()
         self._apply_action()
         self.randomiser.disturb()
         if self._table_steps is not None:

@@ -3,10 +3,9 @@
 N environments, D joints, F fingers, B bodies. World frame: z up; metres, quaternions xyzw.
 """
 
-from typing import Any
-
 import warp as wp
 
+from vd.kernels.launch import launch
 from vd.kernels.task.shapes import (
     ORIENTATIONS,
     clearance_kernel,
@@ -37,7 +36,7 @@ class ShapeObserver:
         tip_body: wp.array,
         tip_offset: wp.array,
     ):
-        device = self._device = points.device
+        device = points.device
         self._shapes = [points, world_object, world_scale]
         self._tips, fingers = [tip_body, tip_offset], len(tip_body)
         self._directions = wp.array(extent_directions(fingers), dtype=wp.vec3, device=device)
@@ -54,7 +53,7 @@ class ShapeObserver:
             out: Heights.
         """
         table = PAPER.scene.table_top_m
-        self._launch(clearance_kernel, len(out), [*self._shapes, column, table, joint_q], out)
+        launch(clearance_kernel, len(out), [*self._shapes, column, table, joint_q], [out])
 
     def observe(
         self, joint_q: wp.array, column: int, body_q: wp.array, goal: wp.array, out: wp.array, first: int = 0
@@ -71,9 +70,6 @@ class ShapeObserver:
         """
         begin = {name: first + columns.start for name, columns in self._slices.items()}
         surface = [*self._shapes, *self._tips, column, begin["surface"], joint_q, body_q]
-        self._launch(surface_kernel, self._surface_dim, surface, out)
+        launch(surface_kernel, self._surface_dim, surface, [out])
         extent = [*self._shapes, self._directions, column, begin["extent"], joint_q, goal]
-        self._launch(extent_kernel, self._extent_dim, extent, out)
-
-    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list[Any], out: wp.array) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[out], device=self._device)
+        launch(extent_kernel, self._extent_dim, extent, [out])

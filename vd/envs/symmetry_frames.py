@@ -203,11 +203,7 @@ def _observation_map(observation: ObservationCfg, tips: np.ndarray, turn: np.nda
         first = parts["shape"].start
         for name, columns in shape_observation_slices(count).items():
             slices[name] = slice(first + columns.start, first + columns.stop)
-    frames = np.eye(observation.history)
-    blocks |= {
-        "history": np.kron(frames, block_diag(joints, joints, turn, axial)),
-        "dynamics": block_diag(np.kron(np.eye(JOINT_CHANNELS), np.abs(joints)), np.eye(SCALARS)),
-    }
+    blocks["dynamics"] = block_diag(np.kron(np.eye(JOINT_CHANNELS), np.abs(joints)), np.eye(SCALARS))
     slices |= {name: columns for name, columns in parts.items() if name in blocks}
     size = max(columns.stop for columns in parts.values())
     matrix = np.zeros((size, size))

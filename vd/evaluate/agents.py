@@ -167,19 +167,43 @@ def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
     return policy
 
 
-def check_bundle(name: str, task: ReorientCfg) -> None:
-    """Refuse a bundle that was made for another hand than that of ``task``; other policies pass.
+def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_layer: str | None = None) -> None:
+    """Refuse a policy that moves another hand, before anything slow; agents without a file move any.
+
+    Args:
+        name: Of the policy.
+        policy: What :func:`open_policy` gave.
+        hand: Hand name; None takes the policy's.
+        hand_layer: As of :func:`task_for`.
 
     Raises:
-        vd.bundle.contract.ContractError: Names field, found, expected and remedy.
+        vd.bundle.contract.ContractError: A bundle; names field, found, expected and remedy.
+        ValueError: The hand has another number of joints, or cannot be read.
     """
-    if name in BUILT_IN or not is_bundle(path := find_policy(name)):
+    if policy is None:
         return
     from vd.assets_usd.hands import load_hand
-    from vd.bundle.contract import check_hand
-    from vd.bundle.store import read_contract
 
-    check_hand(read_contract(path), load_hand(task.hand, task.fingertip, task.hand_layer), path)
+    task = _on_hand(trained_task(policy), hand, hand_layer)
+    model, path = load_hand(task.hand, task.fingertip, task.hand_layer), find_policy(name)
+    if is_bundle(path):
+        from vd.bundle.contract import check_hand
+        from vd.bundle.store import read_contract
+
+        return check_hand(read_contract(path), model, path)
+    moves = policy.spec.num_actions if is_saved_student(policy) else policy.num_actions
+    if moves != model.num_joints:
+        trained = trained_task(policy).hand
+        raise ValueError(
+            f"{name} moves {moves} joints, the hand {model.name} has {model.num_joints}; "
+            f"use the hand it was trained for: --hand {trained}"
+        )
+
+
+def _on_hand(task: ReorientCfg, hand: str | None, hand_layer: str | None) -> ReorientCfg:
+    """A task with the hand and layer that were asked for; None: as trained."""
+    layer = task.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer
+    return replace(task, hand=hand or task.hand, hand_layer=layer)
 
 
 def is_saved_student(policy: Any | None) -> "TypeGuard[SavedStudent]":
@@ -272,9 +296,7 @@ def task_for(
     if base.observation.dynamics == "critic":  # whom nobody asks here
         base = replace(base, observation=replace(base.observation, dynamics="none"))
     return replace(
-        base,
-        hand=hand or base.hand,
-        hand_layer=base.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer,
+        _on_hand(base, hand, hand_layer),
         objects=objects,
         num_envs=num_envs,
         seed=seed,

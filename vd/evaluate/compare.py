@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vd.evaluate.agents import (
     built_in,
-    check_bundle,
+    check_fits,
     is_tracking_policy,
     open_policy,
     sees_clouds,
@@ -52,8 +52,10 @@ def compare(cfg: EvalCfg, condition: str = "", stop_at: float = math.inf) -> "Re
     from vd.device import resolve_device
 
     device = resolve_device(cfg.device)
-    # A file that cannot be used is told before the simulator is imported.
+    # A file that cannot be used, or is of another hand, is told before the simulator is imported.
     policies = {name: open_policy(name, device) for name in cfg.agent_names}
+    for name, policy in policies.items():
+        check_fits(name, policy, cfg.hand, cfg.hand_layer)
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.result import Result, judge
@@ -70,7 +72,6 @@ def compare(cfg: EvalCfg, condition: str = "", stop_at: float = math.inf) -> "Re
     task, start = None, None
     for name, policy in policies.items():
         wanted = task_of(cfg, policy, everything, envs)
-        check_bundle(name, wanted)
         if task != wanted:
             print("building the environments (the first start compiles kernels: minutes)", file=sys.stderr)
             if env is not None:

@@ -7,47 +7,21 @@ import numpy as np
 
 from vd.evaluate.plots import ecdf_figure
 from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row, Summary
-from vd.evaluate.statistics import TOLERANCES_RAD, Interval
+from vd.evaluate.statistics import Interval
 from vd.evaluate.trace import HOLD_S
 from vd.page import write_html
 from vd.paper import PAPER
 
 NOTHING = "–"  # noqa: RUF001
-WORDS = 4
-"""Columns of the main table that hold text."""
+WORDS = 3
+"""Columns of the tables of rows that hold text."""
 _RUN_FILES = ("policy.pt", "student.pt")
 """Files that are called the same in every run, so that their folder tells more."""
-_HEADER = (
-    "policy",
-    "objects",
-    "condition",
-    "stopped by",
-    "success",
-    f"and held {HOLD_S:g} s",
-    "up to symmetry",
-    "within 0.1 rad",
-    "median error [rad]",
-    "time [s]",
-    "lost",
-)
-_OBJECT_HEADER = (
-    "object",
-    "episodes",
-    *OUTCOMES,
-    *(f"<= {tolerance:g} rad" for tolerance in TOLERANCES_RAD),
-    f"<= {PAPER.success.rotation_rad:g} up to symmetry",
-    "median error [rad]",
-    "time [s]",
-)
-_BOUND_HEADER = (
-    "policy",
-    "objects",
-    "condition",
-    "bound [rad]",
-    "near and seen so",
-    "said and right",
-    "mean error [rad]",
-)
+_NAMES = ("policy", "objects", "stopped by")
+_HEADER = (*_NAMES, "success", f"and held {HOLD_S:g} s", "within 0.1 rad", "lost")
+_BESIDE_HEADER = (*_NAMES, "up to symmetry", "median error [rad]", "time [s]")
+_OBJECT_HEADER = ("object", *OUTCOMES, "up to symmetry", "median error [rad]")
+_BOUND_HEADER = ("policy", "objects", "bound [rad]", "near and seen so", "said and right", "mean error [rad]")
 
 
 def shown_name(text: str) -> str:
@@ -118,6 +92,8 @@ def write_page(
         notes=notes,
         header=_HEADER,
         rows=[_cells(row, short) for row in result.rows],
+        beside_header=_BESIDE_HEADER,
+        beside=[_beside_cells(row, short) for row in result.rows],
         hold_s=f"{HOLD_S:g}",
         differences=_difference_cells(result, short),
         figures=figures,
@@ -143,12 +119,17 @@ def terminal_text(result: Result) -> str:
     if not result.rows:
         return ""
     short, suite = labels(result.policies), any(row.condition for row in result.rows)
-    # Of the shares only success has its interval here: a line has to fit.
-    rows = [
-        [cell if column <= WORDS else cell.split(" (")[0] for column, cell in enumerate(_cells(row, short))]
-        for row in result.rows
-    ]
-    parts = [aligned([_HEADER, *rows], words=WORDS)]
+    parts = []
+    for header, cells in ((_HEADER, _cells), (_BESIDE_HEADER, _beside_cells)):
+        # Only the first figure has its interval here: a line has to fit.
+        rows = [
+            [
+                cell if column <= WORDS else cell.split(" (")[0]
+                for column, cell in enumerate(cells(row, short))
+            ]
+            for row in result.rows
+        ]
+        parts.append(aligned([header, *rows], words=WORDS))
     if len(result.policies) == 1 and not suite:
         parts += [
             f"{_heading(row, short)}\n{aligned([_OBJECT_HEADER, *_object_cells(row)], words=1)}"
@@ -187,19 +168,31 @@ def _heading(row: Row, short: dict[str, str]) -> str:
     return f"{short[row.policy]}, {row.group}, stopped by {_stopped_by(row)}"
 
 
+def _where(row: Row) -> str:
+    """The objects of a row, and its condition where a suite names one."""
+    return f"{row.group}, {row.condition}" if row.condition not in ("", row.group) else row.group
+
+
+def _names(row: Row, short: dict[str, str]) -> tuple[str, ...]:
+    return _named(row, short), _where(row), _stopped_by(row)
+
+
 def _cells(row: Row, short: dict[str, str]) -> tuple[str, ...]:
     return (
-        _named(row, short),
-        row.group,
-        row.condition or NOTHING,
-        _stopped_by(row),
+        *_names(row, short),
         percent(row.overall.outcomes["success"]),
         "not tried" if row.held is None else percent(row.held),
-        percent(row.symmetric),
         percent(row.precise),
+        percent(row.overall.outcomes["object falls"]),
+    )
+
+
+def _beside_cells(row: Row, short: dict[str, str]) -> tuple[str, ...]:
+    return (
+        *_names(row, short),
+        percent(row.symmetric),
         number(row.overall.median_error_rad),
         number(row.overall.time_s),
-        percent(row.overall.outcomes["object falls"]),
     )
 
 
@@ -207,11 +200,9 @@ def _object_cells(row: Row) -> list[tuple[str, ...]]:
     def cells(summary: Summary) -> tuple[str, ...]:
         return (
             summary.name,
-            str(summary.episodes),
-            *(percent(rate) for rate in (*summary.outcomes.values(), *summary.success.values())),
+            *(percent(rate) for rate in summary.outcomes.values()),
             percent(summary.symmetric[str(PAPER.success.rotation_rad)]),
             number(summary.median_error_rad),
-            number(summary.time_s),
         )
 
     return [cells(summary) for summary in (row.overall, *row.per_object)]
@@ -221,8 +212,7 @@ def _difference_cells(result: Result, short: dict[str, str]) -> list[tuple[str, 
     return [
         (
             f"{short[other.policy]} over {short[first.policy]}",
-            first.group,
-            first.condition or NOTHING,
+            _where(first),
             f"{100 * d.value:+.1f} points ({100 * d.low:+.1f} to {100 * d.high:+.1f})",
         )
         for first, other, d in result.differences()
@@ -236,8 +226,7 @@ def _bound_cells(result: Result, short: dict[str, str]) -> list[tuple[str, ...]]
     return [
         (
             short[row.policy],
-            row.group,
-            row.condition or NOTHING,
+            _where(row),
             bound,
             share(row.prediction.seen[bound]),
             share(row.prediction.right[bound]),

@@ -153,16 +153,11 @@ class StudentActor:
             seed: Of the errors of camera and scans.
 
         Raises:
-            ValueError: It is one of stage 0, which cannot act, or of another hand.
+            ValueError: It is one of stage 0, which cannot act.
         """
         spec = student.spec
         if spec.stage == PRETRAINED:
             raise ValueError("a student of stage 0 is an encoder, which cannot act; give one of stage 1 or 2")
-        if spec.num_actions != env.num_actions:
-            raise ValueError(
-                f"the student moves {spec.num_actions} joints, the hand {env.hand.name} has "
-                f"{env.num_actions}; use the hand it was trained for"
-            )
         self.env, self.num_actions, self._student = env, spec.num_actions, student.network
         self.rendered = spec.stage == RENDERED
         depth = from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")

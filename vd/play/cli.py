@@ -129,10 +129,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         quiet_warp()
         return replay(cfg)
     check_names([cfg.agent_name], cfg.objects, cfg.hand)
-    print(
-        f"vd-play: {cfg.agent_name}; building the scene (the first start compiles kernels: minutes)",
-        flush=True,
-    )
     quiet_warp()
     if cfg.video is not None:
         frames = record_video(cfg, cfg.video)
@@ -168,13 +164,14 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
         ValueError: A setting, object set or policy cannot be used.
         FileNotFoundError: There is no such policy.
     """
+    trained = _policy(cfg)
     from tqdm import tqdm
 
     from vd.evaluate.cfg import LOG_EVERY_S
     from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
-    env, policy = _open(cfg, _policy(cfg), num_envs=cfg.cells)
+    env, policy = _open(cfg, trained, num_envs=cfg.cells)
     envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
     renderer = Renderer(
@@ -246,16 +243,22 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
 
 
 def _policy(cfg: PlayCfg) -> Any:
-    """What is trained; a file that cannot be used is told before anything slow."""
-    from vd.evaluate.agents import open_policy
+    """What is trained; a file that cannot be used, or is of another hand, is told before anything slow."""
+    from vd.evaluate.agents import check_fits, open_policy
 
-    return open_policy(cfg.agent_name, resolve_device(cfg.device))
+    policy = open_policy(cfg.agent_name, resolve_device(cfg.device))
+    check_fits(cfg.agent_name, policy, cfg.hand, cfg.hand_layer)
+    return policy
 
 
 def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
     """Environment with at least one environment for each object, and what acts in it."""
-    from vd.evaluate.agents import check_bundle, task_for
+    from vd.evaluate.agents import task_for
 
+    print(
+        f"vd-play: {cfg.agent_name}; building the scene (the first start compiles kernels: minutes)",
+        flush=True,
+    )
     device = resolve_device(cfg.device)
     if device == "cpu":
         compile_side_by_side()
@@ -283,7 +286,6 @@ def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
     )
     if cfg.in_air:
         task = replace(task, table=TableCfg(away_share=1.0))
-    check_bundle(cfg.agent_name, task)
     env = ReorientEnv(task, device)
     return env, actor_of(cfg.agent_name, trained, env, seed=cfg.seed)[0]
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from vd.config import Dropped, from_dict, to_dict
-from vd.envs.cfg import ReorientCfg
 from vd.policy import TrainedPolicy, holds, policy_of, read_state
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
@@ -37,15 +36,6 @@ class TrackingPolicy:
 
     teacher: TrainedPolicy
     spec: TrackingSpec
-
-    def __post_init__(self) -> None:
-        """Raise ``ValueError`` for a teacher that observes what no camera shows."""
-        seen = from_dict(ReorientCfg, self.task, where="task of the policy").observation
-        if seen.history:
-            raise ValueError(
-                "a tracking policy knows the present state alone; its teacher observes more "
-                f"(observation.history {seen.history})"
-            )
 
     @property
     def hand(self) -> str:

@@ -17,6 +17,7 @@ import warp as wp
 
 from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.objects.model import ObjectModel
+from vd.kernels.launch import launch
 from vd.kernels.sensor.registration import (
     Eye,
     fit_poses_kernel,
@@ -137,9 +138,9 @@ class Registration:
         ]
         mesh = array([mesh.id for mesh in meshes], wp.uint64)
         off = wp.empty(samples.shape[:2], dtype=float, device=device)
-        self._launch(off_mesh_kernel, off.shape, [shapes.samples, mesh], [off])
+        launch(off_mesh_kernel, off.shape, [shapes.samples, mesh], [off])
         meshed = array(np.sqrt(np.square(off.numpy()).mean(axis=1)) < ON_MESH_M, wp.int32)
-        self._launch(
+        launch(
             shape_distance_kernel,
             shapes.distance.shape,
             [shapes.samples, mesh, shapes.half, meshed],
@@ -184,7 +185,7 @@ class Registration:
         if points is not None:
             self._nearness.zero_()
             cloud = wp.from_torch(points.contiguous(), dtype=wp.vec3)
-            self._launch(nearness_kernel, cloud.shape, [self._eye, cloud], [self._nearness])
+            launch(nearness_kernel, cloud.shape, [self._eye, cloud], [self._nearness])
         self.looks.masked_fill_(fresh, 0)
         seen_now, known = count > 0, self.looks > 0
         self._follow(wp.from_torch(torch.where(known & seen_now, self._worlds, -1)), inputs)
@@ -241,7 +242,7 @@ class Registration:
         wp.copy(self._found[:, known], self._kept[0])
         self._fit(self._found[:, known], self._cost[:, known], envs, STEPS, 1, inputs)
         # What falls is 4 cm farther at the next look, and steps look FAR_M far.
-        self._launch(
+        launch(
             replace_poses_kernel,
             (len(envs), KEPT),
             [*self._placing, envs, WORSE, *self._kept, self._cost[:, known], *inputs],
@@ -251,20 +252,20 @@ class Registration:
         first = wp.from_torch((self.looks * STRIDE) % ROTATIONS)
         self._start(self._found[:, others], envs, first, inputs)
         self._fit(self._found[:, others], self._cost[:, others], envs, STEPS, 1, inputs)
-        self._launch(take_better_kernel, (len(envs), KEPT), [envs, KEPT], [self._found, self._cost])
+        launch(take_better_kernel, (len(envs), KEPT), [envs, KEPT], [self._found, self._cost])
         self._keep(KEPT, envs, self._found, self._cost)
 
     def _start(self, pose: wp.array, envs: wp.array, first: wp.array, inputs: list[wp.array]) -> None:
         """Write poses [M, C] in so many rotations, from the given ones on."""
         given = [*self._placing, envs, first, self._rotations]
-        self._launch(start_poses_kernel, pose.shape, [*given, *inputs], [pose])
+        launch(start_poses_kernel, pose.shape, [*given, *inputs], [pose])
 
     def _fit(
         self, pose: wp.array, cost: wp.array, envs: wp.array, steps: int, every: int, inputs: list[wp.array]
     ) -> None:
         """Improve poses [M, C], and write their misfits."""
         sizes = [FAR_M, steps, every, EVERY_SAMPLE]
-        self._launch(
+        launch(
             fit_poses_kernel,
             pose.shape,
             [self._shapes, self._eye, *sizes, envs, *inputs, self._nearness],
@@ -274,7 +275,4 @@ class Registration:
     def _keep(self, known: int, envs: wp.array, found: wp.array, cost: wp.array) -> None:
         """Keep the best of poses [M, C], the first of which were kept before."""
         inputs = [APART_RAD, STAY, SHARE, known, envs, found]
-        self._launch(keep_poses_kernel, len(envs), inputs, [cost, *self._kept])
-
-    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        launch(keep_poses_kernel, len(envs), inputs, [cost, *self._kept])
