@@ -163,6 +163,8 @@ def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], hand
     command = np.tile(0.5 * (hand.lower + hand.upper), (len(rows), 1))
     enabled = np.ones(command.shape, dtype=bool)
     for name in joints:
+        if name not in hand.joint_names:
+            raise ValueError(f"the hand has no joint {name}")
         column = hand.joint_names.index(name)
         command[:, column] = [float(row[f"command.{name}"]) for row in rows]
         enabled[:, column] = [row.get(f"enabled.{name}", "1") == "1" for row in rows]
