@@ -257,6 +257,8 @@ def test_pictures_of_markers_give_the_layer_that_the_loop_reads(hand, kept, tmp_
     assert place.fx == hand.camera.fx
     with pytest.raises(ValueError, match="give --hand dclaw3"):
         calibrate(CalibrateCfg(hand="dclaw4", views=folder / "camera.views"))
+    with pytest.raises(ValueError, match=r"^--views \S+none: there is no \S+views\.json; .*--views out"):
+        calibrate(CalibrateCfg(hand="dclaw3", views=folder / "none"))
 
 
 def test_a_bad_condition_is_warned_of(kept, tmp_path, capsys):

@@ -229,10 +229,14 @@ def test_motions_go_finger_by_finger_and_a_plan_of_another_hand_is_refused(hand,
     assert {motion.excitation.conditions["p_gain"] for motion in motions} == {200.0, 100.0, 50.0}
     with pytest.raises(ValueError, match="fingers 0 to 2"):
         record.motions_of(hand, (3,), ("chirp",))
-    (tmp_path / "next_experiment.json").write_text('{"trajectories": [], "joints": ["f9_j1"]}')
-    for path in (tmp_path, tmp_path / "nowhere.json"):
-        with pytest.raises(record.RecordError, match="no plan for dclaw3"):
-            record.read_plan(path, hand)
+    (tmp_path / "of_another.csv").write_text("t,command.f9_j1\n0.0,0.0\n")
+    for file, fault in (("of_another.csv", "f9_j1"), ("gone.csv", "gone.csv")):
+        plan = {"trajectories": [{"file": file}], "joints": ["f9_j1"]}
+        (tmp_path / "next_experiment.json").write_text(json.dumps(plan))
+        with pytest.raises(record.RecordError, match=f"no plan for dclaw3: .*{fault}"):
+            record.read_plan(tmp_path, hand)
+    with pytest.raises(record.RecordError, match="no plan for dclaw3"):
+        record.read_plan(tmp_path / "nowhere.json", hand)
 
 
 @pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])

@@ -83,6 +83,8 @@ def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_pa
     np.testing.assert_array_equal(again.offset, turned.offset)
     with pytest.raises(CalibrationError, match="f3_j1"):
         read_joints(path, load_hand("dclaw4"))
+    with pytest.raises(CalibrationError, match=r"^--calibration \S+none\.json: No such file.*leave it out"):
+        read_joints(tmp_path / "none.json", hand)
 
 
 @pytest.mark.parametrize(

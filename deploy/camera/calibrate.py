@@ -247,6 +247,11 @@ def read_views(folder: Path, hand: HandModel) -> tuple[Intrinsics, float, list[S
                 raise ValueError(f"{row.image} has another size than the lens, or other joints than the hand")
             shots.append(Shot(np.array(row.joint_q), image))
         return lens, record.side_m, shots
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise ValueError(
+            f"--views {folder}: there is no {error.filename}; give the folder .views that an earlier run "
+            "left beside its --out, or leave --views out to take new ones"
+        ) from error
     except (OSError, TypeError, ValueError) as error:  # of JSON, fields and pictures too
         raise ValueError(f"{file} holds no views to solve ({error}); take them again") from error
 

@@ -115,11 +115,16 @@ def read_joints(path: Path, hand: HandModel) -> Joints:
     """Read a calibration file.
 
     Raises:
-        CalibrationError: It is no calibration, or not one of this hand.
+        CalibrationError: It cannot be read, is no calibration, or not one of this hand.
     """
     try:
         motors = _by_joint(from_dict(_File, json.loads(Path(path).read_text()), where="the file"), hand)
-    except (OSError, TypeError, ValueError) as error:  # of JSON, text and fields too
+    except OSError as error:
+        raise CalibrationError(
+            f"--calibration {path}: {error.strerror}; give a file with an entry for each joint of "
+            f"{hand.name}, or leave it out where IDs, zeros and directions are the default"
+        ) from error
+    except (TypeError, ValueError) as error:  # of JSON, text and fields too
         raise CalibrationError(f"{path} is not a calibration of {hand.name}: {error}") from error
     ids = [motor.id for motor in motors]
     sign = np.array([motor.sign for motor in motors])

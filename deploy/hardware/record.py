@@ -4,7 +4,7 @@ import csv
 import itertools
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -143,30 +143,35 @@ def read_plan(path: Path, hand: "HandModel") -> list[Motion]:
     Raises:
         RecordError: It is no such plan, or one of another hand.
     """
-    from vd.gap.excitations import Excitation
-
     file = path / "next_experiment.json" if path.is_dir() else path
     try:
         plan: dict[str, Any] = json.loads(file.read_text())
-        entries, joints = plan["trajectories"], plan["joints"]
-        columns = [hand.joint_names.index(name) for name in joints]
-    except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        return [_planned(file.parent, entry, plan["joints"], hand) for entry in plan["trajectories"]]
+    except RecordError:
+        raise
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise RecordError(f"{file} is no plan for {hand.name}: {error}; vd-gap plan writes one") from error
-    motions = []
-    for entry in entries:
-        with (file.parent / entry["file"]).open(newline="") as stream:
-            rows = list(csv.DictReader(stream))
-        time_s = np.array([float(row["t"]) for row in rows])
-        command = np.tile(0.5 * (hand.lower + hand.upper), (len(rows), 1))
-        enabled = np.ones(command.shape, dtype=bool)
-        for name, column in zip(joints, columns, strict=True):
-            command[:, column] = [float(row[f"command.{name}"]) for row in rows]
-            enabled[:, column] = [row.get(f"enabled.{name}", "1") == "1" for row in rows]
-        excitation = Excitation(
-            entry["excitation"], tuple(entry["joints"]), time_s, command, entry["conditions"], enabled
-        )
-        motions.append(_motion("plan_" + Path(entry["file"]).name, excitation, hand))
-    return motions
+
+
+def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], hand: "HandModel") -> Motion:
+    """The motion of a plan's entry, whose file is in ``folder``."""
+    from vd.gap.excitations import Excitation
+
+    with (folder / entry["file"]).open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    time_s = np.array([float(row["t"]) for row in rows])
+    command = np.tile(0.5 * (hand.lower + hand.upper), (len(rows), 1))
+    enabled = np.ones(command.shape, dtype=bool)
+    for name in joints:
+        if name not in hand.joint_names:
+            raise ValueError(f"the hand has no joint {name}")
+        column = hand.joint_names.index(name)
+        command[:, column] = [float(row[f"command.{name}"]) for row in rows]
+        enabled[:, column] = [row.get(f"enabled.{name}", "1") == "1" for row in rows]
+    excitation = Excitation(
+        entry["excitation"], tuple(entry["joints"]), time_s, command, entry["conditions"], enabled
+    )
+    return _motion("plan_" + Path(entry["file"]).name, excitation, hand)
 
 
 def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
