@@ -114,26 +114,26 @@ def clouds(rows):
 
 def test_a_first_look_finds_any_rotation_and_later_ones_improve_it():
     truth = torch.tensor(Rotation.random(12, random_state=1).as_matrix(), dtype=torch.float32)
-    aligner = Aligner(NearSighted(truth), 12)
     goal, seen = clouds(torch.arange(12.0))
-    errors = [turn_angle(aligner.look(goal, seen).rotation.transpose(-1, -2) @ truth) for _ in range(4)]
+    aligner = Aligner(NearSighted(truth), goal)
+    errors = [turn_angle(aligner.look(seen).rotation.transpose(-1, -2) @ truth) for _ in range(4)]
     assert errors[0].max() < 0.2 and errors[3].max() < 0.05
-    found = aligner.look(goal, seen + 0.1)
+    found = aligner.look(seen + 0.1)
     torch.testing.assert_close(found.position, torch.full((12, 3), 0.11))
 
 
 def test_another_hypothesis_takes_over_and_a_reset_begins_anew():
     truth = torch.tensor(Rotation.random(2, random_state=2).as_matrix(), dtype=torch.float32)
     network = NearSighted(truth)
-    aligner = Aligner(network, 2, SearchCfg(restart_looks=2))
     goal, seen = clouds(torch.arange(2.0))
-    aligner.look(goal, seen)
+    aligner = Aligner(network, goal, SearchCfg(restart_looks=2))
+    aligner.look(seen)
     network.truth = truth @ Rotation.from_euler("x", 2.0).as_matrix().astype(np.float32)  # it was wrong
     aligner.reset(torch.tensor([True, False]))
-    first = turn_angle(aligner.look(goal, seen).rotation.transpose(-1, -2) @ network.truth)
+    first = turn_angle(aligner.look(seen).rotation.transpose(-1, -2) @ network.truth)
     assert first[0] < 0.2 and first[1] > 0.5
     for _ in range(60):
-        later = turn_angle(aligner.look(goal, seen).rotation.transpose(-1, -2) @ network.truth)
+        later = turn_angle(aligner.look(seen).rotation.transpose(-1, -2) @ network.truth)
     assert later.max() < 0.05
 
 

@@ -1,4 +1,4 @@
-"""``vd-train tracker``: let a teacher act by a camera, and choose when it stops; nothing is learned."""
+"""``vd-train tracker``: let a teacher act by a camera, and choose when it stops; its layers stay."""
 
 import math
 from collections.abc import Sequence
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 class TrackerCfg:
     """Write a tracking policy: a teacher that acts by a depth camera, on objects of known shape.
 
+    With --alignment it is a vision policy: of the shape it knows no more than the points of the goal.
+
     It finds the object among the camera's points. Nothing is learned; its stopping rules are chosen on
     episodes with objects of validation, those of vd-eval with the same flags and --goals points.
     """
@@ -31,11 +33,13 @@ class TrackerCfg:
     """The teacher: a policy.pt, a run's folder, or the name of an installed one."""
     objects: tuple[str, ...]
     """Object sets to choose the stopping rules on, not those of the training."""
+    alignment: Path | None = None
+    """Network that finds objects by their goals' points, the alignment.pt of vd-train student --stage 0."""
     out: Path = Path("tracking.pt")
     """File to write."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m] and
-    quaternion xyzw; the hand's own camera by default."""
+    quaternion xyzw; that of the network's training or the hand's own camera by default."""
     episodes: int = 256
     """Episodes; rounded up to as many of each object."""
     tolerance_rad: float = PAPER.success.rotation_rad
@@ -76,6 +80,7 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     from vd.device import resolve_device
     from vd.tracking.policy import TrackingPolicy, TrackingSpec, tracking_export
     from vd.train.checkpoint import save_checkpoint
+    from vd.vision.saved import load_alignment
     from vd.warp_quiet import quiet_warp
 
     quiet_warp()
@@ -84,7 +89,12 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     if teacher is None:
         raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
     spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
-    trace = _episodes(cfg, TrackingPolicy(teacher, spec), device)
+    policy = TrackingPolicy(teacher, spec)
+    if cfg.alignment is not None:
+        network, learned = load_alignment(cfg.alignment, device)
+        spec = replace(spec, camera=cfg.camera or learned.camera, alignment=learned.network)
+        policy = TrackingPolicy(teacher, spec, network)
+    trace = _episodes(cfg, policy, device)
     found = calibrate_trace(trace, tolerance_rad=cfg.tolerance_rad)
     try:
         precise = calibrate_trace(trace, tolerance_rad=PAPER.success.precise_rad)
@@ -97,7 +107,7 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
         precise=None if precise is None else precise.rule,
         calibrated_on=_conditions(cfg, found.episodes),
     )
-    save_checkpoint(cfg.out, tracking_export(TrackingPolicy(teacher, spec)))
+    save_checkpoint(cfg.out, tracking_export(replace(policy, spec=spec)))
     for result in (found, precise):
         if result is None:
             print(f"{cfg.out}: no rule stops any within {PAPER.success.precise_rad:g} rad: none for it")

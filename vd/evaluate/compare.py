@@ -196,7 +196,7 @@ def actor_of(
     if is_tracking_policy(policy):
         from vd.evaluate.tracking import TrackingActor
 
-        return TrackingActor(env, policy, **settings), "tracking", "rendered clouds", policy.spec.rule_for
+        return TrackingActor(env, policy, **settings), policy.kind, "rendered clouds", policy.spec.rule_for
     from vd.evaluate.student import StudentActor
 
     actor = StudentActor(env, policy, **settings)

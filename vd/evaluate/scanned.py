@@ -59,7 +59,7 @@ def known_by_points(item: ObjectModel, points: np.ndarray, device: str) -> Objec
 
 
 def known_objects(
-    objects: Sequence[ObjectModel], goals: Goals, *, seed: int, device: str
+    objects: Sequence[ObjectModel], goals: Goals, *, seed: int, device: str, surfaces: bool = True
 ) -> Sequence[ObjectModel]:
     """Objects as a policy knows them.
 
@@ -68,13 +68,14 @@ def known_objects(
         goals: By the mesh: as they are; else by their samples, or a scan of these.
         seed: Of the scans.
         device: Warp device.
+        surfaces: Lay surfaces through points; else the points themselves are all that is known.
     """
     if goals == "mesh":
         return objects
     rng = np.random.default_rng(seed)
-    return [
-        known_by_points(
-            item, item.surface_points if goals == "points" else scan(item.surface_points, rng), device
-        )
-        for item in objects
+    clouds = [
+        item.surface_points if goals == "points" else scan(item.surface_points, rng) for item in objects
     ]
+    if not surfaces:
+        return [replace(item, surface_points=points) for item, points in zip(objects, clouds, strict=True)]
+    return [known_by_points(item, points, device) for item, points in zip(objects, clouds, strict=True)]

@@ -1,4 +1,4 @@
-"""A tracking policy at work in an environment."""
+"""A tracking or vision policy at work in an environment."""
 
 from typing import Any
 
@@ -13,11 +13,11 @@ from vd.tracking.tracker import Tracker
 
 
 class TrackingActor:
-    """A tracking policy in every environment of an environment.
+    """A tracking or vision policy in every environment of an environment.
 
     Attributes:
         num_actions: D.
-        predicted: Angle that it found before the latest action [rad], shape [N].
+        predicted: Distance to the goal that it expected before the latest action [rad], shape [N].
         active: Where it acts, bool [N]; elsewhere its actions are 0.
     """
 
@@ -49,7 +49,9 @@ class TrackingActor:
         self._tracker = Tracker(
             policy,
             env.hand,
-            known_objects(env.objects, goals, seed=seed, device=env.device),
+            known_objects(
+                env.objects, goals, seed=seed, device=env.device, surfaces=policy.alignment is None
+            ),
             camera,
             world_object=scene.world_object,
             world_scale=scene.world_scale,

@@ -1,8 +1,10 @@
 """From joints and a camera's points to what a teacher would observe: of the simulator and of a robot alike.
 
-The object is found by its known shape among the camera's points (:mod:`vd.tracking.registration`) and
-followed. N hands, D joints, G fingers, K camera points. World frame unless said otherwise: z up; metres,
-radians, quaternions xyzw.
+The object is found among the camera's points and followed: by its known shape
+(:mod:`vd.tracking.registration`), or by the cloud of its goal alone (:mod:`vd.vision.finder`).
+
+N hands, D joints, G fingers, K camera points. World frame unless said otherwise: z up; metres, radians,
+quaternions xyzw.
 """
 
 from collections.abc import Sequence
@@ -23,8 +25,10 @@ from vd.quaternions import canonical, product, relative_rotation, rotated, rotat
 from vd.senses import Senses
 from vd.tracking.fingertips import Fingertips
 from vd.tracking.object_points import object_points
-from vd.tracking.registration import POINTS, Registration
+from vd.tracking.registration import Registration
 from vd.tracking.symmetry import nearest_goal, symmetries_of_worlds
+from vd.vision.alignment import AlignmentNetwork
+from vd.vision.finder import GoalFinder
 
 UNSEEN = ("object_orientation", "goal_orientation")
 """Orientations in the axes of the object's file, which no camera shows: zeros stand for them."""
@@ -44,6 +48,8 @@ class Found:
     """[m/s] [N, 3]; zero where it is not known."""
     spin: torch.Tensor
     """Angular velocity [rad/s] [N, 3]; zero where it is not known."""
+    error: torch.Tensor
+    """Angle by which the orientation is expected to be wrong [rad] [N]; zero of known shapes."""
 
 
 class Observer:
@@ -51,12 +57,13 @@ class Observer:
 
     Args:
         hand: The hand.
-        objects: The objects, as their shapes are known.
+        objects: The objects, as their shapes are known; with ``alignment`` only their surface points count.
         num_observations: O, values that the teacher observes: its state, and with more the object's shape.
         world_object: Object of each hand [N].
         world_scale: Size factor of each hand's object [N].
         camera: What sees them, posed in the base frame.
         control_hz: Control steps a second.
+        alignment: Finds objects by their goals' clouds; None: they are found by their shapes.
         device: Warp device.
     """
 
@@ -70,6 +77,7 @@ class Observer:
         world_scale: np.ndarray,
         camera: CameraModel,
         control_hz: float,
+        alignment: AlignmentNetwork | None = None,
         device: str,
     ):
         self._hand, self._rate, self._device = hand, control_hz, device
@@ -82,9 +90,14 @@ class Observer:
         self._kinematics = HandKinematics(hand, link_body=links, base=BASE_IN_WORLD, device=device)
         self._hand_cloud = SceneClouds(hand, (), link_body=links, object_body=-1, **envs)
         self._hand_end = array([self._hand_cloud.ends[1]], wp.int32)
-        self._registration = Registration(objects, camera=camera, **envs)
-        self._before = self._registration.pose[:, 0].clone()
-        self._symmetry = symmetries_of_worlds(objects, world_object, device)
+        self._finder: Registration | GoalFinder
+        if alignment is None:
+            self._finder = Registration(objects, camera=camera, **envs)
+            self._symmetry = symmetries_of_worlds(objects, world_object, device)
+        else:
+            self._finder = GoalFinder(alignment, objects, world_object=world_object, world_scale=world_scale)
+            self._symmetry = torch.tensor([0.0, 0.0, 0.0, 1.0], device=place).expand(len(world_object), 1, 4)
+        self._before = self._finder.pose[:, 0].clone()
         self._fingertips = Fingertips(hand, place)
         self._links = wp.empty((len(world_object), len(links)), dtype=wp.transform, device=device)
         self._goal = wp.empty(len(world_object), dtype=wp.quat, device=device)
@@ -116,9 +129,9 @@ class Observer:
             senses: What is sensed.
 
         Returns:
-            The teacher's observation in the world frame [N, O], and the angle from the object to its goal
-            [rad] [N]. Of the orientations that look like the wanted one (:mod:`.symmetry`) the nearest is
-            the goal: which of them it is, nobody can see.
+            The teacher's observation in the world frame [N, O], and how far the object is expected to be from
+            its goal [rad] [N]. Of the orientations in which a known shape looks like the wanted one
+            (:mod:`.symmetry`) the nearest is the goal: which of them it is, nobody can see.
         """
         self._kinematics.write(wp.from_torch(senses.joint_q.contiguous()), self._links)
         found = self.found = self._find(senses)
@@ -141,7 +154,7 @@ class Observer:
             self._shapes.observe(pose, 0, self._links, wanted, wp.from_torch(observation), first)
         for name, values in parts.items():
             observation[:, self._columns[name]] = values
-        return observation, angle
+        return observation, torch.hypot(angle, found.error)
 
     def _find(self, senses: Senses) -> Found:
         """Find the objects among the camera's points, or follow them; links are posed."""
@@ -150,8 +163,8 @@ class Observer:
         points = wp.from_torch(cloud, dtype=wp.vec3)
         self._hand_cloud.write(points, self._links, self._goal, with_object=False)
         cloud[:, first:] = senses.points
-        seen, count = object_points(points, self._hand_end, PAPER.cloud.voxel_m, POINTS)
-        followed, before = self._registration, self._before
+        followed, before = self._finder, self._before
+        seen, count = object_points(points, self._hand_end, PAPER.cloud.voxel_m, followed.most)
         followed.look(seen, count, fresh=senses.fresh, points=senses.points)
         pose, base, turn = followed.pose[:, 0], self._base, self._base[3:].expand(len(seen), 4)
         # A first look knows no motion.
@@ -163,6 +176,7 @@ class Observer:
             position=base[:3] + rotated(turn, pose[:, :3]),
             velocity=moves * rotated(turn, pose[:, :3] - before[:, :3]),
             spin=moves * 2.0 * rotated(turn, step[:, :3] * step[:, 3:].sign()),  # of a small angle
+            error=followed.error,
         )
         before.copy_(pose)
         return found

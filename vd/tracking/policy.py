@@ -1,13 +1,19 @@
-"""Tracking policies in files: a teacher, and how it is let act on what a camera shows."""
+"""Policies by camera in files: a teacher, and how it is let act on what a camera shows.
+
+Tracking policies find the object by its known shape, vision policies by a network that was trained for it.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from vd.config import Dropped, from_dict, to_dict
 from vd.policy import TrainedPolicy, holds, policy_of, read_state
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
+from vd.vision.alignment import AlignmentNetwork
+from vd.vision.cfg import AlignmentCfg
+from vd.vision.saved import alignment_network
 
 TRACKING_FORMAT = "visual-dexterity tracking 1"
 
@@ -23,19 +29,28 @@ class TrackingSpec(StoppingRules):
     """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the hand's."""
     depth: DepthCameraCfg = field(default_factory=DepthCameraCfg)
     """Points and crop of the camera's clouds."""
+    alignment: AlignmentCfg | None = None
+    """Sizes of the network that finds the object by the cloud of its goal; None: it is found by its shape."""
 
 
 @dataclass(frozen=True)
 class TrackingPolicy:
-    """A teacher that acts on a camera's view of an object of known shape; it has learned nothing itself.
+    """A teacher that acts on a camera's view of an object; its layers have learned nothing for that.
 
     Attributes:
         teacher: Its layers, critic, and task.
         spec: All else.
+        alignment: Finds the object by the cloud of its goal; None: it is found by its known shape.
     """
 
     teacher: TrainedPolicy
     spec: TrackingSpec
+    alignment: AlignmentNetwork | None = None
+
+    @property
+    def kind(self) -> Literal["tracking", "vision"]:
+        """What it is called."""
+        return "tracking" if self.alignment is None else "vision"
 
     @property
     def hand(self) -> str:
@@ -63,6 +78,8 @@ def tracking_export(policy: TrackingPolicy) -> dict[str, Any]:
     teacher = policy.teacher
     parts = {"actor_state_dict": teacher.weights, "critic_state_dict": teacher.critic_weights}
     weights = {key: {name: v.cpu() for name, v in part.items()} for key, part in parts.items() if part}
+    network = policy.alignment
+    own = {} if network is None else {name: v.cpu() for name, v in network.state_dict().items()}
     return {
         "format": TRACKING_FORMAT,
         "tracking": to_dict(policy.spec),
@@ -73,6 +90,7 @@ def tracking_export(policy: TrackingPolicy) -> dict[str, Any]:
             "env_steps": teacher.env_steps,
             **weights,
         },
+        **({"alignment_state_dict": own} if own else {}),
     }
 
 
@@ -89,8 +107,9 @@ def load_tracking(path: str | Path, device: str = "cpu") -> TrackingPolicy:
     """
     state = read_state(path, device, remedy="copy it again, or write it anew with vd-train tracker")
     try:
-        return TrackingPolicy(
-            policy_of(state["teacher_state_dict"], device), from_dict(TrackingSpec, state["tracking"])
-        )
+        spec, network = from_dict(TrackingSpec, state["tracking"]), None
+        if spec.alignment is not None:
+            network = alignment_network(spec.alignment, state["alignment_state_dict"], device)
+        return TrackingPolicy(policy_of(state["teacher_state_dict"], device), spec, network)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: {error}; write it anew with vd-train tracker") from error

@@ -24,7 +24,7 @@ class Decision:
     action: torch.Tensor
     """Mean actions [N, D]."""
     angle: torch.Tensor
-    """Angle from the object, as it is found, to what looks like its goal [rad] [N]: it is stopped by this."""
+    """How far the object is expected to be from what looks like its goal [rad] [N]: it is stopped by this."""
 
 
 class Tracker:
@@ -73,6 +73,7 @@ class Tracker:
             world_scale=np.ones(len(objects_of)) if world_scale is None else world_scale,
             camera=camera,
             control_hz=task.sim.control_hz,
+            alignment=policy.alignment,
             device=device,
         )
         place, seen = wp.device_to_torch(device), task.observation

@@ -158,75 +158,75 @@ class Aligner:
 
     Args:
         network: The trained network.
-        count: N.
+        goal: Goals' clouds [m] [N, P, 3].
         search: How hypotheses are handled.
     """
 
-    def __init__(self, network: AlignmentNetwork, count: int, search: SearchCfg | None = None):
+    def __init__(self, network: AlignmentNetwork, goal: torch.Tensor, search: SearchCfg | None = None):
         self.network, self._cfg = network, search or SearchCfg()
-        device = network.summary.device
-        self._starts = cube_rotations(device)
-        self._kept = torch.eye(3, device=device).repeat(count, self._cfg.kept, 1, 1)  # the best first
-        self._looks = torch.zeros(count, dtype=torch.long, device=device)
+        self._starts = cube_rotations(goal.device)
+        self._goal = goal - goal.mean(dim=1, keepdim=True)
+        self._near = network.neighbours(self._goal)
+        self._kept = torch.eye(3, device=goal.device).repeat(len(goal), self._cfg.kept, 1, 1)  # best first
+        self._looks = torch.zeros(len(goal), dtype=torch.long, device=goal.device)
 
     def reset(self, rows: torch.Tensor) -> None:
-        """Forget what is known of objects, a mask or indices: the goal is another, or the object."""
+        """Forget what is known of objects, a mask or indices."""
         self._looks[rows] = 0
 
     @torch.no_grad()
-    def look(self, goal: torch.Tensor, seen: torch.Tensor) -> Alignment:
+    def look(self, seen: torch.Tensor, rows: torch.Tensor | None = None) -> Alignment:
         """Compare once.
 
         Args:
-            goal: Goals' clouds [m] [N, P, 3].
-            seen: What is seen of the objects [m] [N, P', 3], points in no order.
+            seen: What is seen of the objects [m] [R, P', 3], points in no order.
+            rows: Which objects, each once [R]; all by default.
         """
+        rows = torch.arange(len(self._goal), device=seen.device) if rows is None else rows
         mean = seen.mean(dim=1)
-        goal = goal - goal.mean(dim=1, keepdim=True)
         seen = seen - mean[:, None]
         tokens = self.network.encode(seen, SEEN, self.network.neighbours(seen))
-        goals = (goal, self.network.neighbours(goal))
-        new = self._looks == 0
+        new = self._looks[rows] == 0
         if bool(new.any()):
-            starts = self._starts.expand(int(new.sum()), -1, -1, -1)
-            for _ in range(self._cfg.passes):
-                some = (goal[new], goals[1][new])
-                starts, _, error = self._improve(some, tokens[new], starts)
-            best = error.topk(self._cfg.kept, dim=1, largest=False).indices
-            self._kept[new] = starts.take_along_dim(best[:, :, None, None], dim=1)
-        self._restart(~new)
-        found, offset, error = self._improve(goals, tokens, self._kept)
+            self._begin(rows[new], tokens[new])
+        self._restart(rows[~new])
+        found, offset, error = self._improve(rows, tokens, self._kept[rows])
         order = error.argsort(dim=1)
-        self._kept = found.take_along_dim(order[:, :, None, None], dim=1)
-        self._looks += 1
+        self._kept[rows] = found = found.take_along_dim(order[:, :, None, None], dim=1)
+        self._looks[rows] += 1
         offset = offset.take_along_dim(order[:, :1, None], dim=1)[:, 0]
-        return Alignment(self._kept[:, 0].clone(), mean + offset, error.amin(dim=1))
+        return Alignment(found[:, 0], mean + offset, error.amin(dim=1))
 
-    def _restart(self, known: torch.Tensor) -> None:
+    def _begin(self, rows: torch.Tensor, tokens: torch.Tensor) -> None:
+        """Keep the best that starts come to."""
+        found, error = self._starts.expand(len(rows), -1, -1, -1), torch.empty(0)
+        for _ in range(self._cfg.passes):
+            found, _, error = self._improve(rows, tokens, found)
+        best = error.topk(self._cfg.kept, dim=1, largest=False).indices
+        self._kept[rows] = found.take_along_dim(best[:, :, None, None], dim=1)
+
+    def _restart(self, rows: torch.Tensor) -> None:
         """Now and then, begin anew with the last hypothesis, at a start relative to the best."""
         if self._cfg.kept < 2:
             return
-        due = known & (self._looks % self._cfg.restart_looks == 0)
-        turn = (self._looks // self._cfg.restart_looks) % (len(self._starts) - 1) + 1  # not the best itself
-        anew = self._starts[turn] @ self._kept[:, 0]
-        self._kept[:, -1] = torch.where(due[:, None, None], anew, self._kept[:, -1])
+        looks = self._looks[rows]
+        due = looks % self._cfg.restart_looks == 0
+        turn = (looks // self._cfg.restart_looks) % (len(self._starts) - 1) + 1  # not the best itself
+        self._kept[rows[due], -1] = (self._starts[turn] @ self._kept[rows, 0])[due]
 
     def _improve(
-        self, goals: tuple[torch.Tensor, torch.Tensor], seen: torch.Tensor, rotations: torch.Tensor
+        self, rows: torch.Tensor, seen: torch.Tensor, rotations: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """One pass over hypotheses [N, H, 3, 3]: better ones, their offsets [N, H, 3] and errors [N, H]."""
-        goal, near = goals
-        count, hypotheses = rotations.shape[:2]
-        flat = rotations.flatten(0, 1)
-        row = torch.arange(count, device=goal.device).repeat_interleave(hypotheses)
+        """One pass over hypotheses [R, H, 3, 3]: better ones, their offsets [R, H, 3] and errors [R, H]."""
+        shape, flat = rotations.shape[:2], rotations.flatten(0, 1)
+        pair = torch.arange(len(rows), device=rows.device).repeat_interleave(shape[1])
         parts = []
-        for some in torch.arange(len(row), device=goal.device).split(PAIRS_AT_ONCE):
-            turned = goal[row[some]] @ flat[some].transpose(-1, -2)
-            parts.append(
-                self.network.compare(self.network.encode(turned, GOAL, near[row[some]]), seen[row[some]])
-            )
+        for some in torch.arange(len(pair), device=rows.device).split(PAIRS_AT_ONCE):
+            goal = rows[pair[some]]
+            turned = self._goal[goal] @ flat[some].transpose(-1, -2)
+            tokens = self.network.encode(turned, GOAL, self._near[goal])
+            parts.append(self.network.compare(tokens, seen[pair[some]]))
         better = torch.cat([part.rotation for part in parts]) @ flat
         better = matrices(torch.cat([better[..., 0], better[..., 1]], dim=-1))  # still rotations after many
         offset, error = torch.cat([p.offset for p in parts]), torch.cat([p.error for p in parts])
-        shape = (count, hypotheses)
         return better.unflatten(0, shape), offset.unflatten(0, shape), error.unflatten(0, shape)

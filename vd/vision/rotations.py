@@ -50,6 +50,25 @@ def matrices(columns: torch.Tensor) -> torch.Tensor:
     return torch.stack((first, second, torch.linalg.cross(first, second)), dim=-1)
 
 
+def quaternions(matrix: torch.Tensor) -> torch.Tensor:
+    """Quaternions xyzw [.., 4] of rotation matrices [.., 3, 3]; of either sign."""
+    m = matrix.flatten(-2)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = m.unbind(-1)
+    x, y, z, w = 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz
+    # Each row is the quaternion times four of its own numbers: the one of the largest loses no digits.
+    rows = torch.stack(
+        [
+            torch.stack([x, xy + yx, xz + zx, zy - yz], dim=-1),
+            torch.stack([xy + yx, y, yz + zy, xz - zx], dim=-1),
+            torch.stack([xz + zx, yz + zy, z, yx - xy], dim=-1),
+            torch.stack([zy - yz, xz - zx, yx - xy, w], dim=-1),
+        ],
+        dim=-2,
+    )
+    best = torch.stack([x, y, z, w], dim=-1).argmax(dim=-1)[..., None, None]
+    return nn.functional.normalize(rows.take_along_dim(best, dim=-2).squeeze(-2), dim=-1)
+
+
 def turn_angle(matrix: torch.Tensor) -> torch.Tensor:
     """Angles [..] in [0, pi] [rad] of rotation matrices [.., 3, 3]; exact for small ones, as acos is not."""
     half = (matrix - torch.eye(3, device=matrix.device)).square().sum((-1, -2)).sqrt() / math.sqrt(8.0)

@@ -84,11 +84,16 @@ def load_alignment(path: str | Path, device: str = "cpu") -> tuple[AlignmentNetw
         raise ValueError(f"{path} holds no network of alignment; give the alignment.pt of a stage 0")
     try:
         spec = from_dict(AlignmentSpec, state["spec"], where="spec")
-        network = AlignmentNetwork(spec.network).to(device)
-        network.load_state_dict(state["alignment_state_dict"])
+        return alignment_network(spec.network, state["alignment_state_dict"], device), spec
     except (ValueError, TypeError, RuntimeError) as error:
         raise ValueError(f"{path}: {error}; it was written by another version") from error
-    return network.eval().requires_grad_(False), spec
+
+
+def alignment_network(cfg: AlignmentCfg, weights: dict[str, Any], device: str) -> AlignmentNetwork:
+    """A network of alignment with weights, in evaluation mode and without gradients."""
+    network = AlignmentNetwork(cfg).to(device)
+    network.load_state_dict(weights)
+    return network.eval().requires_grad_(False)
 
 
 def is_student(path: Path) -> bool:

@@ -1,0 +1,89 @@
+"""Where objects are, by the clouds of their goals alone: what is known of a shape is points of it.
+
+N environments, M seen points at most. Base frame; metres, quaternions xyzw.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from vd.assets_usd.objects.model import ObjectModel
+from vd.vision.alignment import Aligner, AlignmentNetwork
+from vd.vision.rotations import quaternions
+
+POINTS = 512
+"""Points seen of the object that are looked at: as many as the network learned from."""
+LEAST = 16
+"""Of fewer points nothing is told: those that it learned from had twice as many."""
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+"""Multiples of the golden ratio, but for whole numbers, are spread evenly whatever their count."""
+
+
+class GoalFinder:
+    """Finds and follows the object of each environment by a network of alignment.
+
+    The cloud is aligned in its own axes, so that a new goal of the same shape leaves what is known as it is.
+
+    Args:
+        network: The network.
+        objects: The objects; of each the surface points are known.
+        world_object: Object of each environment [N].
+        world_scale: Size factor of each environment's object [N].
+
+    Attributes:
+        pose: Of the cloud's frame in the base frame [N, 1, 7].
+        error: Angle by which its orientation is expected to be wrong [rad] [N].
+        looks: How often each environment's object was seen since it was begun anew, [N] int32.
+        most: Points seen of the object that are looked at.
+    """
+
+    most = POINTS
+
+    def __init__(
+        self,
+        network: AlignmentNetwork,
+        objects: Sequence[ObjectModel],
+        *,
+        world_object: np.ndarray,
+        world_scale: np.ndarray,
+    ):
+        device, envs = network.summary.device, len(world_object)
+        clouds = np.stack([item.surface_points for item in objects])[world_object]
+        scaled = clouds * np.asarray(world_scale)[:, None, None]
+        cloud = torch.tensor(scaled, dtype=torch.float32, device=device)
+        self._mean, self._aligner = cloud.mean(dim=1), Aligner(network, cloud)
+        self._share = (GOLDEN * torch.arange(POINTS, device=device)) % 1.0
+        self.pose = torch.zeros((envs, 1, 7), device=device)
+        self.pose[..., 6] = 1.0
+        self.error = torch.full((envs,), torch.pi, device=device)
+        self.looks = torch.zeros(envs, dtype=torch.int32, device=device)
+
+    def look(
+        self,
+        seen: torch.Tensor,
+        count: torch.Tensor,
+        *,
+        fresh: torch.Tensor,
+        points: torch.Tensor | None = None,
+    ) -> None:
+        """Look once in every environment; where too little is seen of the object all stays as it is.
+
+        Args:
+            seen: Points seen of the object [m], neighbours beside each other [N, M, 3].
+            count: How many there are, [N] int32.
+            fresh: Where nothing is known from before, bool [N].
+            points: All that the camera saw; not looked at.
+        """
+        self.looks.masked_fill_(fresh, 0)
+        self._aligner.reset(fresh)
+        rows = (count >= LEAST).nonzero().flatten()  # waits for the device
+        if not len(rows):
+            return
+        chosen = (self._share * count[rows, None]).long()
+        points = seen[rows].take_along_dim(chosen[..., None], dim=1)
+        found = self._aligner.look(points, rows)
+        place = found.position - (found.rotation @ self._mean[rows, :, None]).squeeze(-1)
+        self.pose[rows, 0] = torch.cat([place, quaternions(found.rotation)], dim=1)
+        self.error[rows] = found.error
+        self.looks[rows] += 1
