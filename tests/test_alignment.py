@@ -18,11 +18,13 @@ from vd.train.student.config import AlignCfg
 from vd.train.student.views import Hands
 from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
 from vd.vision.cfg import AlignmentCfg, SearchCfg
+from vd.vision.finder import LEAST, GoalFinder
 from vd.vision.rotations import (
     angle_between,
     cube_rotations,
     matrices,
     multiply,
+    quaternions,
     random_rotations,
     turn_angle,
     two_columns,
@@ -60,6 +62,9 @@ def test_rotations_agree_with_scipys():
     np.testing.assert_allclose(angle_between(columns), between.magnitude(), atol=2e-3)
     apart = angle_between(two_columns(a), two_columns(b))
     np.testing.assert_allclose(apart, (first.inv() * second).magnitude(), atol=2e-3)
+    every = Rotation.concatenate([first, Rotation.create_group("O")])  # of half a turn too
+    back = quaternions(torch.tensor(every.as_matrix(), dtype=torch.float32))
+    assert (Rotation.from_quat(back.numpy()) * every.inv()).magnitude().max() < 1e-5
     small = torch.tensor(Rotation.from_rotvec([[1e-3, 0.0, 0.0]]).as_matrix(), dtype=torch.float32)
     assert float(turn_angle(small)) == pytest.approx(1e-3, rel=1e-3)
 
@@ -135,6 +140,34 @@ def test_another_hypothesis_takes_over_and_a_reset_begins_anew():
     for _ in range(60):
         later = turn_angle(aligner.look(seen).rotation.transpose(-1, -2) @ network.truth)
     assert later.max() < 0.05
+
+
+def test_a_pose_is_that_of_the_frame_of_the_goals_points():
+    """Whatever is seen as long as it is enough; what is fresh is begun anew."""
+    truth = torch.tensor(Rotation.random(1, random_state=3).as_matrix(), dtype=torch.float32)
+    points = 0.03 * np.concatenate([np.eye(3), np.zeros((1, 3))]) + np.array([0.01, 0.02, -0.03])
+    item = replace(load_set("cube")[0], surface_points=points.astype(np.float32))
+    finder = GoalFinder(
+        NearSighted(truth), [item], world_object=np.zeros(3, int), world_scale=np.full(3, 0.5)
+    )
+    seen = torch.tensor([0.1, 0.2, 0.3]) + 0.001 * torch.randn(3, 20, 3)
+    for look in range(4):
+        finder.look(seen, torch.tensor([20, 20, LEAST - 1]), fresh=torch.tensor([look == 0, look == 3, True]))
+    assert finder.looks.tolist() == [4, 1, 0]
+    assert torch.equal(finder.pose[2, 0], torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
+    found = Rotation.from_quat(finder.pose[:2, 0, 3:].numpy())
+    off = (found * Rotation.from_matrix(truth.numpy()).inv()).magnitude()
+    assert off.max() < 0.2
+    np.testing.assert_allclose(off, finder.error[:2], atol=1e-3)
+    mean = finder.pose[:2, 0, :3].numpy() + found.apply(0.5 * points.mean(axis=0))
+    np.testing.assert_allclose(mean, np.tile([0.11, 0.21, 0.31], (2, 1)), atol=1e-3)
+
+
+def test_points_are_chosen_evenly_whatever_their_number():
+    finder = GoalFinder(AlignmentNetwork(TINY), load_set("cube"), world_object=[0], world_scale=[1.0])
+    for count in (16, 200, 512):
+        often = (finder.share * count).long().bincount(minlength=count)
+        assert len(often) == count and often.min() >= 512 // count - 1 and often.max() <= 512 // count + 2
 
 
 @pytest.fixture(scope="module")

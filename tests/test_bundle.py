@@ -23,6 +23,8 @@ from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRule
 from vd.tracking.policy import load_tracking
 from vd.train.cli import main as train
+from vd.vision.alignment import AlignmentNetwork
+from vd.vision.cfg import AlignmentCfg
 from vd.vision.network import Student
 from vd.vision.saved import SavedStudent, StudentSpec
 
@@ -113,6 +115,25 @@ def test_a_tracking_policy_comes_back(tmp_path, hand, camera):
     edit(tmp_path / "tracking", lambda values: values["network"].update(aim={"enabled": True}))
     with pytest.warns(UserWarning, match=r"network\.aim\.enabled is True; this version ignores it"):
         assert read_bundle(tmp_path / "tracking").spec == original.spec
+
+
+def test_a_vision_policy_comes_back_and_answers_with_its_network(tmp_path):
+    torch.manual_seed(0)
+    sizes = AlignmentCfg(width=16, layers=1, heads=2, tokens=12)
+    network = AlignmentNetwork(sizes).eval().requires_grad_(False)
+    original = load_tracking(SHIPPED_POLICIES["dclaw3-tracking"])
+    original = replace(original, spec=replace(original.spec, alignment=sizes), alignment=network)
+    assert write_bundle(original, tmp_path / "vision").kind == "vision"
+    found = open_policy(str(tmp_path / "vision"), "cpu")
+    assert found.kind == "vision" and found.spec == original.spec
+    clouds = torch.randn(2, 3, 40, 3)
+    assert torch.equal(found.alignment(*clouds).rotation, network(*clouds).rotation)
+    weights = load_file(tmp_path / "vision" / "weights.safetensors")
+    weights["alignment.heads.rotation.2.bias"] += 1.0
+    save_file(weights, tmp_path / "vision" / "weights.safetensors")
+    edit(tmp_path / "vision", lambda _: None)
+    with pytest.raises(ContractError, match="outputs differ by"):
+        read_bundle(tmp_path / "vision")
 
 
 def test_another_hand_is_refused_by_field(teacher_bundle, hand, capsys):

@@ -31,12 +31,23 @@ from vd.tracking.policy import TrackingPolicy, TrackingSpec, is_tracking, load_t
 from vd.tracking.tracker import Tracker
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main as vd_train
+from vd.vision.alignment import AlignmentNetwork
+from vd.vision.cfg import AlignmentCfg
+from vd.vision.saved import AlignmentSpec, alignment_export
 
 TRACKERS = [name for name in SHIPPED_POLICIES if name.endswith("-tracking")]
 WORLDS = 12
 EXACT = RandomisationCfg(enabled=False)
 CLOSE_RAD = 0.15
 """A rotation that was found, from a camera's points."""
+
+
+def vision_of(name: str) -> TrackingPolicy:
+    """An installed tracking policy that finds its object by a network of random weights."""
+    torch.manual_seed(0)
+    policy, sizes = load_tracking(find_policy(name)), AlignmentCfg(width=16, layers=1, heads=2, tokens=12)
+    network = AlignmentNetwork(sizes).eval().requires_grad_(False)
+    return replace(policy, spec=replace(policy.spec, alignment=sizes), alignment=network)
 
 
 def observer_of(env: ReorientEnv) -> Observer:
@@ -198,6 +209,15 @@ def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):
         load_tracking(tmp_path / "other.pt")
 
 
+def test_a_vision_policy_comes_back_with_its_network(tmp_path):
+    policy = vision_of("dclaw3-tracking")
+    save_checkpoint(tmp_path / "vision.pt", tracking_export(policy))
+    found = open_policy(str(tmp_path / "vision.pt"), "cpu")
+    assert (found.kind, found.spec) == ("vision", policy.spec) and sees_clouds(str(tmp_path / "vision.pt"))
+    clouds = torch.randn(2, 3, 40, 3)
+    assert torch.equal(found.alignment(*clouds).rotation, policy.alignment(*clouds).rotation)
+
+
 @pytest.mark.parametrize("name", sorted(REPLACED))
 def test_a_former_name_is_refused_with_the_one_to_take(name, capsys, tmp_path):
     assert cli.main([name, "--out", str(tmp_path)]) == 1
@@ -230,9 +250,10 @@ def test_a_former_command_is_refused_with_the_new_one(command, word, capsys):
 
 
 @pytest.mark.slow
-def test_a_runner_decides_on_a_hand_as_in_the_simulator():
+@pytest.mark.parametrize("kind", ["tracking", "vision"])
+def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
     """An episode of the policy; the deploy side is given joints, goal and image, nothing else."""
-    policy = open_policy("dclaw3-tracking", "cpu")
+    policy = vision_of("dclaw3-tracking") if kind == "vision" else open_policy("dclaw3-tracking", "cpu")
     task = task_for(
         policy,
         hand=None,
@@ -248,6 +269,7 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator():
     env = ReorientEnv(task, "cpu")
     actor, runner = TrackingActor(env, policy), TrackingRunner(policy, env.hand, env.objects[0])
     runner.begin()
+    assert runner.kind == kind
     for step in range(env.max_episode_steps):
         sensed = state_of(env)
         action = actor.act(wp.to_torch(env.observation))
@@ -299,5 +321,11 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
     assert "Of 1 episodes" in capsys.readouterr().out
     assert vd_train([*flags, "--in-air"]) == 0
     assert asked[-1].in_air and "in the air" in load_tracking(path).spec.calibrated_on
+    network, camera = vision_of("dclaw3-tracking").alignment, (0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)
+    learned = AlignmentSpec(network=network.cfg, points=512, hand="dclaw4", camera=camera)
+    state = {"student_state_dict": network.state_dict(), "spec": to_dict(learned), "iter": 1, "env_steps": 2}
+    save_checkpoint(tmp_path / "alignment.pt", alignment_export(state))
+    assert vd_train([*flags, "--alignment", str(tmp_path / "alignment.pt")]) == 0
+    assert load_tracking(path).kind == "vision" and load_tracking(path).spec.camera == camera
     assert vd_train(["tracker", "dclaw3-tracking", *flags[2:]]) == 1
     assert "give a teacher" in capsys.readouterr().err

@@ -64,7 +64,7 @@ class PolicyRunner:
         rule: When it has arrived.
 
     Attributes:
-        kind: student, tracking or zero.
+        kind: student, tracking, vision or zero.
         camera: Where its depth camera has to be; None: it has none.
         calibrated: Whether its rule to stop comes from episodes.
     """
@@ -149,15 +149,13 @@ class StudentRunner(PolicyRunner):
 
 
 class TrackingRunner(PolicyRunner):
-    """A tracking policy: finds the object in the camera's images, and lets its teacher act.
+    """A tracking or vision policy: finds the object in the camera's images, and lets its teacher act.
 
     Arguments are those of :func:`load_runner`.
 
     Raises:
         ValueError: It is for another hand.
     """
-
-    kind = "tracking"
 
     def __init__(
         self,
@@ -169,6 +167,7 @@ class TrackingRunner(PolicyRunner):
         seed: int = 0,
     ):
         super().__init__(trained_task(policy), policy.spec.rule_for(tolerance_rad))
+        self.kind = policy.kind
         self.calibrated, depth = policy.spec.calibrated_for(tolerance_rad), policy.spec.depth
         self._cloud = partial(CameraCloud, points=depth.points, crop_m=depth.crop_m, seed=seed)
         self._tracker_of = partial(Tracker, policy, hand, [item])
@@ -184,7 +183,7 @@ class TrackingRunner(PolicyRunner):
         self._fresh = True
 
     def decide(self, sensed: Sensed) -> Decision:
-        """Mean action, and the angle that was found."""
+        """Mean action, and the expected distance."""
         points = seen_points(self._eye, sensed.depth)
         senses = senses_of(sensed, points, fresh=self._fresh)
         decided = self._tracker.step(senses)

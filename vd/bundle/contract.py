@@ -24,7 +24,7 @@ BUNDLE_FORMAT = "visual-dexterity bundle 1"
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-4, 1e-5
 """Differences of numbers that are no difference: a hand that was measured again differs by more."""
 
-Kind = Literal["teacher", "student", "tracking"]
+Kind = Literal["teacher", "student", "tracking", "vision"]
 
 
 class ContractError(ValueError):
@@ -75,7 +75,7 @@ class ActionPart:
 
 @dataclass(frozen=True)
 class ObservationPart:
-    """The vector that a teacher's layers see; a tracking policy makes it of joints and camera."""
+    """The vector that a teacher's layers see; tracking and vision policies make it of joints and camera."""
 
     parts: dict[str, tuple[int, int]]
     """First column and the one after the last of each part."""
@@ -203,7 +203,8 @@ class Contract:
     kind: Kind
     interface: Interface
     network: dict[str, Any]
-    """What rebuilds the network: PolicySpec or StudentCfg; of a tracking policy the former, as ``policy``."""
+    """What rebuilds the network: PolicySpec or StudentCfg; of a tracking or vision policy the former, as
+    ``policy``, and of a vision policy AlignmentCfg, as ``alignment``."""
     stopping: StoppingPart | None
     provenance: Provenance
     software: dict[str, str]

@@ -33,7 +33,7 @@ from vd.tracking.policy import TrackingPolicy, TrackingSpec
 from vd.versions import installed_versions
 from vd.vision.cfg import StudentCfg
 from vd.vision.network import Student
-from vd.vision.saved import SavedStudent, StudentSpec
+from vd.vision.saved import SavedStudent, StudentSpec, alignment_network
 from vd.vision.voxels import Voxeliser
 
 WEIGHTS_FILE, GOLDEN_FILE = "weights.safetensors", "golden.safetensors"
@@ -44,6 +44,8 @@ RENDERED = 2
 STATES, STEPS, GOLDEN_POINTS = 8, 3, 500
 """Golden observations of a teacher; golden control steps of a student, one after the other since memory
 counts, and points of the goal and of the object in each; the hand has twice as many."""
+GOLDEN_M = 0.03
+"""Standard deviation of the golden points of a network of alignment [m]: about that of an object's."""
 SCENE_VOXELS = 16
 """Golden points lie within so many voxels of the base frame's origin."""
 TOLERANCE = 5e-3
@@ -76,11 +78,14 @@ def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
     rules: StoppingRules | None = None
     trained: TrainedPolicy | SavedStudent
     if isinstance(policy, TrackingPolicy):
-        kind, rules, trained = "tracking", policy.spec, policy.teacher
+        kind, rules, trained = policy.kind, policy.spec, policy.teacher
         source = _provenance(trained, policy.spec.teacher, None, to_dict(policy.spec.depth))
         network, camera = {"policy": to_dict(trained.spec)}, policy.spec.camera
-        weights = {f"actor.{name}": value for name, value in trained.weights.items()}
-        weights |= {f"critic.{name}": value for name, value in trained.critic_weights.items()}
+        parts = {"actor": trained.weights, "critic": trained.critic_weights}
+        if policy.alignment is not None:
+            network["alignment"] = to_dict(policy.spec.alignment)
+            parts["alignment"] = policy.alignment.state_dict()
+        weights = {f"{part}.{name}": value for part, own in parts.items() for name, value in own.items()}
     elif isinstance(policy, SavedStudent):
         kind, rules, trained, spec = "student", policy.spec, policy, policy.spec
         source = _provenance(policy, spec.teacher, spec.stage, policy.depth if spec.stage == RENDERED else {})
@@ -159,7 +164,8 @@ def read_bundle(folder: str | Path, device: str = "cpu") -> AnyPolicy:
 def _golden_inputs(policy: AnyPolicy) -> Tensors:
     """Inputs, and the outputs that have to come back.
 
-    Of a teacher's layers ``observation`` [S, O] of size 1. Of a student ``goal_points`` [T, G, 3] and
+    Of a teacher's layers ``observation`` [S, O] of size 1. Of a network of alignment ``goal_points`` and
+    ``seen_points`` [S, G, 3] about their means [m]. Of a student ``goal_points`` [T, G, 3] and
     ``scene_points`` [T, P, 3], hand and object [m], base frame, all at centres of voxels, where no rounding
     decides; ``previous_action``, ``joint_q`` [rad] and ``joint_qd`` [rad/s] [T, D].
     """
@@ -175,14 +181,25 @@ def _golden_inputs(policy: AnyPolicy) -> Tensors:
     else:
         teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
         drawn = {"observation": rng.normal(size=(STATES, teacher.num_observations))}
+        if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
+            shape = (STATES, GOLDEN_POINTS, 3)
+            drawn |= {name: rng.normal(scale=GOLDEN_M, size=shape) for name in ("goal_points", "seen_points")}
     return {name: torch.tensor(value, dtype=torch.float32) for name, value in drawn.items()}
 
 
 def _answers(policy: AnyPolicy, golden: Mapping[str, torch.Tensor]) -> Tensors:
-    """What a policy makes of golden inputs on its device: ``action``, of a student ``distance`` too [rad]."""
+    """What a policy makes of golden inputs on its device: ``action``, of a student ``distance`` too [rad].
+
+    Of a network of alignment ``rotation``, matrices [S, 3, 3].
+    """
     if not isinstance(policy, SavedStudent):
         teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
-        return {"action": teacher.act(golden["observation"]).cpu()}
+        found = {"action": teacher.act(golden["observation"]).cpu()}
+        if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
+            with torch.no_grad():
+                turn = policy.alignment(golden["goal_points"], golden["seen_points"]).rotation
+            found["rotation"] = turn.cpu()
+        return found
     network, goal, scene = policy.network, golden["goal_points"], golden["scene_points"]
     voxelise = Voxeliser(network.cfg.voxel_m, device=str(goal.device))
     # The object has as many points as the goal.
@@ -207,11 +224,14 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     settings: dict[str, Any] = {"teacher": source.teacher, "camera": contract.own_camera}
     if (stopping := contract.stopping) is not None:
         settings |= stopping.rules()
-    if contract.kind == "tracking":
+    if contract.kind in ("tracking", "vision"):
         teacher = _teacher(network.pop("policy"), source, weights, device, parts=True)
         spec = from_dict(TrackingSpec, network, where="network")
         depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth")
-        return TrackingPolicy(teacher, replace(spec, depth=depth, **settings))
+        alignment = None
+        if spec.alignment is not None:
+            alignment = alignment_network(spec.alignment, _part(weights, "alignment."), device)
+        return TrackingPolicy(teacher, replace(spec, depth=depth, **settings), alignment)
     assert source.stage is not None
     student = StudentSpec(
         network=from_dict(StudentCfg, network, where="network"),
@@ -229,19 +249,20 @@ def _teacher(
     spec: dict[str, Any], source: Provenance, weights: Tensors, device: str, *, parts: bool = False
 ) -> TrainedPolicy:
     """A teacher; with ``parts`` the names of its weights say whether they are the actor's or the critic's."""
-
-    def of(part: str) -> Tensors:
-        return {n.removeprefix(part): value for n, value in weights.items() if n.startswith(part)}
-
     return TrainedPolicy(
         from_dict(PolicySpec, spec, where="network"),
-        of("actor.") if parts else weights,
+        _part(weights, "actor.") if parts else weights,
         task=source.task,
         iteration=source.iterations,
         env_steps=source.env_steps,
         device=device,
-        critic=(of("critic.") or None) if parts else None,
+        critic=(_part(weights, "critic.") or None) if parts else None,
     )
+
+
+def _part(weights: Tensors, prefix: str) -> Tensors:
+    """Weights whose names begin so, without that."""
+    return {n.removeprefix(prefix): value for n, value in weights.items() if n.startswith(prefix)}
 
 
 def _provenance(

@@ -36,6 +36,7 @@ class GoalFinder:
         error: Angle by which its orientation is expected to be wrong [rad] [N].
         looks: How often each environment's object was seen since it was begun anew, [N] int32.
         most: Points seen of the object that are looked at.
+        share: Which they are, as shares of all that are seen, in order [most].
     """
 
     most = POINTS
@@ -53,7 +54,7 @@ class GoalFinder:
         scaled = clouds * np.asarray(world_scale)[:, None, None]
         cloud = torch.tensor(scaled, dtype=torch.float32, device=device)
         self._mean, self._aligner = cloud.mean(dim=1), Aligner(network, cloud)
-        self._share = (GOLDEN * torch.arange(POINTS, device=device)) % 1.0
+        self.share = (GOLDEN * torch.arange(POINTS, device=device)) % 1.0
         self.pose = torch.zeros((envs, 1, 7), device=device)
         self.pose[..., 6] = 1.0
         self.error = torch.full((envs,), torch.pi, device=device)
@@ -80,7 +81,7 @@ class GoalFinder:
         rows = (count >= LEAST).nonzero().flatten()  # waits for the device
         if not len(rows):
             return
-        chosen = (self._share * count[rows, None]).long()
+        chosen = (self.share * count[rows, None]).long()
         points = seen[rows].take_along_dim(chosen[..., None], dim=1)
         found = self._aligner.look(points, rows)
         place = found.position - (found.rotation @ self._mean[rows, :, None]).squeeze(-1)
