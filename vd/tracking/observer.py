@@ -32,6 +32,9 @@ from vd.vision.finder import GoalFinder
 
 UNSEEN = ("object_orientation", "goal_orientation")
 """Orientations in the axes of the object's file, which no camera shows: zeros stand for them."""
+AGES_S = (0.0, 0.035, 0.07)
+"""How old what a camera shows of a moving hand may be [s]: known shapes are found beside fingers too, clouds
+are not."""
 LEAP_RAD = 0.5
 """A larger turn in one step is another belief, not a motion."""
 
@@ -89,7 +92,8 @@ class Observer:
         envs: dict[str, Any] = {"world_object": world_object, "world_scale": world_scale, "device": device}
         self._kinematics = HandKinematics(hand, link_body=links, base=BASE_IN_WORLD, device=device)
         self._hand_cloud = SceneClouds(hand, (), link_body=links, object_body=-1, **envs)
-        self._hand_end = array([self._hand_cloud.ends[1]], wp.int32)
+        self._ages = (0.0,) if alignment is None else AGES_S
+        self._hand_end = array([self._hand_cloud.ends[1] * len(self._ages)], wp.int32)
         self._finder: Registration | GoalFinder
         if alignment is None:
             self._finder = Registration(objects, camera=camera, **envs)
@@ -156,14 +160,23 @@ class Observer:
             observation[:, self._columns[name]] = values
         return observation, torch.hypot(angle, found.error)
 
+    def _hand_points(self, age: float, senses: Senses) -> torch.Tensor:
+        """The hand's own points as they were so long ago [s], base frame [N, H, 3]."""
+        links = self._links
+        if age > 0.0:
+            links = wp.empty_like(links)
+            joints = senses.joint_q - age * senses.joint_qd
+            self._kinematics.write(wp.from_torch(joints.contiguous()), links)
+        points = torch.empty((len(senses.points), self._hand_cloud.ends[1], 3), device=self._base.device)
+        cloud = wp.from_torch(points, dtype=wp.vec3)
+        self._hand_cloud.write(cloud, links, self._goal, with_object=False)
+        return points
+
     def _find(self, senses: Senses) -> Found:
         """Find the objects among the camera's points, or follow them; links are posed."""
-        first = self._hand_cloud.ends[1]
-        cloud = torch.empty((len(senses.points), first + senses.points.shape[1], 3), device=self._base.device)
-        points = wp.from_torch(cloud, dtype=wp.vec3)
-        self._hand_cloud.write(points, self._links, self._goal, with_object=False)
-        cloud[:, first:] = senses.points
         followed, before = self._finder, self._before
+        cloud = torch.cat([*(self._hand_points(age, senses) for age in self._ages), senses.points], dim=1)
+        points = wp.from_torch(cloud, dtype=wp.vec3)
         seen, count = object_points(points, self._hand_end, PAPER.cloud.voxel_m, followed.most)
         followed.look(seen, count, fresh=senses.fresh, points=senses.points)
         pose, base, turn = followed.pose[:, 0], self._base, self._base[3:].expand(len(seen), 4)
