@@ -172,12 +172,18 @@ def test_points_are_chosen_evenly_whatever_their_number():
 
 @pytest.fixture(scope="module")
 def scenes():
+    return make_quick_scenes()
+
+
+def make_quick_scenes():
     torch.manual_seed(0)
     hands = Hands(load_hand("dclaw3"), QUICK.hands, device="cpu")
     return make_scenes(load_set(["cube", "cuboid"]), load_set(["cuboid"]), hands, QUICK)
 
 
-def trainer(scenes, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000):
+def make_runner(scenes=None, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000, looks=None):
+    """A trainer of a network that is small enough to learn in a second."""
+    scenes = make_quick_scenes() if scenes is None else scenes
     torch.manual_seed(seed)
     return AlignTrainer(
         scenes,
@@ -186,13 +192,13 @@ def trainer(scenes, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000):
         RunCfg(out=out, device="cpu", save_every=1, tensorboard=False, max_steps=steps),
         spec=AlignmentSpec(network=cfg.network, points=cfg.points, hand="dclaw3"),
         task={},
-        depth={},
+        looks=looks,
         device="cpu",
     )
 
 
 def test_losses_are_least_at_the_truth_and_fall(scenes):
-    runner = trainer(scenes)
+    runner = make_runner(scenes)
     pairs = runner.pairs()
     right = Residual(pairs.rotation, pairs.offset, torch.zeros(QUICK.batch))
     losses, error = alignment_losses(right, pairs)
@@ -208,9 +214,9 @@ def test_losses_are_least_at_the_truth_and_fall(scenes):
 
 
 def test_a_run_measures_goes_on_and_leaves_a_network(scenes, tmp_path):
-    runner = trainer(scenes, out=tmp_path, steps=96)
+    runner = make_runner(scenes, out=tmp_path, steps=96)
     runner.learn(2)
-    again = trainer(scenes, seed=5, out=tmp_path, steps=96)
+    again = make_runner(scenes, seed=5, out=tmp_path, steps=96)
     again.load(list_checkpoints(tmp_path)[-1])
     for name, value in runner.network.state_dict().items():
         assert torch.equal(value, again.network.state_dict()[name])
@@ -222,7 +228,6 @@ def test_a_run_measures_goes_on_and_leaves_a_network(scenes, tmp_path):
     network, spec = load_alignment(tmp_path / "alignment.pt")
     assert spec.hand == "dclaw3" and spec.network == TINY
     pairs = again.pairs()
-    runner.network.eval()
     expected = runner.network(pairs.goal, pairs.seen)
     torch.testing.assert_close(network(pairs.goal, pairs.seen).rotation, expected.rotation)
 

@@ -10,6 +10,8 @@ import warp as wp
 from fake_env import FakeEnv, FakeObject
 from scipy.spatial.transform import Rotation
 
+from vd.envs.cfg import RandomisationCfg, ReorientCfg, SuccessCfg
+from vd.envs.reorient import ReorientEnv
 from vd.evaluate.cfg import parse_groups
 from vd.evaluate.result import OUTCOMES, OWN_NORM, SUCCESS, Protocol, Result, judge, ways_to_stop
 from vd.evaluate.trace import NEVER_RAD, record
@@ -207,7 +209,7 @@ def test_success_is_reported_at_the_stop_and_after_the_hold():
         protocol(2),
         objects,
         policy="s",
-        kind="student of stage 2",
+        kind="vision",
         sees="rendered clouds",
         group="g",
         rules=lambda _: StoppingRule(0.3, 2.5),
@@ -275,7 +277,7 @@ def compared(offset=-0.3, fall_at=None, rules=lambda _: StoppingRule(0.2)):
         protocol(4),
         list(objects),
         policy="student.pt",
-        kind="student of stage 1",
+        kind="tracking",
         sees="complete clouds",
         group="training",
         rules=rules,
@@ -344,3 +346,32 @@ def test_groups_of_objects():
         "training": ("a", "c"),
         "held-out": ("b",),
     }
+
+
+def test_without_a_table_objects_fall_and_it_comes_back():
+    class Still:
+        def act(self, observation):
+            """Nothing: open fingers hold nothing."""
+            return torch.zeros((3, 9))
+
+    # Over a second long: the solver is told of new frictions in between.
+    # Frictions and gains are handed to the solver now and then, which must not move the table. No
+    # pushes: they would lose objects from open fingers.
+    task = ReorientCfg(
+        hand="dclaw3",
+        objects=("cube",),
+        num_envs=3,
+        episode_s=3.0,
+        success=replace(SuccessCfg(), rotation_rad=NEVER_RAD),
+        success_ends_episode=True,
+        randomisation=RandomisationCfg(redraw_s=0.0, force_probability=0.0),
+    )
+    env = ReorientEnv(task, "cpu")
+    starts, goals = (np.tile(quat, (1, 3, 1)) for quat in ([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]))
+    settings = dict(starts=starts, goals=goals)
+    rests = record(env, Still(), 3, **settings)
+    falls = record(env, Still(), 3, **settings, table_steps=24)
+    again = record(env, Still(), 3, **settings)
+    assert not rests.fell.any() and not again.fell.any()
+    assert falls.fell.all() and (falls.steps > 24).all() and (falls.steps <= 28).all()
+    env.check()

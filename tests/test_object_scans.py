@@ -9,7 +9,7 @@ from vd.assets_usd.objects.geometry import mesh_volume, random_surface_points
 from vd.assets_usd.objects.model import SURFACE_POINTS
 from vd.assets_usd.objects.scans import surface_of_scan
 from vd.assets_usd.objects.sets import load_set
-from vd.evaluate.scanned import known_by_points, scan
+from vd.evaluate.scanned import MISSING, NOISE_M, known_by_points, known_objects, scan
 from vd.tracking.registration import Registration
 from vd.tracking.symmetry import symmetries
 
@@ -72,3 +72,27 @@ def test_an_object_is_known_by_its_scan(device):
     found = Registration(known, world_object=np.arange(2), world_scale=np.ones(2), camera=None, device=device)
     assert (found._shapes.distance.numpy().min(axis=(1, 2, 3)) < 0.0).all()
     assert [len(turns) for turns in symmetries(known, device)] == [1] * 2, "noise makes nothing symmetric"
+
+
+def test_a_scan_is_noisy_and_misses_one_side():
+    rng, whole = np.random.default_rng(0), ball(4000)
+    scanned = scan(whole, rng)
+    assert scanned.shape == whole.shape
+    assert scan(whole.astype(np.float32), rng).dtype == np.float32, "of the kind that the search for it takes"
+    off = np.linalg.norm(scanned, axis=1) - RADIUS_M  # across the surface only one axis of the noise shows
+    assert off.std() == pytest.approx(NOISE_M, rel=0.1)
+    side = -scanned.mean(axis=0) / np.linalg.norm(scanned.mean(axis=0))
+    # A cap with a fifth of a sphere's area begins at 0.6 of its radius.
+    assert (scanned @ side > (0.6 * RADIUS_M + 3 * NOISE_M)).mean() < 0.01
+    assert (whole @ side > 0.6 * RADIUS_M).mean() == pytest.approx(MISSING, abs=0.03)
+
+
+def test_what_is_known_of_objects_is_a_surface_or_points_alone():
+    cubes = load_set("cube")
+    surface, points = (known_objects(cubes, "scan", seed=0, device="cpu", surfaces=yes)[0] for yes in (1, 0))
+    assert known_objects(cubes, "mesh", seed=0, device="cpu") is cubes
+    exact = known_objects(cubes, "points", seed=0, device="cpu", surfaces=False)[0]
+    np.testing.assert_array_equal(exact.surface_points, cubes[0].surface_points)
+    scanned = scan(cubes[0].surface_points, np.random.default_rng(0))
+    np.testing.assert_array_equal(points.surface_points, scanned)
+    assert points.vertices is cubes[0].vertices and len(surface.vertices) != len(points.vertices)

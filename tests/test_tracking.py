@@ -13,6 +13,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.config import to_dict
 from vd.deploy.cli import main as vd_deploy
+from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.policy_runner import TrackingRunner
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
@@ -25,7 +26,7 @@ from vd.evaluate.tracking import TrackingActor
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 from vd.policy import PolicySpec, TrainedPolicy, load_policy, perceptron
-from vd.sensors.cfg import DepthCameraCfg
+from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.tracking.observer import UNSEEN, Observer
 from vd.tracking.policy import TrackingPolicy, TrackingSpec, is_tracking, load_tracking, tracking_export
 from vd.tracking.tracker import Tracker
@@ -249,6 +250,17 @@ def test_a_former_command_is_refused_with_the_new_one(command, word, capsys):
     assert word in capsys.readouterr().err
 
 
+def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
+    policy = load_tracking(find_policy("dclaw3-tracking"))
+    plain, real = (
+        TrackingActor(env, policy, sensor_errors=errs)._senses.camera.cfg for errs in (False, True)
+    )
+    assert not plain.sensor.enabled and plain.latency_s == (0.0, 0.0) and plain.position_noise_m == 0.0
+    assert real.sensor == DepthSensorCfg.realistic() and real.latency_s[1] > real.latency_s[0] > 0.0
+    assert real.position_noise_m > 0.0 and real.rotation_noise_rad > 0.0
+    assert real.points == plain.points, "all else is as in its training"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["tracking", "vision"])
 def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
@@ -270,6 +282,7 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
     actor, runner = TrackingActor(env, policy), TrackingRunner(policy, env.hand, env.objects[0])
     runner.begin()
     assert runner.kind == kind
+    actions = ActionFilter(env.hand, task)
     for step in range(env.max_episode_steps):
         sensed = state_of(env)
         action = actor.act(wp.to_torch(env.observation))
@@ -277,7 +290,10 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
         decision = runner.decide(replace(sensed, depth=image))
         np.testing.assert_allclose(decision.action, action[0], atol=1e-3, err_msg=f"step {step}")
         assert decision.distance == pytest.approx(float(actor.predicted[0]), abs=1e-4)
+        actions.put(sensed.smoothed)
+        target = actions.goal(action[0].numpy(), sensed.joint_q)
         env.step(wp.from_torch(action.contiguous()))
+        np.testing.assert_allclose(target, env.sim.target.numpy()[0, : env.num_actions], atol=1e-6)
     with pytest.raises(ValueError, match="there is no image"):
         runner.decide(sensed)
 

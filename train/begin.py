@@ -42,7 +42,7 @@ def find_start(name: str, flag: str = "--init") -> Path:
 
     Raises:
         FileNotFoundError: There is none.
-        ValueError: It is a student or a bundle.
+        ValueError: It is a bundle.
     """
     from vd.bundle import is_bundle
     from vd.evaluate.agents import SHIPPED_POLICIES, find_policy

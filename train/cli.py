@@ -11,13 +11,13 @@ USAGE = """usage: vd-train COMMAND [flags]
 
 commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --out runs/first
-  student    imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
+  student    learn to see without a mesh          vd-train student --teacher dclaw3-table --objects SET
   tracker    let it act by a camera, learn nothing vd-train tracker dclaw3-table --objects SET
   average    mean weights of several teachers     vd-train average runs/a runs/b --out policy.pt
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
-  bundle     write a policy as it is deployed     vd-train bundle student.pt bundles/first
+  bundle     write a policy as it is deployed     vd-train bundle tracking.pt bundles/first
   curves     draw the curves of a run             vd-train curves runs/first
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset gpu

@@ -24,14 +24,11 @@ PANELS = (
     ("mean rotation error [rad]", "task/rotation_error", 1.0),
     ("mean std of the actions", "action_std", 1.0),
     ("episodes that end in a fall [%]", "drop_rate", 100.0),
-    ("error of the student's mean action", "student/action_error", 1.0),
-    ("share of the labels' variance that is left", "student/unexplained", 1.0),
-    ("error of the predicted distance [rad]", "student/distance_error", 1.0),
-    ("objects told right [%]", "student/category", 100.0),
     ("error of the predicted rotation [rad]", "student/rotation_error", 1.0),
-    ("error of joint positions [rad]", "student/joint_error", 1.0),
+    ("its median on held-out objects [rad]", "validation/rotation_error", 1.0),
+    ("goals reached by looks [%]", "looks/success_per_goal", 100.0),
     ("imitation loss", "loss/imitation", 1.0),
-    ("control steps (stage 0: clouds) per second", "steps_per_s", 1.0),
+    ("control steps (of a student: clouds) per second", "steps_per_s", 1.0),
 )
 """Title, quantity and factor of each panel, as far as a run has them; of a group (``/``) the first run's."""
 

@@ -11,7 +11,6 @@ import numpy as np
 import tyro
 
 from vd.files import atomic_path, check_file, check_folder
-from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -28,12 +27,10 @@ class ExportCfg:
     """Write the policy of a checkpoint without its training state, as ONNX, or a small checkpoint.
 
     A policy keeps its critic, so that --init can go on from it.
-
-    A student keeps its weights, and --init goes on from it.
     """
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
-    """Checkpoint of vd-train teacher, or its policy.pt; or a student."""
+    """Checkpoint of vd-train teacher, or its policy.pt."""
     output: Annotated[Path, tyro.conf.Positional] = Path("policy.pt")
     """File to write. A name that ends in .onnx gets the network from observation to mean action, checked
     against onnxruntime where that is installed."""
@@ -50,7 +47,7 @@ class BundleCfg:
     """
 
     policy: Annotated[str, tyro.conf.Positional]
-    """policy.pt, student.pt, a checkpoint, a run's folder, or the name of an installed policy."""
+    """policy.pt, tracking.pt, a checkpoint, a run's folder, or the name of an installed policy."""
     output: Annotated[Path, tyro.conf.Positional]
     """Folder to write; a bundle that is there is replaced."""
 
@@ -77,14 +74,7 @@ def _exported(cfg: ExportCfg) -> dict[str, Any]:
     """What the file gets."""
     from vd.policy import policy_export
     from vd.train.checkpoint import load_checkpoint, without_worlds
-    from vd.vision.saved import is_student, read_student, saved_spec, student_export
 
-    if is_student(cfg.checkpoint):
-        if cfg.resumable:
-            raise ValueError(f"{cfg.checkpoint} is a student, which goes on with --init: without --resumable")
-        student = read_student(cfg.checkpoint)
-        saved_spec(student, cfg.checkpoint)  # refuses one that nothing reads any more
-        return student_export(student)
     state = load_checkpoint(cfg.checkpoint, flag="vd-train export")
     if cfg.resumable and "optimizer_state_dict" not in state:
         raise ValueError(f"{cfg.checkpoint} is a policy, not a checkpoint; nothing can go on from it")
@@ -141,7 +131,6 @@ def bundle_command(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(BundleCfg, args=arguments, prog="vd-train bundle")
     check_folder(cfg.output.parent)
 
-    quiet_warp()  # golden outputs of a student come from its kernels
     from vd.bundle.store import write_bundle
     from vd.evaluate.agents import find_policy, open_policy
 

@@ -63,7 +63,7 @@ class TrainingLoop:
 
     Attributes:
         iteration: Iterations completed, over all resumed runs.
-        env_steps: Control steps (clouds in stage 0) completed, over all environments and processes.
+        env_steps: Control steps (of a student clouds) completed, over all environments and processes.
         new_episodes: Why the checkpoint that was loaded could not restore the environments; empty if it did.
     """
 

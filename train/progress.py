@@ -14,10 +14,8 @@ FIGURES = {
     "mean_reward": "reward {:.3f}",
     "task/rotation_error": "error {:.2f} rad",
     "action_std": "std {:.3f}",
-    "student/action_error": "action error {:.3f}",
-    "student/category": "category right {:.1%}",
-    "student/distance_error": "distance error {:.2f} rad",
-    "student/joint_error": "joint error {:.2f} rad",
+    "student/rotation_error": "rotation {:.2f} rad",
+    "looks/success_per_goal": "success {:.1%} of goals",
 }
 """What the first line says of an iteration, as far as its row has it."""
 

@@ -34,7 +34,7 @@ class TrackerCfg:
     objects: tuple[str, ...]
     """Object sets to choose the stopping rules on, not those of the training."""
     alignment: Path | None = None
-    """Network that finds objects by their goals' points, the alignment.pt of vd-train student --stage 0."""
+    """Network that finds objects by their goals' points, the alignment.pt of vd-train student."""
     out: Path = Path("tracking.pt")
     """File to write."""
     camera: tuple[float, float, float, float, float, float, float] | None = None

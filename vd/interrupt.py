@@ -37,11 +37,10 @@ RENAMED = {
     "--goal-s": "--episode-s",
     "--air": "--in-air",
     "--num-worlds": "--num-envs",
-    "--network.senses": "--network.proprioception",
 }
 """Flags of earlier versions, and what they are called in all commands."""
 GONE = {
-    "--from-scratch": "stage 2 begins from what --init names",
+    "--from-scratch": "stage 1 begins from what --init names",
     "--env.observation.history": "a memory of past steps cost 2 points (docs/results.md#robustness)",
     "--ppo.optimizer": "Adam is the only one",
     "--agent": "name zero or random in place of a policy",

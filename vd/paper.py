@@ -159,51 +159,13 @@ class CameraConstants:
 
 @dataclass(frozen=True)
 class CloudConstants:
-    """Point clouds of the student and their voxels (Methods, stages 1 and 2; point cloud voxelization)."""
+    """Point clouds, their voxels and their noise (Methods, point cloud voxelization)."""
 
     points_per_link: int = source(500, "C", "cached samples of every link with a mesh, the base excepted")
     object_points: int = source(500, "C", "samples of the object, and of the goal")
-    goal_position_m: tuple[float, float, float] = source(
-        (0.0, 0.0, -0.08), "C", "the goal's cloud in the base frame, behind the palm"
-    )
     voxel_m: float = source(0.005, "P", "point cloud voxelization; true floor, the code truncates")
-    feature: float = source(0.5, "C", "the one feature of every voxel: nothing marks the goal but its place")
-    jitter_probability: float = source(0.4, "P", "of each cloud, Supplementary Methods, observation noise")
     jitter_std_m: float = source(0.004, "P", "N(0, 0.004) on point positions")
-    jitter_voxels_code: float = source(1.0, "C", "after voxelisation, clipped at 2 and truncated; 3.4 mm")
-    dropout_probability: float = source(0.4, "P", "of each cloud, independently")
     dropout_ratio: tuple[float, float] = source((0.0, 0.2), "P", "share of the points that is lost")
-
-
-@dataclass(frozen=True)
-class StudentConstants:
-    """Network of the student (Figure 7; sizes from the code)."""
-
-    channels: tuple[int, ...] = source((32, 64, 128, 256), "C", "one stage each, every stage halves the grid")
-    blocks: int = source(2, "C", "pre-activation residual blocks a stage")
-    embedding: int = source(256, "C", "after global pooling, and after the projector")
-    action_hidden: int = source(32, "C", "MLP D-32-GELU-32 of the previous action")
-    memory: int = source(256, "P", "GRU (Methods, architecture); width C")
-    head_hidden: int = source(256, "C", "layer after the GRU, GELU")
-    distance_hidden: int = source(128, "C", "256-128-GELU-1 on the embedding, before action and GRU")
-
-
-@dataclass(frozen=True)
-class DaggerConstants:
-    """Training of the student by imitation (Methods, student; numbers from the code)."""
-
-    rollout_steps: int = source(80, "C", "control steps of every world between two updates")
-    synthetic_envs: int = source(400, "C", "stage 1: complete synthetic clouds")
-    synthetic_minibatch: int = source(
-        40, "C", "stage 1: environments of an optimiser step, whole sequences each"
-    )
-    rendered_envs: int = source(260, "C", "stage 2: rendered clouds")
-    rendered_minibatch: int = source(20, "C", "stage 2: environments of an optimiser step")
-    epochs: int = source(4, "C", "passes over a rollout")
-    learning_rate: float = source(3e-4, "C", "AdamW with amsgrad, constant")
-    grad_norm: float = source(5.0, "C", "gradient norm is clipped to this")
-    distance_weight: float = source(0.5, "C", "of the squared error of the rotation distance [rad^2]")
-    teacher_share: float = source(0.0, "C", "beta of DAgger: the student acts from the first step on")
 
 
 @dataclass(frozen=True)
@@ -248,8 +210,6 @@ class PaperConstants:
     teacher: TeacherConstants = TeacherConstants()
     camera: CameraConstants = CameraConstants()
     cloud: CloudConstants = CloudConstants()
-    student: StudentConstants = StudentConstants()
-    dagger: DaggerConstants = DaggerConstants()
     results: ResultConstants = ResultConstants()
 
 

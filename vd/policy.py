@@ -252,6 +252,11 @@ def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
             f"no policy at {path}; give a policy.pt or a file of a run's checkpoints folder"
         )
     state = read_state(path, device, remedy="copy it again, or give another file of its run")
+    if "student_state_dict" in state and "spec" in state:
+        raise ValueError(
+            f"{path} is a student or its checkpoint, which does not act by itself; vd-train tracker TEACHER "
+            "--alignment alignment.pt makes a policy of a student that vd-train student trained"
+        )
     if not {"policy", "actor_state_dict", "task"} <= state.keys():
         raise ValueError(f"{path} holds no policy; give a file that vd-train wrote")
     try:

@@ -10,19 +10,14 @@ import warp as wp
 
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.config import from_dict
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import check_fits, is_saved_student, is_tracking_policy, open_policy, trained_task
-from vd.evaluate.student import RENDERED
+from vd.evaluate.agents import check_fits, is_tracking_policy, open_policy, trained_task
 from vd.paper import PAPER
 from vd.senses import Senses
-from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_cloud import CameraCloud
 from vd.stopping import StoppingRule
 from vd.tracking.policy import TrackingPolicy
 from vd.tracking.tracker import Tracker
-from vd.vision.saved import SavedStudent
-from vd.vision.sight import Frame, Sight
 
 ZERO = "zero"
 """Name of the zero-action baseline."""
@@ -64,7 +59,7 @@ class PolicyRunner:
         rule: When it has arrived.
 
     Attributes:
-        kind: student, tracking, vision or zero.
+        kind: tracking, vision or zero.
         camera: Where its depth camera has to be; None: it has none.
         calibrated: Whether its rule to stop comes from episodes.
     """
@@ -91,67 +86,13 @@ class PolicyRunner:
         return Decision(np.zeros_like(sensed.smoothed), float("nan"))
 
 
-class StudentRunner(PolicyRunner):
-    """A student: sees by a depth camera, remembers, and predicts its distance.
-
-    Arguments are those of :func:`load_runner`.
-
-    Raises:
-        ValueError: It is none of stage 2, and so does not see by a camera.
-    """
-
-    kind = "student"
-
-    def __init__(
-        self,
-        student: SavedStudent,
-        hand: HandModel,
-        item: ObjectModel,
-        *,
-        tolerance_rad: float = PAPER.success.rotation_rad,
-        seed: int = 0,
-    ):
-        spec = student.spec
-        if spec.stage != RENDERED:
-            raise ValueError(f"a student of stage {spec.stage} does not see by a camera; give one of stage 2")
-        super().__init__(trained_task(student), spec.rule_for(tolerance_rad))
-        self.calibrated, self._network = spec.calibrated_for(tolerance_rad), student.network
-        depth = from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
-        self._cloud = partial(CameraCloud, points=depth.points, crop_m=depth.crop_m, seed=seed)
-        self.sight = Sight(hand, [item], spec.network, complete=False)
-        self.look_by(hand.camera.at(spec.camera))
-        self._hidden = self._network.initial_hidden(1)
-
-    def look_by(self, camera: CameraModel) -> None:
-        """See by another camera."""
-        self.camera, self._eye = camera, self._cloud(camera)
-
-    def new_goal(self) -> None:
-        """The memory starts empty."""
-        self._hidden = self._network.initial_hidden(1)
-
-    def frame(self, sensed: Sensed) -> Frame:
-        """What it sees and senses.
-
-        Raises:
-            ValueError: There is no image.
-        """
-        return self.sight.frame(senses_of(sensed, seen_points(self._eye, sensed.depth)), None)
-
-    def decide(self, sensed: Sensed) -> Decision:
-        """Mean action and predicted distance."""
-        with torch.inference_mode():
-            seen = self.frame(sensed)
-            known = self._network.proprioception(seen)
-            output = self._network.act(self.sight.sites(seen), known, self._hidden)
-        self._hidden = output.hidden
-        return Decision(output.mean[0].numpy().copy(), float(output.distance[0, -1]))
-
-
 class TrackingRunner(PolicyRunner):
     """A tracking or vision policy: finds the object in the camera's images, and lets its teacher act.
 
     Arguments are those of :func:`load_runner`.
+
+    Attributes:
+        eye: Makes clouds of its camera's images.
 
     Raises:
         ValueError: It is for another hand.
@@ -176,7 +117,7 @@ class TrackingRunner(PolicyRunner):
 
     def look_by(self, camera: CameraModel) -> None:
         """See by another camera."""
-        self.camera, self._eye, self._tracker = camera, self._cloud(camera), self._tracker_of(camera)
+        self.camera, self.eye, self._tracker = camera, self._cloud(camera), self._tracker_of(camera)
 
     def begin(self) -> None:
         """The object is looked for anew, which takes several times as long as a step."""
@@ -184,7 +125,7 @@ class TrackingRunner(PolicyRunner):
 
     def decide(self, sensed: Sensed) -> Decision:
         """Mean action, and the expected distance."""
-        points = seen_points(self._eye, sensed.depth)
+        points = seen_points(self.eye, sensed.depth)
         senses = senses_of(sensed, points, fresh=self._fresh)
         decided = self._tracker.step(senses)
         self._fresh = False
@@ -214,14 +155,11 @@ def load_runner(
         ValueError: It is for another hand, or does not see by a camera.
     """
     policy: Any = None if name == ZERO else open_policy(name, "cpu")
-    student = is_saved_student(policy)
     if policy is None:
         if name != ZERO:
             raise ValueError(f"{name} is not for a hand; give a bundle, a policy's file, or {ZERO}")
         return PolicyRunner(ReorientCfg(hand=hand_name), StoppingRule())
     check_fits(name, policy, hand_name)
-    if student:
-        return StudentRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     if is_tracking_policy(policy):
         return TrackingRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     raise ValueError(

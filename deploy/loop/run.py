@@ -1,6 +1,6 @@
 """Drive a hand with a policy: pursue goals one after the other, in one process at 12 Hz, and log every step.
 
-The policy sees joints and a depth camera: a tracking policy, or a student.
+The policy sees joints and a depth camera: a tracking or vision policy.
 """
 
 import contextlib

@@ -1,154 +1,93 @@
+import itertools
+
 import numpy as np
-import pytest
+import torch
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from kernel_oracle import ALPHA, EXAMPLES, device_array, launch, streams
-from scipy import stats
+from kernel_oracle import EXAMPLES, device_array, launch, unwritten
 
-from vd.kernels.sparse.voxels import (
-    CloudNoise,
-    cloud_offsets,
-    coordinates,
-    draw_noise,
-    voxel_key_kernel,
-    voxelise,
-)
+from vd.kernels.sensor.voxels import CLOUD_SHIFT, beside_kernel, coordinates_kernel, voxel_key_kernel
+from vd.tracking.object_points import object_points
 
-SIZE = 0.005
 HALF = 2048
+NEAR = list(itertools.product((-1, 0, 1), repeat=3))
 
 
 @st.composite
 def clouds(draw):
-    """Points in voxel units, many in the same voxel or on a border, some not finite or far away."""
+    """Points in voxel units, many in the same voxel or on a border, some not finite or at the grid's ends."""
     shape = (draw(st.integers(1, 3)), draw(st.integers(1, 12)), 3)
     whole = draw(hnp.arrays(np.int32, shape, elements=st.integers(-3, 3)))
     part = draw(hnp.arrays(np.float32, shape, elements=st.sampled_from([0.0, 0.25, 0.5, 0.875])))
     points = (whole + part).astype(np.float32)
     odd = draw(hnp.arrays(np.int8, shape[:2], elements=st.integers(0, 9)))
-    points[odd == 0, 1] = np.nan
-    points[odd == 1, 2] = np.inf
-    points[odd == 2, 0] = HALF
-    points[odd == 3, 0] = -HALF
+    for kind, (axis, value) in enumerate([(1, np.nan), (2, np.inf), (0, HALF), (0, -HALF), (1, HALF - 0.5)]):
+        points[odd == kind, axis] = value
     return points
 
 
-def expected_voxels(points, size):
-    """Sorted set of (cloud, x, y, z), by Python's integers."""
-    found = set()
-    for cloud, rows in enumerate(points):
-        for point in rows:
-            cell = np.floor(point / np.float32(size))
-            if np.isfinite(cell).all() and (cell >= -HALF).all() and (cell < HALF).all():
-                found.add((cloud, *(int(c) for c in cell)))
-    return found
+def cell(point) -> tuple[int, ...] | None:
+    """Voxel of a point, by Python's integers."""
+    if not np.isfinite(point).all() or (point < -HALF).any() or (point >= HALF).any():
+        return None
+    return tuple(int(np.floor(value)) for value in point)
 
 
-def voxels(points, device, size=1.0, noise=None):
-    keys, _ = voxelise(device_array(points, wp.vec3, device), size, noise)
-    return coordinates(keys).numpy(), keys
+def keys_of(points, device):
+    keys = unwritten(points.shape[:2], wp.int64, device)
+    launch(voxel_key_kernel, keys.shape, [device_array(points, wp.vec3, device), 1.0, keys], device)
+    return keys.numpy()
+
+
+def rows_of(keys, device):
+    rows = unwritten((len(keys), 4), int, device)
+    launch(coordinates_kernel, len(keys), [device_array(keys, wp.int64, device), rows], device)
+    return [tuple(row) for row in rows.numpy().tolist()]
 
 
 @EXAMPLES
 @given(points=clouds())
-def test_voxels_are_the_set_of_floors(device, points):
-    rows, keys = voxels(points, device)
-    assert len(set(map(tuple, rows))) == len(rows)
-    assert set(map(tuple, rows)) == expected_voxels(points, 1.0)
-    offsets = cloud_offsets(keys, len(points)).numpy()
-    np.testing.assert_array_equal(offsets, [np.sum(rows[:, 0] < b) for b in range(len(points) + 1)])
-    assert (np.diff(keys.numpy()) > 0).all()
+def test_keys_name_cloud_and_floor_and_sort_by_cloud(device, points):
+    keys = keys_of(points, device)
+    for cloud, (own, rows) in enumerate(zip(keys, points, strict=True)):
+        for key, point in zip(own, rows, strict=True):
+            if (expected := cell(point)) is None:
+                assert key == len(points) << CLOUD_SHIFT
+            else:
+                assert rows_of([key], device) == [(cloud, *expected)]
+                assert cloud << CLOUD_SHIFT <= key < (cloud + 1) << CLOUD_SHIFT
 
 
 @EXAMPLES
-@given(points=clouds(), data=st.data())
-def test_marks_name_the_groups_whose_points_a_voxel_holds(device, points, data):
-    ends = sorted(data.draw(st.lists(st.integers(0, points.shape[1]), min_size=1, max_size=3)))
-    groups = device_array(np.array(ends, np.int32), int, device)
-    keys, marks = voxelise(device_array(points, wp.vec3, device), 1.0, ends=groups)
-    rows = [tuple(row) for row in coordinates(keys).numpy()]
-    np.testing.assert_array_equal(keys.numpy(), voxels(points, device)[1].numpy())
-    expected = np.zeros((len(rows), len(ends)))
-    for group, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
-        for voxel in expected_voxels(points[:, start:end], 1.0):
-            expected[rows.index(voxel), group] = 1.0
-    np.testing.assert_array_equal(marks.numpy(), expected)
+@given(points=clouds(), kinds=st.integers(2, 4))
+def test_voxels_beside_others_have_one_of_them_about(device, points, kinds):
+    keys = np.unique(keys_of(points, device))
+    keys = keys[keys < len(points) << CLOUD_SHIFT]
+    rows = rows_of(keys, device)
+    others = np.array([sum(row) % kinds == 0 for row in rows], dtype=bool)
+    there = {row for row, other in zip(rows, others, strict=True) if other}
+    found = wp.empty(len(keys), dtype=wp.bool, device=device)
+    inputs = [device_array(keys, wp.int64, device), device_array(others, wp.bool, device), found]
+    launch(beside_kernel, len(keys), inputs, device)
+    expected = [any((c, x + i, y + j, z + k) in there for i, j, k in NEAR) for c, x, y, z in rows]
+    assert found.numpy().tolist() == expected
 
 
-def test_a_cloud_without_points_has_no_voxel(device):
-    points = np.full((3, 2, 3), np.nan, np.float32)
-    points[1] = 0.0
-    rows, keys = voxels(points, device)
-    np.testing.assert_array_equal(rows, [[1, 0, 0, 0]])
-    np.testing.assert_array_equal(cloud_offsets(keys, 3).numpy(), [0, 0, 1, 1])
-    assert len(voxels(np.full((2, 1, 3), np.nan, np.float32), device)[0]) == 0
-
-
-def test_refuses_a_size_that_is_not_positive():
-    with pytest.raises(ValueError, match="voxel_size"):
-        voxelise(wp.zeros((1, 1), dtype=wp.vec3, device="cpu"), 0.0)
-
-
-def noise_of(device, count, seed=0, jitter=0.4, std=0.004, dropout=0.4, ratio=(0.0, 0.2)):
-    noise = CloudNoise()
-    noise.jitter_probability, noise.jitter_std = jitter, std
-    noise.dropout_probability, noise.dropout_ratio = dropout, wp.vec2(*ratio)
-    return draw_noise(wp.array([noise], dtype=CloudNoise, device=device), streams(count, seed, device))
-
-
-def test_noise_is_drawn_for_each_cloud_as_the_paper_says(device):
-    count = 20000
-    draw = noise_of(device, count)
-    jitter, dropout = draw.jitter.numpy(), draw.dropout.numpy()
-    assert set(np.unique(jitter)) == {0.0, np.float32(0.004)}
-    jittered, dropped = jitter > 0, dropout > 0
-    for share in (jittered, dropped):
-        assert stats.binomtest(int(share.sum()), count, 0.4).pvalue > ALPHA
-    assert stats.binomtest(int((jittered & dropped).sum()), count, 0.16).pvalue > ALPHA
-    assert stats.kstest(dropout[dropped], stats.uniform(0, 0.2).cdf).pvalue > ALPHA
-    assert len(np.unique(draw.stream.numpy())) > count - 3
-
-
-def keys_of(points, draw, device, size):
-    out = wp.full(2 * points.shape[0] * points.shape[1], -1, dtype=wp.int64, device=device)
-    launch(
-        voxel_key_kernel,
-        points.shape[:2],
-        [points, size, draw.jitter, draw.dropout, draw.stream, out],
-        device,
-    )
-    return out
-
-
-def test_jitter_is_gaussian_in_metres_and_dropout_loses_its_share(device):
-    points = np.zeros((2, 20000, 3), np.float32)
-    fine = 1e-4  # voxels far below the jitter, so that their coordinates show its distribution
-    draw = noise_of(device, 2, jitter=1.0, dropout=1.0, ratio=(0.2, 0.2))
-    keys = keys_of(points, draw, device, fine)
-    per_cloud = []
-    for cloud in range(2):
-        own = keys[cloud * 20000 : (cloud + 1) * 20000]
-        rows = coordinates(own).numpy()
-        kept = rows[rows[:, 0] == cloud][:, 1:] * fine
-        assert stats.binomtest(len(kept), 20000, 0.8).pvalue > ALPHA
-        for axis in range(3):
-            assert stats.kstest(kept[:, axis] + 0.5 * fine, stats.norm(0, 0.004).cdf).statistic < 0.02
-        assert np.abs(np.corrcoef(kept.T) - np.eye(3)).max() < 0.05
-        per_cloud.append(kept)
-    assert len(per_cloud[0]) != len(per_cloud[1]) or not np.array_equal(*per_cloud)
-
-
-def test_noise_repeats_with_the_seed_and_differs_between_clouds_and_draws(device):
-    points = np.tile(np.random.default_rng(0).normal(size=(1, 300, 3)).astype(np.float32) * 0.05, (4, 1, 1))
-
-    def rows(seed):
-        draw = noise_of(device, 4, seed, jitter=1.0, dropout=1.0, ratio=(0.1, 0.2))
-        found = voxels(points, device, SIZE, draw)[0]
-        return [found[found[:, 0] == cloud][:, 1:].tobytes() for cloud in range(4)]
-
-    first = rows(1)
-    assert first == rows(1)
-    assert len(set(first)) == 4
-    assert not set(first) & set(rows(2))
+@EXAMPLES
+@given(points=clouds(), data=st.data(), most=st.integers(1, 8))
+def test_an_objects_points_are_voxels_away_from_the_hands(device, points, data, most):
+    hand = data.draw(st.integers(0, points.shape[1]))
+    place = wp.device_to_torch(device)
+    centres, counts = object_points(torch.tensor(points, device=place), hand, 1.0, most)
+    for cloud, own in enumerate(points):
+        of_hand = {cell(point) for point in own[:hand]} - {None}
+        seen = {cell(point) for point in own[hand:]} - {None}
+        about = {tuple(np.add(voxel, step).tolist()) for voxel in of_hand for step in NEAR}
+        expected = {tuple(value + 0.5 for value in voxel) for voxel in seen - about}
+        count = int(counts[cloud])
+        assert count == min(most, len(expected))
+        found = [tuple(row) for row in centres[cloud].tolist()]
+        assert set(found[:count]) <= expected and len(set(found[:count])) == count
+        assert not any(any(row) for row in found[count:])

@@ -1,6 +1,7 @@
-"""Stage 0: a network learns to turn a goal's cloud onto what a camera sees of an object, on ever new shapes.
+"""A network learns to turn a goal's cloud onto what a camera sees of an object, on ever new shapes.
 
-No simulation: clouds are made from shapes (:mod:`.shapes`) and from what hides them (:mod:`.views`).
+Clouds are made from shapes (:mod:`.shapes`) and from what hides them (:mod:`.views`), without simulation. In
+stage 1 others are what a camera saw in simulation while the policy acted (:mod:`.looks`).
 """
 
 import math
@@ -15,16 +16,17 @@ import trimesh
 from torch import nn
 
 from vd.assets_usd.objects.model import ObjectModel
-from vd.train.checkpoint import save_checkpoint
+from vd.config import to_dict
+from vd.train.checkpoint import load_checkpoint, save_checkpoint
 from vd.train.config import RunCfg
-from vd.train.loop import check_update
+from vd.train.loop import TrainingLoop, check_update
 from vd.train.student.config import ALIGNMENT_NAME, AlignCfg
-from vd.train.student.runner import StudentRunner
+from vd.train.student.looks import SimulatedLooks
 from vd.train.student.shapes import made_shapes, mesh_shapes
-from vd.train.student.views import Hands, Pairs, draw_pairs
+from vd.train.student.views import Hands, Pairs, draw_pairs, joined
 from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
 from vd.vision.rotations import turn_angle
-from vd.vision.saved import alignment_export
+from vd.vision.saved import AlignmentSpec, alignment_export
 
 MESH_POINTS = 6000
 """Points kept of a mesh: of them each deformed copy draws its own."""
@@ -60,9 +62,13 @@ def mesh_points(objects: Sequence[ObjectModel], count: int, device: torch.device
         points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
         both = [torch.as_tensor(x, dtype=torch.float32) for x in (points, mesh.face_normals[faces])]
         rows.append(torch.cat(both, dim=1))
-    shapes = torch.stack(rows)
-    shapes[..., :3] -= shapes[..., :3].mean(dim=1, keepdim=True)
-    return shapes.to(device)
+    return torch.stack(rows).to(device)
+
+
+def centred(shapes: torch.Tensor) -> torch.Tensor:
+    """Shapes [O, P, 6] about the means of their points."""
+    mean = shapes[..., :3].mean(dim=1, keepdim=True)
+    return torch.cat([shapes[..., :3] - mean, shapes[..., 3:]], dim=-1)
 
 
 class ShapeBank:
@@ -122,8 +128,8 @@ def make_scenes(
     device, points = hands.eye.device, CLOUDS * cfg.points
     sets = {"made": made_shapes(UNSEEN_SHAPES, points, device)}
     if held_out:
-        sets["validation"] = mesh_points(held_out, points, device)
-    meshes = mesh_points(objects, max(MESH_POINTS, points), device)
+        sets["validation"] = centred(mesh_points(held_out, points, device))
+    meshes = centred(mesh_points(objects, max(MESH_POINTS, points), device))
     return Scenes(ShapeBank(meshes, cfg.shapes, points), hands, sets)
 
 
@@ -143,40 +149,84 @@ def alignment_losses(found: Residual, pairs: Pairs) -> tuple[dict[str, torch.Ten
     return losses, error
 
 
-class AlignTrainer(StudentRunner):
+class AlignTrainer(TrainingLoop):
     """Trains the network of alignment.
 
-    A run that goes on has its weights, optimiser and random state; its shapes are made anew.
+    A run that goes on has its weights, optimiser and random state; its shapes, episodes and looks are begun
+    anew.
 
     Args:
-        scenes: Where pairs come from.
+        scenes: Where made pairs come from.
         network: The network.
         cfg: Settings.
         run: Run settings.
-        **kept: What :class:`StudentRunner` keeps with the network, and its device and deadline.
+        spec: Description of the network, kept with it.
+        task: The environment's configuration as a dictionary, kept with it.
+        looks: What is seen in simulation; None: all pairs are made.
+        device: Torch device.
+        deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
     """
 
     def __init__(
-        self, scenes: Scenes, network: AlignmentNetwork, cfg: AlignCfg, run: RunCfg, **kept: Any
+        self,
+        scenes: Scenes,
+        network: AlignmentNetwork,
+        cfg: AlignCfg,
+        run: RunCfg,
+        *,
+        spec: AlignmentSpec,
+        task: dict[str, Any],
+        looks: SimulatedLooks | None = None,
+        device: str,
+        deadline: float | None = None,
     ) -> None:
-        super().__init__(network, {}, run, **kept)
-        self.scenes, self.cfg, self.network = scenes, cfg, network
+        super().__init__(run, device=device, deadline=deadline)
+        self.scenes, self.cfg, self.network, self.looks = scenes, cfg, network, looks
+        self.spec, self.task = spec, task
+        self.optimizer = torch.optim.AdamW(network.parameters())
         self._compare: nn.Module | Any = torch.compile(network) if cfg.compile else network
         self._half = torch.autocast(
             torch.device(self.device).type, torch.bfloat16, enabled=cfg.precision == "bf16"
         )
+        self._steps_done = 0
         self._started = time.monotonic()
+
+    def load(self, path: Path) -> None:
+        """Go on from a checkpoint.
+
+        Args:
+            path: The checkpoint.
+
+        Raises:
+            ValueError: The file is damaged, or of another network.
+        """
+        state = load_checkpoint(path, self.device, network="student")
+        try:
+            self.network.load_state_dict(state["student_state_dict"])
+            self.optimizer.load_state_dict(state["learner"]["optimizer"])
+            self._steps_done = state["learner"]["steps"]
+            self._restore(state)
+        except (RuntimeError, ValueError, KeyError) as error:
+            raise ValueError(
+                f"{path} does not fit this run's network; resume with the configuration it was trained with "
+                f"(its run folder's config.json), or start anew ({error})"
+            ) from error
 
     def _samples(self) -> int:
         return self.cfg.batch * self.cfg.steps
 
     def _begin(self) -> None:
-        super()._begin()
+        if self.is_distributed:
+            for value in self.network.state_dict().values():
+                torch.distributed.broadcast(value, 0)
         self._started = time.monotonic()
 
     def _iterate(self) -> dict[str, Any] | None:
-        cfg = self.cfg
-        self.network.train()
+        cfg, seen = self.cfg, dict[str, float]()
+        if self.looks is not None:
+            if (collected := self.looks.collect(self._stopping)) is None:
+                return None
+            seen = self._read(collected)
         if self.iteration:
             self.scenes.bank.renew(cfg.fresh_shapes)
         done, rows = self._done(), []
@@ -189,14 +239,19 @@ class AlignTrainer(StudentRunner):
         if count % cfg.validate_every == 0 or count == self.total_iterations:
             means |= self.measure()
         figures = self._read(means)
-        check_update(figures, self.networks, LOWER_RATES)
-        return dict(figures)
+        check_update(figures, self.network, LOWER_RATES)
+        return figures | seen
 
     def pairs(self) -> Pairs:
         """A batch to learn from."""
         cfg = self.cfg
-        shapes = self.scenes.bank.draw(cfg.batch)
-        return draw_pairs(self.scenes.hands, shapes, cfg.points, near=cfg.near_share, scans=cfg.scan_share)
+        shares = {"near": cfg.near_share, "scans": cfg.scan_share}
+        simulated = 0 if self.looks is None else round(self.looks.cfg.share * cfg.batch)
+        made = self.scenes.bank.draw(cfg.batch - simulated)
+        pairs = draw_pairs(self.scenes.hands, made, cfg.points, **shares)
+        if self.looks is None:
+            return pairs
+        return joined(pairs, self.looks.pairs(simulated, cfg.points, **shares))
 
     def _step(self, done: float) -> dict[str, torch.Tensor]:
         pairs = self.pairs()
@@ -205,9 +260,38 @@ class AlignTrainer(StudentRunner):
         losses, error = alignment_losses(found, pairs)
         warm = min(1.0, (self._steps_done + 1) / max(1, self.cfg.warmup_steps))
         rate = self.cfg.learning_rate * warm * max(LEAST_RATE, 0.5 * (1.0 + math.cos(math.pi * done)))
-        norm = self._descend(torch.stack(tuple(losses.values())).sum(), rate=rate, grad_norm=GRAD_NORM)
+        norm = self._descend(torch.stack(tuple(losses.values())).sum(), rate)
         logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
         return logged | {"loss/grad_norm": norm, "student/rotation_error": error.median()}
+
+    def _descend(self, loss: torch.Tensor, rate: float) -> torch.Tensor:
+        """One optimiser step on the gradient of ``loss``, averaged over processes and clipped.
+
+        Returns:
+            Norm of the gradient before clipping, a scalar on the device.
+        """
+        self._steps_done += 1
+        self.optimizer.param_groups[0]["lr"] = rate
+        self.optimizer.zero_grad()
+        loss.backward()
+        parameters = list(self.network.parameters())
+        if self.is_distributed:
+            # Every process has to take part with every weight, also one whose loss does not reach it.
+            gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+            flat = nn.utils.parameters_to_vector(gradients)
+            torch.distributed.all_reduce(flat)
+            nn.utils.vector_to_parameters(flat / self.world_size, gradients)
+        norm = nn.utils.clip_grad_norm_(parameters, GRAD_NORM)
+        self.optimizer.step()
+        return norm.detach()
+
+    def _read(self, figures: dict[str, torch.Tensor]) -> dict[str, float]:
+        """Scalars, averaged over the processes; waits for the device."""
+        values = torch.stack(tuple(figures.values()))
+        if self.is_distributed:
+            torch.distributed.all_reduce(values)
+            values /= self.world_size
+        return dict(zip(figures, values.tolist(), strict=True))
 
     def _done(self) -> float:
         """Share of the run that is done, by clouds or by time, whichever is more; all processes agree."""
@@ -227,7 +311,6 @@ class AlignTrainer(StudentRunner):
 
         Medians are means of the processes' medians.
         """
-        self.network.eval()
         figures = {}
         for name, shapes in self.scenes.held_out.items():
             views = max(1, self.cfg.views // (self.world_size * (4 if name == "made" else 1)))
@@ -251,14 +334,26 @@ class AlignTrainer(StudentRunner):
         error, offset, surface = (torch.cat(values) for values in zip(*parts, strict=True))
         return error, offset, surface
 
+    def _shared_state(self) -> dict[str, Any]:
+        return {
+            "student_state_dict": self.network.state_dict(),
+            "learner": {"optimizer": self.optimizer.state_dict(), "steps": self._steps_done},
+            "spec": to_dict(self.spec),
+            "task": self.task,
+        }
+
     def _own_state(self) -> dict[str, Any]:
         return {}
 
     def _load_own_state(self, state: dict[str, Any]) -> None:
-        """Nothing: shapes are made anew."""
+        """Nothing: shapes and episodes are begun anew."""
 
     def _misfit(self, ranks: list[dict[str, Any]]) -> str:
         return ""
+
+    def _close(self) -> None:
+        if self.looks is not None:
+            self.looks.close()
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:
         save_checkpoint(self.run.out / ALIGNMENT_NAME, alignment_export(state))

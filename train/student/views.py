@@ -6,7 +6,7 @@ batch nothing of a hand is left to do but a look into its tables.
 B pairs, P points of a shape, M postures of the hand. All is in the hand's base frame, in metres.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch.nn.functional import normalize
 
 from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, compose, invert
-from vd.clouds import HandKinematics, SceneClouds
+from vd.clouds import HandCloud, HandKinematics
 from vd.train.student.shapes import drawn, random_matrices, uniform
 from vd.vision.rotations import matrices, rotations_about, two_columns
 
@@ -154,19 +154,7 @@ def posture_points(hand: HandModel, count: int, device: str) -> torch.Tensor:
     poses = wp.empty((count, len(links)), dtype=wp.transform, device=device)
     base = BASE_IN_WORLD
     HandKinematics(hand, link_body=links, base=base, device=device).write(wp.from_torch(joints), poses)
-    cloud = SceneClouds(
-        hand,
-        (),
-        link_body=links,
-        object_body=-1,
-        world_object=np.zeros(count, dtype=int),
-        world_scale=np.ones(count),
-        device=device,
-    )
-    points = torch.empty((count, cloud.ends[1], 3), device=place)
-    goal = wp.zeros(count, dtype=wp.quat, device=device)
-    cloud.write(wp.from_torch(points, dtype=wp.vec3), poses, goal, with_object=False)
-    return points
+    return HandCloud(hand, link_body=links, device=device)(poses)
 
 
 def nearest(cell: torch.Tensor, depth: torch.Tensor, cells: int) -> torch.Tensor:
@@ -242,21 +230,51 @@ def draw_pairs(
     """
     batch, device = len(shapes), shapes.device
     shapes = shapes[:, torch.randperm(shapes.shape[1], device=device)].float()
-    wanted, turn = random_matrices(batch, device), random_matrices(batch, device)
-    angle = NEAR_RAD * torch.rand(batch, device=device)
-    small = matrices(two_columns(rotations_about(torch.randn((batch, 3), device=device), angle)))
-    turn = torch.where(torch.rand((batch, 1, 1), device=device) < near, small, turn)
-    held = (turn @ wanted).transpose(-1, -2)
+    orientation = random_matrices(batch, device)
+    held = orientation.transpose(-1, -2)
     place = hands.box[0] + (hands.box[1] - hands.box[0]) * uniform(0.0, 1.0, batch, 3, device=device)
     rest = shapes[:, count:]
     posed = torch.cat([rest[..., :3] @ held + place[:, None], rest[..., 3:] @ held], dim=-1)
     seen = camera_points(hands, hands.holding(posed[..., :3]), posed, count)
-    goal = goal_points(shapes[:, :count, :3], count, scans)
+    return with_goals(shapes[..., :3], orientation, place, seen, near=near, scans=scans)
+
+
+def with_goals(
+    shapes: torch.Tensor,
+    orientation: torch.Tensor,
+    place: torch.Tensor,
+    seen: torch.Tensor,
+    *,
+    near: float,
+    scans: float,
+) -> Pairs:
+    """Pairs of what is seen of shapes and of goals, turned at random, whose points come first in the shapes.
+
+    Args:
+        shapes: Points of shapes in their own frames, in no order [m] [B, P, 3].
+        orientation: Of these frames, matrices [B, 3, 3].
+        place: Where their origins are [m] [B, 3].
+        seen: What is seen [m] [B, G, 3].
+        near: Share of pairs that are less than ``NEAR_RAD`` apart; others are uniform on SO(3).
+        scans: Share of goals as from scans.
+    """
+    batch, device = len(shapes), shapes.device
+    angle = NEAR_RAD * torch.rand(batch, device=device)
+    small = matrices(two_columns(rotations_about(torch.randn((batch, 3), device=device), angle)))
+    is_near = torch.rand((batch, 1, 1), device=device) < near
+    turn = torch.where(is_near, small, random_matrices(batch, device))
+    wanted = orientation.transpose(-1, -2) @ turn  # its transpose turns the shape to the goal
+    goal = goal_points(shapes, seen.shape[1], scans)
     middle, mean = goal.mean(dim=1, keepdim=True), seen.mean(dim=1)
     return Pairs(
-        (goal - middle) @ wanted.transpose(-1, -2),
+        (goal - middle) @ wanted,
         seen - mean[:, None],
         turn,
-        (middle @ held)[:, 0] + place - mean,
-        (shapes[..., :3] - middle) @ wanted.transpose(-1, -2),
+        (middle @ orientation.transpose(-1, -2))[:, 0] + place - mean,
+        (shapes - middle) @ wanted,
     )
+
+
+def joined(first: Pairs, second: Pairs) -> Pairs:
+    """Pairs of both, one after the other."""
+    return Pairs(*(torch.cat([getattr(pairs, f.name) for pairs in (first, second)]) for f in fields(Pairs)))

@@ -11,20 +11,19 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel
-from vd.config import Renamed, from_dict, to_dict
+from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRule, StoppingRules
-from vd.vision.cfg import StudentCfg
 
 BUNDLE_FORMAT = "visual-dexterity bundle 1"
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-4, 1e-5
 """Differences of numbers that are no difference: a hand that was measured again differs by more."""
 
-Kind = Literal["teacher", "student", "tracking", "vision"]
+Kind = Literal["teacher", "tracking", "vision"]
 
 
 class ContractError(ValueError):
@@ -88,29 +87,6 @@ class ObservationPart:
 
 
 @dataclass(frozen=True)
-class CloudPart:
-    """The cloud a student sees, base frame: points of the goal, the hand, the object (or of a camera)."""
-
-    RETIRED: ClassVar[dict[str, Any]] = {"goal": "merged", "senses": Renamed("proprioception")}
-    point_names: tuple[str, ...]
-    """Sets of the hand's points, in order."""
-    points_per_set: int
-    """Points of each of them."""
-    voxel_m: float
-    """Side of a voxel; true floor of coordinate / side."""
-    goal_position_m: tuple[float, float, float] = PAPER.cloud.goal_position_m
-    """Where the goal's cloud, turned as wanted, is put in the base frame."""
-    feature: float = PAPER.cloud.feature
-    """The constant feature of a voxel."""
-    inputs: tuple[str, ...] = ("constant",)
-    """Features of a voxel, in order. position: its centre in the base frame, in units of 0.1 m; marks:
-    whether it holds points of the goal, and of the hand."""
-    proprioception: tuple[str, ...] = ("action",)
-    """What the network reads besides the cloud, in order: the smoothed action before [D], positions [rad] and
-    0.2 times velocities [rad/s] of the joints as measured [D]."""
-
-
-@dataclass(frozen=True)
 class CameraPart:
     """The depth camera behind a policy that sees by one."""
 
@@ -135,11 +111,11 @@ class CameraPart:
 class Interface:
     """All that hand and policy have to agree on."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"cloud": None}
     conventions: Conventions
     hand: HandPart
     action: ActionPart
-    observation: ObservationPart | None = None
-    cloud: CloudPart | None = None
+    observation: ObservationPart
     camera: CameraPart | None = None
 
 
@@ -182,10 +158,9 @@ class StoppingPart:
 class Provenance:
     """Where a policy comes from."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"stage": None}
     teacher: str
-    """What a student imitates; empty for a teacher."""
-    stage: int | None
-    """Stage of a student's training."""
+    """Whose layers act by what a camera shows; empty for a teacher."""
     objects: tuple[str, ...]
     """Names of the object sets it was trained on."""
     iterations: int
@@ -203,8 +178,8 @@ class Contract:
     kind: Kind
     interface: Interface
     network: dict[str, Any]
-    """What rebuilds the network: PolicySpec or StudentCfg; of a tracking or vision policy the former, as
-    ``policy``, and of a vision policy AlignmentCfg, as ``alignment``."""
+    """What rebuilds the network: PolicySpec; of a tracking or vision policy as ``policy``, and of a vision
+    policy AlignmentCfg beside it, as ``alignment``."""
     stopping: StoppingPart | None
     provenance: Provenance
     software: dict[str, str]
@@ -227,8 +202,6 @@ class Contract:
 
 def derive_interface(
     hand: HandModel,
-    kind: Kind,
-    network: dict[str, Any],
     source: Provenance,
     camera: tuple[float, ...] | None = None,
 ) -> Interface:
@@ -236,8 +209,6 @@ def derive_interface(
 
     Args:
         hand: The hand.
-        kind: Of the policy.
-        network: What rebuilds its network.
         source: Where it comes from; ``depth`` is empty for one that sees by no camera.
         camera: Where the training put that, optical frame in the base frame [7]; None: the hand's own.
 
@@ -246,7 +217,6 @@ def derive_interface(
     """
     task = from_dict(ReorientCfg, source.task, where="provenance.task")
     depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth") if source.depth else None
-    student = kind == "student"
     return Interface(
         conventions=Conventions(),
         hand=HandPart(
@@ -257,8 +227,7 @@ def derive_interface(
             base_in_world=_floats(BASE_IN_WORLD),
         ),
         action=ActionPart(task.sim.control_hz, task.action.ema_alpha, task.action.scale_rad_s),
-        observation=None if student else _observation(hand, task),
-        cloud=_cloud(hand, from_dict(StudentCfg, network, where="network")) if student else None,
+        observation=_observation(hand, task),
         camera=None if depth is None else _camera(hand, depth, camera),
     )
 
@@ -271,16 +240,6 @@ def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
         end = slices["previous_action"].stop
         parts["shape"] = (end, end + shape_observation_size(hand.num_fingers))
     return ObservationPart(parts, view=seen.view, file_axes=seen.file_axes)
-
-
-def _cloud(hand: HandModel, network: StudentCfg) -> CloudPart:
-    return CloudPart(
-        point_names=hand.point_names,
-        points_per_set=hand.link_points.shape[1],
-        voxel_m=network.voxel_m,
-        inputs=network.encoder.inputs,
-        proprioception=network.proprioception,
-    )
 
 
 def _camera(hand: HandModel, depth: DepthCameraCfg, pose: tuple[float, ...] | None) -> CameraPart:
@@ -303,7 +262,6 @@ _REMEDY = {
     "hand": "use the hand it was trained for, or train a policy for this one",
     "action": "export the policy again; its contract was changed after the export",
     "observation": "export the policy again with this version",
-    "cloud": "use the hand it was trained for, or export the policy again with this version",
     "camera": "use the camera it was made for, or write it for this one (vd-train, --camera)",
 }
 """What to do about a difference in each part of the interface."""
@@ -320,7 +278,7 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
     Raises:
         ContractError: The first field that differs, what the hand has, what the bundle wants, what to do.
     """
-    found = derive_interface(hand, contract.kind, contract.network, contract.provenance, contract.own_camera)
+    found = derive_interface(hand, contract.provenance, contract.own_camera)
     for name, have, want in _differences(to_dict(found), to_dict(contract.interface)):
         part = name.split(".")[0]
         raise ContractError(

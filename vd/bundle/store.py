@@ -31,32 +31,22 @@ from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
 from vd.tracking.policy import TrackingPolicy, TrackingSpec
 from vd.versions import installed_versions
-from vd.vision.cfg import StudentCfg
-from vd.vision.network import Student
-from vd.vision.saved import SavedStudent, StudentSpec, alignment_network
-from vd.vision.voxels import Voxeliser
+from vd.vision.saved import alignment_network
 
 WEIGHTS_FILE, GOLDEN_FILE = "weights.safetensors", "golden.safetensors"
 FILE_MODE, FOLDER_MODE = 0o644, 0o755
 """A bundle is for others to read."""
-RENDERED = 2
-"""Stage of students that see a depth camera."""
-STATES, STEPS, GOLDEN_POINTS = 8, 3, 500
-"""Golden observations of a teacher; golden control steps of a student, one after the other since memory
-counts, and points of the goal and of the object in each; the hand has twice as many."""
+STATES, GOLDEN_POINTS = 8, 500
+"""Golden observations of a teacher or pairs of clouds, and points of each cloud."""
 GOLDEN_M = 0.03
 """Standard deviation of the golden points of a network of alignment [m]: about that of an object's."""
-SCENE_VOXELS = 16
-"""Golden points lie within so many voxels of the base frame's origin."""
 TOLERANCE = 5e-3
 """Largest difference of an output from the golden one. Actions are of size 1; processors, GPUs and other
 versions of torch differ by 1e-6 to 1e-3."""
-PROPRIOCEPTION = {"action": "previous_action", "position": "joint_q", "velocity": "joint_qd"}
-"""Golden input behind each part of a student's proprioception."""
 _PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
 _AGAIN = "write the bundle again with vd-train bundle"
 
-AnyPolicy = TrainedPolicy | SavedStudent | TrackingPolicy
+AnyPolicy = TrainedPolicy | TrackingPolicy
 Tensors = dict[str, torch.Tensor]
 
 
@@ -76,26 +66,22 @@ def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
     kind: Kind = "teacher"
     rules: StoppingRules | None = None
-    trained: TrainedPolicy | SavedStudent
+    trained = policy.teacher if isinstance(policy, TrackingPolicy) else policy
     if isinstance(policy, TrackingPolicy):
-        kind, rules, trained = policy.kind, policy.spec, policy.teacher
-        source = _provenance(trained, policy.spec.teacher, None, to_dict(policy.spec.depth))
+        kind, rules = policy.kind, policy.spec
+        source = _provenance(trained, policy.spec.teacher, to_dict(policy.spec.depth))
         network, camera = {"policy": to_dict(trained.spec)}, policy.spec.camera
         parts = {"actor": trained.weights, "critic": trained.critic_weights}
         if policy.alignment is not None:
             network["alignment"] = to_dict(policy.spec.alignment)
             parts["alignment"] = policy.alignment.state_dict()
         weights = {f"{part}.{name}": value for part, own in parts.items() for name, value in own.items()}
-    elif isinstance(policy, SavedStudent):
-        kind, rules, trained, spec = "student", policy.spec, policy, policy.spec
-        source = _provenance(policy, spec.teacher, spec.stage, policy.depth if spec.stage == RENDERED else {})
-        network, camera, weights = to_dict(spec.network), spec.camera, policy.network.state_dict()
     else:
-        trained, source = policy, _provenance(policy, "", None, {})
+        source = _provenance(policy, "", {})
         network, camera, weights = to_dict(policy.spec), None, policy.weights
     contract = Contract(
         kind=kind,
-        interface=derive_interface(hand, kind, network, source, camera),
+        interface=derive_interface(hand, source, camera),
         network=network,
         stopping=None if rules is None else StoppingPart.of(rules),
         provenance=source,
@@ -165,55 +151,29 @@ def _golden_inputs(policy: AnyPolicy) -> Tensors:
     """Inputs, and the outputs that have to come back.
 
     Of a teacher's layers ``observation`` [S, O] of size 1. Of a network of alignment ``goal_points`` and
-    ``seen_points`` [S, G, 3] about their means [m]. Of a student ``goal_points`` [T, G, 3] and
-    ``scene_points`` [T, P, 3], hand and object [m], base frame, all at centres of voxels, where no rounding
-    decides; ``previous_action``, ``joint_q`` [rad] and ``joint_qd`` [rad/s] [T, D].
+    ``seen_points`` [S, G, 3] about their means [m].
     """
     rng = np.random.default_rng(0)
-    if isinstance(policy, SavedStudent):
-        side, joints = policy.spec.network.voxel_m, (STEPS, policy.spec.num_actions)
-        points = rng.integers(-SCENE_VOXELS, SCENE_VOXELS, (STEPS, 4 * GOLDEN_POINTS, 3)) + 0.5
-        drawn = {
-            "goal_points": side * points[:, :GOLDEN_POINTS],
-            "scene_points": side * points[:, GOLDEN_POINTS:],
-            **{name: rng.uniform(-1.0, 1.0, joints) for name in PROPRIOCEPTION.values()},
-        }
-    else:
-        teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
-        drawn = {"observation": rng.normal(size=(STATES, teacher.num_observations))}
-        if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
-            shape = (STATES, GOLDEN_POINTS, 3)
-            drawn |= {name: rng.normal(scale=GOLDEN_M, size=shape) for name in ("goal_points", "seen_points")}
+    teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
+    drawn = {"observation": rng.normal(size=(STATES, teacher.num_observations))}
+    if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
+        shape = (STATES, GOLDEN_POINTS, 3)
+        drawn |= {name: rng.normal(scale=GOLDEN_M, size=shape) for name in ("goal_points", "seen_points")}
     return {name: torch.tensor(value, dtype=torch.float32) for name, value in drawn.items()}
 
 
 def _answers(policy: AnyPolicy, golden: Mapping[str, torch.Tensor]) -> Tensors:
-    """What a policy makes of golden inputs on its device: ``action``, of a student ``distance`` too [rad].
+    """What a policy makes of golden inputs on its device: ``action`` [S, D].
 
     Of a network of alignment ``rotation``, matrices [S, 3, 3].
     """
-    if not isinstance(policy, SavedStudent):
-        teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
-        found = {"action": teacher.act(golden["observation"]).cpu()}
-        if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
-            with torch.no_grad():
-                turn = policy.alignment(golden["goal_points"], golden["seen_points"]).rotation
-            found["rotation"] = turn.cpu()
-        return found
-    network, goal, scene = policy.network, golden["goal_points"], golden["scene_points"]
-    voxelise = Voxeliser(network.cfg.voxel_m, device=str(goal.device))
-    # The object has as many points as the goal.
-    ends = (goal.shape[1], scene.shape[1]) if network.cfg.marked else ()
-    known = network.proprioception({part: golden[name] for part, name in PROPRIOCEPTION.items()})
-    hidden, actions, distances = network.initial_hidden(1), [], []
-    with torch.no_grad():
-        for step, points in enumerate(torch.cat([goal, scene], dim=1)):
-            sites = voxelise(points[None].contiguous(), ends=ends)
-            output = network.act(sites, known[step : step + 1], hidden)
-            hidden = output.hidden
-            actions.append(output.mean[0])
-            distances.append(output.distance[0])
-    return {"action": torch.stack(actions).cpu(), "distance": torch.stack(distances).cpu()}
+    teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
+    found = {"action": teacher.act(golden["observation"]).cpu()}
+    if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
+        with torch.no_grad():
+            turn = policy.alignment(golden["goal_points"], golden["seen_points"]).rotation
+        found["rotation"] = turn.cpu()
+    return found
 
 
 def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
@@ -224,25 +184,13 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     settings: dict[str, Any] = {"teacher": source.teacher, "camera": contract.own_camera}
     if (stopping := contract.stopping) is not None:
         settings |= stopping.rules()
-    if contract.kind in ("tracking", "vision"):
-        teacher = _teacher(network.pop("policy"), source, weights, device, parts=True)
-        spec = from_dict(TrackingSpec, network, where="network")
-        depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth")
-        alignment = None
-        if spec.alignment is not None:
-            alignment = alignment_network(spec.alignment, _part(weights, "alignment."), device)
-        return TrackingPolicy(teacher, replace(spec, depth=depth, **settings), alignment)
-    assert source.stage is not None
-    student = StudentSpec(
-        network=from_dict(StudentCfg, network, where="network"),
-        num_actions=len(contract.interface.hand.joint_names),
-        stage=source.stage,
-        **settings,
-    )
-    net = Student(student.network, student.num_actions).to(device)
-    net.load_state_dict(weights)
-    net.eval().requires_grad_(False)
-    return SavedStudent(student, net, source.task, source.depth, source.iterations, source.env_steps)
+    teacher = _teacher(network.pop("policy"), source, weights, device, parts=True)
+    spec = from_dict(TrackingSpec, network, where="network")
+    depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth")
+    alignment = None
+    if spec.alignment is not None:
+        alignment = alignment_network(spec.alignment, _part(weights, "alignment."), device)
+    return TrackingPolicy(teacher, replace(spec, depth=depth, **settings), alignment)
 
 
 def _teacher(
@@ -265,14 +213,11 @@ def _part(weights: Tensors, prefix: str) -> Tensors:
     return {n.removeprefix(prefix): value for n, value in weights.items() if n.startswith(prefix)}
 
 
-def _provenance(
-    trained: TrainedPolicy | SavedStudent, teacher: str, stage: int | None, depth: dict[str, Any]
-) -> Provenance:
+def _provenance(trained: TrainedPolicy, teacher: str, depth: dict[str, Any]) -> Provenance:
     """Where a policy comes from, without folders of the machine it was trained on."""
     objects = tuple(Path(name).name for name in trained.task.get("objects", ()))
     return Provenance(
         teacher=Path(teacher).name,
-        stage=stage,
         objects=objects,
         iterations=trained.iteration,
         env_steps=trained.env_steps,

@@ -20,7 +20,6 @@ from vd.paper import PAPER
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
     from vd.tracking.policy import TrackingPolicy
-    from vd.vision.saved import SavedStudent
 
 BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
@@ -46,7 +45,7 @@ LAYER_HELP = (
 )
 """What --hand-layer means on the command lines of vd-eval and vd-play."""
 # What a run's folder holds, best first.
-_RUN_FILES = ("policy.pt", "student.pt", "checkpoints/best.pt")
+_RUN_FILES = ("policy.pt", "checkpoints/best.pt")
 
 
 def find_policy(name: str | Path) -> Path:
@@ -67,7 +66,7 @@ def find_policy(name: str | Path) -> Path:
         return path
     if not path.is_dir():
         raise FileNotFoundError(
-            f"no policy at {path}; give a policy.pt, a student.pt, a bundle's folder, a file of a run's "
+            f"no policy at {path}; give a policy.pt, a bundle's folder, a file of a run's "
             f"checkpoints folder, a run's folder, or the name of an installed policy: "
             f"{', '.join(SHIPPED_POLICIES)}"
         )
@@ -106,7 +105,7 @@ def trained_task(policy: Any) -> ReorientCfg:
     return from_dict(ReorientCfg, policy.task, where="task of the policy")
 
 
-def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | TrackingPolicy | None":
+def open_policy(name: str, device: str) -> "TrainedPolicy | TrackingPolicy | None":
     """Load a trained policy; None for a built-in agent, which needs the number of actions first.
 
     Args:
@@ -122,7 +121,6 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | Track
         return None
     from vd.policy import load_policy
     from vd.tracking.policy import is_tracking, load_tracking
-    from vd.vision.saved import is_student, load_student
 
     path = find_policy(name)
     if is_bundle(path):
@@ -131,11 +129,11 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | Track
         return read_bundle(path, device)
     if is_tracking(path):
         return load_tracking(path, device)
-    return load_student(path, device) if is_student(path) else load_policy(path, device)
+    return load_policy(path, device)
 
 
 def sees_clouds(name: str) -> bool:
-    """Whether a policy sees point clouds: a student, or one that tracks.
+    """Whether a policy sees point clouds.
 
     Raises:
         FileNotFoundError: There is no such policy.
@@ -148,9 +146,8 @@ def sees_clouds(name: str) -> bool:
 
         return read_contract(path).kind != "teacher"
     from vd.tracking.policy import is_tracking
-    from vd.vision.saved import is_student
 
-    return is_student(path) or is_tracking(path)
+    return is_tracking(path)
 
 
 def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
@@ -191,11 +188,10 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
         from vd.bundle.store import read_contract
 
         return check_hand(read_contract(path), model, path)
-    moves = policy.spec.num_actions if is_saved_student(policy) else policy.num_actions
-    if moves != model.num_joints:
+    if policy.num_actions != model.num_joints:
         trained = trained_task(policy).hand
         raise ValueError(
-            f"{name} moves {moves} joints, the hand {model.name} has {model.num_joints}; "
+            f"{name} moves {policy.num_actions} joints, the hand {model.name} has {model.num_joints}; "
             f"use the hand it was trained for: --hand {trained}"
         )
 
@@ -204,15 +200,6 @@ def _on_hand(task: ReorientCfg, hand: str | None, hand_layer: str | None) -> Reo
     """A task with the hand and layer that were asked for; None: as trained."""
     layer = task.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer
     return replace(task, hand=hand or task.hand, hand_layer=layer)
-
-
-def is_saved_student(policy: Any | None) -> "TypeGuard[SavedStudent]":
-    """Whether what :func:`open_policy` gave is a student."""
-    if policy is None:
-        return False
-    from vd.vision.saved import SavedStudent
-
-    return isinstance(policy, SavedStudent)
 
 
 def is_tracking_policy(policy: Any | None) -> "TypeGuard[TrackingPolicy]":
@@ -290,7 +277,7 @@ def task_for(
         condition: What is drawn, in place of ``randomised`` (:mod:`vd.evaluate.conditions`).
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
-    if is_saved_student(policy) or is_tracking_policy(policy):
+    if is_tracking_policy(policy):
         # Who does not look at its teacher's observation.
         base = replace(base, observation=ObservationCfg())
     if base.observation.dynamics == "critic":  # whom nobody asks here

@@ -34,7 +34,7 @@ OF_THE_SUITE = (
 )
 """Settings that a suite decides."""
 POLICY_HELP = (
-    "A policy.pt or student.pt, a checkpoint, the folder of a bundle or of a run, the name of an installed "
+    "A policy.pt, a checkpoint, the folder of a bundle or of a run, the name of an installed "
     f"policy ({', '.join(SHIPPED_POLICIES)}), or zero or random, which have no file."
 )
 """What names a policy on a command line."""

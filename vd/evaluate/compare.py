@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from vd.evaluate.agents import (
     built_in,
     check_fits,
-    is_tracking_policy,
     open_policy,
     sees_clouds,
     start_at_rest,
@@ -189,19 +188,12 @@ def actor_of(
         return built_in(name, env.num_actions, seed=seed, device=env.device), name, "nothing", StoppingRule
     if isinstance(policy, TrainedPolicy):
         return policy, "teacher", "state", StoppingRule
+    from vd.evaluate.tracking import TrackingActor
     from vd.workers import one_thread_without_gpu
 
     one_thread_without_gpu(env.device)
     settings: dict[str, Any] = {"goals": goals, "sensor_errors": sensor_errors, "seed": seed}
-    if is_tracking_policy(policy):
-        from vd.evaluate.tracking import TrackingActor
-
-        return TrackingActor(env, policy, **settings), policy.kind, "rendered clouds", policy.spec.rule_for
-    from vd.evaluate.student import StudentActor
-
-    actor = StudentActor(env, policy, **settings)
-    sees = "rendered clouds" if actor.rendered else "complete clouds"
-    return actor, f"student of stage {policy.spec.stage}", sees, policy.spec.rule_for
+    return TrackingActor(env, policy, **settings), policy.kind, "rendered clouds", policy.spec.rule_for
 
 
 def run_episodes(

@@ -121,9 +121,9 @@ class Row:
     policy: str
     """As it was named."""
     kind: str
-    """teacher, tracking, student of stage 1 or 2, zero, random."""
+    """teacher, tracking, vision, zero, random."""
     sees: str
-    """state, complete clouds, rendered clouds or nothing."""
+    """state, rendered clouds or nothing."""
     group: str
     """Name of the group of objects."""
     condition: str

@@ -17,6 +17,7 @@ class TrackingActor:
 
     Attributes:
         num_actions: D.
+        tracker: What decides.
         predicted: Distance to the goal that it expected before the latest action [rad], shape [N].
         active: Where it acts, bool [N]; elsewhere its actions are 0.
     """
@@ -46,7 +47,7 @@ class TrackingActor:
         self.num_actions = policy.num_actions
         depth = depth.with_errors() if sensor_errors else depth
         self._senses = EnvironmentSenses(env, camera, depth, seed=seed)
-        self._tracker = Tracker(
+        self.tracker = Tracker(
             policy,
             env.hand,
             known_objects(
@@ -63,6 +64,6 @@ class TrackingActor:
 
     def act(self, _observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] for what is sensed now; the teacher's observation is not looked at."""
-        decision = self._tracker.step(self._senses.read())
+        decision = self.tracker.step(self._senses.read())
         self.predicted.copy_(decision.angle)
         return decision.action.masked_fill(~self.active[:, None], 0.0)

@@ -3,12 +3,12 @@
 import torch
 import warp as wp
 
-from vd.kernels.sparse.coordinate_maps import beside
-from vd.kernels.sparse.voxels import coordinates, voxelise
+from vd.kernels.launch import launch
+from vd.kernels.sensor.voxels import CLOUD_SHIFT, beside_kernel, coordinates_kernel, voxel_key_kernel
 
 
 def object_points(
-    points: wp.array, hand: wp.array, voxel_m: float, most: int
+    points: torch.Tensor, hand: int, voxel_m: float, most: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Centres of the object's voxels.
 
@@ -16,29 +16,37 @@ def object_points(
     the hand's too.
 
     Args:
-        points: Clouds [m]: the hand's own samples, then what the camera sees, NaN for none, vec3 [N, P].
-        hand: Column at which the hand's samples end, int32 [1].
+        points: Clouds [m]: the hand's own samples, then what the camera sees, NaN for none [N, P, 3].
+        hand: Column at which the hand's samples end.
         voxel_m: Side of a voxel [m].
         most: M, voxels of a cloud at most.
 
     Returns:
-        Centres [m], zeros where a cloud has fewer, shape [N, M', 3] with M' <= M, and how many there are,
-        int32 [N]. Waits for the device.
+        Centres [m], zeros where a cloud has fewer, shape [N, M', 3] with M' <= M, neighbours beside each
+        other, and how many there are, int32 [N]. Waits for the device.
     """
-    keys, marks = voxelise(points, voxel_m, ends=hand)
-    of_hand = wp.to_torch(marks)[:, 0] > 0
-    free = ~of_hand
-    touches = wp.to_torch(beside(keys, wp.from_torch(free), wp.from_torch(of_hand)))
-    rows = wp.to_torch(coordinates(keys))[free & ~touches]
+    device, envs = points.device, len(points)
+    keys = torch.empty(points.shape[:2], dtype=torch.int64, device=device)
+    cloud = wp.from_torch(points.contiguous(), dtype=wp.vec3)
+    launch(voxel_key_kernel, keys.shape, [cloud, voxel_m], [wp.from_torch(keys)])
+    voxels, place = torch.unique(keys, return_inverse=True)
+    of_hand = torch.zeros(len(voxels), dtype=torch.bool, device=device)
+    of_hand[place[:, :hand]] = True
+    touches = torch.empty_like(of_hand)
+    inputs = [wp.from_torch(voxels), wp.from_torch(of_hand)]
+    launch(beside_kernel, len(voxels), inputs, [wp.from_torch(touches)])
+    free = voxels[~touches & (voxels < envs << CLOUD_SHIFT)]
+    rows = torch.empty((len(free), 4), dtype=torch.int32, device=device)
+    launch(coordinates_kernel, len(free), [wp.from_torch(free)], [wp.from_torch(rows)])
     cloud = rows[:, 0].long()
-    first = torch.searchsorted(cloud, torch.arange(points.shape[0] + 1, device=rows.device))
-    counts, rank = first.diff(), torch.arange(len(cloud), device=rows.device) - first[cloud]
+    first = torch.searchsorted(cloud, torch.arange(envs + 1, device=device))
+    counts, rank = first.diff(), torch.arange(len(cloud), device=device) - first[cloud]
     # Of more than ``most`` every so many-th is taken, in the order of the rows, in which neighbours follow
     # each other: those left out would share a place with the one before them.
     share = counts.clamp(min=most)[cloud]
     place = rank * most // share
     taken = (rank == 0) | ((rank - 1) * most // share < place)
     size = min(most, max(1, int(counts.max())))
-    centres = torch.zeros((len(counts), size, 3), device=rows.device)
+    centres = torch.zeros((envs, size, 3), device=device)
     centres[cloud[taken], place[taken]] = rows[taken, 1:] + 0.5
     return voxel_m * centres, counts.clamp(max=most).int()

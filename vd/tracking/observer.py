@@ -17,7 +17,7 @@ import warp as wp
 
 from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.clouds import HandKinematics, SceneClouds
+from vd.clouds import HandCloud, HandKinematics
 from vd.envs.shapes import ShapeObserver
 from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
 from vd.paper import PAPER
@@ -91,20 +91,18 @@ class Observer:
 
         envs: dict[str, Any] = {"world_object": world_object, "world_scale": world_scale, "device": device}
         self._kinematics = HandKinematics(hand, link_body=links, base=BASE_IN_WORLD, device=device)
-        self._hand_cloud = SceneClouds(hand, (), link_body=links, object_body=-1, **envs)
+        self._hand_cloud = HandCloud(hand, link_body=links, device=device)
         self._ages = (0.0,) if alignment is None else AGES_S
-        self._hand_end = array([self._hand_cloud.ends[1] * len(self._ages)], wp.int32)
-        self._finder: Registration | GoalFinder
+        self.finder: Registration | GoalFinder
         if alignment is None:
-            self._finder = Registration(objects, camera=camera, **envs)
+            self.finder = Registration(objects, camera=camera, **envs)
             self._symmetry = symmetries_of_worlds(objects, world_object, device)
         else:
-            self._finder = GoalFinder(alignment, objects, world_object=world_object, world_scale=world_scale)
+            self.finder = GoalFinder(alignment, objects, world_object=world_object, world_scale=world_scale)
             self._symmetry = torch.tensor([0.0, 0.0, 0.0, 1.0], device=place).expand(len(world_object), 1, 4)
-        self._before = self._finder.pose[:, 0].clone()
+        self._before = self.finder.pose[:, 0].clone()
         self._fingertips = Fingertips(hand, place)
         self._links = wp.empty((len(world_object), len(links)), dtype=wp.transform, device=device)
-        self._goal = wp.empty(len(world_object), dtype=wp.quat, device=device)
         self._base = torch.tensor(BASE_IN_WORLD, dtype=torch.float32, device=place)
         limits = np.stack([hand.lower, hand.upper])
         self._lower, self._upper = torch.tensor(limits, dtype=torch.float32, device=place)
@@ -167,17 +165,14 @@ class Observer:
             links = wp.empty_like(links)
             joints = senses.joint_q - age * senses.joint_qd
             self._kinematics.write(wp.from_torch(joints.contiguous()), links)
-        points = torch.empty((len(senses.points), self._hand_cloud.ends[1], 3), device=self._base.device)
-        cloud = wp.from_torch(points, dtype=wp.vec3)
-        self._hand_cloud.write(cloud, links, self._goal, with_object=False)
-        return points
+        return self._hand_cloud(links)
 
     def _find(self, senses: Senses) -> Found:
         """Find the objects among the camera's points, or follow them; links are posed."""
-        followed, before = self._finder, self._before
+        followed, before = self.finder, self._before
         cloud = torch.cat([*(self._hand_points(age, senses) for age in self._ages), senses.points], dim=1)
-        points = wp.from_torch(cloud, dtype=wp.vec3)
-        seen, count = object_points(points, self._hand_end, PAPER.cloud.voxel_m, followed.most)
+        hand = len(self._ages) * self._hand_cloud.count
+        seen, count = object_points(cloud, hand, PAPER.cloud.voxel_m, followed.most)
         followed.look(seen, count, fresh=senses.fresh, points=senses.points)
         pose, base, turn = followed.pose[:, 0], self._base, self._base[3:].expand(len(seen), 4)
         # A first look knows no motion.

@@ -40,6 +40,8 @@ class GoalFinder:
         looks: How often each environment's object was seen since it was begun anew, [N] int32.
         most: Points seen of the object that are looked at.
         share: Which they are, as shares of all that are seen, in order [most].
+        seen: Those of the latest look of each environment [m] [N, most, 3].
+        seen_now: Where there was one now, bool [N].
     """
 
     most = POINTS
@@ -62,6 +64,8 @@ class GoalFinder:
         self.pose[..., 6] = 1.0
         self.error = torch.full((envs,), torch.pi, device=device)
         self.looks = torch.zeros(envs, dtype=torch.int32, device=device)
+        self.seen = torch.zeros((envs, POINTS, 3), device=device)
+        self.seen_now = torch.zeros(envs, dtype=torch.bool, device=device)
 
     def look(
         self,
@@ -82,11 +86,12 @@ class GoalFinder:
         self.looks.masked_fill_(fresh, 0)
         self._aligner.reset(fresh)
         count, crowded = self._crowded(seen, count)
-        rows = (count >= LEAST).nonzero().flatten()  # waits for the device
+        self.seen_now = count >= LEAST
+        rows = self.seen_now.nonzero().flatten()  # waits for the device
         if not len(rows):
             return
         chosen = torch.searchsorted(crowded[rows].cumsum(dim=1), (self.share * count[rows, None]).long() + 1)
-        points = seen[rows].take_along_dim(chosen[..., None], dim=1)
+        self.seen[rows] = points = seen[rows].take_along_dim(chosen[..., None], dim=1)
         found = self._aligner.look(points, rows)
         place = found.position - (found.rotation @ self._mean[rows, :, None]).squeeze(-1)
         self.pose[rows, 0] = torch.cat([place, quaternions(found.rotation)], dim=1)

@@ -1,1 +1,0 @@
-"""Kernels of sparse convolutions: voxels and coordinate maps."""

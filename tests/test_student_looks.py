@@ -1,0 +1,165 @@
+"""Looks of the simulation that alignment learns from, stages on the command line, several processes."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from test_alignment import QUICK, TINY, make_runner
+
+from vd.envs.cfg import RandomisationCfg, ReorientCfg
+from vd.envs.reorient import ReorientEnv
+from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy
+from vd.policy import load_policy
+from vd.tracking.policy import TrackingPolicy, TrackingSpec
+from vd.train.cli import main
+from vd.train.metrics import read_progress
+from vd.train.student.align import CLOUDS, mesh_points
+from vd.train.student.config import PRESETS, LooksCfg
+from vd.train.student.looks import SimulatedLooks
+from vd.train.vec_env import ReorientVecEnv
+from vd.vision.alignment import AlignmentNetwork
+from vd.vision.saved import load_alignment
+
+NEAR_M = 0.008
+"""Median distance of what a camera sees, at centres of voxels, from samples 3 mm apart, of a camera that is late."""
+
+
+def make_looks(points: int) -> SimulatedLooks:
+    """Two cubes of so many points, seen by a policy of random weights."""
+    torch.manual_seed(0)
+    cfg = ReorientCfg(hand="dclaw3", objects=("cube",), num_envs=2, randomisation=RandomisationCfg())
+    env = ReorientEnv(cfg, "cpu")
+    network = AlignmentNetwork(TINY)
+    teacher = load_policy(find_policy("dclaw3-table"))
+    policy = TrackingPolicy(teacher, TrackingSpec(alignment=TINY), network)
+    surfaces = mesh_points(env.objects, points, torch.device("cpu"))[..., :3]
+    return SimulatedLooks(ReorientVecEnv(env), policy, surfaces, LooksCfg(steps=4, kept=12), seed=0)
+
+
+def test_goals_turned_as_the_label_says_lie_on_what_was_seen():
+    looks = make_looks(2000)
+    for _ in range(2):  # more than are kept
+        figures = looks.collect(lambda: False)
+    assert set(figures) == {"looks/rotation_error", "looks/success_per_goal"}
+    pairs = looks.pairs(64, 200, near=0.5, scans=0.0)
+    assert pairs.goal.shape == pairs.seen.shape == (64, 200, 3)
+    back = pairs.surface @ pairs.rotation.transpose(-1, -2) + pairs.offset[:, None]
+    apart = torch.cdist(pairs.seen, back).amin(dim=-1).median(dim=-1).values
+    assert apart.median() < NEAR_M
+    turned = torch.cdist(pairs.seen, pairs.surface + pairs.offset[:, None]).amin(dim=-1).median(dim=-1).values
+    assert turned.median() > 1.3 * apart.median()
+    assert looks.collect(lambda: True) is None
+
+
+def test_a_batch_is_of_both():
+    runner = make_runner(looks=make_looks(CLOUDS * QUICK.points))
+    runner.looks.collect(lambda: False)
+    assert len(runner.pairs().goal) == QUICK.batch
+    assert {"looks/success_per_goal", "loss/rotation"} <= runner._iterate().keys()
+
+
+def test_presets_are_valid_and_bad_settings_named():
+    for preset in PRESETS.values():
+        for number in (0, 1):
+            preset(number).validate()
+    first = PRESETS["gpu"](1)
+    with pytest.raises(ValueError, match=r"--looks\.share is 2"):
+        replace(first, looks=LooksCfg(share=2.0)).validate()
+
+
+def test_what_is_missing_or_of_before_is_explained(tmp_path, capsys):
+    base = ["student", "--preset", "cpu-demo", "--out", str(tmp_path / "run"), "--device", "cpu"]
+    assert main([*base, "--stage", "1"]) == 1
+    assert "give its alignment.pt as --init" in capsys.readouterr().err
+    assert main(["student", "--device", "cpu", "--out", str(tmp_path / "run")]) == 1
+    assert "--teacher is missing" in capsys.readouterr().err
+    torch.save({"spec": {}, "student_state_dict": {}, "task": {}, "depth": {}}, tmp_path / "student.pt")
+    assert main([*base, "--stage", "1", "--init", str(tmp_path / "student.pt")]) == 1
+    assert "holds no network of alignment" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="vd-train tracker TEACHER --alignment"):
+        open_policy(str(tmp_path / "student.pt"), "cpu")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_stages_on_the_command_line(tmp_path, capsys):
+    sizes = {"batch": 8, "steps": 2, "shapes": 8, "hands": 4, "points": 64, "views": 1, "fresh-shapes": 1}
+    small = [word for name, value in sizes.items() for word in (f"--align.{name}", str(value))]
+    network = ["--align.network.width", "16", "--align.network.tokens", "12", "--align.network.layers", "1"]
+    common = ["--preset", "cpu-demo", "--num-envs", "2", "--no-tensorboard", "--teacher", "dclaw3-table"]
+    common += ["--objects", "cube", *small]
+    folders = [tmp_path / f"stage{number}" for number in (0, 1)]
+    assert main(["student", *common, *network, "--out", str(folders[0]), "--max-steps", "32"]) == 0
+    init = ["--stage", "1", "--init", str(folders[0] / "alignment.pt"), "--looks.steps", "2"]
+    assert main(["student", *common, *init, "--out", str(folders[1]), "--max-steps", "32"]) == 0
+    assert "begins with the weights of" in capsys.readouterr().out
+    assert main(["student", "--out", str(folders[1]), "--resume", "--max-steps", "48"]) == 0
+    assert "resumed after iteration 2 of 3" in capsys.readouterr().out
+    rows = read_progress(folders[1] / "progress.jsonl")
+    assert [row["iteration"] for row in rows] == [1, 2, 3]
+    assert all(0.0 <= row["looks/rotation_error"] <= 3.15 for row in rows)
+    assert load_alignment(folders[1] / "alignment.pt")[1].network.width == 16
+
+
+PROCESS = """
+import json, os, sys
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+sys.path.insert(0, {tests!r})
+from test_alignment import make_runner
+rank, folder = int(os.environ["RANK"]), Path({folder!r})
+runner = make_runner(seed=rank, out=folder)
+runner.learn(2)
+weights = torch.nn.utils.parameters_to_vector(runner.network.parameters())
+result = [weights.tolist(), float(runner.pairs().seen.sum())]
+(folder / f"rank{{rank}}.json").write_text(json.dumps(result))
+runner.shutdown()
+"""
+
+
+def test_two_processes_share_gradients_and_draw_their_own(tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    code = PROCESS.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    common = os.environ | {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    environments = [common | {"RANK": rank, "LOCAL_RANK": rank} for rank in "01"]
+    processes = [subprocess.Popen([sys.executable, "-c", code], env=one) for one in environments]
+    try:
+        assert [process.wait(timeout=300) for process in processes] == [0, 0]
+    finally:
+        for process in processes:
+            process.kill()
+    one, two = (json.loads((tmp_path / f"rank{rank}.json").read_text()) for rank in range(2))
+    assert one[0] == two[0] and one[1] != two[1]
+    rows = read_progress(tmp_path / "progress.jsonl")
+    assert [row["env_steps"] for row in rows] == [64, 128]  # 2 processes x 16 pairs x 2 steps
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in SHIPPED_POLICIES if name.endswith("-vision")])
+def test_with_its_network_set_to_zero_success_falls_to_chance(name, tmp_path):
+    from vd.evaluate.cli import main as evaluate
+    from vd.evaluate.result import Result
+    from vd.tracking.policy import load_tracking, tracking_export
+    from vd.train.checkpoint import save_checkpoint
+
+    policy, rates = load_tracking(find_policy(name)), []
+    for blind in (False, True):
+        if blind:
+            torch.nn.utils.vector_to_parameters(
+                0.0 * torch.nn.utils.parameters_to_vector(policy.alignment.parameters()),
+                policy.alignment.parameters(),
+            )
+        save_checkpoint(tmp_path / f"{blind}.pt", tracking_export(policy))
+        flags = ["--objects", "cuboid", "--episodes", "16", "--device", "cpu", "--out", str(tmp_path)]
+        assert evaluate([str(tmp_path / f"{blind}.pt"), *flags]) == 0
+        rates.append(Result.read(tmp_path / "eval.json").rows[0].overall.outcomes["success"].value)
+    assert rates[1] < 0.3 * rates[0]

@@ -1,0 +1,101 @@
+"""What a camera sees in simulation while a policy acts by the network that learns from it (DAgger).
+
+The simulator knows how each object lies: whatever the network believes, and wherever that leads, is labelled
+by the truth (Ross et al. 2011). N environments, K looks kept, P points of a look. Base frame, metres.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import warp as wp
+
+from vd.assets_usd.hand_data import BASE_IN_WORLD
+from vd.evaluate.tracking import TrackingActor
+from vd.quaternions import product, rotated, rotation_distance
+from vd.tracking.policy import TrackingPolicy
+from vd.train.student.config import LooksCfg
+from vd.train.student.views import Pairs, with_goals
+from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
+from vd.vision.finder import POINTS
+from vd.vision.rotations import matrices, two_columns
+
+ENDS = ("task/reached", "task/dropped", "task/timed_out")
+"""How goals end; shares of the environments in each step."""
+
+
+class SimulatedLooks:
+    """Lets a policy act, and keeps what it saw.
+
+    Args:
+        env: The environments.
+        policy: Acts by the network that is trained.
+        surfaces: Points of the objects' surfaces in their frames, unscaled [m] [O, P', 3].
+        cfg: Settings.
+        seed: Of the camera's errors.
+    """
+
+    def __init__(
+        self, env: ReorientVecEnv, policy: TrackingPolicy, surfaces: torch.Tensor, cfg: LooksCfg, seed: int
+    ):
+        self.cfg, self._env, self._surfaces = cfg, env, surfaces
+        simulation, place = env.env, surfaces.device
+        self._actor = TrackingActor(simulation, policy, goals="points", sensor_errors=True, seed=seed)
+        self._pose = wp.to_torch(simulation.sim.body_q)[:, simulation.scene.object_body]
+        self._base = torch.tensor(BASE_IN_WORLD, dtype=torch.float32, device=place)
+        self._object = torch.tensor(np.asarray(simulation.scene.world_object), device=place)
+        self._scale = torch.tensor(np.asarray(simulation.scene.world_scale), device=place).float()
+        self._seen = torch.empty((cfg.kept, POINTS, 3), dtype=torch.half, device=place)
+        self._poses = torch.empty((cfg.kept, 7), device=place)
+        self._envs = torch.empty(cfg.kept, dtype=torch.long, device=place)
+        self._next, self._full = 0, False
+
+    @torch.no_grad()
+    def collect(self, stopping: Callable[[], bool]) -> dict[str, torch.Tensor] | None:
+        """Some steps of every environment; figures of these, or ``None`` if they were cut short."""
+        finder, logs, errors = self._actor.tracker.observer.finder, [], []
+        observation = self._env.get_observations()[OBSERVATION_GROUP]
+        for _ in range(self.cfg.steps):
+            if stopping():
+                return None
+            action = self._actor.act(observation)
+            pose = self._poses_in_base()
+            rows = finder.seen_now.nonzero().flatten()
+            self._keep(finder.seen[rows], pose[rows], rows)
+            errors.append(rotation_distance(finder.pose[rows, 0, 3:], pose[rows, 3:]))
+            _, _, _, extras = self._env.step(action)
+            logs.append(torch.stack([extras["log"][name] for name in ENDS]))
+        self._env.env.check()
+        ends = torch.stack(logs).sum(dim=0)
+        return {
+            "looks/rotation_error": torch.cat(errors).median(),
+            "looks/success_per_goal": ends[0] / ends.sum().clamp(min=1.0 / self._env.num_envs),
+        }
+
+    def pairs(self, count: int, points: int, *, near: float, scans: float) -> Pairs:
+        """Pairs of looks, drawn from those kept, with goals of the same shapes; clouds of ``points``."""
+        device, known = self._surfaces.device, len(self._seen) if self._full else self._next
+        drawn = torch.randint(known, (count,), device=device)
+        envs, pose = self._envs[drawn], self._poses[drawn]
+        order = torch.randperm(self._surfaces.shape[1], device=device)
+        shapes = self._scale[envs, None, None] * self._surfaces[self._object[envs]][:, order]
+        turn = matrices(two_columns(pose[:, 3:]))
+        seen = self._seen[drawn, :points].float()
+        return with_goals(shapes, turn, pose[:, :3], seen, near=near, scans=scans)
+
+    def close(self) -> None:
+        """Release the environments."""
+        self._env.env.close()
+
+    def _keep(self, seen: torch.Tensor, pose: torch.Tensor, envs: torch.Tensor) -> None:
+        place = (self._next + torch.arange(len(envs), device=envs.device)) % len(self._seen)
+        self._seen[place], self._poses[place], self._envs[place] = seen.half(), pose, envs
+        self._full |= self._next + len(envs) >= len(self._seen)
+        self._next = (self._next + len(envs)) % len(self._seen)
+
+    def _poses_in_base(self) -> torch.Tensor:
+        """True poses of the objects in the base frame [N, 7]."""
+        back = torch.cat([-self._base[3:6], self._base[6:]]).expand(len(self._pose), 4)
+        return torch.cat(
+            [rotated(back, self._pose[:, :3] - self._base[:3]), product(back, self._pose[:, 3:])], dim=1
+        )
