@@ -20,10 +20,8 @@ from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
 from vd.vision.cfg import AlignmentCfg, SearchCfg
 from vd.vision.finder import LEAST, GoalFinder
 from vd.vision.rotations import (
-    angle_between,
     cube_rotations,
     matrices,
-    multiply,
     quaternions,
     random_rotations,
     turn_angle,
@@ -56,12 +54,9 @@ def test_rotations_agree_with_scipys():
     np.testing.assert_allclose(rotation_distance(a, b), between.magnitude(), atol=1e-5)
     difference = Rotation.from_quat(relative_rotation(a, b).numpy())
     assert (difference * between.inv()).magnitude().max() < 1e-5
-    assert (Rotation.from_quat(multiply(a, b).numpy()) * (first * second).inv()).magnitude().max() < 1e-5
     columns = two_columns(relative_rotation(a, b))
     np.testing.assert_allclose(matrices(columns), between.as_matrix(), atol=1e-5)
-    np.testing.assert_allclose(angle_between(columns), between.magnitude(), atol=2e-3)
-    apart = angle_between(two_columns(a), two_columns(b))
-    np.testing.assert_allclose(apart, (first.inv() * second).magnitude(), atol=2e-3)
+    np.testing.assert_allclose(turn_angle(matrices(columns)), between.magnitude(), atol=2e-3)
     every = Rotation.concatenate([first, Rotation.create_group("O")])  # of half a turn too
     back = quaternions(torch.tensor(every.as_matrix(), dtype=torch.float32))
     assert (Rotation.from_quat(back.numpy()) * every.inv()).magnitude().max() < 1e-5

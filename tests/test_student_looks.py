@@ -27,7 +27,7 @@ from vd.vision.alignment import AlignmentNetwork
 from vd.vision.saved import load_alignment
 
 NEAR_M = 0.008
-"""Median distance of what a camera sees, at centres of voxels, from samples 3 mm apart, of a camera that is late."""
+"""Median distance of what a camera sees, at centres of voxels, from samples 3 mm apart, of a late camera."""
 
 
 def make_looks(points: int) -> SimulatedLooks:

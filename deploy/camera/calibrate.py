@@ -43,7 +43,7 @@ SEAT_M = 0.012
 SAME_RAD = 0.05
 """Joints of a finger that differ by less show its marker once more, not anew."""
 LARGEST_ERROR_M = PAPER.cloud.voxel_m
-"""Uncertainty at the object above which the result is called ill-conditioned [m]: a voxel of the student."""
+"""Uncertainty at the object above which the result is called ill-conditioned [m]: a voxel of what is seen."""
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Training of the student: imitation of the teacher from point clouds, and pre-training of its encoder."""
+"""Training of the network by which a teacher acts on what a camera sees, without a mesh."""

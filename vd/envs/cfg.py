@@ -92,8 +92,8 @@ class ObservationCfg:
     image, as dclaw3 is; of dclaw4 all fingers lean the same way round."""
     file_axes: bool = True
     """See how the axes of the object's file lie, now and at the goal, as in the paper. No cloud shows which
-    they are; students know the rotation from one to the other alone. Ours: without them a teacher sees zeros
-    in their place, and knows no more of them than its students."""
+    they are; a camera shows the rotation from one to the other alone. Ours: without them a teacher sees zeros
+    in their place, and knows no more of them than a camera shows."""
     canonical: bool = False
     """Of the two quaternions of a rotation see always the same, of object, goal and the rotation between
     them. On in all presets; off where a policy's file does not say: those policies have learned the signs."""

@@ -1,4 +1,4 @@
-"""Tracking policies: the object found by its known shape, and a teacher acting on it; no network that sees.
+"""Policies that see: the object found by its known shape or its goal's cloud, and a teacher acting on it.
 
 One control step, top to bottom: :meth:`vd.tracking.tracker.Tracker.step`.
 """

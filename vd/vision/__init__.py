@@ -1,1 +1,1 @@
-"""The student: point clouds to voxels, and a sparse 3-D network with memory that acts on them."""
+"""Finding an object by the cloud of its goal: a network that turns one cloud onto another, and its search."""

@@ -7,8 +7,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from vd.quaternions import relative_rotation
-
 
 def random_rotations(count: int, device: torch.device) -> torch.Tensor:
     """Quaternions uniform on SO(3), xyzw [count, 4]."""
@@ -19,11 +17,6 @@ def rotations_about(axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     """Quaternions xyzw [R, 4] about axes [R, 3], which need no unit length, by angles [R] [rad]."""
     half = 0.5 * angle[:, None]
     return torch.cat([nn.functional.normalize(axis, dim=-1) * half.sin(), half.cos()], dim=1)
-
-
-def multiply(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Product of quaternions xyzw [R, 4]: first turns what second turned."""
-    return relative_rotation(first, torch.cat([-second[:, :3], second[:, 3:]], dim=1))
 
 
 def two_columns(quaternion: torch.Tensor) -> torch.Tensor:
@@ -73,12 +66,6 @@ def turn_angle(matrix: torch.Tensor) -> torch.Tensor:
     """Angles [..] in [0, pi] [rad] of rotation matrices [.., 3, 3]; exact for small ones, as acos is not."""
     half = (matrix - torch.eye(3, device=matrix.device)).square().sum((-1, -2)).sqrt() / math.sqrt(8.0)
     return 2.0 * torch.asin(half.clamp(max=1.0))
-
-
-def angle_between(columns: torch.Tensor, others: torch.Tensor | None = None) -> torch.Tensor:
-    """Angles [..] [rad] between rotations, each two columns [.., 6]; to no rotation without ``others``."""
-    matrix = matrices(columns)
-    return turn_angle(matrix if others is None else matrix.transpose(-1, -2) @ matrices(others))
 
 
 def cube_rotations(device: torch.device | str) -> torch.Tensor:
