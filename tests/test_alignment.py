@@ -240,7 +240,7 @@ def test_other_files_and_sizes_are_refused(tmp_path):
     save_checkpoint(tmp_path / "student.pt", {"format": "visual-dexterity student 1"})
     with pytest.raises(ValueError, match="no network of alignment"):
         load_alignment(tmp_path / "student.pt")
-    with pytest.raises(FileNotFoundError, match="stage 0"):
+    with pytest.raises(FileNotFoundError, match="give an alignment.pt"):
         load_alignment(tmp_path / "none.pt")
     with pytest.raises(ValueError, match=r"--align\.points is 4"):
         replace(QUICK, points=4).validate()
