@@ -173,8 +173,12 @@ class Observer:
         cloud = torch.cat([*(self._hand_points(age, senses) for age in self._ages), senses.points], dim=1)
         hand = len(self._ages) * self._hand_cloud.count
         seen, count = object_points(cloud, hand, PAPER.cloud.voxel_m, followed.most)
-        followed.look(seen, count, fresh=senses.fresh, points=senses.points)
         pose, base, turn = followed.pose[:, 0], self._base, self._base[3:].expand(len(seen), 4)
+        if isinstance(followed, Registration):
+            followed.look(seen, count, fresh=senses.fresh, points=senses.points)
+        else:
+            back = torch.cat([-turn[:, :3], turn[:, 3:]], dim=1)
+            followed.look(seen, count, fresh=senses.fresh, goal=product(back, senses.goal_quat))
         # A first look knows no motion.
         known = (followed.looks > 1) & (rotation_distance(pose[:, 3:], before[:, 3:]) < LEAP_RAD)
         moves = self._rate * known[:, None].float()

@@ -15,7 +15,7 @@ from torch import nn
 from torch.nn import functional
 
 from vd.vision.cfg import AlignmentCfg, SearchCfg
-from vd.vision.rotations import cube_rotations, matrices
+from vd.vision.rotations import cube_rotations, matrices, turn_angle
 
 PATCH_M = 0.03
 """Unit of places within a patch [m]: about its size."""
@@ -25,6 +25,13 @@ WAVES = (1.5, 3.0, 6.0, 12.0)
 """Frequencies at which a token knows its place [rad per CLOUD_M]: half a wave is from 17 to 2 cm."""
 PAIRS_AT_ONCE = 4096
 """Pairs of clouds compared at a time: what the tokens of more take counts in gigabytes."""
+SHARE = 0.3
+"""Share of the latest look in the average of predicted errors."""
+STAY = 0.8
+"""Another hypothesis must be expected to err less by a fifth to be believed: of an object that looks the same
+in several orientations all err alike, and to change from one to the other is no motion that it makes."""
+NEARER = 0.05
+"""Predicted error that a first look takes for a radian nearer to the goal."""
 GOAL, SEEN = 0, 1
 """Kinds of clouds, in the order in which they are given."""
 
@@ -147,7 +154,7 @@ class Alignment:
     position: torch.Tensor
     """Where the goal's mean lies on the object, in the frame of what is seen [m] [N, 3]."""
     error: torch.Tensor
-    """Angle by which the rotation is expected to be wrong [rad] [N]."""
+    """Angle by which the rotation is expected to be wrong, averaged over looks [rad] [N]."""
 
 
 class Aligner:
@@ -168,6 +175,7 @@ class Aligner:
         self._goal = goal - goal.mean(dim=1, keepdim=True)
         self._near = network.neighbours(self._goal)
         self._kept = torch.eye(3, device=goal.device).repeat(len(goal), self._cfg.kept, 1, 1)  # best first
+        self._errors = torch.full(self._kept.shape[:2], torch.nan, device=goal.device)  # averages; NaN: none
         self._looks = torch.zeros(len(goal), dtype=torch.long, device=goal.device)
 
     def reset(self, rows: torch.Tensor) -> None:
@@ -175,12 +183,16 @@ class Aligner:
         self._looks[rows] = 0
 
     @torch.no_grad()
-    def look(self, seen: torch.Tensor, rows: torch.Tensor | None = None) -> Alignment:
+    def look(
+        self, seen: torch.Tensor, rows: torch.Tensor | None = None, toward: torch.Tensor | None = None
+    ) -> Alignment:
         """Compare once.
 
         Args:
             seen: What is seen of the objects [m] [R, P', 3], points in no order.
             rows: Which objects, each once [R]; all by default.
+            toward: Rotations to which of several that look alike the nearest is taken at a first look,
+                matrices [R, 3, 3]; any by default.
         """
         rows = torch.arange(len(self._goal), device=seen.device) if rows is None else rows
         mean = seen.mean(dim=1)
@@ -188,31 +200,39 @@ class Aligner:
         tokens = self.network.encode(seen, SEEN, self.network.neighbours(seen))
         new = self._looks[rows] == 0
         if bool(new.any()):
-            self._begin(rows[new], tokens[new])
+            self._begin(rows[new], tokens[new], None if toward is None else toward[new])
         self._restart(rows[~new])
         found, offset, error = self._improve(rows, tokens, self._kept[rows])
-        order = error.argsort(dim=1)
+        before = self._errors[rows]
+        error = torch.where(before.isnan(), error, before.lerp(error, SHARE))
+        believed = torch.cat([STAY * error[:, :1], error[:, 1:]], dim=1)
+        order = believed.argsort(dim=1)
         self._kept[rows] = found = found.take_along_dim(order[:, :, None, None], dim=1)
+        self._errors[rows] = error = error.take_along_dim(order, dim=1)
         self._looks[rows] += 1
         offset = offset.take_along_dim(order[:, :1, None], dim=1)[:, 0]
-        return Alignment(found[:, 0], mean + offset, error.amin(dim=1))
+        return Alignment(found[:, 0], mean + offset, error[:, 0])
 
-    def _begin(self, rows: torch.Tensor, tokens: torch.Tensor) -> None:
-        """Keep the best that starts come to."""
+    def _begin(self, rows: torch.Tensor, tokens: torch.Tensor, toward: torch.Tensor | None) -> None:
+        """Keep the best that starts come to; of those that look alike the ones nearest to ``toward``."""
         found, error = self._starts.expand(len(rows), -1, -1, -1), torch.empty(0)
         for _ in range(self._cfg.passes):
             found, _, error = self._improve(rows, tokens, found)
+        if toward is not None:
+            error = error + NEARER * turn_angle(toward[:, None].transpose(-1, -2) @ found)
         best = error.topk(self._cfg.kept, dim=1, largest=False).indices
         self._kept[rows] = found.take_along_dim(best[:, :, None, None], dim=1)
+        self._errors[rows] = torch.nan
 
     def _restart(self, rows: torch.Tensor) -> None:
-        """Now and then, begin anew with the last hypothesis, at a start relative to the best."""
+        """Now and then begin anew with the last hypothesis, if it is the worse, at a start relative to the best."""
         if self._cfg.kept < 2:
             return
-        looks = self._looks[rows]
-        due = looks % self._cfg.restart_looks == 0
+        looks, errors = self._looks[rows], self._errors[rows]
+        due = (looks % self._cfg.restart_looks == 0) & (errors[:, -1] > errors[:, 0])
         turn = (looks // self._cfg.restart_looks) % (len(self._starts) - 1) + 1  # not the best itself
         self._kept[rows[due], -1] = (self._starts[turn] @ self._kept[rows, 0])[due]
+        self._errors[rows[due], -1] = torch.nan
 
     def _improve(
         self, rows: torch.Tensor, seen: torch.Tensor, rotations: torch.Tensor

@@ -10,7 +10,7 @@ import torch
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.vision.alignment import Aligner, AlignmentNetwork
-from vd.vision.rotations import quaternions
+from vd.vision.rotations import matrices, quaternions, two_columns
 
 POINTS = 512
 """Points seen of the object that are looked at: as many as the network learned from."""
@@ -73,7 +73,7 @@ class GoalFinder:
         count: torch.Tensor,
         *,
         fresh: torch.Tensor,
-        points: torch.Tensor | None = None,
+        goal: torch.Tensor,
     ) -> None:
         """Look once in every environment; where too little is seen of the object all stays as it is.
 
@@ -81,7 +81,8 @@ class GoalFinder:
             seen: Points seen of the object [m], neighbours beside each other [N, M, 3].
             count: How many there are, [N] int32.
             fresh: Where nothing is known from before, bool [N].
-            points: All that the camera saw; not looked at.
+            goal: Wanted orientations of the clouds' frames [N, 4]: of several that look alike the nearest is
+                taken at first.
         """
         self.looks.masked_fill_(fresh, 0)
         self._aligner.reset(fresh)
@@ -92,7 +93,7 @@ class GoalFinder:
             return
         chosen = torch.searchsorted(crowded[rows].cumsum(dim=1), (self.share * count[rows, None]).long() + 1)
         self.seen[rows] = points = seen[rows].take_along_dim(chosen[..., None], dim=1)
-        found = self._aligner.look(points, rows)
+        found = self._aligner.look(points, rows, matrices(two_columns(goal[rows])))
         place = found.position - (found.rotation @ self._mean[rows, :, None]).squeeze(-1)
         self.pose[rows, 0] = torch.cat([place, quaternions(found.rotation)], dim=1)
         self.error[rows] = found.error
