@@ -225,7 +225,7 @@ class Aligner:
         self._errors[rows] = torch.nan
 
     def _restart(self, rows: torch.Tensor) -> None:
-        """Now and then begin anew with the last hypothesis, if it is the worse, at a start relative to the best."""
+        """Now and then begin anew with the last hypothesis, if it is the worse, relative to the best."""
         if self._cfg.kept < 2:
             return
         looks, errors = self._looks[rows], self._errors[rows]
