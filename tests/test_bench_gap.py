@@ -8,14 +8,11 @@ from vd.bench import gap
 from vd.bench.cli import GapCommand
 from vd.bench.gap_score import (
     KINDS,
-    NEIGHBOURS,
     Case,
     figures,
     markdown,
     score,
 )
-from vd.bench.hidden_plant import OUTSIDE
-from vd.kernels.servo.effects import EFFECTS
 
 TRUTH = {
     "noise_floor_rad": 5e-4,
@@ -51,17 +48,6 @@ def case(*effects, kind="single", model="servo", **values):
 def value(results, what):
     (figure,) = [f for f in figures(results) if f.what == what]
     return figure
-
-
-def test_the_whole_battery_is_what_the_goals_ask_for():
-    cases = gap.battery("dclaw3")
-    count = {kind: sum(c.kind == kind for c in cases) for kind in KINDS}
-    n = len({c.effects for c in cases if c.kind == "single"})
-    assert n == len(EFFECTS)
-    assert count == {"single": n * 20, "none": 200, "pair": n * (n - 1) // 2, "outside": len(OUTSIDE) * 20}
-    assert len({c.name for c in cases}) == len(cases)
-    assert {c.change for c in cases if c.kind == "none"} == {"exact", "base", "mass"}
-    assert set(NEIGHBOURS) == set(OUTSIDE)
 
 
 def test_any_first_part_of_the_battery_is_a_fair_sample():

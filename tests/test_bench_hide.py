@@ -6,14 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vd.bench.gap_sizes import showing, sized_effect
 from vd.bench.hidden_plant import FULL_DUTY_RAD, OUTSIDE
 from vd.bench.hide import (
     ENCODER_COUNT,
     FULL_P_GAIN,
-    NOISE_FLOOR_RAD,
     Hiding,
-    effect_parameters,
     hide,
     parse_effect,
     simulate_hidden,
@@ -90,19 +87,6 @@ def test_seeds_repeat_and_differ_alone_and_in_batches():
     assert one.truth["base"] != other.truth["base"]
 
 
-def test_the_noise_is_the_stated_floor(monkeypatch):
-    def readings():
-        (hidden,) = simulate_hidden([Hiding("servo", seed=1)])
-        assert hidden.truth["noise_floor_rad"] == NOISE_FLOOR_RAD
-        motions = hidden.recording.trajectories
-        return np.concatenate([t.position for t in motions if t.excitation.startswith("sine")])
-
-    noisy = readings()
-    monkeypatch.setattr("vd.bench.hide.NOISE_RAD", 0.0)
-    # Both are rounded, one is noisy: the variances of two roundings and of the noise, not quite independent.
-    assert NOISE_FLOOR_RAD < (noisy - readings()).std() < np.sqrt(2.0) * NOISE_FLOOR_RAD
-
-
 def test_a_finger_is_recorded_by_name():
     motion = {"excitations": ("torque_release",)}
     hidden = simulate_hidden([
@@ -166,16 +150,3 @@ def test_excitations_stay_within_the_joints_and_excite_one_each():
     paper = excitation_set(reach)
     assert 40.0 < sum(m.duration for m in paper) / 2 < 60.0 and len(paper) == 16
     assert {m.conditions["p_gain"] for m in excitation_set(reach, ("gain_ladder",))} == {200.0, 400.0, 800.0}
-
-
-def test_sizes_grow_and_stay_within_the_bounds():
-    for model in ("dclaw3", "servo"):
-        for name in showing(model):
-            sizes = [sized_effect(name, size, model) for size in range(4)]
-            assert sizes[0] != sizes[3]
-            for parameter in EFFECTS[name].parameters:
-                assert set(sizes[0]) == set(effect_parameters(name))
-                assert all(parameter.lower <= abs(s[parameter.name]) <= parameter.upper
-                           or name == "acceleration_limit" for s in sizes)  # fmt: skip
-    with pytest.raises(ValueError, match="does not show"):
-        sized_effect("joint_coupling", 1, "servo")

@@ -5,7 +5,7 @@ import pytest
 
 from vd.bench.gap_sizes import effect_at
 from vd.bench.hidden_finger import FingerBody
-from vd.bench.hidden_plant import OUTSIDE, STEP_S, Plant, Run, simulate
+from vd.bench.hidden_plant import OUTSIDE, Plant, Run, simulate
 from vd.bench.hide import COUPLING, Hiding, machine, simulate_hidden
 from vd.gap.chain import chains
 from vd.gap.rollout import Rollouts
@@ -46,19 +46,6 @@ def ramp(time):
     return 0.2 * np.minimum(time, 4.0 - time)
 
 
-def linear_step(time):
-    """The plain servo's answer to the step, in closed form (two real or complex poles)."""
-    poles = np.roots([INERTIA, KD, KP]).astype(complex)
-    late = np.maximum(time - 0.1, 0.0)
-    a, b = poles
-    return STEP * np.real(1.0 + (b * np.exp(a * late) - a * np.exp(b * late)) / (a - b))
-
-
-def test_the_plain_servo_is_a_linear_oscillator():
-    time, path = answer(servo(), step)
-    np.testing.assert_allclose(path[:, 0], linear_step(time), atol=2e-5)
-
-
 BASE = {"kp": kernel.KP, "kd": kernel.KD, "velocity_limit": kernel.VELOCITY_LIMIT, "inertia": kernel.INERTIA}
 
 SMALL = ("thermal_drift", "load_friction", "supply_sag", "torque_saturation")
@@ -97,20 +84,6 @@ def test_jitter_delays_on_average_and_drops_hold_the_last_command():
     assert (plain - dropped)[50:].mean() / 0.5 == pytest.approx(0.01, abs=0.004)  # one write late on average
 
 
-def test_a_motor_at_its_limit_acts_when_the_command_comes():
-    """The answer to a step does not depend on where in a time step of the plant the command falls."""
-    limited = {"torque_limit": {"tau_max_nm": 0.2}}
-    paths = []
-    for shift in (0.0, 0.5, 0.9):
-        time = np.arange(0.0, 1.0, 0.01)
-        time[1:] += shift * STEP_S
-        command = np.where(np.arange(len(time)) < 20, 0.0, 0.8)[:, None]
-        run = Run(servo(**limited), time, command, np.ones(command.shape, bool))
-        paths.append(simulate([run])[0].position[:, 0])
-    assert np.ptp(paths[0]) > 0.5
-    assert max(np.abs(path - paths[0]).max() for path in paths[1:]) < 2e-4
-
-
 def test_another_joint_pulls_through_the_coupling():
     plant = servo(2, joint_coupling={"from_1": np.array([0.3, 0.3])})
     _, path = answer(plant, step, duration=3.0)
@@ -126,15 +99,6 @@ def test_effects_outside_the_table_act():
     _, early = answer(servo(**warm), ramp)
     _, late = answer(servo(**warm), ramp, session_s=100.0)
     assert np.abs(late - early).max() > 0.05
-
-
-def test_conditions_act():
-    _, soft = answer(servo(gravity=0.5), step, conditions={"p_gain": 0.5})
-    assert 0.5 * KP * (STEP - soft[-1, 0]) == pytest.approx(0.5 * np.sin(soft[-1, 0]), abs=1e-3)
-    off = np.ones((1001, 1), dtype=bool)
-    off[500:] = False
-    _, released = answer(servo(gravity=0.5), lambda t: 1.0 + 0 * t, enabled=off)
-    assert released[499, 0] > 0.7 and abs(released[-1, 0]) < 0.3
 
 
 def test_the_time_step_does_not_show():

@@ -17,7 +17,7 @@ import trimesh
 from vd.assets_usd.objects import decompose as d
 from vd.assets_usd.objects import meshes as m
 from vd.assets_usd.objects.bodies import body_of, error_of_parts
-from vd.assets_usd.objects.geometry import Hull, hull_depth, mesh_volume, union_depth
+from vd.assets_usd.objects.geometry import Hull, hull_depth, union_depth
 from vd.assets_usd.objects.importer import import_mesh, import_meshes
 from vd.assets_usd.objects.model import read_object
 from vd.assets_usd.objects.plan import plan_jobs
@@ -342,26 +342,6 @@ def test_the_error_of_parts_counts_what_they_lack_and_what_they_have_too_much():
     longer = Hull(cube.vertices * [1.1, 1.0, 1.0 / 1.1], cube.faces)
     assert error_of([longer]) == pytest.approx(2.0 * (1.0 - 1.0 / 1.1), rel=0.02)
     assert error_of([Hull(cube.vertices, cube.faces)]) < 1e-3
-
-
-def test_slivers_among_the_parts_are_dropped():
-    block = trimesh.creation.box((0.1, 0.05, 0.05)).vertices
-    sheet = trimesh.creation.box((0.1, 0.05, 1e-5)).vertices
-    crumb = trimesh.creation.box((0.002, 0.002, 0.002)).vertices
-    line = np.linspace([0, 0, 0], [0.1, 0, 0], 5)
-    (kept,) = d.tidy_hulls([sheet, block, crumb, line], 32)
-    assert mesh_volume(*kept) == pytest.approx(0.1 * 0.05 * 0.05)
-
-
-def test_parts_are_merged_where_that_fills_least():
-    """Of a ring of four bars the halves of bars go together, not bars across the hole."""
-    corners = trimesh.creation.box((0.05, 0.02, 0.02)).vertices
-    turns = [trimesh.transformations.rotation_matrix(k * np.pi / 2, [0, 0, 1])[:3, :3] for k in range(4)]
-    halves = [(corners + np.array([x, 0.04, 0.0])) @ turn.T for turn in turns for x in (-0.025, 0.025)]
-    merged = d.merge_parts(halves, 4)
-    assert sorted(np.ptp(part, axis=0).round(6).tolist() for part in merged) == [
-        [0.02, 0.1, 0.02], [0.02, 0.1, 0.02], [0.1, 0.02, 0.02], [0.1, 0.02, 0.02]
-    ]  # fmt: skip
 
 
 def test_a_ring_gets_more_parts_and_a_bracket_does_not(imported):
