@@ -1,12 +1,12 @@
 """Small chains and their rollouts, for the tests of :mod:`vd.kernels.servo.chains`."""
 
 import numpy as np
-from kernel_oracle import device_array, launch, unwritten
+from kernel_oracle import launch
 
 from vd.gap.rollout import links_of
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.chain_bodies import Links
-from vd.kernels.servo.chains import Samples, rollout_kernel
+from vd.kernels.servo.chains import rollout_kernel
 from vd.kernels.servo.effects import neutral_row
 
 DT = 1 / 480
@@ -30,10 +30,6 @@ def random_bodies(rng, n):
     }
 
 
-def links_struct(bodies, gravity):
-    return links_of(**bodies, gravity=gravity)
-
-
 def rows_of(*settings, n=1):
     """Parameter rows [C, n, P] of the plain servo with settings by column."""
     rows = np.tile(neutral_row(), (len(settings), n, 1))
@@ -43,65 +39,25 @@ def rows_of(*settings, n=1):
     return rows
 
 
-def roll(
-    device,
-    rows,
-    time,
-    command,
-    start,
-    *,
-    bodies=None,
-    gravity=GRAVITY,
-    dt=DT,
-    power=None,
-    stops=1e6,
-    effort=1e6,
-):
+def roll(device, rows, time, command, start, *, bodies=None, dt=DT, power=None, stops=1e6, effort=1e6):
     """Roll trajectories out; time [T], command [R, T, n], start [R, n]. Returns [C, R, T, n]."""
     runs, count, n = command.shape
     sets = len(rows)
     steps = np.tile(time / dt, runs)
-    samples = Samples()
-    samples.step = device_array(np.floor(steps), int, device)
-    samples.fraction = device_array(steps - np.floor(steps), float, device)
-    samples.sent_step, samples.sent_fraction = samples.step, samples.fraction
-    samples.command = device_array(command.reshape(-1, n), float, device)
     power = np.ones_like(command) if power is None else power
-    samples.power = device_array(power.reshape(-1, n), float, device)
+    step, fraction = np.floor(steps), steps - np.floor(steps)
+    samples = {"step": step, "fraction": fraction, "sent_step": step, "sent_fraction": fraction}
+    samples |= {"command": command.reshape(-1, n), "power": power.reshape(-1, n)}
     rolls = sets * runs
-
-    def by_roll(values, dtype=int):
-        """What belongs to a trajectory, for the rollouts of all sets."""
-        return device_array(np.concatenate([values] * sets), dtype, device)
-
-    links = Links() if bodies is None else links_struct(bodies, gravity)
-    parameters = np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS)
-    predicted = unwritten((rolls * count, n), float, device)
-    launch(
-        rollout_kernel,
-        rolls,
-        [
-            samples,
-            by_roll(np.arange(runs) * count),
-            by_roll(np.full(runs, count)),
-            np.arange(rolls) * count,
-            by_roll(np.arange(runs)),
-            by_roll(start, float),
-            by_roll(np.full(runs, -1)),
-            np.arange(n),
-            np.full(n, -stops),
-            np.full(n, stops),
-            np.full(n, effort),
-            int(bodies is not None),
-            links,
-            parameters,
-            dt,
-            unwritten((rolls, n, servo.STATE_COLUMNS), float, device),
-            predicted,
-        ],
-        device,
-    )
-    result = predicted.numpy().astype(float)
+    run = np.tile(np.arange(runs), sets)
+    inputs = [samples, run * count, np.full(rolls, count), np.arange(rolls) * count, run]
+    inputs += [np.tile(start, (sets, 1))]
+    inputs += [np.full(rolls, -1), np.arange(n), np.full(n, -stops), np.full(n, stops), np.full(n, effort)]
+    inputs += [int(bodies is not None), Links() if bodies is None else links_of(**bodies, gravity=GRAVITY)]
+    inputs += [np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS), dt]
+    shapes = [(rolls, n, servo.STATE_COLUMNS), (rolls * count, n)]
+    _, predicted = launch(rollout_kernel, rolls, inputs, device, *shapes)
+    result = predicted.astype(float)
     assert np.isfinite(result).all(), "a sample was not written, or is no number"
     return result.reshape(sets, runs, count, n)
 

@@ -4,22 +4,12 @@ import mujoco
 import numpy as np
 import pytest
 import warp as wp
-from chain_rolls import (
-    DT,
-    FINE,
-    GRAVITY,
-    PLAIN,
-    excitation,
-    links_struct,
-    one_joint,
-    random_bodies,
-    roll,
-    rows_of,
-)
+from chain_rolls import DT, FINE, GRAVITY, PLAIN, excitation, one_joint, random_bodies, roll, rows_of
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, launch, unwritten
+from kernel_oracle import EXAMPLES, launch
 
+from vd.gap.rollout import links_of
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.chain_bodies import Links, chain_dynamics
 from vd.kernels.servo.effects import EFFECTS
@@ -72,8 +62,7 @@ def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
     rng = np.random.default_rng(seed)
     bodies = random_bodies(rng, n)
     q, speed = rng.uniform(-3, 3, (5, 3)), rng.uniform(-6, 6, (5, 3))
-    mass, bias = unwritten(5, wp.mat33, device), unwritten(5, wp.vec3, device)
-    launch(dynamics_kernel, 5, [q, speed, links_struct(bodies, GRAVITY), mass, bias], device)
+    mass, bias = launch(dynamics_kernel, 5, [q, speed, links_of(**bodies, gravity=GRAVITY)], device, 5, 5)
     model, data = mujoco_chain(bodies, GRAVITY)
     for i in range(5):
         data.qpos[:], data.qvel[:] = q[i, :n], speed[i, :n]
@@ -81,9 +70,9 @@ def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
         full = np.zeros((n, n))
         mujoco.mj_fullM(model, full, data.qM) if hasattr(data, "qM") else mujoco.mj_fullM(model, data, full)
         scale = np.abs(full).max()
-        np.testing.assert_allclose(mass.numpy()[i, :n, :n], full, atol=1e-5 * scale)
-        np.testing.assert_allclose(bias.numpy()[i, :n], data.qfrc_bias, atol=2e-6)
-        assert not mass.numpy()[i, n:].any() and not bias.numpy()[i, n:].any()
+        np.testing.assert_allclose(mass[i, :n, :n], full, atol=1e-5 * scale)
+        np.testing.assert_allclose(bias[i, :n], data.qfrc_bias, atol=2e-6)
+        assert not mass[i, n:].any() and not bias[i, n:].any()
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import (
@@ -12,15 +11,12 @@ from kernel_oracle import (
     pose_matrix,
     quaternions,
     relative_quaternion,
-    settings_array,
     streams,
     transforms,
-    unwritten,
 )
 from scipy import stats
 
 from vd.kernels.task.observations import (
-    ObservationParams,
     fingertip_kernel,
     teacher_observation_kernel,
     teacher_observation_size,
@@ -56,22 +52,19 @@ def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
 def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=True, canonical=False):
     """Launch the kernel on a scene; returns observation and streams."""
     worlds = len(scene["q"])
-    out = unwritten((worlds, teacher_observation_size(len(scene["tip_body"]))), float, device)
-    params = settings_array(
-        ObservationParams,
-        device,
-        velocity_scale=PAPER.observation.velocity_scale,
-        noise_mean=noise_mean,
-        noise_std=noise_std,
-        file_axes=float(file_axes),
-        canonical=float(canonical),
-    )
+    params = {
+        "velocity_scale": PAPER.observation.velocity_scale,
+        "noise_mean": noise_mean,
+        "noise_std": noise_std,
+        "file_axes": float(file_axes),
+        "canonical": float(canonical),
+    }
     rng = streams(worlds, seed, device)
     model = [scene[name] for name in ("lower", "upper", "tip_body", "tip_offset", "body_com")]
     names = ["measured_q", "measured_qd", "q", "qd", "body_q", "body_qd", "goal", "smoothed", "offset"]
-    seen = [scene[name] for name in names]
-    launch(teacher_observation_kernel, worlds, [*model, params, *seen, rng, out], device)
-    return out.numpy(), rng.numpy()
+    inputs = [*model, params, *(scene[name] for name in names), rng]
+    shape = (worlds, teacher_observation_size(len(scene["tip_body"])))
+    return launch(teacher_observation_kernel, worlds, inputs, device, shape)[0], rng.numpy()
 
 
 def expected_observation(scene):
@@ -176,16 +169,11 @@ def test_canonical_orientations_do_not_tell_which_quaternion_they_came_from(devi
 @EXAMPLES
 @given(scene=scenes())
 def test_fingertip_positions_are_those_observed(device, scene):
-    worlds, fingers = len(scene["q"]), len(scene["tip_body"])
-    out = unwritten((worlds, fingers), wp.vec3, device)
-    launch(
-        fingertip_kernel,
-        (worlds, fingers),
-        [scene["tip_body"], scene["tip_offset"], scene["body_q"], out],
-        device,
-    )
+    shape = (len(scene["q"]), len(scene["tip_body"]))
+    inputs = [scene["tip_body"], scene["tip_offset"], scene["body_q"]]
+    (out,) = launch(fingertip_kernel, shape, inputs, device, shape)
     tip = pose_matrix(scene["body_q"])[:, scene["tip_body"]] @ pose_matrix(scene["tip_offset"])
-    np.testing.assert_allclose(out.numpy(), tip[..., :3, 3], atol=1e-6)
+    np.testing.assert_allclose(out, tip[..., :3, 3], atol=1e-6)
 
 
 def uniform_scene(fingers, worlds):

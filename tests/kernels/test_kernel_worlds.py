@@ -42,12 +42,8 @@ def test_pair_forces_are_summed_per_world(device, seed, worlds):
         expected[world[c]] += force[world[c], row[c, 0]]
 
     out = device_array(np.zeros(worlds), float, device)
-    launch(
-        pair_force_kernel,
-        slots,
-        [np.array([count]), world, pairs, row, force, kind, 1, 2, out],
-        device,
-    )
+    inputs = [np.array([count]), world, pairs, row, force, kind, 1, 2, out]
+    launch(pair_force_kernel, slots, inputs, device)
     np.testing.assert_allclose(out.numpy(), expected, atol=1e-5)
 
 
@@ -72,22 +68,8 @@ def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
     dumps = [device_array(np.full((worlds, n), np.nan), float, device) for n in (4, 3, 2)]
 
     def guard(start: float, q: np.ndarray, qd: np.ndarray) -> None:
-        launch(
-            guard_kernel,
-            worlds,
-            [
-                q,
-                qd,
-                np.full((worlds, 4), start),
-                np.full((worlds, 3), start),
-                np.full((worlds, 2), start),
-                500.0,
-                failures,
-                *dumps,
-                failed,
-            ],
-            device,
-        )
+        before = [np.full((worlds, n), start) for n in (4, 3, 2)]
+        launch(guard_kernel, worlds, [q, qd, *before, 500.0, failures, *dumps, failed], device)
 
     guard(good, q, qd)
     np.testing.assert_array_equal(failed.numpy(), [0, 1, 0])
@@ -105,10 +87,10 @@ def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
 def test_redraw_waits_for_a_reset_of_old_dynamics(device, seed, worlds):
     random = np.random.default_rng(seed)
     reset, age = random.integers(0, 2, worlds), random.integers(0, 20, worlds)
-    ages, mask = device_array(age, int, device), device_array(np.full(worlds, SENTINEL), int, device)
-    launch(redraw_mask_kernel, worlds, [reset, 10, ages, mask], device)
+    ages = device_array(age, int, device)
+    (mask,) = launch(redraw_mask_kernel, worlds, [reset, 10, ages], device, worlds)
     due = (reset == 1) & (age + 1 >= 10)
-    np.testing.assert_array_equal(mask.numpy(), due.astype(int))
+    np.testing.assert_array_equal(mask, due.astype(int))
     np.testing.assert_array_equal(ages.numpy(), np.where(due, 0, age + 1))
 
 
@@ -133,12 +115,8 @@ def test_friction_of_a_pair_is_the_average(device, seed, worlds):
         elif kind[s] == 3:
             expected[s] = 0.5 * (hand[w] * nominal[s] / FRICTION + item[w])
     out = device_array(before, float, device)
-    launch(
-        write_friction_kernel,
-        shapes,
-        [world, kind, nominal, FRICTION, 1, 2, 3, hand, item, table, out],
-        device,
-    )
+    inputs = [world, kind, nominal, FRICTION, 1, 2, 3, hand, item, table, out]
+    launch(write_friction_kernel, shapes, inputs, device)
     np.testing.assert_allclose(out.numpy(), expected, rtol=1e-5)
 
 
@@ -147,12 +125,8 @@ def test_a_force_and_a_share_of_the_weight_act_on_the_object_alone(device):
     force = random.normal(size=(envs, 3)).astype(np.float32)
     mass, lightened = random.uniform(0.05, 0.2, envs).astype(np.float32), np.array([0, 1, 1, 0])
     body_force = wp.zeros((envs, 5), dtype=wp.spatial_vector, device=device)
-    launch(
-        write_object_force_kernel,
-        envs,
-        [mass, lightened, wp.vec3(0.5, 0.0, -9.81), np.array([0.3]), 4, force, body_force],
-        device,
-    )
+    inputs = [mass, lightened, wp.vec3(0.5, 0.0, -9.81), np.array([0.3]), 4, force, body_force]
+    launch(write_object_force_kernel, envs, inputs, device)
     carried = force - 0.7 * (lightened * mass)[:, None] * np.array([0.5, 0.0, -9.81])
     np.testing.assert_allclose(body_force.numpy()[:, 4, :3], carried, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(body_force.numpy()[lightened == 0, 4, :3], force[lightened == 0])
