@@ -128,13 +128,6 @@ def test_names_are_scored_against_the_truth():
     assert value([*results, small], "first name right").cases == 4
 
 
-def test_parameters_are_scored_with_their_intervals():
-    rows = score(case("coulomb_friction"), report("coulomb_friction", "command_delay"), TRUTH)["parameters"]
-    errors = {row["parameter"]: (row["error"], row["covered"]) for row in rows}
-    assert errors["coulomb_friction.tau_c_nm"] == (pytest.approx(0.1), True)
-    assert errors["command_delay.delay_s"] == (pytest.approx(0.5), False)
-
-
 def test_nothing_hidden_allows_no_name_but_a_changed_mass():
     quiet = score(case(kind="none", change="exact"), report(), TRUTH)
     heavy = score(case(kind="none", change="mass"), report("gravity_load"), TRUTH)

@@ -105,34 +105,6 @@ def test_kinematics_of_a_batch(hand: HandModel) -> None:
         hand.forward_kinematics(np.zeros(hand.num_joints + 1))
 
 
-def test_limits_gains_and_masses(hand: HandModel) -> None:
-    fingers = hand.num_fingers
-    for values, per_finger in (
-        (hand.lower, LOWER),
-        (hand.upper, UPPER),
-        (hand.kp, (2.772, 3.559, 3.559)),
-        (hand.kd, (0.2739, 0.3824, 0.3824)),
-        (hand.effort, (2.6, 2.6, 2.6)),
-        (hand.velocity_limit, (6.552, 7.759, 7.759)),
-        (hand.armature, (0.001, 0.001, 0.001)),
-        (hand.link_mass[1:], (0.093, 0.093, 0.025)),
-        (hand.link_com[1:, 2], (0.0505, 0.0505, 0.0409)),
-    ):
-        np.testing.assert_allclose(values, np.tile(per_finger, fingers), rtol=1e-6)
-    np.testing.assert_array_equal(hand.link_com[1:, :2], 0.0)
-    # About the finger axis, about the joint axis of k2 and k3, and about the third.
-    inertia = np.array(
-        [(1.001e-5, 1.345e-5, 1.336e-5), (1.001e-5, 1.176e-5, 1.505e-5), (5.03e-6, 7.84e-6, 1.034e-5)]
-    )
-    got = hand.link_inertia[1:].reshape(fingers, 3, 3, 3)
-    np.testing.assert_allclose(
-        got, np.broadcast_to([np.diag(i[::-1]) for i in inertia], got.shape), rtol=1e-6
-    )
-    palm = {"dclaw3": 0.110, "dclaw4": 0.124}[hand.name]
-    assert hand.link_mass[0] == pytest.approx(palm + 0.093 * fingers, rel=1e-6)
-    assert np.all(np.linalg.eigvalsh(hand.link_inertia[0]) > 0)
-
-
 def drawn(hand: HandModel, link: str, prefix: str = "") -> trimesh.Trimesh:
     """The drawn meshes of a link, as one."""
     stage, parts = open_stage(hand.path), []

@@ -34,21 +34,6 @@ def make_session(speed=1.0, **kwargs):
     return Session(env, Turn(speed))
 
 
-def test_the_policy_acts_in_every_step():
-    session = make_session(tolerance=-1.0)
-    before = session.snapshot.joint_q[-4:]
-    moved = session.step().joint_q[-4:]
-    assert rotation_angle(before, moved) == pytest.approx(1 / 12, abs=1e-3)
-
-
-def test_object_chosen_is_the_one_watched():
-    session = make_session(tolerance=-1.0)
-    session.choose_object("b")
-    assert session.object_name == session.snapshot.name == "b"
-    assert session.env.world_object[session.world] == 1
-    np.testing.assert_allclose(session.snapshot.joint_q, session.env.sim.joint_q.numpy()[session.world])
-
-
 def test_new_goal_changes_the_goal_alone():
     session = make_session(tolerance=-1.0)
     session.env.cfg.goal.max_angle_rad = 0.5
