@@ -159,7 +159,6 @@ class HandModel:
         link_mass: Masses [L] [kg].
         link_com: Centres of mass in the link frames [L, 3] [m].
         link_inertia: Inertia about the centre of mass in the link frames [L, 3, 3] [kg m^2].
-        tip_names: Names of the fingertip sites [F].
         tip_link: Index of the link of each site [F].
         tip_frame: Pose of each site in its link [F, 7].
         camera: The depth camera.
@@ -195,7 +194,6 @@ class HandModel:
     link_mass: np.ndarray
     link_com: np.ndarray
     link_inertia: np.ndarray
-    tip_names: tuple[str, ...]
     tip_link: np.ndarray
     tip_frame: np.ndarray
     camera: CameraModel

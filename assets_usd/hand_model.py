@@ -138,8 +138,7 @@ class _Reader:
         drives = np.array([self._drive(joint) for joint in joints])
         baseline = dict(zip(("kp", "kd", "velocity_limit", "inertia"), drives.T[[2, 3, 5, 6]], strict=True))
         servo, servo_interval = read_servo(joints, baseline, self.layer or self.path)
-        tips = [f"f{f}_tip" for f in range(fingers)]
-        tip_prims = [self.prim(f"f{f}_l{JOINTS_PER_FINGER}/{tip}") for f, tip in enumerate(tips)]
+        tip_prims = [self.prim(f"f{f}_l{JOINTS_PER_FINGER}/f{f}_tip") for f in range(fingers)]
         points = [(f"f{f}_motor", self.prim(f"base/f{f}_motor_points"), 0) for f in range(fingers)]
         points += [(links[i], self.prim(f"{links[i]}/points"), i) for i in range(1, len(links))]
         points.sort(key=lambda entry: (int(entry[0][1 : entry[0].index("_")]), entry[2]))
@@ -168,7 +167,6 @@ class _Reader:
             link_mass=np.array([mass for mass, _, _ in masses]),
             link_com=np.array([com for _, com, _ in masses]),
             link_inertia=np.array([inertia for _, _, inertia in masses]),
-            tip_names=tuple(tips),
             tip_link=np.array([index[prim.GetParent().GetPath()] for prim in tip_prims]),
             tip_frame=np.array([self._relative(prim, prim.GetParent()) for prim in tip_prims]),
             camera=self._camera(self.prim("base/camera"), bodies[0]),

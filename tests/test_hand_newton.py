@@ -98,7 +98,6 @@ def test_filtered_pairs(imported: tuple[HandModel, newton.ModelBuilder]) -> None
 def test_sites(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
     hand, builder = imported
     sites = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.SITE]
-    assert [builder.shape_label[i].rsplit("/")[-1] for i in sites] == list(hand.tip_names)
     for i, link, frame in zip(sites, hand.tip_link, hand.tip_frame, strict=True):
         assert builder.shape_body[i] == link
         np.testing.assert_allclose(tuple(builder.shape_transform[i]), frame, atol=1e-6)

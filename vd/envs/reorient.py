@@ -23,7 +23,7 @@ from vd.envs.task_state import build_task
 from vd.kernels.task.actions import apply_action_kernel
 from vd.kernels.task.environments import record_step_kernel
 from vd.kernels.task.guard import void_step_kernel
-from vd.kernels.task.resets import episode_kernel, give_goal_kernel, reset_kernel
+from vd.kernels.task.resets import episode_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.task.success import success_kernel
 from vd.paper import PAPER
@@ -187,22 +187,6 @@ class ReorientEnv:
         self._reset_envs(use_start=object_quat is not None, use_goal=goal_quat is not None)
         self.randomiser.push()
         self.observe()
-
-    def give_goals(self, goal_quat: np.ndarray) -> None:
-        """Give every environment a new goal; what is observed is to be refreshed (:meth:`observe`).
-
-        Args:
-            goal_quat: Goal orientations, xyzw, either sign, shape [N, 4].
-        """
-        self._given_goal.assign(np.asarray(goal_quat, dtype=np.float32))
-        self._launch(
-            give_goal_kernel,
-            [self._given_goal, self.sim.joint_q, self.num_actions + 3],
-            [self.goal_quat, self.goal_steps],
-        )
-        if self.symmetry_frames is not None:
-            self._new_goal.fill_(1)
-            self.symmetry_frames.choose(self._new_goal, self._new_goal)
 
     def step(self, action: Any) -> None:
         """Simulate one control step; environments that end are reset, and the observation is fresh.
