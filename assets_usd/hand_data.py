@@ -167,7 +167,6 @@ class HandModel:
         point_link: Link whose frame each set is in [P]; the first motors are fixed to link 0.
         link_points: Surface samples [P, 500, 3] [m].
         shapes: Collision primitives.
-        filtered_pairs: Pairs of links (lower index first) that never collide.
     """
 
     name: str
@@ -201,7 +200,6 @@ class HandModel:
     point_link: np.ndarray
     link_points: np.ndarray
     shapes: tuple[CollisionShape, ...]
-    filtered_pairs: tuple[tuple[int, int], ...]
 
     @property
     def num_joints(self) -> int:

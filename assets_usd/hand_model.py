@@ -174,7 +174,6 @@ class _Reader:
             point_link=np.array([link for _, _, link in points]),
             link_points=self._points([prim for _, prim, _ in points]),
             shapes=tuple(shape for i, body in enumerate(bodies) for shape in self._shapes(body, i)),
-            filtered_pairs=self._filtered(bodies, index),
         )
 
     def _check_units(self) -> None:
@@ -369,17 +368,6 @@ class _Reader:
             gap=self.number(prim, "newton:contactGap"),
             fingertip=surface.GetName() == "fingertip_surface",
         )
-
-    def _filtered(self, bodies: list[Usd.Prim], index: dict[Any, int]) -> tuple[tuple[int, int], ...]:
-        pairs = set()
-        for first, body in enumerate(bodies):
-            for target in body.GetRelationship("physics:filteredPairs").GetTargets():
-                if target not in index or index[target] == first:
-                    raise self.fail(
-                        body, f"'physics:filteredPairs' names {target}", "name another link of the hand"
-                    )
-                pairs.add((min(first, index[target]), max(first, index[target])))
-        return tuple(sorted(pairs))
 
 
 def _xyzw(quaternion: Gf.Quatf) -> np.ndarray:

@@ -75,27 +75,6 @@ def test_the_effect_that_stands_for_another_is_right_if_the_report_says_so():
     assert value(results, "right, or in the named set").value == pytest.approx(2 / 3)
 
 
-def test_effects_that_are_one_together_are_right_as_that_one_if_the_report_says_so():
-    hidden = case("dead_zone", "encoder_bias", kind="pair")
-    group = ("asymmetric_friction", "dead_zone", "encoder_bias")
-    told = score(hidden, report("asymmetric_friction", sets=[group]), TRUTH)
-    assert told["by_convention"] == ["dead_zone", "encoder_bias"] and not told["false"]
-    assert value([told], "two hidden: both named").value == 1.0
-    silent = score(hidden, report("asymmetric_friction"), TRUTH)
-    assert silent["false"] == ["asymmetric_friction"] and not silent["by_convention"]
-    single = score(case("dead_zone"), report("asymmetric_friction", sets=[group]), TRUTH)
-    assert single["false"] == ["asymmetric_friction"], "one of them alone is something else"
-    other = score(hidden, report("torque_limit", sets=[("torque_limit", *group[1:])]), TRUTH)
-    assert other["false"] == ["torque_limit"]
-    # Coulomb friction beside Stribeck friction is Stribeck friction with other numbers.
-    sums = score(
-        case("coulomb_friction", "stribeck_friction", kind="pair"), report("stribeck_friction"), TRUTH
-    )
-    assert (
-        sums["by_convention"] == ["coulomb_friction"] and value([sums], "two hidden: both named").value == 1.0
-    )
-
-
 @pytest.mark.parametrize(
     ("model", "options", "words"),
     [

@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vd.bench.hidden_plant import FULL_DUTY_RAD, OUTSIDE
+from vd.bench.hidden_plant import OUTSIDE
 from vd.bench.hide import (
     ENCODER_COUNT,
-    FULL_P_GAIN,
     Hiding,
     hide,
     parse_effect,
@@ -40,25 +39,6 @@ def test_the_recording_tells_nothing_and_the_truth_lies_beside_it(tmp_path):
     counts = trajectory.position / ENCODER_COUNT
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-2)
     assert 0.5e-3 < np.diff(trajectory.time).std() < 2.5e-3
-
-
-def test_the_duty_cycle_is_the_controllers_output():
-    """It follows the error that the controller sees, whatever a motor with limits makes of it."""
-    limits = {"torque_limit": {"tau_max_nm": 0.4}, "coulomb_friction": {"tau_c_nm": 0.05}}
-    bare = Hiding(model="servo", effects=limits, seed=2, excitations=("gain_ladder",))
-    plain, told = simulate_hidden([bare, replace(bare, pwm=True)])
-    assert all(t.pwm is None for t in plain.recording.trajectories)
-    gains = set()
-    for t in told.recording.trajectories:
-        assert np.abs(t.pwm).max() <= 1.0
-        gain = t.conditions["p_gain"] / FULL_P_GAIN
-        gains.add(gain)
-        expected = np.clip(gain * (t.command - t.position) / FULL_DUTY_RAD, -1.0, 1.0)
-        np.testing.assert_allclose(t.pwm, expected, atol=6e-3)
-    assert len(gains) > 1
-    # Everything else of the recording is the same.
-    for one, other in zip(plain.recording.trajectories, told.recording.trajectories, strict=True):
-        np.testing.assert_array_equal(one.position, other.position)
 
 
 @pytest.mark.parametrize("late", ["command_delay", "read_delay"])

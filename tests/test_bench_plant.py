@@ -73,17 +73,6 @@ def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect(monkeypatch):
         assert true < 0.7e-3 and without > 1.2 * true, f"{name}: {true:.1e} rad, without it {without:.1e}"
 
 
-def test_jitter_delays_on_average_and_drops_hold_the_last_command():
-    _, plain = answer(servo(), lambda t: 0.5 * t, rate=100.0)
-    _, jittered = answer(
-        servo(command_jitter={"sigma_s": 0.02, "p_drop": 0.0}), lambda t: 0.5 * t, rate=100.0
-    )
-    lag = (plain - jittered)[50:].mean() / 0.5
-    assert 0.02 * np.sqrt(2.0 / np.pi) < lag < 0.045  # in order, hence later than the mean of |N|
-    _, dropped = answer(servo(command_jitter={"sigma_s": 0.0, "p_drop": 0.5}), lambda t: 0.5 * t, rate=100.0)
-    assert (plain - dropped)[50:].mean() / 0.5 == pytest.approx(0.01, abs=0.004)  # one write late on average
-
-
 def test_another_joint_pulls_through_the_coupling():
     plant = servo(2, joint_coupling={"from_1": np.array([0.3, 0.3])})
     _, path = answer(plant, step, duration=3.0)

@@ -105,16 +105,6 @@ def test_commands_act_from_when_they_were_sent(hand, device, sent_s, delay_s, sa
     assert np.abs(positions(sent, delay_s) - positions(plain, delay_s)).max() > 1e-3
 
 
-def test_a_rollout_starts_where_it_was_measured():
-    position = np.full((100, 1), 0.25)
-    data = recording("servo", ("j",), trajectory("a", np.full((100, 1), 0.2), position=position))
-    (chain,) = chains(data)
-    row = chain.start_row.copy()
-    row[0, servo.ENCODER_BIAS] = 0.05
-    got = Rollouts(chain, data).predict(row[None])[0, :, 0]
-    np.testing.assert_allclose(got, 0.25, atol=1e-6)
-
-
 def test_play_begins_where_the_joint_rests():
     """Between the ends of its play a joint stays where it is; from beyond them its drive takes it to one."""
     start = np.array([0.18, 0.21, 0.3])

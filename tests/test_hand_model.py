@@ -249,7 +249,6 @@ def mesh_collider(stage: Usd.Stage, root: str) -> None:
         ),
         (aiming("f0_j2", "physics:body1", "f1_l2"), "f0_j2", ("joins other links", "f0_l2")),
         (aiming("f0_j2", "physics:body1", "camera"), "f0_j2", ("physics:body1", "one link")),
-        (aiming("f0_l1", "physics:filteredPairs", "nothing"), "f0_l1", ("filteredPairs", "another link")),
         (setting("f0_l2/points", "points", [Gf.Vec3f(0)] * 3), "f0_l2/points", ("points", "(3, 3)")),
         (fourth_joints, "dclaw4", ("f0_j4", "f3_j4", "3 joints", "supported so far")),
         (mesh_collider, "f0_l1/visual/servo", ("Mesh", "Capsule")),

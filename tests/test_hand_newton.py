@@ -1,7 +1,5 @@
 """Newton's import of a hand equals what :func:`read_hand` says about it."""
 
-import itertools
-
 import newton
 import numpy as np
 import pytest
@@ -82,17 +80,6 @@ def test_shapes(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
         assert builder.shape_margin[i] == 0.0
     colliding = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES]
     assert len(colliding) == len(hand.shapes)
-
-
-def test_filtered_pairs(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
-    """All and only the authored pairs of links (shapes of one body never collide in Newton)."""
-    hand, builder = imported
-    filtered = {tuple(sorted(pair)) for pair in builder.shape_collision_filter_pairs}
-    index = [builder.shape_label.index(shape.path) for shape in hand.shapes]
-    for (a, i), (b, j) in itertools.combinations(zip(hand.shapes, index, strict=True), 2):
-        if a.link != b.link:
-            expected = (min(a.link, b.link), max(a.link, b.link)) in hand.filtered_pairs
-            assert (tuple(sorted((i, j))) in filtered) == expected, (a.path, b.path)
 
 
 def test_sites(imported: tuple[HandModel, newton.ModelBuilder]) -> None:

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from rsl_rl.env import VecEnv
-from tensordict import TensorDict
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
 from vd.policy import TrainedPolicy
@@ -21,29 +19,6 @@ from vd.train.vec_env import ReorientVecEnv
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs and waits need a GPU")
 NORMALISING = dataclasses.replace(SMALL_POLICY, normalise_observations=True)
 TIGHTENING = dataclasses.replace(NORMALISING, std_range=(0.2, 1.0), quiet_std=0.05)
-
-
-@pytest.fixture
-def env() -> ReorientVecEnv:
-    return ReorientVecEnv(DummyEnv(num_envs=4))
-
-
-def test_vec_env_contract(env):
-    assert isinstance(env, VecEnv)
-    observation = env.get_observations()
-    assert isinstance(observation, TensorDict) and observation.batch_size == torch.Size([4])
-    assert observation["policy"].shape == (4, 5) and observation["policy"].dtype == torch.float32
-    keys = None
-    for _ in range(12):
-        observation, reward, done, extras = env.step(torch.zeros(4, 2))
-        assert observation["policy"].shape == (4, 5)
-        assert reward.shape == done.shape == extras["time_outs"].shape == (4,)
-        assert keys in (None, list(extras["log"]))
-        keys = list(extras["log"])
-        assert all(value.ndim == 0 for value in extras["log"].values())
-    assert {"reward/total", "reward/distance", "reward/bonus", "task/rotation_error", "task/reached"} <= set(
-        keys
-    )
 
 
 def _fixed_flags(env: ReorientVecEnv, success, fell, timed_out) -> None:

@@ -5,7 +5,7 @@ import os
 import time
 from pathlib import Path
 
-from vd.workers import SINGLE, one_thread_without_gpu, run_tasks
+from vd.workers import SINGLE, run_tasks
 
 
 def work(task):
@@ -55,23 +55,6 @@ def wait_for(condition):
     while not condition() and time.monotonic() < end:
         time.sleep(0.1)
     return condition()
-
-
-def test_torch_has_one_thread_on_a_cpu_unless_told_otherwise(monkeypatch):
-    import torch  # here, since workers import this module
-
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        monkeypatch.setenv(SINGLE[0], "2")
-        one_thread_without_gpu("cpu")
-        monkeypatch.delenv(SINGLE[0])
-        one_thread_without_gpu("cuda:0")
-        assert torch.get_num_threads() == 2
-        one_thread_without_gpu("cpu")
-        assert torch.get_num_threads() == 1
-    finally:
-        torch.set_num_threads(before)
 
 
 def test_a_worker_ends_with_a_parent_that_is_killed(tmp_path):

@@ -83,13 +83,6 @@ def row_of(kp=3.0, kd=0.3, **settings):
     return row
 
 
-def total(out, position, speed):
-    """The torque on the joint, dry friction aside."""
-    out = out.astype(float)
-    spring = out[..., STIFFNESS] * (out[..., REFERENCE] - position)
-    return spring - out[..., DAMPING] * speed + out[..., TORQUE]
-
-
 @EXAMPLES
 @given(
     numbers=st.tuples(*[floats(-2, 2, width=32)] * 3),
@@ -129,27 +122,3 @@ def test_the_table_names_every_column_once():
     for p in parameters:
         assert p.lower <= p.typical <= p.upper, p
         assert p.neutral >= 0.0, p
-
-
-MOTOR = {
-    "SUPPLY_SAG": lambda wanted, p, v, t: wanted / (1 + p * abs(wanted)),
-    "THERMAL_RATE": lambda wanted, p, v, t: wanted * np.exp(-p * t),
-    "SATURATION_TORQUE": lambda wanted, p, v, t: p * np.tanh(wanted / p),
-    "TORQUE_LIMIT": lambda wanted, p, v, t: np.clip(wanted, -p, p),
-    # The line to a no-load speed of 2 p.
-    "STALL_TORQUE": lambda wanted, p, v, t: (
-        np.sign(wanted) * min(abs(wanted), p * max(0.0, 1 - abs(v) / (2 * p)) if wanted * v > 0 else p)
-    ),
-}
-
-
-@pytest.mark.parametrize("stage", MOTOR)
-@EXAMPLES
-@given(size=floats(0.01, 10.0), error=floats(-2.0, 2.0), speed=floats(-5.0, 5.0), steps=st.integers(1, 50))
-def test_a_loss_of_the_motor_is_its_formula(device, stage, size, error, speed, steps):
-    row = row_of(NO_LOAD_SPEED=2 * size, **{stage: size})
-    out = steps_of(device, row, np.full(steps, error), 0.0, speed)
-    wanted = 3.0 * error - 0.3 * speed
-    expected = MOTOR[stage](wanted, size, speed, (steps - 1) * DT)
-    assert total(out, 0.0, speed)[0, -1] == pytest.approx(expected, rel=1e-3, abs=1e-5)
-    assert out[0, -1, DAMPING] >= 0.0 and out[0, -1, STIFFNESS] >= 0.0

@@ -111,14 +111,6 @@ def measured(fingers):
     return mask
 
 
-@pytest.mark.parametrize(("fingers", "size"), [(3, 87), (4, 109)])
-def test_sizes_are_those_of_the_paper_and_columns_tile_the_observation(fingers, size):
-    assert teacher_observation_size(fingers) == size == 19 * fingers + 21 + 3 * fingers
-    slices = list(teacher_observation_slices(fingers).values())
-    columns = np.concatenate([np.arange(s.start, s.stop) for s in slices])
-    np.testing.assert_array_equal(columns, np.arange(size))
-
-
 @EXAMPLES
 @given(scene=scenes(), file_axes=st.booleans())
 def test_observation_matches_the_oracle(device, scene, file_axes):

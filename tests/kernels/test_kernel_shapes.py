@@ -68,18 +68,6 @@ def placed(scene, world, quat):
     return Rotation.from_quat(quat).apply(points)
 
 
-@pytest.mark.parametrize("fingers", [3, 4])
-def test_directions_are_even_and_as_symmetric_as_the_hand(fingers):
-    directions = np.array(extent_directions(fingers))
-    count = 9 * fingers + 2
-    assert directions.shape == (count, 3)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
-    cosine = directions @ directions.T - 2.0 * np.eye(count)
-    assert np.degrees(np.arccos(cosine.max(axis=1))).max() < 46.0, "a direction without a neighbour"
-    turned = Rotation.from_euler("z", 2 * np.pi / fingers).apply(directions)
-    assert cKDTree(directions).query(turned)[0].max() < 1e-12
-
-
 @EXAMPLES
 @given(scene=scenes())
 def test_fingertips_are_told_the_nearest_point_of_the_surface(device, scene):

@@ -10,7 +10,6 @@ from vd.kernels.task.starts import (
     IN_TABLE_M,
     move_start_kernel,
     start_depth_kernel,
-    start_places,
 )
 
 TABLE = 0.01
@@ -74,8 +73,3 @@ def test_an_object_starts_where_it_is_the_least_deep_and_others_stay(device, sce
         moved[world, 9:12] += scene["places"][found[world].argmin()]
     np.testing.assert_array_equal(q.numpy(), moved)
     assert not depth.numpy().any(), "the next reset begins with none"
-
-
-def test_near_places_come_before_far_ones():
-    away = np.linalg.norm(start_places(), axis=1)
-    assert away[0] == 0.0 < away[1] and (np.diff(away) > -1e-9).all()
