@@ -26,9 +26,9 @@ def test_tasks_that_hang_or_die_cost_themselves_only():
     def finished(task, result, why):
         results[task], reasons[task] = result, why
 
-    run_tasks(work, tasks, finished, jobs=2, limit_s=20.0)
+    run_tasks(work, tasks, finished, jobs=2, limit_s=10.0)
     assert [results[task] for task in tasks] == [2, None, None, 8, 10]
-    assert "died" in reasons[tasks[1]] and "longer than 20 s" in reasons[tasks[2]]
+    assert "died" in reasons[tasks[1]] and "longer than 10 s" in reasons[tasks[2]]
     assert not any(reasons[task] for task in (tasks[0], tasks[3], tasks[4]))
 
 
