@@ -5,8 +5,8 @@ import pytest
 
 from vd.bench.gap_sizes import effect_at
 from vd.bench.hidden_finger import FingerBody
-from vd.bench.hidden_plant import OUTSIDE, Plant, Run, simulate
-from vd.bench.hide import COUPLING, Hiding, machine, simulate_hidden
+from vd.bench.hidden_plant import Plant, Run, simulate
+from vd.bench.hide import COUPLING, Hiding, simulate_hidden
 from vd.gap.chain import chains
 from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators as kernel
@@ -88,20 +88,6 @@ def test_effects_outside_the_table_act():
     _, early = answer(servo(**warm), ramp)
     _, late = answer(servo(**warm), ramp, session_s=100.0)
     assert np.abs(late - early).max() > 0.05
-
-
-def test_the_time_step_does_not_show():
-    names = [name for name in (*EFFECTS, *OUTSIDE) if name != COUPLING]  # which one joint cannot have
-    time = np.arange(80) * 1e-2
-    command = np.sin(4.0 * np.pi * time)[:, None]
-    runs = []
-    for name in names:
-        hiding = Hiding("pendulum", {name: effect_at(name, 1.0)}, base_spread=0.0)
-        _, plant = machine(hiding, np.random.default_rng(0))
-        runs.append(Run(plant, time, command, np.ones(command.shape, dtype=bool), seed=3))
-    for name, coarse, fine in zip(names, simulate(runs), simulate(runs, dt=1e-4), strict=True):
-        # Under half the noise floor of 0.5 mrad.
-        assert np.sqrt(np.mean((coarse.position - fine.position) ** 2)) < 2e-4, name
 
 
 FINGER = FingerBody(

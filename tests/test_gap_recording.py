@@ -322,3 +322,31 @@ def test_real_recordings_are_read(shared_dir, name, model, joints, trajectories)
     for trajectory in recording.trajectories:  # one motion alone tells less
         if np.ptp(trajectory.command, axis=0).any():
             check_motion(replace(recording, trajectories=(trajectory,)))
+
+
+@pytest.fixture(scope="module")
+def machine():
+    (hidden,) = simulate_hidden([Hiding("servo", joints=("a", "b"))])
+    return hidden.recording
+
+
+def test_joints_that_no_motion_or_few_move_are_named(machine):
+    assert cautions(machine) == ()
+    first = replace(machine, trajectories=tuple(t for t in machine.trajectories if t.joints == ("a",)))
+    (idle,) = cautions(first)
+    assert "No motion moves b" in idle
+    few = first.subset(range(3))
+    assert any("Fewer than 4 kinds of motion move a:" in line for line in cautions(few))
+
+
+def test_samples_far_apart_are_told(machine):
+    slow = tuple(replace(t, time=4.0 * t.time) for t in machine.trajectories)
+    (line,) = cautions(replace(machine, trajectories=slow))
+    assert "40 ms apart" in line and "50 Hz" in line
+
+
+def test_a_count_that_is_not_the_encoders_is_told(machine):
+    count = 4.0 * machine.encoder_resolution_rad
+    coarse = tuple(replace(t, position=np.round(t.position / count) * count) for t in machine.trajectories)
+    lines = cautions(replace(machine, trajectories=coarse))
+    assert ["steps of 6.1" in line and "1.53" in line for line in lines] == [True, True]

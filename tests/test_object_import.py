@@ -320,19 +320,6 @@ def test_a_cavity_counts_in_mass_properties_and_is_said(tmp_path: Path, inward: 
     assert model.inertia_matrix[0, 0] == pytest.approx(about_x * scale**2, rel=1e-5)
 
 
-def test_what_lies_in_a_cavity_is_solid_again():
-    boxes = [trimesh.creation.box((side,) * 3) for side in (1.0, 0.8, 0.6, 0.4)]
-    boxes[1].invert()
-    boxes[3].invert()
-    for turned in (False, True):
-        mesh = trimesh.util.concatenate(boxes)
-        if turned:
-            mesh.invert()
-        solid = body_of(repair_mesh(mesh)).solid
-        assert solid.volume == pytest.approx(1.0 - 0.8**3 + 0.6**3 - 0.4**3)
-        assert solid.inertia[0, 0] == pytest.approx((1.0 - 0.8**5 + 0.6**5 - 0.4**5) / 6.0)
-
-
 def test_the_error_of_parts_counts_what_they_lack_and_what_they_have_too_much():
     cube = trimesh.creation.box((0.1, 0.1, 0.1))
     error_of = error_of_parts(body_of(repair_mesh(cube)), cube.vertices)
