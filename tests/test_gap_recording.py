@@ -77,8 +77,7 @@ def test_what_is_written_is_read(tmp_path):
         np.testing.assert_allclose(getattr(b, name), getattr(a, name), atol=1e-6)
     np.testing.assert_array_equal(b.enabled, enabled)
     assert b.current is None and b.time.dtype == np.float64
-    again = read_recording(tmp_path / "r" / "recording.json")
-    assert again.subset([0, 0]).trajectories == again.trajectories * 2
+    assert read_recording(tmp_path / "r" / "recording.json").joints == read.joints
 
 
 def test_commands_may_be_sent_at_other_times_than_the_stamps(tmp_path):
@@ -335,7 +334,7 @@ def test_joints_that_no_motion_or_few_move_are_named(machine):
     first = replace(machine, trajectories=tuple(t for t in machine.trajectories if t.joints == ("a",)))
     (idle,) = cautions(first)
     assert "No motion moves b" in idle
-    few = first.subset(range(3))
+    few = replace(first, trajectories=first.trajectories[:3])
     assert any("Fewer than 4 kinds of motion move a:" in line for line in cautions(few))
 
 
