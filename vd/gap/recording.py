@@ -9,6 +9,7 @@ import csv
 import json
 import math
 import sys
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -91,12 +92,13 @@ def read_recording(path: str | Path) -> Recording:
     return recording
 
 
-def write_recording(recording: Recording, folder: str | Path) -> Path:
+def write_recording(recording: Recording, folder: str | Path, *, only: Collection[str] | None = None) -> Path:
     """Write a recording into a folder: each file atomically, ``recording.json`` last.
 
     Args:
         recording: The recording.
         folder: Where.
+        only: CSV files to write, where the others are there from before; all by default.
 
     Returns:
         The folder.
@@ -104,7 +106,8 @@ def write_recording(recording: Recording, folder: str | Path) -> Path:
     folder = Path(folder)
     entries = []
     for trajectory in recording.trajectories:
-        _write_csv(folder / trajectory.file, trajectory, recording.joints)
+        if only is None or trajectory.file in only:
+            _write_csv(folder / trajectory.file, trajectory, recording.joints)
         entries.append(
             {
                 "file": trajectory.file,
