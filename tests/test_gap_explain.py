@@ -8,7 +8,7 @@ import pytest
 from gap_recordings import recorded, true_row
 
 import vd.kernels.servo.actuators as servo
-from vd.bench.hidden_plant import CABLE, COGGING, OUTSIDE
+from vd.bench.hidden_plant import COGGING, OUTSIDE
 from vd.bench.hide import Hiding, simulate_hidden
 from vd.gap.chain import chains
 from vd.gap.fit_cache import FOLDER
@@ -134,10 +134,9 @@ def test_a_cause_among_no_candidates_is_unknown(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cause", [COGGING, CABLE])
-def test_a_cause_outside_the_table_is_unknown(cause: str, tmp_path: Path) -> None:
+def test_a_cause_outside_the_table_is_unknown(tmp_path: Path) -> None:
     effects = ("coulomb_friction", "gravity_load", "encoder_bias", "backlash", "command_delay")
-    report = analysed(hidden(**{cause: OUTSIDE[cause]}), tmp_path, effects=effects)
+    report = analysed(hidden(**{COGGING: OUTSIDE[COGGING]}), tmp_path, effects=effects)
     assert report.verdict == "unknown" and not report.effects
 
 

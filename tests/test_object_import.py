@@ -152,7 +152,7 @@ def test_a_second_run_does_no_work(imported):
     assert (finer.status, finer.model.mass_kg) == ("imported", 0.2)
 
 
-@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGKILL])
 def test_interrupted_import_leaves_no_part_and_no_process(ending: signal.Signals, tmp_path: Path):
     """However an import ends, its children and theirs end too; no half-written file stays."""
     folder = tmp_path / "meshes"
