@@ -68,3 +68,13 @@ def test_surface_points_lie_on_the_outer_surface_and_cover_it():
     gap = np.linalg.norm(probes[:, None] - points[None], axis=2).min(axis=1).max()
     assert gap < 0.01
     np.testing.assert_array_equal(points, g.surface_points(vertices, faces, 500, outside=parts))
+
+
+def test_coarsened_mesh_keeps_its_box_and_shape():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
+    vertices, faces = g.cluster_vertices(ball.vertices, ball.faces, 3000)
+    assert 1500 < len(faces) <= 3000
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), np.ptp(ball.vertices, axis=0), rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, rtol=0.02)
+    same = g.cluster_vertices(ball.vertices, ball.faces, len(ball.faces))
+    assert same[1] is ball.faces
