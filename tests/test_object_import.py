@@ -54,6 +54,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory):
     box = trimesh.creation.box((120.0, 60.0, 40.0))
     box.export(folder / "brick in mm.ply")
     trimesh.creation.box((0.1, 0.05, 0.05)).export(folder / "sub" / "clamp.glb")
+    trimesh.creation.annulus(0.05, 0.058, 0.02, sections=16).export(folder / "ring.stl")
     (folder / "empty.obj").write_text("")
     (folder / "cloud.obj").write_text("".join(f"v {i} {i * i} 1\n" for i in range(9)))
     (folder / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 1\nf 1 2 3\nf 1 2 4\n")
@@ -332,16 +333,9 @@ def test_the_error_of_parts_counts_what_they_lack_and_what_they_have_too_much():
 
 
 def test_a_ring_gets_more_parts_and_a_bracket_does_not(imported):
-    ring = repair_mesh(trimesh.creation.annulus(0.05, 0.058, 0.02, sections=16))
-    found = d.best_decomposition(
-        ring.vertices,
-        ring.faces,
-        ImportSettings(mcts_iterations=5),
-        error_of_parts(body_of(ring), ring.vertices),
-    )
-    assert found.error <= d.GOOD_ERROR and found.fallback == ()
-    assert 8 < len(found.hulls) <= 16
-    assert len(imported[3]["bracket"].model.hulls) <= 8
+    ring, bracket = (read_object(imported[1] / f"{name}.usd") for name in ("ring", "bracket"))
+    assert ring.volume_error <= d.GOOD_ERROR and ring.warnings == ()
+    assert 8 < len(ring.hulls) <= 16 and len(bracket.hulls) <= 8
 
 
 def stuck(*_: object) -> list[np.ndarray]:
