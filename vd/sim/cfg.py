@@ -52,7 +52,7 @@ class SimCfg:
     }
 
     engine: Engine = "newton"
-    """What steps the physics: Newton's solver on MuJoCo Warp, or MuJoCo's own engine in C, on the CPU alone."""
+    """What steps the physics: Newton on MuJoCo Warp, or MuJoCo's own engine in C, on the CPU alone."""
     physics_hz: float = PAPER.scene.physics_hz
     """Physics rate [Hz]; a whole, even multiple of ``control_hz``."""
     control_hz: float = PAPER.scene.control_hz
@@ -132,7 +132,7 @@ def coarser(cfg: SimCfg) -> SimCfg:
 
 
 MUJOCO_PHYSICS_HZ = 1008.0
-"""Physics rate in MuJoCo's engine [Hz]: the multiple of the control rate that is nearest to a step of 1 ms."""
+"""Physics rate in MuJoCo's engine [Hz]: the even multiple of the control rate next to a step of 1 ms."""
 MUJOCO_ITERATIONS, MUJOCO_LS_ITERATIONS = 100, 50
 """MuJoCo's defaults. With 10 iterations of its line search the solver stops at wrong answers."""
 

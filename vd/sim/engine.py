@@ -68,11 +68,12 @@ class CSolver(WarpSolver):
         super().__init__(model, **settings)
         template, shapes = self.mj_model, self.mjc_geom_to_newton_shape.numpy()
         template.opt.timestep = physics_dt
-        # Bounding volumes are those of the first world's object, a model that is not finite is the guard's
-        # to see, and hulls of other worlds' objects are exported without a graph: no contacts by it for any.
-        template.opt.disableflags |= (
-            mujoco.mjtDisableBit.mjDSBL_MIDPHASE | mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        )
+        template.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO  # dense: faster on a CPU
+        # A state that is not finite is for the guard to see.
+        template.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        # What was compiled of hulls fits the first world's object: the tree of their bounds, and their graphs,
+        # which the hulls of other objects lack. Without, all of their corners are looked at.
+        template.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
         template.mesh_graphadr[:] = -1
         self._batch = Batch(template, len(shapes), nthread=threads(), persistent=True)
         for mask in ("geom_contype", "geom_conaffinity"):
