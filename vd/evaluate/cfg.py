@@ -104,7 +104,7 @@ class EvalCfg:
     observation-late (the object), all-late (joints too) and command-late, 83 ms and nothing else; the others
     change one thing, which the page of --suite robust names."""
     engine: Engine = "newton"
-    """What steps the physics: as in training, or MuJoCo's own engine in C, in steps of 1 ms, on the CPU alone."""
+    """What steps the physics: as in training, or MuJoCo's own engine in C, in steps of 1 ms, on the CPU."""
     num_envs: int | None = None
     """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a GPU (1024
     with camera policies)."""

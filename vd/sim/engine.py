@@ -6,7 +6,7 @@ between is one method, and all else reads those arrays, whichever engine filled 
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -47,15 +47,27 @@ class WarpSolver(SolverMuJoCo):
 
 
 class CSolver(WarpSolver):
-    """MuJoCo's own engine, in double precision, with one simulation for each world.
+    """MuJoCo's own engine, in double precision.
 
     MuJoCo Warp's arrays stay what everything reads and writes; on a CPU they are the host's.
     """
 
     captured = False
 
-    def __init__(self, model: newton.Model, physics_dt: float, **settings: Any):
-        """Take over what Newton has made; arguments as of :class:`SolverMuJoCo`, and the physics step [s].
+    def __init__(
+        self,
+        model: newton.Model,
+        worlds: Sequence[tuple[newton.ModelBuilder, int]],
+        physics_dt: float,
+        **settings: Any,
+    ):
+        """Have each kind of world compiled by MuJoCo.
+
+        Args:
+            model: The model of all worlds.
+            worlds: Runs of equal worlds in their order: what builds one of them, and how many they are.
+            physics_dt: Physics step [s].
+            settings: Of :class:`SolverMuJoCo`.
 
         Raises:
             ValueError: The model is not on the CPU.
@@ -66,20 +78,18 @@ class CSolver(WarpSolver):
             )
         self._model_changed = True
         super().__init__(model, **settings)
-        template, shapes = self.mj_model, self.mjc_geom_to_newton_shape.numpy()
-        template.opt.timestep = physics_dt
-        template.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO  # dense: faster on a CPU
-        # A state that is not finite is for the guard to see.
-        template.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        # What was compiled of hulls fits the first world's object: the tree of their bounds, and their graphs,
-        # which the hulls of other objects lack. Without, all of their corners are looked at.
-        template.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
-        template.mesh_graphadr[:] = -1
-        self._batch = Batch(template, len(shapes), nthread=threads(), persistent=True)
-        for mask in ("geom_contype", "geom_conaffinity"):
-            self._batch.expand(mask)[shapes < 0] = 0
-        self._fixed = template.geom_bodyid == 0
-        self._scratch = mujoco.MjData(template)
+        shapes, first = self.mjc_geom_to_newton_shape.numpy(), 0
+        self._runs = []
+        for builder, count in worlds:
+            one = newton.ModelBuilder()
+            one.replicate(builder, 1)
+            exported = WarpSolver(one.finalize(device="cpu"), **settings)
+            exported.mj_model.opt.timestep = physics_dt
+            begin = np.flatnonzero(model.shape_world.numpy() == first)[0]
+            wanted = begin + exported.mjc_geom_to_newton_shape.numpy()[0]
+            geoms = np.array([np.flatnonzero(shapes[first] == shape)[0] for shape in wanted])
+            self._runs.append(_Run(exported.mj_model, slice(first, first + count), geoms))
+            first += count
 
     def notify_model_changed(self, flags: newton.ModelFlags | int) -> None:
         """As of SolverMuJoCo."""
@@ -88,47 +98,77 @@ class CSolver(WarpSolver):
 
     def _mujoco_warp_step(self) -> None:
         """In place of Newton's method of this name: one step of all worlds, from its arrays into them."""
-        batch, data = self._batch, self.mjw_data
-        self._copy_model(DRIVES)
-        if self._model_changed:
-            everything = [field.name for field in fields(self.mjw_model) if field.name in MODEL_FIELDS]
-            self._copy_model(everything)
-            batch.set_const()
-            self._copy_model(everything)  # bounds of hulls are those of the first world's again
-            # Tables are moved: their place counts, also if it was that of their body when this was computed.
-            batch.expand("geom_sameframe")[:, self._fixed] = 0
-            self._model_changed = False
-        batch.expand("geom_pos")[:, self._fixed] = data.geom_xpos.numpy()[:, self._fixed]
-        for name in (*STATE, *INPUTS):
-            batch.bind(name)[:] = getattr(data, name).numpy()
-        batch.step()
-        for name in (*STATE, "qfrc_actuator"):
-            getattr(data, name).numpy()[:] = batch.bind(name)
-
-    def _copy_model(self, names: Iterable[str]) -> None:
-        """Copy fields that MuJoCo Warp has for each world; all others are as they were exported."""
-        for name in names:
-            ours, exported = getattr(self.mjw_model, name), getattr(self.mj_model, name)
-            values = ours.numpy() if isinstance(ours, wp.array) else np.empty(0)
-            if exported.size and len(values) in (1, self._batch.nsim) and values[0].size == exported.size:
-                copied = self._batch.expand(name)
-                copied[:] = values.reshape((len(values), *copied.shape[1:]))
+        for run in self._runs:
+            run.step(self.mjw_model, self.mjw_data, model_changed=self._model_changed)
+        self._model_changed = False
 
     def publish_contacts(self) -> None:
         """Have the contacts of the last step, with their normal forces, in ``mjw_data``."""
-        contact, found = self.mjw_data.contact, 0
-        for world in range(self._batch.nsim):
-            data = self._batch.get_data(world, self._scratch)
-            rows = data.contact.efc_address
-            active = rows >= 0
+        found = 0
+        for run in self._runs:
+            found = run.publish_contacts(self.mjw_data, found)
+        self.mjw_data.nacon.fill_(found)
+
+
+class _Run:
+    """Equal worlds in MuJoCo: those of ``rows`` of MuJoCo Warp's arrays, with those of its geoms."""
+
+    def __init__(self, exported: mujoco.MjModel, rows: slice, geoms: np.ndarray):
+        self._exported, self._rows, self._geoms = exported, rows, geoms
+        self._worlds = rows.stop - rows.start
+        exported.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO  # dense: faster on a CPU
+        # A state that is not finite is for the guard to see; bounding volumes do not follow centres of mass.
+        exported.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        exported.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+        self._batch = Batch(exported, self._worlds, nthread=threads(), persistent=True)
+        self._fixed = np.flatnonzero(exported.geom_bodyid == 0)
+        self._scratch = mujoco.MjData(exported)
+
+    def step(self, model: Any, data: Any, *, model_changed: bool) -> None:
+        """One step from MuJoCo Warp's arrays into them."""
+        batch, rows = self._batch, self._rows
+        self._copy_model(model, DRIVES)
+        if model_changed:
+            self._copy_model(model, [field.name for field in fields(model) if field.name in MODEL_FIELDS])
+            batch.set_const()
+            # Tables are moved: their place counts, also if it was that of their body when this was computed.
+            batch.expand("geom_sameframe")[:, self._fixed] = 0
+        places = data.geom_xpos.numpy()[rows, self._geoms[self._fixed]]
+        batch.expand("geom_pos")[:, self._fixed] = places
+        for name in (*STATE, *INPUTS):
+            batch.bind(name)[:] = getattr(data, name).numpy()[rows]
+        batch.step()
+        for name in (*STATE, "qfrc_actuator"):
+            getattr(data, name).numpy()[rows] = batch.bind(name)
+
+    def _copy_model(self, model: Any, names: Iterable[str]) -> None:
+        """Copy numbers that MuJoCo Warp has for each world; all others are as they were exported."""
+        for name in names:
+            ours, exported = getattr(model, name), getattr(self._exported, name)
+            if not exported.size or not isinstance(ours, wp.array) or ours.dtype is wp.int32:
+                continue
+            values = ours.numpy()
+            if values.ndim > exported.ndim and len(values) >= self._rows.stop:
+                values = values[self._rows]
+                if name.startswith("geom_"):
+                    values = values[:, self._geoms]
+                self._batch.expand(name)[:] = values.reshape((self._worlds, *exported.shape))
+
+    def publish_contacts(self, data: Any, found: int) -> int:
+        """Write contacts behind those already ``found``; returns how many there are then."""
+        contact = data.contact
+        for world in range(self._worlds):
+            own = self._batch.get_data(world, self._scratch)
+            active = own.contact.efc_address >= 0
             place = np.arange(active.sum())
             end = found + len(place)
-            self.mjw_data.efc.force.numpy()[world, place] = data.efc_force[rows[active]]
+            forces = own.efc_force[own.contact.efc_address[active]]
+            data.efc.force.numpy()[self._rows.start + world, place] = forces
             contact.efc_address.numpy()[found:end, 0] = place
-            contact.geom.numpy()[found:end] = data.contact.geom[active]
-            contact.worldid.numpy()[found:end] = world
+            contact.geom.numpy()[found:end] = self._geoms[own.contact.geom[active]]
+            contact.worldid.numpy()[found:end] = self._rows.start + world
             found = end
-        self.mjw_data.nacon.fill_(found)
+        return found
 
 
 def threads() -> int:
@@ -136,7 +176,9 @@ def threads() -> int:
     return int(os.environ.get("OMP_NUM_THREADS") or len(os.sched_getaffinity(0)))
 
 
-def make_solver(model: newton.Model, cfg: SimCfg) -> WarpSolver:
+def make_solver(
+    model: newton.Model, cfg: SimCfg, worlds: Sequence[tuple[newton.ModelBuilder, int]] = ()
+) -> WarpSolver:
     """The solver of ``sim.engine`` with the project's settings.
 
     Overflow is left to the guards, which need no prints. Room for contacts, which worlds share, grows with
@@ -150,7 +192,9 @@ def make_solver(model: newton.Model, cfg: SimCfg) -> WarpSolver:
     parts = np.bincount(model.shape_world.numpy()[convex], minlength=model.world_count)
     room = max(1.0, parts.mean() / USUAL_PARTS)
     rows = cfg.njmax + ROWS_A_PART * max(0, int(parts.max()) - USUAL_PARTS)
-    engine = WarpSolver if cfg.engine == "newton" else partial(CSolver, physics_dt=cfg.physics_dt)
+    engine = (
+        WarpSolver if cfg.engine == "newton" else partial(CSolver, worlds=worlds, physics_dt=cfg.physics_dt)
+    )
     solver = engine(
         model,
         solver="newton",

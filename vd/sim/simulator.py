@@ -73,7 +73,7 @@ class Simulator:
         self.model = scene.model
         self.device = self.model.device
         self.num_envs = n = scene.num_envs
-        self.solver = make_solver(self.model, cfg)
+        self.solver = make_solver(self.model, cfg, scene.worlds)
         self.state, self._next = self.model.state(), self.model.state()
         self.control = self.model.control()
         if self.device.is_cuda:  # a processor has no warps that would wait
