@@ -196,7 +196,7 @@ class ReorientEnv:
         """
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
-        if not self._kernels_loaded:
+        if not (self._kernels_loaded and self.sim.solver.captured):
             self.launch_step()  # before the capture, also in a run that resumes at a later step
             self._kernels_loaded = True
         else:
@@ -222,6 +222,9 @@ class ReorientEnv:
 
     def hold(self) -> None:
         """One control step in which no policy acts and the hand keeps its last targets; nothing is reset."""
+        if not self.sim.solver.captured:
+            self.sim.step()
+            return
         if self._hold_graph is None:
             with wp.ScopedCapture(device=self.device) as capture:
                 self.sim.step()

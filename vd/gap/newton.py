@@ -30,8 +30,8 @@ from vd.kernels.servo.joint_replay import (
 )
 from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
+from vd.sim.engine import make_solver
 from vd.sim.scene import build_hand, new_builder
-from vd.sim.simulator import make_solver
 
 JOINTS_PER_FINGER = 3
 DEFAULT_DT = 1.0 / 480.0
