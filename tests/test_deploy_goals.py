@@ -100,9 +100,6 @@ def test_orientations_are_read_as_written(tmp_path):
     goals = read_goals(["1,0,0@180", str(file)])
     half = np.sqrt(0.5)
     np.testing.assert_allclose(goals, [[1, 0, 0, 0], [0, 0, half, half], [0, 0, 0, 1]], atol=1e-12)
-
-
-def test_both_quaternions_of_an_orientation_are_one_goal():
     for one, other in (("0.1,-0.2,0.3,0.9", "-0.1,0.2,-0.3,-0.9"), ("0,-1,1,0", "0,1,-1,0")):
         first, second = read_goals([one, other])
         np.testing.assert_array_equal(first, second)
@@ -116,9 +113,6 @@ def test_what_is_no_orientation_is_refused(text, tmp_path):
     (tmp_path / "goals.csv").write_text(f"0,0,0,1\n{text}\n")
     with pytest.raises(GoalError, match="line 2"):
         read_goals([str(tmp_path / "goals.csv")])
-
-
-def test_files_without_orientations_are_refused(tmp_path):
     (tmp_path / "empty.txt").write_text("# nothing\n")
     with pytest.raises(GoalError, match="no orientation"):
         read_goals([str(tmp_path / "empty.txt")])

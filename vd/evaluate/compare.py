@@ -18,6 +18,7 @@ from vd.evaluate.agents import (
 )
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
 from vd.evaluate.conditions import in_condition
+from vd.sim.cfg import in_mujoco
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 ENVS_CPU, ENVS_GPU, ENVS_CAMERA_GPU = 64, 8192, 1024
 """Environments simulated at once by default: enough to keep the device busy, few enough to fit anywhere;
 images and clouds take memory."""
-_PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
+_PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "mujoco", "torch")
 
 
 def compare(cfg: EvalCfg, condition: str = "", stop_at: float = math.inf) -> "Result":
@@ -50,7 +51,7 @@ def compare(cfg: EvalCfg, condition: str = "", stop_at: float = math.inf) -> "Re
     quiet_warp()
     from vd.device import resolve_device
 
-    device = resolve_device(cfg.device)
+    device = resolve_device("cpu" if cfg.engine == "mujoco" else cfg.device)
     # A file that cannot be used, or is of another hand, is told before the simulator is imported.
     policies = {name: open_policy(name, device) for name in cfg.agent_names}
     for name, policy in policies.items():
@@ -126,6 +127,8 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         task = in_condition(task, cfg.condition)
     if cfg.table_friction is not None:
         task = replace(task, table_friction=cfg.table_friction)
+    if cfg.engine == "mujoco":
+        task = replace(task, sim=in_mujoco(task.sim))
     if cfg.randomised:
         return task
     # Noise that is switched off anyway, and would keep a teacher and a tracker from sharing environments.
@@ -159,6 +162,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
         table_friction=cfg.table_friction,
         goals=cfg.goals,
         sensor_errors=cfg.sensor_errors and sees == "rendered clouds",
+        engine=cfg.engine,
     )
 
 

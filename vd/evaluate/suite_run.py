@@ -286,6 +286,7 @@ def _write(
     write_json(cfg.out / f"{cfg.suite}.json", result.summary() | {"quick": cfg.quick, "figures": figures})
     notes = [f"Objects, {group}: {objects.text}." for group, objects in groups.items()]
     notes += ["Held-out objects judge, and nothing is chosen on them."]
+    notes += [] if cfg.engine == "newton" else ["Physics by MuJoCo's own engine."]
     write_page(
         result,
         cfg.out / f"{cfg.suite}.html",
