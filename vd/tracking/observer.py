@@ -177,8 +177,7 @@ class Observer:
         if isinstance(followed, Registration):
             followed.look(seen, count, fresh=senses.fresh, points=senses.points)
         else:
-            back = torch.cat([-turn[:, :3], turn[:, 3:]], dim=1)
-            followed.look(seen, count, fresh=senses.fresh, goal=product(back, senses.goal_quat))
+            followed.look(seen, count, fresh=senses.fresh)
         # A first look knows no motion.
         known = (followed.looks > 1) & (rotation_distance(pose[:, 3:], before[:, 3:]) < LEAP_RAD)
         moves = self._rate * known[:, None].float()

@@ -15,7 +15,7 @@ from torch import nn
 from torch.nn import functional
 
 from vd.vision.cfg import AlignmentCfg, SearchCfg
-from vd.vision.rotations import cube_rotations, matrices, turn_angle
+from vd.vision.rotations import cube_rotations, matrices
 
 PATCH_M = 0.03
 """Unit of places within a patch [m]: about its size."""
@@ -30,8 +30,6 @@ SHARE = 0.3
 STAY = 0.8
 """Another hypothesis must be expected to err less by a fifth to be believed: of an object that looks the same
 in several orientations all err alike, and to change from one to the other is no motion that it makes."""
-NEARER = 0.05
-"""Predicted error that a first look takes for a radian nearer to the goal."""
 GOAL, SEEN = 0, 1
 """Kinds of clouds, in the order in which they are given."""
 
@@ -183,16 +181,12 @@ class Aligner:
         self._looks[rows] = 0
 
     @torch.no_grad()
-    def look(
-        self, seen: torch.Tensor, rows: torch.Tensor | None = None, toward: torch.Tensor | None = None
-    ) -> Alignment:
+    def look(self, seen: torch.Tensor, rows: torch.Tensor | None = None) -> Alignment:
         """Compare once.
 
         Args:
             seen: What is seen of the objects [m] [R, P', 3], points in no order.
             rows: Which objects, each once [R]; all by default.
-            toward: Rotations to which of several that look alike the nearest is taken at a first look,
-                matrices [R, 3, 3]; any by default.
         """
         rows = torch.arange(len(self._goal), device=seen.device) if rows is None else rows
         mean = seen.mean(dim=1)
@@ -200,26 +194,24 @@ class Aligner:
         tokens = self.network.encode(seen, SEEN, self.network.neighbours(seen))
         new = self._looks[rows] == 0
         if bool(new.any()):
-            self._begin(rows[new], tokens[new], None if toward is None else toward[new])
+            self._begin(rows[new], tokens[new])
         self._restart(rows[~new])
         found, offset, error = self._improve(rows, tokens, self._kept[rows])
         before = self._errors[rows]
         error = torch.where(before.isnan(), error, before.lerp(error, SHARE))
-        believed = torch.cat([STAY * error[:, :1], error[:, 1:]], dim=1)
-        order = believed.argsort(dim=1)
+        stay = torch.where(new[:, None], 1.0, STAY)
+        order = torch.cat([stay * error[:, :1], error[:, 1:]], dim=1).argsort(dim=1)
         self._kept[rows] = found = found.take_along_dim(order[:, :, None, None], dim=1)
         self._errors[rows] = error = error.take_along_dim(order, dim=1)
         self._looks[rows] += 1
         offset = offset.take_along_dim(order[:, :1, None], dim=1)[:, 0]
         return Alignment(found[:, 0], mean + offset, error[:, 0])
 
-    def _begin(self, rows: torch.Tensor, tokens: torch.Tensor, toward: torch.Tensor | None) -> None:
-        """Keep the best that starts come to; of those that look alike the ones nearest to ``toward``."""
+    def _begin(self, rows: torch.Tensor, tokens: torch.Tensor) -> None:
+        """Keep the best that starts come to."""
         found, error = self._starts.expand(len(rows), -1, -1, -1), torch.empty(0)
         for _ in range(self._cfg.passes):
             found, _, error = self._improve(rows, tokens, found)
-        if toward is not None:
-            error = error + NEARER * turn_angle(toward[:, None].transpose(-1, -2) @ found)
         best = error.topk(self._cfg.kept, dim=1, largest=False).indices
         self._kept[rows] = found.take_along_dim(best[:, :, None, None], dim=1)
         self._errors[rows] = torch.nan

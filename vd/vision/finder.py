@@ -10,7 +10,7 @@ import torch
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.vision.alignment import Aligner, AlignmentNetwork
-from vd.vision.rotations import matrices, quaternions, two_columns
+from vd.vision.rotations import quaternions
 
 POINTS = 512
 """Points seen of the object that are looked at: as many as the network learned from."""
@@ -67,22 +67,13 @@ class GoalFinder:
         self.seen = torch.zeros((envs, POINTS, 3), device=device)
         self.seen_now = torch.zeros(envs, dtype=torch.bool, device=device)
 
-    def look(
-        self,
-        seen: torch.Tensor,
-        count: torch.Tensor,
-        *,
-        fresh: torch.Tensor,
-        goal: torch.Tensor,
-    ) -> None:
+    def look(self, seen: torch.Tensor, count: torch.Tensor, *, fresh: torch.Tensor) -> None:
         """Look once in every environment; where too little is seen of the object all stays as it is.
 
         Args:
             seen: Points seen of the object [m], neighbours beside each other [N, M, 3].
             count: How many there are, [N] int32.
             fresh: Where nothing is known from before, bool [N].
-            goal: Wanted orientations of the clouds' frames [N, 4]: of several that look alike the nearest is
-                taken at first.
         """
         self.looks.masked_fill_(fresh, 0)
         self._aligner.reset(fresh)
@@ -93,7 +84,7 @@ class GoalFinder:
             return
         chosen = torch.searchsorted(crowded[rows].cumsum(dim=1), (self.share * count[rows, None]).long() + 1)
         self.seen[rows] = points = seen[rows].take_along_dim(chosen[..., None], dim=1)
-        found = self._aligner.look(points, rows, matrices(two_columns(goal[rows])))
+        found = self._aligner.look(points, rows)
         place = found.position - (found.rotation @ self._mean[rows, :, None]).squeeze(-1)
         self.pose[rows, 0] = torch.cat([place, quaternions(found.rotation)], dim=1)
         self.error[rows] = found.error
