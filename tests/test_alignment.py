@@ -145,15 +145,9 @@ def test_a_pose_is_that_of_the_frame_of_the_goals_points():
     finder = GoalFinder(
         NearSighted(truth), [item], world_object=np.zeros(3, int), world_scale=np.full(3, 0.5)
     )
-    goal = torch.tensor([[0.0, 0.0, 0.0, 1.0]]).expand(3, 4)
     seen = torch.tensor([0.1, 0.2, 0.3]) + 0.001 * torch.randn(3, 20, 3)
     for look in range(4):
-        finder.look(
-            seen,
-            torch.tensor([20, 20, LEAST - 1]),
-            fresh=torch.tensor([look == 0, look == 3, True]),
-            goal=goal,
-        )
+        finder.look(seen, torch.tensor([20, 20, LEAST - 1]), fresh=torch.tensor([look == 0, look == 3, True]))
     assert finder.looks.tolist() == [4, 1, 0]
     assert torch.equal(finder.pose[2, 0], torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
     found = Rotation.from_quat(finder.pose[:2, 0, 3:].numpy())
@@ -171,7 +165,7 @@ def test_points_are_chosen_evenly_whatever_their_number():
         assert len(often) == count and often.min() >= 512 // count - 1 and often.max() <= 512 // count + 2
 
 
-def test_of_orientations_that_look_alike_the_nearest_to_the_goal_is_taken_and_stays():
+def test_of_orientations_that_look_alike_one_is_taken_and_stays():
     """The network is right about all of four turns."""
     turns = Rotation.from_rotvec(np.outer([0.0, 0.5, 1.0, 1.5], [0.0, 0.0, np.pi])).as_matrix()
     turns = turns.astype(np.float32)
@@ -186,9 +180,9 @@ def test_of_orientations_that_look_alike_the_nearest_to_the_goal_is_taken_and_st
 
     goal, seen = clouds(torch.zeros(4))
     aligner = Aligner(Alike(torch.eye(3)[None]), goal, SearchCfg(kept=3, restart_looks=2))
+    first = aligner.look(seen).rotation
     for _ in range(12):
-        found = aligner.look(seen, toward=torch.tensor(turns))
-        torch.testing.assert_close(found.rotation, torch.tensor(turns), atol=1e-5, rtol=0.0)
+        torch.testing.assert_close(aligner.look(seen).rotation, first, atol=1e-5, rtol=0.0)
 
 
 @pytest.fixture(scope="module")
