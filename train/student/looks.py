@@ -17,7 +17,7 @@ from vd.tracking.policy import TrackingPolicy
 from vd.train.student.config import LooksCfg
 from vd.train.student.views import Pairs, with_goals
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
-from vd.vision.finder import POINTS
+from vd.vision.finder import POINTS, GoalFinder
 from vd.vision.rotations import matrices, two_columns
 
 ENDS = ("task/reached", "task/dropped", "task/timed_out")
@@ -54,6 +54,7 @@ class SimulatedLooks:
     def collect(self, stopping: Callable[[], bool]) -> dict[str, torch.Tensor] | None:
         """Some steps of every environment; figures of these, or ``None`` if they were cut short."""
         finder, logs, errors = self._actor.tracker.observer.finder, [], []
+        assert isinstance(finder, GoalFinder)  # the policy has a network
         observation = self._env.get_observations()[OBSERVATION_GROUP]
         for _ in range(self.cfg.steps):
             if stopping():
