@@ -9,7 +9,7 @@ import tyro
 
 from vd.config import Dropped, Renamed
 from vd.train.config import RunCfg, require
-from vd.vision.cfg import AlignmentCfg, SearchCfg
+from vd.vision.cfg import SEEN_POINTS, AlignmentCfg, SearchCfg
 
 Stage = Literal[0, 1]
 PresetName = Literal["gpu", "cpu-demo"]
@@ -162,6 +162,10 @@ class StudentTrainCfg:
         self.align.validate()
         self.looks.validate()
         require(self.task, "--", "positive", "num_envs")
+        if self.stage == SIMULATED and self.align.points > SEEN_POINTS:
+            raise ValueError(
+                f"--align.points is {self.align.points}; policies look at {SEEN_POINTS}, at most"
+            )
 
 
 def gpu(stage: Stage) -> StudentTrainCfg:

@@ -17,7 +17,8 @@ from vd.tracking.policy import TrackingPolicy
 from vd.train.student.config import LooksCfg
 from vd.train.student.views import Pairs, with_goals
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
-from vd.vision.finder import POINTS, GoalFinder
+from vd.vision.cfg import SEEN_POINTS
+from vd.vision.finder import GoalFinder
 from vd.vision.rotations import matrices, two_columns
 
 ENDS = ("task/reached", "task/dropped", "task/timed_out")
@@ -45,7 +46,7 @@ class SimulatedLooks:
         self._base = torch.tensor(BASE_IN_WORLD, dtype=torch.float32, device=place)
         self._object = torch.tensor(np.asarray(simulation.scene.world_object), device=place)
         self._scale = torch.tensor(np.asarray(simulation.scene.world_scale), device=place).float()
-        self._seen = torch.empty((cfg.kept, POINTS, 3), dtype=torch.half, device=place)
+        self._seen = torch.empty((cfg.kept, SEEN_POINTS, 3), dtype=torch.half, device=place)
         self._poses = torch.empty((cfg.kept, 7), device=place)
         self._envs = torch.empty(cfg.kept, dtype=torch.long, device=place)
         self._next, self._full = 0, False

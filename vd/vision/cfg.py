@@ -3,6 +3,10 @@
 from dataclasses import dataclass, fields
 
 
+SEEN_POINTS = 512
+"""Points of what is seen that a policy looks at: as many as its network learns from."""
+
+
 @dataclass(frozen=True)
 class AlignmentCfg:
     """Sizes of the network that turns a goal's cloud onto a seen one (:mod:`vd.vision.alignment`)."""

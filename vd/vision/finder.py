@@ -10,10 +10,9 @@ import torch
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.vision.alignment import Aligner, AlignmentNetwork
+from vd.vision.cfg import SEEN_POINTS
 from vd.vision.rotations import quaternions
 
-POINTS = 512
-"""Points seen of the object that are looked at: as many as the network learned from."""
 LEAST = 16
 """Of fewer points nothing is told: those that it learned from had twice as many."""
 CROWD, CROWD_M = 4, 0.0102
@@ -44,7 +43,7 @@ class GoalFinder:
         seen_now: Where there was one now, bool [N].
     """
 
-    most = POINTS
+    most = SEEN_POINTS
 
     def __init__(
         self,
@@ -59,12 +58,12 @@ class GoalFinder:
         scaled = clouds * np.asarray(world_scale)[:, None, None]
         cloud = torch.tensor(scaled, dtype=torch.float32, device=device)
         self._mean, self._aligner = cloud.mean(dim=1), Aligner(network, cloud)
-        self.share = (GOLDEN * torch.arange(POINTS, device=device)) % 1.0
+        self.share = (GOLDEN * torch.arange(SEEN_POINTS, device=device)) % 1.0
         self.pose = torch.zeros((envs, 1, 7), device=device)
         self.pose[..., 6] = 1.0
         self.error = torch.full((envs,), torch.pi, device=device)
         self.looks = torch.zeros(envs, dtype=torch.int32, device=device)
-        self.seen = torch.zeros((envs, POINTS, 3), device=device)
+        self.seen = torch.zeros((envs, SEEN_POINTS, 3), device=device)
         self.seen_now = torch.zeros(envs, dtype=torch.bool, device=device)
 
     def look(self, seen: torch.Tensor, count: torch.Tensor, *, fresh: torch.Tensor) -> None:
