@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, fields
 
-
 SEEN_POINTS = 512
 """Points of what is seen that a policy looks at: as many as its network learns from."""
 
