@@ -99,13 +99,16 @@ def beside_kernel(
     row = wp.tid()
     key = key_in[row]
     cell = key_coordinates(key & _MORTON_MASK)
-    beside_out[row] = False
-    for k in range(_NEIGHBOURS):
+    found = wp.bool(other_in[row])
+    k = wp.int32(0)
+    while k < _NEIGHBOURS and not found:
         x, y, z = cell[0] + k // 9 - 1, cell[1] + (k // 3) % 3 - 1, cell[2] + k % 3 - 1
         wanted = voxel_key(key >> _CLOUD_SHIFT, x, y, z)
         place = wp.lower_bound(key_in, wanted)
-        if place < key_in.shape[0] and key_in[place] == wanted and other_in[place]:
-            beside_out[row] = True
+        if place < key_in.shape[0] and key_in[place] == wanted:
+            found = other_in[place]
+        k += 1
+    beside_out[row] = found
 
 
 @wp.kernel
