@@ -158,10 +158,10 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
     )
     env = ReorientEnv(task_of(evaluation, policy, cfg.objects, envs), device)
     env.objects = with_symmetries(env.objects, device)
-    actor, _, _, rules = actor_of(
+    acting = actor_of(
         cfg.teacher, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
     )
-    trace = run_episodes(evaluation, env, actor, cfg.teacher, rules, math.inf)
+    trace = run_episodes(evaluation, env, *acting)
     env.close()
     return trace
 

@@ -104,6 +104,8 @@ class TrainedPolicy:
         network: From observations [N, O] to mean actions [N, D]; what an exporter needs.
     """
 
+    kind = "teacher"
+
     def __init__(
         self,
         spec: PolicySpec,
@@ -142,37 +144,25 @@ class TrainedPolicy:
             return self.network(observation)
 
 
-class ZeroPolicy:
-    """Keeps still: every action is zero.
+class BuiltIn:
+    """An agent without a file: every action is zero, or uniform in [-1, 1].
 
     Args:
+        name: ``zero`` or ``random``.
         num_actions: Actions D.
-    """
-
-    def __init__(self, num_actions: int) -> None:
-        self.num_actions = num_actions
-
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Zeros [N, D]."""
-        return observation.new_zeros((observation.shape[0], self.num_actions))
-
-
-class RandomPolicy:
-    """Actions uniform in [-1, 1], the same for the same seed on the same device.
-
-    Args:
-        num_actions: Actions D.
-        seed: Seed of the sequence.
+        seed: Of random actions, the same for the same seed on the same device.
         device: Torch device of the observations it will get.
     """
 
-    def __init__(self, num_actions: int, *, seed: int = 0, device: str = "cpu") -> None:
-        self.num_actions = num_actions
+    def __init__(self, name: str, num_actions: int, *, seed: int = 0, device: str = "cpu") -> None:
+        self.num_actions, self._still = num_actions, name == "zero"
         self._generator = torch.Generator(device=device).manual_seed(seed)
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Uniform actions [N, D]."""
+        """Actions [N, D]."""
         shape = (observation.shape[0], self.num_actions)
+        if self._still:
+            return observation.new_zeros(shape)
         return torch.rand(shape, generator=self._generator, device=observation.device) * 2.0 - 1.0
 
 

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
 from vd.paper import PAPER
 
@@ -21,9 +20,9 @@ class StoppingRule:
     action_norm: float = PAPER.success.action_norm
     """Bound of the norm of the smoothed action, a-bar."""
 
-    def stops(self, predicted: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Where to stop: predicted distances [...] [rad], smoothed actions [..., D] give booleans [...]."""
-        return (predicted < self.distance_rad) & (action.norm(dim=-1) < self.action_norm)
+    def stops(self, distance: np.ndarray, action_norm: np.ndarray) -> np.ndarray:
+        """Where to stop, for predicted distances [rad] and norms of the smoothed action of one shape."""
+        return (distance < self.distance_rad) & (action_norm < self.action_norm)
 
 
 @dataclass(frozen=True, kw_only=True)

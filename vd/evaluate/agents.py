@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any
 
 from vd.bundle import is_bundle
 from vd.config import from_dict
@@ -134,23 +134,9 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | Track
     return load_student(path, device) if is_student(path) else load_policy(path, device)
 
 
-def sees_clouds(name: str) -> bool:
-    """Whether a policy sees point clouds: a student, or one that tracks.
-
-    Raises:
-        FileNotFoundError: There is no such policy.
-    """
-    if name in BUILT_IN:
-        return False
-    path = find_policy(name)
-    if is_bundle(path):
-        from vd.bundle.store import read_contract
-
-        return read_contract(path).kind != "teacher"
-    from vd.tracking.policy import is_tracking
-    from vd.vision.saved import is_student
-
-    return is_student(path) or is_tracking(path)
+def sees_clouds(policy: Any | None) -> bool:
+    """Whether what :func:`open_policy` gave sees point clouds: a student, or one that tracks."""
+    return policy is not None and policy.kind != "teacher"
 
 
 def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
@@ -162,7 +148,7 @@ def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
     from vd.policy import TrainedPolicy
 
     policy = open_policy(name, device)
-    if policy is not None and not isinstance(policy, TrainedPolicy):
+    if not isinstance(policy, TrainedPolicy | None):
         raise ValueError(f"{name} sees point clouds; give a teacher, or use vd-eval")
     return policy
 
@@ -191,12 +177,10 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
         from vd.bundle.store import read_contract
 
         return check_hand(read_contract(path), model, path)
-    moves = policy.spec.num_actions if is_saved_student(policy) else policy.num_actions
-    if moves != model.num_joints:
-        trained = trained_task(policy).hand
+    if policy.num_actions != model.num_joints:
         raise ValueError(
-            f"{name} moves {moves} joints, the hand {model.name} has {model.num_joints}; "
-            f"use the hand it was trained for: --hand {trained}"
+            f"{name} moves {policy.num_actions} joints, the hand {model.name} has {model.num_joints}; "
+            f"use the hand it was trained for: --hand {trained_task(policy).hand}"
         )
 
 
@@ -204,24 +188,6 @@ def _on_hand(task: ReorientCfg, hand: str | None, hand_layer: str | None) -> Reo
     """A task with the hand and layer that were asked for; None: as trained."""
     layer = task.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer
     return replace(task, hand=hand or task.hand, hand_layer=layer)
-
-
-def is_saved_student(policy: Any | None) -> "TypeGuard[SavedStudent]":
-    """Whether what :func:`open_policy` gave is a student."""
-    if policy is None:
-        return False
-    from vd.vision.saved import SavedStudent
-
-    return isinstance(policy, SavedStudent)
-
-
-def is_tracking_policy(policy: Any | None) -> "TypeGuard[TrackingPolicy]":
-    """Whether what :func:`open_policy` gave is a tracking policy."""
-    if policy is None:
-        return False
-    from vd.tracking.policy import TrackingPolicy
-
-    return isinstance(policy, TrackingPolicy)
 
 
 def start_at_rest(yes: bool, no: bool) -> bool | None:
@@ -242,30 +208,17 @@ def episode_limit_s(episode_s: float | None, *, in_air: bool) -> float:
     return PAPER.scene.air_episode_s if in_air else PAPER.scene.episode_s
 
 
-def built_in(name: str, num_actions: int, *, seed: int, device: str) -> Any:
-    """The agent ``zero`` or ``random``."""
-    from vd.policy import RandomPolicy, ZeroPolicy
-
-    if name == "zero":
-        return ZeroPolicy(num_actions)
-    return RandomPolicy(num_actions, seed=seed, device=device)
-
-
 def task_for(
     policy: Any | None,
     *,
-    hand: str | None,
-    objects: tuple[str, ...],
-    num_envs: int,
-    seed: int,
     stop_tolerance_rad: float,
-    max_goal_angle_rad: float | None,
-    episode_s: float,
     randomised: bool,
-    success_ends_episode: bool,
-    at_rest: bool | None = None,
+    hand: str | None = None,
     hand_layer: str | None = None,
+    max_goal_angle_rad: float | None = None,
+    at_rest: bool | None = None,
     condition: RandomisationCfg | None = None,
+    **settings: Any,
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
 
@@ -274,34 +227,24 @@ def task_for(
 
     Args:
         policy: A trained policy, or None.
-        hand: Hand name; None takes the policy's.
-        objects: Object sets.
-        num_envs: N.
-        seed: Of the environment.
         stop_tolerance_rad: Orientation tolerance of success [rad].
-        max_goal_angle_rad: Largest angle from an object to a goal the environment draws [rad]; None: as
-            trained.
-        episode_s: Time limit [s].
         randomised: Domain randomisation, noise and disturbances.
-        success_ends_episode: End at success, or give a new goal.
-        at_rest: Start at rest on the table rather than from a drop; None: as trained.
+        hand: Hand name; None takes the policy's.
         hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is, None: as
             trained.
+        max_goal_angle_rad: Largest angle from an object to a goal the environment draws [rad]; None: as
+            trained.
+        at_rest: Start at rest on the table rather than from a drop; None: as trained.
         condition: What is drawn, in place of ``randomised`` (:mod:`vd.evaluate.conditions`).
+        settings: Other fields of the task.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
-    if is_saved_student(policy) or is_tracking_policy(policy):
-        # Who does not look at its teacher's observation.
+    if sees_clouds(policy):  # who does not look at its teacher's observation
         base = replace(base, observation=ObservationCfg())
     if base.observation.dynamics == "critic":  # whom nobody asks here
         base = replace(base, observation=replace(base.observation, dynamics="none"))
     return replace(
         _on_hand(base, hand, hand_layer),
-        objects=objects,
-        num_envs=num_envs,
-        seed=seed,
-        episode_s=episode_s,
-        success_ends_episode=success_ends_episode,
         success=replace(SuccessCfg(), rotation_rad=stop_tolerance_rad),
         start=base.start if at_rest is None else replace(base.start, at_rest=at_rest),
         goal=base.goal
@@ -310,4 +253,5 @@ def task_for(
         curriculum=CurriculumCfg(),
         table=TableCfg(),
         randomisation=condition or replace(base.randomisation, enabled=randomised),
+        **settings,
     )

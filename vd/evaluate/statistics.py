@@ -1,4 +1,4 @@
-"""Orientation errors, chance levels and confidence intervals.
+"""Orientation errors and confidence intervals.
 
 Angles are radians in [0, pi], quaternions xyzw (unit), rotations world from body.
 
@@ -17,7 +17,6 @@ from typing import Literal
 
 import numpy as np
 from scipy import stats
-from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
 Unit = Literal["object", "episode"]
@@ -27,8 +26,6 @@ TOLERANCES_RAD = (0.1, 0.2, 0.4, 0.8)
 """Errors at which success is reported; the paper's figures use 0.1, 0.4 and 0.8."""
 # How much objects differ is not known from fewer than this.
 MIN_CLUSTERS = 8
-# Draws for chance on a symmetric object, for which no closed form is used: 0.5 % at a rate of one half.
-CHANCE_DRAWS = 40_000
 
 
 @dataclass(frozen=True)
@@ -81,25 +78,6 @@ def symmetric_error(object_quat: np.ndarray, goal_quat: np.ndarray, symmetry: np
     """
     turned = quat_multiply(np.asarray(object_quat)[..., None, :], np.asarray(symmetry))
     return rotation_angle(turned, np.asarray(goal_quat)[..., None, :]).min(axis=-1)
-
-
-def chance_cdf(angle: np.ndarray | float, symmetry: np.ndarray | None = None) -> np.ndarray:
-    """Probability that a uniformly random orientation is within ``angle`` of the goal.
-
-    Args:
-        angle: Angles [rad], any shape.
-        symmetry: The object's symmetry rotations xyzw, shape [S, 4]; None for an asymmetric object, which
-            has the closed form (angle - sin angle) / pi (0.34 % at 0.4 rad).
-
-    Returns:
-        Probabilities, the shape of ``angle``.
-    """
-    angle = np.clip(np.asarray(angle, dtype=float), 0.0, np.pi)
-    if symmetry is None or len(symmetry) == 1:
-        return (angle - np.sin(angle)) / np.pi
-    draws = Rotation.random(CHANCE_DRAWS, rng=np.random.default_rng(0)).as_quat()
-    errors = np.sort(symmetric_error(draws, np.array([0.0, 0.0, 0.0, 1.0]), symmetry))
-    return np.searchsorted(errors, angle, side="right") / CHANCE_DRAWS
 
 
 def choose_unit(num_objects: int) -> Unit:

@@ -34,6 +34,7 @@ class TrackingPolicy:
         spec: All else.
     """
 
+    kind: ClassVar = "tracking"
     teacher: TrainedPolicy
     spec: TrackingSpec
 
