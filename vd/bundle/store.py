@@ -5,7 +5,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from vd.bundle.contract import (
     ContractError,
     Kind,
     Provenance,
-    StoppingPart,
     derive_interface,
 )
 from vd.config import from_dict, to_dict
@@ -52,6 +51,7 @@ versions of torch differ by 1e-6 to 1e-3."""
 PROPRIOCEPTION = {"action": "previous_action", "position": "joint_q", "velocity": "joint_qd"}
 """Golden input behind each part of a student's proprioception."""
 _PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
+_RULES = [one.name for one in fields(StoppingRules)]
 _AGAIN = "write the bundle again with vd-train bundle"
 
 AnyPolicy = TrainedPolicy | SavedStudent | TrackingPolicy
@@ -92,7 +92,7 @@ def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
         kind=kind,
         interface=derive_interface(hand, kind, network, source, camera),
         network=network,
-        stopping=None if rules is None else StoppingPart.of(rules),
+        stopping=None if rules is None else StoppingRules(**{n: getattr(rules, n) for n in _RULES}),
         provenance=source,
         software=installed_versions(_PACKAGES),
     )
@@ -116,8 +116,13 @@ def read_contract(folder: str | Path) -> Contract:
         found = values.get("format") if isinstance(values, dict) else None
         if found != BUNDLE_FORMAT:
             raise ValueError(f"format is {found!r}, this version reads {BUNDLE_FORMAT!r}")
+        if (rules := values.get("stopping")) and "distance_rad" in rules:  # of an earlier version
+            pairs = (rules.pop("distance_rad"), rules.pop("action_norm")), rules.get("precise")
+            rules["stopping"], rules["precise"] = (
+                pair and dict(zip(("distance_rad", "action_norm"), pair, strict=True)) for pair in pairs
+            )
         return from_dict(Contract, values)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, KeyError) as error:
         raise ContractError(f"{path}: {error}; {_AGAIN}") from error
 
 
@@ -205,8 +210,7 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     if contract.kind == "teacher":
         return _teacher(network, source, weights, device)
     settings: dict[str, Any] = {"teacher": source.teacher, "camera": contract.own_camera}
-    if (stopping := contract.stopping) is not None:
-        settings |= stopping.rules()
+    settings |= vars(contract.stopping or StoppingRules())
     if contract.kind == "tracking":
         teacher = _teacher(network.pop("policy"), source, weights, device, parts=True)
         spec = from_dict(TrackingSpec, network, where="network")
@@ -215,7 +219,7 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     assert source.stage is not None
     student = StudentSpec(
         network=from_dict(StudentCfg, network, where="network"),
-        num_actions=len(contract.interface.hand.joint_names),
+        num_actions=len(contract.interface["hand"]["joint_names"]),
         stage=source.stage,
         **settings,
     )

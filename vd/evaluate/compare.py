@@ -98,7 +98,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         stop_tolerance_rad=NEVER_RAD,
         max_goal_angle_rad=cfg.max_goal_angle,
         episode_s=cfg.limit_s,
-        randomised=cfg.randomised,
+        randomised=True,
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
@@ -106,18 +106,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
     )
     if cfg.condition is not None:
         task = in_condition(task, cfg.condition)
-    if cfg.table_friction is not None:
-        task = replace(task, table_friction=cfg.table_friction)
-    if cfg.randomised:
-        return task
-    # Noise that is switched off anyway, and would keep a teacher and a tracker from sharing environments.
-    exact = replace(
-        task.randomisation,
-        observation_noise_mean=0.0,
-        observation_noise_std=0.0,
-        observation_offset_std=0.0,
-    )
-    return replace(task, randomisation=exact)
+    return task if cfg.table_friction is None else replace(task, table_friction=cfg.table_friction)
 
 
 def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: str) -> "Protocol":
@@ -134,7 +123,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
         stop_tolerance_rad=cfg.stop_tolerance,
         episode_s=task.episode_s,
         control_hz=task.sim.control_hz,
-        randomisation=cfg.condition or ("on" if cfg.randomised else "off"),
+        randomisation=cfg.condition or ("on" if cfg.randomise else "off"),
         at_rest=task.start.at_rest,
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
         in_air=cfg.in_air,

@@ -40,7 +40,15 @@ from vd.workers import run_tasks
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
 PAPER_HEADER: tuple[str, ...] = ("figure", "condition", "paper")
-ROBUST_HEADER = ("condition", "changed", "policy", "success", "points from nominal", "within 0.1 rad", "lost")
+ROBUST_HEADER: tuple[str, ...] = (
+    "condition",
+    "changed",
+    "policy",
+    "success",
+    "points from nominal",
+    "within 0.1 rad",
+    "lost",
+)
 LOG_FILE = "log.txt"
 """Progress of an evaluation that ran beside others."""
 OUT_OF_TIME = "out of time; the same command goes on from here"
