@@ -13,7 +13,7 @@ from vd.config import to_dict
 from vd.envs.cfg import RandomisationCfg, ReorientCfg, SuccessCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import student as module
-from vd.evaluate.agents import sees_clouds
+from vd.evaluate.agents import open_policy, sees_clouds
 from vd.evaluate.cli import main
 from vd.evaluate.result import Result
 from vd.evaluate.scanned import MISSING, NOISE_M, known_objects, scan
@@ -106,8 +106,8 @@ def test_memory_lasts_until_the_reset(env):
 
 
 def test_what_it_sees_is_as_its_stage_was_trained(env, tmp_path):
-    assert sees_clouds(save_student(tmp_path / "student.pt", 2))
-    assert not sees_clouds("dclaw3-table") and not sees_clouds("zero")
+    assert sees_clouds(open_policy(save_student(tmp_path / "student.pt", 2), "cpu"))
+    assert not any(sees_clouds(open_policy(name, "cpu")) for name in ("dclaw3-table", "zero"))
     assert [StudentActor(env, make_student(stage)).rendered for stage in (1, 2)] == [False, True]
     with pytest.raises(ValueError, match="stage 0 is an encoder"):
         StudentActor(env, make_student(0))

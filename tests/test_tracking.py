@@ -233,18 +233,8 @@ def test_a_former_command_is_refused_with_the_new_one(command, word, capsys):
 def test_a_runner_decides_on_a_hand_as_in_the_simulator():
     """An episode of the policy; the deploy side is given joints, goal and image, nothing else."""
     policy = open_policy("dclaw3-tracking", "cpu")
-    task = task_for(
-        policy,
-        hand=None,
-        objects=("cube",),
-        num_envs=1,
-        seed=3,
-        stop_tolerance_rad=0.4,
-        max_goal_angle_rad=None,
-        episode_s=3.0,
-        randomised=False,
-        success_ends_episode=False,
-    )
+    settings = {"num_envs": 1, "seed": 3, "episode_s": 3.0, "success_ends_episode": False}
+    task = task_for(policy, stop_tolerance_rad=0.4, randomised=False, objects=("cube",), **settings)
     env = ReorientEnv(task, "cpu")
     actor, runner = TrackingActor(env, policy), TrackingRunner(policy, env.hand, env.objects[0])
     runner.begin()
