@@ -18,14 +18,13 @@ from vd.bundle.contract import (
     BUNDLE_FORMAT,
     Contract,
     ContractError,
-    Kind,
     Provenance,
     derive_interface,
 )
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.files import atomic_path, make_folder, write_json, writing
-from vd.policy import PolicySpec, TrainedPolicy
+from vd.policy import TrainedPolicy, policy_of
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
 from vd.tracking.policy import TrackingPolicy, TrackingSpec
@@ -59,38 +58,31 @@ Tensors = dict[str, torch.Tensor]
 
 
 def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
-    """Write the bundle of a policy; one that is there is replaced.
-
-    Args:
-        policy: The policy, on the CPU.
-        folder: To write.
+    """Write the bundle of a policy on the CPU; one that is there is replaced.
 
     Raises:
-        ContractError: A robot's loop cannot give what it observes.
         FileExistsError: The folder holds something else.
         OutputError: It cannot be written.
     """
     task = from_dict(ReorientCfg, policy.task, where="task of the policy")
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
-    kind: Kind = "teacher"
     rules: StoppingRules | None = None
-    trained: TrainedPolicy | SavedStudent
     if isinstance(policy, TrackingPolicy):
-        kind, rules, trained = "tracking", policy.spec, policy.teacher
+        rules, trained = policy.spec, policy.teacher
         source = _provenance(trained, policy.spec.teacher, None, to_dict(policy.spec.depth))
         network, camera = {"policy": to_dict(trained.spec)}, policy.spec.camera
         weights = {f"actor.{name}": value for name, value in trained.weights.items()}
         weights |= {f"critic.{name}": value for name, value in trained.critic_weights.items()}
     elif isinstance(policy, SavedStudent):
-        kind, rules, trained, spec = "student", policy.spec, policy, policy.spec
+        rules = spec = policy.spec
         source = _provenance(policy, spec.teacher, spec.stage, policy.depth if spec.stage == RENDERED else {})
         network, camera, weights = to_dict(spec.network), spec.camera, policy.network.state_dict()
     else:
-        trained, source = policy, _provenance(policy, "", None, {})
+        source = _provenance(policy, "", None, {})
         network, camera, weights = to_dict(policy.spec), None, policy.weights
     contract = Contract(
-        kind=kind,
-        interface=derive_interface(hand, kind, network, source, camera),
+        kind=policy.kind,
+        interface=derive_interface(hand, policy.kind, network, source, camera),
         network=network,
         stopping=None if rules is None else StoppingRules(**{n: getattr(rules, n) for n in _RULES}),
         provenance=source,
@@ -128,10 +120,6 @@ def read_contract(folder: str | Path) -> Contract:
 
 def read_bundle(folder: str | Path, device: str = "cpu") -> AnyPolicy:
     """The policy of a bundle, once it has answered the golden inputs as it did when it was written.
-
-    Args:
-        folder: The bundle.
-        device: Torch device of the policy.
 
     Raises:
         FileNotFoundError: A file is missing.
@@ -212,7 +200,7 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     settings: dict[str, Any] = {"teacher": source.teacher, "camera": contract.own_camera}
     settings |= vars(contract.stopping or StoppingRules())
     if contract.kind == "tracking":
-        teacher = _teacher(network.pop("policy"), source, weights, device, parts=True)
+        teacher = _teacher(network.pop("policy"), source, weights, device)
         spec = from_dict(TrackingSpec, network, where="network")
         depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth")
         return TrackingPolicy(teacher, replace(spec, depth=depth, **settings))
@@ -229,23 +217,12 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     return SavedStudent(student, net, source.task, source.depth, source.iterations, source.env_steps)
 
 
-def _teacher(
-    spec: dict[str, Any], source: Provenance, weights: Tensors, device: str, *, parts: bool = False
-) -> TrainedPolicy:
-    """A teacher; with ``parts`` the names of its weights say whether they are the actor's or the critic's."""
-
-    def of(part: str) -> Tensors:
-        return {n.removeprefix(part): value for n, value in weights.items() if n.startswith(part)}
-
-    return TrainedPolicy(
-        from_dict(PolicySpec, spec, where="network"),
-        of("actor.") if parts else weights,
-        task=source.task,
-        iteration=source.iterations,
-        env_steps=source.env_steps,
-        device=device,
-        critic=(of("critic.") or None) if parts else None,
-    )
+def _teacher(spec: dict[str, Any], source: Provenance, weights: Tensors, device: str) -> TrainedPolicy:
+    """A teacher; of a tracking policy names of weights say whether they are the actor's or the critic's."""
+    actor = {n.removeprefix("actor."): v for n, v in weights.items() if not n.startswith("critic.")}
+    critic = {n.removeprefix("critic."): v for n, v in weights.items() if n.startswith("critic.")}
+    trained = {"policy": spec, "task": source.task, "iter": source.iterations, "env_steps": source.env_steps}
+    return policy_of(trained | {"actor_state_dict": actor, "critic_state_dict": critic}, device)
 
 
 def _provenance(

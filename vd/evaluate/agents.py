@@ -78,12 +78,7 @@ def find_policy(name: str | Path) -> Path:
 
 
 def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None = None) -> None:
-    """Refuse agents, object sets and a hand that are not there, before anything slow is imported.
-
-    Raises:
-        FileNotFoundError: There is no such policy.
-        ValueError: There is no such object set or hand.
-    """
+    """Refuse agents, object sets and a hand that are not there, before anything slow is imported."""
     from vd.assets_usd.hands import check_hand_name
     from vd.assets_usd.objects.sets import check_sets
 
@@ -107,12 +102,7 @@ def trained_task(policy: Any) -> ReorientCfg:
 
 
 def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | TrackingPolicy | None":
-    """Load a trained policy; None for a built-in agent, which needs the number of actions first.
-
-    Args:
-        name: ``zero``, ``random``, the name of an installed policy, a policy's file, a bundle's folder, or a
-            run's folder.
-        device: Torch device.
+    """Load what :func:`find_policy` finds; None for a built-in agent, which has to know its task first.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -155,12 +145,6 @@ def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
 
 def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_layer: str | None = None) -> None:
     """Refuse a policy that moves another hand, before anything slow; agents without a file move any.
-
-    Args:
-        name: Of the policy.
-        policy: What :func:`open_policy` gave.
-        hand: Hand name; None takes the policy's.
-        hand_layer: As of :func:`task_for`.
 
     Raises:
         vd.bundle.contract.ContractError: A bundle; names field, found, expected and remedy.
@@ -229,12 +213,10 @@ def task_for(
         policy: A trained policy, or None.
         stop_tolerance_rad: Orientation tolerance of success [rad].
         randomised: Domain randomisation, noise and disturbances.
-        hand: Hand name; None takes the policy's.
-        hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is, None: as
-            trained.
-        max_goal_angle_rad: Largest angle from an object to a goal the environment draws [rad]; None: as
-            trained.
-        at_rest: Start at rest on the table rather than from a drop; None: as trained.
+        hand: Hand name; None, here and below: as trained.
+        hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is.
+        max_goal_angle_rad: Largest angle from an object to a goal the environment draws [rad].
+        at_rest: Start at rest on the table rather than from a drop.
         condition: What is drawn, in place of ``randomised`` (:mod:`vd.evaluate.conditions`).
         settings: Other fields of the task.
     """

@@ -24,11 +24,7 @@ _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
 
 
 def compare(cfg: EvalCfg, condition: str = "") -> "Result":
-    """Run an evaluation and write its JSON into ``cfg.out``.
-
-    Args:
-        cfg: Settings of the command line.
-        condition: Of the suite.
+    """Run an evaluation, of a suite under ``condition``, and write its JSON into ``cfg.out``.
 
     Raises:
         ValueError: A setting, object set or policy cannot be used.
@@ -106,7 +102,9 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
     )
     if cfg.condition is not None:
         task = in_condition(task, cfg.condition)
-    return task if cfg.table_friction is None else replace(task, table_friction=cfg.table_friction)
+    if cfg.table_friction is not None:
+        task = replace(task, table_friction=cfg.table_friction)
+    return task
 
 
 def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: str) -> "Protocol":
@@ -142,16 +140,7 @@ def actor_of(
     sensor_errors: bool = False,
     seed: int = 0,
 ) -> tuple[Any, "Agent"]:
-    """What acts in an environment, and who that is.
-
-    Args:
-        name: Of the policy.
-        policy: What :func:`open_policy` gave.
-        env: The environment.
-        goals: What a camera policy knows shapes and goals by.
-        sensor_errors: Its camera errs as a real one.
-        seed: Of everything random.
-    """
+    """What acts in an environment, and who that is; a camera policy with ``goals`` and ``sensor_errors``."""
     from vd.evaluate.result import Agent
     from vd.policy import BuiltIn
     from vd.stopping import StoppingRule

@@ -87,16 +87,16 @@ def write_page(
     conditions: Sequence[Sequence[str]] = (),
     of_paper: bool = False,
 ) -> None:
-    """Write the page.
+    """Write the page; of a suite with all that follows ``path``.
 
     Args:
         result: What was found.
         path: Of the page.
         title: By default the policies.
         lead: By default what was asked.
-        figures: Of a suite: its table, header and rows.
-        notes: Of a suite: what has to be said of its objects.
-        conditions: Of a suite: name, place in the paper or what is changed, and flags of each.
+        figures: Its own table.
+        notes: What has to be said of its objects.
+        conditions: Name, place in the paper or what is changed, and flags of each.
         of_paper: Whether the figures are the paper's beside ours.
     """
     short = labels(result.policies)
@@ -162,11 +162,7 @@ def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
 def ecdf_figure(result: Result, short: dict[str, str]) -> "Figure":
     """Distributions of the errors at the stop or end, by each policy's own rule.
 
-    A panel for each condition and group.
-
-    Args:
-        result: What was found.
-        short: Short names of the policies.
+    A panel for each condition and group; ``short`` are names of the policies.
     """
     from matplotlib.figure import Figure
 

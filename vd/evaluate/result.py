@@ -267,16 +267,7 @@ class Agent:
 def judge(
     trace: Trace, protocol: Protocol, objects: list[Any], agent: Agent, *, group: str, condition: str = ""
 ) -> list[Row]:
-    """Rows of one policy in one group, one for each way to stop.
-
-    Args:
-        trace: Its episodes with the objects of the group.
-        protocol: How they were run.
-        objects: The objects (name and warnings are read).
-        agent: The policy.
-        group: Name of the group.
-        condition: Of the suite.
-    """
+    """Rows of one policy, one for each way to stop, from its episodes with the objects of one group."""
     rows, tolerance, precise = [], protocol.stop_tolerance_rad, PAPER.success.precise_rad
     near = agent.ways_to_stop(precise)
     names, unit = tuple(item.name for item in objects), choose_unit(len(objects))

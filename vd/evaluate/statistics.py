@@ -1,6 +1,7 @@
 """Orientation errors and confidence intervals.
 
-Angles are radians in [0, pi], quaternions xyzw (unit), rotations world from body.
+Angles are radians in [0, pi], quaternions xyzw (unit), rotations world from body. K objects, M episodes of
+each.
 
 Rates have t intervals on the log odds, with the jackknife's standard error (Efron and Stein 1981). Medians
 have the intervals of the share below them, turned into quantiles (Woodruff 1952). What the jackknife leaves
@@ -41,15 +42,7 @@ class Interval:
 
 
 def rotation_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between two rotations [rad].
-
-    Args:
-        a: Quaternions xyzw, shape [..., 4].
-        b: Quaternions xyzw, shape [..., 4], broadcast against ``a``.
-
-    Returns:
-        Angles in [0, pi], the broadcast shape without the last axis.
-    """
+    """Angle between two rotations in [0, pi], quaternions xyzw [..., 4], broadcast."""
     # |a - b| and |a + b| stay exact for small angles, where the arc cosine of a dot product does not.
     minus = np.linalg.norm(a - b, axis=-1)
     plus = np.linalg.norm(a + b, axis=-1)
@@ -65,16 +58,12 @@ def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def symmetric_error(object_quat: np.ndarray, goal_quat: np.ndarray, symmetry: np.ndarray) -> np.ndarray:
-    """Orientation error up to the object's symmetry: min over s of angle(q_object s, q_goal).
+    """Orientation error [...] up to the object's symmetry: min over s of angle(q_object s, q_goal).
 
     Args:
         object_quat: Object orientations xyzw, shape [..., 4].
         goal_quat: Goal orientations xyzw, shape [..., 4].
-        symmetry: The rotations of the object onto itself, body frame, xyzw, shape [S, 4]; the identity
-            alone for an asymmetric object.
-
-    Returns:
-        Errors [rad], shape [...].
+        symmetry: The rotations of the object onto itself, body frame, xyzw, shape [S, 4].
     """
     turned = quat_multiply(np.asarray(object_quat)[..., None, :], np.asarray(symmetry))
     return rotation_angle(turned, np.asarray(goal_quat)[..., None, :]).min(axis=-1)
@@ -86,13 +75,7 @@ def choose_unit(num_objects: int) -> Unit:
 
 
 def paired_difference(outcomes: np.ndarray, others: np.ndarray, unit: Unit) -> Interval:
-    """How much larger the rate of some outcomes is than that of others on the same starts and goals.
-
-    Args:
-        outcomes: Booleans, shape [K, M]: K objects, M episodes each.
-        others: What they are compared with, likewise.
-        unit: What the statement is about.
-    """
+    """How much larger the rate of some outcomes is than that of others on the same episodes, bool [K, M]."""
     pairs = outcomes.astype(float) - others
     units = pairs.mean(axis=1)[None] if unit == "object" or pairs.shape[1] == 1 else pairs
     strata, n = units.shape
@@ -111,11 +94,8 @@ def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
     is Clopper and Pearson's exact binomial one over all episodes, taken as independent.
 
     Args:
-        outcomes: Booleans, or shares in [0, 1], shape [R, K, M]: R rates, K objects, M episodes each.
+        outcomes: Booleans, or shares in [0, 1], shape [R, K, M] for R rates.
         unit: What the statement is about.
-
-    Returns:
-        R intervals.
     """
     outcomes = np.asarray(outcomes, dtype=float)
     intervals = []
@@ -156,12 +136,7 @@ def _logit_t(outcomes: np.ndarray, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
 
 
 def median_interval(values: np.ndarray, unit: Unit) -> Interval:
-    """Median over all objects and episodes with its 95 % interval.
-
-    Args:
-        values: Shape [K, M]: K objects, M episodes each; finite.
-        unit: What the statement is about.
-    """
+    """Median of finite values [K, M] with its 95 % interval."""
     values = np.asarray(values, dtype=float)
     median = float(np.median(values))
     below = (values < median) + 0.5 * (values == median)
@@ -175,10 +150,8 @@ def median_interval(values: np.ndarray, unit: Unit) -> Interval:
 def order_interval(values: np.ndarray) -> Interval:
     """Median with the distribution-free interval between two order statistics.
 
-    With fewer than six values no such interval reaches 95 %: the smallest and largest are given.
-
-    Args:
-        values: Shape [n], n >= 1, finite.
+    With fewer than six values no such interval reaches 95 %: the smallest and largest are given. Values are
+    finite [n], n >= 1.
     """
     ordered = np.sort(np.asarray(values, dtype=float))
     rank = max(int(stats.binom.ppf((1 - CONFIDENCE) / 2, len(ordered), 0.5)), 1)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from vd.config import from_dict
 from vd.policy import holds, read_state
@@ -33,7 +33,7 @@ class StudentSpec(StoppingRules):
 class SavedStudent:
     """A student that was read from a file."""
 
-    kind: ClassVar = "student"
+    kind: ClassVar[Literal["student"]] = "student"
     spec: StudentSpec
     network: Student
     """In evaluation mode, without gradients."""
