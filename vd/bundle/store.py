@@ -71,8 +71,8 @@ def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
         rules, trained = policy.spec, policy.teacher
         source = _provenance(trained, policy.spec.teacher, None, to_dict(policy.spec.depth))
         network, camera = {"policy": to_dict(trained.spec)}, policy.spec.camera
-        weights = {f"actor.{name}": value for name, value in trained.weights.items()}
-        weights |= {f"critic.{name}": value for name, value in trained.critic_weights.items()}
+        parts = {"actor": trained.weights, "critic": trained.critic_weights}
+        weights = {f"{part}.{name}": value for part, own in parts.items() for name, value in own.items()}
     elif isinstance(policy, SavedStudent):
         rules = spec = policy.spec
         source = _provenance(policy, spec.teacher, spec.stage, policy.depth if spec.stage == RENDERED else {})
@@ -219,10 +219,14 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
 
 def _teacher(spec: dict[str, Any], source: Provenance, weights: Tensors, device: str) -> TrainedPolicy:
     """A teacher; of a tracking policy names of weights say whether they are the actor's or the critic's."""
-    actor = {n.removeprefix("actor."): v for n, v in weights.items() if not n.startswith("critic.")}
-    critic = {n.removeprefix("critic."): v for n, v in weights.items() if n.startswith("critic.")}
     trained = {"policy": spec, "task": source.task, "iter": source.iterations, "env_steps": source.env_steps}
+    actor, critic = _part(weights, "actor.") or weights, _part(weights, "critic.")
     return policy_of(trained | {"actor_state_dict": actor, "critic_state_dict": critic}, device)
+
+
+def _part(weights: Tensors, prefix: str) -> Tensors:
+    """Weights whose names begin so, without that."""
+    return {n.removeprefix(prefix): value for n, value in weights.items() if n.startswith(prefix)}
 
 
 def _provenance(

@@ -154,17 +154,16 @@ def actor_of(
 
     one_thread_without_gpu(env.device)
     settings: dict[str, Any] = {"goals": goals, "sensor_errors": sensor_errors, "seed": seed}
-    kind, sees = "tracking", "rendered clouds"
     eyes: Any
-    if policy.kind == "tracking":
+    if policy.kind != "student":
         from vd.evaluate.tracking import TrackingActor
 
         eyes = TrackingActor(env, policy, **settings)
-    else:
-        from vd.evaluate.student import StudentActor
+        return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for, predicts=True)
+    from vd.evaluate.student import StudentActor
 
-        eyes = StudentActor(env, policy, **settings)
-        kind, sees = f"student of stage {policy.spec.stage}", sees if eyes.rendered else "complete clouds"
+    eyes, kind = StudentActor(env, policy, **settings), f"student of stage {policy.spec.stage}"
+    sees = "rendered clouds" if eyes.rendered else "complete clouds"
     return eyes, Agent(name, kind, sees, policy.spec.rule_for, predicts=True)
 
 

@@ -38,9 +38,6 @@ class TrackingActor:
             goals: What it knows shapes and goals by (:mod:`vd.evaluate.scanned`).
             sensor_errors: Give its camera the errors of a real one.
             seed: Of the errors of camera and scans.
-
-        Raises:
-            ValueError: It is of another hand.
         """
         scene, camera, depth = env.scene, env.hand.camera.at(policy.spec.camera), policy.spec.depth
         self.num_actions = policy.num_actions
