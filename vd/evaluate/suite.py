@@ -176,55 +176,49 @@ def _share(row: Row, chosen: list[bool] | np.ndarray) -> Interval:
     return rate_intervals(np.reshape(chosen, (1, objects, -1)), choose_unit(objects))[0]
 
 
+def _claims(name: str, *claims: tuple[Any, ...]) -> list[Claim]:
+    """Claims of a condition: their text, measure and figure of the paper, and what else they have."""
+    return [Claim(text, name, *others) for text, *others in claims]
+
+
 def _on_table(name: str, key: str) -> list[Claim]:
     """The paper's figures on the table; ``key`` begins their names."""
-    return [
-        Claim("error at most 0.4 rad", name, lambda row: row.overall.success["0.4"], key),
-        Claim("error at most 0.8 rad", name, lambda row: row.overall.success["0.8"], f"{key}_rad08"),
-        Claim(
-            "median error [rad]", name, lambda row: row.overall.median_error_rad, f"{key}_median_rad", "rad"
-        ),
-    ]
+    return _claims(
+        name,
+        ("error at most 0.4 rad", lambda row: row.overall.success["0.4"], key),
+        ("error at most 0.8 rad", lambda row: row.overall.success["0.8"], f"{key}_rad08"),
+        ("median error [rad]", lambda row: row.overall.median_error_rad, f"{key}_median_rad", "rad"),
+    )
 
 
 def _in_air(name: str) -> list[Claim]:
     """The paper's figures in the air."""
 
-    def success(row: Row) -> Interval:
-        return row.overall.outcomes["success"]
+    def share(outcome: str) -> Callable[[Row], Interval]:
+        return lambda row: row.overall.outcomes[outcome]
 
-    ways: tuple[tuple[StoppedBy, str], ...] = (("prediction", "prediction"), ("true distance", "truth"))
     claims = []
-    for way, key in ways:
-        claims += [
-            Claim(f"stopped within 0.4 rad by {way}", name, success, f"air_by_{key}", stopped_by=way),
-            Claim(
+    for way, key in (("prediction", "prediction"), ("true distance", "truth")):
+        claims += _claims(
+            name,
+            (f"stopped within 0.4 rad by {way}", share("success"), f"air_by_{key}", "share", way),
+            (
                 f"stopped within 0.1 rad by {way}",
-                name,
                 lambda row: row.precise,
                 f"air_by_{key}_rad01",
-                stopped_by=way,
+                "share",
+                way,
             ),
-        ]
-    return [
-        *claims,
-        Claim("stopped within 0.4 rad without the table", name, success_without_table, None),
-        Claim("median time to success [s]", name, lambda row: row.overall.time_s, "air_time_s", "s"),
-        Claim("object lost", name, lambda row: row.overall.outcomes["object falls"], "air_dropped"),
-        Claim("object lost within 0.5 s of the table", name, lost_at_once, "air_dropped_at_once"),
-        Claim(
-            "states within 0.4 rad up to symmetry seen so",
-            name,
-            lambda row: _seen(row, "0.4"),
-            "near_seen",
-        ),
-        Claim(
-            "states within 0.1 rad up to symmetry seen so",
-            name,
-            lambda row: _seen(row, "0.1"),
-            "near_seen_rad01",
-        ),
-    ]
+        )
+    return claims + _claims(
+        name,
+        ("stopped within 0.4 rad without the table", success_without_table, None),
+        ("median time to success [s]", lambda row: row.overall.time_s, "air_time_s", "s"),
+        ("object lost", share("object falls"), "air_dropped"),
+        ("object lost within 0.5 s of the table", lost_at_once, "air_dropped_at_once"),
+        ("states within 0.4 rad up to symmetry seen so", lambda row: _seen(row, "0.4"), "near_seen"),
+        ("states within 0.1 rad up to symmetry seen so", lambda row: _seen(row, "0.1"), "near_seen_rad01"),
+    )
 
 
 CLAIMS = (

@@ -72,6 +72,11 @@ class Task:
     """Fingerprint of the policy."""
 
     @property
+    def key(self) -> tuple[str, str]:
+        """Condition and policy."""
+        return self.condition, self.policy
+
+    @property
     def wanted(self) -> dict[str, Any]:
         """What an evaluation that can stand for it was run with."""
         settings = {key: value for key, value in to_dict(self.cfg).items() if key not in _NOT_MEASURED}
@@ -100,29 +105,24 @@ def run_suite(cfg: EvalCfg) -> Result:
     groups = object_groups(cfg.objects, {c.objects for c in suite}, quick=cfg.quick)
     conditions = tuple(c for c in suite if (c.quick or not cfg.quick) and c.objects in groups)
     tasks = make_tasks(cfg, conditions, groups)
-    found = {(task.condition, task.policy): task.there() for task in tasks}
-    missing = {key: NOT_RUN for key, result in found.items() if result is None}
-    waiting = [task for task in tasks if (task.condition, task.policy) in missing]
+    found: dict[tuple[str, str], Result | str] = {task.key: task.there() or NOT_RUN for task in tasks}
+    waiting = [task for task in tasks if isinstance(found[task.key], str)]
     print(f"{len(tasks) - len(waiting)} of {len(tasks)} evaluations were done before", file=sys.stderr)
 
     def finished(task: Task, failure: str | None, died: str) -> None:
-        why, key = died if failure is None else failure, (task.condition, task.policy)
-        minutes = (time.monotonic() - begun) / 60.0
+        why, minutes = died if failure is None else failure, (time.monotonic() - begun) / 60.0
         print(f"[{minutes:.1f} min] {task.condition}: {task.policy} {why or 'done'}", file=sys.stderr)
-        if why:
-            missing[key] = why
-            return
-        del missing[key]
-        found[key] = Result.read(task.cfg.out / "eval.json")
-        write_json(task.cfg.out / SETTINGS_FILE, task.wanted)
+        found[task.key] = why or Result.read(task.cfg.out / "eval.json")
+        if not why:
+            write_json(task.cfg.out / SETTINGS_FILE, task.wanted)
 
     try:
         _run(cfg, waiting, finished, begun + QUICK_S if cfg.quick else math.inf)
     finally:
-        rows = [row for one in found.values() if one for row in one.rows if row.stopped_by != SUCCESS]
-        software = next((one.software for one in found.values() if one), {})
-        left = tuple((*key, why) for key, why in missing.items())
-        result = Result(tuple(rows), software, left)
+        measured = [one for one in found.values() if isinstance(one, Result)]
+        rows = tuple(row for one in measured for row in one.rows if row.stopped_by != SUCCESS)
+        left = tuple((*key, why) for key, why in found.items() if isinstance(why, str))
+        result = Result(rows, measured[0].software if measured else {}, left)
         _write(result, cfg, conditions, groups)
     return result
 
