@@ -35,7 +35,7 @@ def folder(tmp_path):
     for step in range(STEPS):
         wave = 0.3 * np.sin(0.5 * step + np.arange(9))
         joints = {channel: wave + 0.01 * i for i, channel in enumerate(JOINT_CHANNELS)}
-        values = [float(step >= 10), 1.0, 0.5, 0.001, 0.002, 0.02, 0.02, 0.0]
+        values = [float(step >= 10), 1.0, 0.5, 0.001, -0.03, 0.002, 0.02, 0.02, 0.0]
         assert len(values) == len(STEP_COLUMNS)
         now = clock.now()
         log.step(now, now + SENT_S, joints, values, [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step])

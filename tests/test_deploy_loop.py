@@ -1,6 +1,6 @@
 """The control loop: its clock, how goals end, what is logged, and the whole of it on a twin."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -8,11 +8,12 @@ from simulated_clock import SimulatedClock
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy import cli
+from vd.deploy.camera.camera import Frame
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
-from vd.deploy.loop.loop import ControlLoop, LoopCfg
+from vd.deploy.loop.loop import ControlLoop, LoopCfg, summary
 from vd.deploy.loop.policy_runner import Decision, PolicyRunner, TrackingRunner
 from vd.deploy.loop.run_page import FILM_FILE, PAGE_FILE, goal_results, summary_line
 from vd.deploy.safety.safety import StoppedError
@@ -49,6 +50,21 @@ class Hand:
     def beat(self, *, missed: bool) -> None:
         """As :class:`SafeHand`."""
         self.missed.append(missed)
+
+    def image_at(self, time_s: float) -> None:
+        """As :class:`SafeHand`."""
+
+
+@dataclass
+class LateCamera:
+    """Images that are 40 ms old when they come, after a wait of 5 ms."""
+
+    clock: SimulatedClock
+
+    def read(self, _timeout_s: float) -> Frame:
+        """As :class:`Camera`."""
+        self.clock.sleep(0.005)
+        return Frame(np.zeros((2, 2), np.float32), self.clock.now() - 0.04)
 
 
 class Countdown(PolicyRunner):
@@ -203,6 +219,20 @@ def test_missed_deadlines_are_counted_and_told(parts):
     look = [False, False]
     assert hand.missed == [*look, False, False, True, False, False, False] and pacer.missed == 1
     assert loop.times[2].sent_s == pytest.approx(0.1) and loop.times[3].late_s == pytest.approx(0.1 - 1 / HZ)
+
+
+def test_latency_is_told_as_training_draws_it(parts):
+    hand, runner, actions, pacer, log = parts
+    hand.work, camera = [0.02] * 9, LateCamera(hand.clock)
+    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(hold_s=0.0), camera=camera, twin=Truth())
+    loop.run([GOAL])
+    log.finish("done")
+    found = summary(loop.times)
+    assert found["observation_latency_ms"]["median"] == pytest.approx(40.0)  # the image, when joints are read
+    assert found["command_delay_ms"]["median"] == pytest.approx(20.0)  # from then until goals are sent
+    np.testing.assert_allclose(read_log(log.folder).columns["image_s"], 0.005 - 0.04, atol=1e-6)
+    blind = summary([replace(loop.times[0], image_s=np.nan)])
+    assert "observation_latency_ms" not in blind and "command_delay_ms" in blind
 
 
 @pytest.fixture

@@ -27,14 +27,16 @@ STEP_COLUMNS = (
     "acting",
     "distance",
     "late_s",
+    "image_s",
     "sensed_s",
     "sent_s",
     "cpu_s",
     "missed",
 )
 """Number of the goal; whether the policy acts, or the hand holds still after a stop; distance to the goal
-that the stopping rule sees [rad]; how late the step began, and from its beginning, the state's reading and
-the sending of goals [s]; processor time of the process for this step [s]; deadlines missed so far."""
+that the stopping rule sees [rad]; how late the step began, and from its due time, the image's exposure, the
+state's reading and the sending of goals [s]; processor time of the process for this step [s]; deadlines
+missed so far."""
 TRUTH_COLUMNS = (*(f"object.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")), "error")
 """Pose of the object and its angle to the goal, up to symmetry: a twin's only."""
 

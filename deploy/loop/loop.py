@@ -44,6 +44,8 @@ class StepTimes:
 
     late_s: float
     """When it began."""
+    image_s: float
+    """When its image was exposed, negative if before; NaN without a camera."""
     sensed_s: float
     """When the joints were read."""
     sent_s: float
@@ -140,7 +142,7 @@ class ControlLoop:
             What ends the pursuit, if anything does, and the distance to the goal [rad], NaN for none.
         """
         late_s, busy_s, due_s = self._pacer.wait(), time.process_time(), self._pacer.due_s
-        sensed, state = self._sense(goal)
+        sensed, state, image_s = self._sense(goal)
         action, distance, ended = np.zeros_like(sensed.smoothed), np.nan, ""
         if acting:
             decision = self._runner.decide(sensed)
@@ -151,26 +153,27 @@ class ControlLoop:
         sent = self._safe.command(self._target)
         sent_s = self._pacer.clock.now() - due_s
         self._safe.beat(missed=self._pacer.end())
-        times = StepTimes(late_s, state.time_s - due_s, sent_s, time.process_time() - busy_s)
+        busy_s = time.process_time() - busy_s
+        times = StepTimes(late_s, image_s - due_s, state.time_s - due_s, sent_s, busy_s)
         self._note(number, sensed, state, action, sent, distance, acting, times)
         return ended, distance
 
-    def _sense(self, goal: np.ndarray) -> tuple[Sensed, HandState]:
-        """Read the camera, then the joints: what the policy is told, and all that was measured.
+    def _sense(self, goal: np.ndarray) -> tuple[Sensed, HandState, float]:
+        """Read the camera, then the joints: what the policy is told, all that was measured, the image's time.
 
         Raises:
             StoppedError: The hand was stopped.
             StaleCamera: There is no new image.
         """
-        depth = None
+        depth, image_s = None, np.nan
         if self._camera is not None:
             frame = self._camera.read(CAMERA_SHARE * self._pacer.period_s)
             self._safe.image_at(frame.time_s)
-            depth = frame.image
+            depth, image_s = frame.image, frame.time_s
         pose = None if self._twin is None else self._twin.object_pose()
         state = self._safe.read()
         smoothed = self._actions.smoothed
-        return Sensed(state.position, state.velocity, smoothed, goal, depth, pose), state
+        return Sensed(state.position, state.velocity, smoothed, goal, depth, pose), state, image_s
 
     def _ended(self, distance: float, sensed: Sensed, *, first: bool) -> str:
         """``stopped``, ``lost``, or nothing."""
@@ -225,10 +228,19 @@ class ControlLoop:
 
 
 def summary(times: Sequence[StepTimes]) -> dict[str, dict[str, float]]:
-    """Median, 99th percentile and most of each of the times [ms]."""
+    """Median, 99th percentile and most of each of the times [ms], and of the two latencies of training.
+
+    ``observation_latency_ms`` is how old the image is when the joints are read, ``command_delay_ms`` how much
+    later goals are sent (``randomisation.observation_latency_s``; ``command_delay.delay_s`` has the motors'
+    own delay besides). What no step has is left out.
+    """
+    values = {name: np.array([getattr(one, name) for one in times]) for name in StepTimes.__annotations__}
+    values["observation_latency_s"] = values["sensed_s"] - values["image_s"]
+    values["command_delay_s"] = values["sent_s"] - values["sensed_s"]
     found = {}
-    for name in vars(times[0]) if times else ():
-        values = 1e3 * np.array([getattr(one, name) for one in times])
-        figures = {"median": np.median(values), "p99": np.percentile(values, 99), "max": values.max()}
-        found[name.replace("_s", "_ms")] = {key: round(float(value), 3) for key, value in figures.items()}
+    for name, seconds in values.items():
+        ms = 1e3 * seconds[np.isfinite(seconds)]
+        if len(ms):
+            figures = {"median": np.median(ms), "p99": np.percentile(ms, 99), "max": ms.max()}
+            found[name.replace("_s", "_ms")] = {key: round(float(value), 3) for key, value in figures.items()}
     return found

@@ -328,10 +328,12 @@ def report(folder: Path, steps: int, missed: int, times: dict[str, Any]) -> None
     print(f"{steps} control steps, {missed} deadlines missed")
     for name, title in (
         ("late_ms", "began late by"),
+        ("observation_latency_ms", "image older than joints by"),
+        ("command_delay_ms", "goals sent after joints by"),
         ("sent_ms", "goals sent after"),
         ("cpu_ms", "processor time"),
     ):
         if name in times:
             t = times[name]
-            print(f"{title:<17} {t['median']:.1f} ms, 99 % {t['p99']:.1f}, most {t['max']:.1f}")
+            print(f"{title:<26} {t['median']:.1f} ms, 99 % {t['p99']:.1f}, most {t['max']:.1f}")
     print(f"log: {folder}")

@@ -156,11 +156,14 @@ def recall_state_kernel(
     slots: int,  # rows of each world, L
     tip_body: wp.array[int],  # [G] link of each fingertip; only their poses are written
     physics_dt: float,  # time between two rows [s]
+    jitter: float,  # most that the object is seen later still, drawn in each call [s]
     # In:
-    latency_in: wp.array[float],  # [N] how late each object is seen [s], at most (L - 1) steps
+    latency_in: wp.array[float],  # [N] how late each object is seen [s], with jitter at most (L - 1) steps
     encoder_latency_in: wp.array[float],  # [N] how late joints and fingertips are seen [s], likewise
     head_in: wp.array[int],  # [N] slot written last
     ring_in: wp.array2d[float],  # [N L, C] past states
+    # In/Out:
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
     measured_q_out: wp.array2d[float],  # as in :func:`record_state_kernel`, and the five after it
     measured_qd_out: wp.array2d[float],  # likewise
@@ -171,7 +174,12 @@ def recall_state_kernel(
 ):
     """Object and hand as they were their latency ago, of the nearest physics step. Launch: [N]."""
     world = wp.tid()
-    seen = aged_row(world, latency_in[world], physics_dt, slots, head_in)
+    latency = latency_in[world]
+    if jitter > 0.0:
+        state, more = uniform(rng[world], wp.vec2(0.0, jitter))
+        latency += more
+        rng[world] = next_stream(state, world)
+    seen = aged_row(world, latency, physics_dt, slots, head_in)
     row = aged_row(world, encoder_latency_in[world], physics_dt, slots, head_in)
     for i in range(joints):
         measured_q_out[world, i] = ring_in[row, i]

@@ -297,6 +297,9 @@ class RandomisationCfg:
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old the object's state is that the policy sees [s], drawn for each episode, to the nearest physics
     step: a camera and its loop. Rewards and success are of the true state."""
+    observation_jitter_s: float = 0.0
+    """By how much more the object's state is old in a step, uniform from 0 to this [s]: images come at a rate
+    of their own, and the newest is up to one period old (1/30 s of a D415)."""
     encoder_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old joints and fingertips are that the policy sees [s]; a loop reads them when its step begins.
     Drawn at the same share of its range as the object's."""
@@ -326,6 +329,11 @@ class RandomisationCfg:
                 raise ValueError(
                     f"randomisation.{name} is {low:g} {high:g}; it has to rise within 0 and {MAX_LATENCY_S:g}"
                 )
+        if not 0.0 <= self.observation_jitter_s <= MAX_LATENCY_S:
+            raise ValueError(
+                f"randomisation.observation_jitter_s is {self.observation_jitter_s:g}; it has to be in "
+                f"[0, {MAX_LATENCY_S:g}]"
+            )
         if self.force_s <= 0.0:
             raise ValueError(f"randomisation.force_s is {self.force_s:g}; it has to be positive")
         from vd.envs.effects import check_effects  # needs Warp, which settings alone do not

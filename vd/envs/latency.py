@@ -31,7 +31,9 @@ class SeenState:
         self._state = state
         sim, n, device = state.sim, state.num_envs, state.device
         random = state.cfg.randomisation
-        longest = max(random.observation_latency_s[1], random.encoder_latency_s[1])
+        longest = max(
+            random.observation_latency_s[1] + random.observation_jitter_s, random.encoder_latency_s[1]
+        )
         self.is_late = random.enabled and longest > 0.0
         self.latency = wp.zeros(n, dtype=float, device=device)
         self.encoder_latency = wp.zeros(n, dtype=float, device=device)
@@ -72,9 +74,9 @@ class SeenState:
         """Refresh :attr:`arrays`."""
         if self.is_late:
             state = self._state
-            ages = [self.latency, self.encoder_latency]
-            inputs = [*self._model, state.cfg.sim.physics_dt, *ages, self._head, self._ring]
-            state.launch(recall_state_kernel, inputs, self.arrays)
+            times = [state.cfg.sim.physics_dt, state.cfg.randomisation.observation_jitter_s]
+            inputs = [*times, self.latency, self.encoder_latency, self._head, self._ring]
+            state.launch(recall_state_kernel, [*self._model, *inputs], [state.rng, *self.arrays])
 
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint, by name."""
