@@ -22,7 +22,6 @@ from vd.evaluate.trace import NEVER_RAD, record
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.train.checkpoint import save_checkpoint
-from vd.train.cli import main as train
 from vd.vision.saved import student_export
 
 TASK = ReorientCfg(
@@ -192,20 +191,3 @@ def test_students_and_teacher_side_by_side(tmp_path, capsys):
     }
     assert len(starts) == 2 * 2, "everyone has the same starts and goals"
     assert (tmp_path / "out" / "eval.html").is_file()
-
-
-@pytest.mark.slow
-def test_a_bundled_student_with_scanned_goals_in_the_air(tmp_path, capsys):
-    path = str(tmp_path / "bundle")
-    assert train(["bundle", save_student(tmp_path / "student.pt", 2), path]) == 0
-    flags = ["--in-air", "--goals", "scan", "--episodes", "2", "--device", "cpu", "--episode-s", "2.5"]
-    assert main([path, *flags, "--out", str(tmp_path / "out")]) == 0
-    assert "lost" in capsys.readouterr().out
-    by_prediction, by_truth = Result.read(tmp_path / "out" / "eval.json").rows
-    assert by_prediction.sees == "rendered clouds"
-    protocol = by_prediction.protocol
-    assert protocol.goals == "scan" and protocol.sensor_errors and protocol.in_air
-    assert by_prediction.held is not None
-    assert "500 points of a scan" in (tmp_path / "out" / "eval.html").read_text()
-    outcomes = by_truth.overall.outcomes
-    assert outcomes["object falls"].value + outcomes["success"].value > 0.0

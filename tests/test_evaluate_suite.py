@@ -28,7 +28,7 @@ from vd.evaluate.suite import (
 from vd.evaluate.trace import Episode
 from vd.paper import PAPER, ResultConstants
 
-TEACHER, CAMERA = "dclaw3-table", "runs/s/student.pt"
+TEACHER, CAMERA = "dclaw3-table", "dclaw3-tracking"
 OBJECTS = ("training=cube", "held-out=cube", "symmetric=cube")
 """Sets that need no authoring; the test double looks at none of them."""
 OF_TEACHERS = [c.name for c in CONDITIONS if c.objects != "validation" and "goals" not in c.settings]
@@ -56,9 +56,6 @@ def asked(monkeypatch, found):
         Result(tuple(rows), software={"device": "a double"}).write(cfg.out / "eval.json")
 
     monkeypatch.setattr(suite_run, "compare", compare)
-    monkeypatch.setattr(suite_run, "open_policy", lambda name, device: name)
-    monkeypatch.setattr(suite_run, "sees_clouds", lambda name: name == CAMERA)
-    monkeypatch.setattr(suite_run, "fingerprint", lambda name: f"weights of {name}")
     return asked
 
 
@@ -149,40 +146,35 @@ def test_side_by_side_the_same_is_measured_camera_policies_first(tmp_path, asked
     assert (tmp_path / "out" / "training" / TEACHER / suite_run.LOG_FILE).is_file()
 
 
-@pytest.mark.parametrize("done", [0, 2])
-def test_an_interruption_keeps_what_was_measured(tmp_path, asked, monkeypatch, done):
+@pytest.mark.parametrize(
+    ("left_out", "error", "status"),
+    [
+        (("air", "air-training"), RuntimeError("environment 3 (spoon) is not finite"), 1),
+        (OF_TEACHERS[2:], KeyboardInterrupt(), 130),
+        (OF_TEACHERS, KeyboardInterrupt(), 130),
+    ],
+)
+def test_what_fails_costs_no_other_and_is_measured_by_the_next_call(
+    tmp_path, asked, monkeypatch, capsys, left_out, error, status
+):
     whole = suite_run.compare
 
-    def interrupted(*args):
-        if len(asked) == done:
-            raise KeyboardInterrupt
-        return whole(*args)
-
-    monkeypatch.setattr(suite_run, "compare", interrupted)
-    assert command(tmp_path) == 130
-    assert ("Nothing has been measured yet" in read_page(tmp_path / "out" / "paper.html")[0]) == (done == 0)
-    monkeypatch.setattr(suite_run, "compare", whole)
-    assert command(tmp_path) == 0
-    assert asked == [(name, TEACHER) for name in OF_TEACHERS]
-
-
-def test_a_condition_that_fails_costs_no_other(tmp_path, asked, monkeypatch, capsys):
-    whole = suite_run.compare
-
-    def fails(cfg, *others):
-        if cfg.in_air:
-            raise RuntimeError("environment 3 (spoon) is not finite")
-        return whole(cfg, *others)
+    def fails(cfg, condition):
+        if condition in left_out:
+            raise error
+        return whole(cfg, condition)
 
     monkeypatch.setattr(suite_run, "compare", fails)
-    assert command(tmp_path, "--json") == 1
-    printed = capsys.readouterr()
-    assert {condition for condition, *_ in json.loads(printed.out)["missing"]} == {"air", "air-training"}
-    assert "spoon" in printed.err and "spoon" in (tmp_path / "out" / "paper.html").read_text()
+    assert command(tmp_path) == status
+    text, said = read_page(tmp_path / "out" / "paper.html")[0], capsys.readouterr().err
+    assert ("Nothing has been measured yet" in text) == (left_out == OF_TEACHERS)
+    assert status == 130 or ("spoon" in said and "spoon" in text)
+    written = json.loads((tmp_path / "out" / "paper.json").read_text())
+    assert {condition for condition, *_ in written["missing"]} == set(left_out)
     asked.clear()
     monkeypatch.setattr(suite_run, "compare", whole)
     assert command(tmp_path) == 0
-    assert [condition for condition, _ in asked] == ["air", "air-training"]
+    assert [condition for condition, _ in asked] == list(left_out)
 
 
 def test_the_papers_figures_stand_beside_ours(tmp_path, asked):
@@ -218,9 +210,9 @@ def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monk
     assert {n for n, policy in asked if policy == CAMERA} == set(names) - of_state
     assert {n for n, policy in asked if policy == TEACHER} == set(names)
     table = json.loads((tmp_path / "out" / "robust.json").read_text())["figures"]
-    lines = [(name, policy) for name in names for policy in ("s", TEACHER)]
-    expected = [line for line in lines if line[1] == TEACHER or line[0] not in of_state]
-    assert [(row["condition"], row["policy"]) for row in table] == expected
+    lines = [(name, policy) for name in names for policy in (CAMERA, TEACHER)]
+    expected = {line for line in lines if line[1] == TEACHER or line[0] not in of_state}
+    assert {(row["condition"], row["policy"]) for row in table} == expected
     assert len(table[0]) <= 7 and table[0]["points from nominal"] == "–"  # noqa: RUF001
     cost = {float(row["points from nominal"].split()[0]) for row in table[2:]}
     assert len(cost) <= 2 and min(cost) < 0.0

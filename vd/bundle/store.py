@@ -23,7 +23,7 @@ from vd.bundle.contract import (
 )
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
-from vd.files import atomic_path, make_folder, write_json, writing
+from vd.files import make_folder, write_json, writing
 from vd.policy import TrainedPolicy, policy_of
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
@@ -35,8 +35,6 @@ from vd.vision.saved import SavedStudent, StudentSpec
 from vd.vision.voxels import Voxeliser
 
 WEIGHTS_FILE, GOLDEN_FILE = "weights.safetensors", "golden.safetensors"
-FILE_MODE, FOLDER_MODE = 0o644, 0o755
-"""A bundle is for others to read."""
 RENDERED = 2
 """Stage of students that see a depth camera."""
 STATES, STEPS, GOLDEN_POINTS = 8, 3, 500
@@ -247,18 +245,16 @@ def _provenance(
 
 def _write(folder: Path, contract: Contract, weights: Tensors, golden: Tensors) -> None:
     """Write the files beside the place of the bundle, then put them there at once."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     if folder.exists() and not is_bundle(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} exists and is no bundle; choose another name")
     make_folder(folder.parent)
     with writing(folder), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
         made = Path(name) / folder.name
-        made.mkdir(FOLDER_MODE)
+        made.mkdir()
         for file, tensors in ((WEIGHTS_FILE, weights), (GOLDEN_FILE, golden)):
-            with atomic_path(made / file) as path:
-                save_file({key: v.detach().cpu().contiguous() for key, v in tensors.items()}, path)
-            (made / file).chmod(FILE_MODE)  # the library writes for the owner's eyes only
+            (made / file).write_bytes(save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}))
         digests = {file: _digest(made / file) for file in (WEIGHTS_FILE, GOLDEN_FILE)}
         write_json(made / CONTRACT_FILE, to_dict(replace(contract, files=digests)))
         if folder.exists():

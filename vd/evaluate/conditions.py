@@ -34,6 +34,7 @@ EXACT = RandomisationCfg(
 _only = partial(replace, EXACT)
 STEP_LATE_S = 1.0 / PAPER.scene.control_hz
 """One control step, 83 ms: a camera and the loop behind it are this late at worst."""
+_LATE = _at(STEP_LATE_S)
 FRICTION_NM, PLAY_RAD = 0.15, 0.03
 """Largest dry friction [N m] and backlash [rad] of a joint (ours; identified servos have up to half)."""
 COMMAND_DELAY_S, OBSERVATION_LATENCY_S = 0.04, 0.12
@@ -61,18 +62,12 @@ _NAMED: dict[str, tuple[str, RandomisationCfg]] = {
             observation_latency_s=(0.0, OBSERVATION_LATENCY_S),
         ),
     ),
-    "observation-late": (
-        f"object seen {STEP_LATE_S:.3f} s late",
-        _only(observation_latency_s=_at(STEP_LATE_S)),
-    ),
+    "observation-late": (f"object seen {STEP_LATE_S:.3f} s late", _only(observation_latency_s=_LATE)),
     "all-late": (
         f"object and joints seen {STEP_LATE_S:.3f} s late",
-        _only(observation_latency_s=_at(STEP_LATE_S), encoder_latency_s=_at(STEP_LATE_S)),
+        _only(observation_latency_s=_LATE, encoder_latency_s=_LATE),
     ),
-    "command-late": (
-        f"commands {STEP_LATE_S:.3f} s late",
-        _only(effects={"command_delay.delay_s": _at(STEP_LATE_S)}),
-    ),
+    "command-late": (f"commands {STEP_LATE_S:.3f} s late", _only(effects={"command_delay.delay_s": _LATE})),
     "joint-friction": (
         f"friction of {FRICTION_NM:g} N m in every joint",
         _only(effects={"coulomb_friction.tau_c_nm": _at(FRICTION_NM)}),

@@ -87,17 +87,10 @@ def write_page(
     conditions: Sequence[Sequence[str]] = (),
     of_paper: bool = False,
 ) -> None:
-    """Write the page; of a suite with all that follows ``path``.
+    """Write the page; all that follows ``path`` is of a suite.
 
-    Args:
-        result: What was found.
-        path: Of the page.
-        title: By default the policies.
-        lead: By default what was asked.
-        figures: Its own table.
-        notes: What has to be said of its objects.
-        conditions: Name, place in the paper or what is changed, and flags of each.
-        of_paper: Whether the figures are the paper's beside ours.
+    Its own table is ``figures``, the paper's beside ours or not; ``notes`` are of its objects. ``conditions``
+    have a name, the place in the paper or what is changed, and flags.
     """
     short = labels(result.policies)
     success, beside = _tables(result, short)

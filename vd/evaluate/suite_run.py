@@ -39,16 +39,6 @@ from vd.workers import run_tasks
 
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
-PAPER_HEADER: tuple[str, ...] = ("figure", "condition", "paper")
-ROBUST_HEADER: tuple[str, ...] = (
-    "condition",
-    "changed",
-    "policy",
-    "success",
-    "points from nominal",
-    "within 0.1 rad",
-    "lost",
-)
 LOG_FILE = "log.txt"
 """Progress of an evaluation that ran beside others."""
 OUT_OF_TIME = "out of time; the same command goes on from here"
@@ -249,18 +239,17 @@ def fingerprint(name: str) -> str:
 
 def _write(result: Result, cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]) -> None:
     """The page and its figures, of what there is."""
-    short = labels(result.policies)
-    title, of, header = "Robustness", "", ROBUST_HEADER
-    if of_paper := cfg.suite == "paper":
-        title, of, header = "The paper's evaluations", " beside the paper", (*PAPER_HEADER, *short.values())
-        figures = paper_figures(result, conditions)
+    short, of_paper = labels(result.policies), cfg.suite == "paper"
+    if of_paper:
+        title, of, figures = "The paper's evaluations", " beside the paper", paper_figures(result, conditions)
         table = [
-            [row["figure"], row["condition"], row["paper"] or NOTHING, *row["ours"].values()]
+            {"figure": row["figure"], "condition": row["condition"], "paper": row["paper"] or NOTHING}
+            | {short[policy]: text for policy, text in row["ours"].items()}
             for row in figures
         ]
     else:
-        table = robust_table(result, conditions, short)
-        figures = [dict(zip(header, row, strict=True)) for row in table]
+        title, of, figures = "Robustness", "", robust_table(result, conditions, short)
+        table = figures
     write_json(cfg.out / f"{cfg.suite}.json", result.summary() | {"quick": cfg.quick, "figures": figures})
     notes = [f"Objects, {group}: {text}." for group, (_, text) in groups.items()]
     write_page(
@@ -268,14 +257,16 @@ def _write(result: Result, cfg: EvalCfg, conditions: Sequence[Condition], groups
         cfg.out / f"{cfg.suite}.html",
         title=title,
         lead=f"{', '.join(short.values())}{of}{', the reduced suite' if cfg.quick else ''}",
-        figures=(header, table),
+        figures=(list(table[0]), [list(row.values()) for row in table]) if table else None,
         notes=[*notes, "Held-out objects judge, and nothing is chosen on them."],
         conditions=[(c.name, c.shown, c.flags) for c in conditions],
         of_paper=of_paper,
     )
 
 
-def robust_table(result: Result, conditions: Sequence[Condition], short: dict[str, str]) -> list[list[str]]:
+def robust_table(
+    result: Result, conditions: Sequence[Condition], short: dict[str, str]
+) -> list[dict[str, str]]:
     """A line for each condition and policy: what it changes, and how much success it costs."""
     found = {
         (condition, row.policy): row
@@ -293,7 +284,9 @@ def robust_table(result: Result, conditions: Sequence[Condition], short: dict[st
                 change = points(paired_difference(row.successes, nominal.successes, row.overall.unit))
             rates = (row.overall.outcomes["success"], row.precise, row.overall.outcomes["object falls"])
             success, precise, lost = (share_text(r.value, r.low, r.high) for r in rates)
-            table.append([condition.name, condition.shown, short[policy], success, change, precise, lost])
+            told = {"condition": condition.name, "changed": condition.shown, "policy": short[policy]}
+            figures = {"success": success, "points from nominal": change, "within 0.1 rad": precise}
+            table.append(told | figures | {"lost": lost})
     return table
 
 
