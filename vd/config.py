@@ -50,18 +50,13 @@ def to_dict(value: Any) -> Any:
 def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
     """Build the dataclass ``cls`` from what :func:`to_dict` wrote. Fields that are absent keep their default.
 
-    Args:
-        cls: A dataclass.
-        values: Field values by name.
-        where: Dotted path of ``values``, for error messages.
-
     A class that lost a field says so in ``RETIRED``: by name the value that means what is now always so, of a
     group that went the values of those fields that say so. Others are refused, but for :class:`Dropped`.
     A field that has another name is :class:`Renamed`.
 
     Raises:
         ValueError: A field that ``cls`` does not have, one that is needed and absent, or a value of the wrong
-            type, named by its path.
+            type, named by its path, which begins with ``where``.
     """
     values = without_retired(values, getattr(cls, "RETIRED", {}), where or cls.__name__)
     hints = typing.get_type_hints(cls)

@@ -196,12 +196,7 @@ _REMEDY = {
 
 
 def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
-    """Refuse a hand that is not the one of the contract.
-
-    Args:
-        contract: Of the bundle.
-        hand: The hand to move.
-        where: The bundle, for the message.
+    """Refuse a hand that is not the one of the contract of the bundle at ``where``.
 
     Raises:
         ContractError: The first field that differs, what the hand has, what the bundle wants, what to do.

@@ -14,13 +14,7 @@ import torch
 
 from vd.assets_usd.hands import load_hand
 from vd.bundle import CONTRACT_FILE, is_bundle
-from vd.bundle.contract import (
-    BUNDLE_FORMAT,
-    Contract,
-    ContractError,
-    Provenance,
-    derive_interface,
-)
+from vd.bundle.contract import BUNDLE_FORMAT, Contract, ContractError, Provenance, derive_interface
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.files import make_folder, write_json, writing

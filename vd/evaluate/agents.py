@@ -7,14 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from vd.bundle import is_bundle
 from vd.config import from_dict
-from vd.envs.cfg import (
-    CurriculumCfg,
-    ObservationCfg,
-    RandomisationCfg,
-    ReorientCfg,
-    SuccessCfg,
-    TableCfg,
-)
+from vd.envs.cfg import CurriculumCfg, ObservationCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TableCfg
 from vd.paper import PAPER
 
 if TYPE_CHECKING:

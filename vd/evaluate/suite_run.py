@@ -225,11 +225,7 @@ def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> d
 
 
 def fingerprint(name: str) -> str:
-    """What tells the content of a policy from others: a SHA-256, or the name of a built-in agent.
-
-    Raises:
-        FileNotFoundError: There is no such policy.
-    """
+    """What tells the content of a policy from others: a SHA-256, or the name of a built-in agent."""
     if name in BUILT_IN:
         return name
     path = find_policy(name)
