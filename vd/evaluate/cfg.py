@@ -16,7 +16,6 @@ from vd.paper import PAPER
 
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0
-DEFAULT_OBJECTS = ("cube",)
 OF_THE_SUITE = (
     "episodes",
     "max_goal_angle",
@@ -126,7 +125,7 @@ class EvalCfg:
     @property
     def object_sets(self) -> tuple[str, ...]:
         """The sets of ``objects``, the default included."""
-        return self.objects or DEFAULT_OBJECTS
+        return self.objects or ("cube",)
 
     @property
     def limit_s(self) -> float:

@@ -54,7 +54,7 @@ class Condition:
     quick: bool = True
     """Part of the reduced suite."""
     by_camera: bool = True
-    """Whether camera policies meet it too."""
+    """Whether camera policies meet it too; they look for themselves, as late as their images are."""
 
     @property
     def flags(self) -> str:
@@ -103,8 +103,7 @@ ROBUST = tuple(
         changed,
         {"condition": name},
         quick=name in ("nominal", "s3", "mixed"),
-        by_camera=name
-        not in ("observation-late", "all-late", "pose-error"),  # it looks for itself, as late as images are
+        by_camera=name not in ("observation-late", "all-late", "pose-error"),
     )
     for name, changed in CHANGED.items()
 )
