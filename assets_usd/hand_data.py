@@ -159,7 +159,6 @@ class HandModel:
         link_mass: Masses [L] [kg].
         link_com: Centres of mass in the link frames [L, 3] [m].
         link_inertia: Inertia about the centre of mass in the link frames [L, 3, 3] [kg m^2].
-        tip_names: Names of the fingertip sites [F].
         tip_link: Index of the link of each site [F].
         tip_frame: Pose of each site in its link [F, 7].
         camera: The depth camera.
@@ -168,7 +167,6 @@ class HandModel:
         point_link: Link whose frame each set is in [P]; the first motors are fixed to link 0.
         link_points: Surface samples [P, 500, 3] [m].
         shapes: Collision primitives.
-        filtered_pairs: Pairs of links (lower index first) that never collide.
     """
 
     name: str
@@ -195,7 +193,6 @@ class HandModel:
     link_mass: np.ndarray
     link_com: np.ndarray
     link_inertia: np.ndarray
-    tip_names: tuple[str, ...]
     tip_link: np.ndarray
     tip_frame: np.ndarray
     camera: CameraModel
@@ -203,7 +200,6 @@ class HandModel:
     point_link: np.ndarray
     link_points: np.ndarray
     shapes: tuple[CollisionShape, ...]
-    filtered_pairs: tuple[tuple[int, int], ...]
 
     @property
     def num_joints(self) -> int:

@@ -138,8 +138,7 @@ class _Reader:
         drives = np.array([self._drive(joint) for joint in joints])
         baseline = dict(zip(("kp", "kd", "velocity_limit", "inertia"), drives.T[[2, 3, 5, 6]], strict=True))
         servo, servo_interval = read_servo(joints, baseline, self.layer or self.path)
-        tips = [f"f{f}_tip" for f in range(fingers)]
-        tip_prims = [self.prim(f"f{f}_l{JOINTS_PER_FINGER}/{tip}") for f, tip in enumerate(tips)]
+        tip_prims = [self.prim(f"f{f}_l{JOINTS_PER_FINGER}/f{f}_tip") for f in range(fingers)]
         points = [(f"f{f}_motor", self.prim(f"base/f{f}_motor_points"), 0) for f in range(fingers)]
         points += [(links[i], self.prim(f"{links[i]}/points"), i) for i in range(1, len(links))]
         points.sort(key=lambda entry: (int(entry[0][1 : entry[0].index("_")]), entry[2]))
@@ -168,7 +167,6 @@ class _Reader:
             link_mass=np.array([mass for mass, _, _ in masses]),
             link_com=np.array([com for _, com, _ in masses]),
             link_inertia=np.array([inertia for _, _, inertia in masses]),
-            tip_names=tuple(tips),
             tip_link=np.array([index[prim.GetParent().GetPath()] for prim in tip_prims]),
             tip_frame=np.array([self._relative(prim, prim.GetParent()) for prim in tip_prims]),
             camera=self._camera(self.prim("base/camera"), bodies[0]),
@@ -176,7 +174,6 @@ class _Reader:
             point_link=np.array([link for _, _, link in points]),
             link_points=self._points([prim for _, prim, _ in points]),
             shapes=tuple(shape for i, body in enumerate(bodies) for shape in self._shapes(body, i)),
-            filtered_pairs=self._filtered(bodies, index),
         )
 
     def _check_units(self) -> None:
@@ -371,17 +368,6 @@ class _Reader:
             gap=self.number(prim, "newton:contactGap"),
             fingertip=surface.GetName() == "fingertip_surface",
         )
-
-    def _filtered(self, bodies: list[Usd.Prim], index: dict[Any, int]) -> tuple[tuple[int, int], ...]:
-        pairs = set()
-        for first, body in enumerate(bodies):
-            for target in body.GetRelationship("physics:filteredPairs").GetTargets():
-                if target not in index or index[target] == first:
-                    raise self.fail(
-                        body, f"'physics:filteredPairs' names {target}", "name another link of the hand"
-                    )
-                pairs.add((min(first, index[target]), max(first, index[target])))
-        return tuple(sorted(pairs))
 
 
 def _xyzw(quaternion: Gf.Quatf) -> np.ndarray:

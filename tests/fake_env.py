@@ -22,11 +22,6 @@ class FakeObject:
     warnings: tuple[str, ...] = ()
 
 
-@dataclass
-class FakeHand:
-    name: str = "dclaw3"
-
-
 class FakeEnv:
     def __init__(
         self,
@@ -35,21 +30,19 @@ class FakeEnv:
         max_episode_steps=24,
         tolerance=0.4,
         fall_at=None,
-        fingers=3,
         hand=None,
     ):
         self.objects = list(objects)
-        self.hand = hand or FakeHand(f"dclaw{fingers}")
+        self.hand = hand or SimpleNamespace(name="dclaw3")
         self.device = "cpu"
         self.num_envs = n = num_envs
-        self.num_actions, self.num_observations = 3 * fingers, 8
+        self.num_actions, self.num_observations = 9, 8
         self.max_episode_steps = max_episode_steps
         self.cfg = SimpleNamespace(
             sim=SimpleNamespace(control_hz=12.0), goal=SimpleNamespace(max_angle_rad=np.pi)
         )
         self.control_dt = 1.0 / 12.0
         self.world_object = (np.arange(n) * len(self.objects)) // n
-        self.reward_term_names = ("success", "rotation", "energy")
         self.tolerance, self.fall_at = tolerance, fall_at or {}
         self.still_speed = 0.5
 
@@ -57,7 +50,6 @@ class FakeEnv:
             return wp.zeros(shape, dtype=dtype, device="cpu")
 
         self.observation = zeros((n, self.num_observations))
-        self.reward, self.reward_terms = zeros(n), zeros((n, 3))
         self.success, self.fell = zeros(n, wp.int32), zeros(n, wp.int32)
         self.still, self.smoothed = zeros(n, wp.int32), zeros((n, self.num_actions))
         self.timed_out, self.done = zeros(n, wp.int32), zeros(n, wp.int32)
@@ -115,8 +107,6 @@ class FakeEnv:
             array.numpy()[:] = value
         self.rotation_error.numpy()[:] = error
         self.object_pose_end.numpy()[:] = self._pose()
-        self.reward_terms.numpy()[:] = np.stack([800.0 * success, 1 / (error + 0.1), -(a**2).sum(1)], axis=1)
-        self.reward.numpy()[:] = self.reward_terms.numpy().sum(axis=1)
         self._restart(np.flatnonzero(done))
         self._publish()
 
@@ -135,22 +125,16 @@ class FakeEnv:
 
     def state_dict(self):
         """Everything that :meth:`load_state_dict` needs to go on as from here."""
-        arrays = {name: array.numpy().copy() for name, array in self._stateful().items()}
+        arrays = [array.numpy().copy() for array in (self.goal_quat, self.step_count)]
         return {"arrays": arrays, "quat": self._quat.copy(), "rng": self._rng.bit_generator.state}
 
     def load_state_dict(self, state):
         """Go on from :meth:`state_dict`."""
-        for name, array in self._stateful().items():
-            array.numpy()[:] = state["arrays"][name]
+        for array, saved in zip((self.goal_quat, self.step_count), state["arrays"], strict=True):
+            array.numpy()[:] = saved
         self._quat = state["quat"].copy()
         self._rng.bit_generator.state = state["rng"]
         self._publish()
-
-    def _stateful(self):
-        return {
-            "goal": self.goal_quat,
-            "steps": self.step_count,
-        }
 
     def close(self):
         """Nothing to release."""

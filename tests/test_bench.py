@@ -4,21 +4,11 @@ import json
 
 import pytest
 
-from vd.bench.cli import PhysicsCommand, SimCommand, main
-from vd.bench.sim import own_kernel_names, own_share
+from vd.bench import depth
+from vd.bench.cli import DepthCommand, PhysicsCommand, SimCommand, main
+from vd.bench.sim import own_share
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
-
-
-def test_all_kernels_of_a_step_count_as_ours():
-    names = own_kernel_names()
-    assert {
-        "reward_kernel",
-        "teacher_observation_kernel",
-        "limit_joint_velocity_kernel",
-        "guard_kernel",
-    } <= names
-    assert not any("mujoco" in name for name in names)
 
 
 def test_sim_rows_add_up(tmp_path, capsys):
@@ -55,3 +45,17 @@ def test_physics_report_names_what_moves(tmp_path):
 def test_a_dump_that_is_not_there_is_told_by_its_name(tmp_path, capsys):
     assert main(["replay", str(tmp_path / "none.json")]) == 1
     assert "there is no file" in capsys.readouterr().err
+
+
+def test_both_cameras_see_the_same_scene(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(depth, "LEAST_TIME_S", 0.01)
+    out = tmp_path / "depth.json"
+    DepthCommand(envs=(1, 2), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
+    report = json.loads(out.read_text())
+    assert [row["envs"] for row in report["rows"]] == [1, 2]
+    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == report["rows"]
+    for row in report["rows"]:
+        assert row["images_over_newton"] == pytest.approx(row["images"] / row["newton"])
+        # The hand covers some of the picture, and nobody sees it otherwise.
+        assert row["points"] > 500
+        assert row["different"] < 1e-3

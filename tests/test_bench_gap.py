@@ -8,14 +8,11 @@ from vd.bench import gap
 from vd.bench.cli import GapCommand
 from vd.bench.gap_score import (
     KINDS,
-    NEIGHBOURS,
     Case,
     figures,
     markdown,
     score,
 )
-from vd.bench.hidden_plant import OUTSIDE
-from vd.kernels.servo.effects import EFFECTS
 
 TRUTH = {
     "noise_floor_rad": 5e-4,
@@ -53,17 +50,6 @@ def value(results, what):
     return figure
 
 
-def test_the_whole_battery_is_what_the_goals_ask_for():
-    cases = gap.battery("dclaw3")
-    count = {kind: sum(c.kind == kind for c in cases) for kind in KINDS}
-    n = len({c.effects for c in cases if c.kind == "single"})
-    assert n == len(EFFECTS)
-    assert count == {"single": n * 20, "none": 200, "pair": n * (n - 1) // 2, "outside": len(OUTSIDE) * 20}
-    assert len({c.name for c in cases}) == len(cases)
-    assert {c.change for c in cases if c.kind == "none"} == {"exact", "base", "mass"}
-    assert set(NEIGHBOURS) == set(OUTSIDE)
-
-
 def test_any_first_part_of_the_battery_is_a_fair_sample():
     cases = gap.battery("dclaw3")
     part = cases[: len(cases) // 5]
@@ -87,27 +73,6 @@ def test_the_effect_that_stands_for_another_is_right_if_the_report_says_so():
     assert [value([r], "single: a wrong name").value for r in results] == [0.0, 1.0, 1.0]
     assert value([said], "size of the set").value == 1.0
     assert value(results, "right, or in the named set").value == pytest.approx(2 / 3)
-
-
-def test_effects_that_are_one_together_are_right_as_that_one_if_the_report_says_so():
-    hidden = case("dead_zone", "encoder_bias", kind="pair")
-    group = ("asymmetric_friction", "dead_zone", "encoder_bias")
-    told = score(hidden, report("asymmetric_friction", sets=[group]), TRUTH)
-    assert told["by_convention"] == ["dead_zone", "encoder_bias"] and not told["false"]
-    assert value([told], "two hidden: both named").value == 1.0
-    silent = score(hidden, report("asymmetric_friction"), TRUTH)
-    assert silent["false"] == ["asymmetric_friction"] and not silent["by_convention"]
-    single = score(case("dead_zone"), report("asymmetric_friction", sets=[group]), TRUTH)
-    assert single["false"] == ["asymmetric_friction"], "one of them alone is something else"
-    other = score(hidden, report("torque_limit", sets=[("torque_limit", *group[1:])]), TRUTH)
-    assert other["false"] == ["torque_limit"]
-    # Coulomb friction beside Stribeck friction is Stribeck friction with other numbers.
-    sums = score(
-        case("coulomb_friction", "stribeck_friction", kind="pair"), report("stribeck_friction"), TRUTH
-    )
-    assert (
-        sums["by_convention"] == ["coulomb_friction"] and value([sums], "two hidden: both named").value == 1.0
-    )
 
 
 @pytest.mark.parametrize(
@@ -140,13 +105,6 @@ def test_names_are_scored_against_the_truth():
     # A gap below three noise floors does not count.
     small = score(one, report("backlash", baseline=1e-3), TRUTH)
     assert value([*results, small], "first name right").cases == 4
-
-
-def test_parameters_are_scored_with_their_intervals():
-    rows = score(case("coulomb_friction"), report("coulomb_friction", "command_delay"), TRUTH)["parameters"]
-    errors = {row["parameter"]: (row["error"], row["covered"]) for row in rows}
-    assert errors["coulomb_friction.tau_c_nm"] == (pytest.approx(0.1), True)
-    assert errors["command_delay.delay_s"] == (pytest.approx(0.5), False)
 
 
 def test_nothing_hidden_allows_no_name_but_a_changed_mass():

@@ -6,14 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vd.bench.gap_sizes import showing, sized_effect
-from vd.bench.hidden_plant import FULL_DUTY_RAD, OUTSIDE
+from vd.bench.hidden_plant import OUTSIDE
 from vd.bench.hide import (
     ENCODER_COUNT,
-    FULL_P_GAIN,
-    NOISE_FLOOR_RAD,
     Hiding,
-    effect_parameters,
     hide,
     parse_effect,
     simulate_hidden,
@@ -45,25 +41,6 @@ def test_the_recording_tells_nothing_and_the_truth_lies_beside_it(tmp_path):
     assert 0.5e-3 < np.diff(trajectory.time).std() < 2.5e-3
 
 
-def test_the_duty_cycle_is_the_controllers_output():
-    """It follows the error that the controller sees, whatever a motor with limits makes of it."""
-    limits = {"torque_limit": {"tau_max_nm": 0.4}, "coulomb_friction": {"tau_c_nm": 0.05}}
-    bare = Hiding(model="servo", effects=limits, seed=2, excitations=("gain_ladder",))
-    plain, told = simulate_hidden([bare, replace(bare, pwm=True)])
-    assert all(t.pwm is None for t in plain.recording.trajectories)
-    gains = set()
-    for t in told.recording.trajectories:
-        assert np.abs(t.pwm).max() <= 1.0
-        gain = t.conditions["p_gain"] / FULL_P_GAIN
-        gains.add(gain)
-        expected = np.clip(gain * (t.command - t.position) / FULL_DUTY_RAD, -1.0, 1.0)
-        np.testing.assert_allclose(t.pwm, expected, atol=6e-3)
-    assert len(gains) > 1
-    # Everything else of the recording is the same.
-    for one, other in zip(plain.recording.trajectories, told.recording.trajectories, strict=True):
-        np.testing.assert_array_equal(one.position, other.position)
-
-
 @pytest.mark.parametrize("late", ["command_delay", "read_delay"])
 def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path):
     hide(Hiding("servo", {late: {"delay_s": 0.03}}, seed=6, pwm=True), tmp_path / "r")
@@ -88,19 +65,6 @@ def test_seeds_repeat_and_differ_alone_and_in_batches():
         np.testing.assert_array_equal(a.position, b.position)
         np.testing.assert_array_equal(a.position, c.position)
     assert one.truth["base"] != other.truth["base"]
-
-
-def test_the_noise_is_the_stated_floor(monkeypatch):
-    def readings():
-        (hidden,) = simulate_hidden([Hiding("servo", seed=1)])
-        assert hidden.truth["noise_floor_rad"] == NOISE_FLOOR_RAD
-        motions = hidden.recording.trajectories
-        return np.concatenate([t.position for t in motions if t.excitation.startswith("sine")])
-
-    noisy = readings()
-    monkeypatch.setattr("vd.bench.hide.NOISE_RAD", 0.0)
-    # Both are rounded, one is noisy: the variances of two roundings and of the noise, not quite independent.
-    assert NOISE_FLOOR_RAD < (noisy - readings()).std() < np.sqrt(2.0) * NOISE_FLOOR_RAD
 
 
 def test_a_finger_is_recorded_by_name():
@@ -166,16 +130,3 @@ def test_excitations_stay_within_the_joints_and_excite_one_each():
     paper = excitation_set(reach)
     assert 40.0 < sum(m.duration for m in paper) / 2 < 60.0 and len(paper) == 16
     assert {m.conditions["p_gain"] for m in excitation_set(reach, ("gain_ladder",))} == {200.0, 400.0, 800.0}
-
-
-def test_sizes_grow_and_stay_within_the_bounds():
-    for model in ("dclaw3", "servo"):
-        for name in showing(model):
-            sizes = [sized_effect(name, size, model) for size in range(4)]
-            assert sizes[0] != sizes[3]
-            for parameter in EFFECTS[name].parameters:
-                assert set(sizes[0]) == set(effect_parameters(name))
-                assert all(parameter.lower <= abs(s[parameter.name]) <= parameter.upper
-                           or name == "acceleration_limit" for s in sizes)  # fmt: skip
-    with pytest.raises(ValueError, match="does not show"):
-        sized_effect("joint_coupling", 1, "servo")

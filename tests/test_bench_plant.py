@@ -5,8 +5,8 @@ import pytest
 
 from vd.bench.gap_sizes import effect_at
 from vd.bench.hidden_finger import FingerBody
-from vd.bench.hidden_plant import OUTSIDE, STEP_S, Plant, Run, simulate
-from vd.bench.hide import COUPLING, Hiding, machine, simulate_hidden
+from vd.bench.hidden_plant import Plant, Run, simulate
+from vd.bench.hide import COUPLING, Hiding, simulate_hidden
 from vd.gap.chain import chains
 from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators as kernel
@@ -46,19 +46,6 @@ def ramp(time):
     return 0.2 * np.minimum(time, 4.0 - time)
 
 
-def linear_step(time):
-    """The plain servo's answer to the step, in closed form (two real or complex poles)."""
-    poles = np.roots([INERTIA, KD, KP]).astype(complex)
-    late = np.maximum(time - 0.1, 0.0)
-    a, b = poles
-    return STEP * np.real(1.0 + (b * np.exp(a * late) - a * np.exp(b * late)) / (a - b))
-
-
-def test_the_plain_servo_is_a_linear_oscillator():
-    time, path = answer(servo(), step)
-    np.testing.assert_allclose(path[:, 0], linear_step(time), atol=2e-5)
-
-
 BASE = {"kp": kernel.KP, "kd": kernel.KD, "velocity_limit": kernel.VELOCITY_LIMIT, "inertia": kernel.INERTIA}
 
 SMALL = ("thermal_drift", "load_friction", "supply_sag", "torque_saturation")
@@ -86,31 +73,6 @@ def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect(monkeypatch):
         assert true < 0.7e-3 and without > 1.2 * true, f"{name}: {true:.1e} rad, without it {without:.1e}"
 
 
-def test_jitter_delays_on_average_and_drops_hold_the_last_command():
-    _, plain = answer(servo(), lambda t: 0.5 * t, rate=100.0)
-    _, jittered = answer(
-        servo(command_jitter={"sigma_s": 0.02, "p_drop": 0.0}), lambda t: 0.5 * t, rate=100.0
-    )
-    lag = (plain - jittered)[50:].mean() / 0.5
-    assert 0.02 * np.sqrt(2.0 / np.pi) < lag < 0.045  # in order, hence later than the mean of |N|
-    _, dropped = answer(servo(command_jitter={"sigma_s": 0.0, "p_drop": 0.5}), lambda t: 0.5 * t, rate=100.0)
-    assert (plain - dropped)[50:].mean() / 0.5 == pytest.approx(0.01, abs=0.004)  # one write late on average
-
-
-def test_a_motor_at_its_limit_acts_when_the_command_comes():
-    """The answer to a step does not depend on where in a time step of the plant the command falls."""
-    limited = {"torque_limit": {"tau_max_nm": 0.2}}
-    paths = []
-    for shift in (0.0, 0.5, 0.9):
-        time = np.arange(0.0, 1.0, 0.01)
-        time[1:] += shift * STEP_S
-        command = np.where(np.arange(len(time)) < 20, 0.0, 0.8)[:, None]
-        run = Run(servo(**limited), time, command, np.ones(command.shape, bool))
-        paths.append(simulate([run])[0].position[:, 0])
-    assert np.ptp(paths[0]) > 0.5
-    assert max(np.abs(path - paths[0]).max() for path in paths[1:]) < 2e-4
-
-
 def test_another_joint_pulls_through_the_coupling():
     plant = servo(2, joint_coupling={"from_1": np.array([0.3, 0.3])})
     _, path = answer(plant, step, duration=3.0)
@@ -126,29 +88,6 @@ def test_effects_outside_the_table_act():
     _, early = answer(servo(**warm), ramp)
     _, late = answer(servo(**warm), ramp, session_s=100.0)
     assert np.abs(late - early).max() > 0.05
-
-
-def test_conditions_act():
-    _, soft = answer(servo(gravity=0.5), step, conditions={"p_gain": 0.5})
-    assert 0.5 * KP * (STEP - soft[-1, 0]) == pytest.approx(0.5 * np.sin(soft[-1, 0]), abs=1e-3)
-    off = np.ones((1001, 1), dtype=bool)
-    off[500:] = False
-    _, released = answer(servo(gravity=0.5), lambda t: 1.0 + 0 * t, enabled=off)
-    assert released[499, 0] > 0.7 and abs(released[-1, 0]) < 0.3
-
-
-def test_the_time_step_does_not_show():
-    names = [name for name in (*EFFECTS, *OUTSIDE) if name != COUPLING]  # which one joint cannot have
-    time = np.arange(80) * 1e-2
-    command = np.sin(4.0 * np.pi * time)[:, None]
-    runs = []
-    for name in names:
-        hiding = Hiding("pendulum", {name: effect_at(name, 1.0)}, base_spread=0.0)
-        _, plant = machine(hiding, np.random.default_rng(0))
-        runs.append(Run(plant, time, command, np.ones(command.shape, dtype=bool), seed=3))
-    for name, coarse, fine in zip(names, simulate(runs), simulate(runs, dt=1e-4), strict=True):
-        # Under half the noise floor of 0.5 mrad.
-        assert np.sqrt(np.mean((coarse.position - fine.position) ** 2)) < 2e-4, name
 
 
 FINGER = FingerBody(

@@ -1,8 +1,5 @@
 """dynamixel-sdk, unchanged, against the twin over its pseudo-terminal."""
 
-import os
-import random
-import threading
 import time
 
 import numpy as np
@@ -24,18 +21,17 @@ from vd.deploy.hardware.answers import (  # noqa: E402
     StateCheck,
 )
 from vd.deploy.hardware.bus import MotorBus  # noqa: E402
-from vd.deploy.hardware.control_table import MODELS, table, to_angle, to_counts  # noqa: E402
+from vd.deploy.hardware.control_table import MODELS, to_angle, to_counts  # noqa: E402
 from vd.deploy.hardware.joints import uncalibrated  # noqa: E402
-from vd.deploy.hardware.packets import Failure, Instruction, Packet, PacketReader, encode  # noqa: E402
+from vd.deploy.hardware.packets import Failure  # noqa: E402
 from vd.deploy.hardware.registers import MotorSettings  # noqa: E402
 from vd.deploy.twin.line import Faults, MotorLine  # noqa: E402
 from vd.deploy.twin.motor import Motor  # noqa: E402
-from vd.deploy.twin.plant import FirstOrderPlant  # noqa: E402
 from vd.deploy.twin.twin import Twin  # noqa: E402
 
 IDS = (10, 11, 12)
 MODEL = "XH430-V210"
-LIMITS = MotorSettings(current_limit_a=0.5, velocity_limit_rad_s=5.0, lower_rad=-1.0, upper_rad=1.2)
+LIMITS = MotorSettings(current_limit_a=0.5, velocity_limit_rad_s=1.0, lower_rad=-1.0, upper_rad=1.2)
 
 
 @pytest.fixture
@@ -83,35 +79,21 @@ def test_a_port_is_for_one_program_at_a_time_and_says_why_it_cannot_be_opened(bu
         again.read_state()
 
 
-def test_settings_are_written_and_read_back(bus, twin):
-    bus.configure(dict.fromkeys(IDS, LIMITS))
-    motor = twin.motors[1]
-    assert (motor.get("position_p_gain"), motor.get("position_d_gain")) == (200, 10)
-    assert motor.get("current_limit") == int(0.5 / 1.34e-3)
-    assert motor.get("min_position_limit") == to_counts(-1.0)
-    assert bus.read(11, "velocity_limit") == motor.get("velocity_limit") > 0
-
-
-def test_goals_are_reached_and_clipped_to_the_limits(bus, twin):
+def test_goals_are_reached_by_the_settings_that_were_written(bus, twin):
+    """At the speed that is allowed, and no farther than the limits."""
     ready(bus)
+    assert bus.read(11, "position_p_gain") == 200
+    assert twin.motors[1].get("current_limit") == int(0.5 / 1.34e-3)
     bus.write_goals(np.array([0.5, -0.4, 3.0]))
-    state = settle(bus)
+    first = bus.read_state()
+    second = settle(bus, 0.3)
+    rate = (second.position - first.position) / (second.time_s - first.time_s)
+    np.testing.assert_allclose(rate[0], 1.0, rtol=0.2)
+    state = settle(bus, 1.5)
     np.testing.assert_allclose(state.position, [0.5, -0.4, 1.2], atol=0.005)
     assert not state.alert.any()
     with pytest.raises(ValueError, match="finite angles"):
         bus.write_goals(np.array([0.0, np.nan, 0.0]))
-
-
-def test_speed_keeps_its_limit(bus, twin):
-    slow = MotorSettings(current_limit_a=0.5, velocity_limit_rad_s=0.5, lower_rad=-1.0, upper_rad=1.2)
-    bus.configure(dict.fromkeys(IDS, slow))
-    bus.torque(True)
-    bus.write_goals(np.full(3, 1.0))
-    first = bus.read_state()
-    second = settle(bus, 0.5)
-    rate = (second.position - first.position) / (second.time_s - first.time_s)
-    np.testing.assert_allclose(rate, 0.5, rtol=0.1)
-    np.testing.assert_allclose(second.velocity, 0.5, rtol=0.1)
 
 
 @pytest.mark.parametrize(
@@ -258,38 +240,6 @@ def test_the_second_answer_to_a_question_asked_twice_is_not_taken_for_the_next_o
         assert (first, bus.read(motor.id, "position_d_gain")) == (321, 12)
 
 
-class Noise:
-    """A far end that answers every reading with broken, cut, doubled, foreign or made-up packets."""
-
-    def __init__(self, twin: Twin, seed: int):
-        self.twin, self.random, self.sent = twin, random.Random(seed), 0
-        twin.put = self.put
-
-    def put(self, data: bytes) -> None:
-        """Send something else than ``data``."""
-        rng, self.sent = self.random, self.sent + 1
-        kind = rng.randrange(7)
-        broken = bytearray(data)
-        if kind == 0:
-            del broken[rng.randrange(len(broken)) :]
-        elif kind == 1:
-            for _ in range(rng.randrange(1, 4)):
-                broken[rng.randrange(len(broken))] ^= rng.randrange(1, 256)
-        elif kind == 2:
-            broken[5:7] = rng.randrange(65536).to_bytes(2, "little")
-        elif kind == 3:
-            broken = bytearray(rng.randbytes(rng.randrange(60)))
-        elif kind == 4:
-            broken = bytearray(b"\xff\xff\xfd\x00" * rng.randrange(1, 8)) + broken[: rng.randrange(12)]
-        elif kind == 5:
-            del broken[rng.randrange(4, len(broken))]
-        else:
-            at = rng.randrange(len(broken))
-            broken[at:at] = rng.randbytes(rng.randrange(1, 6))
-        if bytes(broken) != data:
-            self.twin._write(bytes(broken))
-
-
 @pytest.mark.parametrize("counts", [25_882_000, -25_882_000])
 def test_a_position_that_no_motor_can_count_is_refused_before_any_other_is_known(counts):
     """As from a broken packet whose checksum happens to be right."""
@@ -302,99 +252,6 @@ def test_a_position_that_no_motor_can_count_is_refused_before_any_other_is_known
     with pytest.raises(BusError, match=f"motor 11: its position came as {counts} counts"):
         check.accept(0.0, [Answer(11, 0, bytes(far))])
     assert check.accept(0.0, [Answer(11, 0, sound)]).position[0] == 0.0
-
-
-@pytest.mark.slow
-def test_thousands_of_broken_packets_make_no_hang_no_crash_and_no_position():
-    """Every accepted state would be wrong: none of the packets that arrive is a whole answer of the motor.
-
-    Of so many one may have a right checksum all the same: whether, the timing decides. The motor is
-    configured as before every run, so that its speed is known, and a position has to be within its reach.
-    """
-    motor = Motor(MODELS[MODEL], 1)
-    with Twin([motor]) as twin, MotorBus(twin.path, [1], MODEL, retries=20) as bus:
-        bus.configure({1: LIMITS})
-        true = bus.read_state()
-        bus.retries = 0
-        bus._port.setPacketTimeout = lambda length: bus._port.setPacketTimeoutMillis(3.0)
-        noise = Noise(twin, seed=0)
-        slowest = 0.0
-        while noise.sent < 2_000:
-            begin = time.monotonic()
-            try:
-                state = bus.read_state()
-            except BusError:
-                pass
-            else:
-                # Bytes put before or behind a whole packet leave it whole, which is no fault.
-                np.testing.assert_array_equal(state.position, true.position)
-            slowest = max(slowest, time.monotonic() - begin)
-        assert slowest < 20.0  # it does not wait for ever
-        del bus._port.setPacketTimeout
-        twin.put = twin._write
-        bus.retries = 20
-        bus.read_state()
-
-
-def test_the_twin_survives_broken_instructions(bus, twin):
-    """What a program sends may be broken as well: nothing moves, and the next sound packet is answered."""
-    ready(bus)
-    goals = [motor.get("goal_position") for motor in twin.motors]
-    rng = random.Random(3)
-    item = table(MODELS[MODEL])["goal_position"]
-    from vd.deploy.hardware.packets import BROADCAST, Instruction, Packet, encode
-
-    rows = b"".join(bytes([id]) + item.to_bytes(2500) for id in IDS)
-    start = item.address.to_bytes(2, "little") + (4).to_bytes(2, "little")
-    sound = encode(Packet(BROADCAST, Instruction.SYNC_WRITE, start + rows))
-    for _ in range(500):
-        broken = bytearray(sound)
-        if rng.random() < 0.5:
-            del broken[rng.randrange(1, len(broken)) :]
-        else:
-            broken[rng.randrange(len(broken))] ^= rng.randrange(1, 256)
-        bus._port.writePort(bytes(broken))
-    time.sleep(0.1)
-    assert [motor.get("goal_position") for motor in twin.motors] == goals
-    assert bus.missing() == {}
-
-
-def test_motors_hear_what_arrives_when_it_arrives_however_long_the_plant_takes():
-    """A state is that of the moment of its packet, not of the end of the step in which the plant was."""
-
-    class Slow(FirstOrderPlant):
-        rate, slow = 2.0, threading.Event()
-        busy = threading.Event()
-
-        def advance(self, seconds, drives):
-            self.position += self.rate * seconds
-            if self.slow.is_set():
-                self.slow.clear()
-                self.busy.set()
-                time.sleep(0.4)
-
-    plant = Slow(1, position=np.array([-3.0]))
-    item = table(MODELS[MODEL])["present_position"]
-    where = item.address.to_bytes(2, "little") + item.size.to_bytes(2, "little")
-    question = encode(Packet(1, Instruction.READ, where))
-    with Twin([Motor(MODELS[MODEL], 1)], plant) as twin:
-        line = os.open(twin.path, os.O_RDWR | os.O_NOCTTY)
-
-        def started() -> float:
-            """When it was at zero, by what it answers to a packet of now."""
-            now = time.monotonic()
-            os.write(line, question)
-            answers: list[Packet] = []
-            reader = PacketReader()
-            while not answers:
-                answers = reader.feed(os.read(line, 100))
-            return now - to_angle(item.from_bytes(answers[0].parameters[1:])) / plant.rate
-
-        calm = started()
-        plant.slow.set()
-        assert plant.busy.wait(5.0)
-        assert started() == pytest.approx(calm, abs=0.15)
-        os.close(line)
 
 
 def test_goals_arrive_with_the_question_for_the_state_unless_others_are_sent_before(bus, twin):

@@ -28,6 +28,8 @@ cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed (extra: hardwar
 
 SIDE_M = 0.02
 COUNT = 54
+VIEWS = 8
+"""Of each finger, where pictures are drawn."""
 SLIP = np.array(
     [0.002, -0.003, 0.001, *Rotation.from_euler("xyz", (8.0, -5.0, 12.0), degrees=True).as_quat()]
 )
@@ -231,13 +233,14 @@ class Bench:
 @pytest.fixture(scope="module")
 def kept(hand, lens, poses, camera, tmp_path_factory):
     """What calibrate leaves where somebody holds each pose for two pictures, and where the camera is."""
-    bench = Bench(hand, lens, np.repeat(poses[(0, 1, 2)], 2, axis=0), camera)
+    each = poses[(0, 1, 2)].reshape(3, -1, hand.num_joints)[:, [*range(VIEWS), -1]]
+    bench = Bench(hand, lens, np.repeat(np.concatenate(each), 2, axis=0), camera)
     folder = tmp_path_factory.mktemp("taken")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "connect", lambda cfg: contextlib.nullcontext(bench))
         patch.setattr(command, "find_device", lambda serial: None)
         patch.setattr(command, "RealSense", lambda *_, **__: bench)
-        cfg = CalibrateCfg(hand="dclaw3", port="none", out=folder / "camera.usda", count=18, yes=True)
+        cfg = CalibrateCfg(hand="dclaw3", port="none", out=folder / "camera.usda", count=VIEWS, yes=True)
         assert calibrate(cfg) == 0
     return folder, bench.camera
 

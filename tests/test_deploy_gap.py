@@ -30,7 +30,6 @@ from vd.gap.chain import chains
 from vd.gap.recording import read_recording
 from vd.gap.rollout import Rollouts
 from vd.gap.workflow import explain
-from vd.kernels.servo.actuators import COMMAND_DELAY
 from vd.sim.cfg import SimCfg
 from vd.stopping import StoppingRule
 
@@ -137,14 +136,3 @@ def test_a_run_tells_when_its_goals_were_sent(tmp_path):
         return np.median(np.abs(rollouts.predict(chain.start_row[None])[0] - rollouts.measured))
 
     assert error(run) < 0.001 < 0.01 < error(stamped)
-
-
-@pytest.mark.slow
-def test_a_run_alone_is_given_no_name(tmp_path):
-    """Not even that of an effect which it has: one motion leaves none to hold out."""
-    hand = load_hand("dclaw3")
-    servo = hand.servo.copy()
-    servo[:, COMMAND_DELAY] = 0.06
-    folder = rollout(tmp_path / "log", replace(hand, servo=servo), 4.0)
-    report = explain(folder, hand, tmp_path / "gap", effects=("command_delay",), workers=1)
-    assert report.verdict == "under_excited" and not report.effects

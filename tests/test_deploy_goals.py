@@ -2,19 +2,11 @@
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, compose, invert
-from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop.goals import GoalError, one_object, read_goals, scan_object
-from vd.deploy.loop.policy_runner import Sensed, senses_of
-from vd.paper import PAPER
-from vd.vision.cfg import PRESETS
-from vd.vision.sight import Sight
 
 NOISE_M = 0.001
 HOLE_M = 0.012
@@ -81,20 +73,6 @@ def test_a_closed_mesh_is_taken_as_it_is(item, tmp_path, suffix):
     assert np.abs(height.max(axis=1)).max() < 1e-5
 
 
-def test_a_goal_of_the_robot_is_seen_turned_behind_the_palm(item):
-    """The cloud that the kernel makes is the one that SciPy makes, for any orientation."""
-    hand, network = load_hand("dclaw3"), PRESETS["small"]
-    sight = Sight(hand, [item], network, complete=True)
-    quat = Rotation.random(random_state=np.random.default_rng(3)).as_quat()
-    zero = np.zeros(hand.num_joints)
-    senses = senses_of(Sensed(zero, zero, zero, quat), torch.empty((1, 0, 3)))
-    frame = sight.frame(senses, torch.tensor([[0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0]]))
-    seen = sight.points(frame)[0, : sight.ends[0]].numpy()
-    turn = compose(invert(np.array(BASE_IN_WORLD)), np.array([0.0, 0.0, 0.0, *quat]))[3:]
-    expected = Rotation.from_quat(turn).apply(item.surface_points) + PAPER.cloud.goal_position_m
-    np.testing.assert_allclose(expected, seen, atol=1e-6)
-
-
 def test_scans_of_no_use_are_refused_by_name(tmp_path):
     generator = np.random.default_rng(0)
 
@@ -122,9 +100,6 @@ def test_orientations_are_read_as_written(tmp_path):
     goals = read_goals(["1,0,0@180", str(file)])
     half = np.sqrt(0.5)
     np.testing.assert_allclose(goals, [[1, 0, 0, 0], [0, 0, half, half], [0, 0, 0, 1]], atol=1e-12)
-
-
-def test_both_quaternions_of_an_orientation_are_one_goal():
     for one, other in (("0.1,-0.2,0.3,0.9", "-0.1,0.2,-0.3,-0.9"), ("0,-1,1,0", "0,1,-1,0")):
         first, second = read_goals([one, other])
         np.testing.assert_array_equal(first, second)
@@ -138,9 +113,6 @@ def test_what_is_no_orientation_is_refused(text, tmp_path):
     (tmp_path / "goals.csv").write_text(f"0,0,0,1\n{text}\n")
     with pytest.raises(GoalError, match="line 2"):
         read_goals([str(tmp_path / "goals.csv")])
-
-
-def test_files_without_orientations_are_refused(tmp_path):
     (tmp_path / "empty.txt").write_text("# nothing\n")
     with pytest.raises(GoalError, match="no orientation"):
         read_goals([str(tmp_path / "empty.txt")])

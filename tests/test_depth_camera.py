@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.objects.sets import load_set
 from vd.bench.depth import NewtonCamera, bench_scene, pose
 from vd.paper import PAPER
-from vd.sensors.cfg import BASELINE_M, FOCAL_PX, DepthCameraCfg, DepthSensorCfg
+from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sensors.depth_cloud import CameraCloud
 from vd.sim.scene import hand_mount
@@ -211,26 +211,6 @@ def test_late_images_are_past_images(device, scenes):
     pose(scene, state, np.random.default_rng(3))
 
 
-def test_a_perfect_sensor_costs_no_image(device, scenes):
-    scene, state = scenes(device)
-    camera = make(scene, state)
-    assert camera.depth is camera.true_depth
-    noisy = make(scene, state, sensor=DepthSensorCfg.realistic())
-    assert noisy.depth is not noisy.true_depth
-    noisy.depth.fill_(np.nan)
-    noisy.capture()
-    camera.capture()
-    np.testing.assert_array_equal(host(noisy.true_depth), host(camera.depth))
-    measured, true = host(noisy.depth), host(noisy.true_depth)
-    assert np.isfinite(measured).all()
-    flat = smooth(true) & (measured > 0) & (true > 0)
-    sensor = noisy.cfg.sensor
-    disparity = FOCAL_PX * BASELINE_M / np.stack([measured[flat], true[flat]])
-    error = disparity[0] - disparity[1]
-    expected = np.hypot(sensor.disparity_std_px, sensor.disparity_step_px / np.sqrt(12))
-    assert abs(np.std(error) / expected - 1) < 0.05 and abs(np.mean(error)) < 0.01 * expected
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -267,5 +247,6 @@ def test_a_camera_goes_on_where_another_stopped(device, scenes):
         array.assign(host(one.stateful()[name]))
     for camera in (one, other):
         camera.capture()
+    assert np.isfinite(host(one.depth)).all() and (host(one.depth) != host(one.true_depth)).mean() > 0.3
     np.testing.assert_array_equal(host(other.depth), host(one.depth))
     np.testing.assert_array_equal(host(other.points), host(one.points))

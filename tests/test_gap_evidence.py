@@ -9,7 +9,7 @@ from gap_recordings import COUNT, FLOOR, made_up
 import vd.kernels.servo.actuators as servo
 from vd.gap.consensus import share
 from vd.gap.coordinates import Coordinate
-from vd.gap.explanation import Accepted, Explanation, intervals
+from vd.gap.explanation import Accepted, Explanation
 from vd.gap.statistics import resamples
 from vd.gap.verdict import Verdicts
 
@@ -36,14 +36,6 @@ def test_a_tie_on_unseen_motions_is_a_set(judge: Verdicts) -> None:
     winner = made_up(("coulomb_friction",), 0.004)
     assert judge.tied(winner, made_up(("dead_zone",), 0.004 + noise - noise.mean()))[0]
     assert not judge.tied(winner, made_up(("backlash",), 0.006))[0]
-
-
-def test_at_the_floor_samples_decide(judge: Verdicts) -> None:
-    """An explained recording tells candidates apart even if one motion alone shows the difference."""
-    winner, errors = made_up(("coulomb_friction",), FLOOR), np.full(10, FLOOR)
-    assert judge.tied(winner, made_up(("dead_zone",), errors))[0]
-    errors[3] = 1.5 * FLOOR
-    assert not judge.tied(winner, made_up(("dead_zone",), errors))[0]
 
 
 def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: Verdicts) -> None:
@@ -89,13 +81,6 @@ def test_what_leaves_structure_is_not_explained(judge: Verdicts) -> None:
     assert lacking.verdict == "unknown" and "structure" in lacking.reason
     # Far from the floor a real machine's repeatability is not known.
     assert with_structure(8.0, rms=5.0 * FLOOR).verdict == "effects"
-
-
-def test_what_the_time_step_leaves_open_widens_the_interval() -> None:
-    fit = made_up((), FLOOR)
-    plain = intervals(fit, FLOOR)["p0"]
-    wide = intervals(replace(fit, step_error=np.full(3, 0.5)), FLOOR)["p0"]
-    assert 0.5 * (wide[1] - wide[0]) == pytest.approx(np.hypot(0.5 * (plain[1] - plain[0]), 0.5))
 
 
 def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:

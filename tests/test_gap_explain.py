@@ -8,10 +8,9 @@ import pytest
 from gap_recordings import recorded, true_row
 
 import vd.kernels.servo.actuators as servo
-from vd.bench.hidden_plant import CABLE, COGGING, OUTSIDE
+from vd.bench.hidden_plant import COGGING, OUTSIDE
 from vd.bench.hide import Hiding, simulate_hidden
 from vd.gap.chain import chains
-from vd.gap.fit import JointProblem
 from vd.gap.fit_cache import FOLDER
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
@@ -129,36 +128,21 @@ def test_from_the_identified_model_on_there_is_no_gap(tmp_path: Path) -> None:
     assert report.verdict == "no_gap" and not report.effects
 
 
-def test_a_short_search_that_ends_astray_does_not_hold_the_baseline(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """From an inertia too small to show no descent comes back."""
-
-    def astray(problem: JointProblem, base: np.ndarray, *_: object, **__: object) -> np.ndarray:
-        rows = base.copy()
-        rows[problem.joint, servo.INERTIA] = 1e-5
-        return rows
-
-    monkeypatch.setattr(JointProblem, "start_baseline", astray)
-    report = analysed(recorded({}), tmp_path, effects=("command_delay",))
-    assert report.verdict == "no_gap" and report.baseline.rmse_rad < 1.1 * report.noise_floor_rad
-
-
 def test_a_cause_among_no_candidates_is_unknown(tmp_path: Path) -> None:
     report = analysed(recorded({servo.BACKLASH_WIDTH: 0.08}), tmp_path, effects=("thermal_drift",))
     assert report.verdict == "unknown" and not report.effects
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cause", [COGGING, CABLE])
-def test_a_cause_outside_the_table_is_unknown(cause: str, tmp_path: Path) -> None:
+def test_a_cause_outside_the_table_is_unknown(tmp_path: Path) -> None:
     effects = ("coulomb_friction", "gravity_load", "encoder_bias", "backlash", "command_delay")
-    report = analysed(hidden(**{cause: OUTSIDE[cause]}), tmp_path, effects=effects)
+    report = analysed(hidden(**{COGGING: OUTSIDE[COGGING]}), tmp_path, effects=effects)
     assert report.verdict == "unknown" and not report.effects
 
 
 def test_few_trajectories_are_under_excited(tmp_path: Path) -> None:
-    report = analysed(recorded({servo.COULOMB_TORQUE: 0.05}).subset([0, 3]), tmp_path)
+    recording = recorded({servo.COULOMB_TORQUE: 0.05})
+    report = analysed(replace(recording, trajectories=recording.trajectories[:4:3]), tmp_path)
     assert report.verdict == "under_excited" and not report.effects
 
 

@@ -14,7 +14,7 @@ from vd.gap.find import findings
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
-from vd.gap.statistics import covariance, noise_floor
+from vd.gap.statistics import noise_floor
 from vd.kernels.servo.effects import EFFECTS
 
 NEAR = {"kp": 3.0, "kd": 0.25, "velocity_limit": 7.0, "inertia": 2.5e-3}
@@ -81,19 +81,6 @@ def test_a_refined_fit_depends_less_on_the_step_and_a_wrong_model_leaves_structu
     assert products.sum() / count.sum() > 0.15 * problem.floor**2
 
 
-def test_promise_ranks_the_hidden_effect_first() -> None:
-    problem = problem_of(recorded({servo.COULOMB_TORQUE: 0.06}))
-    fit = fitted(problem)
-    starts = [
-        {"coulomb_friction.tau_c_nm": 0.05},
-        {"thermal_drift.rate_per_s": 0.05},
-        {"encoder_bias.bias_rad": 0.01},
-    ]
-    gains = problem.promise(fit, starts, problem.scales(fit.rows[0], fit.rmse))
-    assert np.argmax(gains) == 0
-    assert 0.5 < gains[0] <= 1.0
-
-
 @pytest.mark.parametrize("refits", [0, 3])
 def test_held_out_errors_see_no_fold_that_they_predict(refits: int) -> None:
     """A trajectory that contradicts the rest is fitted badly when held out, better when not."""
@@ -125,19 +112,6 @@ def test_conditions_are_held_out_before_motions() -> None:
     recording = blank()
     (chain,) = chains(recording)
     assert len(set(design(recording, chain, 0)[1])) == 5
-
-
-def test_intervals_widen_with_disagreement_between_trajectories() -> None:
-    rng = np.random.default_rng(0)
-    basis = rng.normal(size=(6, 200, 2))
-    gram = np.einsum("snp,snq->spq", basis, basis)
-    ridge = np.zeros(2)
-    noise = 1e-3 * rng.normal(size=(6, 200))
-    white = covariance(gram, np.einsum("snp,sn->sp", basis, noise), ridge, 1e-3)
-    offsets = np.array([1, -1, 1, -1, 1, -1])[:, None] * 0.1 * basis[:, :, 0]
-    split = covariance(gram, np.einsum("snp,sn->sp", basis, noise + offsets), ridge, 1e-3)
-    assert split[0, 0] > 100.0 * white[0, 0]
-    assert np.all(np.diag(white) >= 0.99 * 1e-6 * np.diag(np.linalg.inv(gram.sum(0))))
 
 
 def test_what_the_baseline_fits_is_no_candidate() -> None:

@@ -77,8 +77,7 @@ def test_what_is_written_is_read(tmp_path):
         np.testing.assert_allclose(getattr(b, name), getattr(a, name), atol=1e-6)
     np.testing.assert_array_equal(b.enabled, enabled)
     assert b.current is None and b.time.dtype == np.float64
-    again = read_recording(tmp_path / "r" / "recording.json")
-    assert again.subset([0, 0]).trajectories == again.trajectories * 2
+    assert read_recording(tmp_path / "r" / "recording.json").joints == read.joints
 
 
 def test_commands_may_be_sent_at_other_times_than_the_stamps(tmp_path):
@@ -322,3 +321,31 @@ def test_real_recordings_are_read(shared_dir, name, model, joints, trajectories)
     for trajectory in recording.trajectories:  # one motion alone tells less
         if np.ptp(trajectory.command, axis=0).any():
             check_motion(replace(recording, trajectories=(trajectory,)))
+
+
+@pytest.fixture(scope="module")
+def machine():
+    (hidden,) = simulate_hidden([Hiding("servo", joints=("a", "b"))])
+    return hidden.recording
+
+
+def test_joints_that_no_motion_or_few_move_are_named(machine):
+    assert cautions(machine) == ()
+    first = replace(machine, trajectories=tuple(t for t in machine.trajectories if t.joints == ("a",)))
+    (idle,) = cautions(first)
+    assert "No motion moves b" in idle
+    few = replace(first, trajectories=first.trajectories[:3])
+    assert any("Fewer than 4 kinds of motion move a:" in line for line in cautions(few))
+
+
+def test_samples_far_apart_are_told(machine):
+    slow = tuple(replace(t, time=4.0 * t.time) for t in machine.trajectories)
+    (line,) = cautions(replace(machine, trajectories=slow))
+    assert "40 ms apart" in line and "50 Hz" in line
+
+
+def test_a_count_that_is_not_the_encoders_is_told(machine):
+    count = 4.0 * machine.encoder_resolution_rad
+    coarse = tuple(replace(t, position=np.round(t.position / count) * count) for t in machine.trajectories)
+    lines = cautions(replace(machine, trajectories=coarse))
+    assert ["steps of 6.1" in line and "1.53" in line for line in lines] == [True, True]

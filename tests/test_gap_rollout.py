@@ -42,19 +42,6 @@ def hand():
     return load_hand("dclaw3")
 
 
-def test_bare_servos_are_one_chain_each():
-    found = chains(recording("servo", ("Pitch", "Jaw"), trajectory("a", wave(joints=2))))
-    assert [chain.joints for chain in found] == [("Pitch",), ("Jaw",)]
-    assert [list(chain.columns) for chain in found] == [[0], [1]]
-    assert set(found[0].baseline_free) == {"kp", "kd", "velocity_limit", "inertia"}
-    command = wave(joints=2)
-    enabled = np.ones(command.shape, bool)
-    enabled[50:, 1] = False
-    released = chains(recording("servo", ("Pitch", "Jaw"), trajectory("a", command, enabled=enabled)))
-    assert ["kd_off" in chain.baseline_free for chain in released] == [False, True]
-    assert found[0].start_row[0, servo.GRAVITY_TORQUE] == 0.0
-
-
 def test_a_pendulum_hangs_from_its_load():
     load = {"payload_kg": 0.49, "arm_length_m": 0.1}
     (chain,) = chains(recording("pendulum", ("p",), trajectory("a", wave(), conditions=load)))
@@ -80,23 +67,6 @@ def test_each_trajectory_has_its_own_load(device):
     expected = Rollouts(plain, data, device=device).predict(row[None], [0])
     np.testing.assert_allclose(got, expected, atol=1e-6)
     assert np.abs(got - Rollouts(plain, data).predict(chain.start_row[None], [0])).max() > 1e-2
-
-
-def test_a_gain_set_on_purpose_scales_the_stiffness_also_in_a_subset():
-    data = recording(
-        "servo",
-        ("j",),
-        trajectory("a", wave(), conditions={"p_gain": 200}),
-        trajectory("b", wave(), conditions={"p_gain": 800}),
-    )
-    (chain,) = chains(data)
-    row = chain.start_row.copy()
-    got = Rollouts(chain, data).predict(row[None])
-    alone = Rollouts(chain, data.subset([0])).predict(row[None])
-    np.testing.assert_array_equal(alone[0], got[0, :100])
-    row[0, servo.KP] /= 4
-    expected = Rollouts(replace(chain, reference_p_gain=None), data).predict(row[None], [0])
-    np.testing.assert_allclose(alone, expected, atol=1e-6)
 
 
 def test_trajectories_come_in_the_order_asked_for():
@@ -133,16 +103,6 @@ def test_commands_act_from_when_they_were_sent(hand, device, sent_s, delay_s, sa
 
     np.testing.assert_allclose(positions(sent, delay_s), positions(plain, same_as), atol=1e-5)
     assert np.abs(positions(sent, delay_s) - positions(plain, delay_s)).max() > 1e-3
-
-
-def test_a_rollout_starts_where_it_was_measured():
-    position = np.full((100, 1), 0.25)
-    data = recording("servo", ("j",), trajectory("a", np.full((100, 1), 0.2), position=position))
-    (chain,) = chains(data)
-    row = chain.start_row.copy()
-    row[0, servo.ENCODER_BIAS] = 0.05
-    got = Rollouts(chain, data).predict(row[None])[0, :, 0]
-    np.testing.assert_allclose(got, 0.25, atol=1e-6)
 
 
 def test_play_begins_where_the_joint_rests():

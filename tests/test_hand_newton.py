@@ -1,7 +1,5 @@
 """Newton's import of a hand equals what :func:`read_hand` says about it."""
 
-import itertools
-
 import newton
 import numpy as np
 import pytest
@@ -84,21 +82,9 @@ def test_shapes(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
     assert len(colliding) == len(hand.shapes)
 
 
-def test_filtered_pairs(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
-    """All and only the authored pairs of links (shapes of one body never collide in Newton)."""
-    hand, builder = imported
-    filtered = {tuple(sorted(pair)) for pair in builder.shape_collision_filter_pairs}
-    index = [builder.shape_label.index(shape.path) for shape in hand.shapes]
-    for (a, i), (b, j) in itertools.combinations(zip(hand.shapes, index, strict=True), 2):
-        if a.link != b.link:
-            expected = (min(a.link, b.link), max(a.link, b.link)) in hand.filtered_pairs
-            assert (tuple(sorted((i, j))) in filtered) == expected, (a.path, b.path)
-
-
 def test_sites(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
     hand, builder = imported
     sites = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.SITE]
-    assert [builder.shape_label[i].rsplit("/")[-1] for i in sites] == list(hand.tip_names)
     for i, link, frame in zip(sites, hand.tip_link, hand.tip_frame, strict=True):
         assert builder.shape_body[i] == link
         np.testing.assert_allclose(tuple(builder.shape_transform[i]), frame, atol=1e-6)

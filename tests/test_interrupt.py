@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import tomllib
-import warnings
 from pathlib import Path
 
 import pytest
@@ -95,12 +94,6 @@ def test_a_command_below_nohup_outlives_its_terminal():
         assert goes_on() == 0
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-def test_a_warning_is_a_line_of_the_command_without_the_source(monkeypatch):
-    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
-    said = interrupt.command("vd-some")(lambda: warnings.formatwarning("ignored", UserWarning, "x.py", 93))
-    assert said() == "vd-some: ignored\n"
 
 
 def test_a_child_whose_library_swallows_the_first_signal_ends_with_its_parent_still():

@@ -46,28 +46,6 @@ def test_union_of_overlapping_boxes_counts_the_overlap_once():
     np.testing.assert_allclose(solid.centroid, [x, 0, 0], atol=5e-4)
 
 
-def test_thin_plates_along_the_axes_are_measured_without_bias():
-    """Two crossed sheets of 1 mm on a grid of about 1.7 mm: no layer is gained or lost."""
-    sheets = [box((0, 0, 0), (0.12, 0.08, 0.001)), box((0, 0, 0.05), (0.001, 0.08, 0.1))]
-    exact = 0.12 * 0.08 * 0.001 + 0.001 * 0.08 * (0.1 - 0.0005)
-    assert g.solid_of_hulls(sheets).volume == pytest.approx(exact, rel=0.03)
-
-
-@pytest.mark.parametrize("open_lid", [False, True])
-def test_voxelised_mesh_needs_no_closed_surface(open_lid: bool):
-    """A box with a hole of two voxels still encloses its volume."""
-    sides = np.array([0.12, 0.06, 0.05])
-    mesh = trimesh.creation.box(sides).subdivide_to_size(0.002)
-    faces = mesh.faces
-    if open_lid:
-        middle = mesh.triangles_center
-        faces = faces[~((middle[:, 2] > 0.0249) & (np.abs(middle[:, :2]) < 0.0012).all(axis=1))]
-        assert len(faces) < len(mesh.faces)
-    solid = g.solid_of_voxels(*g.voxelise_surface(mesh.vertices, faces))
-    assert solid.volume == pytest.approx(sides.prod(), rel=0.04)
-    np.testing.assert_allclose(np.diag(solid.inertia), np.diag(box_inertia(sides, sides.prod())), rtol=0.1)
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(10, 200), st.integers(6, 32))
 def test_simplified_hull_is_convex_small_and_keeps_its_volume(seed: int, count: int, limit: int):
@@ -77,14 +55,6 @@ def test_simplified_hull_is_convex_small_and_keeps_its_volume(seed: int, count: 
     assert len(simple.vertices) <= limit
     assert_convex_and_outward(simple)
     assert g.mesh_volume(*simple) == pytest.approx(g.mesh_volume(*full), rel=1e-9)
-
-
-def test_flat_or_too_few_points_have_no_hull():
-    grid = np.stack(np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [0.5]), axis=-1).reshape(-1, 3)
-    with pytest.raises(ValueError, match="plane"):
-        g.convex_hull(grid)
-    with pytest.raises(ValueError, match="four points, got 3"):
-        g.convex_hull(np.eye(3))
 
 
 def test_surface_points_lie_on_the_outer_surface_and_cover_it():

@@ -84,22 +84,16 @@ def test_what_is_no_object_of_ours_is_never_written_over(text: str, tmp_path: Pa
     assert mine.read_text() == text
 
 
-def test_objects_whose_mesh_is_gone_stay(in_process: None, tmp_path: Path):
-    old, new, out = brick(tmp_path / "old.stl"), brick(tmp_path / "new.stl"), tmp_path / "out"
-    import_meshes([old], out)
-    old.unlink()
-    result = {r.job.name: r.status for r in import_meshes([new], out)}
-    assert result == {"new": "imported", "old": "gone"}
-    assert (out / "old.usd").is_file()
-
-
-def test_an_object_follows_its_mesh(in_process: None, tmp_path: Path):
+def test_an_object_follows_its_mesh_and_one_whose_mesh_is_gone_stays(in_process: None, tmp_path: Path):
     here, there, out = tmp_path / "here" / "mug.stl", tmp_path / "there" / "mug.stl", tmp_path / "out"
     import_meshes([brick(here)], out)
     here.parent.rename(there.parent)
     assert [r.status for r in import_meshes([there], out)] == ["imported"]
     assert read_object(out / "mug.usd").file == str(there)
     assert [r.status for r in import_meshes([there], out)] == ["cached"]
+    there.unlink()
+    result = {r.job.name: r.status for r in import_meshes([brick(tmp_path / "new.stl")], out)}
+    assert result == {"new": "imported", "mug": "gone"} and (out / "mug.usd").is_file()
 
 
 def test_a_default_set_has_the_objects_of_one_folder(

@@ -3,16 +3,14 @@
 import dataclasses
 import json
 import re
-import typing
 from pathlib import Path
 
 import pytest
 
 from vd.config import from_dict, to_dict
 from vd.device import resolve_device
-from vd.envs.cfg import ObservationCfg
 from vd.train.cli import main
-from vd.train.config import minibatches, validate
+from vd.train.config import validate
 from vd.train.flags import OF_HELP_ALL, parse_teacher
 from vd.train.presets import PRESETS, TeacherCfg
 
@@ -25,15 +23,6 @@ def test_every_preset_parses_validates_and_survives_a_file(name):
     validate(preset.ppo, preset.policy, preset.run)
     preset.env.validate()
     assert from_dict(TeacherCfg, json.loads(json.dumps(to_dict(preset)))) == preset
-
-
-def test_the_task_of_the_paper_preset_is_the_environments_defaults_on_as_many_objects():
-    cfg = PRESETS["paper"]()
-    seen = ObservationCfg(canonical=True)
-    assert cfg.env == type(cfg.env)(num_envs=32000, objects=("procedural-150-seed0",), observation=seen)
-    assert minibatches(cfg.ppo, cfg.env.num_envs) == 4
-    assert all(preset().env.observation.canonical for preset in PRESETS.values()), "in all that is new"
-    assert not ObservationCfg().canonical, "what files do not say that are older"
 
 
 @pytest.mark.parametrize(
@@ -69,50 +58,19 @@ def test_a_preset_for_a_hand_of_its_own_serves_the_other():
         assert parse_teacher(flags).env.observation.view == "world"
 
 
-def _flags(cls: type, prefix: str = "--") -> list[str]:
-    """Flags that the nested dataclass ``cls`` should have."""
-    flags = []
-    hints = typing.get_type_hints(cls)
-    for field in dataclasses.fields(cls):
-        name = field.name.replace("_", "-")
-        if dataclasses.is_dataclass(hints[field.name]):
-            inner = prefix if name == "run" else f"{prefix}{name}."
-            flags += _flags(hints[field.name], inner)
-        else:
-            flags.append(prefix + name)
-    return flags
-
-
-def _listed(capsys, flag: str) -> set[str]:
-    """Flags that a help lists."""
-    with pytest.raises(SystemExit) as end:
-        main(["teacher", flag])
-    assert end.value.code == 0
-    text = capsys.readouterr().out
-    return {f for f in _flags(TeacherCfg) if re.search(rf"^\W*{re.escape(f)}[, ]", text, re.MULTILINE)}
-
-
 def test_help_lists_at_most_80_flags_and_help_all_the_others_too(capsys):
-    short, everything = (_listed(capsys, flag) for flag in ("--help", "--help-all"))
-    assert everything == set(_flags(TeacherCfg)) >= {"--env.reward.success", "--max-minutes"}
-    assert len(short) <= 80
-    hidden = {"--" + name.replace("_", "-") for name in OF_HELP_ALL}
-    left_out = everything - short
-    assert all(any(flag == name or flag.startswith(f"{name}.") for name in hidden) for flag in left_out)
-    assert all(any(flag == name or flag.startswith(f"{name}.") for flag in left_out) for name in hidden)
+    listed = []
+    for flag in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as end:
+            main(["teacher", flag])
+        assert end.value.code == 0
+        listed.append(set(re.findall(r"^\W*(--[\w.-]+)", capsys.readouterr().out, re.MULTILINE)))
+    short, everything = listed
+    assert len(short) <= 80 and {"--env.reward.success", "--max-minutes"} <= everything >= short
+    hidden = ["--" + name.replace("_", "-") for name in OF_HELP_ALL]
+    for flag in everything:
+        assert (flag in short) != any(flag == name or flag.startswith(f"{name}.") for name in hidden), flag
     assert parse_teacher(["--preset", "gpu", "--env.sim.njmax", "200"]).env.sim.njmax == 200
-
-
-def test_help_needs_neither_torch_nor_the_simulator():
-    import subprocess
-    import sys
-
-    code = (
-        "import sys; from vd.train.flags import parse_teacher; parse_teacher(['--preset', 'gpu']);"
-        "heavy = {'torch', 'warp', 'newton', 'matplotlib', 'rsl_rl'} & set(sys.modules);"
-        "assert not heavy, heavy"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_flags_override_the_preset_and_short_forms_mean_the_environment():
@@ -251,21 +209,3 @@ def test_files_from_before_a_field_went_are_read_if_it_was_off():
     before["env"]["aim"]["enabled"] = True
     with pytest.warns(UserWarning, match=r"env\.aim\.enabled is True; this version ignores it"):
         assert from_dict(TeacherCfg, before) == PRESETS["gpu"]()
-
-
-def test_configuration_errors_name_the_path_of_the_field():
-    good = to_dict(PRESETS["gpu"]())
-    for path, value, message in (
-        (("ppo", "epochs"), "three", "ppo.epochs: expected int"),
-        (("env", "sim", "njmax"), "many", "env.sim.njmax: expected int"),
-        (("policy", "std_range"), [0.1], "policy.std_range: expected 2 values"),
-        (("ppo", "schedule"), "linear", "ppo.schedule: 'linear' is not one of"),
-        (("env", "reward"), 3, "env.reward: expected fields of RewardCfg"),
-    ):
-        bad = json.loads(json.dumps(good))
-        inner = bad
-        for key in path[:-1]:
-            inner = inner[key]
-        inner[path[-1]] = value
-        with pytest.raises(ValueError, match=message.replace(".", r"\.")):
-            from_dict(TeacherCfg, bad)

@@ -12,7 +12,7 @@ from vd.envs.cfg import CurriculumCfg, TighteningCfg
 from vd.evaluate.agents import SHIPPED_POLICIES, trained_task
 from vd.policy import MeanAction, load_policy, policy_export
 from vd.train import begin
-from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start, unlike
+from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start
 from vd.train.checkpoint import BEST_NAME, find_checkpoint, load_checkpoint, save_checkpoint
 from vd.train.cli import main
 from vd.train.flags import parse_teacher
@@ -197,16 +197,6 @@ def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it
     assert _same(_state(runner.alg.critic), _state(again.alg.critic)) == list(_state(again.alg.critic))
 
 
-def test_a_policy_that_remembers_is_refused(tmp_path):
-    path = _export(tmp_path / "first")
-    state = load_checkpoint(path)
-    state["task"]["observation"] = {"history": 5}
-    save_checkpoint(path, state)
-    runner = make_runner(tmp_path / "second", policy=NORMALISING)
-    with pytest.raises(ValueError, match=r"--init: .*observation\.history is 5, and this version has only 0"):
-        runner.begin_from(str(path))
-
-
 def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys):
     assert find_start("dclaw3-table") == SHIPPED_POLICIES["dclaw3-table"]
     make_runner(tmp_path).learn(1)
@@ -245,19 +235,3 @@ def test_without_a_preset_the_learner_is_the_policys_if_it_says(tmp_path):
     save_checkpoint(path, state)
     with pytest.raises(ValueError, match=r"task has no field wind.*add --preset"):
         parse_teacher(["--init", str(path)])
-
-
-def test_what_observations_and_actions_mean_is_compared():
-    before, now = to_dict(PRESETS["gpu"]().env), to_dict(PRESETS["paper"]().env)
-    now["action"]["ema_alpha"] = 0.5
-    assert unlike(before, before) == []
-    found = unlike(before, now)
-    assert (
-        "env.observation.view goal, here world" in found and "env.observation.shape full, here none" in found
-    )
-    assert "env.action.ema_alpha 0.8, here 0.5" in found and len(found) == 3, "rewards are the run's own"
-    older, other = to_dict(PRESETS["gpu"]().env), to_dict(PRESETS["gpu"]().env)
-    del older["observation"]["file_axes"]  # a file from before there was a choice
-    assert unlike(older, other) == []
-    other["observation"]["file_axes"] = False
-    assert unlike(older, other) == ["env.observation.file_axes True, here False"]

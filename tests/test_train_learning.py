@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from rsl_rl.env import VecEnv
-from tensordict import TensorDict
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
 from vd.policy import TrainedPolicy
@@ -18,44 +16,9 @@ from vd.train.metrics import GoalWindow, StepMeans, read_progress
 from vd.train.ppo import RUNAWAY_KL
 from vd.train.vec_env import ReorientVecEnv
 
-
-@pytest.fixture
-def env() -> ReorientVecEnv:
-    return ReorientVecEnv(DummyEnv(num_envs=4))
-
-
-def test_vec_env_contract(env):
-    assert isinstance(env, VecEnv)
-    observation = env.get_observations()
-    assert isinstance(observation, TensorDict) and observation.batch_size == torch.Size([4])
-    assert observation["policy"].shape == (4, 5) and observation["policy"].dtype == torch.float32
-    keys = None
-    for _ in range(12):
-        observation, reward, done, extras = env.step(torch.zeros(4, 2))
-        assert observation["policy"].shape == (4, 5)
-        assert reward.shape == done.shape == extras["time_outs"].shape == (4,)
-        assert keys in (None, list(extras["log"]))
-        keys = list(extras["log"])
-        assert all(value.ndim == 0 for value in extras["log"].values())
-    assert {"reward/total", "reward/distance", "reward/bonus", "task/rotation_error", "task/reached"} <= set(
-        keys
-    )
-
-
-def test_actions_reach_the_environment_and_outputs_are_of_this_step(env):
-    target = wp.to_torch(env.env.observation)[:, :2].clone()
-    _, reward, _, extras = env.step(target + 0.5)
-    assert torch.allclose(reward, torch.full((4,), -0.5), atol=1e-6)
-    assert float(extras["log"]["reward/total"]) == pytest.approx(-0.5, abs=1e-6)
-    assert float(extras["log"]["task/rotation_error"]) == pytest.approx(math.sqrt(0.5), abs=1e-6)
-
-
-def test_observation_survives_the_next_step(env):
-    before = env.get_observations()
-    kept = before["policy"].clone()
-    env.step(torch.zeros(4, 2))
-    assert torch.equal(before["policy"], kept)
-    assert not torch.equal(env.get_observations()["policy"], kept)
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs and waits need a GPU")
+NORMALISING = dataclasses.replace(SMALL_POLICY, normalise_observations=True)
+TIGHTENING = dataclasses.replace(NORMALISING, std_range=(0.2, 1.0), quiet_std=0.05)
 
 
 def _fixed_flags(env: ReorientVecEnv, success, fell, timed_out) -> None:
@@ -69,18 +32,9 @@ def _fixed_flags(env: ReorientVecEnv, success, fell, timed_out) -> None:
     env.env.step = step
 
 
-def test_success_is_done_and_only_a_pure_time_out_bootstraps(env):
-    _fixed_flags(env, success=[1, 0, 0, 1], fell=[0, 1, 0, 0], timed_out=[0, 0, 1, 1])
-    _, _, done, extras = env.step(torch.zeros(4, 2))
-    assert done.tolist() == [1, 1, 1, 1]
-    assert extras["time_outs"].tolist() == [0, 0, 1, 0]
-    shares = {name: float(extras["log"][f"task/{name}"]) for name in ("reached", "dropped", "timed_out")}
-    assert shares == {"reached": 0.5, "dropped": 0.25, "timed_out": 0.25}
-
-
-def test_time_out_adds_the_discounted_value_of_the_stored_observation(tmp_path):
+def test_success_is_done_and_a_pure_time_out_adds_the_discounted_value_of_what_was_seen(tmp_path):
     runner = make_runner(tmp_path, env=DummyEnv(num_envs=4))
-    _fixed_flags(runner.env, success=[1, 0, 0, 0], fell=[0, 1, 0, 0], timed_out=[0, 0, 1, 0])
+    _fixed_flags(runner.env, success=[1, 0, 0, 1], fell=[0, 1, 0, 0], timed_out=[0, 0, 1, 1])
     observation = runner.env.get_observations()
     with torch.inference_mode():
         value = runner.alg.critic(observation).squeeze(1)
@@ -90,14 +44,17 @@ def test_time_out_adds_the_discounted_value_of_the_stored_observation(tmp_path):
         runner.alg.process_env_step(observation, reward, done, extras)
     expected = reward + runner.alg.gamma * value * torch.tensor([0.0, 0.0, 1.0, 0.0])
     assert torch.allclose(runner.alg.storage.rewards[0].squeeze(1), expected)
-    assert runner.alg.storage.dones[0].flatten().tolist() == [1, 1, 1, 0]
+    assert runner.alg.storage.dones[0].flatten().tolist() == [1, 1, 1, 1]
+    shares = {name: float(extras["log"][f"task/{name}"]) for name in ("reached", "dropped", "timed_out")}
+    assert shares == {"reached": 0.5, "dropped": 0.25, "timed_out": 0.25}
 
 
 @pytest.mark.parametrize("distribution", ["state-dependent", "gaussian"])
-def test_learns_to_follow_the_target(tmp_path, distribution):
-    ppo = dataclasses.replace(SMALL_PPO, minibatch_size=128)
+def test_learns_to_follow_the_target_on_a_gpu_by_a_graph(tmp_path, distribution, device):
+    ppo = dataclasses.replace(SMALL_PPO, minibatch_size=128, cuda_graph=device != "cpu")
     policy = dataclasses.replace(SMALL_POLICY, distribution=distribution)
-    runner = make_runner(tmp_path, env=DummyEnv(num_envs=64), ppo=ppo, policy=policy, save_every=100)
+    env = DummyEnv(num_envs=64, device=device)
+    runner = make_runner(tmp_path, env=env, ppo=ppo, policy=policy, device=device, save_every=100)
     runner.learn(25)
     rows = read_progress(tmp_path / "progress.jsonl")
     first, last = rows[0], rows[-1]
@@ -105,21 +62,6 @@ def test_learns_to_follow_the_target(tmp_path, distribution):
     assert last["success_per_goal"] > 2 * first["success_per_goal"]
     assert last["action_std"] < first["action_std"]
     assert last["loss/value"] < 0.2 * first["loss/value"]
-
-
-def test_two_learning_rates_survive_the_adaptive_schedule(tmp_path):
-    ppo = dataclasses.replace(SMALL_PPO, schedule="adaptive", desired_kl=1e-4)
-    runner = make_runner(tmp_path, ppo=ppo)
-    actor, critic = runner.alg.optimizer.param_groups
-    assert (actor["lr"], critic["lr"]) == (2e-3, 3e-3)
-    ids = [{id(p) for p in group["params"]} for group in (actor, critic)]
-    assert ids == [
-        {id(p) for p in runner.alg.actor.parameters()},
-        {id(p) for p in runner.alg.critic.parameters()},
-    ]
-    runner.learn(2)
-    assert actor["lr"] == runner.alg.learning_rate < 2e-3
-    assert critic["lr"] == 3e-3
 
 
 def test_an_update_that_runs_away_ends_with_its_epoch(tmp_path):
@@ -263,11 +205,6 @@ def test_policy_equals_the_actor_it_came_from(tmp_path, distribution, normalise)
         assert loaded.hand == "dummy" and loaded.iteration == 3
 
 
-needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs and waits need a GPU")
-NORMALISING = dataclasses.replace(SMALL_POLICY, normalise_observations=True)
-TIGHTENING = dataclasses.replace(NORMALISING, std_range=(0.2, 1.0), quiet_std=0.05)
-
-
 def _after_a_rollout(runner):
     """The runner with a rollout whose samples lie where minibatches are gathered from."""
     observation = runner.env.get_observations()
@@ -278,23 +215,6 @@ def _after_a_rollout(runner):
         runner.alg.compute_returns(observation)
     runner.alg._take_samples()
     return runner
-
-
-def test_gradients_change_nothing_but_gradients(tmp_path):
-    """A recording runs them a few times before, and must not draw from the random numbers of the run."""
-    alg = _after_a_rollout(make_runner(tmp_path, policy=NORMALISING)).alg
-    before = [
-        tensor.clone() for network in (alg.actor, alg.critic) for tensor in network.state_dict().values()
-    ]
-    random, rows = torch.get_rng_state(), torch.arange(64)
-    first = alg._gradients(rows)
-    gradients = [parameter.grad.clone() for parameter in alg._parameters]
-    assert torch.equal(alg._gradients(rows), first)
-    assert all(torch.equal(p.grad, g) for p, g in zip(alg._parameters, gradients, strict=True))
-    assert any(g.abs().max() > 0.0 for g in gradients)
-    after = [tensor for network in (alg.actor, alg.critic) for tensor in network.state_dict().values()]
-    assert all(torch.equal(one, two) for one, two in zip(before, after, strict=True))
-    assert torch.equal(torch.get_rng_state(), random)
 
 
 def test_what_gradients_are_computed_from_stays_where_it_is_in_memory(tmp_path):
@@ -322,22 +242,6 @@ def test_what_gradients_are_computed_from_stays_where_it_is_in_memory(tmp_path):
 
 
 @needs_gpu
-@pytest.mark.parametrize("distribution", ["state-dependent", "gaussian"])
-def test_neither_actions_nor_gradients_wait_for_the_device(tmp_path, distribution):
-    policy = dataclasses.replace(NORMALISING, distribution=distribution)
-    runner = _after_a_rollout(make_runner(tmp_path, policy=policy, device="cuda:0"))
-    observation, rows = runner.env.get_observations(), torch.arange(64, device="cuda:0")
-    runner.alg._gradients(rows)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        with torch.inference_mode():
-            runner.alg.act(observation)
-        runner.alg._minibatch_step(rows)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-
-
-@needs_gpu
 def test_a_recorded_graph_gives_the_gradients_of_every_minibatch(tmp_path):
     graphed = dataclasses.replace(SMALL_PPO, cuda_graph=True)
     plain, recorded = (
@@ -354,21 +258,3 @@ def test_a_recorded_graph_gives_the_gradients_of_every_minibatch(tmp_path):
             assert torch.allclose(one.grad, two.grad, rtol=1e-3, atol=1e-5)
             with torch.no_grad():  # rounding must not add up
                 two.copy_(one)
-
-
-@needs_gpu
-def test_a_run_with_a_recorded_graph_learns_saves_and_goes_on(tmp_path):
-    ppo = dataclasses.replace(SMALL_PPO, minibatch_size=128, cuda_graph=True, schedule="adaptive")
-    env = DummyEnv(num_envs=64, device="cuda:0")
-    runner = make_runner(tmp_path, env=env, ppo=ppo, policy=NORMALISING, device="cuda:0", save_every=25)
-    runner.learn(25)
-    rows = read_progress(tmp_path / "progress.jsonl")
-    assert rows[-1]["success_per_goal"] > 2 * rows[0]["success_per_goal"]
-    assert rows[-1]["loss/value"] < 0.2 * rows[0]["loss/value"]
-    again = make_runner(tmp_path, env=env, ppo=ppo, policy=NORMALISING, device="cuda:0")
-    again.load(str(tmp_path / "checkpoints" / "model_0000025.pt"))
-    again.learn(1)
-    eager = dataclasses.replace(ppo, cuda_graph=False)
-    again = make_runner(tmp_path, env=env, ppo=eager, policy=NORMALISING, device="cuda:0")
-    again.load(str(tmp_path / "checkpoints" / "model_0000025.pt"))
-    again.learn(1)

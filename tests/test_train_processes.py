@@ -99,39 +99,3 @@ def test_two_processes_keep_the_same_parameters_and_their_own_worlds_until_one_h
     assert weights.tolist() == one["weights"]
     alone.learn(1)
     assert [row["env_steps"] for row in read_progress(tmp_path / "progress.jsonl")] == [128, 256, 256 + 64]
-
-
-FAILING = (
-    BEGIN
-    + """
-env = DummyEnv(num_envs=8, seed=rank)
-runner = make_runner(folder, env=env, seed=rank)
-def check():
-    if rank == 0 and env.steps >= 16:
-        raise RuntimeError("a world went bad")
-env.check = check
-def hang():
-    time.sleep(600)
-runner.shutdown = hang  # with NCCL, leaving the group waits for the others
-try:
-    with distributed.ending_together():
-        runner.learn(5)
-finally:
-    runner.shutdown()
-"""
-)
-
-
-@pytest.mark.slow
-def test_the_error_of_one_process_is_told_and_ends_it_at_once(tmp_path):
-    code = FAILING.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
-    processes = _two_processes(code, stderr=subprocess.PIPE, text=True)
-    try:
-        _, error = processes[0].communicate(timeout=PATIENCE_S)
-        assert processes[0].returncode == 1
-        assert "process 0 failed" in error and "a world went bad" in error
-        # The other one was waiting for it in a collective.
-        assert processes[1].wait(timeout=PATIENCE_S) != 0
-    finally:
-        for process in processes:
-            process.kill()

@@ -3,9 +3,7 @@
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +11,6 @@ import pytest
 import torch
 
 from vd.evaluate.agents import trained_task
-from vd.evaluate.cli import main as evaluate
 from vd.policy import load_policy
 from vd.sim.cfg import SimCfg, coarser
 from vd.train.checkpoint import checkpoint_path
@@ -47,7 +44,7 @@ def _train(run_dir: Path, iterations: int, observation=None, **begin) -> Teacher
 
 @pytest.mark.slow
 def test_a_run_goes_on_bit_for_bit_and_another_sees_more_from_there(tmp_path):
-    """It learns in coarser physics; what it learned is judged in the default, also under faults."""
+    """It learns in coarser physics; what it learned is judged in the default."""
     whole = _train(tmp_path / "whole", 4)
     assert whole.env.env.cfg.sim == coarser(SimCfg()) != SimCfg()
     assert trained_task(load_policy(tmp_path / "whole" / "policy.pt")).sim == SimCfg()
@@ -79,25 +76,22 @@ def test_a_run_goes_on_bit_for_bit_and_another_sees_more_from_there(tmp_path):
     policy = load_policy(tmp_path / "seeing" / "policy.pt")
     assert policy.task["observation"]["shape"] == "full"
     assert torch.isfinite(policy.act(seeing.env.get_observations()["policy"])).all()
-    arguments = ["--episodes", "1", "--num-envs", "1", "--episode-s", "0.5", "--device", "cpu"]
-    arguments += ["--condition", "mixed", "--out"]
-    assert evaluate([str(tmp_path / "seeing"), *arguments, str(tmp_path / "eval")]) == 0
 
 
 @pytest.mark.slow
 def test_the_command_trains_saves_on_sigterm_and_resumes(tmp_path):
-    command = [sys.executable, "-m", "vd.train.cli", "teacher", "--out", str(tmp_path)]
-    run = subprocess.Popen(
-        [*command, "--smoke", "--num-envs", "4", "--max-steps", "100000", "--max-minutes", "5"],
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )
-    progress = tmp_path / PROGRESS_FILE
-    deadline = time.monotonic() + 240
-    while not (progress.is_file() and progress.read_text().count("\n") >= 2) and time.monotonic() < deadline:
-        assert run.poll() is None, "training ended by itself"
-        time.sleep(0.2)
-    run.send_signal(signal.SIGTERM)
-    assert run.wait(timeout=300) == 143
+    progress, ended = tmp_path / PROGRESS_FILE, threading.Event()
+
+    def end() -> None:
+        while not (progress.is_file() and progress.read_text().count("\n") >= 2):
+            if ended.wait(0.1):
+                return
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=end).start()
+    limits = ["--num-envs", "4", "--max-steps", "100000", "--max-minutes", "5"]
+    assert main(["teacher", "--out", str(tmp_path), "--smoke", *limits]) == 143
+    ended.set()
     done = read_progress(progress)[-1]["iteration"]
     config = json.loads((tmp_path / "config.json").read_text())
     assert config["env"]["num_envs"] == 4

@@ -57,10 +57,7 @@ class DummyEnv:
         self.step_count = wp.zeros(n, dtype=wp.int32, device=device)
         self.goal_counts = wp.zeros(3, dtype=float, device=device)
         self.stage = Stage(difficulty=0.0)
-        self.updates = 0
-        self.checks = 0
         self.steps = 0
-        self.closed = False
         self._generator = np.random.default_rng(seed)
         self._target = self._draw(n)
         self._observe()
@@ -95,12 +92,10 @@ class DummyEnv:
         self._observe()
 
     def check(self) -> None:
-        """Count the call."""
-        self.checks += 1
+        """All is well."""
 
     def update_curriculum(self) -> dict[str, float]:
         """Raise the difficulty a little."""
-        self.updates += 1
         self.stage = replace(self.stage, difficulty=min(1.0, self.stage.difficulty + 0.01))
         return asdict(self.stage)
 
@@ -142,8 +137,7 @@ class DummyEnv:
         self._observe()
 
     def close(self) -> None:
-        """Note the call."""
-        self.closed = True
+        """Nothing to release."""
 
 
 def simulating_the_dummy(monkeypatch) -> None:

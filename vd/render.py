@@ -123,7 +123,6 @@ class PictureModel:
     ):
         cfg = SimCfg()
         self.cells, self.ghost_in_scene = len(objects), ghost_in_scene
-        self.hand_dofs = hand.num_joints if hand else 0
         scene = new_builder()
         ghosts = []
         hand_builder = build_hand(hand, cfg, visuals=True) if hand else None

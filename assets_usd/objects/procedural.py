@@ -224,11 +224,11 @@ def _block(name: str, sides: Sequence[float], group: str, version: str) -> Objec
     )
 
 
-def cube(side: float = CUBE_SIDE_M) -> ObjectModel:
+def cube() -> ObjectModel:
     """The cube, with its group of 24 rotations."""
-    return _block("cube", (side, side, side), "O", f"{side}")
+    return _block("cube", [CUBE_SIDE_M] * 3, "O", f"{CUBE_SIDE_M}")
 
 
-def cuboid(sides: Sequence[float] = CUBOID_SIDES_M) -> ObjectModel:
+def cuboid() -> ObjectModel:
     """The cuboid, with its group of four rotations."""
-    return _block("cuboid", sides, "D2", f"{list(sides)}")
+    return _block("cuboid", CUBOID_SIDES_M, "D2", f"{list(CUBOID_SIDES_M)}")

@@ -67,19 +67,18 @@ def one_object(name: str) -> ObjectModel:
     return found[0]
 
 
-def scan_object(path: Path, *, seed: int = 0) -> ObjectModel:
+def scan_object(path: Path) -> ObjectModel:
     """An object from a scan, for its surface; its collision shape is its convex hull.
 
     Args:
         path: PLY, OBJ or GLB; a mesh or points, in the unit in which it is as large as objects are.
-        seed: Of the samples.
 
     Raises:
         GoalError: The file is of no use; names it, what is wrong, and the remedy.
     """
     path = Path(path)
     try:
-        surface = _surface(path, np.random.default_rng(seed))
+        surface = _surface(path, np.random.default_rng(0))
     except MeshError as error:
         raise GoalError(f"{path}: {error}; scan it again, or export it as PLY") from error
     factor = _unit(path, float(np.ptp(surface.vertices, axis=0).max()))
@@ -91,7 +90,7 @@ def scan_object(path: Path, *, seed: int = 0) -> ObjectModel:
             faces,
             [convex_hull(vertices)],
             solid_of_mesh(vertices, faces),
-            surface_points(vertices, faces, SURFACE_POINTS, seed=seed),
+            surface_points(vertices, faces, SURFACE_POINTS),
             source=str(path),
             family="scan",
             scale=factor,

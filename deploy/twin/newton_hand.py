@@ -20,8 +20,8 @@ from vd.kernels.task.actions import limit_joint_velocity_kernel
 from vd.paper import PAPER
 from vd.sim.actuators import JointServo, has_effects
 from vd.sim.cfg import SimCfg
+from vd.sim.engine import make_solver
 from vd.sim.scene import Scene, add_table, build_hand, build_scene, new_builder
-from vd.sim.simulator import make_solver
 
 SHORTEST_COMMAND_S = 0.0025
 """Commands do not come more often, or some of those that are delayed are lost: two for each goal."""

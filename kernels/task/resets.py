@@ -161,20 +161,3 @@ def reset_kernel(
     goal_quat_out[world] = goal
     previous_error_out[world] = rotation_angle(rotation_difference(orientation, goal))
     rng[world] = next_stream(state, world)
-
-
-@wp.kernel
-def give_goal_kernel(
-    # In:
-    given_goal_in: wp.array[wp.quat],  # [N] wanted orientations
-    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
-    object_column: int,  # column of the object's quaternion
-    # Out:
-    goal_quat_out: wp.array[wp.quat],  # [N] goal orientation with the sign that :func:`reset_kernel` gives it
-    goal_steps_out: wp.array[int],  # [N] control steps since the goal was given: 0
-):
-    """Give goals from outside to worlds as they are. Launch: [N]."""
-    world = wp.tid()
-    orientation = read_quat(world, object_column, joint_q_in)
-    goal_quat_out[world] = goal_beside(given_goal_in[world], orientation)
-    goal_steps_out[world] = 0

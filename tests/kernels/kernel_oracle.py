@@ -25,17 +25,6 @@ def device_array(value: object, dtype: object, device: str) -> wp.array:
     return wp.array(np.ascontiguousarray(value), dtype=dtype, device=device)
 
 
-def launch(kernel: wp.Kernel, dim: object, arguments: list, device: str) -> None:
-    """Launch ``kernel``; what is not on the device is copied to arrays of the types that it declares."""
-    values = [
-        device_array(value, argument.type.dtype, device)
-        if wp.types.is_array(argument.type) and not isinstance(value, wp.array)
-        else value
-        for argument, value in zip(kernel.adj.args, arguments, strict=True)
-    ]
-    wp.launch(kernel, dim=dim, inputs=values, device=device)
-
-
 def unwritten(shape: int | tuple[int, ...], dtype: object, device: str) -> wp.array:
     """An array of NaN, or of ``SENTINEL`` for integers, so that a cell a kernel missed is seen."""
     array = wp.empty(shape, dtype=dtype, device=device)
@@ -45,14 +34,33 @@ def unwritten(shape: int | tuple[int, ...], dtype: object, device: str) -> wp.ar
     return array
 
 
-def settings_array(struct: object, device: str, **values: object) -> wp.array:
-    """An array of one parameter struct; every field must be given, so that none is forgotten."""
-    expected = set(struct.vars)  # type: ignore[attr-defined]
-    assert set(values) == expected, f"fields {sorted(expected ^ set(values))}"
-    instance = struct()  # type: ignore[operator]
-    for name, value in values.items():
-        setattr(instance, name, value)
-    return wp.array([instance], dtype=struct, device=device)
+def on_device(value: object, declared: object, device: str) -> object:
+    """A value as its declared type: an array, a struct given as a dict with every field, or some of these."""
+    array = wp.types.is_array(declared) and not isinstance(value, wp.array)
+    if array and hasattr(declared.dtype, "vars"):  # type: ignore[attr-defined]
+        given = [value] if isinstance(value, dict) else value
+        rows = [on_device(row, declared.dtype, device) for row in given]
+        return wp.array(rows, dtype=declared.dtype, device=device)
+    if isinstance(value, dict):
+        assert set(value) == set(declared.vars), f"fields {sorted(set(declared.vars) ^ set(value))}"
+        made = declared()
+        for name, variable in declared.vars.items():
+            setattr(made, name, on_device(value[name], variable.type, device))
+        return made
+    return device_array(value, declared.dtype, device) if array else value
+
+
+def launch(
+    kernel: wp.Kernel, dim: object, arguments: list, device: str, *outputs: int | tuple[int, ...]
+) -> list[np.ndarray]:
+    """Launch ``kernel`` on ``arguments``, then on unwritten arrays of these shapes, which are returned."""
+    declared = [argument.type for argument in kernel.adj.args]
+    given = zip(arguments, declared[: len(arguments)], strict=True)
+    values = [on_device(value, kind, device) for value, kind in given]
+    shapes = zip(outputs, declared[len(arguments) :], strict=True)
+    made = [unwritten(shape, kind.dtype, device) for shape, kind in shapes]
+    wp.launch(kernel, dim=dim, inputs=[*values, *made], device=device)
+    return [array.numpy() for array in made]
 
 
 def streams(worlds: int, seed: int, device: str) -> wp.array:
@@ -70,6 +78,11 @@ def floats(shape: tuple[int, ...], low: float = -2.0, high: float = 2.0) -> st.S
     # Subnormal numbers are flushed to zero on some devices and mean nothing here.
     elements = st.floats(low, high, width=32, allow_subnormal=False)
     return hnp.arrays(np.float32, shape, elements=elements)
+
+
+def indices(shape: int | tuple[int, ...], count: int) -> st.SearchStrategy[np.ndarray]:
+    """Arrays of integers from 0 to below ``count``."""
+    return hnp.arrays(np.int32, shape, elements=st.integers(0, count - 1))
 
 
 @st.composite

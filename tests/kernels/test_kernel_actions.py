@@ -2,15 +2,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import ALPHA, EXAMPLES, device_array, floats, launch, settings_array, streams, unwritten
+from kernel_oracle import ALPHA, EXAMPLES, device_array, floats, launch, streams
 from scipy import stats
 
-from vd.kernels.task.actions import (
-    ActionParams,
-    apply_action_kernel,
-    joint_effort_kernel,
-    limit_joint_velocity_kernel,
-)
+from vd.kernels.task.actions import apply_action_kernel, joint_effort_kernel, limit_joint_velocity_kernel
 from vd.paper import PAPER
 
 EXTRA = 7
@@ -21,28 +16,13 @@ STEP_RAD = PAPER.action.scale_rad_s / PAPER.scene.control_hz
 
 def apply_action(device, action, offset, q, smoothed, lower, upper, *, noise_std=0.0, seed=0, alpha=0.8):
     """One launch; returns the smoothed action and the targets (with the EXTRA columns) and the streams."""
-    worlds, joints = action.shape
-    smoothed_array = device_array(smoothed, float, device)
-    target = unwritten((worlds, joints + EXTRA), float, device)
-    rng = streams(worlds, seed, device)
-    params = settings_array(ActionParams, device, alpha=alpha, step_rad=STEP_RAD, noise_std=noise_std)
-    launch(
-        apply_action_kernel,
-        worlds,
-        [
-            lower,
-            upper,
-            params,
-            action,
-            offset,
-            np.pad(q, ((0, 0), (0, EXTRA)), constant_values=np.nan),
-            smoothed_array,
-            rng,
-            target,
-        ],
-        device,
-    )
-    return smoothed_array.numpy(), target.numpy(), rng.numpy()
+    worlds = len(action)
+    average, rng = device_array(smoothed, float, device), streams(worlds, seed, device)
+    params = {"alpha": alpha, "step_rad": STEP_RAD, "noise_std": noise_std}
+    wide = np.pad(q, ((0, 0), (0, EXTRA)), constant_values=np.nan)
+    inputs = [lower, upper, params, action, offset, wide, average, rng]
+    (target,) = launch(apply_action_kernel, worlds, inputs, device, wide.shape)
+    return average.numpy(), target, rng.numpy()
 
 
 @EXAMPLES
@@ -87,10 +67,8 @@ def test_action_noise_has_the_moments_of_table_s3(device):
 @given(data=st.data(), fingers=st.sampled_from([3, 4]), worlds=st.integers(1, 3))
 def test_velocity_limit_shortens_the_step(device, data, fingers, worlds):
     joints, dt = 3 * fingers, 1 / PAPER.scene.physics_hz
-    q_prev, qd = (
-        data.draw(floats((worlds, joints + EXTRA))),
-        data.draw(floats((worlds, joints + EXTRA), -12, 12)),
-    )
+    q_prev = data.draw(floats((worlds, joints + EXTRA)))
+    qd = data.draw(floats((worlds, joints + EXTRA), -12, 12))
     limit = data.draw(floats((joints,), 1.0, 8.0))
     q = (q_prev + dt * qd).astype(np.float32)
     q_array, qd_array = device_array(q, float, device), device_array(qd, float, device)
@@ -112,9 +90,7 @@ def test_effort_is_that_of_a_saturated_pd_servo(device, data, fingers, worlds):
     kp, kd = data.draw(floats(shape, 0, 5)), data.draw(floats(shape, 0, 0.5))
     effort = data.draw(floats(shape[1:], 0.1, 3))
     target, q, qd = (data.draw(floats(wide)) for _ in range(3))
-    out = unwritten(shape, float, device)
-    inputs = [device_array(a, float, device) for a in (effort, kp, kd, target, q, qd)]
-    launch(joint_effort_kernel, shape, [*inputs, out], device)
+    (out,) = launch(joint_effort_kernel, shape, [effort, kp, kd, target, q, qd], device, shape)
     hand = slice(0, shape[1])
     torque = kp * (target[:, hand].astype(np.float64) - q[:, hand]) - kd * qd[:, hand]
-    np.testing.assert_allclose(out.numpy(), np.clip(torque, -effort, effort), atol=1e-5)
+    np.testing.assert_allclose(out, np.clip(torque, -effort, effort), atol=1e-5)

@@ -4,25 +4,80 @@ import mujoco
 import numpy as np
 import pytest
 import warp as wp
-from chain_rolls import (
-    DT,
-    FINE,
-    GRAVITY,
-    PLAIN,
-    excitation,
-    links_struct,
-    one_joint,
-    random_bodies,
-    roll,
-    rows_of,
-)
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, launch, unwritten
+from kernel_oracle import EXAMPLES, launch
 
+from vd.gap.rollout import links_of
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.chain_bodies import Links, chain_dynamics
-from vd.kernels.servo.effects import EFFECTS
+from vd.kernels.servo.chains import DIVERGED, rollout_kernel
+from vd.kernels.servo.effects import EFFECTS, neutral_row
+
+DT = 1 / 480
+FINE = 10
+"""The oracle's steps in one of the kernel's."""
+PLAIN = {servo.KP: 3.0, servo.KD: 0.3, servo.VELOCITY_LIMIT: 50.0, servo.INERTIA: 2e-3}
+GRAVITY = np.array([1.0, -2.0, 9.0])
+
+
+def random_bodies(rng, n):
+    """Axes, offsets, masses, centres of mass, inertias of a finger-sized chain."""
+    axis = rng.normal(size=(n, 3))
+    turn = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    moments = rng.uniform(5e-6, 1e-5, (n, 3)) + 5e-6
+    return {
+        "axis": axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        "offset": rng.uniform(-0.07, 0.07, (n, 3)),
+        "mass": rng.uniform(0.02, 0.1, n),
+        "com": rng.uniform(-0.05, 0.05, (n, 3)),
+        "inertia": np.einsum("nij,nj,nkj->nik", turn, moments, turn),
+    }
+
+
+def rows_of(*settings, n=1):
+    """Parameter rows [C, n, P] of the plain servo with settings by column."""
+    rows = np.tile(neutral_row(), (len(settings), n, 1))
+    for row, values in zip(rows, settings, strict=True):
+        for column, value in {**PLAIN, **values}.items():
+            row[:, column] = value
+    return rows
+
+
+def roll(device, rows, time, command, start, *, bodies=None, dt=DT, power=None, stops=1e6, effort=1e6):
+    """Roll trajectories out; time [T], command [R, T, n], start [R, n]. Returns [C, R, T, n]."""
+    runs, count, n = command.shape
+    sets = len(rows)
+    steps = np.tile(time / dt, runs)
+    power = np.ones_like(command) if power is None else power
+    step, fraction = np.floor(steps), steps - np.floor(steps)
+    samples = {"step": step, "fraction": fraction, "sent_step": step, "sent_fraction": fraction}
+    samples |= {"command": command.reshape(-1, n), "power": power.reshape(-1, n)}
+    rolls = sets * runs
+    run = np.tile(np.arange(runs), sets)
+    inputs = [samples, run * count, np.full(rolls, count), np.arange(rolls) * count, run]
+    inputs += [np.tile(start, (sets, 1))]
+    inputs += [np.full(rolls, -1), np.arange(n), np.full(n, -stops), np.full(n, stops), np.full(n, effort)]
+    inputs += [int(bodies is not None), Links() if bodies is None else links_of(**bodies, gravity=GRAVITY)]
+    inputs += [np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS), dt]
+    shapes = [(rolls, n, servo.STATE_COLUMNS), (rolls * count, n)]
+    _, predicted = launch(rollout_kernel, rolls, inputs, device, *shapes)
+    result = predicted.astype(float)
+    assert np.isfinite(result).all(), "a sample was not written, or is no number"
+    return result.reshape(sets, runs, count, n)
+
+
+def one_joint(device, rows, time, command, start=0.0, **options):
+    """One joint, one trajectory: [C, T]."""
+    return roll(device, rows, time, command[None, :, None], np.full((1, 1), start), **options)[:, 0, :, 0]
+
+
+def excitation(rng, seconds=2.0):
+    """Irregular stamps, and steps and a sine as command."""
+    time = np.concatenate([[0.0], np.cumsum(rng.uniform(0.004, 0.03, int(seconds / 0.017)))])
+    steps = rng.uniform(-0.5, 0.5, 8)[np.minimum((time / (seconds / 8)).astype(int), 7)]
+    return time, np.where(time < 0.75 * seconds, steps, 0.4 * np.sin(2 * np.pi * 2.0 * time))
+
 
 # --- Bodies ---
 
@@ -72,8 +127,7 @@ def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
     rng = np.random.default_rng(seed)
     bodies = random_bodies(rng, n)
     q, speed = rng.uniform(-3, 3, (5, 3)), rng.uniform(-6, 6, (5, 3))
-    mass, bias = unwritten(5, wp.mat33, device), unwritten(5, wp.vec3, device)
-    launch(dynamics_kernel, 5, [q, speed, links_struct(bodies, GRAVITY), mass, bias], device)
+    mass, bias = launch(dynamics_kernel, 5, [q, speed, links_of(**bodies, gravity=GRAVITY)], device, 5, 5)
     model, data = mujoco_chain(bodies, GRAVITY)
     for i in range(5):
         data.qpos[:], data.qvel[:] = q[i, :n], speed[i, :n]
@@ -81,9 +135,9 @@ def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
         full = np.zeros((n, n))
         mujoco.mj_fullM(model, full, data.qM) if hasattr(data, "qM") else mujoco.mj_fullM(model, data, full)
         scale = np.abs(full).max()
-        np.testing.assert_allclose(mass.numpy()[i, :n, :n], full, atol=1e-5 * scale)
-        np.testing.assert_allclose(bias.numpy()[i, :n], data.qfrc_bias, atol=2e-6)
-        assert not mass.numpy()[i, n:].any() and not bias.numpy()[i, n:].any()
+        np.testing.assert_allclose(mass[i, :n, :n], full, atol=1e-5 * scale)
+        np.testing.assert_allclose(bias[i, :n], data.qfrc_bias, atol=2e-6)
+        assert not mass[i, n:].any() and not bias[i, n:].any()
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -311,3 +365,63 @@ def test_a_joint_held_by_friction_stays_while_its_neighbours_move(device):
     got = roll(device, rows, time, command, np.zeros((1, n)), bodies=bodies)[0, 0]
     np.testing.assert_array_equal(got[:, 0], 0.0)
     assert np.ptp(got[:, 1:], axis=0).min() > 0.3
+
+
+# --- Commands ---
+
+
+def test_jitter_delays_by_half_a_normal_on_average_and_is_smooth_in_its_size(device):
+    time = np.arange(0, 20.0, 0.25)
+    command = np.where(np.arange(len(time)) % 2 == 0, 0.0, 1.0)
+    sigma = 0.03
+    rows = rows_of({}, {servo.JITTER_SIGMA: sigma}, {servo.JITTER_SIGMA: 1.001 * sigma})
+    many = roll(device, rows, time, np.tile(command[None, :, None], (50, 1, 1)), np.zeros((50, 1)))[..., 0]
+    plain, jittered, nudged = many
+    # Mean position at the next stamp, linearised: the delay of each command moves the answer back.
+    shifted = one_joint(device, rows_of({servo.COMMAND_DELAY: sigma * np.sqrt(2 / np.pi)}), time, command)[0]
+    np.testing.assert_allclose(jittered.mean(axis=0)[10:], shifted[10:], atol=0.015)
+    assert np.abs(jittered - plain).max() > 0.03
+    assert not np.allclose(jittered[0], jittered[1], atol=1e-3), "trajectories share their draws"
+    assert np.abs(nudged - jittered).max() < 1e-3
+
+
+def test_dropped_commands_leave_the_one_before_in_force(device):
+    time = np.arange(0, 60.0, 1.0)
+    command = np.arange(60) % 2 * 0.5
+    p = 0.3
+    got = one_joint(device, rows_of({servo.JITTER_DROP: p}), time, command, start=0.0)[0]
+    # One second settles: the position before each stamp is the command in force, 0 or 0.5.
+    np.testing.assert_allclose(got[1:], 0.5 * np.round(got[1:] / 0.5), atol=2e-3)
+    wrong = np.mean(np.abs(got[1:] - command[:-1]) > 0.25)
+    # The last write that was kept has the wrong parity with probability p / (1 + p).
+    assert wrong == pytest.approx(p / (1 + p), abs=0.17)
+    assert one_joint(device, rows_of({servo.JITTER_DROP: 1.0}), time, command).max() < 1e-6
+
+
+def test_a_coupled_joint_follows_its_neighbour(device):
+    time = np.arange(0, 2.0, 0.01)
+    command = np.zeros((1, len(time), 2))
+    command[0, :, 0] = 0.5
+    rows = rows_of({}, n=2)
+    rows[0, 1, servo.COUPLING_0] = 0.3
+    got = roll(device, rows, time, command, np.zeros((1, 2)))[0, 0]
+    np.testing.assert_allclose(got[-1], [0.5, 0.15], atol=1e-3)
+
+
+@EXAMPLES
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 3))
+def test_any_parameters_within_their_bounds_give_numbers(device, seed, n):
+    rng = np.random.default_rng(seed)
+    rows = np.tile(neutral_row(), (6, n, 1))
+    for effect in EFFECTS.values():
+        for p in effect.parameters:
+            rows[:, :, p.column] = rng.choice([p.lower, p.upper, p.neutral, p.typical], (6, n))
+    rows[:, :, servo.KP] = rng.choice([1e-3, 1e3], (6, n))
+    rows[:, :, servo.KD] = rng.choice([1e-5, 1e2], (6, n))
+    rows[:, :, servo.INERTIA] = rng.choice([0.0, 1e-6, 10.0], (6, n))
+    rows[:, :, servo.VELOCITY_LIMIT] = rng.choice([0.05, 1e6], (6, n))
+    time, command = excitation(rng, 0.5)
+    commands = np.repeat(command[None, :, None], n, axis=2)
+    bodies = random_bodies(rng, n) if rng.random() < 0.5 else None
+    got = roll(device, rows, time, commands, np.zeros((1, n)), bodies=bodies)
+    assert np.abs(got).max() < 2 * DIVERGED

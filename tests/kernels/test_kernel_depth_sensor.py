@@ -11,14 +11,13 @@ from kernel_oracle import (
     floats,
     launch,
     quaternions,
-    settings_array,
     streams,
     unwritten,
 )
 from scipy import stats
 from scipy.spatial.transform import Rotation, Slerp
 
-from vd.kernels.sensor.depth_sensor import DepthSensorParams, delay_poses_kernel, measure_depth_kernel
+from vd.kernels.sensor.depth_sensor import delay_poses_kernel, measure_depth_kernel
 from vd.sensors.cfg import BASELINE_M, FOCAL_PX
 
 FB = FOCAL_PX * BASELINE_M
@@ -41,11 +40,8 @@ def measure(device, depth, *, seed=0, **effects):
     """Measured images of true images [N, H, W], the same sensor in every world."""
     depth = np.asarray(depth, np.float32)
     worlds = len(depth)
-    params = settings_array(DepthSensorParams, device, **{**OFF, **effects})
-    params = wp.array(np.repeat(params.numpy(), worlds), dtype=DepthSensorParams, device=device)
-    out = unwritten(depth.shape, float, device)
-    launch(measure_depth_kernel, depth.shape, [params, depth, streams(worlds, seed, device), out], device)
-    return out.numpy().copy()
+    inputs = [[OFF | effects] * worlds, depth, streams(worlds, seed, device)]
+    return launch(measure_depth_kernel, depth.shape, inputs, device, depth.shape)[0]
 
 
 @st.composite

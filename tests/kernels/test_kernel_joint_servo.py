@@ -58,12 +58,12 @@ def test_commands_arrive_after_their_delay(device, commands, start, delay):
         both = device_array([[command, command]], float, device)
         launch(send_command_kernel, 1, [rows, DT, both, state, rng, *transit], device)
         for k in range(SUBSTEPS):
-            reference = unwritten((1, joints), float, device)
-            launch(receive_command_kernel, (1, joints), [rows, DT, state, *transit, held, reference], device)
+            inputs = [rows, DT, state, *transit, held]
+            (reference,) = launch(receive_command_kernel, (1, joints), inputs, device, (1, joints))
             step = control * SUBSTEPS + k
             expected = [mean_of_delayed(commands, start, d, step) for d in (0.0, delay)]
             # The grid resolves a thousandth of a step; commands jump by 4 at most.
-            assert np.allclose(reference.numpy()[0], expected, atol=0.02)
+            assert np.allclose(reference[0], expected, atol=0.02)
             clock = state.numpy()
             clock[:, servo.STATE_TIME] += DT
             state.assign(clock)
@@ -111,21 +111,15 @@ def test_what_is_measured_is_old_limited_and_biased(device, positions, delay, bi
         allowed = float(np.clip(speed, -limit, limit))
         after = position if abs(speed) <= limit else before + allowed * DT
         q, qd = device_array([[position]], float, device), device_array([[speed]], float, device)
-        launch(
-            finish_joint_kernel, (1, 1), [rows, DT, [[before]], q, qd, index, history, speed_history], device
-        )
+        inputs = [rows, DT, [[before]], q, qd, index, history, speed_history]
+        launch(finish_joint_kernel, (1, 1), inputs, device)
         assert np.allclose(qd.numpy(), allowed, rtol=1e-4, atol=1e-4)
         assert np.allclose(q.numpy(), after, atol=1e-4)
         before = float(q.numpy()[0, 0])
         past.append(before)
         past_speed.append(float(qd.numpy()[0, 0]))
-        measured, measured_speed = (unwritten((1, 1), float, device) for _ in range(2))
-        launch(
-            measure_joint_kernel,
-            (1, 1),
-            [rows, DT, index, history, speed_history, measured, measured_speed],
-            device,
-        )
+        inputs = [rows, DT, index, history, speed_history]
+        measured, measured_speed = launch(measure_joint_kernel, (1, 1), inputs, device, (1, 1), (1, 1))
         when = np.arange(-len(past) + 1, 1) * DT
-        assert np.allclose(measured.numpy(), np.interp(-delay, when, past) + bias, atol=1e-3)
-        assert np.allclose(measured_speed.numpy(), np.interp(-delay, when, past_speed), atol=1e-2)
+        assert np.allclose(measured, np.interp(-delay, when, past) + bias, atol=1e-3)
+        assert np.allclose(measured_speed, np.interp(-delay, when, past_speed), atol=1e-2)

@@ -2,34 +2,12 @@ import numpy as np
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import (
-    EXAMPLES,
-    device_array,
-    floats,
-    launch,
-    pose_matrix,
-    quaternions,
-    transforms,
-    unwritten,
-)
+from kernel_oracle import EXAMPLES, floats, indices, launch, pose_matrix, quaternions, transforms
 
-from vd.kernels.sensor.link_points import CloudModel, link_points_kernel
+from vd.kernels.sensor.link_points import link_points_kernel
 
 BASE, OBJECT = 0, 1
 GOAL_POSITION = np.array([0.1, -0.2, -0.08])
-
-
-def cloud_model(hand, body, samples, world_object, world_scale, device, shown=None):
-    model = CloudModel()
-    model.hand_points = device_array(hand, wp.vec3, device)
-    model.hand_body = device_array(body, int, device)
-    model.object_points = device_array(samples, wp.vec3, device)
-    model.goal_points = device_array(samples if shown is None else shown, wp.vec3, device)
-    model.world_object = device_array(world_object, int, device)
-    model.world_scale = device_array(world_scale, float, device)
-    model.base_body, model.object_body = BASE, OBJECT
-    model.goal_position = wp.vec3(*GOAL_POSITION)
-    return model
 
 
 @st.composite
@@ -38,17 +16,14 @@ def scenes(draw):
     worlds, rows = draw(st.integers(1, 3)), draw(st.integers(1, 4))
     bodies, hand = draw(st.integers(2, 4)), draw(st.integers(1, 6))
     objects, samples = draw(st.integers(1, 3)), draw(st.integers(1, 4))
-
-    def indices(count, highest):
-        return np.array(draw(st.lists(st.integers(0, highest - 1), min_size=count, max_size=count)))
-
     return {
         "hand": draw(floats((hand, 3), -0.1, 0.1)),
-        "body": indices(hand, bodies),
+        "body": draw(indices(hand, bodies)),
         "samples": draw(floats((objects, samples, 3), -0.05, 0.05)),
-        "world_object": indices(worlds, objects),
+        "shown": draw(floats((objects, samples, 3), -0.05, 0.05)),
+        "world_object": draw(indices(worlds, objects)),
         "world_scale": draw(floats((worlds,), 0.9, 1.1)),
-        "world": indices(rows, worlds),
+        "world": draw(indices(rows, worlds)),
         "body_q": draw(transforms((rows, bodies))),
         "goal": draw(quaternions((rows,))),
     }
@@ -68,52 +43,34 @@ def expected_points(scene):
             carry(poses[b], p[None])[0]
             for b, p in zip(scene["body"], scene["hand"].astype(float), strict=True)
         ]
-        item = scene["samples"][scene["world_object"][world]].astype(float) * scene["world_scale"][world]
+        item, shown = (
+            scene[name][scene["world_object"][world]].astype(float) * scene["world_scale"][world]
+            for name in ("samples", "shown")
+        )
         turn = pose_matrix(np.append(np.zeros(3), scene["goal"][row]))[:3, :3]
-        goal = (to_base[:3, :3] @ turn @ item.T).T + GOAL_POSITION
+        goal = (to_base[:3, :3] @ turn @ shown.T).T + GOAL_POSITION
         clouds.append(np.concatenate([goal, hand, carry(poses[OBJECT], item)]))
     return np.array(clouds)
 
 
-def points_of(scene, device, *, with_object=True, spare=0, shown=None):
-    hand, samples = len(scene["hand"]), scene["samples"].shape[1]
-    rows = len(scene["goal"])
-    model = cloud_model(
-        *(scene[key] for key in ("hand", "body", "samples", "world_object", "world_scale")),
-        device,
-        shown,
-    )
-    columns = hand + samples * (2 if with_object else 1)
-    out = unwritten((rows, columns + spare), wp.vec3, device)
-    launch(
-        link_points_kernel,
-        (rows, columns),
-        [model, scene["world"], scene["body_q"], scene["goal"], out],
-        device,
-    )
-    return out.numpy()
-
-
 @EXAMPLES
-@given(scene=scenes())
-def test_points_match_homogeneous_matrices(device, scene):
-    np.testing.assert_allclose(points_of(scene, device), expected_points(scene), atol=1e-6)
-
-
-@EXAMPLES
-@given(scene=scenes())
-def test_a_shorter_launch_leaves_the_object_out_and_room_for_a_camera(device, scene):
-    points = points_of(scene, device, with_object=False, spare=3)
-    expected = expected_points(scene)[:, : -scene["samples"].shape[1]]
-    np.testing.assert_allclose(points[:, :-3], expected, atol=1e-6)
-    assert np.isnan(points[:, -3:]).all()
-
-
-@EXAMPLES
-@given(scene=scenes())
-def test_a_goal_is_shown_by_samples_of_its_own(device, scene):
-    """Those of a scan, for example: here the same in another order."""
-    goal = scene["samples"].shape[1]
-    expected, points = expected_points(scene), points_of(scene, device, shown=scene["samples"][:, ::-1])
-    np.testing.assert_allclose(points[:, goal:], expected[:, goal:], atol=1e-6)
-    np.testing.assert_allclose(points[:, :goal], expected[:, :goal][:, ::-1], atol=1e-6)
+@given(scene=scenes(), with_object=st.booleans(), spare=st.sampled_from([0, 3]))
+def test_points_match_homogeneous_matrices(device, scene, with_object, spare):
+    """A goal is shown by samples of its own; a shorter launch leaves out the object, and room for more."""
+    model = {
+        "hand_points": scene["hand"],
+        "hand_body": scene["body"],
+        "object_points": scene["samples"],
+        "goal_points": scene["shown"],
+        "world_object": scene["world_object"],
+        "world_scale": scene["world_scale"],
+        "base_body": BASE,
+        "object_body": OBJECT,
+        "goal_position": wp.vec3(*GOAL_POSITION),
+    }
+    samples, rows = scene["samples"].shape[1], len(scene["goal"])
+    columns = len(scene["hand"]) + samples * (2 if with_object else 1)
+    inputs = [model, scene["world"], scene["body_q"], scene["goal"]]
+    (points,) = launch(link_points_kernel, (rows, columns), inputs, device, (rows, columns + spare))
+    np.testing.assert_allclose(points[:, :columns], expected_points(scene)[:, :columns], atol=1e-6)
+    assert np.isnan(points[:, columns:]).all()

@@ -3,14 +3,12 @@ import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import ALPHA, EXAMPLES, device_array, launch, settings_array, streams, unwritten
+from kernel_oracle import ALPHA, EXAMPLES, device_array, launch, streams
 from scipy import stats
 
 from vd.kernels.rng import next_stream
 from vd.kernels.servo.actuators import COMMAND_DELAY, PARAMETER_COLUMNS, READ_DELAY
 from vd.kernels.task.randomisation import (
-    ForceParams,
-    RandomisationParams,
     disturbance_force_kernel,
     draw_dynamics_kernel,
     draw_masses_kernel,
@@ -40,41 +38,22 @@ OUTPUTS = (
 )
 
 
-def draw_dynamics(
-    device, mask, fingers=3, seed=0, observation_size=87, kp_scale=DR.stiffness_scale, **changes
-):
+def draw_dynamics(device, mask, fingers=3, seed=0, observation_size=87):
     """Launch; returns every output and the streams by name."""
     worlds, joints = len(mask), 3 * fingers
-    shapes = [(worlds, joints)] * 2 + [(worlds,)] * 3 + [(worlds, joints), (worlds, observation_size)]
-    out = {name: unwritten(shape, float, device) for name, shape in zip(OUTPUTS, shapes, strict=True)}
-    rng = streams(worlds, seed, device)
-    launch(
-        draw_dynamics_kernel,
-        worlds,
-        [
-            np.tile(KP, fingers),
-            np.tile(KD, fingers),
-            np.broadcast_to(kp_scale, (joints, 2)),
-            np.broadcast_to(DR.damping_scale, (joints, 2)),
-            settings_array(RandomisationParams, device, **{**RANGES, **changes}),
-            mask,
-            rng,
-            *list(out.values()),
-        ],
-        device,
-    )
-    return {**{name: array.numpy() for name, array in out.items()}, "rng": rng.numpy()}
+    shapes = [(worlds, joints)] * 2 + [worlds] * 3 + [(worlds, joints), (worlds, observation_size)]
+    inputs = [np.tile(KP, fingers), np.tile(KD, fingers)]
+    inputs += [np.broadcast_to(scale, (joints, 2)) for scale in (DR.stiffness_scale, DR.damping_scale)]
+    inputs += [RANGES, mask, rng := streams(worlds, seed, device)]
+    drawn = launch(draw_dynamics_kernel, worlds, inputs, device, *shapes)
+    return {**dict(zip(OUTPUTS, drawn, strict=True)), "rng": rng.numpy()}
 
 
 def draw_masses(device, mask, links=9, seed=0):
     """Launch; returns link scales, object masses and streams."""
     worlds = len(mask)
-    out = [unwritten((worlds, links), float, device), unwritten(worlds, float, device)]
-    rng = streams(worlds, seed, device)
-    params = settings_array(RandomisationParams, device, **RANGES)
-    inputs = [params, device_array(mask, int, device), rng]
-    launch(draw_masses_kernel, worlds, [*inputs, *out], device)
-    return out[0].numpy(), out[1].numpy(), rng.numpy()
+    inputs = [RANGES, mask, rng := streams(worlds, seed, device)]
+    return *launch(draw_masses_kernel, worlds, inputs, device, (worlds, links), worlds), rng.numpy()
 
 
 def assert_uniform(values, bounds):
@@ -114,12 +93,9 @@ def test_dynamics_have_the_ranges_of_table_s3(device):
 def draw_servo(device, mask, ranges, gains, seed=0):
     """Launch; returns rows [N, D, P] and streams."""
     worlds, (joints, columns, _) = len(mask), ranges.shape
-    out = unwritten((worlds * joints, columns), float, device)
-    rng = streams(worlds, seed, device)
-    inputs = [device_array(ranges, wp.vec2, device), device_array(mask, int, device)]
-    inputs += [device_array(g, float, device) for g in gains]
-    launch(draw_servo_kernel, worlds, [*inputs, rng, out], device)
-    return out.numpy().reshape(worlds, joints, columns), rng.numpy()
+    inputs = [ranges, mask, *gains, rng := streams(worlds, seed, device)]
+    (out,) = launch(draw_servo_kernel, worlds, inputs, device, (worlds * joints, columns))
+    return out.reshape(worlds, joints, columns), rng.numpy()
 
 
 def test_servos_are_drawn_from_their_ranges_and_carry_the_gains_of_their_world(device):
@@ -193,12 +169,7 @@ def walk_kernel(rng: wp.array[wp.uint32], out: wp.array[float]):
 
 def walk(device, rng, steps):
     """Draw one number per world and step; returns [steps, N]."""
-    out = wp.empty(len(rng), dtype=float, device=device)
-    rows = []
-    for _ in range(steps):
-        launch(walk_kernel, len(rng), [rng, out], device)
-        rows.append(out.numpy().copy())  # on the CPU numpy() is a view
-    return np.array(rows)
+    return np.array([launch(walk_kernel, len(rng), [rng], device, len(rng))[0] for _ in range(steps)])
 
 
 def test_streams_of_different_worlds_never_walk_together(device):
@@ -216,18 +187,8 @@ def test_streams_of_different_worlds_never_walk_together(device):
 def force_array(device, force, mass, seed, **changes):
     """Launch one step; returns forces."""
     values = {"probability": DR.force_probability, "force_per_mass": DR.force_n_per_kg, "decay": 0.0}
-    array = device_array(force, wp.vec3, device)
-    launch(
-        disturbance_force_kernel,
-        len(mass),
-        [
-            mass,
-            settings_array(ForceParams, device, **{**values, **changes}),
-            array,
-            streams(len(mass), seed, device),
-        ],
-        device,
-    )
+    inputs = [mass, values | changes, array := device_array(force, wp.vec3, device)]
+    launch(disturbance_force_kernel, len(mass), [*inputs, streams(len(mass), seed, device)], device)
     return array.numpy().astype(float)
 
 
@@ -251,9 +212,8 @@ def test_disturbance_has_the_paper_s_rate_and_magnitude_and_any_direction(device
 
 def test_restitution_is_that_of_table_s3_and_drawn_for_each_body(device):
     worlds = 20_000
-    drawn = [unwritten(worlds, float, device) for _ in range(3)]
     inputs = [wp.vec2(*DR.restitution), np.ones(worlds, int), streams(worlds, 2, device)]
-    launch(draw_restitution_kernel, worlds, [*inputs, *drawn], device)
+    drawn = launch(draw_restitution_kernel, worlds, inputs, device, *[worlds] * 3)
     for values in drawn:
-        assert_uniform(values.numpy(), (0.0, 1.0))
-    assert_uncorrelated(np.stack([values.numpy() for values in drawn], axis=1), 0.05)
+        assert_uniform(values, (0.0, 1.0))
+    assert_uncorrelated(np.stack(drawn, axis=1), 0.05)

@@ -3,7 +3,7 @@ import trimesh
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, device_array, launch, pose_matrix, unwritten
+from kernel_oracle import EXAMPLES, device_array, launch, pose_matrix
 from scipy.spatial.transform import Rotation
 
 from vd.kernels.sensor.registration import (
@@ -11,7 +11,6 @@ from vd.kernels.sensor.registration import (
     LARGEST_TURN,
     LEVER_M,
     NEVER,
-    Eye,
     fit_poses_kernel,
     keep_poses_kernel,
     nearness_kernel,
@@ -19,7 +18,7 @@ from vd.kernels.sensor.registration import (
     start_poses_kernel,
     take_better_kernel,
 )
-from vd.kernels.sensor.shape_grids import Shapes, off_mesh_kernel, shape_distance_kernel
+from vd.kernels.sensor.shape_grids import off_mesh_kernel, shape_distance_kernel
 
 GRID, SAMPLES, SEEN = 5, 9, 7
 FAR, CELL, MARGIN = 0.02, 8.0, 0.004
@@ -59,31 +58,15 @@ class Scene:
         turns = Rotation.random(int(np.prod(shape)), rng=self.rng).as_quat().reshape(*shape, 4)
         return np.concatenate([self.rng.uniform(-0.03, 0.03, (*shape, 3)), turns], axis=-1)
 
-    def model(self, device: str) -> Shapes:
+    def model(self) -> dict[str, np.ndarray]:
         """The shapes as the kernels take them."""
-        shapes = Shapes()
-        shapes.samples = device_array(self.samples, wp.vec3, device)
-        shapes.distance = device_array(self.distance, float, device)
-        shapes.half = device_array(self.half, float, device)
-        shapes.world_shape = device_array(self.world_shape, int, device)
-        shapes.world_scale = device_array(self.world_scale, float, device)
-        return shapes
+        names = ("samples", "distance", "half", "world_shape", "world_scale")
+        return {name: getattr(self, name) for name in names}
 
-    def camera(self) -> Eye:
+    def camera(self) -> dict[str, object]:
         """The camera likewise."""
-        eye = Eye()
-        eye.focal, eye.centre = wp.vec2(250.0, 250.0), wp.vec2(36.0, 24.0)
-        eye.pose = wp.transform(*self.eye.tolist())
-        eye.cell, eye.margin = CELL, MARGIN
-        return eye
-
-    def inputs(self, device: str) -> list[wp.array]:
-        """World of each row, seen points, and how many."""
-        return [
-            device_array(self.row_world, int, device),
-            device_array(self.seen, wp.vec3, device),
-            device_array(self.count, int, device),
-        ]
+        lens = {"focal": wp.vec2(250.0, 250.0), "centre": wp.vec2(36.0, 24.0), "cell": CELL}
+        return lens | {"pose": wp.transform(*self.eye.tolist()), "margin": MARGIN}
 
     def surface_distance(self, shape: int, place: np.ndarray) -> tuple[float, np.ndarray]:
         """Interpolated distance and its gradient, from the eight corners' weights."""
@@ -183,19 +166,16 @@ def test_distances_are_those_to_the_mesh_or_to_the_nearest_sample(device, seed):
         )
         for box in boxes
     ]
-    samples = device_array(scene.samples, wp.vec3, device)
-    mesh = device_array([each.id for each in meshes], wp.uint64, device)
-    off = unwritten(samples.shape, float, device)
-    launch(off_mesh_kernel, off.shape, [samples, mesh, off], device)
-    out = unwritten(scene.distance.shape, float, device)
-    inputs = [samples, mesh, device_array(scene.half, float, device), device_array(meshed, int, device)]
-    launch(shape_distance_kernel, out.shape, [*inputs, out], device)
+    mesh, shape = np.array([each.id for each in meshes]), scene.samples.shape[:2]
+    (off,) = launch(off_mesh_kernel, shape, [scene.samples, mesh], device, shape)
+    inputs, shape = [scene.samples, mesh, scene.half, meshed], scene.distance.shape
+    (out,) = launch(shape_distance_kernel, shape, inputs, device, shape)
     for shape, extent in enumerate(extents):
         wanted = np.abs(box_distance(extent, scene.samples[shape]))
-        np.testing.assert_allclose(off.numpy()[shape], wanted, atol=1e-6)
+        np.testing.assert_allclose(off[shape], wanted, atol=1e-6)
         signed = box_distance(extent, scene.places[shape])
         expected = signed if meshed[shape] else scene.from_samples[shape]
-        np.testing.assert_allclose(out.numpy()[shape], expected, atol=1e-6)
+        np.testing.assert_allclose(out[shape], expected, atol=1e-6)
 
 
 @given(seed=seeds)
@@ -212,9 +192,7 @@ def test_the_nearest_of_each_cell_is_kept(device, seed):
             if depth > 0.0 and 0 <= row < CELLS[0] and 0 <= column < CELLS[1]:
                 expected[world, row, column] = max(expected[world, row, column], 1.0 / depth)
     nearness = wp.zeros((scene.worlds, *CELLS), dtype=float, device=device)
-    cloud = device_array(points, wp.vec3, device)
-    inputs = [scene.camera(), cloud]
-    launch(nearness_kernel, cloud.shape, [*inputs, nearness], device)
+    launch(nearness_kernel, points.shape[:2], [scene.camera(), points, nearness], device)
     np.testing.assert_allclose(nearness.numpy(), expected, rtol=1e-5)
 
 
@@ -224,47 +202,39 @@ def test_a_start_puts_the_near_side_where_the_points_are(device, seed, rendered,
     scene = Scene(seed)
     rotations = Rotation.random(6, rng=scene.rng)
     first = scene.rng.integers(0, 6, len(scene.row_world))
-    row_world, seen, count = scene.inputs(device)
-    out = unwritten((len(scene.row_world), 4), wp.transform, device)
-    inputs = [scene.model(device), scene.camera(), int(rendered), every, row_world]
-    inputs += [device_array(first, int, device), device_array(rotations.as_quat(), wp.quat, device)]
-    launch(start_poses_kernel, out.shape, [*inputs, seen, count, out], device)
+    inputs = [scene.model(), scene.camera(), int(rendered), every, scene.row_world, first]
+    inputs += [rotations.as_quat(), scene.seen, scene.count]
+    shape = (len(scene.row_world), 4)
+    (out,) = launch(start_poses_kernel, shape, inputs, device, shape)
     for row, world in enumerate(scene.row_world):
         for c in range(4):
             turn = rotations[(first[row] + c) % 6]
             place = scene.placed(world, turn, every, rendered=rendered)
-            np.testing.assert_allclose(out.numpy()[row, c, :3], place, atol=1e-5)
-            np.testing.assert_allclose(out.numpy()[row, c, 3:], turn.as_quat(), atol=1e-6)
+            np.testing.assert_allclose(out[row, c, :3], place, atol=1e-5)
+            np.testing.assert_allclose(out[row, c, 3:], turn.as_quat(), atol=1e-6)
 
 
 @given(seed=seeds, rendered=st.booleans(), every=st.integers(1, 3))
 @EXAMPLES
 def test_poses_that_fit_no_more_are_put_where_the_points_are_and_stay_turned(device, seed, rendered, every):
     scene, worse, poses = Scene(seed), 1.5, 3
-    row_world, seen, count = scene.inputs(device)
-    rows = len(scene.row_world)
-    before, misfit = (
-        scene.random_poses(scene.worlds, poses),
-        scene.rng.uniform(0.1, 1.0, (scene.worlds, poses)),
-    )
+    rows, before = len(scene.row_world), scene.random_poses(scene.worlds, poses)
+    misfit = scene.rng.uniform(0.1, 1.0, (scene.worlds, poses))
     now = scene.rng.uniform(0.1, 1.0, (rows, poses))
-    out, cost = unwritten((rows, poses), wp.transform, device), unwritten((rows, poses), float, device)
-    inputs = [scene.model(device), scene.camera(), int(rendered), every, row_world, worse]
-    inputs += [device_array(before, wp.transform, device)]
-    inputs += [device_array(values, float, device) for values in (misfit, now)]
-    inputs += [seen, count]
-    launch(replace_poses_kernel, out.shape, [*inputs, out, cost], device)
+    inputs = [scene.model(), scene.camera(), int(rendered), every, scene.row_world, worse]
+    inputs += [before, misfit, now, scene.seen, scene.count]
+    out, cost = launch(replace_poses_kernel, (rows, poses), inputs, device, *[(rows, poses)] * 2)
     for row, world in enumerate(scene.row_world):
         for c in range(poses):
             fits = now[row, c] <= worse * misfit[world, c]
-            assert cost.numpy()[row, c] == (np.float32(NEVER) if fits else 0.0)
+            assert cost[row, c] == (np.float32(NEVER) if fits else 0.0)
             if fits:
-                assert np.isnan(out.numpy()[row, c]).all()
+                assert np.isnan(out[row, c]).all()
                 continue
             turn = Rotation.from_quat(before[world, c, 3:])
             place = scene.placed(world, turn, every, rendered=rendered)
-            np.testing.assert_allclose(out.numpy()[row, c, :3], place, atol=1e-5)
-            np.testing.assert_allclose(out.numpy()[row, c, 3:], before[world, c, 3:], atol=1e-6)
+            np.testing.assert_allclose(out[row, c, :3], place, atol=1e-5)
+            np.testing.assert_allclose(out[row, c, 3:], before[world, c, 3:], atol=1e-6)
 
 
 @given(seed=seeds)
@@ -275,8 +245,7 @@ def test_of_two_attempts_the_better_one_is_taken(device, seed):
     found, cost = scene.random_poses(rows, candidates), scene.rng.uniform(0.1, 1.0, (rows, candidates))
     arrays = [device_array(found, wp.transform, device), device_array(cost, float, device)]
     row_world = np.where(np.arange(rows) == 1, -1, scene.row_world)
-    inputs = [device_array(row_world, int, device), kept]
-    launch(take_better_kernel, (rows, kept), [*inputs, *arrays], device)
+    launch(take_better_kernel, (rows, kept), [row_world, kept, *arrays], device)
     expected, poses = cost.copy(), found.copy()
     for row in np.flatnonzero(row_world >= 0):
         for k in range(kept):
@@ -297,29 +266,11 @@ def test_of_two_attempts_the_better_one_is_taken(device, seed):
 @EXAMPLES
 def test_a_step_solves_the_normal_equations(device, seed, rendered, steps, every, every_sample):
     scene = Scene(seed)
-    row_world, seen, count = scene.inputs(device)
-    nearness = scene.nearness if rendered else np.zeros((scene.worlds, 0, 0))
     pose = device_array(scene.pose, wp.transform, device)
-    misfit = unwritten(pose.shape, float, device)
-    launch(
-        fit_poses_kernel,
-        pose.shape,
-        [
-            scene.model(device),
-            scene.camera(),
-            FAR,
-            steps,
-            every,
-            every_sample,
-            row_world,
-            seen,
-            count,
-            nearness,
-            pose,
-            misfit,
-        ],
-        device,
-    )
+    inputs = [scene.model(), scene.camera(), FAR, steps, every, every_sample]
+    inputs += [scene.row_world, scene.seen, scene.count]
+    inputs += [scene.nearness if rendered else np.zeros((scene.worlds, 0, 0)), pose]
+    (misfit,) = launch(fit_poses_kernel, pose.shape, inputs, device, pose.shape)
     found = pose.numpy().astype(float)
     for row, world in enumerate(scene.row_world):
         for c in range(scene.poses):
@@ -330,7 +281,7 @@ def test_a_step_solves_the_normal_equations(device, seed, rendered, steps, every
             np.testing.assert_allclose(matrices[0], matrices[1], atol=2e-3)
             # At the kernel's own pose: rounding of a step must not choose another cell.
             wanted = scene.misfit(world, found[row, c], every, every_sample, rendered=rendered)
-            np.testing.assert_allclose(misfit.numpy()[row, c], wanted, atol=2e-6)
+            np.testing.assert_allclose(misfit[row, c], wanted, atol=2e-6)
 
 
 @given(seed=seeds, known=st.booleans())
@@ -362,12 +313,8 @@ def test_the_best_poses_that_differ_are_kept(device, seed, known):
             angle = (turns * turns[best].inv()).magnitude()
             left = [c for c in left if c != best and angle[c] >= apart and cost[c] < NEVER]
     arrays = [device_array(pose, wp.transform, device), device_array(average, float, device)]
-    launch(
-        keep_poses_kernel,
-        rows,
-        [apart, stay, share, kept if known else 0, scene.row_world, found, misfit, *arrays],
-        device,
-    )
+    inputs = [apart, stay, share, kept if known else 0, scene.row_world, found, misfit]
+    launch(keep_poses_kernel, rows, [*inputs, *arrays], device)
     np.testing.assert_allclose(arrays[1].numpy(), np.minimum(expected, NEVER), rtol=1e-5)
     there = np.isfinite(expected_pose)
     np.testing.assert_allclose(arrays[0].numpy()[there], expected_pose[there], atol=1e-6)

@@ -3,26 +3,10 @@ import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import (
-    EXAMPLES,
-    angle_between,
-    device_array,
-    floats,
-    goals,
-    launch,
-    quaternions,
-    settings_array,
-    unwritten,
-)
+from kernel_oracle import EXAMPLES, angle_between, device_array, floats, goals, indices, launch, quaternions
 
-from vd.kernels.task.rewards import (
-    FINGERTIP_MEAN,
-    FINGERTIP_SQUARED_SUM,
-    REWARD_TERMS,
-    RewardParams,
-    reward_kernel,
-)
-from vd.kernels.task.success import SuccessParams, success_kernel
+from vd.kernels.task.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, REWARD_TERMS, reward_kernel
+from vd.kernels.task.success import success_kernel
 from vd.paper import PAPER
 
 REWARD = {
@@ -78,21 +62,14 @@ def evaluate(device, state, reward=None, success=None):
     """Launch the kernels, success first; returns their outputs by name."""
     envs = len(state["q"])
     previous_error = device_array(state["previous_error"], float, device)
-    reached = {name: unwritten(envs, int, device) for name in ("still", "success", "fell")}
-    reached = {"error": unwritten(envs, float, device), **reached}
-    paid = {
-        "reward": unwritten(envs, float, device),
-        "terms": unwritten((envs, len(REWARD_TERMS)), float, device),
-    }
-    limits = settings_array(SuccessParams, device, **{**SUCCESS, **(success or {})})
     seen = [state[name] for name in ("q", "qd", "goal", "smoothed", "table_force", "must_lift")]
-    launch(success_kernel, envs, [limits, *seen, *reached.values()], device)
-    weights = settings_array(RewardParams, device, **{**REWARD, **(reward or {})})
+    found = launch(success_kernel, envs, [SUCCESS | (success or {}), *seen], device, *[envs] * 4)
+    out = dict(zip(("error", "still", "success", "fell"), found, strict=True))
     seen = [state[name] for name in ("q", "qd", "tips", "effort", "table_force", "clearance")]
-    judged = [reached[name] for name in ("error", "success", "fell")]
-    launch(reward_kernel, envs, [weights, *seen, *judged, previous_error, *paid.values()], device)
-    out = reached | paid | {"previous_error": previous_error}
-    return {name: array.numpy() for name, array in out.items()}
+    seen += [*(out[name] for name in ("error", "success", "fell")), previous_error]
+    inputs = [REWARD | (reward or {}), *seen]
+    out["reward"], out["terms"] = launch(reward_kernel, envs, inputs, device, envs, (envs, len(REWARD_TERMS)))
+    return out | {"previous_error": previous_error.numpy()}
 
 
 def oracle(state, reward, success):
@@ -162,7 +139,7 @@ def states(draw: st.DrawFn) -> dict[str, np.ndarray]:
         "smoothed": draw(floats((worlds, joints), -0.5, 0.5)),
         "table_force": draw(floats((worlds,), 0.0, 1.0)),
         "clearance": draw(floats((worlds,), -0.1, 0.1)),
-        "must_lift": np.array(draw(st.lists(st.integers(0, 1), min_size=worlds, max_size=worlds))),
+        "must_lift": draw(indices(worlds, 2)),
         "previous_error": draw(floats((worlds,), 0.0, 3.0)),
     }
 

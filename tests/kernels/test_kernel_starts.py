@@ -1,17 +1,15 @@
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, device_array, floats, launch, quaternions, transforms
+from kernel_oracle import EXAMPLES, device_array, floats, indices, launch, quaternions, transforms
 from scipy.spatial.transform import Rotation
 
 from vd.kernels.task.starts import (
     APART_M,
     CHUNKS,
     IN_TABLE_M,
-    OpenHand,
     move_start_kernel,
     start_depth_kernel,
-    start_places,
 )
 
 TABLE = 0.01
@@ -28,11 +26,11 @@ def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
         "half": draw(floats((shapes, 3), 0.0, 0.06)),
         "radius": draw(floats((shapes,), 0.0, 0.03)),
         "points": draw(floats((2, count, 3), -0.08, 0.08)),
-        "object": np.array(draw(st.lists(st.integers(0, 1), min_size=worlds, max_size=worlds))),
+        "object": draw(indices(worlds, 2)),
         "scale": draw(floats((worlds,), 0.5, 1.5)),
         "places": draw(floats((draw(st.integers(1, 5)), 3), -0.1, 0.1)),
         "q": np.concatenate([draw(floats((worlds, joints))), position, orientation], axis=1),
-        "mask": np.array(draw(st.lists(st.integers(0, 1), min_size=worlds, max_size=worlds))),
+        "mask": draw(indices(worlds, 2)),
     }
 
 
@@ -53,11 +51,8 @@ def oracle_depth(scene, world, place):
 @EXAMPLES
 @given(scene=scenes())
 def test_an_object_starts_where_it_is_the_least_deep_and_others_stay(device, scene):
-    hand = OpenHand()
-    reach = np.linalg.norm(scene["half"], axis=1) + scene["radius"] + APART_M
-    for name, value in (scene | {"reach": reach}).items():
-        if name in OpenHand.vars:
-            setattr(hand, name, device_array(value, OpenHand.vars[name].type.dtype, device))
+    hand = {name: scene[name] for name in ("pose", "half", "radius")}
+    hand["reach"] = np.linalg.norm(scene["half"], axis=1) + scene["radius"] + APART_M
     worlds, count = len(scene["q"]), len(scene["places"])
     depth = device_array(np.zeros((worlds, count)), float, device)
     q = device_array(scene["q"], float, device)
@@ -78,8 +73,3 @@ def test_an_object_starts_where_it_is_the_least_deep_and_others_stay(device, sce
         moved[world, 9:12] += scene["places"][found[world].argmin()]
     np.testing.assert_array_equal(q.numpy(), moved)
     assert not depth.numpy().any(), "the next reset begins with none"
-
-
-def test_near_places_come_before_far_ones():
-    away = np.linalg.norm(start_places(), axis=1)
-    assert away[0] == 0.0 < away[1] and (np.diff(away) > -1e-9).all()

@@ -2,7 +2,7 @@ import numpy as np
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, SENTINEL, floats, launch, quaternions, unwritten
+from kernel_oracle import EXAMPLES, SENTINEL, floats, indices, launch, quaternions
 from scipy.spatial.transform import Rotation
 
 from vd.kernels.task.symmetry import choose_frame_kernel, frame_observation_kernel, world_action_kernel
@@ -12,12 +12,11 @@ from vd.kernels.task.symmetry import choose_frame_kernel, frame_observation_kern
 def worlds(draw: st.DrawFn) -> dict[str, np.ndarray]:
     """N worlds with new goals or old ones, and F directions."""
     count, frames, joints = draw(st.integers(1, 6)), draw(st.integers(1, 4)), draw(st.integers(0, 4))
-    flags = st.lists(st.integers(0, 1), min_size=count, max_size=count)
     orientation = draw(quaternions((count,)))
     return {
         "sector": draw(floats((frames, 3), -1.0, 1.0)),
-        "reset": np.array(draw(flags)),
-        "new_goal": np.array(draw(flags)),
+        "reset": draw(indices(count, 2)),
+        "new_goal": draw(indices(count, 2)),
         "q": np.concatenate([draw(floats((count, joints + 3))), orientation], axis=1),
         "goal": draw(quaternions((count,))),
     }
@@ -28,12 +27,8 @@ def worlds(draw: st.DrawFn) -> dict[str, np.ndarray]:
 def test_a_new_goal_gets_the_view_that_turns_its_axis_nearest(device, scene):
     count, joints = len(scene["reset"]), scene["q"].shape[1] - 7
     frame = wp.full(count, SENTINEL, dtype=wp.int32, device=device)
-    launch(
-        choose_frame_kernel,
-        count,
-        [scene["sector"], joints, scene["reset"], scene["new_goal"], scene["q"], scene["goal"], frame],
-        device,
-    )
+    inputs = [scene["sector"], joints, *(scene[name] for name in ("reset", "new_goal", "q", "goal"))]
+    launch(choose_frame_kernel, count, [*inputs, frame], device)
     turn = Rotation.from_quat(scene["goal"]) * Rotation.from_quat(scene["q"][:, -4:]).inv()
     half = np.sin(turn.magnitude() / 2.0)[:, None]
     axis = turn.as_rotvec() / np.maximum(turn.magnitude(), 1e-12)[:, None] * half
@@ -50,19 +45,17 @@ def test_a_new_goal_gets_the_view_that_turns_its_axis_nearest(device, scene):
 def test_views_take_observations_apart_and_put_actions_together(device, data):
     count, frames = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 3))
     width, terms = data.draw(st.integers(1, 6)), data.draw(st.integers(1, 3))
-    source = data.draw(st.lists(st.integers(0, width - 1), min_size=frames * width * terms,
-                                max_size=frames * width * terms))  # fmt: skip
-    source = np.array(source).reshape(frames, width, terms)
+    source = data.draw(indices((frames, width, terms), width))
     factor = data.draw(floats((frames, width, terms)))
     offset = data.draw(floats((frames, width)))
     sign = np.sign(data.draw(floats((frames, width))) + 0.5)
-    frame = np.array(data.draw(st.lists(st.integers(0, frames - 1), min_size=count, max_size=count)))
+    frame = data.draw(indices(count, frames))
     values = data.draw(floats((count, width)))
-    seen, done = (unwritten((count, width), float, device) for _ in range(2))
-    launch(frame_observation_kernel, (count, width), [source, factor, offset, frame, values, seen], device)
-    launch(world_action_kernel, (count, width), [source[:, :, 0], sign, frame, values, done], device)
+    dim = (count, width)
+    (seen,) = launch(frame_observation_kernel, dim, [source, factor, offset, frame, values], device, dim)
+    (done,) = launch(world_action_kernel, dim, [source[:, :, 0], sign, frame, values], device, dim)
     for world, k in enumerate(frame):
         expected = (factor[k].astype(float) * values[world][source[k]]).sum(axis=1) + offset[k]
-        np.testing.assert_allclose(seen.numpy()[world], expected, atol=1e-5)
+        np.testing.assert_allclose(seen[world], expected, atol=1e-5)
         wanted = sign[k] * values[world][source[k, :, 0]]
-        assert np.array_equal(done.numpy()[world], wanted.astype(np.float32))
+        assert np.array_equal(done[world], wanted.astype(np.float32))

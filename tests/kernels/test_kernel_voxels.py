@@ -1,10 +1,12 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from kernel_oracle import ALPHA, EXAMPLES, device_array, launch, streams
+from kernel_oracle import ALPHA, EXAMPLES, device_array, launch, on_device, streams
 from scipy import stats
 
 from vd.kernels.sparse.voxels import (
@@ -71,7 +73,7 @@ def test_marks_name_the_groups_whose_points_a_voxel_holds(device, points, data):
     rows = [tuple(row) for row in coordinates(keys).numpy()]
     np.testing.assert_array_equal(keys.numpy(), voxels(points, device)[1].numpy())
     expected = np.zeros((len(rows), len(ends)))
-    for group, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
+    for group, (start, end) in enumerate(pairwise([0, *ends])):
         for voxel in expected_voxels(points[:, start:end], 1.0):
             expected[rows.index(voxel), group] = 1.0
     np.testing.assert_array_equal(marks.numpy(), expected)
@@ -92,10 +94,9 @@ def test_refuses_a_size_that_is_not_positive():
 
 
 def noise_of(device, count, seed=0, jitter=0.4, std=0.004, dropout=0.4, ratio=(0.0, 0.2)):
-    noise = CloudNoise()
-    noise.jitter_probability, noise.jitter_std = jitter, std
-    noise.dropout_probability, noise.dropout_ratio = dropout, wp.vec2(*ratio)
-    return draw_noise(wp.array([noise], dtype=CloudNoise, device=device), streams(count, seed, device))
+    noise = {"jitter_probability": jitter, "jitter_std": std}
+    noise |= {"dropout_probability": dropout, "dropout_ratio": wp.vec2(*ratio)}
+    return draw_noise(on_device([noise], wp.array[CloudNoise], device), streams(count, seed, device))
 
 
 def test_noise_is_drawn_for_each_cloud_as_the_paper_says(device):
@@ -113,12 +114,8 @@ def test_noise_is_drawn_for_each_cloud_as_the_paper_says(device):
 
 def keys_of(points, draw, device, size):
     out = wp.full(2 * points.shape[0] * points.shape[1], -1, dtype=wp.int64, device=device)
-    launch(
-        voxel_key_kernel,
-        points.shape[:2],
-        [points, size, draw.jitter, draw.dropout, draw.stream, out],
-        device,
-    )
+    inputs = [points, size, draw.jitter, draw.dropout, draw.stream, out]
+    launch(voxel_key_kernel, points.shape[:2], inputs, device)
     return out
 
 

@@ -5,7 +5,7 @@ import trimesh
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, device_array, launch, unwritten
+from kernel_oracle import EXAMPLES, device_array, launch
 
 from vd.kernels.sensor.winding import inside_kernel, winding_kernel
 
@@ -29,16 +29,7 @@ def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray)
 
 def run(device, samples, areas, *, width, corner, pitch, shape=SHAPE):
     """Winding numbers of the kernel, [X, Y, Z]."""
-    out = unwritten(shape, float, device)
-    inputs = [
-        device_array(samples, wp.vec3, device),
-        device_array(areas, wp.vec3, device),
-        width,
-        wp.vec3(*corner),
-        pitch,
-    ]
-    launch(winding_kernel, shape, [*inputs, out], device)
-    return out.numpy()
+    return launch(winding_kernel, shape, [samples, areas, width, wp.vec3(*corner), pitch], device, shape)[0]
 
 
 def grid(corner, pitch, shape=SHAPE):
@@ -76,7 +67,6 @@ def test_inside_is_where_the_winding_number_exceeds_the_level(device, seed, kept
         support_winding_number=True,
     )
     out = wp.array(rng.uniform(size=50) < 0.5, dtype=wp.bool, device=device)
-    inputs = [mesh.id, level, device_array(points, wp.vec3, device)]
-    launch(inside_kernel, 50, [*inputs, out], device)
+    launch(inside_kernel, 50, [mesh.id, level, points, out], device)
     clear = np.abs(expected - level) > 0.03  # far triangles count by clusters
     np.testing.assert_array_equal(out.numpy()[clear], (expected > level)[clear])

@@ -1,13 +1,13 @@
-"""Guards, contact forces and bookkeeping against NumPy oracles."""
+"""Guards, contacts and bookkeeping against NumPy oracles."""
 
 import numpy as np
 import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, SENTINEL, device_array, launch
+from kernel_oracle import EXAMPLES, SENTINEL, device_array, floats, indices, launch
 
-from vd.kernels.task.contacts import pair_force_kernel
+from vd.kernels.task.contacts import pair_force_kernel, restitution_kernel
 from vd.kernels.task.environments import (
     redraw_mask_kernel,
     write_friction_kernel,
@@ -42,12 +42,8 @@ def test_pair_forces_are_summed_per_world(device, seed, worlds):
         expected[world[c]] += force[world[c], row[c, 0]]
 
     out = device_array(np.zeros(worlds), float, device)
-    launch(
-        pair_force_kernel,
-        slots,
-        [np.array([count]), world, pairs, row, force, kind, 1, 2, out],
-        device,
-    )
+    inputs = [np.array([count]), world, pairs, row, force, kind, 1, 2, out]
+    launch(pair_force_kernel, slots, inputs, device)
     np.testing.assert_allclose(out.numpy(), expected, atol=1e-5)
 
 
@@ -72,22 +68,8 @@ def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
     dumps = [device_array(np.full((worlds, n), np.nan), float, device) for n in (4, 3, 2)]
 
     def guard(start: float, q: np.ndarray, qd: np.ndarray) -> None:
-        launch(
-            guard_kernel,
-            worlds,
-            [
-                q,
-                qd,
-                np.full((worlds, 4), start),
-                np.full((worlds, 3), start),
-                np.full((worlds, 2), start),
-                500.0,
-                failures,
-                *dumps,
-                failed,
-            ],
-            device,
-        )
+        before = [np.full((worlds, n), start) for n in (4, 3, 2)]
+        launch(guard_kernel, worlds, [q, qd, *before, 500.0, failures, *dumps, failed], device)
 
     guard(good, q, qd)
     np.testing.assert_array_equal(failed.numpy(), [0, 1, 0])
@@ -105,10 +87,10 @@ def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
 def test_redraw_waits_for_a_reset_of_old_dynamics(device, seed, worlds):
     random = np.random.default_rng(seed)
     reset, age = random.integers(0, 2, worlds), random.integers(0, 20, worlds)
-    ages, mask = device_array(age, int, device), device_array(np.full(worlds, SENTINEL), int, device)
-    launch(redraw_mask_kernel, worlds, [reset, 10, ages, mask], device)
+    ages = device_array(age, int, device)
+    (mask,) = launch(redraw_mask_kernel, worlds, [reset, 10, ages], device, worlds)
     due = (reset == 1) & (age + 1 >= 10)
-    np.testing.assert_array_equal(mask.numpy(), due.astype(int))
+    np.testing.assert_array_equal(mask, due.astype(int))
     np.testing.assert_array_equal(ages.numpy(), np.where(due, 0, age + 1))
 
 
@@ -133,12 +115,8 @@ def test_friction_of_a_pair_is_the_average(device, seed, worlds):
         elif kind[s] == 3:
             expected[s] = 0.5 * (hand[w] * nominal[s] / FRICTION + item[w])
     out = device_array(before, float, device)
-    launch(
-        write_friction_kernel,
-        shapes,
-        [world, kind, nominal, FRICTION, 1, 2, 3, hand, item, table, out],
-        device,
-    )
+    inputs = [world, kind, nominal, FRICTION, 1, 2, 3, hand, item, table, out]
+    launch(write_friction_kernel, shapes, inputs, device)
     np.testing.assert_allclose(out.numpy(), expected, rtol=1e-5)
 
 
@@ -147,13 +125,55 @@ def test_a_force_and_a_share_of_the_weight_act_on_the_object_alone(device):
     force = random.normal(size=(envs, 3)).astype(np.float32)
     mass, lightened = random.uniform(0.05, 0.2, envs).astype(np.float32), np.array([0, 1, 1, 0])
     body_force = wp.zeros((envs, 5), dtype=wp.spatial_vector, device=device)
-    launch(
-        write_object_force_kernel,
-        envs,
-        [mass, lightened, wp.vec3(0.5, 0.0, -9.81), np.array([0.3]), 4, force, body_force],
-        device,
-    )
+    inputs = [mass, lightened, wp.vec3(0.5, 0.0, -9.81), np.array([0.3]), 4, force, body_force]
+    launch(write_object_force_kernel, envs, inputs, device)
     carried = force - 0.7 * (lightened * mass)[:, None] * np.array([0.5, 0.0, -9.81])
     np.testing.assert_allclose(body_force.numpy()[:, 4, :3], carried, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(body_force.numpy()[lightened == 0, 4, :3], force[lightened == 0])
     assert not body_force.numpy()[:, :4].any() and not body_force.numpy()[:, 4, 3:].any()
+
+
+OTHER, TABLE, OBJECT, HAND = 0, 1, 2, 3
+LOWEST = 0.05
+
+
+def references(device, nominal, kind, qd, coefficients, threshold=0.2, column=3):
+    """Launch; returns references [N, G, 2], NaN where the kernel wrote nothing."""
+    inputs = [nominal, kind, TABLE, HAND, column, threshold, LOWEST, qd, *coefficients]
+    return launch(restitution_kernel, kind.shape, inputs, device, kind.shape)[0]
+
+
+def oracle_ratio(e):
+    """Solve e = exp(-pi z / sqrt(1 - z^2)) for z by bisection, in [LOWEST, 1]."""
+    low, high = 0.0, 1.0
+    if e <= 0.0:
+        return 1.0
+    for _ in range(60):
+        z = 0.5 * (low + high)
+        low, high = (z, high) if np.exp(-np.pi * z / np.sqrt(1.0 - z * z)) > e else (low, z)
+    return float(np.clip(0.5 * (low + high), LOWEST, 1.0))
+
+
+@EXAMPLES
+@given(data=st.data())
+def test_references_are_those_of_the_damped_spring(device, data):
+    worlds, geoms = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 5))
+    kind = data.draw(indices((worlds, geoms), 4))
+    nominal = data.draw(floats((worlds, geoms, 2), 0.01, 1.0))
+    qd = data.draw(floats((worlds, 9), -0.3, 0.3))
+    coefficients = data.draw(floats((3, worlds), 0.0, 1.0))
+    out = references(device, nominal, kind, qd, coefficients)
+    speed = np.linalg.norm(qd[:, 3:6].astype(float), axis=1)
+    for w in range(worlds):
+        if abs(speed[w] - 0.2) < 1e-6:
+            continue  # either side of the threshold in single precision
+        for g in range(geoms):
+            if kind[w, g] not in (TABLE, HAND):
+                assert np.isnan(out[w, g]).all()
+                continue
+            own = coefficients[2 if kind[w, g] == TABLE else 0, w]
+            ratio = oracle_ratio(0.5 * (own + coefficients[1, w])) if speed[w] > 0.2 else 1.0
+            expected = [nominal[w, g, 0] / ratio, nominal[w, g, 1] * ratio]
+            np.testing.assert_allclose(out[w, g], expected, rtol=2e-5)
+            # The stiffness, which sets how deep a resting object sinks, stays.
+            assert np.prod(out[w, g]) == pytest.approx(np.prod(nominal[w, g]), rel=1e-5)

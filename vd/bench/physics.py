@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.objects.model import ObjectModel
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
+from vd.sim.engine import make_solver
 from vd.sim.scene import (
     CONDIM_TORSIONAL,
     PRIORITY_HAND,
@@ -24,7 +25,6 @@ from vd.sim.scene import (
     new_builder,
     shape_cfg,
 )
-from vd.sim.simulator import make_solver
 
 FINGERTIP_RADIUS_M = 0.0101
 """Radius of the D'Claw's fingertip, for the stand-in fingers of the pinch."""

@@ -414,11 +414,17 @@ class ReorientCfg:
             raise ValueError(f"goal.max_angle_rad = {self.goal.max_angle_rad}; it must be positive")
         if self.success.rotation_rad <= 0.0:
             raise ValueError(f"success.rotation_rad = {self.success.rotation_rad}; it must be positive")
-        if self.curriculum.tightening.enabled:
-            self._check_tightening(self.curriculum.tightening)
+        self._check_together()
 
-    def _check_tightening(self, tightening: TighteningCfg) -> None:
-        """Refuse one that would loosen, or do nothing."""
+    def _check_together(self) -> None:
+        """Refuse contacts that the engine lacks, and a tightening that would loosen or do nothing."""
+        if self.sim.engine == "mujoco" and self.randomisation.bounces:
+            raise ValueError(
+                "randomisation.restitution: sim.engine mujoco has none; set it to 0 0, or take newton"
+            )
+        tightening = self.curriculum.tightening
+        if not tightening.enabled:
+            return
         if self.success.rotation_rad > tightening.rotation_rad:
             raise ValueError(
                 f"success.rotation_rad is {self.success.rotation_rad:g}, looser than where it begins, "

@@ -23,7 +23,7 @@ from vd.envs.task_state import build_task
 from vd.kernels.task.actions import apply_action_kernel
 from vd.kernels.task.environments import record_step_kernel
 from vd.kernels.task.guard import void_step_kernel
-from vd.kernels.task.resets import episode_kernel, give_goal_kernel, reset_kernel
+from vd.kernels.task.resets import episode_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.task.success import success_kernel
 from vd.paper import PAPER
@@ -188,22 +188,6 @@ class ReorientEnv:
         self.randomiser.push()
         self.observe()
 
-    def give_goals(self, goal_quat: np.ndarray) -> None:
-        """Give every environment a new goal; what is observed is to be refreshed (:meth:`observe`).
-
-        Args:
-            goal_quat: Goal orientations, xyzw, either sign, shape [N, 4].
-        """
-        self._given_goal.assign(np.asarray(goal_quat, dtype=np.float32))
-        self._launch(
-            give_goal_kernel,
-            [self._given_goal, self.sim.joint_q, self.num_actions + 3],
-            [self.goal_quat, self.goal_steps],
-        )
-        if self.symmetry_frames is not None:
-            self._new_goal.fill_(1)
-            self.symmetry_frames.choose(self._new_goal, self._new_goal)
-
     def step(self, action: Any) -> None:
         """Simulate one control step; environments that end are reset, and the observation is fresh.
 
@@ -212,7 +196,7 @@ class ReorientEnv:
         """
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
-        if not self._kernels_loaded:
+        if not (self._kernels_loaded and self.sim.solver.captured):
             self.launch_step()  # before the capture, also in a run that resumes at a later step
             self._kernels_loaded = True
         else:
@@ -238,6 +222,9 @@ class ReorientEnv:
 
     def hold(self) -> None:
         """One control step in which no policy acts and the hand keeps its last targets; nothing is reset."""
+        if not self.sim.solver.captured:
+            self.sim.step()
+            return
         if self._hold_graph is None:
             with wp.ScopedCapture(device=self.device) as capture:
                 self.sim.step()

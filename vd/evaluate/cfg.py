@@ -13,6 +13,7 @@ from vd.evaluate.agents import LAYER_HELP, SHIPPED_POLICIES, episode_limit_s, st
 from vd.evaluate.conditions import CONDITIONS, Condition
 from vd.evaluate.goals import Goals
 from vd.paper import PAPER
+from vd.sim.cfg import Engine
 
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0
@@ -99,6 +100,8 @@ class EvalCfg:
     that last a control step; mixed, Table S3 with friction, backlash, late commands and a late object;
     observation-late (the object), all-late (joints too) and command-late, 83 ms and nothing else; the others
     change one thing, which the page of --suite robust names."""
+    engine: Engine = "newton"
+    """What steps the physics: as in training, or MuJoCo's own engine in C, in steps of 1 ms, on the CPU."""
     num_envs: int | None = None
     """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a GPU (1024
     with camera policies)."""
@@ -159,6 +162,8 @@ class EvalCfg:
             raise ValueError("--condition excludes --randomise and --table-friction; give one of them")
         if self.table_friction is not None and self.table_friction < 0.0:
             raise ValueError(f"--table-friction is {self.table_friction}; it must not be negative")
+        if self.engine == "mujoco" and self.device.startswith("cuda"):
+            raise ValueError(f"--engine mujoco steps on the CPU, not on {self.device}; leave --device out")
         self._validate_suite()
         start_at_rest(self.at_rest, self.no_at_rest)
         if self.num_envs is not None and self.num_envs < 1:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vd.evaluate.agents import check_fits, open_policy, sees_clouds, start_at_rest, task_for
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
 from vd.evaluate.conditions import in_condition
+from vd.sim.cfg import in_mujoco
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 ENVS_CPU, ENVS_GPU, ENVS_CAMERA_GPU = 64, 8192, 1024
 """Environments simulated at once by default: enough to keep the device busy, few enough to fit anywhere;
 images and clouds take memory."""
-_PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
+_PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "mujoco", "torch")
 
 
 def compare(cfg: EvalCfg, condition: str = "") -> "Result":
@@ -34,7 +35,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
     quiet_warp()
     from vd.device import resolve_device
 
-    device = resolve_device(cfg.device)
+    device = resolve_device("cpu" if cfg.engine == "mujoco" else cfg.device)
     # A file that cannot be used, or is of another hand, is told before the simulator is imported.
     policies = {name: open_policy(name, device) for name in cfg.agent_names}
     for name, policy in policies.items():
@@ -104,6 +105,8 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         task = in_condition(task, cfg.condition)
     if cfg.table_friction is not None:
         task = replace(task, table_friction=cfg.table_friction)
+    if cfg.engine == "mujoco":
+        task = replace(task, sim=in_mujoco(task.sim))
     return task
 
 
@@ -128,6 +131,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
         table_friction=cfg.table_friction,
         goals=cfg.goals,
         sensor_errors=cfg.sensor_errors and sees == "rendered clouds",
+        engine=cfg.engine,
     )
 
 

@@ -280,6 +280,7 @@ def asked(protocols: Sequence[Protocol]) -> str:
         f"goals {goals}",
         f"stop within {protocol.stop_tolerance_rad:g} rad",
         f"randomisation {protocol.randomisation}",
+        *([] if protocol.engine == "newton" else ["physics by MuJoCo's own engine"]),
     )
     return "; ".join(parts)
 

@@ -26,6 +26,7 @@ from vd.evaluate.statistics import (
 from vd.evaluate.trace import Episode, StopsBy, Trace, Way
 from vd.files import write_json
 from vd.paper import PAPER
+from vd.sim.cfg import Engine
 from vd.stopping import StoppingRule
 
 RESULT_FORMAT = "visual-dexterity evaluation 7"
@@ -77,6 +78,8 @@ class Protocol:
     """What camera policies know shapes and goals by."""
     sensor_errors: bool = False
     """Cameras have the errors of a real one."""
+    engine: Engine = "newton"
+    """What steps the physics."""
 
 
 @dataclass(frozen=True)

@@ -248,13 +248,15 @@ def _write(result: Result, cfg: EvalCfg, conditions: Sequence[Condition], groups
         table = figures
     write_json(cfg.out / f"{cfg.suite}.json", result.summary() | {"quick": cfg.quick, "figures": figures})
     notes = [f"Objects, {group}: {text}." for group, (_, text) in groups.items()]
+    notes += ["Held-out objects judge, and nothing is chosen on them."]
+    notes += [] if cfg.engine == "newton" else ["Physics by MuJoCo's own engine."]
     write_page(
         result,
         cfg.out / f"{cfg.suite}.html",
         title=title,
         lead=f"{', '.join(short.values())}{of}{', the reduced suite' if cfg.quick else ''}",
         figures=(list(table[0]), [list(row.values()) for row in table]) if table else None,
-        notes=[*notes, "Held-out objects judge, and nothing is chosen on them."],
+        notes=notes,
         conditions=[(c.name, c.shown, c.flags) for c in conditions],
         of_paper=of_paper,
     )

@@ -109,11 +109,11 @@ def excite(
     return Excitation(name, (reach.joints[joint],), time, command, dict(conditions or {}), enabled)
 
 
-def staircase(levels: Sequence[float], hold: float, rest: float = REST_S) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps and shape of ``levels`` held in turn for ``hold`` [s] each, after ``rest`` [s] at zero."""
-    time = sampled(rest + hold * len(levels))
+def staircase(levels: Sequence[float], hold: float) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps and shape of ``levels`` held in turn for ``hold`` [s] each, after a rest at zero."""
+    time = sampled(REST_S + hold * len(levels))
     steps = np.concatenate([[0.0], np.asarray(levels, dtype=float)])
-    index = np.clip(np.floor((time - rest) / hold + 1e-9).astype(int) + 1, 0, len(levels))
+    index = np.clip(np.floor((time - REST_S) / hold + 1e-9).astype(int) + 1, 0, len(levels))
     return time, steps[index]
 
 

@@ -90,7 +90,6 @@ def identify(
     *,
     generations: int = 100,
     population: int = 64,
-    start: np.ndarray | None = None,
     dt: float = DEFAULT_DT,
     device: str = "cpu",
     seed: int = 0,
@@ -107,7 +106,6 @@ def identify(
         joints: Joints to identify; all that some motion excites by default.
         generations: Generations of the search.
         population: Candidates of a generation; times the trajectories of a finger: the worlds.
-        start: Servo parameters to start from and to keep otherwise, shape [D, P]; the hand's by default.
         dt: Physics step [s].
         device: Warp device.
         seed: Seed of the search.
@@ -121,7 +119,7 @@ def identify(
     missing = [name for name in names if name not in recording.joints]
     if missing:
         raise ValueError(f"{recording.path}: joints {', '.join(missing)} are not recorded; leave them out")
-    base = np.array(hand.servo if start is None else start, dtype=float)
+    base = np.array(hand.servo, dtype=float)
     chosen = [hand.joint_names.index(name) for name in names]
     fingers = sorted({joint // JOINTS_PER_FINGER for joint in chosen})
     tracks = pack_tracks(recording, hand, fingers)

@@ -29,14 +29,9 @@ class _Waiting:
 
 
 class LaunchBatch:
-    """Threads whose calls are simulated together once all that are at work wait for one.
-
-    Attributes:
-        launches: Launches so far.
-    """
+    """Threads whose calls are simulated together once all that are at work wait for one."""
 
     def __init__(self) -> None:
-        self.launches = 0
         self._condition = threading.Condition()
         self._working = 0
         self._waiting: list[_Waiting] = []
@@ -76,7 +71,6 @@ class LaunchBatch:
             groups.setdefault(id(each.rollouts), []).append(each)
         self._waiting = []
         for group in groups.values():
-            self.launches += 1
             try:
                 results: list[np.ndarray | Exception] = list(
                     group[0].rollouts.simulate([each.call for each in group])

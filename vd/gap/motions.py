@@ -1,6 +1,6 @@
 """The motions of one machine, as they were recorded. SI units, radians, seconds."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -80,10 +80,6 @@ class Recording:
     servo: dict[str, Any]
     encoder_resolution_rad: float
     trajectories: tuple[Trajectory, ...]
-
-    def subset(self, indices: Sequence[int]) -> "Recording":
-        """The same recording with only these trajectories, in this order."""
-        return replace(self, trajectories=tuple(self.trajectories[i] for i in indices))
 
     def cut(self, pieces: Mapping[int, tuple[int, int]]) -> "Recording":
         """The same recording with pieces in the place of some trajectories.

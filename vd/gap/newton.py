@@ -7,7 +7,6 @@ finger. Contacts are off; SI units, radians.
 import dataclasses
 import math
 import zlib
-from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -31,8 +30,8 @@ from vd.kernels.servo.joint_replay import (
 )
 from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
+from vd.sim.engine import make_solver
 from vd.sim.scene import build_hand, new_builder
-from vd.sim.simulator import make_solver
 
 JOINTS_PER_FINGER = 3
 DEFAULT_DT = 1.0 / 480.0
@@ -286,7 +285,6 @@ def simulate_hand(
     *,
     dt: float = DEFAULT_DT,
     device: str = "cpu",
-    indices: Sequence[int] | None = None,
 ) -> np.ndarray:
     """What Newton makes of a recording's commands, sampled where the recording has positions.
 
@@ -296,21 +294,20 @@ def simulate_hand(
         rows: Servo parameters, shape [D, P], or of M models that are simulated side by side [M, D, P].
         dt: Physics step [s].
         device: Warp device.
-        indices: Trajectories to simulate, each a world of one batch; all by default.
 
     Returns:
         Predicted recorded positions [rad] in the recording's columns, the samples of the trajectories one
         after the other, shape [S, J] or [M, S, J].
     """
-    chosen = list(range(len(recording.trajectories)) if indices is None else indices)
+    count = len(recording.trajectories)
     rows = np.asarray(rows, dtype=float)
     models = rows[None] if rows.ndim == 2 else rows
-    tracks = np.repeat(np.array(chosen * len(models))[:, None], hand.num_fingers, axis=1)
+    tracks = np.repeat(np.tile(np.arange(count), len(models))[:, None], hand.num_fingers, axis=1)
     replay = HandReplay(recording, hand, tracks, dt=dt, device=device, keep_positions=True)
-    replay.run(np.repeat(models, len(chosen), axis=0))
+    replay.run(np.repeat(models, count, axis=0))
     columns = [hand.joint_names.index(name) for name in recording.joints]
     positions = replay.positions.numpy()[..., columns].astype(float)
-    positions = positions.reshape(len(models), len(chosen), -1, len(columns))
-    lengths = [len(recording.trajectories[i].time) for i in chosen]
+    positions = positions.reshape(len(models), count, -1, len(columns))
+    lengths = [len(trajectory.time) for trajectory in recording.trajectories]
     answers = np.concatenate([positions[:, k, :length] for k, length in enumerate(lengths)], axis=1)
     return answers[0] if rows.ndim == 2 else answers

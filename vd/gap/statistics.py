@@ -79,9 +79,9 @@ def _slow_noise(time: np.ndarray, position: np.ndarray, resolution: float) -> li
     return result
 
 
-def resamples(units: int, rng: np.random.Generator, count: int = BOOTSTRAP) -> np.ndarray:
-    """Weights of the units in each bootstrap resample, shape [count, units]; every row sums to ``units``."""
-    return rng.multinomial(units, np.full(units, 1.0 / units), size=count).astype(float)
+def resamples(units: int, rng: np.random.Generator) -> np.ndarray:
+    """Weights of the units in each bootstrap resample, [BOOTSTRAP, units]; every row sums to ``units``."""
+    return rng.multinomial(units, np.full(units, 1.0 / units), size=BOOTSTRAP).astype(float)
 
 
 def interval(samples: np.ndarray) -> tuple[float, float]:

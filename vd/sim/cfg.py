@@ -1,10 +1,12 @@
 """Settings of the physics, each with the reason for its value."""
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from vd.config import Dropped
 from vd.paper import PAPER
+
+Engine = Literal["newton", "mujoco"]
 
 # Of a light object (0.1 kg) pinched by strong fingers (2.6 N m), measured in docs/concepts/physics.md.
 CONE = "elliptic"
@@ -49,6 +51,8 @@ class SimCfg:
         "fingertip_torsion_m": FINGERTIP_TORSION_M,
     }
 
+    engine: Engine = "newton"
+    """What steps the physics: Newton on MuJoCo Warp, or MuJoCo's own engine in C, on the CPU alone."""
     physics_hz: float = PAPER.scene.physics_hz
     """Physics rate [Hz]; a whole, even multiple of ``control_hz``."""
     control_hz: float = PAPER.scene.control_hz
@@ -124,4 +128,25 @@ def coarser(cfg: SimCfg) -> SimCfg:
         contact_time_constant_s=max(cfg.contact_time_constant_s, 2.0 / COARSE_PHYSICS_HZ),
         iterations=min(cfg.iterations, COARSE_ITERATIONS),
         ls_iterations=min(cfg.ls_iterations, COARSE_ITERATIONS),
+    )
+
+
+MUJOCO_PHYSICS_HZ = 1008.0
+"""Physics rate in MuJoCo's engine [Hz]: the even multiple of the control rate next to a step of 1 ms."""
+MUJOCO_ITERATIONS, MUJOCO_LS_ITERATIONS = 100, 50
+"""MuJoCo's defaults. With 10 iterations of its line search the solver stops at wrong answers."""
+
+
+def in_mujoco(cfg: SimCfg) -> SimCfg:
+    """The same contacts, joints and shapes in MuJoCo's own engine, in steps of a millisecond.
+
+    Args:
+        cfg: Physics of the task.
+    """
+    return replace(
+        cfg,
+        engine="mujoco",
+        physics_hz=MUJOCO_PHYSICS_HZ,
+        iterations=MUJOCO_ITERATIONS,
+        ls_iterations=MUJOCO_LS_ITERATIONS,
     )

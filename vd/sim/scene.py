@@ -67,6 +67,8 @@ class Scene:
     """Body index within a world of the object."""
     shape_kind: np.ndarray
     """SHAPE_* of every shape, shape [S]."""
+    worlds: list[tuple[newton.ModelBuilder, int]]
+    """Runs of equal worlds in their order: what builds one of them, and how many they are."""
 
     @property
     def num_envs(self) -> int:
@@ -270,7 +272,7 @@ def build_scene(
     hand_builder = build_hand(hand, cfg, visuals=visuals)
     world_object = assign_objects(num_envs, len(objects))
     world_scale = np.ones(num_envs)
-    scene = new_builder()
+    scene, worlds = new_builder(), []
     for index, item in enumerate(objects):
         count = int(np.count_nonzero(world_object == index))
         scale_index = assign_objects(count, len(scales))
@@ -284,6 +286,7 @@ def build_scene(
             add_table(world, cfg, visible=visuals)
             add_object(world, item, cfg, scale=float(scale), visuals=visuals)
             scene.replicate(world, int(copies))
+            worlds.append((world, int(copies)))
     model = scene.finalize(device=device)
     bodies = model.body_count // num_envs
     names = [label.rsplit("/", 1)[-1] for label in model.body_label[:bodies]]
@@ -298,6 +301,7 @@ def build_scene(
         link_body=np.array([names.index(link) for link in hand.link_names], dtype=np.int32),
         object_body=object_body,
         shape_kind=shape_kinds(model, bodies, object_body),
+        worlds=worlds,
     )
 
 

@@ -1,6 +1,5 @@
 """Step many worlds with SolverMuJoCo, with the velocity limits and guards the solver lacks."""
 
-import math
 from collections.abc import Callable
 
 import newton
@@ -15,7 +14,8 @@ from vd.kernels.task.environments import place_table_kernel
 from vd.kernels.task.guard import collect_overflow_kernel, guard_kernel, put_back_kernel
 from vd.paper import PAPER
 from vd.sim.actuators import JointServo
-from vd.sim.cfg import CONE, IMPRATIO, JACOBIAN, TOLERANCE, SimCfg
+from vd.sim.cfg import SimCfg
+from vd.sim.engine import make_solver
 from vd.sim.pair_order import sort_pairs
 from vd.sim.restitution import Restitution
 from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
@@ -26,16 +26,6 @@ MAX_SPEED = 500.0
 
 # Height of a table that is not there [m]: an object that is lost on the way down is reset long before.
 AWAY_M = -10.0
-
-# Work space of convex pairs (5 kB each) is shared by all worlds; few worlds have no average to rely on:
-# 60 of objects wedged between the fingers filled three for each (our choice).
-FEWEST_CONVEX_PAIRS = 1024
-
-# Convex parts of an object up to which sim.nconmax and sim.nccdmax are as they are set: one of 32 parts
-# touches table and fingers at 25 places, one of 8 at 9.
-USUAL_PARTS = 8
-# Constraint rows for each part more that any world's object has: a dish of 32 took 170 within 10 s.
-ROWS_A_PART = 8
 
 # MuJoCo Warp's overflow bits that mean lost contacts or constraint rows, by the setting to change.
 # Its other bits count solver and line-search iterations, which are stopping rules, not losses.
@@ -50,37 +40,6 @@ OVERFLOW_REMEDY = {
 
 class SimulationError(RuntimeError):
     """The simulation lost contacts or left the finite numbers; says what to change."""
-
-
-def make_solver(model: newton.Model, cfg: SimCfg) -> SolverMuJoCo:
-    """The solver with the project's settings; overflow is left to the guards, which need no prints.
-
-    Room for contacts, which worlds share, grows with the convex parts of a world on average; that for
-    constraint rows, which each has for itself, with the most parts of any.
-    """
-    convex = model.shape_type.numpy() == newton.GeoType.CONVEX_MESH
-    parts = np.bincount(model.shape_world.numpy()[convex], minlength=model.world_count)
-    room = max(1.0, parts.mean() / USUAL_PARTS)
-    rows = cfg.njmax + ROWS_A_PART * max(0, int(parts.max()) - USUAL_PARTS)
-    solver = SolverMuJoCo(
-        model,
-        solver="newton",
-        integrator="implicitfast",
-        cone=CONE,
-        impratio=IMPRATIO,
-        iterations=cfg.iterations,
-        ls_iterations=cfg.ls_iterations,
-        tolerance=TOLERANCE,
-        jacobian=JACOBIAN,
-        njmax=rows,
-        nconmax=math.ceil(room * cfg.nconmax),
-        enable_multiccd=False,  # the table is a plane, whose contacts are exact, and fingertips are round
-        kinematic_switchable_roots=False,
-    )
-    solver.mjw_model.opt.warn_overflow = False
-    # The solver would take one for each contact, and has no argument for it.
-    solver.mjw_data.naccdmax = max(math.ceil(room * cfg.nccdmax) * model.world_count, FEWEST_CONVEX_PAIRS)
-    return solver
 
 
 class Simulator:
@@ -114,7 +73,7 @@ class Simulator:
         self.model = scene.model
         self.device = self.model.device
         self.num_envs = n = scene.num_envs
-        self.solver = make_solver(self.model, cfg)
+        self.solver = make_solver(self.model, cfg, scene.worlds)
         self.state, self._next = self.model.state(), self.model.state()
         self.control = self.model.control()
         if self.device.is_cuda:  # a processor has no warps that would wait
@@ -180,7 +139,8 @@ class Simulator:
     def step(self) -> None:
         """Simulate one control step with the present ``target`` and ``body_force``.
 
-        Device work only, so that it can be captured in a CUDA graph.
+        Device work only, so that it can be captured in a CUDA graph, where the solver allows it
+        (:attr:`vd.sim.engine.WarpSolver.captured`).
         """
         wp.copy(self._start_q, self.joint_q)
         wp.copy(self._start_qd, self.joint_qd)
@@ -245,6 +205,7 @@ class Simulator:
         launch(collect_overflow_kernel, self.num_envs, raised, [self.overflow])
 
     def _table_contact(self) -> None:
+        self.solver.publish_contacts()
         data = self.solver.mjw_data
         contact = data.contact
         self.table_force.zero_()

@@ -1,0 +1,97 @@
+"""The web viewer: a headless browser draws its scene, and its controls reach the simulation."""
+
+import asyncio
+import inspect
+import shutil
+import subprocess
+import time
+
+import numpy as np
+import pytest
+from fake_env import FakeEnv
+from PIL import Image
+from test_play_session import Turn
+from test_render import box
+from viser import GuiEvent
+
+from vd.assets_usd.hands import load_hand
+from vd.play.session import Session
+from vd.play.viewer import HIDDEN, PlayViewer, open_page
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--no-first-run",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--window-size=1280,800",
+    "--virtual-time-budget=20000",
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",  # no network
+)
+PATIENCE_S = 300.0
+
+
+@pytest.fixture
+def player():
+    objects = [box("brick", [0.09, 0.05, 0.03]), box("stick", [0.14, 0.02, 0.02])]
+    env = FakeEnv(objects, num_envs=2, max_episode_steps=10_000, tolerance=-1.0, hand=load_hand("dclaw3"))
+    viewer = PlayViewer(Session(env, Turn(1.0)), open_page(verbose=False))
+    yield viewer
+    viewer.close()
+
+
+def picture(player, path):
+    """What a browser shows of the page while it runs, as RGB."""
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        pytest.skip(f"no browser found; install one of {', '.join(BROWSERS)}")
+    profile = f"--user-data-dir={path.with_suffix('')}"
+    browser = subprocess.Popen([program, *FLAGS, profile, f"--screenshot={path}", player.url])
+    deadline = time.monotonic() + PATIENCE_S
+    while browser.poll() is None:
+        assert time.monotonic() < deadline
+        player.update()
+        time.sleep(0.02)
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+@pytest.mark.slow
+def test_a_browser_draws_object_and_goal_without_a_network(player, tmp_path):
+    shown = picture(player, tmp_path / "page.png")
+    red, green, blue = np.moveaxis(shown, -1, 0)
+    assert ((red - blue > 80) & (red > green + 15)).sum() > 300, "the object"
+    assert ((green - red > 20) & (green > blue)).sum() > 300, "its goal"
+
+
+def use(player, label, value=None):
+    """Do with a control of the page what a browser's user does."""
+    handles = player.viewer.server.gui._gui_input_handle_from_uuid.values()
+    (control,) = [handle for handle in handles if handle.label == label]
+    if value is not None:
+        control._impl.value = value
+    for told in control._impl.update_cb:
+        if inspect.isawaitable(done := told(GuiEvent(client=None, client_id=0, target=control))):
+            asyncio.run(done)
+    player.update()
+
+
+def test_controls_reach_the_simulation(player):
+    session = player.session
+    player.run(steps=3)
+    assert session.snapshot.time_s == pytest.approx(3 / 12)
+    use(player, "Pause", True)
+    for _ in range(3):
+        assert not player.update()
+    assert session.snapshot.time_s == pytest.approx(3 / 12)
+    use(player, "Step")
+    assert session.snapshot.time_s == pytest.approx(4 / 12)
+    goal = session.snapshot.goal_quat.copy()
+    use(player, "New goal")
+    assert not np.allclose(session.snapshot.goal_quat, goal)
+    use(player, "Object", "stick")
+    assert session.object_name == "stick" and "stick" in player._status.content
+    use(player, "Goal", HIDDEN)
+    use(player, "Reset")
+    assert session.snapshot.time_s == 0.0
