@@ -73,7 +73,7 @@ def test_a_tracking_policy_comes_back(tmp_path, hand, camera):
     assert torch.equal(found.teacher.act(observation), original.teacher.act(observation))
     for name, value in original.teacher.critic_weights.items():
         assert torch.equal(found.teacher.critic_weights[name], value)
-    source = contract.interface.camera.source
+    source = contract.interface["camera"]["source"]
     assert contract.kind == "tracking" and source == ("hand" if camera is None else "policy")
     check_hand(read_contract(tmp_path / "tracking"), hand, "it")
     assert contract.provenance.objects == ("training-set", "cube"), "no folders of the machine"
@@ -108,18 +108,16 @@ def test_a_vision_policy_comes_back_and_answers_with_its_network(tmp_path):
 
 def test_another_hand_is_refused_by_field(teacher_bundle, hand, capsys):
     contract = read_contract(teacher_bundle)
-    check_hand(contract, hand, teacher_bundle)
-    with pytest.raises(
-        ContractError, match=r"hand.name is 'dclaw4' here, but 'dclaw3' in the bundle; use the"
+    swapped = (hand.joint_names[1], hand.joint_names[0], *hand.joint_names[2:])
+    limited = hand.upper.copy()
+    limited[3] = 1.2
+    for other, message in (
+        (load_hand("dclaw4"), r"hand.name is 'dclaw4' here, but 'dclaw3' in the bundle; use the"),
+        (replace(hand, joint_names=swapped), r"hand\.joint_names\[0\] is 'f0_j2' here, but 'f0_j1'"),
+        (replace(hand, upper=limited), r"hand\.upper_rad\[3\] is 1\.2"),
     ):
-        check_hand(contract, load_hand("dclaw4"), teacher_bundle)
-    swapped = replace(hand, joint_names=(hand.joint_names[1], hand.joint_names[0], *hand.joint_names[2:]))
-    with pytest.raises(ContractError, match=r"hand\.joint_names\[0\] is 'f0_j2' here, but 'f0_j1'"):
-        check_hand(contract, swapped, teacher_bundle)
-    with pytest.raises(ContractError, match=r"hand\.upper_rad\[3\] is 1\.2"):
-        limited = hand.upper.copy()
-        limited[3] = 1.2
-        check_hand(contract, replace(hand, upper=limited), teacher_bundle)
+        with pytest.raises(ContractError, match=message):
+            check_hand(contract, other, teacher_bundle)
     # a hand that is the same but for rounding
     check_hand(contract, replace(hand, upper=hand.upper + 1e-6), teacher_bundle)
     assert evaluate([str(teacher_bundle), "--hand", "dclaw4", "--device", "cpu"]) == 1
@@ -141,25 +139,15 @@ def test_another_camera_is_refused_unless_the_policy_has_its_own(tmp_path, hand)
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "message"),
+    ("part", "field", "value", "message"),
     [
-        (
-            ("interface", "conventions", "quaternion"),
-            "wxyz",
-            "conventions.quaternion is 'xyzw' here, but 'wxyz'",
-        ),
-        (("interface", "action", "scale_rad_s"), 2.0, "action.scale_rad_s is 3.5 here, but 2 in"),
-        (("interface", "observation", "velocity_scale"), 1.0, "observation.velocity_scale is 0.2 here"),
-        (("interface", "observation", "file_axes"), True, "observation.file_axes is False here"),
+        ("conventions", "quaternion", "wxyz", "conventions.quaternion is 'xyzw' here, but 'wxyz'"),
+        ("action", "scale_rad_s", 2.0, "action.scale_rad_s is 3.5 here, but 2 in"),
+        ("observation", "velocity_scale", 1.0, "observation.velocity_scale is 0.2 here"),
     ],
 )
-def test_a_contract_of_other_conventions_is_refused(teacher_bundle, hand, field, value, message):
-    def change(values):
-        for key in field[:-1]:
-            values = values[key]
-        values[field[-1]] = value
-
-    edit(teacher_bundle, change)
+def test_a_contract_of_other_conventions_is_refused(teacher_bundle, hand, part, field, value, message):
+    edit(teacher_bundle, lambda values: values["interface"][part].update({field: value}))
     with pytest.raises(ContractError, match=message):
         check_hand(read_contract(teacher_bundle), hand, teacher_bundle)
 

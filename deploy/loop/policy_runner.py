@@ -11,7 +11,7 @@ import warp as wp
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import check_fits, is_tracking_policy, open_policy, trained_task
+from vd.evaluate.agents import check_fits, open_policy, trained_task
 from vd.paper import PAPER
 from vd.senses import Senses
 from vd.sensors.depth_cloud import CameraCloud
@@ -160,7 +160,7 @@ def load_runner(
             raise ValueError(f"{name} is not for a hand; give a bundle, a policy's file, or {ZERO}")
         return PolicyRunner(ReorientCfg(hand=hand_name), StoppingRule())
     check_fits(name, policy, hand_name)
-    if is_tracking_policy(policy):
+    if isinstance(policy, TrackingPolicy):
         return TrackingRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     raise ValueError(
         f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train tracker "

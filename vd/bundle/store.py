@@ -5,7 +5,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +14,11 @@ import torch
 
 from vd.assets_usd.hands import load_hand
 from vd.bundle import CONTRACT_FILE, is_bundle
-from vd.bundle.contract import (
-    BUNDLE_FORMAT,
-    Contract,
-    ContractError,
-    Kind,
-    Provenance,
-    StoppingPart,
-    derive_interface,
-)
+from vd.bundle.contract import BUNDLE_FORMAT, Contract, ContractError, Provenance, derive_interface
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
-from vd.files import atomic_path, make_folder, write_json, writing
-from vd.policy import PolicySpec, TrainedPolicy
+from vd.files import make_folder, write_json, writing
+from vd.policy import TrainedPolicy, policy_of
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
 from vd.tracking.policy import TrackingPolicy, TrackingSpec
@@ -34,8 +26,6 @@ from vd.versions import installed_versions
 from vd.vision.saved import alignment_network
 
 WEIGHTS_FILE, GOLDEN_FILE = "weights.safetensors", "golden.safetensors"
-FILE_MODE, FOLDER_MODE = 0o644, 0o755
-"""A bundle is for others to read."""
 STATES, GOLDEN_POINTS = 8, 500
 """Golden observations of a teacher or pairs of clouds, and points of each cloud."""
 GOLDEN_M = 0.03
@@ -44,6 +34,7 @@ TOLERANCE = 5e-3
 """Largest difference of an output from the golden one. Actions are of size 1; processors, GPUs and other
 versions of torch differ by 1e-6 to 1e-3."""
 _PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
+_RULES = [one.name for one in fields(StoppingRules)]
 _AGAIN = "write the bundle again with vd-train bundle"
 
 AnyPolicy = TrainedPolicy | TrackingPolicy
@@ -51,24 +42,17 @@ Tensors = dict[str, torch.Tensor]
 
 
 def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
-    """Write the bundle of a policy; one that is there is replaced.
-
-    Args:
-        policy: The policy, on the CPU.
-        folder: To write.
+    """Write the bundle of a policy on the CPU; one that is there is replaced.
 
     Raises:
-        ContractError: A robot's loop cannot give what it observes.
         FileExistsError: The folder holds something else.
         OutputError: It cannot be written.
     """
     task = from_dict(ReorientCfg, policy.task, where="task of the policy")
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
-    kind: Kind = "teacher"
     rules: StoppingRules | None = None
-    trained = policy.teacher if isinstance(policy, TrackingPolicy) else policy
     if isinstance(policy, TrackingPolicy):
-        kind, rules = policy.kind, policy.spec
+        rules, trained = policy.spec, policy.teacher
         source = _provenance(trained, policy.spec.teacher, to_dict(policy.spec.depth))
         network, camera = {"policy": to_dict(trained.spec)}, policy.spec.camera
         parts = {"actor": trained.weights, "critic": trained.critic_weights}
@@ -80,10 +64,10 @@ def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
         source = _provenance(policy, "", {})
         network, camera, weights = to_dict(policy.spec), None, policy.weights
     contract = Contract(
-        kind=kind,
+        kind=policy.kind,
         interface=derive_interface(hand, source, camera),
         network=network,
-        stopping=None if rules is None else StoppingPart.of(rules),
+        stopping=None if rules is None else StoppingRules(**{n: getattr(rules, n) for n in _RULES}),
         provenance=source,
         software=installed_versions(_PACKAGES),
     )
@@ -107,17 +91,18 @@ def read_contract(folder: str | Path) -> Contract:
         found = values.get("format") if isinstance(values, dict) else None
         if found != BUNDLE_FORMAT:
             raise ValueError(f"format is {found!r}, this version reads {BUNDLE_FORMAT!r}")
+        if (rules := values.get("stopping")) and "distance_rad" in rules:  # of an earlier version
+            pairs = (rules.pop("distance_rad"), rules.pop("action_norm")), rules.get("precise")
+            rules["stopping"], rules["precise"] = (
+                pair and dict(zip(("distance_rad", "action_norm"), pair, strict=True)) for pair in pairs
+            )
         return from_dict(Contract, values)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, KeyError) as error:
         raise ContractError(f"{path}: {error}; {_AGAIN}") from error
 
 
 def read_bundle(folder: str | Path, device: str = "cpu") -> AnyPolicy:
     """The policy of a bundle, once it has answered the golden inputs as it did when it was written.
-
-    Args:
-        folder: The bundle.
-        device: Torch device of the policy.
 
     Raises:
         FileNotFoundError: A file is missing.
@@ -182,9 +167,8 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     if contract.kind == "teacher":
         return _teacher(network, source, weights, device)
     settings: dict[str, Any] = {"teacher": source.teacher, "camera": contract.own_camera}
-    if (stopping := contract.stopping) is not None:
-        settings |= stopping.rules()
-    teacher = _teacher(network.pop("policy"), source, weights, device, parts=True)
+    settings |= vars(contract.stopping or StoppingRules())
+    teacher = _teacher(network.pop("policy"), source, weights, device)
     spec = from_dict(TrackingSpec, network, where="network")
     depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth")
     alignment = None
@@ -193,19 +177,11 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     return TrackingPolicy(teacher, replace(spec, depth=depth, **settings), alignment)
 
 
-def _teacher(
-    spec: dict[str, Any], source: Provenance, weights: Tensors, device: str, *, parts: bool = False
-) -> TrainedPolicy:
-    """A teacher; with ``parts`` the names of its weights say whether they are the actor's or the critic's."""
-    return TrainedPolicy(
-        from_dict(PolicySpec, spec, where="network"),
-        _part(weights, "actor.") if parts else weights,
-        task=source.task,
-        iteration=source.iterations,
-        env_steps=source.env_steps,
-        device=device,
-        critic=(_part(weights, "critic.") or None) if parts else None,
-    )
+def _teacher(spec: dict[str, Any], source: Provenance, weights: Tensors, device: str) -> TrainedPolicy:
+    """A teacher; of a tracking policy names of weights say whether they are the actor's or the critic's."""
+    trained = {"policy": spec, "task": source.task, "iter": source.iterations, "env_steps": source.env_steps}
+    actor, critic = _part(weights, "actor.") or weights, _part(weights, "critic.")
+    return policy_of(trained | {"actor_state_dict": actor, "critic_state_dict": critic}, device)
 
 
 def _part(weights: Tensors, prefix: str) -> Tensors:
@@ -228,18 +204,16 @@ def _provenance(trained: TrainedPolicy, teacher: str, depth: dict[str, Any]) -> 
 
 def _write(folder: Path, contract: Contract, weights: Tensors, golden: Tensors) -> None:
     """Write the files beside the place of the bundle, then put them there at once."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     if folder.exists() and not is_bundle(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} exists and is no bundle; choose another name")
     make_folder(folder.parent)
     with writing(folder), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
         made = Path(name) / folder.name
-        made.mkdir(FOLDER_MODE)
+        made.mkdir()
         for file, tensors in ((WEIGHTS_FILE, weights), (GOLDEN_FILE, golden)):
-            with atomic_path(made / file) as path:
-                save_file({key: v.detach().cpu().contiguous() for key, v in tensors.items()}, path)
-            (made / file).chmod(FILE_MODE)  # the library writes for the owner's eyes only
+            (made / file).write_bytes(save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}))
         digests = {file: _digest(made / file) for file in (WEIGHTS_FILE, GOLDEN_FILE)}
         write_json(made / CONTRACT_FILE, to_dict(replace(contract, files=digests)))
         if folder.exists():
