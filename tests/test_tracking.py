@@ -214,7 +214,7 @@ def test_a_vision_policy_comes_back_with_its_network(tmp_path):
     policy = vision_of("dclaw3-tracking")
     save_checkpoint(tmp_path / "vision.pt", tracking_export(policy))
     found = open_policy(str(tmp_path / "vision.pt"), "cpu")
-    assert (found.kind, found.spec) == ("vision", policy.spec) and sees_clouds(str(tmp_path / "vision.pt"))
+    assert (found.kind, found.spec) == ("vision", policy.spec) and sees_clouds(found)
     clouds = torch.randn(2, 3, 40, 3)
     assert torch.equal(found.alignment(*clouds).rotation, policy.alignment(*clouds).rotation)
 
