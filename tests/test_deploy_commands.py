@@ -50,7 +50,7 @@ def line(hand, monkeypatch):
         motors.plant.position[:] = reset_pose(3) + 0.1
 
         @contextlib.contextmanager
-        def connect(options, twin_options=()):
+        def connect(options, **twin_options):
             yield Connection(hand, joints, bus)
 
         for module in (check, home, record):
