@@ -145,9 +145,7 @@ def _motion(file: str, excitation: "Excitation", hand: "HandModel") -> Motion:
 def read_plan(path: Path, hand: "HandModel") -> list[Motion]:
     """The motions of a plan that ``vd-gap plan`` wrote; joints that it does not name are straight.
 
-    Args:
-        path: ``next_experiment.json``, or the folder with it.
-        hand: The hand.
+    ``path`` is next_experiment.json, or the folder with it.
 
     Raises:
         RecordError: It is no such plan, or one of another hand.
@@ -220,13 +218,7 @@ def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
 
 
 def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float) -> "Trajectory":
-    """Go to where a motion starts, play it on an armed hand, and give what was measured.
-
-    Args:
-        safe: The hand.
-        motion: The motion.
-        columns: The joints that are recorded.
-        rate_hz: Samples a second that are tried.
+    """Go to where a motion starts, play it on an armed hand, and give what was measured of some joints.
 
     Raises:
         StoppedError: The hand was stopped.

@@ -48,19 +48,12 @@ class ControlLoop:
     """Pursues goals, one after the other: acts until the policy says it has arrived, holds, and goes on.
 
     Args:
-        safe: The hand, behind its limits, armed.
-        runner: The policy.
-        actions: From its actions to joint goals.
-        pacer: The grid of control steps.
-        log: Takes every step.
+        safe: The hand, armed.
         episode_s: Time for each goal [s].
         hold_s: How long the hand holds still after each stop [s], before it goes on.
         camera: Depth camera; None: the policy needs none.
         twin: Knows the object's true state; None on a real hand.
         symmetry: Rotations that map the object to itself [K, 4], for the true error.
-
-    Attributes:
-        times: Of every step so far.
     """
 
     def __init__(
@@ -82,6 +75,7 @@ class ControlLoop:
         self._camera, self._twin, self._symmetry = camera, twin, symmetry
         self._target = safe.read().position
         self.times: list[StepTimes] = []
+        """Of every step so far."""
 
     def run(self, goals: Sequence[np.ndarray]) -> list[str]:
         """Pursue all goals [4]; the outcome of each.

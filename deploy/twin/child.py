@@ -28,13 +28,7 @@ class TwinError(RuntimeError):
 
 
 class TwinChild:
-    """A running twin.
-
-    Args:
-        command: Which.
-
-    Attributes:
-        path: Device of its bus.
+    """A running twin, with the device of its bus as ``path``.
 
     Raises:
         TwinError: It did not start; says why.
@@ -122,12 +116,7 @@ def _serve(command: TwinCommand, pipe: Connection) -> None:
 
 
 class TwinCamera:
-    """The depth camera of a twin: an image whenever one is wanted.
-
-    Args:
-        twin: The twin.
-        intrinsics: Of the camera that it was told to have.
-    """
+    """The depth camera that a twin was told to have: an image whenever one is wanted."""
 
     def __init__(self, twin: TwinChild, intrinsics: Intrinsics):
         self._twin, self.intrinsics = twin, intrinsics

@@ -179,14 +179,7 @@ class Motor:
         )
 
     def sense(self, seconds: float, position: float, velocity: float, torque: float) -> None:
-        """Take in the state of the axis after ``seconds`` more, and protect the motor.
-
-        Args:
-            seconds: Time since the last call.
-            position: Angle [rad].
-            velocity: Speed [rad/s].
-            torque: Torque of the motor [N m].
-        """
+        """Take in angle [rad], speed [rad/s] and torque [N m] after ``seconds`` more, and protect the motor."""
         self._clock += seconds
         self.put("realtime_tick", int(self._clock / TICK_S) % TICK_MODULUS)
         self._where = position

@@ -46,9 +46,7 @@ class Twin(MotorLine):
     """Motors on a line, stepped in real time, behind a pseudo-terminal.
 
     Args:
-        motors: Motors in the order of the plant's axes.
-        plant: What they move; axes without mass by default.
-        faults: What goes wrong; may be changed while it runs.
+        motors: As of :class:`MotorLine`, as are ``plant`` and ``faults``.
         pipe: To the program that started it, if one did: requests come by it, and it ends with its other end.
         answer: To each request.
     """
