@@ -179,7 +179,7 @@ class Motor:
         )
 
     def sense(self, seconds: float, position: float, velocity: float, torque: float) -> None:
-        """Take in angle [rad], speed [rad/s] and torque [N m] after ``seconds`` more, and protect the motor."""
+        """Take in angle [rad], speed [rad/s] and torque [N m] ``seconds`` later, and protect the motor."""
         self._clock += seconds
         self.put("realtime_tick", int(self._clock / TICK_S) % TICK_MODULUS)
         self._where = position
