@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -59,7 +59,7 @@ class SimCommand:
         task = dataclasses.replace(trained_task(teacher), objects=self.objects)
         tasks = (dataclasses.replace(task, num_envs=envs) for envs in self.envs)
         rows = (measure(cfg, device, teacher=teacher) for cfg in tasks)
-        report(map(dataclasses.asdict, rows), device, self.json)
+        report(rows, device, self.json)
         return 0
 
 
@@ -122,7 +122,7 @@ class DepthCommand:
 
         device, objects = resolve_device(self.device), load_set(list(self.objects))
         rows = (measure(objects, envs, device, hand=self.hand, seed=self.seed) for envs in self.envs)
-        report(map(dataclasses.asdict, rows), device, self.json)
+        report(rows, device, self.json)
         return 0
 
 
@@ -157,27 +157,23 @@ class GapCommand:
 
     out: Path = Path("runs/gap-battery")
     """Folder of the results and their tables (summary.md)."""
-    model: str = "dclaw3"
-    """dclaw3 or dclaw4 (one finger), or servo, which is quick."""
-    kinds: tuple[str, ...] = ("single", "none", "pair", "outside")
+    model: Literal["dclaw3", "dclaw4", "servo"] = "dclaw3"
+    """A hand, of which it takes one finger, or servo, which is quick."""
+    kinds: tuple[Literal["single", "none", "pair", "outside"], ...] = ("single", "none", "pair", "outside")
     """Kinds of cases."""
     effects: tuple[str, ...] = ()
     """Effects to hide; all that show on the model by default."""
-    sizes: tuple[int, ...] = (0, 1, 2, 3)
+    sizes: tuple[Literal[0, 1, 2, 3], ...] = (0, 1, 2, 3)
     """Sizes of single effects: gaps of about 1.5, 3, 6 and 12 noise floors."""
     seeds: int = 5
     """Recordings of each effect and size; 40 times as many with nothing hidden, or only another stiffness,
     damping or mass."""
     first_seed: int = 0
     """Seed of the first recording: others than those that the method was tuned on."""
-    cases: int | None = None
-    """Run this many of the cases, a fair sample; all by default."""
     jobs: int = 1
     """Cases at a time, one process and one thread each."""
     device: str = "cpu"
     """Warp device."""
-    keep: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Keep recordings and analyses."""
 
     def run(self) -> int:
         """Run the cases, then write and print the tables."""
@@ -192,9 +188,9 @@ class GapCommand:
             sizes=self.sizes,
             seeds=self.seeds,
             first_seed=self.first_seed,
-        )[: self.cases]
+        )
         device = resolve_device(self.device)
-        results = run_battery(cases, self.out, jobs=max(self.jobs, 1), device=device, keep=self.keep)
+        results = run_battery(cases, self.out, jobs=max(self.jobs, 1), device=device)
         write_text(self.out / "summary.md", markdown(results))
         print(markdown(results))
         return 0
