@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from vd.config import Dropped, Renamed
+from vd.config import Dropped, Renamed, require
 from vd.paper import PAPER
 
 ACTIVATION = "elu"
@@ -130,21 +130,6 @@ class RunCfg:
             raise ValueError(
                 f"--keep-every is {self.keep_every}; give a multiple of --save-every {self.save_every}"
             )
-
-
-def require(
-    cfg: Any, prefix: str, what: Literal["positive", "zero or positive", "in [0, 1]"], names: str
-) -> None:
-    """Refuse fields, named with spaces between, that are not ``what``; those that are ``None`` are not set.
-
-    Raises:
-        ValueError: The flag, its value and what it has to be.
-    """
-    for name in names.split():
-        value = getattr(cfg, name)
-        good = value is None or value > 0 or (what != "positive" and value == 0)
-        if not good or (what == "in [0, 1]" and value > 1):
-            raise ValueError(f"{prefix}{name.replace('_', '-')} is {value}; it has to be {what}")
 
 
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:

@@ -82,7 +82,6 @@ class TeacherPPO(PPO):
         actor: MLPModel,
         critic: MLPModel,
         storage: RolloutStorage,
-        *,
         cfg: PpoCfg,
         **kwargs: Any,
     ) -> None:
