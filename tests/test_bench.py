@@ -36,7 +36,7 @@ def test_our_kernels_take_a_share_of_a_step(device):
 
 def test_physics_report_names_what_moves(tmp_path):
     out = tmp_path / "physics.json"
-    PhysicsCommand(objects=("cube",), json=out).run()
+    PhysicsCommand(objects=("cube",), device="cpu", json=out).run()
     (report,) = json.loads(out.read_text())["rows"]
     assert report["objects"] == 1 and report["at_rest_share"] == 1.0 and report["moving"] == []
     assert report["pinch"]["creep"] < 0.2e-3

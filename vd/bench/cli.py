@@ -31,19 +31,25 @@ def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> No
 
 
 @dataclass(frozen=True)
-class SimCommand:
-    """Control steps per second, memory and start-up of the simulation under a policy's actions."""
+class Measurement:
+    """What the measurements of simulation, contacts and camera have in common."""
 
-    envs: tuple[int, ...] = (4096, 8192, 16384)
-    """Numbers of environments to measure."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets, mixed over the environments."""
     device: str = "auto"
     """Warp device; auto is the first GPU, or else the CPU."""
-    policy: str = "dclaw4-table"
-    """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
     json: Path | None = None
     """Write the rows to this file as JSON."""
+
+
+@dataclass(frozen=True)
+class SimCommand(Measurement):
+    """Control steps per second, memory and start-up of the simulation under a policy's actions."""
+
+    envs: tuple[int, ...] = (4096, 8192, 16384)
+    """Numbers of environments to measure."""
+    policy: str = "dclaw4-table"
+    """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
 
     def run(self) -> int:
         """Measure and print."""
@@ -64,17 +70,11 @@ class SimCommand:
 
 
 @dataclass(frozen=True)
-class PhysicsCommand:
+class PhysicsCommand(Measurement):
     """Contact quality: objects at rest, a pinched cube."""
 
-    objects: tuple[str, ...] = ("procedural-150-seed0",)
-    """Object sets to drop on the table."""
     seed: int = 0
-    """Of the orientations they are dropped in."""
-    device: str = "cpu"
-    """Warp device."""
-    json: Path | None = None
-    """Write everything to this file as JSON."""
+    """Of the orientations in which objects are dropped on the table."""
 
     def run(self) -> int:
         """Measure and print."""
@@ -83,36 +83,30 @@ class PhysicsCommand:
         from vd.bench.physics import pinch, rest
         from vd.sim.cfg import SimCfg
 
-        cfg = SimCfg()
-        results = rest(load_set(list(self.objects)), cfg, device=self.device, seed=self.seed)
+        cfg, device = SimCfg(), resolve_device(self.device)
+        results = rest(load_set(list(self.objects)), cfg, device=device, seed=self.seed)
         moving = [r for r in results if not r.rests]
         row = {
             "objects": len(results),
             "at_rest_share": 1.0 - len(moving) / len(results),
             "deepest_contact_m": max(r.penetration for r in results),
             "moving": [dataclasses.asdict(r) for r in moving],
-            "pinch": dataclasses.asdict(pinch(load_set("cube")[0], cfg, device=self.device)),
+            "pinch": dataclasses.asdict(pinch(load_set("cube")[0], cfg, device=device)),
         }
-        report([row], self.device, self.json)
+        report([row], device, self.json)
         return 0
 
 
 @dataclass(frozen=True)
-class DepthCommand:
+class DepthCommand(Measurement):
     """Depth images and clouds per second, beside Newton's camera at the same size in the same run."""
 
     envs: tuple[int, ...] = (256, 1024, 4096)
     """Numbers of environments to measure; 1 for the figure at deployment on a CPU."""
-    objects: tuple[str, ...] = ("procedural-150-seed0",)
-    """Object sets, mixed over the environments."""
     hand: str = "dclaw4"
     """Hand."""
-    device: str = "auto"
-    """Warp device; auto is the first GPU, or else the CPU."""
     seed: int = 0
     """Of the poses."""
-    json: Path | None = None
-    """Write the rows to this file as JSON."""
 
     def run(self) -> int:
         """Measure and print."""
@@ -215,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = tyro.cli(Command, args=arguments, prog="vd-bench", description=__doc__)
     if isinstance(command, GapCommand):
         check_folder(command.out)
-    elif not isinstance(command, ReplayCommand) and command.json is not None:
+    elif isinstance(command, Measurement) and command.json is not None:
         check_file(command.json)
     return command.run()
 
