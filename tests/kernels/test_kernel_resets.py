@@ -58,11 +58,11 @@ def test_episode_ends_as_stated_in_every_case(device, hold):
         assert out["new_goal"][i] == int(bool(s) and not reset)
 
 
-def goal_beside(goal, orientation):
-    """Goals with the sign by which the rotation from them is canonical, in float64 from the definition."""
-    turn = relative_quaternion(orientation, goal)
-    flip = np.array([next((v for v in row[[3, 0, 1, 2]] if abs(v) > 1e-7), 1.0) < 0.0 for row in turn])
-    return np.where(flip[:, None], -goal, goal)
+def goal_beside(goal, orientation, found):
+    """Goals with the sign by which the rotation from them is the shorter; half a turn has either."""
+    shortest = relative_quaternion(orientation, goal)[:, 3:]
+    either = np.sign((goal * found).sum(axis=1, keepdims=True))
+    return np.where(np.abs(shortest) < 1e-6, either, np.sign(shortest)) * goal
 
 
 class World:
@@ -136,7 +136,8 @@ def test_only_masked_worlds_change_and_only_in_what_is_theirs(device, data, fing
     np.testing.assert_allclose(np.linalg.norm(after["goal"][changed], axis=1), 1.0, atol=1e-6)
     if start is not None and goal is not None:
         np.testing.assert_array_equal(orientation[reset], start[reset])
-        np.testing.assert_array_equal(after["goal"][changed], goal_beside(goal, orientation)[changed])
+        wanted = goal_beside(goal, orientation, after["goal"])
+        np.testing.assert_array_equal(after["goal"][changed], wanted[changed])
     if changed.any():
         error = angle_between(orientation[changed], after["goal"][changed])
         np.testing.assert_allclose(after["error"][changed], error, atol=2e-3)
