@@ -3,10 +3,7 @@
 ``vd-play LOG`` replays a run on a hand.
 """
 
-import contextlib
-import importlib
 import math
-import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +20,7 @@ from vd.evaluate.cfg import POLICY_HELP
 from vd.files import check_file
 from vd.hand_log import is_log
 from vd.paper import PAPER
+from vd.sim.cfg import Engine, in_mujoco
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -30,19 +28,6 @@ if TYPE_CHECKING:
     from vd.play.session import Session
 
 VIDEO_SECONDS = 10.0
-SLOWEST_MODULES = (
-    "newton._src.solvers.mujoco.kernels",
-    "mujoco_warp._src.smooth",
-    "newton._src.sim.articulation",
-    "newton._src.sensors.sensor_camera_render.camera_utils",
-    "newton._src.geometry.bvh",
-    "mujoco_warp._src.set_const",
-    "mujoco_warp._src.forward",
-    "mujoco_warp._src.derivative",
-    "mujoco_warp._src.passive",
-    "mujoco_warp._src.solver",
-)
-"""Kernels that take longest to compile on a CPU, found by Warp's own log; they are compiled side by side."""
 # A CPU simulates this many environments about in real time.
 FAST_WORLDS_CPU = 16
 
@@ -90,6 +75,8 @@ class PlayCfg:
     """Randomise dynamics and add noise and disturbances as in training."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
+    engine: Engine | None = None
+    """Physics of newton, or MuJoCo's own: the default on a CPU, where newton first compiles for a minute."""
 
     @property
     def agent_name(self) -> str:
@@ -193,17 +180,6 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     return count
 
 
-def compile_side_by_side() -> None:
-    """Compile what takes longest on a CPU with all cores, in place of one module after the other."""
-    import warp as wp
-
-    for name in SLOWEST_MODULES:
-        with contextlib.suppress(ImportError):  # they are not public, and may move
-            importlib.import_module(name)
-    modules = [wp.get_module(name) for name in SLOWEST_MODULES if name in sys.modules]
-    wp.force_load("cpu", modules, max_workers=os.cpu_count())
-
-
 def serve(cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C; the page is there, and says so, while the scene is being built."""
     trained = _policy(cfg)
@@ -260,8 +236,6 @@ def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
         flush=True,
     )
     device = resolve_device(cfg.device)
-    if device == "cpu":
-        compile_side_by_side()
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv
@@ -284,6 +258,8 @@ def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
     )
+    if (cfg.engine or ("mujoco" if device == "cpu" else "newton")) == "mujoco":
+        task = replace(task, sim=in_mujoco(task.sim, task.sim.physics_hz))
     if cfg.in_air:
         task = replace(task, table=TableCfg(away_share=1.0))
     env = ReorientEnv(task, device)

@@ -137,16 +137,17 @@ MUJOCO_ITERATIONS, MUJOCO_LS_ITERATIONS = 100, 50
 """MuJoCo's defaults. With 10 iterations of its line search the solver stops at wrong answers."""
 
 
-def in_mujoco(cfg: SimCfg) -> SimCfg:
-    """The same contacts, joints and shapes in MuJoCo's own engine, in steps of a millisecond.
+def in_mujoco(cfg: SimCfg, physics_hz: float = MUJOCO_PHYSICS_HZ) -> SimCfg:
+    """The same contacts, joints and shapes in MuJoCo's own engine.
 
     Args:
         cfg: Physics of the task.
+        physics_hz: Physics rate [Hz].
     """
     return replace(
         cfg,
         engine="mujoco",
-        physics_hz=MUJOCO_PHYSICS_HZ,
+        physics_hz=physics_hz,
         iterations=MUJOCO_ITERATIONS,
         ls_iterations=MUJOCO_LS_ITERATIONS,
     )
