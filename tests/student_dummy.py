@@ -10,13 +10,14 @@ import warp as wp
 from train_dummy import DummyEnv
 
 from vd.config import to_dict
+from vd.sensors.cfg import DepthCameraCfg
 from vd.train.config import RunCfg
 from vd.train.student.config import DaggerCfg
 from vd.train.student.dagger import Dagger
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.cfg import EncoderCfg, NoiseCfg, StudentCfg
 from vd.vision.network import Student
-from vd.vision.saved import StudentSpec
+from vd.vision.saved import SavedStudent, StudentSpec
 from vd.vision.voxels import Voxeliser
 
 BAR_POINTS = 24
@@ -31,6 +32,16 @@ TINY = StudentCfg(
     head_hidden=16,
     distance_hidden=8,
 )
+
+
+def untrained_student(task: Any, stage: int = 2, *, points: int = 300, **spec: Any) -> SavedStudent:
+    """A student of random weights for three fingers."""
+    torch.manual_seed(stage)
+    told = StudentSpec(network=TINY, num_actions=9, stage=stage, teacher="dclaw3-table", **spec)
+    network = Student(TINY, 9).eval().requires_grad_(False)
+    return SavedStudent(told, network, to_dict(task), to_dict(DepthCameraCfg(points=points)), 1, 100)
+
+
 QUICK = DaggerCfg(rollout_steps=6, minibatch_envs=4, epochs=2, learning_rate=3e-3)
 STILL = NoiseCfg(jitter_probability=0.0, dropout_probability=0.0)
 

@@ -8,23 +8,19 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from student_dummy import TINY
+from student_dummy import untrained_student
 
 from vd.assets_usd.hands import load_hand
 from vd.bundle import is_bundle
 from vd.bundle.contract import ContractError, check_hand
 from vd.bundle.store import read_bundle, read_contract, write_bundle
-from vd.config import to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy
 from vd.evaluate.cli import main as evaluate
 from vd.policy import load_policy
-from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRule
 from vd.tracking.policy import load_tracking
 from vd.train.cli import main as train
-from vd.vision.network import Student
-from vd.vision.saved import SavedStudent, StudentSpec
 
 TEACHER = "dclaw3-table"
 PLACED = (0.5, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)
@@ -37,22 +33,15 @@ def hand():
 
 
 def make_student(stage=2, camera=None):
-    """A student of random weights for three fingers."""
-    torch.manual_seed(0)
-    spec = StudentSpec(
-        network=TINY,
-        num_actions=9,
-        stage=stage,
-        teacher=TEACHER,
+    return untrained_student(
+        ReorientCfg(hand="dclaw3", objects=("/somewhere/mine/training-set", "cube")),
+        stage,
         camera=camera,
         stopping=StoppingRule(0.31, 0.7),
         tolerance_rad=0.3,
         precise=StoppingRule(0.08, 0.9),
         calibrated_on="cube: 8 episodes",
     )
-    task = to_dict(ReorientCfg(hand="dclaw3", objects=("/somewhere/mine/training-set", "cube")))
-    network = Student(TINY, 9).eval().requires_grad_(False)
-    return SavedStudent(spec, network, task, to_dict(DepthCameraCfg(points=500)), 3, 4000)
 
 
 @pytest.fixture
@@ -85,15 +74,32 @@ def test_a_student_comes_back(tmp_path, hand, stage, camera):
     student, folder = make_student(stage, camera), tmp_path / "student"
     contract = write_bundle(student, folder)
     found = read_bundle(folder)
-    assert found.spec == student.spec and found.iteration == 3 and found.env_steps == 4000
+    assert found.spec == student.spec and found.iteration == 1 and found.env_steps == 100
     for name, value in student.network.state_dict().items():
         assert torch.equal(found.network.state_dict()[name], value), name
-    assert (contract.interface.camera is not None) == (stage == 2)
+    assert (contract.interface["camera"] is not None) == (stage == 2)
     assert contract.provenance.objects == ("training-set", "cube"), "no folders of the machine"
     assert "/somewhere" not in (folder / "contract.json").read_text()
-    # One of before says that the goal is part of the cloud, as it always is now.
-    edit(folder, lambda values: values["interface"]["cloud"].update(goal="merged"))
     check_hand(read_contract(folder), hand, "it")
+
+
+def test_bundles_of_earlier_versions_are_read(tmp_path, teacher_bundle, hand):
+    """They say that the goal is in the cloud, as it always is now, and bounds to stop by in a row."""
+    student, folder = make_student(), tmp_path / "student"
+    write_bundle(student, folder)
+
+    def older(values):
+        cloud = values["interface"]["cloud"]
+        cloud |= {"goal": "merged", "senses": cloud.pop("proprioception")}
+        rules = values["stopping"]
+        values["stopping"] = rules | rules.pop("stopping") | {"precise": list(rules["precise"].values())}
+
+    edit(folder, older)
+    assert read_bundle(folder).spec == student.spec
+    check_hand(read_contract(folder), hand, "it")
+    edit(teacher_bundle, lambda values: values["interface"]["observation"].pop("file_axes"))
+    with pytest.raises(ContractError, match=r"file_axes is False here, but True in the bundle"):
+        check_hand(read_contract(teacher_bundle), hand, "it")
 
 
 @pytest.mark.parametrize("camera", [None, PLACED])
@@ -107,7 +113,7 @@ def test_a_tracking_policy_comes_back(tmp_path, hand, camera):
     assert torch.equal(found.teacher.act(observation), original.teacher.act(observation))
     for name, value in original.teacher.critic_weights.items():
         assert torch.equal(found.teacher.critic_weights[name], value)
-    source = contract.interface.camera.source
+    source = contract.interface["camera"]["source"]
     assert contract.kind == "tracking" and source == ("hand" if camera is None else "policy")
     check_hand(read_contract(tmp_path / "tracking"), hand, "it")
     edit(tmp_path / "tracking", lambda values: values["network"].update(aim={"enabled": True}))
@@ -117,18 +123,16 @@ def test_a_tracking_policy_comes_back(tmp_path, hand, camera):
 
 def test_another_hand_is_refused_by_field(teacher_bundle, hand, capsys):
     contract = read_contract(teacher_bundle)
-    check_hand(contract, hand, teacher_bundle)
-    with pytest.raises(
-        ContractError, match=r"hand.name is 'dclaw4' here, but 'dclaw3' in the bundle; use the"
+    swapped = (hand.joint_names[1], hand.joint_names[0], *hand.joint_names[2:])
+    limited = hand.upper.copy()
+    limited[3] = 1.2
+    for other, message in (
+        (load_hand("dclaw4"), r"hand.name is 'dclaw4' here, but 'dclaw3' in the bundle; use the"),
+        (replace(hand, joint_names=swapped), r"hand\.joint_names\[0\] is 'f0_j2' here, but 'f0_j1'"),
+        (replace(hand, upper=limited), r"hand\.upper_rad\[3\] is 1\.2"),
     ):
-        check_hand(contract, load_hand("dclaw4"), teacher_bundle)
-    swapped = replace(hand, joint_names=(hand.joint_names[1], hand.joint_names[0], *hand.joint_names[2:]))
-    with pytest.raises(ContractError, match=r"hand\.joint_names\[0\] is 'f0_j2' here, but 'f0_j1'"):
-        check_hand(contract, swapped, teacher_bundle)
-    with pytest.raises(ContractError, match=r"hand\.upper_rad\[3\] is 1\.2"):
-        limited = hand.upper.copy()
-        limited[3] = 1.2
-        check_hand(contract, replace(hand, upper=limited), teacher_bundle)
+        with pytest.raises(ContractError, match=message):
+            check_hand(contract, other, teacher_bundle)
     # a hand that is the same but for rounding
     check_hand(contract, replace(hand, upper=hand.upper + 1e-6), teacher_bundle)
     assert evaluate([str(teacher_bundle), "--hand", "dclaw4", "--device", "cpu"]) == 1
@@ -156,25 +160,15 @@ def test_another_camera_is_refused_unless_the_policy_has_its_own(tmp_path, hand)
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "message"),
+    ("part", "field", "value", "message"),
     [
-        (
-            ("interface", "conventions", "quaternion"),
-            "wxyz",
-            "conventions.quaternion is 'xyzw' here, but 'wxyz'",
-        ),
-        (("interface", "action", "scale_rad_s"), 2.0, "action.scale_rad_s is 3.5 here, but 2 in"),
-        (("interface", "observation", "velocity_scale"), 1.0, "observation.velocity_scale is 0.2 here"),
-        (("interface", "observation", "file_axes"), True, "observation.file_axes is False here"),
+        ("conventions", "quaternion", "wxyz", "conventions.quaternion is 'xyzw' here, but 'wxyz'"),
+        ("action", "scale_rad_s", 2.0, "action.scale_rad_s is 3.5 here, but 2 in"),
+        ("observation", "velocity_scale", 1.0, "observation.velocity_scale is 0.2 here"),
     ],
 )
-def test_a_contract_of_other_conventions_is_refused(teacher_bundle, hand, field, value, message):
-    def change(values):
-        for key in field[:-1]:
-            values = values[key]
-        values[field[-1]] = value
-
-    edit(teacher_bundle, change)
+def test_a_contract_of_other_conventions_is_refused(teacher_bundle, hand, part, field, value, message):
+    edit(teacher_bundle, lambda values: values["interface"][part].update({field: value}))
     with pytest.raises(ContractError, match=message):
         check_hand(read_contract(teacher_bundle), hand, teacher_bundle)
 

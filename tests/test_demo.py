@@ -51,7 +51,7 @@ def leave_flight(line: list[str]) -> None:
     joints = dict.fromkeys(JOINT_CHANNELS, np.zeros(hand.num_joints))
     for step in range(3):
         now = log.started_s + step / 12
-        log.step(now, now + 0.04, joints, [0.0, 1.0, 0.5, 0.0, 0.002, 0.04, 0.004, 1.0])
+        log.step(now, now + 0.04, joints, [0.0, 1.0, 0.5, 0.0, 0.0, 0.002, 0.04, 0.004, 1.0])
     log.event("stop", goal=0, outcome="stopped", distance=0.2)
     log.finish("all goals pursued")
     (option(line, "--log") / "run.mp4").write_bytes(b"no film")

@@ -9,7 +9,6 @@ import torch
 from vd.evaluate.agents import (
     SHIPPED_POLICIES,
     find_policy,
-    is_tracking_policy,
     open_policy,
     policy_name,
     task_for,
@@ -21,38 +20,24 @@ from vd.policy import load_policy
 
 
 def task_of(policy, **changes):
-    values = dict(
-        hand=None,
-        objects=("cube",),
-        num_envs=2,
-        seed=0,
-        stop_tolerance_rad=0.4,
-        max_goal_angle_rad=None,
-        episode_s=10.0,
-        randomised=False,
-        success_ends_episode=True,
-    )
-    return task_for(policy, **{**values, **changes})
+    return task_for(policy, **{"stop_tolerance_rad": 0.4, "randomised": False, "num_envs": 2} | changes)
 
 
 @pytest.mark.parametrize("name", SHIPPED_POLICIES)
 def test_installed_policies_load_and_act(name):
     policy = open_policy(name, "cpu")
     assert name.startswith(f"{policy.task['hand']}-"), "the name begins with the hand"
-    layers = policy.teacher if is_tracking_policy(policy) else policy
+    layers = policy.teacher if policy.kind == "tracking" else policy
     action = layers.act(torch.zeros(3, layers.num_observations))
     assert action.shape == (3, layers.num_actions) and torch.isfinite(action).all()
     assert not any("/" in item for item in policy.task["objects"]), "a path of the machine it was trained on"
 
 
-def test_the_file_of_an_installed_policy_is_called_by_its_name(tmp_path, monkeypatch):
+def test_names_mean_files_and_files_have_names(tmp_path, monkeypatch):
     path = SHIPPED_POLICIES["dclaw4-cube"]
     monkeypatch.chdir(path.parent)
     assert policy_name(path) == policy_name(path.name) == policy_name("dclaw4-cube") == "dclaw4-cube"
     assert policy_name(tmp_path / "dclaw4-cube.pt") == str(tmp_path / "dclaw4-cube.pt")
-
-
-def test_a_run_folder_means_its_best_policy(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"holds no policy\.pt"):
         find_policy(tmp_path)
     (tmp_path / "checkpoints").mkdir()
@@ -62,12 +47,18 @@ def test_a_run_folder_means_its_best_policy(tmp_path):
     assert find_policy(tmp_path) == find_policy(tmp_path / "policy.pt") == tmp_path / "policy.pt"
 
 
-def test_an_unknown_policy_is_refused_with_the_names_there_are(capsys):
+def test_what_is_not_there_is_refused_with_the_names_there_are(tmp_path, capsys):
+    from vd.play.cli import main as play
+
     assert main(["dclaw4-cubes", "--device", "cpu"]) == 1
     error = capsys.readouterr().err
     assert "dclaw4-cubes" in error and "dclaw4-cube" in error.replace("dclaw4-cubes", "")
     assert main([]) == 1
     assert "dclaw4-cube" in capsys.readouterr().err
+    missing = str(tmp_path / "identified.usda")
+    for command in (main, play):
+        assert command(["zero", "--hand-layer", missing, "--device", "cpu"]) == 1
+        assert f"{missing}: no such hand layer" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("policy", ["dclaw4-table", "dclaw4-tracking"])
@@ -95,15 +86,6 @@ def test_start_goals_and_layer_are_as_trained_unless_asked_otherwise():
     assert task_of(trained).hand_layer == "bench/identified.usda"
     assert task_of(trained, hand_layer="other.usda").hand_layer == "other.usda"
     assert task_of(trained, hand_layer="none").hand_layer is None
-
-
-def test_a_missing_layer_is_named_by_both_commands(tmp_path, capsys):
-    from vd.play.cli import main as play
-
-    missing = str(tmp_path / "identified.usda")
-    for command in (main, play):
-        assert command(["zero", "--hand-layer", missing, "--device", "cpu"]) == 1
-        assert f"{missing}: no such hand layer" in capsys.readouterr().err
 
 
 def test_conditions_replace_what_a_policy_was_trained_in_and_nobody_tells_a_critic():

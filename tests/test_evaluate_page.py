@@ -6,12 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fake_env import FakeObject
-from test_evaluate_rollout import CUBE, rows_of
-from test_evaluate_trace import compared
+from test_evaluate_trace import CUBE, compared, rows_of
 from test_page import References
 
-from vd.evaluate.page import labels, terminal_text, write_page
-from vd.evaluate.plots import ecdf_figure
+from vd.evaluate.page import ecdf_figure, labels, terminal_text, write_page
 from vd.evaluate.result import Result
 
 
@@ -31,25 +29,15 @@ def found():
     return Result(tuple(rows_of(objects, episodes=12, fall_at={0: 1})), software={"torch": "2"})
 
 
-def page_of(found, path, policy="zero", **changes):
-    """The page of an evaluation whose protocol is changed."""
-    rows = (replace(row, policy=policy, protocol=replace(row.protocol, **changes)) for row in found.rows)
-    write_page(replace(found, rows=tuple(rows)), path)
-    return read_page(path)
-
-
-def test_the_page_is_one_offline_file(tmp_path, found):
-    text, references = page_of(found, tmp_path / "eval.html")
+def test_the_page_is_one_offline_file_with_rates_intervals_and_warnings(tmp_path, found):
+    write_page(found, tmp_path / "eval.html")
+    text, references = read_page(tmp_path / "eval.html")
     (figure,) = references.addresses
     assert figure.startswith("data:image/png;base64,")
     assert not {"script", "link", "iframe", "i"} & set(references.tags)
     heads = re.findall(r"<thead>(.*?)</thead>", text)
     assert heads and all(head.count("<th") <= 7 for head in heads), "a table that nobody reads"
     assert not re.search(r"(https?:)?//[a-z]|@import|url\(", re.sub(r"base64,[^\"]*", "", text))
-
-
-def test_the_page_prints_rates_with_their_intervals_and_warnings(tmp_path, found):
-    text, _ = page_of(found, tmp_path / "eval.html")
     lost = found.rows[0].overall.outcomes["object falls"]
     interval = f"({100 * lost.low:.1f} to {100 * lost.high:.1f})"
     assert f"{100 * lost.value:.1f}\N{NO-BREAK SPACE}% <small>{interval}</small>" in text
@@ -59,8 +47,10 @@ def test_the_page_prints_rates_with_their_intervals_and_warnings(tmp_path, found
 
 
 def test_the_page_says_which_task_it_was(tmp_path, found):
-    def text_of(**changes):
-        return page_of(found, tmp_path / "task.html", **changes)[0]
+    def text_of(policy="zero", **changes):
+        rows = (replace(row, policy=policy, protocol=replace(row.protocol, **changes)) for row in found.rows)
+        write_page(replace(found, rows=tuple(rows)), tmp_path / "task.html")
+        return read_page(tmp_path / "task.html")[0]
 
     dropped = text_of()
     assert "dropped into the hand" in dropped and "at rest" not in dropped
@@ -71,10 +61,6 @@ def test_the_page_says_which_task_it_was(tmp_path, found):
     assert "randomisation mixed" in text_of(randomisation="mixed")
     away = text_of(policy="/home/me/a/policy.pt", objects="/data/mugs, cube", hand="/opt/my/hand.usda")
     assert not any(root in away for root in ("/home", "/data", "/opt"))
-    other = replace(
-        found.rows[0], policy="random", protocol=replace(found.rows[0].protocol, hand="other-hand")
-    )
-    assert ", other-hand on the table" in terminal_text(replace(found, rows=(*found.rows, other)))
 
 
 def test_what_predictions_are_worth_is_told(tmp_path):
@@ -89,15 +75,18 @@ def test_curves_end_at_one_minus_the_share_of_lost_objects(found):
     assert np.all(np.diff(line.get_ydata()) >= 0)
 
 
-def test_the_terminal_shows_every_rule_and_every_object_of_a_single_policy(found):
+def test_the_terminal_shows_every_rule_every_object_of_a_single_policy_and_every_hand(found):
     ways, beside, objects, *_ = terminal_text(found).split("\n\n")
     assert len(ways.splitlines()) == len(beside.splitlines()) == 1 + 2
     heading, *lines = objects.splitlines()
-    assert heading == "zero, objects, stopped by true distance"
+    assert heading == "zero, training, stopped by true distance"
     assert len({len(line) for line in lines}) == 1 and len(lines) == 1 + 1 + 3
-    two = replace(found, rows=found.rows + tuple(replace(row, policy="random") for row in found.rows))
-    assert heading not in terminal_text(two)
-    assert "random over zero" in terminal_text(two) and "+0.0 points" in terminal_text(two)
+    others = (
+        replace(row, policy="random", protocol=replace(row.protocol, hand="other-hand")) for row in found.rows
+    )
+    two = terminal_text(replace(found, rows=(*found.rows, *others)))
+    assert heading not in two and ", other-hand on the table" in two
+    assert "random over zero" in two and "+0.0 points" in two
 
 
 def test_names_are_as_short_as_they_can_be():

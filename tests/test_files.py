@@ -1,12 +1,23 @@
 """What cannot be written: a plain message with path and remedy, and nothing left half-written."""
 
+import importlib
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from full_disk import small_files, somebody_else
 
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.model import write_object
+from vd.assets_usd.objects.procedural import cube
+from vd.bundle.store import write_bundle
+from vd.evaluate.agents import open_policy
 from vd.files import OutputError, atomic_path, check_file, check_folder, make_folder, write_text
+from vd.play.video import write_frames
+from vd.train.checkpoint import save_checkpoint
 
 LIMIT = 1 << 16
 
@@ -15,48 +26,22 @@ def noise(*shape: int) -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
 
 
-def _text(path: Path) -> None:
-    write_text(path, "x" * 2 * LIMIT)
+def write(path: Path) -> None:
+    """More than LIMIT bytes, by the writer of files of this kind."""
+    if path.suffix == ".html":
+        write_text(path, "x" * 2 * LIMIT)
+    elif path.suffix == ".pt":
+        save_checkpoint(path, {"weights": torch.zeros(LIMIT)})
+    elif path.suffix == ".npz":
+        with atomic_path(path) as temporary:
+            np.savez(temporary, values=noise(2 * LIMIT))
+    elif path.suffix == ".mp4":
+        write_frames(path, list(noise(8, 200, 200, 3)), 12.0)
+    else:
+        write_object(path, replace(cube(), notes=("x" * 2 * LIMIT,)))
 
 
-def _checkpoint(path: Path) -> None:
-    import torch
-
-    from vd.train.checkpoint import save_checkpoint
-
-    save_checkpoint(path, {"weights": torch.zeros(LIMIT)})
-
-
-def _arrays(path: Path) -> None:
-    with atomic_path(path) as temporary:
-        np.savez(temporary, values=noise(2 * LIMIT))
-
-
-def _picture(path: Path) -> None:
-    from vd.play.video import write_frames
-
-    write_frames(path, list(noise(8, 200, 200, 3)), 12.0)
-
-
-def _object(path: Path) -> None:
-    from dataclasses import replace
-
-    from vd.assets_usd.objects.model import write_object
-    from vd.assets_usd.objects.procedural import cube
-
-    write_object(path, replace(cube(), notes=("x" * 2 * LIMIT,)))
-
-
-WRITERS = {
-    "page.html": _text,
-    "model.pt": _checkpoint,
-    "cache.npz": _arrays,
-    "film.mp4": _picture,
-    "cube.usda": _object,
-}
-
-
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", ["page.html", "model.pt", "cache.npz", "film.mp4", "cube.usda"])
 def test_a_file_that_cannot_grow_is_named_and_the_old_one_stays(tmp_path, name):
     """Whatever writes it, and however that reports it."""
     path = tmp_path / name
@@ -65,7 +50,7 @@ def test_a_file_that_cannot_grow_is_named_and_the_old_one_stays(tmp_path, name):
         small_files(LIMIT),
         pytest.raises(OutputError, match=rf"cannot write .*{name}: the file would be"),
     ):
-        WRITERS[name](path)
+        write(path)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -77,10 +62,6 @@ def test_an_error_of_the_writer_itself_stays_what_it_is(tmp_path):
 
 
 def test_a_bundle_that_does_not_fit_is_not_there(tmp_path):
-    from vd.assets_usd.hands import load_hand
-    from vd.bundle.store import write_bundle
-    from vd.evaluate.agents import open_policy
-
     load_hand("dclaw3")  # authored on first use
     policy = open_policy("dclaw3-table", "cpu")
     with small_files(LIMIT), pytest.raises(OutputError, match=r"cannot write .*first: .*the file would be"):
@@ -88,25 +69,27 @@ def test_a_bundle_that_does_not_fit_is_not_there(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def refused(*cases):
+    for check, path, message in cases:
+        with pytest.raises(OutputError, match=f"cannot write {path}: {message}"):
+            check(path)
+
+
 def test_folders_that_cannot_be_made_are_refused_before_anything_is_written(tmp_path, capsys):
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match=r"cannot write .*file/a/b: .*file is a file; choose another"):
-        check_folder(tmp_path / "file" / "a" / "b")
-    with pytest.raises(OutputError, match=r"file: it is a file; choose another folder"):
-        check_folder(tmp_path / "file")
-    with pytest.raises(OutputError, match=r"file: it is a file"):
-        make_folder(tmp_path / "file")
-    with pytest.raises(OutputError, match=r": it is a folder; name a file"):
-        check_file(tmp_path)
-    with pytest.raises(OutputError, match=r"file/a.png: .*file is a file"):
-        check_file(tmp_path / "file" / "a.png")
+    refused(
+        (check_folder, tmp_path / "file/a/b", ".*file is a file; choose another"),
+        (check_folder, tmp_path / "file", "it is a file; choose another folder"),
+        (make_folder, tmp_path / "file", "it is a file"),
+        (check_file, tmp_path, "it is a folder; name a file"),
+        (check_file, tmp_path / "file/a.png", ".*file is a file"),
+    )
     with somebody_else() as folder:
-        with pytest.raises(OutputError, match=r"run/a: you may not write there; choose another folder, or"):
-            check_folder(folder / "run" / "a")
-        with pytest.raises(OutputError, match=r"run: you may not write there"):
-            make_folder(folder / "run")
-        with pytest.raises(OutputError, match=r"a\.txt: you may not write there"):
-            write_text(folder / "a.txt", "")
+        refused(
+            (check_folder, folder / "run/a", "you may not write there; choose another folder, or"),
+            (make_folder, folder / "run", "you may not write there"),
+            (lambda path: write_text(path, ""), folder / "a.txt", "you may not write there"),
+        )
     check_folder(tmp_path / "new" / "folder")
     check_file(tmp_path / "new.txt")
     assert [path.name for path in tmp_path.iterdir()] == ["file"] and not capsys.readouterr().err
@@ -139,9 +122,6 @@ def commands(taken: str) -> dict[str, list[str]]:
 
 @pytest.mark.parametrize("command", commands(""))
 def test_every_command_says_so_at_once(tmp_path, command, monkeypatch, capsys):
-    import importlib
-    import tomllib
-
     scripts = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
     module, _, function = scripts[command.strip()].partition(":")
     (tmp_path / "file").touch()

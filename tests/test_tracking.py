@@ -180,7 +180,7 @@ def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_ca
 def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
     path = SHIPPED_POLICIES[name]
     policy = load_tracking(path)
-    assert sees_clouds(name) and is_tracking(path) and path.stat().st_size < 2.6e6
+    assert sees_clouds(open_policy(name, "cpu")) and is_tracking(path) and path.stat().st_size < 2.6e6
     assert policy.spec.calibrated_on and "/" not in policy.spec.teacher + policy.spec.calibrated_on
     teacher = load_policy(find_policy(policy.spec.teacher))
     observation = torch.randn(5, teacher.num_observations)
@@ -233,18 +233,8 @@ def test_a_former_command_is_refused_with_the_new_one(command, word, capsys):
 def test_a_runner_decides_on_a_hand_as_in_the_simulator():
     """An episode of the policy; the deploy side is given joints, goal and image, nothing else."""
     policy = open_policy("dclaw3-tracking", "cpu")
-    task = task_for(
-        policy,
-        hand=None,
-        objects=("cube",),
-        num_envs=1,
-        seed=3,
-        stop_tolerance_rad=0.4,
-        max_goal_angle_rad=None,
-        episode_s=3.0,
-        randomised=False,
-        success_ends_episode=False,
-    )
+    settings = {"num_envs": 1, "seed": 3, "episode_s": 3.0, "success_ends_episode": False}
+    task = task_for(policy, stop_tolerance_rad=0.4, randomised=False, objects=("cube",), **settings)
     env = ReorientEnv(task, "cpu")
     actor, runner = TrackingActor(env, policy), TrackingRunner(policy, env.hand, env.objects[0])
     runner.begin()
@@ -284,7 +274,8 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
         asked.append(cfg)
         seen = np.zeros((1, 1, 4))
         norms, quat = np.array([[[0.0, 0.5, 0.4, 0.3]]]), np.zeros((1, 1, 4))
-        return Trace(quat, quat, seen, seen, norms, seen, np.full((1, 1), 4), np.zeros((1, 1), bool))
+        ends = np.full((1, 1), 4), np.zeros((1, 1), bool)
+        return Trace(quat, quat, seen, seen, norms, seen, *ends, still=seen == 0.0)
 
     monkeypatch.setattr("vd.evaluate.compare.run_episodes", spy)
     path = tmp_path / "tracking.pt"

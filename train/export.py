@@ -148,6 +148,6 @@ def bundle_command(arguments: list[str], _started: float) -> int:
     policy = open_policy(str(find_policy(cfg.policy)), "cpu")
     assert policy is not None  # a file was found
     contract = write_bundle(policy, cfg.output)
-    hand = contract.interface.hand
-    print(f"{cfg.output}: {contract.kind} for {hand.name}, {len(hand.joint_names)} joints")
+    hand = contract.interface["hand"]
+    print(f"{cfg.output}: {contract.kind} for {hand['name']}, {len(hand['joint_names'])} joints")
     return 0

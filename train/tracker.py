@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +16,6 @@ from vd.paper import PAPER
 
 if TYPE_CHECKING:
     from vd.evaluate.trace import Trace
-    from vd.stopping import Calibration
     from vd.tracking.policy import TrackingPolicy
 
 
@@ -74,6 +74,7 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     check_names([cfg.teacher], cfg.objects)
     print("running the episodes ...", flush=True)
     from vd.device import resolve_device
+    from vd.stopping import calibrate
     from vd.tracking.policy import TrackingPolicy, TrackingSpec, tracking_export
     from vd.train.checkpoint import save_checkpoint
     from vd.warp_quiet import quiet_warp
@@ -85,9 +86,14 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
         raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
     spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
     trace = _episodes(cfg, TrackingPolicy(teacher, spec), device)
-    found = calibrate_trace(trace, tolerance_rad=cfg.tolerance_rad)
+    assert trace.predicted is not None
+    predicted, norm, true = (
+        values.reshape(trace.steps.size, -1) for values in (trace.predicted, trace.action_norm, trace.error)
+    )
+    chosen = partial(calibrate, predicted, norm, true, trace.steps.ravel())
+    found = chosen(tolerance_rad=cfg.tolerance_rad)
     try:
-        precise = calibrate_trace(trace, tolerance_rad=PAPER.success.precise_rad)
+        precise = chosen(tolerance_rad=PAPER.success.precise_rad)
     except ValueError:  # of a policy that never came so near there is nothing to learn
         precise = None
     spec = replace(
@@ -109,28 +115,6 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
             f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} came that near"
         )
     return 0
-
-
-def calibrate_trace(trace: "Trace", *, tolerance_rad: float = PAPER.success.rotation_rad) -> "Calibration":
-    """The stopping rule that suits recorded episodes.
-
-    Args:
-        trace: Episodes of a policy that predicts its distance, T steps.
-        tolerance_rad: Largest true distance that counts as right [rad].
-
-    Raises:
-        ValueError: The policy predicts none, or no rule stops any episode within the tolerance.
-    """
-    import numpy as np
-
-    from vd.stopping import calibrate
-
-    if trace.predicted is None:
-        raise ValueError("the policy predicts no distance; there is no rule to choose")
-    after = np.arange(trace.error.shape[-1])
-    running = (after > 0) & (after < trace.steps[..., None])
-    values = trace.predicted, trace.action_norm, trace.error, running
-    return calibrate(*(value.reshape(-1, len(after)).T for value in values), tolerance_rad=tolerance_rad)
 
 
 def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace":
@@ -158,10 +142,10 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
     )
     env = ReorientEnv(task_of(evaluation, policy, cfg.objects, envs), device)
     env.objects = with_symmetries(env.objects, device)
-    actor, _, _, rules = actor_of(
+    acting = actor_of(
         cfg.teacher, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
     )
-    trace = run_episodes(evaluation, env, actor, cfg.teacher, rules, math.inf)
+    trace = run_episodes(evaluation, env, *acting)
     env.close()
     return trace
 

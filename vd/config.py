@@ -50,20 +50,15 @@ def to_dict(value: Any) -> Any:
 def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
     """Build the dataclass ``cls`` from what :func:`to_dict` wrote. Fields that are absent keep their default.
 
-    Args:
-        cls: A dataclass.
-        values: Field values by name.
-        where: Dotted path of ``values``, for error messages.
-
     A class that lost a field says so in ``RETIRED``: by name the value that means what is now always so, of a
     group that went the values of those fields that say so. Others are refused, but for :class:`Dropped`.
     A field that has another name is :class:`Renamed`.
 
     Raises:
         ValueError: A field that ``cls`` does not have, one that is needed and absent, or a value of the wrong
-            type, named by its path.
+            type, named by its path, which begins with ``where``.
     """
-    values = _without_retired(values, getattr(cls, "RETIRED", {}), where or cls.__name__)
+    values = without_retired(values, getattr(cls, "RETIRED", {}), where or cls.__name__)
     hints = typing.get_type_hints(cls)
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     names = {field.name for field in fields}
@@ -80,14 +75,14 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
     return cls(**{name: _convert(hints[name], item, prefix + name) for name, item in values.items()})
 
 
-def _without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """``values`` without fields that are no more, and with today's names."""
+def without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """``values`` without fields that are no more, and with today's names; ``retired`` is as ``RETIRED``."""
     new = {old: to.name for old, to in retired.items() if isinstance(to, Renamed)}
     values = {new.get(name, name): value for name, value in values.items()}
     for name in retired.keys() & values.keys():
         value, wanted = values[name], retired[name]
         if isinstance(wanted, Mapping) and wanted and isinstance(value, Mapping):
-            _without_retired(value, wanted, f"{where}.{name}")
+            without_retired(value, wanted, f"{where}.{name}")
         elif isinstance(wanted, Dropped):
             if value != wanted.value:
                 warnings.warn(f"{where}.{name} is {value!r}; this version ignores it", stacklevel=2)

@@ -4,11 +4,11 @@ import errno
 import json
 import os
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 ELSEWHERE = "choose another folder"
 _NO_SPACE = {
@@ -61,41 +61,26 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def make_folder(folder: Path) -> Path:
-    """``folder``, made if it is not there.
-
-    Raises:
-        OutputError: It cannot be made.
-    """
+    """``folder``, made if it is not there."""
     with writing(folder):
         Path(folder).mkdir(parents=True, exist_ok=True)
     return Path(folder)
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that can be neither written to nor made; nothing is written.
-
-    Raises:
-        OutputError: It names the folder and the remedy.
-    """
-    folder = Path(folder)
-    there = _nearest(folder)
-    code = 0
+    """Refuse a folder that can be neither written to nor made; nothing is written."""
+    there = _nearest(Path(folder))
     if not there.is_dir():
-        code = errno.EEXIST
-    elif not os.access(there, os.W_OK | os.X_OK, effective_ids=True):
-        code = errno.EROFS if os.statvfs(there).f_flag & os.ST_RDONLY else errno.EACCES
-    if code:
-        raise output_error(folder, OSError(code, os.strerror(code)))
+        raise output_error(folder, OSError(errno.EEXIST, ""))
+    if not os.access(there, os.W_OK | os.X_OK, effective_ids=True):
+        read_only = os.statvfs(there).f_flag & os.ST_RDONLY
+        raise output_error(folder, OSError(errno.EROFS if read_only else errno.EACCES, ""))
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file that cannot be written to, as :func:`check_folder` does; say if one is there already.
-
-    Raises:
-        OutputError: It names the file and the remedy.
-    """
+    """Refuse a file that cannot be written to, as :func:`check_folder` does; say if one is there already."""
     if Path(path).is_dir():
-        raise output_error(path, IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR)))
+        raise output_error(path, OSError(errno.EISDIR, ""))
     try:
         check_folder(Path(path).parent)
     except OutputError as error:
@@ -115,24 +100,18 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """
     path = Path(path)
     make_folder(path.parent)
+    temporary = path.with_name(f".{path.stem}.{uuid4().hex}{path.suffix}")
     with writing(path):
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
-        os.close(handle)
-        temporary = Path(name)
-        # mkstemp makes files for the owner's eyes only; give them the permissions of any new file.
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
+        temporary.touch()
     try:
         try:
             yield temporary
         except Exception as error:
             # Writers in other languages lose the reason, so the disk is asked.
-            if isinstance(error, OSError) and error.errno in _NO_SPACE:
-                raise output_error(path, error) from error
-            refusal = _refusal(temporary)
-            if refusal is not None:
-                raise output_error(path, refusal) from error
+            told = isinstance(error, OSError) and error.errno in _NO_SPACE
+            reason = error if told else _refusal(temporary)
+            if isinstance(reason, OSError):
+                raise output_error(path, reason) from error
             raise
         with writing(path):
             temporary.replace(path)
@@ -159,10 +138,9 @@ def _nearest(path: Path) -> Path:
 def _refusal(file: Path) -> OSError | None:
     """Why ``file`` cannot grow any more; ``None`` if it can."""
     try:
-        with file.open("ab", buffering=0) as grown:
-            left = PROBE_BYTES
-            while left:
-                left -= grown.write(bytes(left)) or 0
+        with file.open("ab") as grown:
+            grown.write(bytes(PROBE_BYTES))
+            grown.flush()
             os.fsync(grown.fileno())
     except OSError as error:
         return error

@@ -55,8 +55,6 @@ class Stop:
     """Wanted orientation of the object [4]."""
     time_s: float
     """When [s], since the start of the log."""
-    unix_s: float
-    """When, in seconds since 1970."""
     outcome: str
     """``stopped`` by the policy, ``time limit``, ``lost`` or ``aborted``."""
     distance: float | None
@@ -102,7 +100,6 @@ class HandLog:
                 goal=event["goal"],
                 goal_quat=tuple(self.run["goals"][event["goal"]]),
                 time_s=event["t"],
-                unix_s=self.run["unix_s"] + event["t"],
                 outcome=event["outcome"],
                 distance=event["distance"],
             )

@@ -29,22 +29,13 @@ _WITH_INTERVAL = re.compile(r"(-?[\d.]+(?: ?%| [a-z]+)?) (\([^()]+ to [^()]+\))"
 _KINDS = {".gif": "image/gif", ".mp4": "video/mp4"}
 
 
-def render(template: str, **data: Any) -> str:
-    """The HTML of a template.
-
-    Args:
-        template: Name of the file in ``vd/templates``.
-        data: What the template asks for.
+def write_html(path: Path, template: str, **data: Any) -> None:
+    """Write a page from a file of ``vd/templates``, atomically.
 
     Raises:
         jinja2.UndefinedError: The template asks for something that was not given.
     """
-    return environment().get_template(template).render(data)
-
-
-def write_html(path: Path, template: str, **data: Any) -> None:
-    """Write the page of :func:`render` to ``path`` atomically."""
-    write_text(path, render(template, **data))
+    write_text(path, environment().get_template(template).render(data))
 
 
 @cache

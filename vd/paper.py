@@ -62,7 +62,6 @@ class ObservationConstants:
     velocity_scale: float = source(0.2, "C", "joint and object angular velocity are multiplied by it")
     noise_mean: float = source(-0.002, "P", "Table S3, state observation N(-0.002, 0.002)")
     noise_std: float = source(0.002, "P", "Table S3")
-    noise_mean_code: float = source(0.0, "C", "i.i.d. part")
     noise_offset_std_code: float = source(0.001, "C", "offset fixed between re-draws")
 
 
@@ -108,11 +107,9 @@ class RandomisationConstants:
     link_mass_scale: tuple[float, float] = source((0.8, 1.2), "P", "Table S3")
     friction: tuple[float, float] = source((0.24, 1.6), "P", "Table S3, robot and objects")
     table_friction: tuple[float, float] = source((0.05, 1.0), "P", "Table S3")
-    table_friction_code: tuple[float, float] = source((0.005, 1.0), "C", "0.5 x U(0.01, 2)")
     restitution: tuple[float, float] = source((0.0, 1.0), "P", "Table S3")
     object_scale: tuple[float, float] = source((0.95, 1.05), "P", "Table S3")
     object_mass_kg: tuple[float, float] = source((0.009, 0.324), "P", "Table S3")
-    gravity_std_code: float = source(0.4, "C", "m/s^2 per axis; not in the paper")
     force_probability: float = source(0.2, "P", "per control step")
     force_n_per_kg: float = source(15.0, "P", "c_d, Table S1: F = 15 m")
     force_s_code: float = source(
@@ -170,7 +167,6 @@ class CloudConstants:
     feature: float = source(0.5, "C", "the one feature of every voxel: nothing marks the goal but its place")
     jitter_probability: float = source(0.4, "P", "of each cloud, Supplementary Methods, observation noise")
     jitter_std_m: float = source(0.004, "P", "N(0, 0.004) on point positions")
-    jitter_voxels_code: float = source(1.0, "C", "after voxelisation, clipped at 2 and truncated; 3.4 mm")
     dropout_probability: float = source(0.4, "P", "of each cloud, independently")
     dropout_ratio: tuple[float, float] = source((0.0, 0.2), "P", "share of the points that is lost")
 

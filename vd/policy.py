@@ -6,7 +6,7 @@ Reading a policy needs torch only, no simulator and no rsl-rl, and executes noth
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import nn
@@ -37,32 +37,21 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class PolicySpec:
-    """What is needed to rebuild an actor around its weights.
-
-    Attributes:
-        num_observations: Observation length O.
-        num_actions: Actions D.
-        hidden: Widths of the hidden layers.
-        activation: Name of the activation function.
-        distribution: ``gaussian`` (the network gives the mean) or ``state-dependent`` (mean, then std).
-        normalise_observations: Whether a running normalisation belongs to the actor.
-    """
+    """What is needed to rebuild an actor around its weights: O observations, D actions."""
 
     num_observations: int
     num_actions: int
     hidden: tuple[int, ...]
+    """Widths of the hidden layers."""
     activation: str
     distribution: str
+    """``gaussian``, the network gives the mean, or ``state-dependent``: mean, then std."""
     normalise_observations: bool
+    """Whether a running normalisation belongs to the actor."""
 
 
 class MeanAction(nn.Module):
-    """Normalisation of observations, if it belongs to the actor, its perceptron, and the mean it gives.
-
-    Args:
-        spec: Shape of the network.
-        weights: As of :class:`TrainedPolicy`.
-    """
+    """Normalisation of observations, if it belongs to the actor, its perceptron, and the mean it gives."""
 
     def __init__(self, spec: PolicySpec, weights: dict[str, torch.Tensor]) -> None:
         super().__init__()
@@ -95,14 +84,14 @@ class TrainedPolicy:
         iteration: Iterations it was trained for.
         env_steps: Control steps it was trained for.
         device: Torch device.
-        critic: State of rsl-rl's critic, which sees what the actor does; None: there is none.
+        critic: State of rsl-rl's critic, which sees what the actor does; empty: there is none.
 
     Attributes:
         hand: Name of the hand it moves, as ``task`` says ("" if it does not).
-        weights: What it was built from.
-        critic_weights: State of its critic; empty if the file has none.
         network: From observations [N, O] to mean actions [N, D]; what an exporter needs.
     """
+
+    kind: Literal["teacher"] = "teacher"
 
     def __init__(
         self,
@@ -122,13 +111,7 @@ class TrainedPolicy:
         self.network = MeanAction(spec, weights).to(device)
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Mean action.
-
-        Args:
-            observation: Observations [N, O] on the policy's device.
-
-        Returns:
-            Actions [N, D].
+        """Mean actions [N, D] for observations [N, O] on the policy's device.
 
         Raises:
             ValueError: The observation has another length than the policy was trained on.
@@ -142,51 +125,34 @@ class TrainedPolicy:
             return self.network(observation)
 
 
-class ZeroPolicy:
-    """Keeps still: every action is zero.
+class BuiltIn:
+    """An agent without a file: every action is zero, or uniform in [-1, 1].
 
     Args:
+        name: ``zero`` or ``random``.
         num_actions: Actions D.
-    """
-
-    def __init__(self, num_actions: int) -> None:
-        self.num_actions = num_actions
-
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Zeros [N, D]."""
-        return observation.new_zeros((observation.shape[0], self.num_actions))
-
-
-class RandomPolicy:
-    """Actions uniform in [-1, 1], the same for the same seed on the same device.
-
-    Args:
-        num_actions: Actions D.
-        seed: Seed of the sequence.
+        seed: Of random actions, the same for the same seed on the same device.
         device: Torch device of the observations it will get.
     """
 
-    def __init__(self, num_actions: int, *, seed: int = 0, device: str = "cpu") -> None:
-        self.num_actions = num_actions
+    def __init__(self, name: str, num_actions: int, *, seed: int = 0, device: str = "cpu") -> None:
+        self.num_actions, self._still = num_actions, name == "zero"
         self._generator = torch.Generator(device=device).manual_seed(seed)
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Uniform actions [N, D]."""
+        """Actions [N, D]."""
         shape = (observation.shape[0], self.num_actions)
+        if self._still:
+            return observation.new_zeros(shape)
         return torch.rand(shape, generator=self._generator, device=observation.device) * 2.0 - 1.0
 
 
 def read_state(path: str | Path, device: str = "cpu", *, remedy: str) -> dict[str, Any]:
     """What torch saved in a file, its weights whole. Nothing in it is executed.
 
-    Args:
-        path: The file.
-        device: Torch device of its tensors.
-        remedy: What to do about a damaged file, for the message.
-
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It cannot be read, or has weights that are not finite.
+        ValueError: It cannot be read, or has weights that are not finite; with ``remedy``.
     """
     path = Path(path)
     try:
@@ -238,10 +204,6 @@ def holds(path: Path, part: str) -> bool:
 def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
     """Rebuild the actor from a checkpoint of ``vd-train`` or from an exported ``policy.pt``.
 
-    Args:
-        path: The file.
-        device: Torch device to run on.
-
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is damaged, or not a policy.
@@ -278,10 +240,7 @@ def policy_export(state: dict[str, Any]) -> dict[str, Any]:
 
     :func:`load_policy` reads the actor. The rest is for a run that begins from it (``vd-train teacher
     --init``): the critic, unless it is still warming up and so worth nothing, the stage of the curriculum and
-    the settings of the learner.
-
-    Args:
-        state: A checkpoint, or what this function gave.
+    the settings of the learner. ``state`` is a checkpoint, or what this function gave.
     """
     exported = {"format": POLICY_FORMAT} | {
         key: state[key] for key in ("policy", "task", "iter", "env_steps")

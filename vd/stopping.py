@@ -3,9 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
 from vd.paper import PAPER
+
+CANDIDATES = 24
+"""Values tried of each bound."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +23,9 @@ class StoppingRule:
     action_norm: float = PAPER.success.action_norm
     """Bound of the norm of the smoothed action, a-bar."""
 
-    def stops(self, predicted: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Where to stop: predicted distances [...] [rad], smoothed actions [..., D] give booleans [...]."""
-        return (predicted < self.distance_rad) & (action.norm(dim=-1) < self.action_norm)
+    def stops(self, distance: np.ndarray, action_norm: np.ndarray) -> np.ndarray:
+        """Where to stop, for predicted distances [rad] and norms of the smoothed action of one shape."""
+        return (distance < self.distance_rad) & (action_norm < self.action_norm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,12 +76,11 @@ def calibrate(
     predicted: np.ndarray,
     action_norm: np.ndarray,
     true: np.ndarray,
-    alive: np.ndarray,
+    steps: np.ndarray,
     *,
     tolerance_rad: float = PAPER.success.rotation_rad,
-    candidates: int = 24,
 ) -> Calibration:
-    """Choose the bounds so that most episodes stop within the tolerance.
+    """Choose the bounds so that most of M recorded episodes stop within the tolerance.
 
     First that of the distance, with the paper's bound of the action norm, as headline figures have it; then
     one of the norm beside it. Only where nothing near is as still as the paper asks are both chosen together.
@@ -88,27 +89,28 @@ def calibrate(
     stricter one.
 
     Args:
-        predicted: Predicted distances [rad], shape [T, M] for T steps of M episodes.
-        action_norm: Norms of the smoothed action, shape [T, M].
-        true: True distances [rad], shape [T, M].
-        alive: Whether the episode still runs at each step, shape [T, M].
+        predicted: Predicted distances after t steps [rad] [M, T + 1].
+        action_norm: Norms of the smoothed action that led there [M, T + 1].
+        true: True distances [rad] [M, T + 1].
+        steps: Steps to the end of each episode [M]; the state after the last of them is not judged.
         tolerance_rad: Largest true distance that counts as right [rad].
-        candidates: Values tried of each bound.
 
     Raises:
         ValueError: There is no step to choose from, or no episode that any rule stops within the tolerance.
     """
+    after = np.arange(true.shape[1])
+    alive = (after > 0) & (after < steps[:, None])
     if not alive.any():
         raise ValueError("no episode has a step to calibrate the stopping rule on; give more episodes")
     right = (true <= tolerance_rad) & alive
     norms = action_norm[right] if right.any() else action_norm[alive]
-    limits = np.unique(np.quantile(norms, np.linspace(1.0 / candidates, 1.0, candidates)))
-    distances = 2.0 * tolerance_rad * np.arange(1, candidates + 1) / candidates
+    limits = np.unique(np.quantile(norms, np.linspace(1.0 / CANDIDATES, 1.0, CANDIDATES)))
+    distances = 2.0 * tolerance_rad * np.arange(1, CANDIDATES + 1) / CANDIDATES
 
     def score(distance: float, limit: float) -> tuple[float, ...]:
         stop = (predicted < distance) & (action_norm < limit) & alive
-        ends = stop.any(axis=0)
-        error = true[stop.argmax(axis=0), np.arange(true.shape[1])]
+        ends = stop.any(axis=1)
+        error = true[np.arange(len(true)), stop.argmax(axis=1)]
         success = float(np.mean(ends & (error <= tolerance_rad)))
         return success, -float(np.mean(ends & (error > tolerance_rad))), -float(distance), -float(limit)
 
@@ -117,9 +119,9 @@ def calibrate(
         distances = distances[distances == -best[2]]
     best = max(score(distance, limit) for distance in distances for limit in limits)
     if best[0] == 0.0:
-        near = int(right.any(axis=0).sum())
+        near = int(right.any(axis=1).sum())
         raise ValueError(
-            f"no rule stops any of {true.shape[1]} episodes within {tolerance_rad:g} rad ({near} came near); "
+            f"no rule stops any of {len(true)} episodes within {tolerance_rad:g} rad ({near} came near); "
             "train longer, or calibrate on more episodes"
         )
     return Calibration(
@@ -127,6 +129,6 @@ def calibrate(
         tolerance_rad=tolerance_rad,
         success=best[0],
         wrong=-best[1],
-        reachable=float(np.mean(right.any(axis=0))),
-        episodes=true.shape[1],
+        reachable=float(np.mean(right.any(axis=1))),
+        episodes=len(true),
     )

@@ -168,6 +168,17 @@ def set_folder(name: str) -> Path:
     return folder
 
 
+def set_files(names_or_paths: Iterable[str | Path]) -> list[Path]:
+    """The files of :func:`load_set`'s objects, each once; raises what that raises of entries and folders."""
+    files: list[Path] = []
+    for entry in names_or_paths:
+        path = _named_path(entry) or set_folder(str(entry))
+        files += [path] if path.is_file() else object_files(path)
+    if not files:
+        raise ObjectError("no object set was named; for example: cube, procedural-150-seed0, or a folder")
+    return list(dict.fromkeys(files))
+
+
 def load_set(names_or_paths: str | Path | Iterable[str | Path]) -> list[ObjectModel]:
     """Load objects: files, folders of files, or names of sets, in the order given.
 
@@ -179,16 +190,10 @@ def load_set(names_or_paths: str | Path | Iterable[str | Path]) -> list[ObjectMo
     Raises:
         ObjectError: An entry is neither, a folder holds no object, or two objects share a name.
     """
-    entries = [names_or_paths] if isinstance(names_or_paths, str | Path) else list(names_or_paths)
-    if not entries:
-        raise ObjectError("no object set was named; for example: cube, procedural-150-seed0, or a folder")
-    files: list[Path] = []
-    for entry in entries:
-        path = _named_path(entry) or set_folder(str(entry))
-        files += [path] if path.is_file() else object_files(path)
-    models = [read_object(p) for p in dict.fromkeys(files)]
+    files = set_files([names_or_paths] if isinstance(names_or_paths, str | Path) else names_or_paths)
+    models = [read_object(path) for path in files]
     seen: dict[str, Path] = {}
-    for model, path in zip(models, dict.fromkeys(files), strict=True):
+    for model, path in zip(models, files, strict=True):
         if model.name in seen:
             raise ObjectError(f"{path}: object {model.name} is also in {seen[model.name]}; leave one out")
         seen[model.name] = path

@@ -12,7 +12,7 @@ from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import check_fits, is_saved_student, is_tracking_policy, open_policy, trained_task
+from vd.evaluate.agents import check_fits, open_policy, trained_task
 from vd.evaluate.student import RENDERED
 from vd.paper import PAPER
 from vd.senses import Senses
@@ -215,15 +215,14 @@ def load_runner(
         ValueError: It is for another hand, or does not see by a camera.
     """
     policy: Any = None if name == ZERO else open_policy(name, "cpu")
-    student = is_saved_student(policy)
     if policy is None:
         if name != ZERO:
             raise ValueError(f"{name} is not for a hand; give a bundle, a policy's file, or {ZERO}")
         return PolicyRunner(ReorientCfg(hand=hand_name), StoppingRule())
     check_fits(name, policy, hand_name)
-    if student:
+    if isinstance(policy, SavedStudent):
         return StudentRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
-    if is_tracking_policy(policy):
+    if isinstance(policy, TrackingPolicy):
         return TrackingRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     raise ValueError(
         f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train tracker "

@@ -8,174 +8,43 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel
-from vd.config import Renamed, from_dict, to_dict
+from vd.config import Renamed, from_dict, to_dict, without_retired
 from vd.envs.cfg import ReorientCfg
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
-from vd.stopping import StoppingRule, StoppingRules
+from vd.stopping import StoppingRules
 from vd.vision.cfg import StudentCfg
 
 BUNDLE_FORMAT = "visual-dexterity bundle 1"
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-4, 1e-5
 """Differences of numbers that are no difference: a hand that was measured again differs by more."""
+CONVENTIONS = {
+    "units": "m, rad, s, kg, N",
+    "quaternion": "xyzw",
+    "pose": "position x y z, then quaternion",
+    "base_frame": "the hand's base link, +z in the direction of the fingers",
+    "world_frame": "z up, table top at z = 0",
+    "optical_frame": "x right, y down, z forward",
+}
+"""How numbers are to be read."""
+BEFORE: dict[str, dict[str, Any]] = {
+    "observation": {"view": "world", "file_axes": True},
+    "cloud": {"inputs": ["constant"], "proprioception": ["action"]},
+}
+"""By part of the interface the fields that bundles of earlier versions lack, with what is so there."""
+RETIRED: dict[str, dict[str, Any]] = {"cloud": {"goal": "merged", "senses": Renamed("proprioception")}}
+"""Fields of such bundles that are no more."""
 
 Kind = Literal["teacher", "student", "tracking"]
 
 
 class ContractError(ValueError):
     """A bundle that does not fit the hand or this version; names field, found, expected and remedy."""
-
-
-@dataclass(frozen=True)
-class Conventions:
-    """How numbers are to be read."""
-
-    units: str = "m, rad, s, kg, N"
-    quaternion: str = "xyzw"
-    pose: str = "position x y z, then quaternion"
-    base_frame: str = "the hand's base link, +z in the direction of the fingers"
-    world_frame: str = "z up, table top at z = 0"
-    optical_frame: str = "x right, y down, z forward"
-
-
-@dataclass(frozen=True)
-class HandPart:
-    """The hand it moves."""
-
-    name: str
-    """Root prim of its USD."""
-    joint_names: tuple[str, ...]
-    """Order of joint positions and actions, D names."""
-    lower_rad: tuple[float, ...]
-    """Lower joint limits [D]."""
-    upper_rad: tuple[float, ...]
-    """Upper joint limits [D]."""
-    base_in_world: tuple[float, ...]
-    """Pose of the base frame in the world frame [7]."""
-
-
-@dataclass(frozen=True)
-class ActionPart:
-    """From the network's output to joint targets.
-
-    smoothed = ema_alpha clip(action, -1, 1) + (1 - ema_alpha) smoothed, zero at the start;
-    target = clamp(q + smoothed scale_rad_s / control_hz, lower, upper), q as measured.
-    """
-
-    control_hz: float
-    ema_alpha: float
-    scale_rad_s: float
-    clip: tuple[float, float] = (-1.0, 1.0)
-
-
-@dataclass(frozen=True)
-class ObservationPart:
-    """The vector that a teacher's layers see; a tracking policy makes it of joints and camera."""
-
-    parts: dict[str, tuple[int, int]]
-    """First column and the one after the last of each part."""
-    velocity_scale: float = PAPER.observation.velocity_scale
-    """Factor on joint velocities and the object's angular velocity."""
-    view: str = "world"
-    """Frame of observation and action: the world's, or goal: the turn of the hand that the goal asks for."""
-    file_axes: bool = True
-    """Whether orientations of object and goal are shown in the axes of the object's file; else zeros are."""
-
-
-@dataclass(frozen=True)
-class CloudPart:
-    """The cloud a student sees, base frame: points of the goal, the hand, the object (or of a camera)."""
-
-    RETIRED: ClassVar[dict[str, Any]] = {"goal": "merged", "senses": Renamed("proprioception")}
-    point_names: tuple[str, ...]
-    """Sets of the hand's points, in order."""
-    points_per_set: int
-    """Points of each of them."""
-    voxel_m: float
-    """Side of a voxel; true floor of coordinate / side."""
-    goal_position_m: tuple[float, float, float] = PAPER.cloud.goal_position_m
-    """Where the goal's cloud, turned as wanted, is put in the base frame."""
-    feature: float = PAPER.cloud.feature
-    """The constant feature of a voxel."""
-    inputs: tuple[str, ...] = ("constant",)
-    """Features of a voxel, in order. position: its centre in the base frame, in units of 0.1 m; marks:
-    whether it holds points of the goal, and of the hand."""
-    proprioception: tuple[str, ...] = ("action",)
-    """What the network reads besides the cloud, in order: the smoothed action before [D], positions [rad] and
-    0.2 times velocities [rad/s] of the joints as measured [D]."""
-
-
-@dataclass(frozen=True)
-class CameraPart:
-    """The depth camera behind a policy that sees by one."""
-
-    source: str
-    """hand: the camera of the hand's USD; policy: one that the training placed elsewhere."""
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    """Intrinsics [pixel]."""
-    pose_in_base: tuple[float, ...]
-    """Optical frame in the base frame [7]."""
-    points: int
-    """Points of a cloud at most."""
-    crop_m: tuple[float, float]
-    """World heights that are kept [m]."""
-
-
-@dataclass(frozen=True)
-class Interface:
-    """All that hand and policy have to agree on."""
-
-    conventions: Conventions
-    hand: HandPart
-    action: ActionPart
-    observation: ObservationPart | None = None
-    cloud: CloudPart | None = None
-    camera: CameraPart | None = None
-
-
-@dataclass(frozen=True)
-class StoppingPart:
-    """When a policy that sees clouds stops: predicted distance and norm of the smoothed action are below."""
-
-    distance_rad: float
-    action_norm: float
-    calibrated_on: str
-    """Objects and episodes; empty: the paper's bounds."""
-    precise: tuple[float, float] | None = None
-    """The same two to stop within 0.1 rad; None: not calibrated."""
-    tolerance_rad: float = PAPER.success.rotation_rad
-    """Tolerance that the first two are for [rad]."""
-
-    @classmethod
-    def of(cls, rules: StoppingRules) -> "StoppingPart":
-        """The rules of a policy."""
-        stop, precise = rules.stopping, rules.precise
-        return cls(
-            stop.distance_rad,
-            stop.action_norm,
-            rules.calibrated_on,
-            None if precise is None else (precise.distance_rad, precise.action_norm),
-            rules.tolerance_rad,
-        )
-
-    def rules(self) -> dict[str, Any]:
-        """The fields of :class:`vd.stopping.StoppingRules`."""
-        return {
-            "stopping": StoppingRule(self.distance_rad, self.action_norm),
-            "tolerance_rad": self.tolerance_rad,
-            "precise": None if self.precise is None else StoppingRule(*self.precise),
-            "calibrated_on": self.calibrated_on,
-        }
 
 
 @dataclass(frozen=True)
@@ -201,10 +70,12 @@ class Contract:
     """The whole of contract.json."""
 
     kind: Kind
-    interface: Interface
+    interface: dict[str, Any]
+    """As :func:`derive_interface` gives it."""
     network: dict[str, Any]
     """What rebuilds the network: PolicySpec or StudentCfg; of a tracking policy the former, as ``policy``."""
-    stopping: StoppingPart | None
+    stopping: StoppingRules | None
+    """When a policy that sees clouds stops."""
     provenance: Provenance
     software: dict[str, str]
     """Versions with which it was written."""
@@ -220,8 +91,8 @@ class Contract:
     @property
     def own_camera(self) -> tuple[float, ...] | None:
         """Where the training put the camera, optical frame in the base frame [7]; None: the hand's own."""
-        camera = self.interface.camera
-        return camera.pose_in_base if camera is not None and camera.source == "policy" else None
+        camera = self.interface.get("camera")
+        return tuple(camera["pose_in_base"]) if camera and camera["source"] == "policy" else None
 
 
 def derive_interface(
@@ -230,8 +101,8 @@ def derive_interface(
     network: dict[str, Any],
     source: Provenance,
     camera: tuple[float, ...] | None = None,
-) -> Interface:
-    """What a policy of such a training and this hand have to agree on.
+) -> dict[str, Any]:
+    """What a policy of such a training and this hand have to agree on, as JSON has it, by part.
 
     Args:
         hand: The hand.
@@ -239,62 +110,78 @@ def derive_interface(
         network: What rebuilds its network.
         source: Where it comes from; ``depth`` is empty for one that sees by no camera.
         camera: Where the training put that, optical frame in the base frame [7]; None: the hand's own.
-
-    Raises:
-        ContractError: A robot's loop cannot give what it observes.
     """
     task = from_dict(ReorientCfg, source.task, where="provenance.task")
     depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth") if source.depth else None
     student = kind == "student"
-    return Interface(
-        conventions=Conventions(),
-        hand=HandPart(
-            name=hand.name,
-            joint_names=hand.joint_names,
-            lower_rad=_floats(hand.lower),
-            upper_rad=_floats(hand.upper),
-            base_in_world=_floats(BASE_IN_WORLD),
-        ),
-        action=ActionPart(task.sim.control_hz, task.action.ema_alpha, task.action.scale_rad_s),
-        observation=None if student else _observation(hand, task),
-        cloud=_cloud(hand, from_dict(StudentCfg, network, where="network")) if student else None,
-        camera=None if depth is None else _camera(hand, depth, camera),
-    )
+    parts = {
+        "conventions": CONVENTIONS,
+        "hand": {
+            "name": hand.name,  # of the root prim of its USD
+            "joint_names": hand.joint_names,  # in the order of joint positions and actions
+            "lower_rad": _floats(hand.lower),
+            "upper_rad": _floats(hand.upper),
+            "base_in_world": _floats(BASE_IN_WORLD),
+        },
+        # smoothed = ema_alpha clip(action) + (1 - ema_alpha) smoothed, zero at the start;
+        # target = clamp(q + smoothed scale_rad_s / control_hz, lower, upper), q as measured.
+        "action": {
+            "control_hz": task.sim.control_hz,
+            "ema_alpha": task.action.ema_alpha,
+            "scale_rad_s": task.action.scale_rad_s,
+            "clip": (-1.0, 1.0),
+        },
+        "observation": None if student else _observation(hand, task),
+        "cloud": _cloud(hand, from_dict(StudentCfg, network, where="network")) if student else None,
+        "camera": None if depth is None else _camera(hand, depth, camera),
+    }
+    found: dict[str, Any] = to_dict(parts)
+    return found
 
 
-def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
+def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
+    """The vector that a teacher's layers see; a tracking policy makes it of joints and camera."""
     seen = task.observation
     slices = teacher_observation_slices(hand.num_fingers)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}
     if seen.shape != "none":
         end = slices["previous_action"].stop
         parts["shape"] = (end, end + shape_observation_size(hand.num_fingers))
-    return ObservationPart(parts, view=seen.view, file_axes=seen.file_axes)
+    return {
+        "parts": parts,  # first column and the one after the last
+        "velocity_scale": PAPER.observation.velocity_scale,  # of joints, and of the object's turning
+        "view": seen.view,
+        "file_axes": seen.file_axes,
+    }
 
 
-def _cloud(hand: HandModel, network: StudentCfg) -> CloudPart:
-    return CloudPart(
-        point_names=hand.point_names,
-        points_per_set=hand.link_points.shape[1],
-        voxel_m=network.voxel_m,
-        inputs=network.encoder.inputs,
-        proprioception=network.proprioception,
-    )
+def _cloud(hand: HandModel, network: StudentCfg) -> dict[str, Any]:
+    """The cloud a student sees, base frame: points of the goal, the hand, the object (or of a camera)."""
+    return {
+        "point_names": hand.point_names,  # sets of the hand's points, in order
+        "points_per_set": hand.link_points.shape[1],
+        "voxel_m": network.voxel_m,  # true floor of coordinate / side
+        "goal_position_m": PAPER.cloud.goal_position_m,  # of the goal's cloud, turned as wanted
+        "feature": PAPER.cloud.feature,  # the constant one of a voxel
+        "inputs": network.encoder.inputs,  # features of a voxel, in order
+        "proprioception": network.proprioception,  # beside the cloud, in order
+    }
 
 
-def _camera(hand: HandModel, depth: DepthCameraCfg, pose: tuple[float, ...] | None) -> CameraPart:
+def _camera(hand: HandModel, depth: DepthCameraCfg, pose: tuple[float, ...] | None) -> dict[str, Any]:
+    """The depth camera: the one of the hand's USD, or one that the training placed elsewhere."""
     camera = hand.camera.at(pose)
-    return CameraPart(
-        source="hand" if pose is None else "policy",
-        pose_in_base=_floats([*camera.position, *camera.quaternion]),
-        points=depth.points,
-        crop_m=depth.crop_m,
+    return {
+        "source": "hand" if pose is None else "policy",
         **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
-    )
+        "pose_in_base": _floats([*camera.position, *camera.quaternion]),
+        "points": depth.points,  # of a cloud at most
+        "crop_m": depth.crop_m,  # world heights that are kept
+    }
 
 
-def _floats(values: Any) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
+def _floats(values: Any) -> list[float]:
+    return [float(value) for value in values]
 
 
 _REMEDY = {
@@ -309,18 +196,17 @@ _REMEDY = {
 
 
 def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
-    """Refuse a hand that is not the one of the contract.
-
-    Args:
-        contract: Of the bundle.
-        hand: The hand to move.
-        where: The bundle, for the message.
+    """Refuse a hand that is not the one of the contract of the bundle at ``where``.
 
     Raises:
         ContractError: The first field that differs, what the hand has, what the bundle wants, what to do.
     """
     found = derive_interface(hand, contract.kind, contract.network, contract.provenance, contract.own_camera)
-    for name, have, want in _differences(to_dict(found), to_dict(contract.interface)):
+    wanted = {
+        part: values and BEFORE.get(part, {}) | without_retired(values, RETIRED.get(part, {}), part)
+        for part, values in contract.interface.items()
+    }
+    for name, have, want in _differences(found, wanted):
         part = name.split(".")[0]
         raise ContractError(
             f"{where} does not fit the hand {hand.name} ({hand.path}): {name} is {_short(have)} here, but "

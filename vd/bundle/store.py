@@ -5,7 +5,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +14,11 @@ import torch
 
 from vd.assets_usd.hands import load_hand
 from vd.bundle import CONTRACT_FILE, is_bundle
-from vd.bundle.contract import (
-    BUNDLE_FORMAT,
-    Contract,
-    ContractError,
-    Kind,
-    Provenance,
-    StoppingPart,
-    derive_interface,
-)
+from vd.bundle.contract import BUNDLE_FORMAT, Contract, ContractError, Provenance, derive_interface
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
-from vd.files import atomic_path, make_folder, write_json, writing
-from vd.policy import PolicySpec, TrainedPolicy
+from vd.files import make_folder, write_json, writing
+from vd.policy import TrainedPolicy, policy_of
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
 from vd.tracking.policy import TrackingPolicy, TrackingSpec
@@ -37,8 +29,6 @@ from vd.vision.saved import SavedStudent, StudentSpec
 from vd.vision.voxels import Voxeliser
 
 WEIGHTS_FILE, GOLDEN_FILE = "weights.safetensors", "golden.safetensors"
-FILE_MODE, FOLDER_MODE = 0o644, 0o755
-"""A bundle is for others to read."""
 RENDERED = 2
 """Stage of students that see a depth camera."""
 STATES, STEPS, GOLDEN_POINTS = 8, 3, 500
@@ -52,6 +42,7 @@ versions of torch differ by 1e-6 to 1e-3."""
 PROPRIOCEPTION = {"action": "previous_action", "position": "joint_q", "velocity": "joint_qd"}
 """Golden input behind each part of a student's proprioception."""
 _PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
+_RULES = [one.name for one in fields(StoppingRules)]
 _AGAIN = "write the bundle again with vd-train bundle"
 
 AnyPolicy = TrainedPolicy | SavedStudent | TrackingPolicy
@@ -59,40 +50,33 @@ Tensors = dict[str, torch.Tensor]
 
 
 def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
-    """Write the bundle of a policy; one that is there is replaced.
-
-    Args:
-        policy: The policy, on the CPU.
-        folder: To write.
+    """Write the bundle of a policy on the CPU; one that is there is replaced.
 
     Raises:
-        ContractError: A robot's loop cannot give what it observes.
         FileExistsError: The folder holds something else.
         OutputError: It cannot be written.
     """
     task = from_dict(ReorientCfg, policy.task, where="task of the policy")
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
-    kind: Kind = "teacher"
     rules: StoppingRules | None = None
-    trained: TrainedPolicy | SavedStudent
     if isinstance(policy, TrackingPolicy):
-        kind, rules, trained = "tracking", policy.spec, policy.teacher
+        rules, trained = policy.spec, policy.teacher
         source = _provenance(trained, policy.spec.teacher, None, to_dict(policy.spec.depth))
         network, camera = {"policy": to_dict(trained.spec)}, policy.spec.camera
-        weights = {f"actor.{name}": value for name, value in trained.weights.items()}
-        weights |= {f"critic.{name}": value for name, value in trained.critic_weights.items()}
+        parts = {"actor": trained.weights, "critic": trained.critic_weights}
+        weights = {f"{part}.{name}": value for part, own in parts.items() for name, value in own.items()}
     elif isinstance(policy, SavedStudent):
-        kind, rules, trained, spec = "student", policy.spec, policy, policy.spec
+        rules = spec = policy.spec
         source = _provenance(policy, spec.teacher, spec.stage, policy.depth if spec.stage == RENDERED else {})
         network, camera, weights = to_dict(spec.network), spec.camera, policy.network.state_dict()
     else:
-        trained, source = policy, _provenance(policy, "", None, {})
+        source = _provenance(policy, "", None, {})
         network, camera, weights = to_dict(policy.spec), None, policy.weights
     contract = Contract(
-        kind=kind,
-        interface=derive_interface(hand, kind, network, source, camera),
+        kind=policy.kind,
+        interface=derive_interface(hand, policy.kind, network, source, camera),
         network=network,
-        stopping=None if rules is None else StoppingPart.of(rules),
+        stopping=None if rules is None else StoppingRules(**{n: getattr(rules, n) for n in _RULES}),
         provenance=source,
         software=installed_versions(_PACKAGES),
     )
@@ -116,17 +100,18 @@ def read_contract(folder: str | Path) -> Contract:
         found = values.get("format") if isinstance(values, dict) else None
         if found != BUNDLE_FORMAT:
             raise ValueError(f"format is {found!r}, this version reads {BUNDLE_FORMAT!r}")
+        if (rules := values.get("stopping")) and "distance_rad" in rules:  # of an earlier version
+            pairs = (rules.pop("distance_rad"), rules.pop("action_norm")), rules.get("precise")
+            rules["stopping"], rules["precise"] = (
+                pair and dict(zip(("distance_rad", "action_norm"), pair, strict=True)) for pair in pairs
+            )
         return from_dict(Contract, values)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, KeyError) as error:
         raise ContractError(f"{path}: {error}; {_AGAIN}") from error
 
 
 def read_bundle(folder: str | Path, device: str = "cpu") -> AnyPolicy:
     """The policy of a bundle, once it has answered the golden inputs as it did when it was written.
-
-    Args:
-        folder: The bundle.
-        device: Torch device of the policy.
 
     Raises:
         FileNotFoundError: A file is missing.
@@ -205,17 +190,16 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     if contract.kind == "teacher":
         return _teacher(network, source, weights, device)
     settings: dict[str, Any] = {"teacher": source.teacher, "camera": contract.own_camera}
-    if (stopping := contract.stopping) is not None:
-        settings |= stopping.rules()
+    settings |= vars(contract.stopping or StoppingRules())
     if contract.kind == "tracking":
-        teacher = _teacher(network.pop("policy"), source, weights, device, parts=True)
+        teacher = _teacher(network.pop("policy"), source, weights, device)
         spec = from_dict(TrackingSpec, network, where="network")
         depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth")
         return TrackingPolicy(teacher, replace(spec, depth=depth, **settings))
     assert source.stage is not None
     student = StudentSpec(
         network=from_dict(StudentCfg, network, where="network"),
-        num_actions=len(contract.interface.hand.joint_names),
+        num_actions=len(contract.interface["hand"]["joint_names"]),
         stage=source.stage,
         **settings,
     )
@@ -225,23 +209,16 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     return SavedStudent(student, net, source.task, source.depth, source.iterations, source.env_steps)
 
 
-def _teacher(
-    spec: dict[str, Any], source: Provenance, weights: Tensors, device: str, *, parts: bool = False
-) -> TrainedPolicy:
-    """A teacher; with ``parts`` the names of its weights say whether they are the actor's or the critic's."""
+def _teacher(spec: dict[str, Any], source: Provenance, weights: Tensors, device: str) -> TrainedPolicy:
+    """A teacher; of a tracking policy names of weights say whether they are the actor's or the critic's."""
+    trained = {"policy": spec, "task": source.task, "iter": source.iterations, "env_steps": source.env_steps}
+    actor, critic = _part(weights, "actor.") or weights, _part(weights, "critic.")
+    return policy_of(trained | {"actor_state_dict": actor, "critic_state_dict": critic}, device)
 
-    def of(part: str) -> Tensors:
-        return {n.removeprefix(part): value for n, value in weights.items() if n.startswith(part)}
 
-    return TrainedPolicy(
-        from_dict(PolicySpec, spec, where="network"),
-        of("actor.") if parts else weights,
-        task=source.task,
-        iteration=source.iterations,
-        env_steps=source.env_steps,
-        device=device,
-        critic=(of("critic.") or None) if parts else None,
-    )
+def _part(weights: Tensors, prefix: str) -> Tensors:
+    """Weights whose names begin so, without that."""
+    return {n.removeprefix(prefix): value for n, value in weights.items() if n.startswith(prefix)}
 
 
 def _provenance(
@@ -262,18 +239,16 @@ def _provenance(
 
 def _write(folder: Path, contract: Contract, weights: Tensors, golden: Tensors) -> None:
     """Write the files beside the place of the bundle, then put them there at once."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     if folder.exists() and not is_bundle(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} exists and is no bundle; choose another name")
     make_folder(folder.parent)
     with writing(folder), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
         made = Path(name) / folder.name
-        made.mkdir(FOLDER_MODE)
+        made.mkdir()
         for file, tensors in ((WEIGHTS_FILE, weights), (GOLDEN_FILE, golden)):
-            with atomic_path(made / file) as path:
-                save_file({key: v.detach().cpu().contiguous() for key, v in tensors.items()}, path)
-            (made / file).chmod(FILE_MODE)  # the library writes for the owner's eyes only
+            (made / file).write_bytes(save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}))
         digests = {file: _digest(made / file) for file in (WEIGHTS_FILE, GOLDEN_FILE)}
         write_json(made / CONTRACT_FILE, to_dict(replace(contract, files=digests)))
         if folder.exists():

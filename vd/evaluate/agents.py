@@ -3,18 +3,11 @@
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any
 
 from vd.bundle import is_bundle
 from vd.config import from_dict
-from vd.envs.cfg import (
-    CurriculumCfg,
-    ObservationCfg,
-    RandomisationCfg,
-    ReorientCfg,
-    SuccessCfg,
-    TableCfg,
-)
+from vd.envs.cfg import CurriculumCfg, ObservationCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TableCfg
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -78,12 +71,7 @@ def find_policy(name: str | Path) -> Path:
 
 
 def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None = None) -> None:
-    """Refuse agents, object sets and a hand that are not there, before anything slow is imported.
-
-    Raises:
-        FileNotFoundError: There is no such policy.
-        ValueError: There is no such object set or hand.
-    """
+    """Refuse agents, object sets and a hand that are not there, before anything slow is imported."""
     from vd.assets_usd.hands import check_hand_name
     from vd.assets_usd.objects.sets import check_sets
 
@@ -107,12 +95,7 @@ def trained_task(policy: Any) -> ReorientCfg:
 
 
 def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | TrackingPolicy | None":
-    """Load a trained policy; None for a built-in agent, which needs the number of actions first.
-
-    Args:
-        name: ``zero``, ``random``, the name of an installed policy, a policy's file, a bundle's folder, or a
-            run's folder.
-        device: Torch device.
+    """Load what :func:`find_policy` finds; None for a built-in agent, which has to know its task first.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -134,23 +117,9 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | Track
     return load_student(path, device) if is_student(path) else load_policy(path, device)
 
 
-def sees_clouds(name: str) -> bool:
-    """Whether a policy sees point clouds: a student, or one that tracks.
-
-    Raises:
-        FileNotFoundError: There is no such policy.
-    """
-    if name in BUILT_IN:
-        return False
-    path = find_policy(name)
-    if is_bundle(path):
-        from vd.bundle.store import read_contract
-
-        return read_contract(path).kind != "teacher"
-    from vd.tracking.policy import is_tracking
-    from vd.vision.saved import is_student
-
-    return is_student(path) or is_tracking(path)
+def sees_clouds(policy: Any | None) -> bool:
+    """Whether what :func:`open_policy` gave sees point clouds: a student, or one that tracks."""
+    return policy is not None and policy.kind != "teacher"
 
 
 def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
@@ -162,19 +131,13 @@ def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
     from vd.policy import TrainedPolicy
 
     policy = open_policy(name, device)
-    if policy is not None and not isinstance(policy, TrainedPolicy):
+    if not isinstance(policy, TrainedPolicy | None):
         raise ValueError(f"{name} sees point clouds; give a teacher, or use vd-eval")
     return policy
 
 
 def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_layer: str | None = None) -> None:
     """Refuse a policy that moves another hand, before anything slow; agents without a file move any.
-
-    Args:
-        name: Of the policy.
-        policy: What :func:`open_policy` gave.
-        hand: Hand name; None takes the policy's.
-        hand_layer: As of :func:`task_for`.
 
     Raises:
         vd.bundle.contract.ContractError: A bundle; names field, found, expected and remedy.
@@ -191,12 +154,10 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
         from vd.bundle.store import read_contract
 
         return check_hand(read_contract(path), model, path)
-    moves = policy.spec.num_actions if is_saved_student(policy) else policy.num_actions
-    if moves != model.num_joints:
-        trained = trained_task(policy).hand
+    if policy.num_actions != model.num_joints:
         raise ValueError(
-            f"{name} moves {moves} joints, the hand {model.name} has {model.num_joints}; "
-            f"use the hand it was trained for: --hand {trained}"
+            f"{name} moves {policy.num_actions} joints, the hand {model.name} has {model.num_joints}; "
+            f"use the hand it was trained for: --hand {trained_task(policy).hand}"
         )
 
 
@@ -204,24 +165,6 @@ def _on_hand(task: ReorientCfg, hand: str | None, hand_layer: str | None) -> Reo
     """A task with the hand and layer that were asked for; None: as trained."""
     layer = task.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer
     return replace(task, hand=hand or task.hand, hand_layer=layer)
-
-
-def is_saved_student(policy: Any | None) -> "TypeGuard[SavedStudent]":
-    """Whether what :func:`open_policy` gave is a student."""
-    if policy is None:
-        return False
-    from vd.vision.saved import SavedStudent
-
-    return isinstance(policy, SavedStudent)
-
-
-def is_tracking_policy(policy: Any | None) -> "TypeGuard[TrackingPolicy]":
-    """Whether what :func:`open_policy` gave is a tracking policy."""
-    if policy is None:
-        return False
-    from vd.tracking.policy import TrackingPolicy
-
-    return isinstance(policy, TrackingPolicy)
 
 
 def start_at_rest(yes: bool, no: bool) -> bool | None:
@@ -242,30 +185,17 @@ def episode_limit_s(episode_s: float | None, *, in_air: bool) -> float:
     return PAPER.scene.air_episode_s if in_air else PAPER.scene.episode_s
 
 
-def built_in(name: str, num_actions: int, *, seed: int, device: str) -> Any:
-    """The agent ``zero`` or ``random``."""
-    from vd.policy import RandomPolicy, ZeroPolicy
-
-    if name == "zero":
-        return ZeroPolicy(num_actions)
-    return RandomPolicy(num_actions, seed=seed, device=device)
-
-
 def task_for(
     policy: Any | None,
     *,
-    hand: str | None,
-    objects: tuple[str, ...],
-    num_envs: int,
-    seed: int,
     stop_tolerance_rad: float,
-    max_goal_angle_rad: float | None,
-    episode_s: float,
     randomised: bool,
-    success_ends_episode: bool,
-    at_rest: bool | None = None,
+    hand: str | None = None,
     hand_layer: str | None = None,
+    max_goal_angle_rad: float | None = None,
+    at_rest: bool | None = None,
     condition: RandomisationCfg | None = None,
+    **settings: Any,
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
 
@@ -274,34 +204,22 @@ def task_for(
 
     Args:
         policy: A trained policy, or None.
-        hand: Hand name; None takes the policy's.
-        objects: Object sets.
-        num_envs: N.
-        seed: Of the environment.
         stop_tolerance_rad: Orientation tolerance of success [rad].
-        max_goal_angle_rad: Largest angle from an object to a goal the environment draws [rad]; None: as
-            trained.
-        episode_s: Time limit [s].
         randomised: Domain randomisation, noise and disturbances.
-        success_ends_episode: End at success, or give a new goal.
-        at_rest: Start at rest on the table rather than from a drop; None: as trained.
-        hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is, None: as
-            trained.
+        hand: Hand name; None, here and below: as trained.
+        hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is.
+        max_goal_angle_rad: Largest angle from an object to a goal the environment draws [rad].
+        at_rest: Start at rest on the table rather than from a drop.
         condition: What is drawn, in place of ``randomised`` (:mod:`vd.evaluate.conditions`).
+        settings: Other fields of the task.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
-    if is_saved_student(policy) or is_tracking_policy(policy):
-        # Who does not look at its teacher's observation.
+    if sees_clouds(policy):  # who does not look at its teacher's observation
         base = replace(base, observation=ObservationCfg())
     if base.observation.dynamics == "critic":  # whom nobody asks here
         base = replace(base, observation=replace(base.observation, dynamics="none"))
     return replace(
         _on_hand(base, hand, hand_layer),
-        objects=objects,
-        num_envs=num_envs,
-        seed=seed,
-        episode_s=episode_s,
-        success_ends_episode=success_ends_episode,
         success=replace(SuccessCfg(), rotation_rad=stop_tolerance_rad),
         start=base.start if at_rest is None else replace(base.start, at_rest=at_rest),
         goal=base.goal
@@ -310,4 +228,5 @@ def task_for(
         curriculum=CurriculumCfg(),
         table=TableCfg(),
         randomisation=condition or replace(base.randomisation, enabled=randomised),
+        **settings,
     )

@@ -4,22 +4,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from vd.envs.cfg import RandomisationCfg
 from vd.evaluate.agents import LAYER_HELP, SHIPPED_POLICIES, episode_limit_s, start_at_rest
 from vd.evaluate.conditions import CONDITIONS, Condition
 from vd.evaluate.goals import Goals
 from vd.paper import PAPER
 from vd.sim.cfg import Engine
 
-if TYPE_CHECKING:
-    from vd.envs.cfg import RandomisationCfg
-
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0
-DEFAULT_OBJECTS = ("cube",)
 OF_THE_SUITE = (
     "episodes",
     "max_goal_angle",
@@ -131,7 +128,7 @@ class EvalCfg:
     @property
     def object_sets(self) -> tuple[str, ...]:
         """The sets of ``objects``, the default included."""
-        return self.objects or DEFAULT_OBJECTS
+        return self.objects or ("cube",)
 
     @property
     def limit_s(self) -> float:
@@ -139,14 +136,11 @@ class EvalCfg:
         return episode_limit_s(self.episode_s, in_air=self.in_air)
 
     @property
-    def randomisation(self) -> "RandomisationCfg | None":
-        """What is drawn; None: as trained, if at all."""
-        return None if self.condition is None else CONDITIONS[self.condition]
-
-    @property
-    def randomised(self) -> bool:
-        """Whether anything is drawn."""
-        return self.randomise if self.randomisation is None else self.randomisation.enabled
+    def randomisation(self) -> RandomisationCfg | None:
+        """What is drawn; None: as trained."""
+        if self.condition is not None:
+            return CONDITIONS[self.condition]
+        return None if self.randomise else RandomisationCfg(enabled=False)
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""

@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_folder(cfg.out)
         if cfg.suite is None:
             check_file(cfg.out / "eval.json")
-        return _evaluate(cfg) if cfg.suite is None else _run_suite(cfg)
+        return _evaluate(cfg)
     except KeyboardInterrupt:
         hint = "; the same command goes on from here" if cfg.suite else ""
         print(f"\nvd-eval: interrupted{hint}", file=sys.stderr)
@@ -32,25 +32,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _evaluate(cfg: EvalCfg) -> int:
     from vd.evaluate.compare import compare
-
-    result = compare(cfg)
     from vd.evaluate.page import terminal_text, write_page
-
-    write_page(result, cfg.out / "eval.html")
-    if cfg.json:
-        print(json.dumps(result.summary(), indent=1))
-    else:
-        print(f"{terminal_text(result)}\n{cfg.out / 'eval.json'}\n{cfg.out / 'eval.html'}")
-    return 0
-
-
-def _run_suite(cfg: EvalCfg) -> int:
-    from vd.evaluate.page import terminal_text
     from vd.evaluate.suite_run import OUT_OF_TIME, run_suite
 
-    result = run_suite(cfg)
-    written, page = (cfg.out / f"{cfg.suite}{suffix}" for suffix in (".json", ".html"))
-    print(written.read_text() if cfg.json else f"{terminal_text(result)}\n{written}\n{page}")
+    written, page = (cfg.out / f"{cfg.suite or 'eval'}{suffix}" for suffix in (".json", ".html"))
+    if cfg.suite is None:
+        result = compare(cfg)
+        write_page(result, page)
+    else:
+        result = run_suite(cfg)
+    if not cfg.json:
+        print(f"{terminal_text(result)}\n{written}\n{page}")
+    else:
+        print(json.dumps(result.summary(), indent=1) if cfg.suite is None else written.read_text())
     for condition, policy, why in result.missing:
         print(f"vd-eval: {condition} of {policy}: {why}", file=sys.stderr)
     return int(any(why != OUT_OF_TIME for _, _, why in result.missing))

@@ -2,21 +2,11 @@
 
 import math
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vd.evaluate.agents import (
-    built_in,
-    check_fits,
-    is_tracking_policy,
-    open_policy,
-    sees_clouds,
-    start_at_rest,
-    task_for,
-)
+from vd.evaluate.agents import check_fits, open_policy, sees_clouds, start_at_rest, task_for
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
 from vd.evaluate.conditions import in_condition
 from vd.sim.cfg import in_mujoco
@@ -25,9 +15,8 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
     from vd.evaluate.goals import Goals
-    from vd.evaluate.result import Protocol, Result
+    from vd.evaluate.result import Agent, Protocol, Result
     from vd.evaluate.trace import Trace
-    from vd.stopping import StoppingRule
 
 ENVS_CPU, ENVS_GPU, ENVS_CAMERA_GPU = 64, 8192, 1024
 """Environments simulated at once by default: enough to keep the device busy, few enough to fit anywhere;
@@ -35,19 +24,13 @@ images and clouds take memory."""
 _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "mujoco", "torch")
 
 
-def compare(cfg: EvalCfg, condition: str = "", stop_at: float = math.inf) -> "Result":
-    """Run an evaluation and write its JSON into ``cfg.out``.
-
-    Args:
-        cfg: Settings of the command line.
-        condition: Of the suite.
-        stop_at: When to give up [s], on the monotonic clock.
+def compare(cfg: EvalCfg, condition: str = "") -> "Result":
+    """Run an evaluation, of a suite under ``condition``, and write its JSON into ``cfg.out``.
 
     Raises:
         ValueError: A setting, object set or policy cannot be used.
         FileNotFoundError: There is no such policy.
         vd.sim.simulator.SimulationError: Contacts were lost, or an environment left the finite numbers.
-        TimeoutError: It was to give up.
     """
     quiet_warp()
     from vd.device import resolve_device
@@ -57,17 +40,19 @@ def compare(cfg: EvalCfg, condition: str = "", stop_at: float = math.inf) -> "Re
     policies = {name: open_policy(name, device) for name in cfg.agent_names}
     for name, policy in policies.items():
         check_fits(name, policy, cfg.hand, cfg.hand_layer)
-    from vd.assets_usd.objects.sets import load_set
+    import warp as wp
+
+    from vd.assets_usd.objects.sets import set_files
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.result import Result, judge
     from vd.tracking.symmetry import with_symmetries
+    from vd.versions import installed_versions
 
     groups = parse_groups(cfg.object_sets)
     everything = tuple(dict.fromkeys(s for sets in groups.values() for s in sets))
-    members = {name: [item.name for item in load_set(list(sets))] for name, sets in groups.items()}
-    count = len(load_set(list(everything)))
-    camera = any(map(sees_clouds, cfg.agent_names))
-    envs = cfg.num_envs or envs_for(count, cfg.episodes, device, camera=camera)
+    files = set_files(everything)
+    camera = any(map(sees_clouds, policies.values()))
+    envs = cfg.num_envs or envs_for(len(files), cfg.episodes, device, camera=camera)
     rows = []
     env: Any = None
     task, start = None, None
@@ -81,26 +66,18 @@ def compare(cfg: EvalCfg, condition: str = "", stop_at: float = math.inf) -> "Re
             env.objects = with_symmetries(env.objects, device)
             task, start = wanted, env.state_dict()
         env.load_state_dict(start)
-        actor, kind, sees, rules = actor_of(
+        actor, agent = actor_of(
             name, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
         )
-        trace = run_episodes(cfg, env, actor, name, rules, stop_at)
-        index = {item.name: number for number, item in enumerate(env.objects)}
+        trace = run_episodes(cfg, env, actor, agent)
         for group, sets in groups.items():
-            chosen = [index[member] for member in members[group]]
-            rows += judge(
-                trace.of(chosen),
-                _protocol(cfg, wanted, sets, sees),
-                [env.objects[number] for number in chosen],
-                policy=name,
-                kind=kind,
-                sees=sees,
-                group=group,
-                rules=rules,
-                condition=condition,
-            )
+            chosen = [files.index(file) for file in set_files(sets)]
+            objects = [env.objects[number] for number in chosen]
+            protocol = _protocol(cfg, wanted, sets, agent.sees)
+            rows += judge(trace.of(chosen), protocol, objects, agent, group=group, condition=condition)
     env.close()
-    result = Result(tuple(rows), software=_software(device))
+    software = {"device": wp.get_device(device).name} | installed_versions(_PACKAGES)
+    result = Result(tuple(rows), software)
     result.write(cfg.out / "eval.json")
     return result
 
@@ -118,7 +95,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         stop_tolerance_rad=NEVER_RAD,
         max_goal_angle_rad=cfg.max_goal_angle,
         episode_s=cfg.limit_s,
-        randomised=cfg.randomised,
+        randomised=True,
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
@@ -130,16 +107,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         task = replace(task, table_friction=cfg.table_friction)
     if cfg.engine == "mujoco":
         task = replace(task, sim=in_mujoco(task.sim))
-    if cfg.randomised:
-        return task
-    # Noise that is switched off anyway, and would keep a teacher and a tracker from sharing environments.
-    exact = replace(
-        task.randomisation,
-        observation_noise_mean=0.0,
-        observation_noise_std=0.0,
-        observation_offset_std=0.0,
-    )
-    return replace(task, randomisation=exact)
+    return task
 
 
 def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: str) -> "Protocol":
@@ -156,7 +124,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
         stop_tolerance_rad=cfg.stop_tolerance,
         episode_s=task.episode_s,
         control_hz=task.sim.control_hz,
-        randomisation=cfg.condition or ("on" if cfg.randomised else "off"),
+        randomisation=cfg.condition or ("on" if cfg.randomise else "off"),
         at_rest=task.start.at_rest,
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
         in_air=cfg.in_air,
@@ -175,56 +143,39 @@ def actor_of(
     goals: "Goals" = "mesh",
     sensor_errors: bool = False,
     seed: int = 0,
-) -> tuple[Any, str, str, Any]:
-    """What acts in an environment, its kind, what it sees, and its rules to stop, by tolerance.
-
-    Args:
-        name: Of the policy.
-        policy: What :func:`open_policy` gave.
-        env: The environment.
-        goals: What a camera policy knows shapes and goals by.
-        sensor_errors: Its camera errs as a real one.
-        seed: Of everything random.
-    """
-    from vd.policy import TrainedPolicy
+) -> tuple[Any, "Agent"]:
+    """What acts in an environment, and who that is; a camera policy with ``goals`` and ``sensor_errors``."""
+    from vd.evaluate.result import Agent
+    from vd.policy import BuiltIn
     from vd.stopping import StoppingRule
 
     if policy is None:
-        return built_in(name, env.num_actions, seed=seed, device=env.device), name, "nothing", StoppingRule
-    if isinstance(policy, TrainedPolicy):
-        return policy, "teacher", "state", StoppingRule
+        actor = BuiltIn(name, env.num_actions, seed=seed, device=env.device)
+        return actor, Agent(name, name, "nothing", StoppingRule, predicts=False)
+    if not sees_clouds(policy):
+        return policy, Agent(name, "teacher", "state", StoppingRule, predicts=False)
     from vd.workers import one_thread_without_gpu
 
     one_thread_without_gpu(env.device)
     settings: dict[str, Any] = {"goals": goals, "sensor_errors": sensor_errors, "seed": seed}
-    if is_tracking_policy(policy):
+    eyes: Any
+    if policy.kind != "student":
         from vd.evaluate.tracking import TrackingActor
 
-        return TrackingActor(env, policy, **settings), "tracking", "rendered clouds", policy.spec.rule_for
+        eyes = TrackingActor(env, policy, **settings)
+        return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for, predicts=True)
     from vd.evaluate.student import StudentActor
 
-    actor = StudentActor(env, policy, **settings)
-    sees = "rendered clouds" if actor.rendered else "complete clouds"
-    return actor, f"student of stage {policy.spec.stage}", sees, policy.spec.rule_for
+    eyes, kind = StudentActor(env, policy, **settings), f"student of stage {policy.spec.stage}"
+    sees = "rendered clouds" if eyes.rendered else "complete clouds"
+    return eyes, Agent(name, kind, sees, policy.spec.rule_for, predicts=True)
 
 
-def run_episodes(
-    cfg: EvalCfg,
-    env: Any,
-    actor: Any,
-    name: str,
-    rules: Callable[[float], "StoppingRule"],
-    stop_at: float,
-) -> "Trace":
-    """All episodes of one policy, with a progress bar.
-
-    Raises:
-        TimeoutError: The monotonic clock has come to ``stop_at`` [s].
-    """
+def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "Trace":
+    """All episodes of one policy, with a progress bar."""
     import numpy as np
     from tqdm import tqdm
 
-    from vd.evaluate.result import ways_to_stop
     from vd.evaluate.rollout import draw_starts_and_goals
     from vd.evaluate.trace import air_table_steps, record
 
@@ -237,15 +188,8 @@ def run_episodes(
         starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
     rounds = math.ceil(cfg.episodes / (env.num_envs // len(env.objects)))
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
-    title = Path(name).name or name
-    ways = ways_to_stop(rules, cfg.stop_tolerance, predicts=hasattr(actor, "predicted"))
+    title = Path(agent.policy).name or agent.policy
     with tqdm(total=rounds * env.max_episode_steps, unit="step", desc=title, mininterval=refresh) as bar:
-
-        def stepped() -> None:
-            bar.update()
-            if time.monotonic() > stop_at:
-                raise TimeoutError(f"{title} did not end in the time that was left")
-
         trace = record(
             env,
             actor,
@@ -253,8 +197,8 @@ def run_episodes(
             starts=starts,
             goals=goals,
             table_steps=air_table_steps(env.cfg.sim.control_hz) if cfg.in_air else None,
-            held=[(way.rule, way.by) for way in ways if way.by != "success"],
-            on_step=stepped,
+            held=[way for way in agent.ways_to_stop(cfg.stop_tolerance).values() if way[1] != "success"],
+            on_step=bar.update,
         )
     env.check()
     return trace
@@ -264,12 +208,3 @@ def envs_for(num_objects: int, episodes: int, device: str, *, camera: bool = Fal
     """Environments to simulate at once: the same number for every object, at most one for each episode."""
     limit = ENVS_CPU if device == "cpu" else ENVS_CAMERA_GPU if camera else ENVS_GPU
     return num_objects * max(1, min(episodes, limit // num_objects))
-
-
-def _software(device: str) -> dict[str, str]:
-    """The device and the versions of what runs."""
-    import warp as wp
-
-    from vd.versions import installed_versions
-
-    return {"device": wp.get_device(device).name} | installed_versions(_PACKAGES)

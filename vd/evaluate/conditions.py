@@ -1,30 +1,40 @@
 """Conditions to evaluate a policy in, by name, whatever its training: those of ``vd-eval --condition``."""
 
 from dataclasses import replace
-from typing import Literal
+from functools import partial
+from typing import TYPE_CHECKING, Literal
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.paper import PAPER
 
 _MATERIALS = PAPER.materials
 _FRICTION = PAPER.randomisation.friction
+
+
+def _at(value: float) -> tuple[float, float]:
+    """The range that is one value."""
+    return value, value
+
+
 EXACT = RandomisationCfg(
-    stiffness_scale=(1.0, 1.0),
-    damping_scale=(1.0, 1.0),
-    link_mass_scale=(1.0, 1.0),
-    friction=(_MATERIALS.friction, _MATERIALS.friction),
-    table_friction=(_MATERIALS.table_friction, _MATERIALS.table_friction),
-    object_scale=(1.0, 1.0),
+    stiffness_scale=_at(1.0),
+    damping_scale=_at(1.0),
+    link_mass_scale=_at(1.0),
+    friction=_at(_MATERIALS.friction),
+    table_friction=_at(_MATERIALS.table_friction),
+    object_scale=_at(1.0),
     object_scale_count=1,
-    object_mass_kg=(_MATERIALS.object_mass_kg, _MATERIALS.object_mass_kg),
+    object_mass_kg=_at(_MATERIALS.object_mass_kg),
     action_noise_std=0.0,
     observation_noise_mean=0.0,
     observation_noise_std=0.0,
     force_probability=0.0,
 )
 """Nothing varies: the base of conditions that change one thing."""
+_only = partial(replace, EXACT)
 STEP_LATE_S = 1.0 / PAPER.scene.control_hz
 """One control step, 83 ms: a camera and the loop behind it are this late at worst."""
+_LATE = _at(STEP_LATE_S)
 FRICTION_NM, PLAY_RAD = 0.15, 0.03
 """Largest dry friction [N m] and backlash [rad] of a joint (ours; identified servos have up to half)."""
 COMMAND_DELAY_S, OBSERVATION_LATENCY_S = 0.04, 0.12
@@ -37,54 +47,52 @@ OFF_CENTRE_M = 0.01
 POSE_ERROR = (0.005, 0.1)
 """Errors of the object's pose [m] [rad] (ours), all through an episode: a bad registration."""
 
-_LATE = (STEP_LATE_S, STEP_LATE_S)
-
-Condition = Literal[
-    "nominal",
-    "s3",
-    "hard",
-    "mixed",
-    "observation-late",
-    "all-late",
-    "command-late",
-    "joint-friction",
-    "light",
-    "heavy",
-    "slippery",
-    "grippy",
-    "off-centre",
-    "soft-tips",
-    "stiff-contacts",
-    "pose-error",
-]
-CONDITIONS: dict[Condition, RandomisationCfg] = {
-    "nominal": replace(EXACT, enabled=False),
-    "s3": RandomisationCfg(),
-    "hard": RandomisationCfg(force_s=1.0 / PAPER.scene.control_hz),
-    "mixed": RandomisationCfg(
-        effects={
-            "command_delay.delay_s": (0.0, COMMAND_DELAY_S),
-            "coulomb_friction.tau_c_nm": (0.0, FRICTION_NM),
-            "backlash.width_rad": (0.0, PLAY_RAD),
-        },
-        observation_latency_s=(0.0, OBSERVATION_LATENCY_S),
+_NAMED: dict[str, tuple[str, RandomisationCfg]] = {
+    "nominal": ("nothing", _only(enabled=False)),
+    "s3": ("all of Table S3", RandomisationCfg()),
+    "hard": ("Table S3, forces last a control step", RandomisationCfg(force_s=1.0 / PAPER.scene.control_hz)),
+    "mixed": (
+        "Table S3, friction, backlash, late commands, late object",
+        RandomisationCfg(
+            effects={
+                "command_delay.delay_s": (0.0, COMMAND_DELAY_S),
+                "coulomb_friction.tau_c_nm": (0.0, FRICTION_NM),
+                "backlash.width_rad": (0.0, PLAY_RAD),
+            },
+            observation_latency_s=(0.0, OBSERVATION_LATENCY_S),
+        ),
     ),
-    "observation-late": replace(EXACT, observation_latency_s=_LATE),
-    "all-late": replace(EXACT, observation_latency_s=_LATE, encoder_latency_s=_LATE),
-    "command-late": replace(EXACT, effects={"command_delay.delay_s": _LATE}),
-    "joint-friction": replace(EXACT, effects={"coulomb_friction.tau_c_nm": (FRICTION_NM, FRICTION_NM)}),
-    "light": replace(EXACT, object_mass_kg=(MASS_KG[0], MASS_KG[0])),
-    "heavy": replace(EXACT, object_mass_kg=(MASS_KG[1], MASS_KG[1])),
-    "slippery": replace(EXACT, friction=(_FRICTION[0], _FRICTION[0])),
-    "grippy": replace(EXACT, friction=(_FRICTION[1], _FRICTION[1])),
-    "off-centre": replace(EXACT, object_com_m=OFF_CENTRE_M),
-    "soft-tips": replace(EXACT, enabled=False),
-    "stiff-contacts": replace(EXACT, enabled=False),
-    "pose-error": replace(EXACT, object_pose_error=POSE_ERROR),
+    "observation-late": (f"object seen {STEP_LATE_S:.3f} s late", _only(observation_latency_s=_LATE)),
+    "all-late": (
+        f"object and joints seen {STEP_LATE_S:.3f} s late",
+        _only(observation_latency_s=_LATE, encoder_latency_s=_LATE),
+    ),
+    "command-late": (f"commands {STEP_LATE_S:.3f} s late", _only(effects={"command_delay.delay_s": _LATE})),
+    "joint-friction": (
+        f"friction of {FRICTION_NM:g} N m in every joint",
+        _only(effects={"coulomb_friction.tau_c_nm": _at(FRICTION_NM)}),
+    ),
+    "light": (f"objects of {MASS_KG[0]:g} kg", _only(object_mass_kg=_at(MASS_KG[0]))),
+    "heavy": (f"objects of {MASS_KG[1]:g} kg", _only(object_mass_kg=_at(MASS_KG[1]))),
+    "slippery": (f"friction of hand and object {_FRICTION[0]:g}", _only(friction=_at(_FRICTION[0]))),
+    "grippy": (f"friction of hand and object {_FRICTION[1]:g}", _only(friction=_at(_FRICTION[1]))),
+    "off-centre": (f"centre of mass {OFF_CENTRE_M:g} m off", _only(object_com_m=OFF_CENTRE_M)),
+    "soft-tips": ("soft fingertips", _only(enabled=False)),
+    "stiff-contacts": ("contacts twice as stiff, physics steps half as long", _only(enabled=False)),
+    "pose-error": (
+        f"object seen {POSE_ERROR[0]:g} m and {POSE_ERROR[1]:g} rad off",
+        _only(object_pose_error=POSE_ERROR),
+    ),
 }
-"""Nothing drawn; Table S3; the same with forces that last a control step; Table S3, friction, backlash, late
-commands and a late object; the object, object and joints, commands a control step late; then one thing each,
-of which two are no draws (:func:`in_condition`)."""
+"""What is changed, in words, and what is drawn; two changes are no draws (:func:`in_condition`)."""
+CHANGED = {name: words for name, (words, _) in _NAMED.items()}
+"""What each condition changes, in words."""
+CONDITIONS = {name: drawn for name, (_, drawn) in _NAMED.items()}
+"""What is drawn in each."""
+if TYPE_CHECKING:
+    Condition = str
+else:
+    Condition = Literal[tuple(CONDITIONS)]
 
 
 def in_condition(task: ReorientCfg, name: Condition) -> ReorientCfg:

@@ -2,15 +2,21 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vd.evaluate.plots import ecdf_figure
-from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row, Summary
+from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row
 from vd.evaluate.statistics import Interval
 from vd.evaluate.trace import HOLD_S
 from vd.page import write_html
 from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+"""Header and rows."""
 
 NOTHING = "–"  # noqa: RUF001
 WORDS = 3
@@ -22,6 +28,11 @@ _HEADER = (*_NAMES, "success", f"and held {HOLD_S:g} s", "within 0.1 rad", "lost
 _BESIDE_HEADER = (*_NAMES, "up to symmetry", "median error [rad]", "time [s]")
 _OBJECT_HEADER = ("object", *OUTCOMES, "up to symmetry", "median error [rad]")
 _BOUND_HEADER = ("policy", "objects", "bound [rad]", "near and seen so", "said and right", "mean error [rad]")
+GREY = "#8a8f98"
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Of policies in their order: those of Okabe and Ito, which colour-blind readers can tell apart."""
+PANELS, PANEL_INCH = 3, (4.2, 3.6)
+"""Panels of the figure side by side, and the size of one."""
 
 
 def shown_name(text: str) -> str:
@@ -40,6 +51,12 @@ def number(interval: Interval | None) -> str:
     if interval is None:
         return NOTHING
     return f"{interval.value:.2f} ({interval.low:.2f} to {interval.high:.2f})"
+
+
+def points(difference: Interval, unit: str = "") -> str:
+    """``+1.2 (-0.4 to +2.8)``, of shares in per cent, with ``unit`` behind the first number."""
+    value, low, high = (100 * share for share in (difference.value, difference.low, difference.high))
+    return f"{value:+.1f}{unit} ({low:+.1f} to {high:+.1f})"
 
 
 def labels(names: Sequence[str]) -> dict[str, str]:
@@ -65,47 +82,35 @@ def write_page(
     *,
     title: str = "",
     lead: str = "",
-    figures: tuple[Sequence[str], Sequence[Sequence[str]]] | None = None,
+    figures: Table | None = None,
     notes: Sequence[str] = (),
     conditions: Sequence[Sequence[str]] = (),
     of_paper: bool = False,
 ) -> None:
-    """Write the page.
+    """Write the page; all that follows ``path`` is of a suite.
 
-    Args:
-        result: What was found.
-        path: Of the page.
-        title: By default the policies.
-        lead: By default what was asked.
-        figures: Of a suite: its table, header and rows.
-        notes: Of a suite: what has to be said of its objects.
-        conditions: Of a suite: name, place in the paper or what is changed, and flags of each.
-        of_paper: Whether the figures are the paper's beside ours.
+    Its own table is ``figures``, the paper's beside ours or not; ``notes`` are of its objects. ``conditions``
+    have a name, the place in the paper or what is changed, and flags.
     """
     short = labels(result.policies)
-    shown = [shown_name(short[name]) for name in result.policies]
+    success, beside = _tables(result, short)
+    headlines = [row for row in result.rows if row.headline]
     write_html(
         path,
         "evaluation.html",
-        title=title or f"Evaluation of {', '.join(shown)}",
+        title=title or f"Evaluation of {', '.join(shown_name(name) for name in short.values())}",
         lead=lead or (asked([row.protocol for row in result.rows]) if result.rows else ""),
         notes=notes,
-        header=_HEADER,
-        rows=[_cells(row, short) for row in result.rows],
-        beside_header=_BESIDE_HEADER,
-        beside=[_beside_cells(row, short) for row in result.rows],
+        success=success,
+        beside=beside,
         hold_s=f"{HOLD_S:g}",
-        differences=_difference_cells(result, short),
+        differences=_differences(result, short),
         figures=figures,
         missing=[(condition, shown_name(policy), why) for condition, policy, why in result.missing],
         errors=ecdf_figure(result, short) if result.rows else None,
-        bound_header=_BOUND_HEADER,
-        bounds=_bound_cells(result, short),
+        bounds=_bound_table(headlines, short),
         warnings=result.warnings,
-        object_header=_OBJECT_HEADER,
-        objects=[]
-        if conditions
-        else [(_heading(r, short), _object_cells(r)) for r in result.rows if r.headline],
+        objects=[] if conditions else [(_heading(row, short), *_object_table(row)) for row in headlines],
         conditions=conditions,
         of_paper=of_paper,
         protocol=[] if conditions else _protocol(result, short),
@@ -120,23 +125,16 @@ def terminal_text(result: Result) -> str:
         return ""
     short, suite = labels(result.policies), any(row.condition for row in result.rows)
     parts = []
-    for header, cells in ((_HEADER, _cells), (_BESIDE_HEADER, _beside_cells)):
+    for header, rows in _tables(result, short):
         # Only the first figure has its interval here: a line has to fit.
-        rows = [
-            [
-                cell if column <= WORDS else cell.split(" (")[0]
-                for column, cell in enumerate(cells(row, short))
-            ]
-            for row in result.rows
-        ]
-        parts.append(aligned([header, *rows], words=WORDS))
+        cut = [[*row[: WORDS + 1], *(cell.split(" (")[0] for cell in row[WORDS + 1 :])] for row in rows]
+        parts.append(aligned([header, *cut], words=WORDS))
     if len(result.policies) == 1 and not suite:
-        parts += [
-            f"{_heading(row, short)}\n{aligned([_OBJECT_HEADER, *_object_cells(row)], words=1)}"
-            for row in result.rows
-            if row.headline
-        ]
-    parts += ["\n".join("  ".join(cells) for cells in _difference_cells(result, short))]
+        for row in result.rows:
+            if row.headline:
+                header, rows = _object_table(row)
+                parts.append(f"{_heading(row, short)}\n{aligned([header, *rows], words=1)}")
+    parts += ["\n".join("  ".join(cells) for cells in _differences(result, short))]
     parts += [f"warning {name}: {words}" for name, words in result.warnings.items()]
     parts += [] if suite else [asked([row.protocol for row in result.rows])]
     return "\n\n".join(part for part in parts if part)
@@ -154,9 +152,90 @@ def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
     )
 
 
-def _named(row: Row, short: dict[str, str]) -> str:
-    """A policy with its kind; zero and random are their own."""
-    return row.kind if row.kind == row.policy else f"{short[row.policy]} ({row.kind})"
+def ecdf_figure(result: Result, short: dict[str, str]) -> "Figure":
+    """Distributions of the errors at the stop or end, by each policy's own rule.
+
+    A panel for each condition and group; ``short`` are names of the policies.
+    """
+    from matplotlib.figure import Figure
+
+    headlines = result.headlines()
+    columns = min(PANELS, len(headlines))
+    rows = -(-len(headlines) // columns)
+    figure = Figure(figsize=(columns * PANEL_INCH[0], rows * PANEL_INCH[1]), layout="constrained")
+    angle = np.linspace(0.0, np.pi, 200)
+    colour = dict(zip(result.policies, COLOURS * len(result.policies), strict=False))
+    for panel, ((condition, group), found) in enumerate(headlines.items()):
+        axes = figure.add_subplot(rows, columns, panel + 1)
+        axes.spines[["top", "right"]].set_visible(False)
+        for policy, row in found.items():
+            # Lost objects count, but have no error: the curve ends below one.
+            errors = np.sort([e.exact_error_rad for e in row.episodes if not e.fell])
+            share = np.arange(len(errors) + 1) / len(row.episodes)
+            steps = np.concatenate([[0.0], errors, [np.pi]]), np.append(share, share[-1])
+            axes.step(*steps, where="post", color=colour[policy], label=short[policy])
+        by_chance = (angle - np.sin(angle)) / np.pi  # of orientations uniform on SO(3)
+        axes.plot(angle, by_chance, color=GREY, linestyle=":", label="at random")
+        axes.axvline(row.protocol.stop_tolerance_rad, color=GREY, linewidth=0.6)
+        axes.set(xlim=(0.0, np.pi), ylim=(0.0, 1.0), title=condition or group)
+        axes.set(xlabel="error at the stop or end [rad]", ylabel="share of episodes")
+        axes.legend(frameon=False, loc="lower right", fontsize=7)
+    return figure
+
+
+def _tables(result: Result, short: dict[str, str]) -> tuple[Table, Table]:
+    """Of all rows: the figures by which policies are judged, and those beside them."""
+    success, beside = [], []
+    for row in result.rows:
+        name = row.kind if row.kind == row.policy else f"{short[row.policy]} ({row.kind})"
+        names, outcomes = (name, _where(row), _stopped_by(row)), row.overall.outcomes
+        held = "not tried" if row.held is None else percent(row.held)
+        success.append(
+            (
+                *names,
+                percent(outcomes["success"]),
+                held,
+                percent(row.precise),
+                percent(outcomes["object falls"]),
+            )
+        )
+        median, time_s = number(row.overall.median_error_rad), number(row.overall.time_s)
+        beside.append((*names, percent(row.symmetric), median, time_s))
+    return (_HEADER, success), (_BESIDE_HEADER, beside)
+
+
+def _object_table(row: Row) -> Table:
+    """All objects of a row, and each."""
+    return _OBJECT_HEADER, [
+        (
+            one.name,
+            *map(percent, one.outcomes.values()),
+            percent(one.symmetric[str(PAPER.success.rotation_rad)]),
+            number(one.median_error_rad),
+        )
+        for one in (row.overall, *row.per_object)
+    ]
+
+
+def _bound_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
+    """What predictions are worth at each bound."""
+
+    def share(value: float | None) -> str:
+        return "none" if value is None else f"{100 * value:.1f} %"
+
+    return _BOUND_HEADER, [
+        (
+            short[row.policy],
+            _where(row),
+            bound,
+            share(seen),
+            share(row.prediction.right[bound]),
+            f"{row.prediction.mean_error_rad:.2f}",
+        )
+        for row in rows
+        if row.prediction is not None
+        for bound, seen in row.prediction.seen.items()
+    ]
 
 
 def _stopped_by(row: Row) -> str:
@@ -173,68 +252,10 @@ def _where(row: Row) -> str:
     return f"{row.group}, {row.condition}" if row.condition not in ("", row.group) else row.group
 
 
-def _names(row: Row, short: dict[str, str]) -> tuple[str, ...]:
-    return _named(row, short), _where(row), _stopped_by(row)
-
-
-def _cells(row: Row, short: dict[str, str]) -> tuple[str, ...]:
-    return (
-        *_names(row, short),
-        percent(row.overall.outcomes["success"]),
-        "not tried" if row.held is None else percent(row.held),
-        percent(row.precise),
-        percent(row.overall.outcomes["object falls"]),
-    )
-
-
-def _beside_cells(row: Row, short: dict[str, str]) -> tuple[str, ...]:
-    return (
-        *_names(row, short),
-        percent(row.symmetric),
-        number(row.overall.median_error_rad),
-        number(row.overall.time_s),
-    )
-
-
-def _object_cells(row: Row) -> list[tuple[str, ...]]:
-    def cells(summary: Summary) -> tuple[str, ...]:
-        return (
-            summary.name,
-            *(percent(rate) for rate in summary.outcomes.values()),
-            percent(summary.symmetric[str(PAPER.success.rotation_rad)]),
-            number(summary.median_error_rad),
-        )
-
-    return [cells(summary) for summary in (row.overall, *row.per_object)]
-
-
-def _difference_cells(result: Result, short: dict[str, str]) -> list[tuple[str, ...]]:
+def _differences(result: Result, short: dict[str, str]) -> list[tuple[str, ...]]:
     return [
-        (
-            f"{short[other.policy]} over {short[first.policy]}",
-            _where(first),
-            f"{100 * d.value:+.1f} points ({100 * d.low:+.1f} to {100 * d.high:+.1f})",
-        )
+        (f"{short[other.policy]} over {short[first.policy]}", _where(first), points(d, " points"))
         for first, other, d in result.differences()
-    ]
-
-
-def _bound_cells(result: Result, short: dict[str, str]) -> list[tuple[str, ...]]:
-    def share(value: float | None) -> str:
-        return "none" if value is None else f"{100 * value:.1f} %"
-
-    return [
-        (
-            short[row.policy],
-            _where(row),
-            bound,
-            share(row.prediction.seen[bound]),
-            share(row.prediction.right[bound]),
-            f"{row.prediction.mean_error_rad:.2f}",
-        )
-        for row in result.rows
-        if row.prediction is not None and row.headline
-        for bound in row.prediction.seen
     ]
 
 

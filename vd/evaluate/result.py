@@ -23,7 +23,7 @@ from vd.evaluate.statistics import (
     paired_difference,
     rate_intervals,
 )
-from vd.evaluate.trace import Episode, StopsBy, Trace
+from vd.evaluate.trace import Episode, StopsBy, Trace, Way
 from vd.files import write_json
 from vd.paper import PAPER
 from vd.sim.cfg import Engine
@@ -157,7 +157,7 @@ class Row:
     @property
     def successes(self) -> np.ndarray:
         """Which episodes were stopped within the tolerance of the very goal, bool [K, M]."""
-        return _outcome_masks(self.episodes, self.protocol)[0].reshape(len(self.object_names), -1)
+        return _outcomes(self.episodes, self.protocol)[0]
 
     @property
     def headline(self) -> bool:
@@ -236,91 +236,78 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Way:
-    """A way to stop the episodes of a policy."""
+class Agent:
+    """Who acts, and when it is stopped."""
 
-    stopped_by: StoppedBy
-    rule: StoppingRule
-    by: StopsBy
-    ours: str = ""
+    policy: str
+    """Its name."""
+    kind: str
+    sees: str
+    """Both as of :class:`Row`."""
+    rules: Callable[[float], StoppingRule]
+    """Its own rule for a tolerance [rad]."""
+    predicts: bool
+    """Whether it predicts its distance to the goal."""
 
+    def ways_to_stop(self, tolerance_rad: float) -> dict[tuple[StoppedBy, str], Way]:
+        """The ways to stop it within a tolerance [rad], the headline first, by name and what is ours of it.
 
-def ways_to_stop(
-    rules: Callable[[float], StoppingRule], tolerance_rad: float, *, predicts: bool
-) -> list[Way]:
-    """The ways to stop a policy, the headline first.
-
-    They are the bounds of the distance that it predicts, if it does, and of the true one, both with the
-    released code's bound of the action's norm; and, as ours, its own bound of the norm where that is another.
-    What predicts nothing is stopped by the success criteria of training, too.
-
-    Args:
-        rules: The policy's own rule for a tolerance [rad].
-        tolerance_rad: Of the stop; bound of the true distance, too.
-        predicts: Whether it predicts distances.
-    """
-    own, norm = rules(tolerance_rad), PAPER.success.action_norm
-    ways = [Way("true distance", StoppingRule(tolerance_rad, norm), "exact")]
-    if predicts:
-        ways.insert(0, Way("prediction", replace(own, action_norm=norm), "predicted"))
-        if own.action_norm != norm:
-            ways.append(Way("prediction", own, "predicted", OWN_NORM))
-    else:
-        ways.append(Way(SUCCESS, StoppingRule(tolerance_rad, norm), "success"))
-    return ways
+        They are the bounds of the distance that it predicts, if it does, and of the true one, both with the
+        released code's bound of the action's norm; and, as ours, its own bound of the norm where that is
+        another. What predicts nothing is stopped by the success criteria of training, too.
+        """
+        own, norm = self.rules(tolerance_rad), PAPER.success.action_norm
+        true = StoppingRule(tolerance_rad, norm)
+        if not self.predicts:
+            return {("true distance", ""): (true, "exact"), (SUCCESS, ""): (true, "success")}
+        ways: dict[tuple[StoppedBy, str], Way] = {
+            ("prediction", ""): (replace(own, action_norm=norm), "predicted"),
+            ("true distance", ""): (true, "exact"),
+        }
+        return ways if own.action_norm == norm else ways | {("prediction", OWN_NORM): (own, "predicted")}
 
 
 def judge(
-    trace: Trace,
-    protocol: Protocol,
-    objects: list[Any],
-    *,
-    policy: str,
-    kind: str,
-    sees: str,
-    group: str,
-    rules: Callable[[float], StoppingRule],
-    condition: str = "",
+    trace: Trace, protocol: Protocol, objects: list[Any], agent: Agent, *, group: str, condition: str = ""
 ) -> list[Row]:
-    """Rows of one policy in one group, one for each way to stop.
-
-    Args:
-        trace: Its episodes with the objects of the group.
-        protocol: How they were run.
-        objects: The objects (name and warnings are read).
-        policy: Its name.
-        kind: Of the policy.
-        sees: What it sees.
-        group: Name of the group.
-        rules: The policy's own rule for a tolerance [rad], see :func:`ways_to_stop`.
-        condition: Of the suite.
-    """
-    rows, predicts, tolerance = [], trace.predicted is not None, protocol.stop_tolerance_rad
+    """Rows of one policy, one for each way to stop, from its episodes with the objects of one group."""
+    rows, tolerance, precise = [], protocol.stop_tolerance_rad, PAPER.success.precise_rad
+    near = agent.ways_to_stop(precise)
     names, unit = tuple(item.name for item in objects), choose_unit(len(objects))
-    for way in ways_to_stop(rules, tolerance, predicts=predicts):
-        episodes = trace.episodes(way.rule, way.by)
-        by_object = [episodes[k : k + protocol.episodes] for k in range(0, len(episodes), protocol.episodes)]
+
+    def share(episodes: np.ndarray) -> Interval:
+        return rate_intervals(episodes[None], unit)[0]
+
+    for (stopped_by, ours), (rule, by) in agent.ways_to_stop(tolerance).items():
+        episodes, count = trace.episodes(rule, by), protocol.episodes
+        # A rule that has the paper's bound of the norm for 0.1 rad has no other of its own for it.
+        near_rule, _ = near.get((stopped_by, ours), (agent.rules(precise), by))
+        held = trace.held.get((rule, by))
         rows.append(
             Row(
-                policy=policy,
-                kind=kind,
-                sees=sees,
+                policy=agent.policy,
+                kind=agent.kind,
+                sees=agent.sees,
                 group=group,
                 condition=condition,
-                stopped_by=way.stopped_by,
-                rule=way.rule,
-                ours=way.ours,
+                stopped_by=stopped_by,
+                rule=rule,
+                ours=ours,
                 protocol=protocol,
                 object_names=names,
                 overall=summarise("all", episodes, protocol, unit),
                 per_object=tuple(
-                    summarise(name, part, protocol, "episode")
-                    for name, part in zip(names, by_object, strict=True)
+                    summarise(name, episodes[k * count : (k + 1) * count], protocol, "episode")
+                    for k, name in enumerate(names)
                 ),
-                held=_held(trace, way, tolerance, unit),
-                symmetric=_symmetric(trace, way, tolerance, unit),
-                precise=_precise(trace, rules, way, unit),
-                prediction=_prediction(trace) if way.by == "predicted" else None,
+                held=None
+                if held is None
+                else share(_stopped_within(trace, rule, by, trace.exact, tolerance) & (held <= tolerance)),
+                symmetric=share(
+                    _stopped_within(trace, rule, "error" if by == "exact" else by, trace.error, tolerance)
+                ),
+                precise=share(_stopped_within(trace, near_rule, by, trace.exact, precise)),
+                prediction=_prediction(trace) if by == "predicted" else None,
                 warnings={item.name: "; ".join(item.warnings) for item in objects if item.warnings},
                 episodes=episodes,
             )
@@ -330,78 +317,62 @@ def judge(
 
 def summarise(name: str, episodes: tuple[Episode, ...], protocol: Protocol, unit: Unit) -> Summary:
     """Every rate, median and interval of some episodes, whole objects of them."""
-    shape = -1, protocol.episodes
+    fell = _column(episodes, protocol, "fell")
     errors, alike = (
-        np.array([np.pi if e.fell else getattr(e, attribute) for e in episodes]).reshape(shape)
-        for attribute in ("exact_error_rad", "error_rad")
+        np.where(fell, np.pi, _column(episodes, protocol, error))
+        for error in ("exact_error_rad", "error_rad")
     )
-    outcomes = _outcome_masks(episodes, protocol)
+    outcomes = _outcomes(episodes, protocol)
     within = [values <= tolerance for values in (errors, alike) for tolerance in TOLERANCES_RAD]
-    rates = rate_intervals(np.stack([*outcomes.reshape(-1, *errors.shape), *within]), unit)
+    rates = rate_intervals(np.stack([*outcomes, *within]), unit)
     labels, first = [str(tolerance) for tolerance in TOLERANCES_RAD], len(OUTCOMES)
-    times = np.array([e.steps for e in episodes])[outcomes[0]] / protocol.control_hz
+    times = _column(episodes, protocol, "steps")[outcomes[0]] / protocol.control_hz
     return Summary(
         name=name,
         episodes=len(episodes),
         unit=unit,
-        outcomes=dict(zip(OUTCOMES, rates[:first], strict=True)),
-        success=dict(zip(labels, rates[first : first + len(labels)], strict=True)),
+        outcomes=dict(zip(OUTCOMES, rates, strict=False)),
+        success=dict(zip(labels, rates[first:], strict=False)),
         symmetric=dict(zip(labels, rates[first + len(labels) :], strict=True)),
         median_error_rad=median_interval(errors, unit),
         time_s=order_interval(times) if times.size else None,
     )
 
 
-def _outcome_masks(episodes: tuple[Episode, ...], protocol: Protocol) -> np.ndarray:
-    """Which episodes are in each class of OUTCOMES, bool [4, K M]."""
-    stopped, fell = (np.array([getattr(e, name) for e in episodes]) for name in ("stopped", "fell"))
-    right = np.array([e.exact_error_rad <= protocol.stop_tolerance_rad for e in episodes])
+def _column(episodes: tuple[Episode, ...], protocol: Protocol, name: str) -> np.ndarray:
+    """One field of episodes [K, M]."""
+    return np.array([getattr(e, name) for e in episodes]).reshape(-1, protocol.episodes)
+
+
+def _outcomes(episodes: tuple[Episode, ...], protocol: Protocol) -> np.ndarray:
+    """Which episodes are in each class of OUTCOMES, bool [4, K, M]."""
+    stopped, fell, error = (
+        _column(episodes, protocol, name) for name in ("stopped", "fell", "exact_error_rad")
+    )
+    right = error <= protocol.stop_tolerance_rad
     return np.stack([stopped & right, stopped & ~right, ~stopped & ~fell, ~stopped & fell])
 
 
-def _held(trace: Trace, way: Way, tolerance_rad: float, unit: Unit) -> Interval | None:
-    """Share of episodes stopped within the tolerance of the very goal, and still there after the hold."""
-    hold = trace.hold(way.rule, way.by)
-    if hold is None:
-        return None
-    _, error = _at_stop(trace, way.rule, way.by, trace.exact)
-    with np.errstate(invalid="ignore"):  # what was never stopped was not held
-        return rate_intervals(((error <= tolerance_rad) & (hold.exact <= tolerance_rad))[None], unit)[0]
-
-
-def _symmetric(trace: Trace, way: Way, tolerance_rad: float, unit: Unit) -> Interval:
-    """Share of episodes that are stopped within the tolerance of what looks like the goal."""
-    by: StopsBy = "error" if way.by == "exact" else way.by
-    stopped, error = _at_stop(trace, way.rule, by, trace.error)
-    return rate_intervals((stopped & (error <= tolerance_rad))[None], unit)[0]
-
-
-def _precise(trace: Trace, rules: Callable[[float], StoppingRule], way: Way, unit: Unit) -> Interval:
-    """Share of episodes that stop within 0.1 rad of the very goal, by the rule for it."""
-    bound = PAPER.success.precise_rad
-    ways = ways_to_stop(rules, bound, predicts=trace.predicted is not None)
-    same = next((w for w in ways if (w.by, w.ours) == (way.by, way.ours)), None)
-    # A rule that has the paper's bound for this tolerance has no other of its own.
-    stopped, error = _at_stop(trace, rules(bound) if same is None else same.rule, way.by, trace.exact)
-    return rate_intervals((stopped & (error <= bound))[None], unit)[0]
-
-
-def _at_stop(
-    trace: Trace, rule: StoppingRule, by: StopsBy, error: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Whether a rule stops each episode, and the error where it ends, one of the trace's [K, M]."""
+def _stopped_within(
+    trace: Trace, rule: StoppingRule, by: StopsBy, error: np.ndarray, bound_rad: float
+) -> np.ndarray:
+    """Which episodes a rule stops within a bound of an error, one of the trace's, bool [K, M]."""
     steps, stopped = trace.ends(rule, by)
-    return stopped, np.take_along_axis(error, steps[..., None], axis=-1)[..., 0]
+    at_stop = np.take_along_axis(error, steps[..., None], axis=-1)[..., 0]
+    return np.asarray(stopped & (at_stop <= bound_rad))
 
 
 def _prediction(trace: Trace) -> Prediction:
     assert trace.predicted is not None
     there = np.isfinite(trace.predicted)
     true, predicted = trace.error[there], trace.predicted[there]
-    seen: dict[str, float | None] = {}
-    right: dict[str, float | None] = {}
-    for bound in BOUNDS_RAD:
-        near, said = true <= bound, predicted <= bound
-        seen[str(bound)] = float(said[near].mean()) if near.any() else None
-        right[str(bound)] = float(near[said].mean()) if said.any() else None
-    return Prediction(len(true), float(np.abs(predicted - true).mean()), seen, right)
+
+    def share(of: np.ndarray, among: np.ndarray) -> float | None:
+        return float(of[among].mean()) if among.any() else None
+
+    return Prediction(
+        states=len(true),
+        mean_error_rad=float(np.abs(predicted - true).mean()),
+        seen={str(bound): share(predicted <= bound, true <= bound) for bound in BOUNDS_RAD},
+        right={str(bound): share(true <= bound, predicted <= bound) for bound in BOUNDS_RAD},
+    )

@@ -16,13 +16,7 @@ def draw_starts_and_goals(
 
     They depend on the object's name, the seed and the number of the episode alone: not on the other
     objects, the number of environments or the device. Starts are uniform on SO(3); goals are uniform on the
-    part of SO(3) within ``max_goal_angle`` of the start.
-
-    Args:
-        name: Object name.
-        episodes: M.
-        seed: Of the evaluation.
-        max_goal_angle: Largest angle from start to goal [rad], in (0, pi].
+    part of SO(3) within ``max_goal_angle`` [rad], in (0, pi], of the start.
 
     Returns:
         Starts and goals, quaternions xyzw, shapes [M, 4].
@@ -33,16 +27,7 @@ def draw_starts_and_goals(
 
 
 def draw_goals(start: np.ndarray, rng: np.random.Generator, max_goal_angle: float) -> np.ndarray:
-    """Orientations uniform on the part of SO(3) within ``max_goal_angle`` [rad] of each of ``start``.
-
-    Args:
-        start: Quaternions xyzw, shape [n, 4].
-        rng: Where randomness comes from.
-        max_goal_angle: In (0, pi].
-
-    Returns:
-        Quaternions xyzw, shape [n, 4].
-    """
+    """Orientations uniform on SO(3) within ``max_goal_angle`` [rad] of ``start``, quaternions xyzw [n, 4]."""
     axis = rng.normal(size=(len(start), 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     # The angle of a uniform rotation has density (1 - cos)/pi: invert its cumulative distribution.

@@ -24,15 +24,7 @@ MISSING = PAPER.cloud.dropout_ratio[1]
 
 
 def scan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Samples of a shape as a scan of it has them.
-
-    Args:
-        points: Samples [m], shape [K, 3], body frame.
-        rng: Where randomness comes from.
-
-    Returns:
-        As many points: those of the missing side are replaced by others, and all are noisy.
-    """
+    """Samples [m] of a shape [K, 3], body frame, as a scan has them: noisy, one side replaced by others."""
     side = rng.normal(size=3)
     seen = np.argsort(points @ side)[: round(len(points) * (1.0 - MISSING))]
     again = rng.choice(seen, len(points) - len(seen))
@@ -41,13 +33,7 @@ def scan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def known_by_points(item: ObjectModel, points: np.ndarray, device: str) -> ObjectModel:
-    """An object as points of it tell: the surface through them and its samples, in the frame of the true one.
-
-    Args:
-        item: The object.
-        points: Points [m], shape [K, 3], body frame.
-        device: Warp device.
-    """
+    """An object as points of it [m] [K, 3], body frame, tell: the surface through them, and its samples."""
     vertices, faces = surface_of_scan(points, device)
     samples = surface_points(vertices, faces, len(item.surface_points))
     return replace(
@@ -61,14 +47,7 @@ def known_by_points(item: ObjectModel, points: np.ndarray, device: str) -> Objec
 def known_objects(
     objects: Sequence[ObjectModel], goals: Goals, *, seed: int, device: str
 ) -> Sequence[ObjectModel]:
-    """Objects as a policy knows them.
-
-    Args:
-        objects: The true ones.
-        goals: By the mesh: as they are; else by their samples, or a scan of these.
-        seed: Of the scans.
-        device: Warp device.
-    """
+    """Objects as a policy knows them: as they are, by their samples, or by a scan of these."""
     if goals == "mesh":
         return objects
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""What the hands of an environment sense: their encoders, and a depth camera in every environment."""
+"""What camera policies are told of an environment."""
 
 from typing import Any
 

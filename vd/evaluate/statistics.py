@@ -1,6 +1,7 @@
-"""Orientation errors, chance levels and confidence intervals.
+"""Orientation errors and confidence intervals.
 
-Angles are radians in [0, pi], quaternions xyzw (unit), rotations world from body.
+Angles are radians in [0, pi], quaternions xyzw (unit), rotations world from body. K objects, M episodes of
+each.
 
 Rates have t intervals on the log odds, with the jackknife's standard error (Efron and Stein 1981). Medians
 have the intervals of the share below them, turned into quantiles (Woodruff 1952). What the jackknife leaves
@@ -17,7 +18,6 @@ from typing import Literal
 
 import numpy as np
 from scipy import stats
-from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
 Unit = Literal["object", "episode"]
@@ -27,8 +27,6 @@ TOLERANCES_RAD = (0.1, 0.2, 0.4, 0.8)
 """Errors at which success is reported; the paper's figures use 0.1, 0.4 and 0.8."""
 # How much objects differ is not known from fewer than this.
 MIN_CLUSTERS = 8
-# Draws for chance on a symmetric object, for which no closed form is used: 0.5 % at a rate of one half.
-CHANCE_DRAWS = 40_000
 
 
 @dataclass(frozen=True)
@@ -44,15 +42,7 @@ class Interval:
 
 
 def rotation_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between two rotations [rad].
-
-    Args:
-        a: Quaternions xyzw, shape [..., 4].
-        b: Quaternions xyzw, shape [..., 4], broadcast against ``a``.
-
-    Returns:
-        Angles in [0, pi], the broadcast shape without the last axis.
-    """
+    """Angle between two rotations in [0, pi], quaternions xyzw [..., 4], broadcast."""
     # |a - b| and |a + b| stay exact for small angles, where the arc cosine of a dot product does not.
     minus = np.linalg.norm(a - b, axis=-1)
     plus = np.linalg.norm(a + b, axis=-1)
@@ -68,38 +58,15 @@ def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def symmetric_error(object_quat: np.ndarray, goal_quat: np.ndarray, symmetry: np.ndarray) -> np.ndarray:
-    """Orientation error up to the object's symmetry: min over s of angle(q_object s, q_goal).
+    """Orientation error [...] up to the object's symmetry: min over s of angle(q_object s, q_goal).
 
     Args:
         object_quat: Object orientations xyzw, shape [..., 4].
         goal_quat: Goal orientations xyzw, shape [..., 4].
-        symmetry: The rotations of the object onto itself, body frame, xyzw, shape [S, 4]; the identity
-            alone for an asymmetric object.
-
-    Returns:
-        Errors [rad], shape [...].
+        symmetry: The rotations of the object onto itself, body frame, xyzw, shape [S, 4].
     """
     turned = quat_multiply(np.asarray(object_quat)[..., None, :], np.asarray(symmetry))
     return rotation_angle(turned, np.asarray(goal_quat)[..., None, :]).min(axis=-1)
-
-
-def chance_cdf(angle: np.ndarray | float, symmetry: np.ndarray | None = None) -> np.ndarray:
-    """Probability that a uniformly random orientation is within ``angle`` of the goal.
-
-    Args:
-        angle: Angles [rad], any shape.
-        symmetry: The object's symmetry rotations xyzw, shape [S, 4]; None for an asymmetric object, which
-            has the closed form (angle - sin angle) / pi (0.34 % at 0.4 rad).
-
-    Returns:
-        Probabilities, the shape of ``angle``.
-    """
-    angle = np.clip(np.asarray(angle, dtype=float), 0.0, np.pi)
-    if symmetry is None or len(symmetry) == 1:
-        return (angle - np.sin(angle)) / np.pi
-    draws = Rotation.random(CHANCE_DRAWS, rng=np.random.default_rng(0)).as_quat()
-    errors = np.sort(symmetric_error(draws, np.array([0.0, 0.0, 0.0, 1.0]), symmetry))
-    return np.searchsorted(errors, angle, side="right") / CHANCE_DRAWS
 
 
 def choose_unit(num_objects: int) -> Unit:
@@ -108,13 +75,7 @@ def choose_unit(num_objects: int) -> Unit:
 
 
 def paired_difference(outcomes: np.ndarray, others: np.ndarray, unit: Unit) -> Interval:
-    """How much larger the rate of some outcomes is than that of others on the same starts and goals.
-
-    Args:
-        outcomes: Booleans, shape [K, M]: K objects, M episodes each.
-        others: What they are compared with, likewise.
-        unit: What the statement is about.
-    """
+    """How much larger the rate of some outcomes is than that of others on the same episodes, bool [K, M]."""
     pairs = outcomes.astype(float) - others
     units = pairs.mean(axis=1)[None] if unit == "object" or pairs.shape[1] == 1 else pairs
     strata, n = units.shape
@@ -133,11 +94,8 @@ def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
     is Clopper and Pearson's exact binomial one over all episodes, taken as independent.
 
     Args:
-        outcomes: Booleans, or shares in [0, 1], shape [R, K, M]: R rates, K objects, M episodes each.
+        outcomes: Booleans, or shares in [0, 1], shape [R, K, M] for R rates.
         unit: What the statement is about.
-
-    Returns:
-        R intervals.
     """
     outcomes = np.asarray(outcomes, dtype=float)
     intervals = []
@@ -178,12 +136,7 @@ def _logit_t(outcomes: np.ndarray, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
 
 
 def median_interval(values: np.ndarray, unit: Unit) -> Interval:
-    """Median over all objects and episodes with its 95 % interval.
-
-    Args:
-        values: Shape [K, M]: K objects, M episodes each; finite.
-        unit: What the statement is about.
-    """
+    """Median of finite values [K, M] with its 95 % interval."""
     values = np.asarray(values, dtype=float)
     median = float(np.median(values))
     below = (values < median) + 0.5 * (values == median)
@@ -197,10 +150,8 @@ def median_interval(values: np.ndarray, unit: Unit) -> Interval:
 def order_interval(values: np.ndarray) -> Interval:
     """Median with the distribution-free interval between two order statistics.
 
-    With fewer than six values no such interval reaches 95 %: the smallest and largest are given.
-
-    Args:
-        values: Shape [n], n >= 1, finite.
+    With fewer than six values no such interval reaches 95 %: the smallest and largest are given. Values are
+    finite [n], n >= 1.
     """
     ordered = np.sort(np.asarray(values, dtype=float))
     rank = max(int(stats.binom.ppf((1 - CONFIDENCE) / 2, len(ordered), 0.5)), 1)

@@ -3,31 +3,26 @@
 :mod:`vd.evaluate.suite_run` runs the lists.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Literal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
-from vd.evaluate import conditions
-from vd.evaluate.goals import Goals
+from vd.evaluate.conditions import CHANGED
 from vd.evaluate.result import Row, StoppedBy
 from vd.evaluate.statistics import Interval, choose_unit, rate_intervals
 from vd.evaluate.trace import air_table_steps
 from vd.paper import PAPER
 
-Suite = Literal["paper", "robust"]
-Group = Literal["training", "validation", "held-out", "symmetric"]
-
-OWN_SETS: dict[Group, str | None] = {
+OWN_SETS: dict[str, str | None] = {
     "training": "procedural-150-seed0",
     "validation": None,
     "held-out": "procedural-heldout",
     "symmetric": "symmetric",
 }
-"""Object sets where none is given: ours, which are made on demand. The paper's are meshes. Choices are made
-on training and validation, held-out judges. For validation nothing stands in: its condition is left out."""
+"""By group of objects the set where none is given: ours, made on demand; the paper's are meshes. Choices are
+made on training and validation, held-out judges. For validation nothing stands in: it is left out."""
 
 FRICTIONS = (*PAPER.randomisation.table_friction, 0.25, 0.75)
 """Frictions of the table beside the nominal one. The paper's five materials have no published values; these
@@ -37,58 +32,48 @@ QUICK_OBJECTS, QUICK_EPISODES, QUICK_CAMERA_EPISODES = 6, 4, 1
 """Objects of a group and episodes of each in the reduced suite; a control step of a camera policy takes a
 second and more on a CPU."""
 QUICK_S = 540.0
-"""Time after which the reduced suite shows what it has [s]: with start and page ten minutes."""
+"""Time after which the reduced suite begins no evaluation any more [s]."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One evaluation of every policy: an invocation of ``vd-eval`` with a name.
-
-    Attributes:
-        name: Of its folder.
-        objects: Group of objects.
-        episodes: Starts and goals of every object.
-        camera_episodes: The same for a camera policy, whose clouds and fits take most of the time.
-        paper: Where the paper shows the same, or what is changed.
-        in_air: The table is taken away.
-        table_friction: Of the table; None: nominal.
-        goals: What camera policies know shapes and goals by; others have the mesh's alone.
-        quick: Part of the reduced suite.
-        condition: What is drawn; None: nothing.
-        by_camera: Whether camera policies meet it too.
-    """
+    """One evaluation of every policy: an invocation of ``vd-eval`` with a name."""
 
     name: str
-    objects: Group
+    """Of its folder."""
+    objects: str
+    """Group of objects."""
     episodes: int
+    """Starts and goals of every object."""
     camera_episodes: int
-    paper: str
-    in_air: bool = False
-    table_friction: float | None = None
-    goals: Goals = "mesh"
+    """The same for a camera policy, whose clouds and fits take most of the time."""
+    shown: str
+    """Where the paper shows the same, or what is changed."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Fields of ``EvalCfg`` beside these."""
     quick: bool = True
-    condition: conditions.Condition | None = None
+    """Part of the reduced suite."""
     by_camera: bool = True
+    """Whether camera policies meet it too; they look for themselves, as late as their images are."""
 
     @property
     def flags(self) -> str:
         """What ``vd-eval`` is told to do the same, policy and objects apart."""
-        flags = [f"--episodes {self.episodes} (camera policies {self.camera_episodes})", "--no-at-rest"]
-        flags += ["--in-air"] if self.in_air else []
-        flags += [] if self.table_friction is None else [f"--table-friction {self.table_friction:g}"]
-        flags += [] if self.goals == "mesh" else [f"--goals {self.goals}"]
-        flags += [] if self.condition is None else [f"--condition {self.condition}"]
-        return " ".join(flags)
+        said = [f"--episodes {self.episodes} (camera policies {self.camera_episodes})", "--no-at-rest"]
+        for name, value in self.settings.items():
+            text = f" {value:g}" if isinstance(value, float) else f" {value}"
+            said.append(f"--{name.replace('_', '-')}{'' if value is True else text}")
+        return " ".join(said)
 
 
 _TRAINING = Condition("training", "training", 50, 8, "Table 1, Figures 2D and 7D")
 _HELD_OUT = Condition("held-out", "held-out", 100, 50, "Table 1, Figures 2D, 4E, 7E-G")
-_AIR = Condition("air", "held-out", 100, 50, "Figures S12 to S14", in_air=True)
+_AIR = Condition("air", "held-out", 100, 50, "Figures S12 to S14", {"in_air": True})
 CONDITIONS = (
     _TRAINING,
-    replace(_TRAINING, name="training-points", goals="points", quick=False),
+    replace(_TRAINING, name="training-points", settings={"goals": "points"}, quick=False),
     _HELD_OUT,
-    replace(_HELD_OUT, name="held-out-points", goals="points"),
+    replace(_HELD_OUT, name="held-out-points", settings={"goals": "points"}),
     Condition("validation", "validation", 100, 50, ""),
     Condition("symmetric", "symmetric", 100, 50, "Figure 4F"),
     *(
@@ -98,37 +83,17 @@ CONDITIONS = (
             100,
             24,
             "Figures 2F and 2G (real materials)",
-            table_friction=friction,
+            {"table_friction": friction},
             quick=friction in PAPER.randomisation.table_friction,
         )
         for friction in sorted(FRICTIONS)
     ),
     _AIR,
-    replace(_AIR, name="air-points", goals="points"),
-    Condition("air-training", "training", 20, 4, "Figures S12 to S14", in_air=True, quick=False),
-    Condition("scanned-goals", "held-out", 100, 24, "Figure 5", goals="scan"),
+    replace(_AIR, name="air-points", settings={"in_air": True, "goals": "points"}),
+    Condition("air-training", "training", 20, 4, "Figures S12 to S14", {"in_air": True}, quick=False),
+    Condition("scanned-goals", "held-out", 100, 24, "Figure 5", {"goals": "scan"}),
 )
 """What the paper's suite runs, in this order."""
-
-_FRICTION = PAPER.randomisation.friction
-_VARIED: dict[conditions.Condition, str] = {
-    "nominal": "nothing",
-    "s3": "all of Table S3",
-    "hard": "Table S3, forces last a control step",
-    "mixed": "Table S3, friction, backlash, late commands, late object",
-    "observation-late": f"object seen {conditions.STEP_LATE_S:.3f} s late",
-    "all-late": f"object and joints seen {conditions.STEP_LATE_S:.3f} s late",
-    "command-late": f"commands {conditions.STEP_LATE_S:.3f} s late",
-    "joint-friction": f"friction of {conditions.FRICTION_NM:g} N m in every joint",
-    "light": f"objects of {conditions.MASS_KG[0]:g} kg",
-    "heavy": f"objects of {conditions.MASS_KG[1]:g} kg",
-    "slippery": f"friction of hand and object {_FRICTION[0]:g}",
-    "grippy": f"friction of hand and object {_FRICTION[1]:g}",
-    "off-centre": f"centre of mass {conditions.OFF_CENTRE_M:g} m off",
-    "soft-tips": "soft fingertips",
-    "stiff-contacts": "contacts twice as stiff, physics steps half as long",
-    "pose-error": f"object seen {conditions.POSE_ERROR[0]:g} m and {conditions.POSE_ERROR[1]:g} rad off",
-}
 ROBUST = tuple(
     Condition(
         name,
@@ -136,43 +101,37 @@ ROBUST = tuple(
         20,
         4,
         changed,
-        condition=name,
+        {"condition": name},
         quick=name in ("nominal", "s3", "mixed"),
-        by_camera=name
-        not in ("observation-late", "all-late", "pose-error"),  # it looks for itself, as late as images are
+        by_camera=name not in ("observation-late", "all-late", "pose-error"),
     )
-    for name, changed in _VARIED.items()
+    for name, changed in CHANGED.items()
 )
 """What ``--suite robust`` runs: one thing changed in each, but in the first four."""
-SUITES: dict[Suite, tuple[Condition, ...]] = {"paper": CONDITIONS, "robust": ROBUST}
+SUITES = {"paper": CONDITIONS, "robust": ROBUST}
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A figure of the paper, and how ours beside it is measured.
-
-    Attributes:
-        text: What it is.
-        condition: Name of the condition.
-        measure: Takes it from a row; None where it has no meaning.
-        paper: Name of the paper's figure in ``PAPER.results``; None: it gives no number.
-        unit: share, rad or s.
-        stopped_by: Whose rule: that of each policy, or one for all.
-    """
+    """A figure of the paper, and how ours beside it is measured."""
 
     text: str
+    """What it is."""
     condition: str
+    """Name of the condition."""
     measure: Callable[[Row], Interval | float | None]
+    """Takes it from a row; None where it has no meaning."""
     paper: str | None
+    """Name of the paper's figure in ``PAPER.results``; None: it gives no number."""
     unit: Literal["share", "rad", "s"] = "share"
-    stopped_by: Literal["own"] | StoppedBy = "own"
+    stopped_by: StoppedBy | None = None
+    """Whose rule; None: that of each policy."""
 
-    def of(self, rows: list[Row]) -> Interval | float | None:
+    def of(self, rows: Sequence[Row]) -> Interval | float | None:
         """Ours, from the rows of one policy in the condition; None where it has no such figure."""
         for row in rows:
-            if not row.ours and (
-                row.headline if self.stopped_by == "own" else row.stopped_by == self.stopped_by
-            ):
+            own = row.headline if self.stopped_by is None else row.stopped_by == self.stopped_by
+            if own and not row.ours:
                 return self.measure(row)
         return None
 
@@ -193,26 +152,6 @@ def share_text(value: float, *interval: float) -> str:
     return f"{texts[0]} %" + (f" ({texts[1]} to {texts[2]})" if interval else "")
 
 
-def ended_within(row: Row, tolerance_rad: float) -> Interval:
-    """Share of episodes whose error to the very goal, at the stop or end, is at most this."""
-    return row.overall.success[str(tolerance_rad)]
-
-
-def outcome(row: Row, name: str) -> Interval:
-    """Share of episodes that end so."""
-    return row.overall.outcomes[name]
-
-
-def precise(row: Row) -> Interval:
-    """Share of episodes that stop within 0.1 rad, by the rule for it."""
-    return row.precise
-
-
-def seen_within(row: Row, bound_rad: float) -> float | None:
-    """Share of the states truly within a bound, up to symmetry, that a camera policy predicts within it."""
-    return None if row.prediction is None else row.prediction.seen[str(bound_rad)]
-
-
 def lost_at_once(row: Row) -> Interval:
     """Share of episodes that lost the object in the half second after the table went."""
     gone = air_table_steps(row.protocol.control_hz)
@@ -223,8 +162,12 @@ def lost_at_once(row: Row) -> Interval:
 def success_without_table(row: Row) -> Interval:
     """Share of episodes that were stopped within the tolerance when the table had gone."""
     gone = air_table_steps(row.protocol.control_hz)
-    late = np.array([e.steps > gone for e in row.episodes])
-    return _share(row, row.successes.ravel() & late)
+    return _share(row, row.successes.ravel() & [e.steps > gone for e in row.episodes])
+
+
+def _seen(row: Row, bound: str) -> float | None:
+    """Share of the states truly within a bound [rad] that a camera policy predicts within it."""
+    return None if row.prediction is None else row.prediction.seen[bound]
 
 
 def _share(row: Row, chosen: list[bool] | np.ndarray) -> Interval:
@@ -232,44 +175,49 @@ def _share(row: Row, chosen: list[bool] | np.ndarray) -> Interval:
     return rate_intervals(np.reshape(chosen, (1, objects, -1)), choose_unit(objects))[0]
 
 
+def _claims(name: str, *claims: tuple[Any, ...]) -> list[Claim]:
+    """Claims of a condition: their text, measure and figure of the paper, and what else they have."""
+    return [Claim(text, name, *others) for text, *others in claims]
+
+
 def _on_table(name: str, key: str) -> list[Claim]:
     """The paper's figures on the table; ``key`` begins their names."""
-    return [
-        Claim("error at most 0.4 rad", name, partial(ended_within, tolerance_rad=0.4), key),
-        Claim("error at most 0.8 rad", name, partial(ended_within, tolerance_rad=0.8), f"{key}_rad08"),
-        Claim("median error [rad]", name, lambda r: r.overall.median_error_rad, f"{key}_median_rad", "rad"),
-    ]
+    return _claims(
+        name,
+        ("error at most 0.4 rad", lambda row: row.overall.success["0.4"], key),
+        ("error at most 0.8 rad", lambda row: row.overall.success["0.8"], f"{key}_rad08"),
+        ("median error [rad]", lambda row: row.overall.median_error_rad, f"{key}_median_rad", "rad"),
+    )
 
 
 def _in_air(name: str) -> list[Claim]:
     """The paper's figures in the air."""
-    success, lost = partial(outcome, name="success"), partial(outcome, name="object falls")
-    ways: tuple[tuple[StoppedBy, str], ...] = (("prediction", "prediction"), ("true distance", "truth"))
+
+    def share(outcome: str) -> Callable[[Row], Interval]:
+        return lambda row: row.overall.outcomes[outcome]
+
     claims = []
-    for way, key in ways:
-        claims += [
-            Claim(f"stopped within 0.4 rad by {way}", name, success, f"air_by_{key}", stopped_by=way),
-            Claim(f"stopped within 0.1 rad by {way}", name, precise, f"air_by_{key}_rad01", stopped_by=way),
-        ]
-    return [
-        *claims,
-        Claim("stopped within 0.4 rad without the table", name, success_without_table, None),
-        Claim("median time to success [s]", name, lambda row: row.overall.time_s, "air_time_s", "s"),
-        Claim("object lost", name, lost, "air_dropped"),
-        Claim("object lost within 0.5 s of the table", name, lost_at_once, "air_dropped_at_once"),
-        Claim(
-            "states within 0.4 rad up to symmetry seen so",
+    for way, key in (("prediction", "prediction"), ("true distance", "truth")):
+        claims += _claims(
             name,
-            partial(seen_within, bound_rad=0.4),
-            "near_seen",
-        ),
-        Claim(
-            "states within 0.1 rad up to symmetry seen so",
-            name,
-            partial(seen_within, bound_rad=0.1),
-            "near_seen_rad01",
-        ),
-    ]
+            (f"stopped within 0.4 rad by {way}", share("success"), f"air_by_{key}", "share", way),
+            (
+                f"stopped within 0.1 rad by {way}",
+                lambda row: row.precise,
+                f"air_by_{key}_rad01",
+                "share",
+                way,
+            ),
+        )
+    return claims + _claims(
+        name,
+        ("stopped within 0.4 rad without the table", success_without_table, None),
+        ("median time to success [s]", lambda row: row.overall.time_s, "air_time_s", "s"),
+        ("object lost", share("object falls"), "air_dropped"),
+        ("object lost within 0.5 s of the table", lost_at_once, "air_dropped_at_once"),
+        ("states within 0.4 rad up to symmetry seen so", lambda row: _seen(row, "0.4"), "near_seen"),
+        ("states within 0.1 rad up to symmetry seen so", lambda row: _seen(row, "0.1"), "near_seen_rad01"),
+    )
 
 
 CLAIMS = (

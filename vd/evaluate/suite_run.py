@@ -8,18 +8,18 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
+from vd.bundle import CONTRACT_FILE
 from vd.config import to_dict
-from vd.evaluate.agents import BUILT_IN, find_policy, sees_clouds
+from vd.evaluate.agents import BUILT_IN, find_policy, open_policy, sees_clouds
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.compare import compare
-from vd.evaluate.page import NOTHING, labels, number, shown_name, write_page
+from vd.evaluate.page import NOTHING, labels, number, points, shown_name, write_page
 from vd.evaluate.result import SUCCESS, Result
 from vd.evaluate.statistics import Interval, paired_difference
 from vd.evaluate.suite import (
@@ -32,7 +32,6 @@ from vd.evaluate.suite import (
     SUITES,
     Claim,
     Condition,
-    Group,
     share_text,
 )
 from vd.files import make_folder, write_json
@@ -40,7 +39,6 @@ from vd.workers import run_tasks
 
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
-ROBUST_HEADER = ("condition", "changed", "policy", "success", "points from nominal", "within 0.1 rad", "lost")
 LOG_FILE = "log.txt"
 """Progress of an evaluation that ran beside others."""
 OUT_OF_TIME = "out of time; the same command goes on from here"
@@ -49,18 +47,8 @@ NOT_RUN = "not run; the same command goes on from here"
 # Settings that say where and how an evaluation runs, not what it measures.
 _NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs")
 
-
-@dataclass(frozen=True)
-class Objects:
-    """The objects of one group.
-
-    Attributes:
-        sets: What vd-eval is given: sets, or chosen files of them.
-        text: The same for a reader.
-    """
-
-    sets: tuple[str, ...]
-    text: str
+Objects = tuple[tuple[str, ...], str]
+"""The objects of a group: what vd-eval is given, sets or chosen files of them, and the same for a reader."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +62,11 @@ class Task:
     """Fingerprint of the policy."""
 
     @property
+    def key(self) -> tuple[str, str]:
+        """Condition and policy."""
+        return self.condition, self.policy
+
+    @property
     def wanted(self) -> dict[str, Any]:
         """What an evaluation that can stand for it was run with."""
         settings = {key: value for key, value in to_dict(self.cfg).items() if key not in _NOT_MEASURED}
@@ -82,8 +75,7 @@ class Task:
     def there(self) -> Result | None:
         """What an earlier call measured with the same settings; None: nothing."""
         try:
-            told = json.loads((self.cfg.out / SETTINGS_FILE).read_text())
-            if told != json.loads(json.dumps(self.wanted)):
+            if json.loads((self.cfg.out / SETTINGS_FILE).read_text()) != self.wanted:
                 return None
             return Result.read(self.cfg.out / "eval.json")
         except (OSError, ValueError):  # not there, not whole, or of an older version: measure it
@@ -98,35 +90,29 @@ def run_suite(cfg: EvalCfg) -> Result:
         FileNotFoundError: There is no such policy.
     """
     begun = time.monotonic()
-    stop_at = begun + QUICK_S if cfg.quick else math.inf
     assert cfg.suite is not None
     suite = SUITES[cfg.suite]
     groups = object_groups(cfg.objects, {c.objects for c in suite}, quick=cfg.quick)
     conditions = tuple(c for c in suite if (c.quick or not cfg.quick) and c.objects in groups)
     tasks = make_tasks(cfg, conditions, groups)
-    found = {(task.condition, task.policy): task.there() for task in tasks}
-    missing = {key: NOT_RUN for key, result in found.items() if result is None}
-    waiting = [task for task in tasks if (task.condition, task.policy) in missing]
+    found: dict[tuple[str, str], Result | str] = {task.key: task.there() or NOT_RUN for task in tasks}
+    waiting = [task for task in tasks if isinstance(found[task.key], str)]
     print(f"{len(tasks) - len(waiting)} of {len(tasks)} evaluations were done before", file=sys.stderr)
 
     def finished(task: Task, failure: str | None, died: str) -> None:
-        why, key = died if failure is None else failure, (task.condition, task.policy)
-        minutes = (time.monotonic() - begun) / 60.0
+        why, minutes = died if failure is None else failure, (time.monotonic() - begun) / 60.0
         print(f"[{minutes:.1f} min] {task.condition}: {task.policy} {why or 'done'}", file=sys.stderr)
-        if why:
-            missing[key] = why
-            return
-        del missing[key]
-        found[key] = Result.read(task.cfg.out / "eval.json")
-        write_json(task.cfg.out / SETTINGS_FILE, task.wanted)
+        found[task.key] = why or Result.read(task.cfg.out / "eval.json")
+        if not why:
+            write_json(task.cfg.out / SETTINGS_FILE, task.wanted)
 
     try:
-        _run(cfg, waiting, finished, stop_at)
+        _run(cfg, waiting, finished, begun + QUICK_S if cfg.quick else math.inf)
     finally:
-        rows = [row for one in found.values() if one for row in one.rows if row.stopped_by != SUCCESS]
-        software = next((one.software for one in found.values() if one), {})
-        left = tuple((*key, why) for key, why in missing.items())
-        result = Result(tuple(rows), software, left)
+        measured = [one for one in found.values() if isinstance(one, Result)]
+        rows = tuple(row for one in measured for row in one.rows if row.stopped_by != SUCCESS)
+        left = tuple((*key, why) for key, why in found.items() if isinstance(why, str))
+        result = Result(rows, measured[0].software if measured else {}, left)
         _write(result, cfg, conditions, groups)
     return result
 
@@ -145,27 +131,25 @@ def _run(
     if cfg.device == "auto" and wp.is_cuda_available():
         devices = [device.alias for device in wp.get_cuda_devices()]
     spread = [
-        replace(task, cfg=replace(task.cfg, device=devices[number % len(devices)]))
-        for number, task in enumerate(waiting)
+        replace(task, cfg=replace(task.cfg, device=devices[turn % len(devices)]))
+        for turn, task in enumerate(waiting)
     ]
     work = partial(_measure_apart, stop_at=stop_at)
     run_tasks(work, spread, finished, jobs=cfg.jobs, limit_s=math.inf, gpu=True)
 
 
-def measure(task: Task, stop_at: float = math.inf) -> str:
-    """Evaluate into the task's folder until ``stop_at``; returns why that failed, or nothing."""
+def measure(task: Task, stop_at: float) -> str:
+    """Evaluate into the task's folder, if it is not later than ``stop_at``; why that failed, or nothing."""
     if time.monotonic() > stop_at:  # the same clock in all processes
         return OUT_OF_TIME
     try:
-        compare(task.cfg, task.condition, stop_at)
-    except TimeoutError:
-        return OUT_OF_TIME
+        compare(task.cfg, task.condition)
     except (RuntimeError, ValueError) as error:  # one environment that fails must not cost the others
         return str(error)
     return ""
 
 
-def _measure_apart(task: Task, stop_at: float = math.inf) -> str:
+def _measure_apart(task: Task, stop_at: float) -> str:
     """The same in a process of its own, whose progress goes to a file: several would mix."""
     make_folder(task.cfg.out)
     with (task.cfg.out / LOG_FILE).open("w") as log, redirect_stdout(log), redirect_stderr(log):
@@ -175,24 +159,22 @@ def _measure_apart(task: Task, stop_at: float = math.inf) -> str:
             return str(error)
 
 
-def make_tasks(cfg: EvalCfg, conditions: tuple[Condition, ...], groups: dict[Group, Objects]) -> list[Task]:
+def make_tasks(cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]) -> list[Task]:
     """Everything that is to be measured, camera policies at the end if time is short, else first.
 
     All names are looked up here, before anything slow.
     """
     short = labels(cfg.agent_names)
-    camera = {name: sees_clouds(name) for name in cfg.agent_names}
+    camera = {name: sees_clouds(open_policy(name, "cpu")) for name in cfg.agent_names}
     prints = {name: fingerprint(name) for name in cfg.agent_names}
     tasks = []
     for condition in conditions:
         for name in cfg.agent_names:
-            if condition.goals != "mesh" and not camera[name]:  # a teacher's goals are orientations
-                continue
-            if camera[name] and not condition.by_camera:
-                continue
-            one = settings(cfg, condition, name, groups[condition.objects], camera=camera[name])
-            one = replace(one, out=cfg.out / condition.name / short[name].replace("/", "-"))
-            tasks.append(Task(condition.name, name, one, prints[name]))
+            # A teacher's goals are orientations, whatever tells a camera policy of shapes.
+            if condition.by_camera if camera[name] else "goals" not in condition.settings:
+                one = settings(cfg, condition, name, groups[condition.objects], camera=camera[name])
+                one = replace(one, out=cfg.out / condition.name / short[name].replace("/", "-"))
+                tasks.append(Task(condition.name, name, one, prints[name]))
     return sorted(tasks, key=lambda task: camera[task.policy] == cfg.quick)
 
 
@@ -207,84 +189,65 @@ def settings(cfg: EvalCfg, condition: Condition, policy: str, objects: Objects, 
         quick=False,
         jobs=1,
         policies=(policy,),
-        objects=tuple(f"{condition.objects}={item}" for item in objects.sets),
+        objects=tuple(f"{condition.objects}={item}" for item in objects[0]),
         episodes=episodes,
         no_at_rest=True,  # the paper's objects fall into the hand, whatever a policy was trained with
-        in_air=condition.in_air,
-        table_friction=condition.table_friction,
-        goals=condition.goals,
-        condition=condition.condition,
+        **condition.settings,
     )
 
 
-def object_groups(objects: tuple[str, ...], wanted: set[Group], *, quick: bool) -> dict[Group, Objects]:
+def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> dict[str, Objects]:
     """The objects of each wanted group: those given as ``GROUP=SET``, our procedural ones for the others.
 
     Raises:
         ValueError: No such group is wanted.
     """
-    from vd.assets_usd.objects.model import object_files
-    from vd.assets_usd.objects.sets import set_folder
+    from vd.assets_usd.objects.sets import set_files
 
     given = parse_groups(objects)
     own_sets = {group: own for group, own in OWN_SETS.items() if group in wanted}
     if unknown := [name for name in given if name not in own_sets]:
         raise ValueError(f"--objects: '{unknown[0]}' is no group of the suite; {', '.join(own_sets)} are")
-    groups: dict[Group, Objects] = {}
+    groups: dict[str, Objects] = {}
     for group, own in own_sets.items():
-        if group not in given and own is None:
+        sets = given.get(group) or (() if own is None else (own,))
+        if not sets:
             continue
-        sets = given.get(group) or (str(own),)
-        files: list[str] = []
-        for entry in sets:
-            path = Path(entry).expanduser()
-            folder = path if path.is_dir() else None if path.is_file() else set_folder(entry)
-            files += [entry] if folder is None else [str(file) for file in object_files(folder)]
+        files = set_files(sets)
         text = f"{len(files)} of {shown_name(', '.join(sets))}"
         if quick and len(files) > QUICK_OBJECTS:
-            sets = tuple(files[i * len(files) // QUICK_OBJECTS] for i in range(QUICK_OBJECTS))
+            sets = tuple(str(files[i * len(files) // QUICK_OBJECTS]) for i in range(QUICK_OBJECTS))
             text = f"{len(sets)} of the {text}"
         if group not in given and group != "symmetric":
             text += ", our own, since no others were given: they stand for the paper's meshes"
-        groups[group] = Objects(sets, text)
+        groups[group] = sets, text
     return groups
 
 
 def fingerprint(name: str) -> str:
-    """What tells the content of a policy from others: its file's SHA-256, or the name of a built-in agent.
-
-    Raises:
-        FileNotFoundError: There is no such policy.
-    """
+    """What tells the content of a policy from others: a SHA-256, or the name of a built-in agent."""
     if name in BUILT_IN:
         return name
     path = find_policy(name)
-    digest = hashlib.sha256()
-    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-        if file.is_file():
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
+    # A bundle's contract has the digests of its other files.
+    return hashlib.sha256((path / CONTRACT_FILE if path.is_dir() else path).read_bytes()).hexdigest()
 
 
-def _write(
-    result: Result, cfg: EvalCfg, conditions: tuple[Condition, ...], groups: dict[Group, Objects]
-) -> None:
+def _write(result: Result, cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]) -> None:
     """The page and its figures, of what there is."""
-    short = labels(result.policies)
-    title, of = "The paper's evaluations", " beside the paper"
-    header: tuple[str, ...] = ("figure", "condition", "paper", *short.values())
-    if cfg.suite == "paper":
-        figures = paper_figures(result, conditions)
+    short, of_paper = labels(result.policies), cfg.suite == "paper"
+    if of_paper:
+        title, of, figures = "The paper's evaluations", " beside the paper", paper_figures(result, conditions)
         table = [
-            [row["figure"], row["condition"], row["paper"] or NOTHING, *row["ours"].values()]
+            {"figure": row["figure"], "condition": row["condition"], "paper": row["paper"] or NOTHING}
+            | {short[policy]: text for policy, text in row["ours"].items()}
             for row in figures
         ]
     else:
-        title, of, header = "Robustness", "", ROBUST_HEADER
-        table = robust_table(result, conditions, short)
-        figures = [dict(zip(header, row, strict=True)) for row in table]
+        title, of, figures = "Robustness", "", robust_table(result, conditions, short)
+        table = figures
     write_json(cfg.out / f"{cfg.suite}.json", result.summary() | {"quick": cfg.quick, "figures": figures})
-    notes = [f"Objects, {group}: {objects.text}." for group, objects in groups.items()]
+    notes = [f"Objects, {group}: {text}." for group, (_, text) in groups.items()]
     notes += ["Held-out objects judge, and nothing is chosen on them."]
     notes += [] if cfg.engine == "newton" else ["Physics by MuJoCo's own engine."]
     write_page(
@@ -292,14 +255,16 @@ def _write(
         cfg.out / f"{cfg.suite}.html",
         title=title,
         lead=f"{', '.join(short.values())}{of}{', the reduced suite' if cfg.quick else ''}",
-        figures=(header, table),
+        figures=(list(table[0]), [list(row.values()) for row in table]) if table else None,
         notes=notes,
-        conditions=[(c.name, c.paper, c.flags) for c in conditions],
-        of_paper=cfg.suite == "paper",
+        conditions=[(c.name, c.shown, c.flags) for c in conditions],
+        of_paper=of_paper,
     )
 
 
-def robust_table(result: Result, conditions: tuple[Condition, ...], short: dict[str, str]) -> list[list[str]]:
+def robust_table(
+    result: Result, conditions: Sequence[Condition], short: dict[str, str]
+) -> list[dict[str, str]]:
     """A line for each condition and policy: what it changes, and how much success it costs."""
     found = {
         (condition, row.policy): row
@@ -314,15 +279,16 @@ def robust_table(result: Result, conditions: tuple[Condition, ...], short: dict[
                 continue
             change = NOTHING
             if nominal not in (None, row):
-                d = paired_difference(row.successes, nominal.successes, row.overall.unit)
-                change = f"{100 * d.value:+.1f} ({100 * d.low:+.1f} to {100 * d.high:+.1f})"
+                change = points(paired_difference(row.successes, nominal.successes, row.overall.unit))
             rates = (row.overall.outcomes["success"], row.precise, row.overall.outcomes["object falls"])
             success, precise, lost = (share_text(r.value, r.low, r.high) for r in rates)
-            table.append([condition.name, condition.paper, short[policy], success, change, precise, lost])
+            told = {"condition": condition.name, "changed": condition.shown, "policy": short[policy]}
+            figures = {"success": success, "points from nominal": change, "within 0.1 rad": precise}
+            table.append(told | figures | {"lost": lost})
     return table
 
 
-def paper_figures(result: Result, conditions: tuple[Condition, ...]) -> list[dict[str, Any]]:
+def paper_figures(result: Result, conditions: Sequence[Condition]) -> list[dict[str, Any]]:
     """The paper's figures beside ours, as text."""
     names = {condition.name for condition in conditions}
     return [

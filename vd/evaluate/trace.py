@@ -23,6 +23,8 @@ HOLD_S = 2.0
 StopsBy = Literal["predicted", "exact", "error", "success"]
 """What a rule asks for: a distance, which is a camera policy's prediction, or the true one to the very goal,
 or to what looks like it; or the success criteria of training, which are the true one and stillness."""
+Way = tuple[StoppingRule, StopsBy]
+"""A rule, and what it asks for."""
 NEVER_RAD = 1e-9
 """Orientation tolerance that no state meets: an environment with it stops no episode."""
 
@@ -37,9 +39,9 @@ class Episode:
     """One start and one goal of one object, to its end or stop."""
 
     object_index: int
-    start_quat: tuple[float, float, float, float]
+    start_quat: tuple[float, ...]
     """Object orientation at the reset."""
-    goal_quat: tuple[float, float, float, float]
+    goal_quat: tuple[float, ...]
     """Goal orientation."""
     start_error_rad: float
     """Orientation error at the reset, up to the object's symmetry."""
@@ -56,23 +58,6 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Hold:
-    """What became of stopped episodes while the hand held its last targets; NaN where nothing stopped [K, M].
-
-    Attributes:
-        rule: What stopped them.
-        by: The distance it asked for.
-        error: Orientation error afterwards, up to the object's symmetry; pi where it was lost.
-        exact: The same to the very goal.
-    """
-
-    rule: StoppingRule
-    by: StopsBy
-    error: np.ndarray
-    exact: np.ndarray
-
-
-@dataclass(frozen=True)
 class Trace:
     """Episodes to their falls or time limits.
 
@@ -85,9 +70,9 @@ class Trace:
         predicted: What a camera policy predicts of ``error`` there; None for other policies [K, M, T + 1].
         steps: Steps to the fall or the time limit [K, M].
         fell: Whether the object was lost [K, M].
-        still: Whether hand and object are as still after t steps as success asks; None: not known
-            [K, M, T + 1].
-        holds: What came after the stops, of the rules that were to be held.
+        still: Whether hand and object are as still after t steps as success asks [K, M, T + 1].
+        held: By the way to stop that was to be held: error to the very goal after the hold, pi where the
+            object was lost, NaN where nothing stopped [K, M].
     """
 
     start_quat: np.ndarray
@@ -98,21 +83,17 @@ class Trace:
     predicted: np.ndarray | None
     steps: np.ndarray
     fell: np.ndarray
-    still: np.ndarray | None = None
-    holds: list[Hold] = field(default_factory=list)
+    still: np.ndarray
+    held: dict[Way, np.ndarray] = field(default_factory=dict)
 
     def of(self, objects: Sequence[int]) -> "Trace":
         """The episodes of some objects."""
         chosen = list(objects)
         parts: dict[str, Any] = {
-            k: v[chosen] if isinstance(v, np.ndarray) else v for k, v in vars(self).items()
+            name: value[chosen] if isinstance(value, np.ndarray) else value
+            for name, value in vars(self).items()
         }
-        parts["holds"] = [Hold(h.rule, h.by, h.error[chosen], h.exact[chosen]) for h in self.holds]
-        return Trace(**parts)
-
-    def hold(self, rule: StoppingRule, by: StopsBy) -> Hold | None:
-        """What came after the stops of a rule; None if that was not to be held."""
-        return next((hold for hold in self.holds if (hold.rule, hold.by) == (rule, by)), None)
+        return Trace(**parts | {"held": {way: error[chosen] for way, error in self.held.items()}})
 
     def ends(self, rule: StoppingRule, by: StopsBy) -> tuple[np.ndarray, np.ndarray]:
         """Where a rule ends every episode.
@@ -123,22 +104,13 @@ class Trace:
 
         Returns:
             Steps to the stop, fall or time limit, and whether the rule stopped it, shape [K, M] each.
-
-        Raises:
-            ValueError: The record does not have what it asks for.
         """
-        last = self.steps - 1  # nobody acts on, or predicts, the state after the last step
-        with np.errstate(invalid="ignore"):  # NaN stops nothing
-            if by == "success":
-                if self.still is None:
-                    raise ValueError("this record does not know what is still; stop by the true distance")
-                stops = (self.exact <= rule.distance_rad) & self.still
-                last = self.steps - self.fell  # but the environment sees it; a fall is no success
-            else:
-                distance = {"predicted": self.predicted, "exact": self.exact, "error": self.error}[by]
-                if distance is None:
-                    raise ValueError("only camera policies predict distances; stop by the true distance")
-                stops = (distance < rule.distance_rad) & (self.action_norm < rule.action_norm)
+        if by == "success":
+            stops = (self.exact <= rule.distance_rad) & self.still
+            last = self.steps - self.fell  # a fall is no success
+        else:
+            stops = rule.stops(getattr(self, by), self.action_norm)
+            last = self.steps - 1  # nobody acts on, or predicts, the state after the last step
         stops[..., 0] = False  # before the first action there is nothing to stop
         stops &= np.arange(stops.shape[-1]) <= last[..., None]
         stopped: np.ndarray = np.asarray(stops.any(axis=-1))
@@ -147,18 +119,14 @@ class Trace:
     def episodes(self, rule: StoppingRule, by: StopsBy) -> tuple[Episode, ...]:
         """The episodes as a rule ends them, object by object; arguments as of :meth:`ends`."""
         steps, stopped = self.ends(rule, by)
-        error, exact = (
-            np.take_along_axis(values, steps[..., None], axis=-1)[..., 0]
-            for values in (self.error, self.exact)
-        )
         return tuple(
             Episode(
                 object_index=k,
-                start_quat=_quat(self.start_quat[k, m]),
-                goal_quat=_quat(self.goal_quat[k, m]),
+                start_quat=tuple(self.start_quat[k, m].tolist()),
+                goal_quat=tuple(self.goal_quat[k, m].tolist()),
                 start_error_rad=float(self.error[k, m, 0]),
-                error_rad=float(error[k, m]),
-                exact_error_rad=float(exact[k, m]),
+                error_rad=float(self.error[k, m, steps[k, m]]),
+                exact_error_rad=float(self.exact[k, m, steps[k, m]]),
                 steps=int(steps[k, m]),
                 stopped=bool(stopped[k, m]),
                 fell=bool(self.fell[k, m] and not stopped[k, m]),
@@ -175,7 +143,7 @@ def record(
     starts: np.ndarray | None = None,
     goals: np.ndarray | None = None,
     table_steps: int | None = None,
-    held: Sequence[tuple[StoppingRule, StopsBy]] = (),
+    held: Sequence[Way] = (),
     on_step: Callable[[], object] = lambda: None,
 ) -> Trace:
     """Run a policy and write down what happens.
@@ -192,25 +160,26 @@ def record(
         starts: Initial orientations [K, M, 4]; None: the environment draws them.
         goals: Goal orientations [K, M, 4], with ``starts``.
         table_steps: Steps after which the table is taken away; None: never.
-        held: Rules whose stops are to be held for HOLD_S.
+        held: What stops is to be held for HOLD_S.
         on_step: Called after every control step.
     """
     world_object = np.asarray(env.world_object)
-    symmetry = [item.symmetry for item in env.objects]
     shape = (len(env.objects), episodes)
-    length = env.max_episode_steps + 1
-    predicts = hasattr(policy, "predicted")
+
+    def blank() -> np.ndarray:
+        return np.full((*shape, env.max_episode_steps + 1), np.nan)
+
     trace = Trace(
         start_quat=np.empty((*shape, 4)),
         goal_quat=np.empty((*shape, 4)),
-        error=np.full((*shape, length), np.nan),
-        exact=np.full((*shape, length), np.nan),
-        action_norm=np.full((*shape, length), np.nan),
-        predicted=np.full((*shape, length), np.nan) if predicts else None,
+        error=blank(),
+        exact=blank(),
+        action_norm=blank(),
+        predicted=blank() if hasattr(policy, "predicted") else None,
         steps=np.full(shape, env.max_episode_steps),
         fell=np.zeros(shape, dtype=bool),
-        still=np.zeros((*shape, length), dtype=bool),
-        holds=[Hold(rule, by, np.full(shape, np.nan), np.full(shape, np.nan)) for rule, by in held],
+        still=np.zeros((*shape, env.max_episode_steps + 1), dtype=bool),
+        held={way: np.full(shape, np.nan) for way in held},
     )
     rounds, drawn = episode_rounds(world_object, *shape), []
     for numbers in rounds:
@@ -221,150 +190,108 @@ def record(
         if table_steps is not None:
             env.sim.place_table(present=True)
         env.load_state_dict(state)
-        stops = [_Stops(env, hold) for hold in trace.holds]
-        _record_round(env, policy, numbers, trace, symmetry, table_steps, on_step, stops)
-        for one in stops:
-            one.hold(numbers, trace.goal_quat, symmetry, table_steps)
+        _Round(env, trace, numbers, table_steps).run(policy, on_step)
     if table_steps is not None:
         env.sim.place_table(present=True)
     return trace
 
 
-class _Stops:
-    """The states in which a rule stops the environments of a round; of others those of its beginning."""
+class _Round:
+    """One episode in every environment that has one: ``numbers`` [N], place among its object's, else -1."""
 
-    def __init__(self, env: Any, hold: Hold) -> None:
-        self._env, self._hold = env, hold
-        self._state = {name: _rows(array, env.num_envs).clone() for name, array in env.motion().items()}
-        self._after = np.full(env.num_envs, -1)
+    def __init__(self, env: Any, trace: Trace, numbers: np.ndarray, table_steps: int | None) -> None:
+        self._env, self._trace, self._numbers, self._table_steps = env, trace, numbers, table_steps
+        self._objects = np.asarray(env.world_object)
+        # The state in which each way to stop ends an environment, after how many steps; -1: not yet.
+        self._stopped = {way: (np.full(env.num_envs, -1), self._motion(copy=True)) for way in trace.held}
 
-    def look(self, step: int, trace: Trace, envs: np.ndarray, place: tuple[np.ndarray, np.ndarray]) -> None:
-        """Keep the states of environments, those of ``place``, that the rule stops after ``step`` steps."""
-        rule, by = self._hold.rule, self._hold.by
-        distance = {"predicted": trace.predicted, "exact": trace.exact, "error": trace.error}.get(by)
-        assert distance is not None  # what success criteria stop is not held
-        near = distance[(*place, step)] < rule.distance_rad
-        stops = near & (trace.action_norm[(*place, step)] < rule.action_norm) & (self._after[envs] < 0)
-        if step == 0 or not stops.any():
-            return
-        self._after[envs[stops]] = step
+    def run(self, policy: Any, on_step: Callable[[], object]) -> None:
+        """Go to the ends, then go on from the stops that are to be held."""
+        env, trace = self._env, self._trace
+        envs = np.flatnonzero(self._numbers >= 0)
+        trace.start_quat[self._place(envs)] = quat = unit_quats(env.object_pose()[envs, 3:7])
+        trace.goal_quat[self._place(envs)] = unit_quats(env.goal_quat.numpy()[envs])
+        self._write_errors(envs, 0, quat)
+        smoothed = wp.to_torch(env.smoothed)
+        for step in range(env.max_episode_steps):
+            if step == self._table_steps:
+                env.sim.place_table(present=False)
+            place = self._place(envs)
+            trace.action_norm[(*place, step)] = smoothed.norm(dim=-1).cpu().numpy()[envs]
+            if trace.predicted is not None:
+                policy.active = torch.zeros(env.num_envs, dtype=torch.bool, device=smoothed.device)
+                policy.active[torch.from_numpy(envs).to(smoothed.device)] = True
+            action = policy.act(wp.to_torch(env.observation))
+            if trace.predicted is not None:
+                trace.predicted[(*place, step)] = policy.predicted.cpu().numpy()[envs]
+            self._keep_stops(envs, step)
+            env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
+            self._write_errors(envs, step + 1, unit_quats(env.object_pose_end.numpy()[envs, 3:7]))
+            trace.still[(*place, step + 1)] = env.still.numpy()[envs] != 0
+            done = env.done.numpy()[envs] != 0
+            trace.fell[self._place(envs[done])] = env.fell.numpy()[envs[done]] != 0
+            trace.steps[self._place(envs[done])] = step + 1
+            envs = envs[~done]
+            on_step()
+            if not len(envs):
+                break
+        for way in trace.held:
+            self._hold(way)
+
+    def _place(self, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Object and number of the episodes of environments."""
+        return self._objects[envs], self._numbers[envs]
+
+    def _write_errors(self, envs: np.ndarray, step: int, quat: np.ndarray) -> None:
+        """Write the errors of environments after ``step`` steps."""
+        trace, (objects, numbers) = self._trace, self._place(envs)
+        goal = trace.goal_quat[objects, numbers]
+        trace.exact[objects, numbers, step] = rotation_angle(quat, goal)
+        for k in np.unique(objects):
+            rows = objects == k
+            error = symmetric_error(quat[rows], goal[rows], self._env.objects[k].symmetry)
+            trace.error[k, numbers[rows], step] = error
+
+    def _motion(self, *, copy: bool = False) -> dict[str, torch.Tensor]:
+        """What moves, with a row for each environment, sharing the environment's memory or copied."""
+        found = {}
         for name, array in self._env.motion().items():
-            live, kept = _rows(array, self._env.num_envs), self._state[name]
-            rows = torch.from_numpy(envs[stops]).to(kept.device)
-            kept[rows] = live[rows]
+            rows = wp.to_torch(array).view(self._env.num_envs, -1)
+            rows = rows.view(torch.int32) if rows.dtype == torch.uint32 else rows  # the other has no index
+            found[name] = rows.clone() if copy else rows
+        return found
 
-    def hold(
-        self,
-        numbers: np.ndarray,
-        goals: np.ndarray,
-        symmetry: Sequence[np.ndarray],
-        table_steps: int | None,
-    ) -> None:
+    def _keep_stops(self, envs: np.ndarray, step: int) -> None:
+        """Keep the states of environments that are stopped after ``step`` steps."""
+        place = (*self._place(envs), step)
+        for (rule, by), (after, state) in self._stopped.items():
+            stops = rule.stops(getattr(self._trace, by)[place], self._trace.action_norm[place])
+            chosen = envs[stops & (after[envs] < 0)]
+            if step == 0 or not len(chosen):
+                continue
+            after[chosen] = step
+            for name, live in self._motion().items():
+                rows = torch.from_numpy(chosen).to(live.device)
+                state[name][rows] = live[rows]
+
+    def _hold(self, way: Way) -> None:
         """Go on from the stops with the last targets, and write down what came of them."""
-        env = self._env
-        envs = np.flatnonzero(self._after >= 0)
+        env, (after, state) = self._env, self._stopped[way]
+        envs = np.flatnonzero(after >= 0)
         if not len(envs):
             return
-        for name, array in env.motion().items():
-            _rows(array, env.num_envs).copy_(self._state[name])
-        place = np.asarray(env.world_object)[envs], numbers[envs]
+        for name, live in self._motion().items():
+            live.copy_(state[name])
         lost = np.zeros(len(envs), dtype=bool)
         for step in range(round(HOLD_S * env.cfg.sim.control_hz)):
-            if table_steps is not None:
-                env.sim.place_tables(*_int_arrays(env, self._after + step, table_steps))
+            if self._table_steps is not None:
+                counts = (after + step, np.full(env.num_envs, self._table_steps))
+                env.sim.place_tables(
+                    *(wp.array(count, dtype=wp.int32, device=env.device) for count in counts)
+                )
             env.hold()
             away = env.object_pose()[envs, :3] - np.array(PAPER.scene.goal_position_m)
             lost |= ~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_m)  # not a number is lost too
-        quat, goal = unit_quats(env.object_pose()[envs, 3:7]), goals[place]
-        exact = rotation_angle(quat, goal)
-        error = np.array(
-            [symmetric_error(q, g, symmetry[k]) for q, g, k in zip(quat, goal, place[0], strict=True)]
-        )
-        self._hold.exact[place] = np.where(lost, np.pi, exact)
-        self._hold.error[place] = np.where(lost, np.pi, error)
-
-
-def _rows(array: wp.array, envs: int) -> torch.Tensor:
-    """An array of all environments with a row for each, sharing its memory."""
-    rows = wp.to_torch(array).view(envs, -1)
-    return rows.view(torch.int32) if rows.dtype == torch.uint32 else rows  # torch cannot index the other
-
-
-def _int_arrays(env: Any, *values: Any) -> list[wp.array]:
-    """One number, or one of each environment, as device arrays [N]."""
-    rows = (np.broadcast_to(np.asarray(value, dtype=np.int32), env.num_envs) for value in values)
-    return [wp.array(row, dtype=wp.int32, device=env.device) for row in rows]
-
-
-def _record_round(
-    env: Any,
-    policy: Any,
-    numbers: np.ndarray,
-    trace: Trace,
-    symmetry: Sequence[np.ndarray],
-    table_steps: int | None,
-    on_step: Callable[[], object],
-    stops: Sequence[_Stops],
-) -> None:
-    """One episode in environments that have one; ``numbers`` [N]: place among its object's, -1 for none."""
-    envs = np.flatnonzero(numbers >= 0)
-    place = np.asarray(env.world_object)[envs], numbers[envs]
-    goal = unit_quats(env.goal_quat.numpy())[envs]
-    quat = unit_quats(env.object_pose()[:, 3:7])[envs]
-    trace.start_quat[place], trace.goal_quat[place] = quat, goal
-    _write_errors(trace, symmetry, place, 0, quat, goal)
-    alive = np.ones(len(envs), dtype=bool)
-    smoothed = wp.to_torch(env.smoothed)
-    for step in range(env.max_episode_steps):
-        if step == table_steps:
-            env.sim.place_table(present=False)
-        living = place[0][alive], place[1][alive]
-        trace.action_norm[(*living, step)] = smoothed.norm(dim=-1).cpu().numpy()[envs][alive]
-        if trace.predicted is not None:
-            policy.active = _mask(envs[alive], env.num_envs, smoothed.device)
-        action = policy.act(wp.to_torch(env.observation))
-        if trace.predicted is not None:
-            trace.predicted[(*living, step)] = policy.predicted.cpu().numpy()[envs][alive]
-        for one in stops:
-            one.look(step, trace, envs[alive], living)
-        env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
-        quat = unit_quats(env.object_pose_end.numpy()[:, 3:7])[envs]
-        _write_errors(trace, symmetry, living, step + 1, quat[alive], goal[alive])
-        assert trace.still is not None
-        trace.still[(*living, step + 1)] = env.still.numpy()[envs][alive] != 0
-        ended = (env.done.numpy()[envs] != 0) & alive
-        last = place[0][ended], place[1][ended]
-        trace.fell[last] = env.fell.numpy()[envs][ended] != 0
-        trace.steps[last] = step + 1
-        alive &= ~ended
-        on_step()
-        if not alive.any():
-            return
-
-
-def _mask(envs: np.ndarray, count: int, device: torch.device) -> torch.Tensor:
-    """True at some environments [N]."""
-    mask = torch.zeros(count, dtype=torch.bool, device=device)
-    mask[torch.from_numpy(envs).to(device)] = True
-    return mask
-
-
-def _write_errors(
-    trace: Trace,
-    symmetry: Sequence[np.ndarray],
-    place: tuple[np.ndarray, np.ndarray],
-    step: int,
-    quat: np.ndarray,
-    goal: np.ndarray,
-) -> None:
-    """Write the errors of some episodes after ``step`` steps."""
-    trace.exact[(*place, step)] = rotation_angle(quat, goal)
-    for k in np.unique(place[0]):
-        rows = place[0] == k
-        error = symmetric_error(quat[rows], goal[rows], symmetry[k])
-        trace.error[k, place[1][rows], step] = error
-
-
-def _quat(values: np.ndarray) -> tuple[float, float, float, float]:
-    x, y, z, w = (float(value) for value in values)
-    return x, y, z, w
+        place = self._place(envs)
+        error = rotation_angle(unit_quats(env.object_pose()[envs, 3:7]), self._trace.goal_quat[place])
+        self._trace.held[way][place] = np.where(lost, np.pi, error)

@@ -30,18 +30,7 @@ class TrackingActor:
         sensor_errors: bool = False,
         seed: int = 0,
     ):
-        """Open its eyes in every environment.
-
-        Args:
-            env: The environment.
-            policy: The policy.
-            goals: What it knows shapes and goals by (:mod:`vd.evaluate.scanned`).
-            sensor_errors: Give its camera the errors of a real one.
-            seed: Of the errors of camera and scans.
-
-        Raises:
-            ValueError: It is of another hand.
-        """
+        """Open its eyes in every environment, with ``sensor_errors`` those of a real camera."""
         scene, camera, depth = env.scene, env.hand.camera.at(policy.spec.camera), policy.spec.depth
         self.num_actions = policy.num_actions
         depth = depth.with_errors() if sensor_errors else depth

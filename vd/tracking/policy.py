@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from vd.config import Dropped, from_dict, to_dict
 from vd.policy import TrainedPolicy, holds, policy_of, read_state
@@ -34,6 +34,7 @@ class TrackingPolicy:
         spec: All else.
     """
 
+    kind: ClassVar[Literal["tracking"]] = "tracking"
     teacher: TrainedPolicy
     spec: TrackingSpec
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 from vd.config import from_dict
 from vd.policy import holds, read_state
@@ -33,6 +33,7 @@ class StudentSpec(StoppingRules):
 class SavedStudent:
     """A student that was read from a file."""
 
+    kind: ClassVar[Literal["student"]] = "student"
     spec: StudentSpec
     network: Student
     """In evaluation mode, without gradients."""
@@ -44,6 +45,11 @@ class SavedStudent:
     """Iterations it was trained for."""
     env_steps: int
     """Control steps it was trained for (clouds in stage 0)."""
+
+    @property
+    def num_actions(self) -> int:
+        """Actions D."""
+        return self.spec.num_actions
 
 
 def is_student(path: Path) -> bool:
