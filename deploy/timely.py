@@ -12,24 +12,31 @@ TURN_S = 1e-4
 
 
 @contextlib.contextmanager
-def real_time(wanted: bool, *, level: int = 0) -> Iterator[bool]:
-    """Run before all ordinary programs where the system permits it (root, ``ulimit -r 1``).
+def undisturbed(before_all: bool, *, level: int = 0) -> Iterator[bool]:
+    """Run without the garbage collector, without long turns of other threads, and before other programs.
 
-    All threads do, those that begin later too: the watchdog must not wait for other programs. Loop and twin
-    need it on a busy machine; both mostly sleep.
+    The collector pauses for a second where there is much; a run makes little. A thread that waits for the
+    interpreter, as after every packet, waits for whoever has it: 5 ms by default. Before all ordinary
+    programs run all threads, those that begin later too, where the system permits it (root, ``ulimit -r 1``):
+    the watchdog must not wait for other programs. Loop and twin need it on a busy machine; both mostly sleep.
 
     Args:
-        wanted: Whether to try.
+        before_all: Whether to try that.
         level: Above the lowest real-time priority. A twin's is higher than the loop's, as motors' processors
             do not wait for ours.
 
     Yields:
         Whether it does.
     """
+    turn_s = sys.getswitchinterval()
+    sys.setswitchinterval(TURN_S)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
     before: dict[int, tuple[int, os.sched_param]] = {}
     with contextlib.suppress(AttributeError, FileNotFoundError, PermissionError):  # not Linux, not permitted
         priority = os.sched_param(os.sched_get_priority_min(os.SCHED_RR) + level)
-        for thread in (int(entry.name) for entry in Path("/proc/self/task").iterdir() if wanted):
+        for thread in (int(entry.name) for entry in Path("/proc/self/task").iterdir() if before_all):
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 had = os.sched_getscheduler(thread), os.sched_getparam(thread)
                 os.sched_setscheduler(thread, os.SCHED_RR, priority)
@@ -40,23 +47,6 @@ def real_time(wanted: bool, *, level: int = 0) -> Iterator[bool]:
         for thread, had in before.items():
             with contextlib.suppress(ProcessLookupError):
                 os.sched_setscheduler(thread, *had)
-
-
-@contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """Without the garbage collector, and without long turns of other threads.
-
-    The collector pauses for a second where there is much; a run makes little. A thread that waits for the
-    interpreter, as after every packet, waits for whoever has it: 5 ms by default.
-    """
-    turn_s = sys.getswitchinterval()
-    sys.setswitchinterval(TURN_S)
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        yield
-    finally:
         sys.setswitchinterval(turn_s)
         gc.enable()
         gc.unfreeze()

@@ -6,13 +6,7 @@ import pytest
 
 from vd.bench import gap
 from vd.bench.cli import GapCommand
-from vd.bench.gap_score import (
-    KINDS,
-    Case,
-    figures,
-    markdown,
-    score,
-)
+from vd.bench.gap_score import Case, figures, markdown, score
 
 TRUTH = {
     "noise_floor_rad": 5e-4,
@@ -50,18 +44,6 @@ def value(results, what):
     return figure
 
 
-def test_any_first_part_of_the_battery_is_a_fair_sample():
-    cases = gap.battery("dclaw3")
-    part = cases[: len(cases) // 5]
-    for kind in KINDS:
-        share = sum(c.kind == kind for c in part) / sum(c.kind == kind for c in cases)
-        assert share == pytest.approx(0.2, abs=0.02), kind
-    single = [c for c in part if c.kind == "single"]
-    assert {c.size for c in single} == {0, 1, 2, 3} and {c.seed for c in single} == set(range(5))
-    assert cases == gap.battery("dclaw3"), "the order is always the same: a run can be resumed"
-    assert min(c.seed for c in gap.battery("servo", first_seed=500, seeds=2)) == 500
-
-
 def test_the_effect_that_stands_for_another_is_right_if_the_report_says_so():
     one = case("read_delay")
     truth = {**TRUTH, "effects": {"read_delay": {"joints": ["joint"], "parameters": {}}}}
@@ -70,23 +52,12 @@ def test_the_effect_that_stands_for_another_is_right_if_the_report_says_so():
     more = score(one, report("command_delay", "backlash", sets=[("command_delay", "read_delay")]), truth)
     results = [said, silent, more]
     assert [value([r], "first name right").value for r in results] == [1.0, 0.0, 0.0]
-    assert [value([r], "single: a wrong name").value for r in results] == [0.0, 1.0, 1.0]
-    assert value([said], "size of the set").value == 1.0
-    assert value(results, "right, or in the named set").value == pytest.approx(2 / 3)
+    assert [bool(r["false"]) for r in results] == [False, True, True]
 
 
-@pytest.mark.parametrize(
-    ("model", "options", "words"),
-    [
-        ("servo", {"kinds": ("triple",)}, "no triple"),
-        ("servo", {"effects": ("gremlins",)}, "no gremlins"),
-        ("servo", {"sizes": (7,)}, "no 7"),
-        ("motor", {}, "--model is motor"),
-    ],
-)
-def test_bad_requests_are_refused(model, options, words):
-    with pytest.raises(ValueError, match=words):
-        gap.battery(model, **options)
+def test_an_effect_that_does_not_show_is_refused():
+    with pytest.raises(ValueError, match="no payload_inertia"):
+        gap.battery("servo", effects=("payload_inertia",))
 
 
 def test_names_are_scored_against_the_truth():
@@ -97,14 +68,12 @@ def test_names_are_scored_against_the_truth():
     also = score(one, report("coulomb_friction", "backlash"), TRUTH)
     results = [right, wrong, among, also]
     assert value(results, "first name right").value == 0.5
-    assert value(results, "right, or in the named set").value == 0.75
-    assert value(results, "single: a wrong name").value == 0.5
-    assert value(results, "size of the set").value == 1.5
+    assert [r["false"] for r in results] == [[], ["backlash"], [], ["backlash"]]
     assert value(results, "held-out gap: times smaller").value == pytest.approx(6.0 / 0.55)
     assert value(results, "held-out gap: noise floors left").reached
     # A gap below three noise floors does not count.
     small = score(one, report("backlash", baseline=1e-3), TRUTH)
-    assert value([*results, small], "first name right").cases == 4
+    assert len(value([*results, small], "first name right").values) == 4
 
 
 def test_nothing_hidden_allows_no_name_but_a_changed_mass():
@@ -112,8 +81,7 @@ def test_nothing_hidden_allows_no_name_but_a_changed_mass():
     heavy = score(case(kind="none", change="mass"), report("gravity_load"), TRUTH)
     false = score(case(kind="none", change="base"), report("gravity_load"), TRUTH)
     results = [quiet, heavy, false, false]
-    assert value(results, "nothing hidden: a false name").value == 0.5
-    assert value(results, "nothing hidden: any name at all (mass included)").value == 0.75
+    assert value(results, "nothing hidden: no false name").value == 0.5
 
 
 def test_pairs_and_outsiders_are_scored():
@@ -139,7 +107,6 @@ def test_pairs_and_outsiders_are_scored():
         )
     ]
     assert value(strange, "outside: unknown or neighbours").value == pytest.approx(3 / 5)
-    assert value(strange, "outside: a confident wrong name").value == pytest.approx(1 / 5)
 
 
 def test_a_failed_case_counts_against_every_goal():
@@ -147,7 +114,7 @@ def test_a_failed_case_counts_against_every_goal():
         case("backlash"), case(kind="none"), case("backlash", "dead_zone", kind="pair"),
         case("cogging", kind="outside"))]  # fmt: skip
     for figure in figures(failed):
-        assert figure.reached is not True
+        assert not figure.reached
     assert "| `backlash` | 2 | - | 1 | 0 | 1 x failed |" in markdown(failed)
 
 
@@ -162,15 +129,17 @@ def test_a_battery_goes_on_where_it_ended_and_names_what_is_hidden(tmp_path, mon
     monkeypatch.setattr(gap, "run_tasks", here)
     effects = ("coulomb_friction", "encoder_bias")
     some = {"out": tmp_path, "model": "servo", "effects": effects, "sizes": (3,), "seeds": 1}
-    GapCommand(**some, kinds=("none",), cases=1).run()
+    monkeypatch.setattr(gap, "NOTHING_A_SEED", 1)
+    GapCommand(**some, kinds=("none",)).run()
     GapCommand(**some, kinds=("single",)).run()
     results = {one.effects: json.loads((tmp_path / f"{one.name}.json").read_text()) for one in ran}
     assert len(ran) == 3 and not any(r["false"] for r in results.values())
-    assert not results[("coulomb_friction",)]["missed"] and not results[("encoder_bias",)]["missed"]
+    offset = results[("encoder_bias",)]
+    assert any("encoder_bias" in names for names in (offset["found"], *offset["sets"]))
+    assert results[("coulomb_friction",)]["found"] == ["coulomb_friction"]
     assert results[()]["verdict"] == "no_gap"
     assert results[("coulomb_friction",)]["shrunk"] > 5.0
     assert all(row["error"] < 0.1 for one in results.values() for row in one["parameters"]), "in N m"
-    assert not list((tmp_path / "work").iterdir())
     assert (
         "| figure |" in capsys.readouterr().out
         and "coulomb_friction" in (tmp_path / "summary.md").read_text()

@@ -109,13 +109,8 @@ def test_effects_are_read_from_the_command_line():
         {"tau_s_nm": 0.2, "v_s_rad_s": 0.1},
         ("f0_j2", "f0_j3"),
     )
-    for text, words in (
-        ("gremlins", "command_delay"),
-        ("backlash:depth=1", "width_rad"),
-        ("backlash:width_rad", "NUMBER"),
-        ("backlash:width_rad=wide", "NUMBER"),
-    ):
-        with pytest.raises(ValueError, match=words):
+    for text in ("backlash:width_rad", "backlash:width_rad=wide"):
+        with pytest.raises(ValueError, match="write width_rad=NUMBER"):
             parse_effect(text)
 
 

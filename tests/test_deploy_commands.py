@@ -50,7 +50,7 @@ def line(hand, monkeypatch):
         motors.plant.position[:] = reset_pose(3) + 0.1
 
         @contextlib.contextmanager
-        def connect(options, twin_options=()):
+        def connect(options, **twin_options):
             yield Connection(hand, joints, bus)
 
         for module in (check, home, record):
@@ -282,7 +282,11 @@ def test_options_and_commands_that_cannot_be_are_refused(capsys):
     assert cli.main([]) == cli.OK and "vd-deploy COMMAND" in capsys.readouterr().out
 
 
-def test_a_twin_that_cannot_start_says_why():
-    command = [sys.executable, "-m", "vd.deploy.cli", "check", "--twin", "--twin-args=--seed no"]
+@pytest.mark.parametrize(
+    ("twin", "status", "said"), [("--seed no", 2, "seed"), ("--ids 300", 1, "an ID lies")]
+)
+def test_a_twin_that_cannot_be_says_why(twin, status, said):
+    command = [sys.executable, "-m", "vd.deploy.cli", "check", "--twin", f"--twin-args={twin}"]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert run.returncode == 1 and "the twin did not start" in run.stderr
+    assert run.returncode == status and said in run.stderr
+    assert ("the twin did not start" in run.stderr) == (status == 1)

@@ -21,7 +21,7 @@ from vd.deploy.hardware.joints import uncalibrated
 from vd.deploy.hardware.motion import move
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
-from vd.deploy.loop.loop import ControlLoop, LoopCfg
+from vd.deploy.loop.loop import ControlLoop
 from vd.deploy.loop.policy_runner import Decision, PolicyRunner
 from vd.deploy.safety.safety import SafeHand
 from vd.deploy.twin.newton_hand import NewtonHand
@@ -75,7 +75,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     chosen = [m for m in motions if m.excitation.joints == ("f0_j1",) and m.excitation.name in KINDS]
 
     @contextlib.contextmanager
-    def connect(_, twin_options=()):
+    def connect(_, **twin_options):
         plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=960.0))
         with simulated_bus(hand, joints, plant) as (_, bus):
             yield Connection(hand, joints, bus)
@@ -117,7 +117,7 @@ def rollout(folder, plant_hand, episode_s):
             move(safe, np.tile([0.0, 0.3, -0.5], 3), 0.5)
             log = LogWriter(folder, hand, run, servo={}, clock=bus.clock)
             pacer, actions = Pacer(12.0, bus.clock), ActionFilter(hand, ReorientCfg())
-            loop = ControlLoop(safe, Waving(bus.clock), actions, pacer, log, LoopCfg(episode_s, 0.0))
+            loop = ControlLoop(safe, Waving(bus.clock), actions, pacer, log, episode_s=episode_s, hold_s=0.0)
             loop.run([np.array([0.0, 0.0, 0.0, 1.0])])
         log.finish("done")
     return folder

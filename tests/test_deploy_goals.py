@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from vd.assets_usd.objects.sets import load_set
-from vd.deploy.loop.goals import GoalError, one_object, read_goals, scan_object
+from vd.deploy.loop.goals import GoalError, make_goals, one_object, scan_object
 
 NOISE_M = 0.001
 HOLE_M = 0.012
@@ -97,11 +97,11 @@ def test_scans_of_no_use_are_refused_by_name(tmp_path):
 def test_orientations_are_read_as_written(tmp_path):
     file = tmp_path / "goals.txt"
     file.write_text("# a sequence\n0,0,1@90\n\n0,0,0,2  # twice as long\n")
-    goals = read_goals(["1,0,0@180", str(file)])
+    goals = make_goals(["1,0,0@180", str(file)])
     half = np.sqrt(0.5)
     np.testing.assert_allclose(goals, [[1, 0, 0, 0], [0, 0, half, half], [0, 0, 0, 1]], atol=1e-12)
     for one, other in (("0.1,-0.2,0.3,0.9", "-0.1,0.2,-0.3,-0.9"), ("0,-1,1,0", "0,1,-1,0")):
-        first, second = read_goals([one, other])
+        first, second = make_goals([one, other])
         np.testing.assert_array_equal(first, second)
         assert first[3] > 0.0 or (first[3] == 0.0 and first[1] > 0.0)
 
@@ -109,12 +109,12 @@ def test_orientations_are_read_as_written(tmp_path):
 @pytest.mark.parametrize("text", ["1,2,3", "0,0,0@90", "0,0,0,0", "a,b,c,d", "0,0,1,0@90", "nan,0,0,1"])
 def test_what_is_no_orientation_is_refused(text, tmp_path):
     with pytest.raises(GoalError, match="such as 0,0,1@90"):
-        read_goals([text])
+        make_goals([text])
     (tmp_path / "goals.csv").write_text(f"0,0,0,1\n{text}\n")
     with pytest.raises(GoalError, match="line 2"):
-        read_goals([str(tmp_path / "goals.csv")])
+        make_goals([str(tmp_path / "goals.csv")])
     (tmp_path / "empty.txt").write_text("# nothing\n")
     with pytest.raises(GoalError, match="no orientation"):
-        read_goals([str(tmp_path / "empty.txt")])
+        make_goals([str(tmp_path / "empty.txt")])
     with pytest.raises(GoalError, match="cannot be read"):
-        read_goals([str(tmp_path / "none.txt")])
+        make_goals([str(tmp_path / "none.txt")])

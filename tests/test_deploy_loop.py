@@ -13,7 +13,7 @@ from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
-from vd.deploy.loop.loop import ControlLoop, LoopCfg, summary
+from vd.deploy.loop.loop import ControlLoop, summary
 from vd.deploy.loop.policy_runner import Decision, PolicyRunner, TrackingRunner
 from vd.deploy.loop.run_page import FILM_FILE, PAGE_FILE, goal_results, summary_line
 from vd.deploy.safety.safety import StoppedError
@@ -129,7 +129,7 @@ def test_the_grid_stays_where_it_was_whatever_is_late():
 
 def test_it_acts_until_the_policy_has_arrived_then_holds_and_goes_on(parts):
     hand, runner, actions, pacer, log = parts
-    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=10.0, hold_s=0.5), twin=Truth())
+    loop = ControlLoop(hand, runner, actions, pacer, log, episode_s=10.0, hold_s=0.5, twin=Truth())
     assert loop.run([GOAL, GOAL]) == ["stopped", "stopped"]
     log.finish("done")
     read = read_log(log.folder)
@@ -168,9 +168,7 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
     truth = None if turned is None else Truth(quat=tuple(quat))
     if truth is None:
         log = LogWriter(log.folder / "real", load_hand("dclaw3"), log._run, servo={}, clock=hand.clock)
-    ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=limit_s, hold_s=0.2), twin=truth).run(
-        [GOAL]
-    )
+    ControlLoop(hand, runner, actions, pacer, log, episode_s=limit_s, hold_s=0.2, twin=truth).run([GOAL])
     log.finish("done")
     results = goal_results(read_log(log.folder))
     assert [str(one) for one in results] == [said]
@@ -181,18 +179,18 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
 def test_a_goal_that_is_not_reached_ends_by_its_time_and_a_lost_object_the_run(parts):
     hand, runner, actions, pacer, log = parts
     runner.start = 9.0
-    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), twin=Truth())
+    loop = ControlLoop(hand, runner, actions, pacer, log, episode_s=1.0, hold_s=0.0, twin=Truth())
     assert loop.run([GOAL]) == ["time limit"]
     assert runner.decided == 12
     away = Truth((0.3, 0.0, 0.03))
-    lost = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), twin=away)
+    lost = ControlLoop(hand, runner, actions, pacer, log, episode_s=1.0, hold_s=0.0, twin=away)
     assert lost.run([GOAL, GOAL]) == ["lost"]
 
 
 def test_there_is_nothing_to_stop_before_the_first_action(parts):
     hand, runner, actions, pacer, log = parts
     runner.start = 0.1
-    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(hold_s=0.0))
+    loop = ControlLoop(hand, runner, actions, pacer, log, hold_s=0.0)
     assert loop.run([GOAL]) == ["stopped"]
     assert runner.decided == 2
 
@@ -214,7 +212,7 @@ def test_missed_deadlines_are_counted_and_told(parts):
     hand, runner, actions, pacer, log = parts
     hand.work = [0.01, 0.01, 0.1, 0.01]
     runner.start = 9.0
-    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=0.5, hold_s=0.0))
+    loop = ControlLoop(hand, runner, actions, pacer, log, episode_s=0.5, hold_s=0.0)
     loop.run([GOAL])
     look = [False, False]
     assert hand.missed == [*look, False, False, True, False, False, False] and pacer.missed == 1
@@ -224,7 +222,7 @@ def test_missed_deadlines_are_counted_and_told(parts):
 def test_latency_is_told_as_training_draws_it(parts):
     hand, runner, actions, pacer, log = parts
     hand.work, camera = [0.02] * 9, LateCamera(hand.clock)
-    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(hold_s=0.0), camera=camera, twin=Truth())
+    loop = ControlLoop(hand, runner, actions, pacer, log, hold_s=0.0, camera=camera, twin=Truth())
     loop.run([GOAL])
     log.finish("done")
     found = summary(loop.times)

@@ -109,7 +109,7 @@ def test_what_is_mended_by_a_restart_is_named_with_it(rig, spoil, said):
 def test_motors_of_wrong_ids_are_named(rig, motor, id, said):
     """Two of one ID answer a ping alike, and so soundly; what differs is garbled."""
     rig.line.motors[motor].put("id", id)
-    assert rig.bus.ping(id) == MODELS[MOTOR].number
+    assert rig.bus.ping_all()[id][0] == MODELS[MOTOR].number
     (wrong,) = rig.wrong()
     assert re.search(said, wrong)
 

@@ -17,7 +17,7 @@ from vd.deploy.hardware.joints import Joints, uncalibrated
 from vd.deploy.hardware.motion import move, reset_pose
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import WATCH_S, SafeHand, StoppedError
-from vd.deploy.timely import real_time
+from vd.deploy.timely import undisturbed
 
 EXCHANGE_S = 0.006
 """Asking nine motors once: 3.7 ms on the line, and what the program waits for."""
@@ -248,7 +248,7 @@ def test_all_threads_run_before_other_programs_and_not_after():
     end = threading.Event()
     thread = threading.Thread(target=end.wait, daemon=True)
     thread.start()
-    with real_time(True) as permitted:
+    with undisturbed(True) as permitted:
         if not permitted:
             pytest.skip("this system permits no real-time priority")
         assert [os.sched_getscheduler(one) for one in (0, thread.native_id)] == [os.SCHED_RR] * 2

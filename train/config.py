@@ -5,12 +5,11 @@ Defaults are the paper's (Table S1), or its released code's where the paper says
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from vd.config import Dropped, Renamed
+from vd.config import Dropped, Renamed, require
 from vd.paper import PAPER
 
 ACTIVATION = "elu"
@@ -133,21 +132,6 @@ class RunCfg:
             )
 
 
-def require(
-    cfg: Any, prefix: str, what: Literal["positive", "zero or positive", "in [0, 1]"], names: str
-) -> None:
-    """Refuse fields, named with spaces between, that are not ``what``; those that are ``None`` are not set.
-
-    Raises:
-        ValueError: The flag, its value and what it has to be.
-    """
-    for name in names.split():
-        value = getattr(cfg, name)
-        good = value is None or value > 0 or (what != "positive" and value == 0)
-        if not good or (what == "in [0, 1]" and value > 1):
-            raise ValueError(f"{prefix}{name.replace('_', '-')} is {value}; it has to be {what}")
-
-
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:
     """Minibatches in a rollout of ``num_envs`` environments, of at most ``minibatch_size`` samples each."""
     return max(1, math.ceil(num_envs * ppo.rollout_steps / ppo.minibatch_size))
@@ -179,58 +163,3 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
             f"--policy.quiet-std is {policy.quiet_std}; it has to be positive and at most the lower end "
             f"{low} of --policy.std-range, and needs --policy.distribution state-dependent"
         )
-
-
-def rsl_rl_config(
-    ppo: PpoCfg, policy: PolicyCfg, num_envs: int, groups: Sequence[str], rank: int, world_size: int
-) -> dict[str, Any]:
-    """The dictionary that rsl-rl builds algorithm and models from.
-
-    Args:
-        ppo: Algorithm settings.
-        policy: Network settings.
-        num_envs: Environments.
-        groups: Groups of observations; the actor reads the first, the critic all.
-        rank: Number of this process.
-        world_size: Processes of the run.
-    """
-    from vd.train.distribution import BoundedStdGaussian, FreeStdGaussian  # imports torch
-    from vd.train.ppo import TeacherPPO
-
-    distribution: dict[str, Any] = {"init_std": policy.initial_std, "std_range": policy.std_range}
-    if policy.distribution == "gaussian":
-        distribution |= {"class_name": FreeStdGaussian, "std_type": "log"}
-    else:
-        distribution |= {"class_name": BoundedStdGaussian}
-    network = {
-        "class_name": "MLPModel",
-        "hidden_dims": policy.hidden,
-        "activation": ACTIVATION,
-        "obs_normalization": policy.normalise_observations,
-    }
-    return {
-        "multi_gpu": {"global_rank": rank, "world_size": world_size} if world_size > 1 else None,
-        "num_steps_per_env": ppo.rollout_steps,
-        "obs_groups": {"actor": [groups[0]], "critic": list(groups)},
-        "actor": network | {"distribution_cfg": distribution},
-        "critic": network,
-        "algorithm": {
-            "class_name": TeacherPPO,
-            "num_learning_epochs": ppo.epochs,
-            "num_mini_batches": minibatches(ppo, num_envs),
-            "learning_rate": ppo.actor_learning_rate,
-            "critic_learning_rate": ppo.critic_learning_rate,
-            "schedule": ppo.schedule,
-            "desired_kl": ppo.desired_kl,
-            "clip_param": ppo.clip,
-            "gamma": ppo.gamma,
-            "lam": ppo.gae_lambda,
-            "value_loss_coef": ppo.value_coefficient,
-            "entropy_coef": ppo.entropy_coefficient,
-            "bound_coef": ppo.bound_coefficient,
-            "cuda_graph": ppo.cuda_graph,
-            "max_grad_norm": ppo.grad_norm,
-            "optimizer": "adam",
-            "use_clipped_value_loss": False,
-        },
-    }

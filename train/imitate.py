@@ -4,17 +4,13 @@ While the critic learns alone, the actor repeats what the policy that it began f
 state, in the states that it comes to itself (DAgger, Ross et al. 2011).
 """
 
-from collections.abc import Mapping
 from copy import deepcopy
-from pathlib import Path
-from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import nn
 
-from vd.train.config import PpoCfg
 from vd.train.ppo import OBSERVED, TeacherPPO
 from vd.train.vec_env import OBSERVATION_GROUP, PRIVILEGED_GROUP
 
@@ -31,17 +27,15 @@ class Imitation:
     begins fresh, and that of PPO sees none of these gradients.
 
     Args:
-        learner: The learner, whose actor has the weights of the policy to imitate.
-        inputs: Values that this policy read, the first that the actor observes. As many of the present state
-            are the last that the critic is told.
+        learner: The learner, whose actor has the weights of the policy to imitate. The last that its critic
+            is told is what the actor observes, of the present state.
 
     Attributes:
-        teacher: The policy to imitate. It gets what the actor observes with the present state in its place;
-            it has no weights for what the actor observes more.
+        teacher: The policy to imitate.
     """
 
-    def __init__(self, learner: TeacherPPO, inputs: int) -> None:
-        self._learner, self._inputs = learner, inputs
+    def __init__(self, learner: TeacherPPO) -> None:
+        self._learner = learner
         self.teacher: MLPModel = deepcopy(learner.actor).requires_grad_(False)
         if hasattr(self.teacher.distribution, "log_floor"):  # it falls for both as stillness tightens
             self.teacher.distribution.log_floor = learner.actor.distribution.log_floor
@@ -59,9 +53,8 @@ class Imitation:
         self._optimizer.param_groups[0]["lr"] = LEARNING_RATE * left
         learner, samples = self._learner, self._learner.samples
         seen, told = samples[OBSERVED + OBSERVATION_GROUP], samples[OBSERVED + PRIVILEGED_GROUP]
-        present = torch.cat((told[:, -self._inputs :], seen[:, self._inputs :]), dim=1)
         with torch.no_grad():
-            wanted = _distribution(self.teacher, present)
+            wanted = _distribution(self.teacher, told[:, -seen.shape[1] :])
         losses = []
         for rows in learner.minibatches():
             found = _distribution(learner.actor, seen[rows])
@@ -77,30 +70,6 @@ class Imitation:
             losses.append(loss.detach())
         learner.actor.distribution._distribution = self.teacher.distribution._distribution = None
         return {"imitation": float(torch.stack(losses).mean())}
-
-
-def begin_imitation(
-    learner: TeacherPPO, ppo: PpoCfg, present: int, state: Mapping[str, Any], path: str | Path
-) -> Imitation | None:
-    """What the actor of a run does first that begins from another; None: it stays as it is.
-
-    Args:
-        learner: The learner, whose actor has the weights of the file.
-        ppo: Settings.
-        present: Values of the present that the critic is told last.
-        state: The file that the run begins from.
-        path: Its name.
-
-    Raises:
-        ValueError: The policy reads other things than those.
-    """
-    read = state["policy"]["num_observations"]
-    if ppo.imitation_iterations and present != read:
-        raise ValueError(
-            f"--ppo.imitation-iterations: {path} reads {read} values, and the critic is told {present} of "
-            "the present; give --env.observation.dynamics critic, and --init a policy of state and shape"
-        )
-    return Imitation(learner, present) if ppo.imitation_iterations else None
 
 
 def _distribution(actor: MLPModel, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,6 +1,6 @@
 """Proximal policy optimisation as the paper runs it, on top of rsl-rl's."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -10,7 +10,10 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import nn
 
+from vd.train.config import ACTIVATION, PolicyCfg, PpoCfg, minibatches
+from vd.train.distribution import BoundedStdGaussian, FreeStdGaussian
 from vd.train.graphed import Recorded
+from vd.train.vec_env import ReorientVecEnv
 
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2
 """Bounds of the adaptive schedule, as in rsl-rl."""
@@ -60,10 +63,8 @@ class TeacherPPO(PPO):
         actor: Policy.
         critic: Value function.
         storage: Rollout of T steps in N environments.
-        critic_learning_rate: The critic's rate; ``learning_rate`` is the actor's.
-        bound_coef: Weight of the squared excess of mean actions beyond :data:`ACTION_BOUND`.
-        cuda_graph: Whether to record the passes of a minibatch.
-        **kwargs: rsl-rl's PPO arguments.
+        cfg: Settings.
+        **kwargs: rsl-rl's PPO arguments that are no settings: the device, and the processes.
 
     Attributes:
         actor_learns: Whether updates change the actor. A critic that knows nothing yet gives random
@@ -81,31 +82,39 @@ class TeacherPPO(PPO):
         actor: MLPModel,
         critic: MLPModel,
         storage: RolloutStorage,
-        *,
-        critic_learning_rate: float,
-        bound_coef: float = 0.0,
-        cuda_graph: bool = False,
+        cfg: PpoCfg,
         **kwargs: Any,
     ) -> None:
-        super().__init__(actor, critic, storage, **kwargs)
-        if self.actor.is_recurrent or self.critic.is_recurrent or self.rnd or self.symmetry:
-            raise ValueError("TeacherPPO trains feed-forward networks, without RND and symmetry")
-        self.bound_coef = bound_coef
+        super().__init__(
+            actor,
+            critic,
+            storage,
+            num_learning_epochs=cfg.epochs,
+            num_mini_batches=minibatches(cfg, storage.num_envs),
+            learning_rate=cfg.actor_learning_rate,
+            schedule=cfg.schedule,
+            desired_kl=cfg.desired_kl,
+            clip_param=cfg.clip,
+            gamma=cfg.gamma,
+            lam=cfg.gae_lambda,
+            value_loss_coef=cfg.value_coefficient,
+            entropy_coef=cfg.entropy_coefficient,
+            max_grad_norm=cfg.grad_norm,
+            **kwargs,
+        )
+        self.bound_coef = cfg.bound_coefficient
         self.actor_learns = True
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
         # The rollout as rows of samples, in the same memory in every update, and the rows of a minibatch.
         self.samples: dict[str, torch.Tensor] = {}
         self._rows = torch.zeros(self._minibatch_size, dtype=torch.long, device=self.device)
-        self._gradients = Recorded(
-            self._compute_gradients,
-            [self._rows],
-            self._parameters,
-            record=cuda_graph and str(self.device).startswith("cuda"),
-        )
-        self.optimizer = type(self.optimizer)(
+        self._gradients: Callable[[], torch.Tensor] = self._compute_gradients
+        if cfg.cuda_graph and self.device.startswith("cuda"):
+            self._gradients = Recorded(self._compute_gradients, self._parameters)
+        self.optimizer = torch.optim.Adam(
             [
-                {"params": list(self.actor.parameters()), "lr": self.learning_rate},
-                {"params": list(self.critic.parameters()), "lr": critic_learning_rate},
+                {"params": list(self.actor.parameters()), "lr": cfg.actor_learning_rate},
+                {"params": list(self.critic.parameters()), "lr": cfg.critic_learning_rate},
             ]
         )
 
@@ -188,7 +197,8 @@ class TeacherPPO(PPO):
         Returns:
             :data:`STATISTICS`, shape [7], on the device.
         """
-        statistics = self._gradients(rows)
+        self._rows.copy_(rows)
+        statistics = self._gradients()
         if self.is_multi_gpu:
             self.reduce_parameters()
         grad_norm = nn.utils.clip_grad_norm_(self._parameters, self.max_grad_norm)
@@ -203,6 +213,8 @@ class TeacherPPO(PPO):
         Returns:
             :data:`STATISTICS` but the last, shape [6], on the device.
         """
+        for parameter in self._parameters:
+            parameter.grad = None
         batch = {name: tensor[self._rows] for name, tensor in self.samples.items()}
         observed = {name.removeprefix(OBSERVED): t for name, t in batch.items() if name.startswith(OBSERVED)}
         observations = TensorDict(observed, batch_size=[len(self._rows)])
@@ -254,3 +266,44 @@ class TeacherPPO(PPO):
         elif 0.0 < divergence < self.desired_kl / KL_BAND:
             self.learning_rate = min(MAX_LEARNING_RATE, self.learning_rate * KL_STEP)
         self.optimizer.param_groups[ACTOR_GROUP]["lr"] = self.learning_rate
+
+
+def make_learner(
+    env: ReorientVecEnv, ppo: PpoCfg, policy: PolicyCfg, *, rank: int, world_size: int
+) -> TeacherPPO:
+    """A learner with new networks, on the environment's device.
+
+    Args:
+        env: Environment; the actor reads the first group of its observations, the critic all.
+        ppo: Algorithm settings.
+        policy: Network settings.
+        rank: Number of this process.
+        world_size: Processes of the run.
+    """
+    observations, device = env.get_observations(), env.device
+    groups = list(observations.keys())
+    distribution: dict[str, Any] = {"init_std": policy.initial_std, "std_range": policy.std_range}
+    if policy.distribution == "gaussian":
+        distribution |= {"class_name": FreeStdGaussian, "std_type": "log"}
+    else:
+        distribution |= {"class_name": BoundedStdGaussian}
+    shape: dict[str, Any] = {
+        "hidden_dims": policy.hidden,
+        "activation": ACTIVATION,
+        "obs_normalization": policy.normalise_observations,
+    }
+    return TeacherPPO(
+        MLPModel(
+            observations,
+            {"actor": groups[:1]},
+            "actor",
+            env.num_actions,
+            distribution_cfg=distribution,
+            **shape,
+        ),
+        MLPModel(observations, {"critic": groups}, "critic", 1, **shape),
+        RolloutStorage("rl", env.num_envs, ppo.rollout_steps, observations, [env.num_actions], device),
+        ppo,
+        device=device,
+        multi_gpu_cfg={"global_rank": rank, "world_size": world_size} if world_size > 1 else None,
+    )

@@ -1,7 +1,5 @@
 """The teacher's training: rollouts and updates of PPO, its checkpoints, and beginning from another run."""
 
-import contextlib
-import io
 import math
 import time
 from pathlib import Path
@@ -22,11 +20,11 @@ from vd.train.checkpoint import (
     saved_worlds,
     without_worlds,
 )
-from vd.train.config import ACTIVATION, PolicyCfg, PpoCfg, RunCfg, rsl_rl_config, validate
-from vd.train.imitate import IMITATED, Imitation, begin_imitation
+from vd.train.config import ACTIVATION, PolicyCfg, PpoCfg, RunCfg, validate
+from vd.train.imitate import IMITATED, Imitation
 from vd.train.loop import TrainingDivergedError, TrainingLoop, check_update
 from vd.train.metrics import GoalWindow, StepMeans
-from vd.train.ppo import TeacherPPO
+from vd.train.ppo import make_learner
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv, all_values
 
 POLICY_NAME = "policy.pt"
@@ -69,12 +67,7 @@ class TeacherRunner(TrainingLoop):
         validate(ppo, policy, run)
         super().__init__(run, device=device, deadline=deadline)
         self.env, self.ppo, self.policy_cfg, self.task = env, ppo, policy, task
-        observations = env.get_observations()
-        config = rsl_rl_config(
-            ppo, policy, env.num_envs, tuple(observations.keys()), self.rank, self.world_size
-        )
-        with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints its models while it builds them
-            self.alg: TeacherPPO = TeacherPPO.construct_algorithm(observations, env, config, device)
+        self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
         self._means, self._window = StepMeans(), self._new_window()
         self._score = (0.0, 0.0, -math.inf)
@@ -122,15 +115,22 @@ class TeacherRunner(TrainingLoop):
         """
         found = load_checkpoint(Path(path), self.device, flag="--init")
         check_fit(found, self._spec(), self.task, path)
+        present, read = self.env.env.num_present, found["policy"]["num_observations"]
+        if self.ppo.imitation_iterations and present != read:
+            raise ValueError(
+                f"--ppo.imitation-iterations: {path} reads {read} values, and the critic is told {present} "
+                "of the present; give --env.observation.dynamics critic, and --init a policy of state and "
+                "shape"
+            )
         self.unlike = unlike(found["task"], self.task)
         found, self.new_inputs = widen(found, self.alg.actor, self.alg.critic)
         own = self.alg.save() | {"window": self._window.state_dict()}
         self._take(without_worlds(completed(found, own, stage)), path)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.begun = True
-        self.imitation = begin_imitation(self.alg, self.ppo, self.env.env.num_present, found, path)
-        imitating = self.imitation is not None
-        self.critic_warmup = self.ppo.imitation_iterations if imitating else warmup_iterations(found)
+        self.critic_warmup = self.ppo.imitation_iterations or warmup_iterations(found)
+        if self.ppo.imitation_iterations:
+            self.imitation = Imitation(self.alg)
         self._best, self._window = None, self._new_window()
 
     def save(self) -> None:
@@ -287,7 +287,7 @@ class TeacherRunner(TrainingLoop):
         self.critic_warmup = state.get("critic_warmup", 0)
         self.imitation = None
         if IMITATED in state and self.ppo.imitation_iterations:
-            self.imitation = Imitation(self.alg, self.env.env.num_present)
+            self.imitation = Imitation(self.alg)
             self.imitation.teacher.load_state_dict(state[IMITATED])
         self._best = tuple(state["best"]) if state["best"] is not None else None
         self._window.load_state_dict(state["window"])

@@ -157,3 +157,25 @@ def _convert_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
         except ValueError as error:
             errors.append(str(error))
     raise ValueError("; ".join(errors) or f"{where}: cannot be {value!r}")
+
+
+def require(
+    cfg: Any, prefix: str, what: typing.Literal["positive", "zero or positive", "in [0, 1]"], names: str
+) -> None:
+    """Refuse fields that are not ``what``; those that are ``None`` are not set.
+
+    Args:
+        cfg: A dataclass with these fields.
+        prefix: What stands before the name of a field in messages, such as ``--ppo.`` or ``goal.``.
+        what: What the fields have to be.
+        names: Fields, with spaces between.
+
+    Raises:
+        ValueError: The field or flag, its value and what it has to be.
+    """
+    for name in names.split():
+        value = getattr(cfg, name)
+        good = value is None or value > 0 or (what != "positive" and value == 0)
+        if not good or (what == "in [0, 1]" and value > 1):
+            shown = name.replace("_", "-") if prefix.startswith("--") else name
+            raise ValueError(f"{prefix}{shown} is {value}; it has to be {what}")

@@ -184,9 +184,7 @@ def seat(hand: HandModel, finger: int, camera: np.ndarray) -> np.ndarray:
     normal = camera[:3] - tip[:3]
     normal /= np.linalg.norm(normal)
     right = Rotation.from_quat(camera[3:]).apply([1.0, 0.0, 0.0])
-    right -= normal * (right @ normal)
-    right /= np.linalg.norm(right)
-    turn = Rotation.from_matrix(np.stack([right, np.cross(normal, right), normal], axis=1))
+    turn, _ = Rotation.align_vectors([normal, right], [[0, 0, 1], [1, 0, 0]], weights=[np.inf, 1.0])
     return compose(invert(tip), np.concatenate([tip[:3] + SEAT_M * normal, turn.as_quat()]))
 
 

@@ -109,19 +109,12 @@ def read_answer(frame: bytes) -> Answer | None:
 
 
 class StateCheck:
-    """Makes states of answers, and refuses those that cannot follow the last one.
-
-    Args:
-        ids: The motors, in the order of the arrays.
-        model: Their model.
-
-    Attributes:
-        fastest: Limits of the motors' speeds, as far as they are known [rad/s] [D].
-    """
+    """Makes states of the answers of some motors, and refuses those that cannot follow the last one."""
 
     def __init__(self, ids: Sequence[int], model: Model):
         self._ids, self._model, self._items = tuple(ids), model, table(model)
         self.fastest = np.full(len(self._ids), np.inf)
+        """Limits of the motors' speeds, as far as they are known [rad/s] [D]."""
         self._last: HandState | None = None
 
     def forget(self) -> None:

@@ -9,7 +9,7 @@ import os
 import termios
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -37,15 +37,20 @@ from vd.deploy.hardware.control_table import (
     table,
     to_counts,
 )
-from vd.deploy.hardware.packets import MAX_ID
-from vd.deploy.hardware.port import BAUD_RATE, WAIT_S, KeptPacket, open_port, pseudo, sdk
+from vd.deploy.hardware.packets import BROADCAST, MAX_ID, STATUS_BYTES, Instruction, Packet, encode, numbers
+from vd.deploy.hardware.port import BAUD_RATE, WAIT_S, open_port, pseudo, sdk
 from vd.deploy.hardware.registers import MotorSettings, different
 
+T = TypeVar("T")
 STARVED_S = 0.02
 """A read of the port that returns so much too late may have missed an answer: motors answer within 5 ms, and
 the SDK, once it runs again, finds that its 34 ms are over."""
 BUSY = "this computer is busy; end other programs, or give this one real-time priority (ulimit -r 1)"
-TORQUE_BYTES = 1
+TWICE = (
+    "its answers are garbled: two motors have the ID {id} (unplug one, and give the other a new one with "
+    "ROBOTIS' DYNAMIXEL Wizard 2.0), or a cable is bad"
+)
+"""What garbled answers mean."""
 RETRIES, TWIN_RETRIES = 1, 3
 """The twin is a process among others, which may not run for longer than the SDK waits for an answer."""
 LATE_S = 0.02
@@ -114,17 +119,6 @@ class MotorBus:
         """Name of the port."""
         return str(self._port.getPortName())
 
-    def _garbled(self, result: int) -> bool:
-        """Whether what answered the last exchange is no sound packet, though this program listened."""
-        return bool(result == self._sdk.COMM_RX_CORRUPT) and self._late_s <= STARVED_S
-
-    def _twice(self, id: int) -> str:
-        """What garbled answers mean."""
-        return (
-            f"its answers are garbled: two motors have the ID {id} (unplug one, and give the other a new one "
-            "with ROBOTIS' DYNAMIXEL Wizard 2.0), or a cable is bad"
-        )
-
     def close(self) -> None:
         """Close the port. Torque stays as it is."""
         with self._lock:
@@ -151,32 +145,32 @@ class MotorBus:
             finally:
                 self._port.is_using = False  # else no packet could follow an exchange that was interrupted
 
-    def _ask(self, ask: Callable[..., tuple[Any, int, int]], *arguments: Any) -> tuple[Any, int, int]:
-        """One exchange with one motor, again if no sound answer came: answer, result and error byte."""
+    def _ask(
+        self, id: int, what: str, instruction: Instruction, parameters: bytes = b"", size: int = 0
+    ) -> bytes:
+        """One exchange with one motor, again if no sound answer came: the ``size`` bytes of its answer."""
         first = self.clock.now()
         for attempt in range(self.retries + 1):
             last = self.clock.now()
-            with self._line():
-                answer, result, error = ask(self._port, *arguments)
-            sound = result == self._sdk.COMM_SUCCESS
-            if not sound or attempt:
-                # An answer that comes now is none to the next question. A sound one may have been to the
-                # first try, and that to the last is as late.
-                self.clock.sleep(LATE_S + (last - first if sound else 0.0))
-            if sound:
+            try:
+                with self._line():
+                    self._send(encode(Packet(id, instruction, parameters)), STATUS_BYTES + size)
+                    answer = self._answer(id, size, f"{what}: " if what else "")
+            except (SilentError, LateError, GarbledError) as error:
+                # An answer that comes now is none to the next question.
+                self.clock.sleep(LATE_S)
+                if attempt < self.retries:
+                    continue
+                if isinstance(error, GarbledError):
+                    raise GarbledError(f"{error}: {TWICE.format(id=id)}") from error
+                raise
+            else:
+                if attempt:  # it may have been to the first try, and that to the last is as late
+                    self.clock.sleep(LATE_S + last - first)
                 break
-        return answer, result, error
-
-    def ping(self, id: int) -> int | None:
-        """Model number of a motor, or None if it does not answer.
-
-        Raises:
-            GarbledError: Something answers, but not soundly.
-        """
-        number, result, _ = self._ask(self._packets.ping, id)
-        if self._garbled(result):
-            raise GarbledError(self._twice(id))
-        return int(number) if result == self._sdk.COMM_SUCCESS else None
+        if answer.refused:
+            raise BusError(f"motor {id}: {what}: {answer.refused}")
+        return answer.data
 
     def ping_all(self) -> dict[int, tuple[int, int]]:
         """Model number and firmware version of every motor that answers a ping to all, by ID."""
@@ -189,20 +183,19 @@ class MotorBus:
         wrong = {}
         for id in self.ids:
             try:
-                number = self.ping(id)
-            except GarbledError as error:
+                number = int.from_bytes(self._ask(id, "", Instruction.PING, size=3)[:2], "little")
+            except (SilentError, LateError, GarbledError) as error:
                 wrong[id] = str(error)
-                continue
-            if number is None:
-                wrong[id] = str(self._silence("does not answer"))
-            elif number != self.model.number:
-                wrong[id] = f"is {model_name(number)}, not {self.model.name}"
+            else:
+                if number != self.model.number:
+                    wrong[id] = f"motor {id} is {model_name(number)}, not {self.model.name}"
         return wrong
 
     def read(self, id: int, name: str) -> int:
         """Value of one item of the control table."""
         item = self._items[name]
-        return item.from_bytes(self._read(id, name, item.address, item.size))
+        where = numbers(item.address, item.size)
+        return item.from_bytes(self._ask(id, f"read {name}", Instruction.READ, where, item.size))
 
     def read_table(self, id: int) -> dict[str, int]:
         """The whole control table of a motor, with one packet: values by item.
@@ -210,40 +203,17 @@ class MotorBus:
         Raises:
             BusError: No sound answer; GarbledError where answers came that were none.
         """
-        data = self._read(id, "the control table", 0, SIZE)
+        data = self._ask(id, "read the control table", Instruction.READ, numbers(0, SIZE), SIZE)
         return {
             name: item.from_bytes(data[item.address : item.address + item.size])
             for name, item in self._items.items()
         }
 
-    def _read(self, id: int, what: str, address: int, size: int) -> bytes:
-        """Bytes of the control table of a motor."""
-
-        def receive(_: Any, motor: int, address: int, size: int) -> tuple[bytes, int, int]:
-            result = self._packets.readTx(self._port, motor, address, size)
-            if result != self._sdk.COMM_SUCCESS:
-                return b"", result, 0
-            frame, result = self._packets.rxPacket(self._port, False)
-            answer = read_answer(bytes(frame)) if result == self._sdk.COMM_SUCCESS else None
-            # The SDK's own reading takes any answer, such as one to a write that came late.
-            if answer is None or answer.id != motor or (not answer.refused and len(answer.data) != size):
-                return b"", result if result != self._sdk.COMM_SUCCESS else self._sdk.COMM_RX_CORRUPT, 0
-            return answer.data, result, answer.error
-
-        data, result, error = self._ask(receive, id, address, size)
-        self._check(id, f"read {what}", result, error)
-        return bytes(data)
-
     def write(self, id: int, name: str, value: int) -> None:
         """Write one item of the control table."""
         item = self._items[name]
-        data = list(item.to_bytes(value))
-
-        def send(*arguments: Any) -> tuple[None, int, int]:
-            return None, *self._packets.writeTxRx(*arguments)
-
-        _, result, error = self._ask(send, id, item.address, item.size, data)
-        self._check(id, f"write {value} to {name}", result, error)
+        data = numbers(item.address) + item.to_bytes(value)
+        self._ask(id, f"write {value} to {name}", Instruction.WRITE, data)
 
     def configure(self, settings: Mapping[int, MotorSettings]) -> None:
         """Torque off, write what differs of the registers that are ours to set, and read all of it back.
@@ -255,16 +225,21 @@ class MotorBus:
         for id in self.ids:
             self.write(id, "torque_enable", 0)
             for _ in range(2):  # another operating mode changes the gains
-                for one, (_, wanted) in different(self.read_table(id), self.model, settings[id]).items():
-                    self.write(id, one.name, wanted)
-            for one, (found, wanted) in different(self.read_table(id), self.model, settings[id]).items():
-                wrong.append(f"motor {id}: {one.name} is {found}, not {wanted}")
+                for name, (_, wanted) in self._to_set(id, settings[id]).items():
+                    self.write(id, name, wanted)
+            for name, (found, wanted) in self._to_set(id, settings[id]).items():
+                wrong.append(f"motor {id}: {name} is {found}, not {wanted}")
         if wrong:
             raise BusError("; ".join(wrong))
         with self._lock:
             self._settings = dict(settings)
             self._states.fastest[:] = [settings[id].velocity_limit_rad_s for id in self.ids]
             self._states.forget()
+
+    def _to_set(self, id: int, settings: MotorSettings) -> dict[str, tuple[int, int]]:
+        """Registers that are ours to set and differ: value, and the wanted one."""
+        rows = different(self.read_table(id), self.model, settings)
+        return {one.name: values for one, values in rows.items() if not one.remedy}
 
     def torque(self, on: bool, ids: Iterable[int] | None = None) -> dict[int, str]:
         """Switch torque on or off. Goes on to the other motors if one does not answer.
@@ -332,15 +307,13 @@ class MotorBus:
     def _write_all(self, name: str, values: Sequence[int], *, later: bool = False) -> None:
         """Write one item of every motor in one packet, now or with the question for their state."""
         item = self._items[name]
-        rows = [
-            byte for id, value in zip(self.ids, values, strict=True) for byte in (id, *item.to_bytes(value))
-        ]
+        rows = [bytes([id]) + item.to_bytes(value) for id, value in zip(self.ids, values, strict=True)]
+        parameters = numbers(item.address, item.size) + b"".join(rows)
+        packet = encode(Packet(BROADCAST, Instruction.SYNC_WRITE, parameters))
         with self._line():
-            port = KeptPacket() if later else self._port
-            result = self._packets.syncWriteTxOnly(port, item.address, item.size, rows, len(rows))
-            self._goals = port.packet if later else b""
-        if result != self._sdk.COMM_SUCCESS:
-            raise BusError(f"{name} was not sent: {self._words(result)}")
+            self._goals = packet if later else b""
+            if not later:
+                self._send(packet)
 
     def read_state(self, *, retries: int | None = None) -> HandState:
         """Read all motors at once.
@@ -351,41 +324,41 @@ class MotorBus:
         Raises:
             BusError: No whole, fresh and possible state came, also not when asked again; names the motor.
         """
-        retries = self.retries if retries is None else retries
-        for attempt in range(retries + 1):
-            try:
-                return self._read_state()
-            except BusError:
-                self.rejected += 1
-                self._length = STATE_BYTES + OTHER_BYTES - self._length
-                if attempt == retries:
-                    raise
-        raise AssertionError("retries are not negative")
+        return self._again(self._read_state, self.retries if retries is None else retries)
+
+    def _again(self, ask: Callable[[], T], retries: int) -> T:
+        """What all motors answer, asked again where no sound answer came."""
+        for _ in range(retries):
+            with contextlib.suppress(BusError):
+                return ask()
+        return ask()
 
     def _read_state(self) -> HandState:
-        with self._line():
-            asked = self.clock.now()
-            goals, self._goals = self._goals, b""
-            heard, answers = self._ask_all(STATE_ADDRESS, self._length, before=goals)
-            took = self.clock.now() - asked
-            if took > CLOCK_TOLERANCE_S:
-                # This process did not run: whose time is not known is nothing to compare later ones with.
-                raise LateError(f"the state took {took:.3f} s: {BUSY}")
-            # Motors measure when they have heard it, or not before they answer. A later time than theirs
-            # would look like a delay of the goals, which has a name; an earlier one does not.
-            return self._states.accept(heard, answers)
+        try:
+            with self._line():
+                asked = self.clock.now()
+                goals, self._goals = self._goals, b""
+                heard, answers = self._ask_all(STATE_ADDRESS, self._length, before=goals)
+                took = self.clock.now() - asked
+                if took > CLOCK_TOLERANCE_S:
+                    # This process did not run: whose time is not known is nothing to compare later ones with.
+                    raise LateError(f"the state took {took:.3f} s: {BUSY}")
+                # Motors measure when they have heard it, or not before they answer. A later time than theirs
+                # would look like a delay of the goals, which has a name; an earlier one does not.
+                return self._states.accept(heard, answers)
+        except BusError:
+            self.rejected += 1
+            self._length = STATE_BYTES + OTHER_BYTES - self._length
+            raise
 
     def read_torque(self) -> np.ndarray:
         """Whether each motor has its torque on, shape [D] bool."""
+        return self._again(self._read_torque, self.retries)
+
+    def _read_torque(self) -> np.ndarray:
         item = self._items["torque_enable"]
-        for attempt in range(self.retries + 1):
-            try:
-                with self._line():
-                    _, answers = self._ask_all(item.address, item.size)
-                break
-            except BusError:
-                if attempt == self.retries:
-                    raise
+        with self._line():
+            _, answers = self._ask_all(item.address, item.size)
         return np.array([bool(item.from_bytes(answer.data)) for answer in answers])
 
     def _ask_all(self, address: int, length: int, before: bytes = b"") -> tuple[float, list[Answer]]:
@@ -396,39 +369,42 @@ class MotorBus:
             length: How many.
             before: Packets to send in one piece with it.
         """
-        ids, question = list(self.ids), KeptPacket()
-        self._packets.syncReadTx(question, address, length, ids, len(ids), fast_option=False)
-        packets = before + question.packet
-        self._port.clearPort()
-        if self._port.writePort(packets) != len(packets):
-            raise BusError("the motors were not asked: the port did not take the packet")
-        self._port.setPacketTimeout(question.answer_bytes)
+        question = encode(
+            Packet(BROADCAST, Instruction.SYNC_READ, numbers(address, length) + bytes(self.ids))
+        )
         # One time for all: the SDK counts no time for the answers' bytes.
-        heard = self._listened_s = self.clock.now()
-        answers = [self._answer(id, length) for id in ids]
+        heard = self._send(before + question, (STATUS_BYTES + length) * len(self.ids))
+        answers = [self._answer(id, length) for id in self.ids]
         for answer in answers:
             if answer.refused:
                 raise BusError(f"motor {answer.id}: {answer.refused}")
-            if len(answer.data) != length:
-                raise BusError(f"motor {answer.id}: {len(answer.data)} bytes came, not {length}")
         return heard, answers
 
-    def _answer(self, id: int, length: int) -> Answer:
-        """This motor's next answer."""
+    def _send(self, packets: bytes, answer_bytes: int = 0) -> float:
+        """Send packets in one piece, and wait from then on for so many bytes: when they were sent [s]."""
+        self._port.clearPort()
+        if self._port.writePort(packets) != len(packets):
+            raise BusError(f"{self.port} did not take what was to be sent")
+        self._port.setPacketTimeout(answer_bytes)
+        self._listened_s = self.clock.now()
+        return self._listened_s
+
+    def _answer(self, id: int, size: int, what: str = "") -> Answer:
+        """This motor's next answer of ``size`` bytes, or that it refuses.
+
+        What else comes is late from an exchange before: the time limit is one for all.
+        """
         while True:
             frame, result = self._packets.rxPacket(self._port, False)
             if result != self._sdk.COMM_SUCCESS:
-                raise self._failure(f"motor {id}", result)
+                break
             answer = read_answer(bytes(frame))
-            if answer is None:
-                raise BusError(f"motor {id}: what answered is no status packet")
-            late = len(answer.data) in {STATE_BYTES, OTHER_BYTES, TORQUE_BYTES} - {length}
-            if answer.id == id and not late:
-                return answer  # others come late from an exchange before; the time limit is one for all
-
-    def _words(self, result: int) -> str:
-        """What went wrong in an exchange, in the SDK's words."""
-        return str(self._packets.getTxRxResult(result)).removeprefix("[TxRxResult] ").rstrip("!.")
+            if answer is not None and answer.id == id and (answer.refused or len(answer.data) == size):
+                return answer
+        if result == self._sdk.COMM_RX_TIMEOUT or self._late_s > STARVED_S:
+            raise self._silence(f"{what}motor {id} does not answer")
+        words = self._packets.getTxRxResult(result).removeprefix("[TxRxResult] ").rstrip("!.")
+        raise GarbledError(f"motor {id}: {what}{words}")
 
     def _silence(self, what: str) -> BusError:
         """Nobody was heard in the last exchange: by this program's own fault, or the motor's."""
@@ -440,17 +416,3 @@ class MotorBus:
         return SilentError(
             f"{what}: check its cable, power, baud rate and ID, which may be that of another motor"
         )
-
-    def _failure(self, what: str, result: int) -> BusError:
-        """What went wrong in the last exchange."""
-        if result == self._sdk.COMM_RX_TIMEOUT or self._late_s > STARVED_S:
-            return self._silence(f"{what} does not answer")
-        return BusError(f"{what}: {self._words(result)}")
-
-    def _check(self, id: int, what: str, result: int, error: int) -> None:
-        if self._garbled(result):
-            raise GarbledError(f"motor {id}: {what}: {self._words(result)}: {self._twice(id)}")
-        if result != self._sdk.COMM_SUCCESS:
-            raise self._failure(f"{what}: motor {id}", result)
-        if refused := Answer(id, error, b"").refused:
-            raise BusError(f"motor {id}: {what}: {refused}")

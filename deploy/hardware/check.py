@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
+from vd.assets_usd.hand_data import CameraModel
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.finding import Finding, finding, listed, show
 from vd.deploy.hardware.answers import BusError, GarbledError, LateError
@@ -21,7 +22,7 @@ from vd.deploy.hardware.motion import move
 from vd.deploy.hardware.registers import RESTART, Register, different, kept
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import SafeHand
-from vd.deploy.twin.child import TwinCamera
+from vd.deploy.twin.child import TwinCamera, TwinChild
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def preflight(connection: Connection) -> Iterator[Finding]:
         yield from adapter_findings(bus.port)
         missing = bus.missing()
         tables, deaf = _read_tables(bus, [id for id in bus.ids if id not in missing])
-        wrong = [f"motor {id} {why}" for id, why in missing.items()] + deaf
+        wrong = [*missing.values(), *deaf]
         if strangers := sorted(set(bus.ping_all()) - set(bus.ids)) if missing else []:
             wrong.insert(0, f"ID {', '.join(map(str, strangers))} answers, and is none of the hand's")
         yield finding("motors answer", wrong, f"all {len(bus.ids)}")
@@ -136,25 +137,23 @@ def register_findings(connection: Connection, tables: Tables) -> Iterator[Findin
         yield Finding("registers", False, str(error))
         return
     rows: dict[Register, list[tuple[int, int, int]]] = {}
-    for ours in (False, True):
-        for id, found in tables.items():
-            for one, values in different(found, bus.model, settings[id], ours=ours).items():
-                rows.setdefault(one, []).append((id, *values))
+    for id, found in tables.items():
+        for one, values in different(found, bus.model, settings[id]).items():
+            rows.setdefault(one, []).append((id, *values))
     for one, motors in rows.items():
-        if one.remedy:
-            mend = [
-                f"motor {id}: {value}; {one.remedy.format(wanted=wanted)}" for id, value, wanted in motors
-            ]
-            yield Finding(one.name, False, f"{one.why}: {listed(mend)}")
-            continue
         alike: dict[tuple[int, int], list[str]] = {}
         for id, value, wanted in motors:
             alike.setdefault((value, wanted), []).append(str(id))
-        changes = [
-            f"motor {', '.join(ids)}: {old}; will be set to {new}" for (old, new), ids in alike.items()
-        ]
+        remedy = one.remedy or "will be set to {wanted}"
+        changes = listed(
+            [
+                f"motor {', '.join(ids)}: {value}; {remedy.format(wanted=wanted)}"
+                for (value, wanted), ids in alike.items()
+            ]
+        )
         where = " (kept without power)" if kept(bus.model, one) else ""
-        yield Finding(one.name, True, f"{listed(changes)}{where}; else {one.why}")
+        found_is = f"{one.why}: {changes}" if one.remedy else f"{changes}{where}; else {one.why}"
+        yield Finding(one.name, not one.remedy, found_is)
     if not rows:
         yield Finding("registers", True, "as the hand needs them")
 
@@ -290,6 +289,15 @@ def confirm(question: str, *, yes: bool) -> None:
         raise RuntimeError("nothing moves: not confirmed")
 
 
+def open_camera(cfg: RealSenseCfg, twin: TwinChild | None, place: CameraModel) -> "Camera":
+    """The depth camera, or that of a twin, which it was told to have at this place.
+
+    Raises:
+        CameraError: There is none, or it has no such images.
+    """
+    return RealSense(find_device(cfg.serial), cfg) if twin is None else TwinCamera(twin, place)
+
+
 def camera_preflight(cfg: CheckCfg, connection: Connection) -> Iterator[Finding]:
     """Find the camera, and look at it."""
     from vd.assets_usd.camera_layer import read_camera
@@ -298,15 +306,11 @@ def camera_preflight(cfg: CheckCfg, connection: Connection) -> Iterator[Finding]
 
     hand, twin = connection.hand, connection.twin
     place = hand.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
-    camera: Camera
-    if twin is not None:
-        camera = TwinCamera(twin, place)
-    else:
-        try:
-            camera = RealSense(find_device(cfg.camera.serial), cfg.camera)
-        except CameraError as error:
-            yield Finding("camera", False, str(error))
-            return
+    try:
+        camera = open_camera(cfg.camera, twin, place)
+    except CameraError as error:
+        yield Finding("camera", False, str(error))
+        return
     with contextlib.closing(camera):
         fps = PAPER.scene.control_hz if twin is not None else cfg.camera.fps
         yield from camera_findings(camera, place, fps=fps)
@@ -315,7 +319,7 @@ def camera_preflight(cfg: CheckCfg, connection: Connection) -> Iterator[Finding]
 def check(cfg: CheckCfg) -> int:
     """Look, and print a table; 1 if something is wrong."""
     with contextlib.ExitStack() as stack:
-        connection = stack.enter_context(connect(cfg, [] if cfg.no_camera else ["--object", "cube"]))
+        connection = stack.enter_context(connect(cfg, object=None if cfg.no_camera else "cube"))
         findings = show(preflight(connection), quiet=cfg.json)
         if not cfg.no_camera:
             findings += show(camera_preflight(cfg, connection), quiet=cfg.json)

@@ -2,10 +2,10 @@
 
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -76,12 +76,12 @@ def read_hand_and_joints(options: HandOptions) -> tuple["HandModel", "Joints"]:
 
 
 @contextlib.contextmanager
-def connect(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[Connection]:
+def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
     """Open the bus to the hand of the options; a twin behind it is started, and ended with the block.
 
     Args:
         options: The options.
-        twin_options: More of the twin's, if there is one.
+        twin_options: Defaults of the twin, if there is one: fields of TwinCommand.
 
     Raises:
         ValueError: Options that cannot be.
@@ -90,6 +90,7 @@ def connect(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[
     """
     from vd.deploy.hardware.bus import MotorBus
     from vd.deploy.twin.child import TwinChild
+    from vd.deploy.twin.twin import TwinCommand
 
     hand, joints = read_hand_and_joints(options)
     if options.twin == (options.port is not None):
@@ -97,17 +98,22 @@ def connect(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[
     with contextlib.ExitStack() as stack:
         twin, port = None, options.port
         if port is None:
+            default = TwinCommand(
+                hand=options.hand,
+                hand_layer=options.hand_layer,
+                calibration=options.calibration,
+                model=options.motor,
+                **twin_options,
+            )
+            command = tyro.cli(
+                TwinCommand, args=options.twin_args.split(), default=default, prog="--twin-args"
+            )
             print(
                 "starting the twin (the first start compiles its kernels for minutes) ...",
                 file=sys.stderr,
                 flush=True,
             )
-            arguments = ["--hand", options.hand, "--model", options.motor]
-            if options.hand_layer is not None:
-                arguments += ["--hand-layer", str(options.hand_layer)]
-            if options.calibration is not None:
-                arguments += ["--calibration", str(options.calibration)]
-            twin = TwinChild([*arguments, *twin_options, *options.twin_args.split()])
+            twin = TwinChild(command)
             stack.callback(twin.close)
             port = twin.path
         bus = MotorBus(port, joints.ids, options.motor, baud_rate=options.baud_rate)

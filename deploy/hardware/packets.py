@@ -15,6 +15,8 @@ BROADCAST = 0xFE
 MAX_ID = 0xFC
 SHORTEST, LONGEST = 3, 1024
 """Values of the length field: instruction and CRC at least; the largest buffer of an X motor at most."""
+STATUS_BYTES = 11
+"""Bytes of a status packet without data."""
 POLYNOMIAL = 0x8005
 ALERT = 0x80
 """Bit of a status packet's error byte: the motor's hardware error status is not zero."""
@@ -77,6 +79,11 @@ def encode(packet: Packet) -> bytes:
     body = body.replace(STUFFED, STUFFED + STUFFING)
     start = HEADER + bytes([packet.id]) + (len(body) + 2).to_bytes(2, "little") + body
     return start + crc16(start).to_bytes(2, "little")
+
+
+def numbers(*values: int) -> bytes:
+    """Numbers of two bytes, as addresses and lengths are."""
+    return b"".join(value.to_bytes(2, "little") for value in values)
 
 
 def status(id: int, error: int, data: bytes = b"") -> Packet:

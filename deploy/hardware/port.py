@@ -4,7 +4,6 @@ import errno
 import fcntl
 import os
 import termios
-from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,25 +17,6 @@ WAIT_S = 0.002
 again and again, which takes a core, and keeps whatever shares it from answering."""
 PSEUDO_TERMINALS = "/dev/pts/"
 """A twin holds its own end of these open, so exclusive use by one program is for the lock alone."""
-
-
-class KeptPacket:
-    """In place of a port: keeps the packet that the SDK makes."""
-
-    def __init__(self) -> None:
-        self.is_using, self.packet, self.answer_bytes = False, b"", 0
-
-    def clearPort(self) -> None:  # noqa: N802 (the SDK's name)
-        """Nothing has come."""
-
-    def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
-        """Keep it."""
-        self.packet = bytes(packet)
-        return len(packet)
-
-    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
-        """Keep how long the answer is."""
-        self.answer_bytes = packet_length
 
 
 def sdk() -> ModuleType:
@@ -63,34 +43,19 @@ def open_port(path: str, baud_rate: int = BAUD_RATE) -> Any:
         BusError: It cannot be opened, another program has it, or there is no SDK.
     """
     handler = sdk().PortHandler(path)
-    try:
-        _ask_for(path)
-        opened = handler.setBaudRate(baud_rate)
-        if opened:
-            fcntl.flock(handler.ser.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if not pseudo(path):
-                fcntl.ioctl(handler.ser.fileno(), termios.TIOCEXCL)
-    except OSError as error:  # the SDK lets errors of the serial port through
-        if handler.is_open:
-            handler.closePort()
-        raise BusError(f"cannot open {path}: {_why(path, error)}") from error
-    if not opened:
+    import serial
+
+    if handler.getCFlagBaud(baud_rate) < 0:
         raise BusError(f"{path}: no baud rate {baud_rate}")
-    handler.ser.timeout = WAIT_S
-    return handler
-
-
-def _ask_for(path: str) -> None:
-    """Whether the port is free, before the SDK opens it: that drops what has come for whoever has it.
-
-    Raises:
-        OSError: It is not, or cannot be opened.
-    """
-    probe = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
-        fcntl.flock(probe, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    finally:
-        os.close(probe)
+        # The SDK's own opening drops what has come for whoever has the port.
+        handler.ser = serial.Serial(path, baud_rate, timeout=WAIT_S, exclusive=True)
+        if not pseudo(path):
+            fcntl.ioctl(handler.ser.fileno(), termios.TIOCEXCL)
+    except OSError as error:
+        raise BusError(f"cannot open {path}: {_why(path, error)}") from error
+    handler.baudrate, handler.tx_time_per_byte, handler.is_open = baud_rate, 1e4 / baud_rate, True
+    return handler
 
 
 def pseudo(path: str) -> bool:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
@@ -24,7 +24,7 @@ from vd.deploy.hardware.motion import move
 from vd.deploy.hardware.registers import D_GAIN, P_GAIN
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
-from vd.deploy.timely import real_time, undisturbed
+from vd.deploy.timely import undisturbed
 from vd.files import check_folder
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ ASIDE = 0.8
 hand a straight finger that bends through its range would press on its neighbour."""
 WIDE = SafetyCfg(step_rad=4.0)
 """Steps go through most of a joint's range at once, which a policy must not."""
-TWIN_ARGS = ("--physics-hz", "3840")
+TWIN_HZ = 3840.0
 """Steps of the twin so short that its integrator is as exact as vd-gap's: at 960 Hz it is off by 0.3 mrad
 (median of a moving hand; up to 0.9), two thirds of what the encoders round."""
 RATE_SHARE = 0.95
@@ -100,6 +100,15 @@ class Motion:
         return mass, self.excitation.joints[0].partition("_")[0] if mass > 0.0 else ""
 
 
+class Sample(NamedTuple):
+    """A goal and the state at the moment at which it arrived, of the whole hand."""
+
+    state: HandState
+    goal: np.ndarray
+    sent_s: float
+    enabled: np.ndarray
+
+
 def motions_of(hand: "HandModel", fingers: Sequence[int], sets: Sequence[str]) -> list[Motion]:
     """The motions of excitation sets, finger by finger.
 
@@ -136,9 +145,7 @@ def _motion(file: str, excitation: "Excitation", hand: "HandModel") -> Motion:
 def read_plan(path: Path, hand: "HandModel") -> list[Motion]:
     """The motions of a plan that ``vd-gap plan`` wrote; joints that it does not name are straight.
 
-    Args:
-        path: ``next_experiment.json``, or the folder with it.
-        hand: The hand.
+    ``path`` is next_experiment.json, or the folder with it.
 
     Raises:
         RecordError: It is no such plan, or one of another hand.
@@ -211,15 +218,7 @@ def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
 
 
 def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float) -> "Trajectory":
-    """Go to where a motion starts, play it on an armed hand, and give what was measured.
-
-    A sample is a goal and the state at the moment at which it arrived.
-
-    Args:
-        safe: The hand.
-        motion: The motion.
-        columns: The joints that are recorded.
-        rate_hz: Samples a second that are tried.
+    """Go to where a motion starts, play it on an armed hand, and give what was measured of some joints.
 
     Raises:
         StoppedError: The hand was stopped.
@@ -229,7 +228,7 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
     move(safe, excitation.command[0], SPEED_RAD_S)
     motors = [bus.ids[column] for column in columns]
     _set_gain(bus, motors, int(float(excitation.conditions["p_gain"])))
-    states, goals, sent, enabled = list[HandState](), list[np.ndarray](), list[float](), list[np.ndarray]()
+    samples = list[Sample]()
     pacer = Pacer(rate_hz, bus.clock)
     pacer.wait()
     begin = pacer.due_s
@@ -242,17 +241,14 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
         goal = safe.command(excitation.command[at], with_state=True)
         sent_s = bus.clock.now()
         state = safe.read()
-        if not states or state.time_s > states[-1].time_s:  # else the last one again
-            states.append(state)
-            goals.append(goal)
-            sent.append(sent_s)
-            enabled.append(on)
+        if not samples or state.time_s > samples[-1].state.time_s:  # else the last one again
+            samples.append(Sample(state, goal, sent_s, on))
         safe.beat()
         pacer.wait()
     if not on.all():
         safe.switch(np.ones_like(on))
     _set_gain(bus, motors, P_GAIN)
-    return _trajectory(motion, columns, states, goals, np.array(sent), enabled)
+    return _trajectory(motion, columns, samples)
 
 
 def _set_gain(bus: MotorBus, motors: Sequence[int], gain: int) -> None:
@@ -261,22 +257,16 @@ def _set_gain(bus: MotorBus, motors: Sequence[int], gain: int) -> None:
             bus.write(id, "position_p_gain", gain)
 
 
-def _trajectory(
-    motion: Motion,
-    columns: Sequence[int],
-    states: Sequence[HandState],
-    goals: Sequence[np.ndarray],
-    sent_s: np.ndarray,
-    enabled: Sequence[np.ndarray],
-) -> "Trajectory":
+def _trajectory(motion: Motion, columns: Sequence[int], samples: Sequence[Sample]) -> "Trajectory":
     """What was measured, of some joints, at the times of the motors' clocks."""
     from vd.gap.recording import Trajectory
 
     def of(name: str) -> np.ndarray:
-        return np.array([getattr(state, name) for state in states])[:, columns]
+        return np.array([getattr(one.state, name) for one in samples])[:, columns]
 
-    asked_s = np.array([state.time_s for state in states])
-    measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
+    asked_s = np.array([one.state.time_s for one in samples])
+    sent_s = np.array([one.sent_s for one in samples])
+    measured_s = measured_at(asked_s, np.array([one.state.tick for one in samples]))
     # A goal arrives with the question for its state, unless that was asked again.
     sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
     measured: dict[str, Any] = {name: of(name) for name in STATE_CHANNELS}
@@ -287,9 +277,9 @@ def _trajectory(
         conditions=motion.excitation.conditions,
         time=measured_s - measured_s[0],
         command_time=sent_s - measured_s[0],
-        command=np.array(goals)[:, columns],
+        command=np.array([one.goal for one in samples])[:, columns],
         position=of("position"),
-        enabled=np.array(enabled)[:, columns],
+        enabled=np.array([one.enabled for one in samples])[:, columns],
         # A motor that does not tell its duty cycle says zero.
         **{name: values for name, values in measured.items() if name != "pwm" or values.any()},
     )
@@ -308,9 +298,8 @@ def record(cfg: RecordCfg) -> int:
         motions_of(hand, cfg.fingers, cfg.excitations) if cfg.plan is None else read_plan(cfg.plan, hand)
     )
     with (
-        connect(cfg, [*TWIN_ARGS, *["--realtime"] * cfg.realtime]) as connection,
-        undisturbed(),
-        real_time(cfg.realtime),
+        connect(cfg, physics_hz=TWIN_HZ, realtime=cfg.realtime) as connection,
+        undisturbed(cfg.realtime),
     ):
         recording = _begun(cfg, connection, joints)
         done = {trajectory.file for trajectory in recording.trajectories}

@@ -97,7 +97,7 @@ class MotorSettings:
 
 
 def different(
-    found: Mapping[str, int], model: Model, settings: MotorSettings, *, ours: bool = True
+    found: Mapping[str, int], model: Model, settings: MotorSettings
 ) -> dict[Register, tuple[int, int]]:
     """Registers that are not as they should be: the value of each, and the wanted one.
 
@@ -105,12 +105,9 @@ def different(
         found: Control table of a motor.
         model: Its model.
         settings: What its joint wants; the factory's values otherwise.
-        ours: Those that we set, else those that only a person can.
     """
     items, own = table(model), settings.values(model)
-    wanted = {
-        one: own.get(one.name, items[one.name].initial) for one in REGISTERS if ours != bool(one.remedy)
-    }
+    wanted = {one: own.get(one.name, items[one.name].initial) for one in REGISTERS}
     return {
         one: (found[one.name], value)
         for one, value in wanted.items()

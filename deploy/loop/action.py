@@ -11,15 +11,7 @@ from vd.kernels.task.actions import ActionParams, apply_action_kernel
 
 
 class ActionFilter:
-    """Clip, moving average and increment of the training.
-
-    Args:
-        hand: The hand.
-        task: Environment of the training.
-
-    Attributes:
-        smoothed: Moving average of the actions so far [D]; what a policy sees as its previous action.
-    """
+    """Clip, moving average and increment of the training whose environment is ``task``."""
 
     def __init__(self, hand: HandModel, task: ReorientCfg):
         params = ActionParams()
@@ -38,7 +30,7 @@ class ActionFilter:
 
     @property
     def smoothed(self) -> np.ndarray:
-        """Moving average of the actions so far [D]."""
+        """Moving average of the actions so far [D]; what a policy sees as its previous action."""
         return self._smoothed.numpy()[0].copy()
 
     def reset(self) -> None:

@@ -99,11 +99,16 @@ def scan_object(path: Path) -> ObjectModel:
         raise GoalError(f"{path}: {error}; scan it from more sides") from error
 
 
-def read_goals(texts: Sequence[str]) -> list[np.ndarray]:
-    """Orientations as they were typed, or from files, in their order.
+def make_goals(
+    texts: Sequence[str], drawn: int = 0, max_angle: float = np.pi, *, seed: int = 0
+) -> list[np.ndarray]:
+    """Goals as they were typed, in their order, or drawn ones, each within an angle of the one before.
 
     Args:
         texts: ``x,y,z,w``, ``x,y,z@degrees``, or a file (.txt, .csv) with one on each line, # for comments.
+        drawn: How many to draw where there are none.
+        max_angle: Largest angle between two drawn goals [rad]; the first from no rotation.
+        seed: Of the draw.
 
     Returns:
         Unit quaternions xyzw, the same whichever of its two signs was typed.
@@ -111,7 +116,7 @@ def read_goals(texts: Sequence[str]) -> list[np.ndarray]:
     Raises:
         GoalError: One is none, or a file cannot be read.
     """
-    goals = []
+    goals: list[np.ndarray] = []
     for text in texts:
         if Path(text).suffix.lower() not in GOALS_SUFFIXES:
             goals.append(_goal(text, f"--goal {text}"))
@@ -124,25 +129,6 @@ def read_goals(texts: Sequence[str]) -> list[np.ndarray]:
         if not found:
             raise GoalError(f"--goal {text} holds no orientation; write one on each line, such as 0,0,1@90")
         goals += found
-    return goals
-
-
-def make_goals(texts: Sequence[str], drawn: int, max_angle: float, *, seed: int) -> list[np.ndarray]:
-    """Goals as they were typed, or drawn ones, each within an angle of the one before.
-
-    Args:
-        texts: As :func:`read_goals` reads them.
-        drawn: How many to draw where there are none.
-        max_angle: Largest angle between two drawn goals [rad]; the first from no rotation.
-        seed: Of the draw.
-
-    Returns:
-        Quaternions xyzw.
-
-    Raises:
-        GoalError: A text that is no orientation.
-    """
-    goals = read_goals(texts)
     rng, last = np.random.default_rng(seed), np.array([0.0, 0.0, 0.0, 1.0])
     for _ in range(0 if goals else drawn):
         last = draw_goals(last[None], rng, max_angle)[0]

@@ -29,16 +29,6 @@ NO_SYMMETRY = np.array([[0.0, 0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
-class LoopCfg:
-    """How goals are pursued."""
-
-    episode_s: float = PAPER.scene.episode_s
-    """Time for each goal [s]."""
-    hold_s: float = 1.0
-    """How long the hand holds still after each stop [s], before it goes on."""
-
-
-@dataclass(frozen=True)
 class StepTimes:
     """Times of one control step [s], from when it was due."""
 
@@ -58,18 +48,12 @@ class ControlLoop:
     """Pursues goals, one after the other: acts until the policy says it has arrived, holds, and goes on.
 
     Args:
-        safe: The hand, behind its limits, armed.
-        runner: The policy.
-        actions: From its actions to joint goals.
-        pacer: The grid of control steps.
-        log: Takes every step.
-        cfg: Times.
+        safe: The hand, armed.
+        episode_s: Time for each goal [s].
+        hold_s: How long the hand holds still after each stop [s], before it goes on.
         camera: Depth camera; None: the policy needs none.
         twin: Knows the object's true state; None on a real hand.
         symmetry: Rotations that map the object to itself [K, 4], for the true error.
-
-    Attributes:
-        times: Of every step so far.
     """
 
     def __init__(
@@ -79,16 +63,19 @@ class ControlLoop:
         actions: ActionFilter,
         pacer: Pacer,
         log: LogWriter,
-        cfg: LoopCfg,
         *,
+        episode_s: float = PAPER.scene.episode_s,
+        hold_s: float = 1.0,
         camera: Camera | None = None,
         twin: TwinChild | None = None,
         symmetry: np.ndarray = NO_SYMMETRY,
     ):
         self._safe, self._runner, self._actions, self._pacer, self._log = safe, runner, actions, pacer, log
-        self._cfg, self._camera, self._twin, self._symmetry = cfg, camera, twin, symmetry
+        self._episode_s, self._hold_s = episode_s, hold_s
+        self._camera, self._twin, self._symmetry = camera, twin, symmetry
         self._target = safe.read().position
         self.times: list[StepTimes] = []
+        """Of every step so far."""
 
     def run(self, goals: Sequence[np.ndarray]) -> list[str]:
         """Pursue all goals [4]; the outcome of each.
@@ -109,7 +96,7 @@ class ControlLoop:
             self._log.event("stop", goal=number, outcome=outcome, distance=distance)
             if outcome == "lost":
                 break
-            for _ in range(round(self._cfg.hold_s / self._pacer.period_s)):
+            for _ in range(round(self._hold_s / self._pacer.period_s)):
                 self.step(number, goal, acting=False)
         return outcomes
 
@@ -120,7 +107,7 @@ class ControlLoop:
         self._log.event("goal", goal=number)
         distance = np.nan
         outcome = "time limit"
-        for step in range(round(self._cfg.episode_s / self._pacer.period_s)):
+        for step in range(round(self._episode_s / self._pacer.period_s)):
             ended, distance = self.step(number, goal, first=step == 0)
             if ended:
                 outcome = ended

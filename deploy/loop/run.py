@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from vd.deploy.camera.camera import Camera
-from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
+from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.finding import Finding
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
 from vd.deploy.hardware.motion import MOVE_S, move, reset_pose
@@ -24,7 +24,7 @@ from vd.deploy.hardware.registers import D_GAIN, P_GAIN
 from vd.deploy.loop.run_page import goal_results, summary_line, write_page
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand, StoppedError
-from vd.deploy.timely import real_time, undisturbed
+from vd.deploy.timely import undisturbed
 from vd.evaluate.agents import check_names
 from vd.files import check_folder
 from vd.hand_log import LogError, read_log
@@ -32,7 +32,6 @@ from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
-    from vd.assets_usd.hand_model import HandModel
     from vd.assets_usd.objects.model import ObjectModel
     from vd.deploy.loop.policy_runner import PolicyRunner
     from vd.deploy.twin.child import TwinChild
@@ -150,10 +149,10 @@ def run(cfg: RunCfg) -> int:
     fault: StoppedError | None = None
     status = 0
     camera = runner.camera or hand.camera
-    pose = [f"{value:.9g}" for value in (*camera.position, *camera.quaternion)]
-    twin_options = ["--object", cfg.object, "--camera", *pose]
-    twin_options += ["--realistic"] * cfg.realistic + ["--realtime"] * cfg.realtime
-    with connect(cfg, twin_options) as connection:
+    place = (*map(float, camera.position), *map(float, camera.quaternion))
+    with connect(
+        cfg, object=cfg.object, camera=place, realistic=cfg.realistic, realtime=cfg.realtime
+    ) as connection:
         try:
             status = _pursue(cfg, name, runner, connection, item, goals, folder)
         except StoppedError as error:
@@ -181,12 +180,13 @@ def _pursue(
     folder: Path,
 ) -> int:
     """Preflight, way to the start, the loop, and its log in a folder; the exit status."""
+    from vd.assets_usd.camera_layer import read_camera
     from vd.deploy.camera.check_camera import camera_findings
     from vd.deploy.clock import Pacer
-    from vd.deploy.hardware.check import ready
+    from vd.deploy.hardware.check import open_camera, ready
     from vd.deploy.loop.action import ActionFilter
     from vd.deploy.loop.log import LogWriter
-    from vd.deploy.loop.loop import ControlLoop, LoopCfg, summary
+    from vd.deploy.loop.loop import ControlLoop, summary
 
     hand, twin, hz = connection.hand, connection.twin, runner.task.sim.control_hz
     pose = reset_pose(hand.num_fingers)
@@ -194,12 +194,13 @@ def _pursue(
         camera: Camera | None = None
         seen: Iterable[Finding] = ()
         if runner.camera is not None:
-            camera = open_camera(cfg, runner, hand, twin)
+            camera = open_camera(cfg.camera, twin, runner.camera)
             stack.callback(camera.close)
+            where = runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
+            runner.look_by(camera.intrinsics.seen_from(where))
             seen = camera_findings(camera, runner.camera, fps=cfg.camera.fps if twin is None else hz)
         warm_up(runner, pose, goals[0], camera)
-        stack.enter_context(undisturbed())
-        stack.enter_context(real_time(cfg.realtime))
+        stack.enter_context(undisturbed(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals."
         ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=seen)
         log = LogWriter(
@@ -223,7 +224,8 @@ def _pursue(
                     ActionFilter(hand, runner.task),
                     pacer,
                     log,
-                    LoopCfg(cfg.episode_s, cfg.hold_s),
+                    episode_s=cfg.episode_s,
+                    hold_s=cfg.hold_s,
                     camera=camera,
                     twin=twin,
                     symmetry=item.symmetry,
@@ -239,27 +241,6 @@ def _pursue(
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
             report(folder, steps, pacer.missed, times)
     return int(reason == "lost")
-
-
-def open_camera(cfg: RunCfg, runner: "PolicyRunner", hand: "HandModel", twin: "TwinChild | None") -> Camera:
-    """The depth camera, by whose own lens, from where it was found to be, the policy sees from now on.
-
-    Raises:
-        CameraError: There is none, or it has no such images.
-        HandError: The layer is none of this hand.
-    """
-    from vd.assets_usd.camera_layer import read_camera
-    from vd.deploy.twin.child import TwinCamera
-
-    assert runner.camera is not None
-    camera: Camera
-    if twin is None:
-        camera = RealSense(find_device(cfg.camera.serial), cfg.camera)
-    else:
-        camera = TwinCamera(twin, runner.camera)
-    where = runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
-    runner.look_by(camera.intrinsics.seen_from(where))
-    return camera
 
 
 def warm_up(

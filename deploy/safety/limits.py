@@ -61,17 +61,7 @@ class SafetyCfg:
 
 
 class Limits:
-    """Limits of one hand.
-
-    Args:
-        hand: The hand; its ranges, speeds and torques are taken.
-        motor: Model of its motors.
-        names: What its joints are called when a limit is passed [D].
-        cfg: Where the limits are.
-
-    Attributes:
-        lower: Least goals [rad] [D].
-        upper: Largest goals [rad] [D].
+    """Limits of one hand; ``lower`` and ``upper`` are the least and largest goals [rad] [D].
 
     Raises:
         ValueError: The margin leaves a joint no range.

@@ -51,15 +51,7 @@ SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "asked to end", signal.SIGHU
 
 
 class StoppedError(RuntimeError):
-    """The hand was stopped; the message says why.
-
-    Args:
-        reason: Why.
-        number: Signal that asked for it; 0 for another reason.
-
-    Attributes:
-        signal: The same.
-    """
+    """The hand was stopped; the message says why, ``signal`` which one asked for it, 0 for another reason."""
 
     def __init__(self, reason: str, number: int = 0):
         super().__init__(reason)
@@ -90,14 +82,8 @@ def unheard(error: BusError) -> str:
 class SafeHand:
     """A hand whose goals are limited and that stops by itself.
 
-    Once it is stopped, each method raises :class:`StoppedError` with the reason.
-
-    Args:
-        bus: Its motors, configured.
-        joints: Which motor turns which joint.
-        hand: The hand; its limits are taken.
-        cfg: Limits.
-        say: Tells the person.
+    Once it is stopped, each method raises :class:`StoppedError` with the reason. Its bus has to be
+    configured; ``say`` tells the person.
     """
 
     def __init__(
@@ -293,12 +279,7 @@ class SafeHand:
         return ""
 
     def _stop(self, reason: str, *, lost: bool = False) -> StoppedError:
-        """Hold, and give what to raise.
-
-        Args:
-            reason: Why.
-            lost: Whether the bus is not to be relied on.
-        """
+        """Hold, without the states of a bus that is ``lost``, and give what to raise."""
         self._hold(reason, lost=lost)
         return self._error()
 

@@ -4,19 +4,16 @@ Beside its motors it tells what no real hand does: the object's true pose and de
 """
 
 import multiprocessing
-import select
-import subprocess
-import sys
-import tempfile
+import os
 import threading
-import time
-from collections.abc import Sequence
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 
 from vd.assets_usd.hand_data import Intrinsics
 from vd.deploy.camera.camera import Frame, StaleCamera
+from vd.deploy.twin.twin import TwinCommand
 
 START_S = 1200.0
 """Longest start: on a machine that has not compiled the simulator's kernels, and has other work."""
@@ -31,50 +28,33 @@ class TwinError(RuntimeError):
 
 
 class TwinChild:
-    """A running twin.
-
-    Args:
-        arguments: Of ``python -m vd.deploy.twin.twin``.
-
-    Attributes:
-        path: Device of its bus.
+    """A running twin, with the device of its bus as ``path``.
 
     Raises:
         TwinError: It did not start; says why.
     """
 
-    def __init__(self, arguments: Sequence[str]):
+    def __init__(self, command: TwinCommand):
         """Start it and wait until it serves."""
-        self._pipe, far = multiprocessing.Pipe()
+        new = multiprocessing.get_context("spawn")
+        self._pipe, far = new.Pipe()
         self._lock = threading.Lock()
-        self._words = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed with the twin)
-        # A session of its own: Ctrl-C in the terminal is for the one who drives the hand.
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "vd.deploy.twin.twin", "--side", str(far.fileno()), *arguments],
-            stdout=subprocess.PIPE,
-            stderr=self._words,
-            bufsize=0,
-            pass_fds=[far.fileno()],
-            start_new_session=True,
-        )
+        self._process = new.Process(target=_serve, args=(command, far), daemon=True)
+        self._process.start()
         far.close()
         try:
-            self.path = self._first_line()
+            self.path = self._started()
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
         """End it."""
-        assert self._process.stdout is not None
         self._pipe.close()
-        try:
-            self._process.wait(timeout=END_S)
-        except subprocess.TimeoutExpired:
+        self._process.join(END_S)
+        if self._process.is_alive():
             self._process.kill()
-            self._process.wait()
-        self._process.stdout.close()
-        self._words.close()
+            self._process.join()
 
     def object_pose(self) -> np.ndarray:
         """The object's true position [m] and quaternion xyzw [7].
@@ -82,7 +62,7 @@ class TwinChild:
         Raises:
             TwinError: No answer.
         """
-        return np.asarray(self._ask("pose"))
+        return np.asarray(self.ask("pose"))
 
     def place_object(self) -> None:
         """Put the object where an episode starts; it falls from there.
@@ -90,18 +70,14 @@ class TwinChild:
         Raises:
             TwinError: No answer.
         """
-        self._ask("place")
+        self.ask("place")
 
-    def depth(self, timeout_s: float) -> tuple[np.ndarray, float]:
-        """A depth image of the present [m] [H, W], and its time [s].
+    def ask(self, what: str, timeout_s: float = ANSWER_S) -> Any:
+        """The answer to a request of :meth:`vd.deploy.twin.twin.TwinCommand.serve`.
 
         Raises:
-            TwinError: No answer.
+            TwinError: None within ``timeout_s``.
         """
-        image, time_s = self._ask("depth", timeout_s)
-        return image, time_s
-
-    def _ask(self, what: str, timeout_s: float = ANSWER_S) -> Any:
         with self._lock:
             try:
                 while self._pipe.poll():  # an answer that came too late
@@ -113,35 +89,34 @@ class TwinChild:
                 raise TwinError("the twin is gone") from error
         raise TwinError(f"the twin does not answer within {timeout_s:.2f} s")
 
-    def _first_line(self) -> str:
-        """The device that it prints when it serves; libraries may have said something before.
+    def _started(self) -> str:
+        """The device of its bus, once it serves."""
+        if not self._pipe.poll(START_S):
+            raise TwinError(
+                f"the twin did not start within {START_S:g} s; what it has compiled is kept, so try again, "
+                "or with fewer other programs"
+            )
+        try:
+            told = self._pipe.recv()
+        except EOFError:
+            told = TwinError("it ended")
+        if isinstance(told, Exception):
+            raise TwinError(f"the twin did not start: {told}")
+        return str(told)
 
-        Raises:
-            TwinError: It ended before, or takes too long.
-        """
-        assert self._process.stdout is not None
-        end = time.monotonic() + START_S
-        while select.select([self._process.stdout], [], [], max(0.0, end - time.monotonic()))[0]:
-            line = self._process.stdout.readline().decode()
-            if line.startswith("/"):
-                return line.strip()
-            if not line:
-                self._words.seek(0)
-                words = self._words.read().strip().splitlines()
-                raise TwinError(f"the twin did not start: {words[-1] if words else 'no answer'}")
-        raise TwinError(
-            f"the twin did not start within {START_S:g} s; what it has compiled is kept, so try again, "
-            "or with fewer other programs"
-        )
+
+def _serve(command: TwinCommand, pipe: Connection) -> None:
+    """Be a twin, in a process of its own."""
+    os.setsid()  # Ctrl-C in the terminal is for the one who drives the hand
+    os.dup2(2, 1)  # what libraries say is no output of a command
+    try:
+        command.serve(pipe)
+    except (ValueError, OSError, RuntimeError) as error:
+        pipe.send(TwinError(str(error)))
 
 
 class TwinCamera:
-    """The depth camera of a twin: an image whenever one is wanted.
-
-    Args:
-        twin: The twin.
-        intrinsics: Of the camera that it was told to have.
-    """
+    """The depth camera that a twin was told to have: an image whenever one is wanted."""
 
     def __init__(self, twin: TwinChild, intrinsics: Intrinsics):
         self._twin, self.intrinsics = twin, intrinsics
@@ -153,7 +128,7 @@ class TwinCamera:
             StaleCamera: None came in time.
         """
         try:
-            return Frame(*self._twin.depth(timeout_s))
+            return Frame(*self._twin.ask("depth", timeout_s))
         except TwinError as error:
             raise StaleCamera(str(error)) from error
 

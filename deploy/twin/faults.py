@@ -52,12 +52,7 @@ START_S = 60.0
 
 
 class Witness:
-    """A plant that remembers what its motors did.
-
-    Args:
-        plant: The plant.
-        motors: The motors on it.
-    """
+    """A plant that remembers what its motors did."""
 
     def __init__(self, plant: Plant, motors: Sequence[Motor]):
         self.plant, self._motors = plant, motors

@@ -1,7 +1,6 @@
 """One motor of the twin: its control table, what can be written when, how it drives and protects itself."""
 
 import math
-from dataclasses import dataclass, field
 
 from vd.deploy.hardware.control_table import (
     COUNTS_PER_TURN,
@@ -43,25 +42,20 @@ MODE_ITEMS = (
 GOALS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
 
 
-@dataclass
 class Motor:
     """A motor on the bus."""
 
-    model: Model
-    id: int
-    memory: bytearray = field(init=False)
-    heat_c_per_s: float = 0.0
-    """Injected heating, whatever the torque [deg C/s]."""
-
-    def __post_init__(self) -> None:
+    def __init__(self, model: Model, id: int):
         """Power on with factory settings."""
-        self.items = table(self.model)
+        self.model = model
+        self.heat_c_per_s = 0.0
+        """Injected heating, whatever the torque [deg C/s]."""
+        self.items = table(model)
         self._at = {item.address: (name, item) for name, item in self.items.items()}
         self.memory = bytearray(SIZE)
-        own = self.id
         for name, item in self.items.items():
             self.put(name, item.initial)
-        self.put("id", own)
+        self.put("id", id)
         self.temperature, self._where = AMBIENT_C, 0.0
         self.reboot()
 
@@ -179,14 +173,7 @@ class Motor:
         )
 
     def sense(self, seconds: float, position: float, velocity: float, torque: float) -> None:
-        """Take in the state of the axis after ``seconds`` more, and protect the motor.
-
-        Args:
-            seconds: Time since the last call.
-            position: Angle [rad].
-            velocity: Speed [rad/s].
-            torque: Torque of the motor [N m].
-        """
+        """Take in angle [rad], speed [rad/s] and torque [N m] ``seconds`` later, and protect the motor."""
         self._clock += seconds
         self.put("realtime_tick", int(self._clock / TICK_S) % TICK_MODULUS)
         self._where = position

@@ -37,15 +37,6 @@ class NewtonHand:
 
     A motor at the paper's position gain has the hand's identified stiffness and damping; its stiffness grows
     with the gain. With its torque off a joint has neither. Effects of the hand's layer act as in training.
-
-    Args:
-        hand: The hand.
-        joints: Which motor turns which joint, and how.
-        cfg: Physics.
-        item: An object to handle; none by default.
-
-    Attributes:
-        scene: What is where in the world; None without an object.
     """
 
     def __init__(
@@ -56,6 +47,7 @@ class NewtonHand:
         cfg = cfg or SimCfg()
         self.cfg = cfg = replace(cfg, nconmax=ROOM * cfg.nconmax, njmax=ROOM * cfg.njmax)
         self.scene: Scene | None = None
+        """What is where in the world; None without an object to handle."""
         if item is None:
             world = build_hand(hand, cfg, visuals=False)
             add_table(world, cfg, visible=False)

@@ -4,7 +4,7 @@ SI units, radians; one axis per motor.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -42,23 +42,15 @@ class Plant(Protocol):
         """Positions [rad], velocities [rad/s] and motor torques [N m] of the axes, each of shape [D]."""
 
 
-@dataclass
 class FirstOrderPlant:
     """Axes without mass that approach their goals exponentially, within the limits of torque and speed."""
 
-    axes: int
-    """D."""
-    position: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    blocked: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    """Axes that something holds, shape [D]."""
-
-    def __post_init__(self) -> None:
-        """Start at zero, free."""
-        if not self.position.size:
-            self.position = np.zeros(self.axes)
-        if not self.blocked.size:
-            self.blocked = np.zeros(self.axes, dtype=bool)
-        self._velocity, self._torque = np.zeros(self.axes), np.zeros(self.axes)
+    def __init__(self, axes: int, position: np.ndarray | None = None):
+        """Free, at zero by default."""
+        self.position = np.zeros(axes) if position is None else position
+        self.blocked = np.zeros(axes, dtype=bool)
+        """Axes that something holds, shape [D]."""
+        self._velocity, self._torque = np.zeros(axes), np.zeros(axes)
 
     def advance(self, seconds: float, drives: Sequence[Drive]) -> None:
         """Go on by ``seconds``."""

@@ -12,19 +12,21 @@ import select
 import sys
 import termios
 import threading
+import time
 import tty
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from multiprocessing import Pipe
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from vd.deploy.hardware.control_table import MODELS
 from vd.deploy.hardware.packets import MAX_ID
-from vd.deploy.timely import real_time, undisturbed
+from vd.deploy.timely import undisturbed
 from vd.deploy.twin.line import Faults, MotorLine
 from vd.deploy.twin.motor import Motor
 from vd.deploy.twin.plant import Plant
@@ -33,7 +35,6 @@ from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.deploy.twin.newton_hand import NewtonHand
-    from vd.deploy.twin.twin_side import TwinSide
 
 IDLE_S = 0.005
 """Longest wait for bytes: the plant goes on in steps of this size at most."""
@@ -45,10 +46,9 @@ class Twin(MotorLine):
     """Motors on a line, stepped in real time, behind a pseudo-terminal.
 
     Args:
-        motors: Motors in the order of the plant's axes.
-        plant: What they move; axes without mass by default.
-        faults: What goes wrong; may be changed while it runs.
-        side: What it tells beside the motors, if anything.
+        motors: As of :class:`MotorLine`, as are ``plant`` and ``faults``.
+        pipe: To the program that started it, if one did: requests come by it, and it ends with its other end.
+        answer: To each request.
     """
 
     def __init__(
@@ -56,14 +56,15 @@ class Twin(MotorLine):
         motors: Sequence[Motor],
         plant: Plant | None = None,
         faults: Faults | None = None,
-        side: "TwinSide | None" = None,
+        pipe: Connection | None = None,
+        answer: Callable[[str], Any] | None = None,
     ):
         """Open the pseudo-terminal; serves once started."""
         super().__init__(motors, plant, faults, put=self._write)
-        self._side = side
+        self._pipe, self._answer = pipe, answer or (lambda request: None)
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
-        self._ear, self._mouth = Pipe(duplex=False)
+        self._heard: SimpleQueue[tuple[float, bytes | str]] = SimpleQueue()
         self._near, self._far = pty.openpty()
         tty.setraw(self._far)
         os.set_blocking(self._near, False)
@@ -85,8 +86,6 @@ class Twin(MotorLine):
             self._thread.join()
         for end in (self._near, self._far):
             os.close(end)
-        self._mouth.close()
-        self._ear.close()
 
     def end(self) -> None:
         """Have :meth:`serve` return."""
@@ -104,24 +103,32 @@ class Twin(MotorLine):
             listener.join()
 
     def _serve_once(self) -> None:
-        waited: list[Any] = [self._ear] if self._side is None else [self._ear, self._side.pipe]
         wait_s = max(0.0, min(IDLE_S, self.due_s - self._clock.now()))
-        ready, _, _ = select.select(waited, [], [], wait_s)
-        if self._ear in ready:
-            at, heard = self._ear.recv()
-            self.go_on(heard, at=at)
-        else:
+        try:
+            at, heard = self._heard.get(timeout=wait_s)
+        except Empty:
             self.go_on()
-        if self._side is not None and self._side.pipe in ready and not self._side.serve():
-            self.end()
+            return
+        if isinstance(heard, bytes):
+            self.go_on(heard, at=at)
+        elif self._pipe is not None:
+            self.go_on()
+            with contextlib.suppress(OSError):  # who asked is gone, which the listener hears
+                self._pipe.send(self._answer(heard))
 
     def _listen(self) -> None:
         """Pass on what arrives, with the time at which it did: meanwhile the plant may be in a step."""
+        sources: list[Any] = [self._near] if self._pipe is None else [self._near, self._pipe]
         while not self._end.is_set():
-            if select.select([self._near], [], [], IDLE_S)[0]:
+            for source in select.select(sources, [], [], IDLE_S)[0]:
                 at = self._clock.now()
-                with contextlib.suppress(BlockingIOError, OSError):
-                    self._mouth.send((at, os.read(self._near, LONGEST)))
+                try:
+                    heard = os.read(source, LONGEST) if source is self._near else source.recv()
+                except (EOFError, OSError):
+                    if source is self._pipe:
+                        self.end()
+                else:
+                    self._heard.put((at, heard))
 
     def _write(self, data: bytes) -> None:
         try:
@@ -155,11 +162,18 @@ class TwinCommand:
     faults: Annotated[Faults, tyro.conf.arg(name="")] = field(default_factory=Faults)
     realtime: bool = False
     """Run before all ordinary programs, where that is permitted."""
-    side: int | None = None
-    """File descriptor of a pipe to the program that started it, with which it ends."""
 
-    def run(self) -> int:
-        """Serve."""
+    def serve(self, pipe: Connection | None = None) -> None:
+        """Serve until interrupted, or until a pipe's other end is gone.
+
+        Args:
+            pipe: Takes the path of the port, which is printed without one. Answers ``pose`` with the object's
+                position [m] and quaternion xyzw [7], ``depth`` with an image [m] [H, W] and its time [s], and
+                ``place``, by which the object is where an episode starts.
+
+        Raises:
+            ValueError: Options that cannot be.
+        """
         if self.model not in MODELS:
             raise ValueError(f"--model {self.model}: no such motor; choose of {', '.join(MODELS)}")
         wrong = [id for id in self.ids if not 0 <= id <= MAX_ID]
@@ -167,16 +181,14 @@ class TwinCommand:
             raise ValueError(f"--ids {wrong[0]}: an ID lies within 0 and {MAX_ID}")
         ids, plant = (self.ids, None) if self.hand is None else self._hand(self.hand)
         motors = [Motor(MODELS[self.model], id) for id in ids]
-        twin = Twin(motors, plant, self.faults, side=self._beside(plant))
-        try:
-            with undisturbed(), real_time(self.realtime, level=1):
-                print(twin.path, flush=True)  # once it can answer at once: the collector takes a while
-                twin.serve()
-        except KeyboardInterrupt:
-            pass
-        finally:
-            twin.close()
-        return 0
+        tell: Callable[[str], None] = partial(print, flush=True) if pipe is None else pipe.send
+        answer = self._beside(plant) if pipe is not None and plant is not None else None
+        with (
+            contextlib.closing(Twin(motors, plant, self.faults, pipe, answer)) as twin,
+            undisturbed(self.realtime, level=1),
+        ):
+            tell(twin.path)  # once it can answer at once: the collector takes a while
+            twin.serve()
 
     def _hand(self, name: str) -> "tuple[tuple[int, ...], NewtonHand]":
         """The motors and the simulated hand."""
@@ -192,23 +204,39 @@ class TwinCommand:
         item = None if self.object is None else one_object(self.object)
         return joints.ids, NewtonHand(hand, joints, SimCfg(physics_hz=self.physics_hz), item=item)
 
-    def _beside(self, plant: "NewtonHand | None") -> "TwinSide | None":
-        """What answers the program that started it, if one did."""
-        if self.side is None:
+    def _beside(self, hand: "NewtonHand") -> Callable[[str], Any] | None:
+        """What answers requests, of a hand with an object: eyes and a helping hand, which no real one has."""
+        if hand.scene is None:
             return None
-        from vd.deploy.twin.twin_side import TwinSide
-        from vd.sensors.cfg import DepthSensorCfg
+        from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+        from vd.sensors.depth_camera import DepthCamera
 
-        camera = None if plant is None else plant.hand.camera.at(self.camera)
-        sensor = DepthSensorCfg.realistic() if self.realistic else None
-        return TwinSide(Connection(self.side), plant, camera, sensor=sensor, seed=self.faults.seed)
+        sensor = DepthSensorCfg.realistic() if self.realistic else DepthSensorCfg()
+        cfg, place = DepthCameraCfg(points=0, sensor=sensor), hand.hand.camera.at(self.camera)
+        camera = DepthCamera.of_scene(hand.scene, hand.body_q, cfg, place, seed=self.faults.seed)
+        camera.capture()  # loads kernels
+
+        def answer(request: str) -> Any:
+            match request:
+                case "pose":
+                    return hand.joint_q[-7:]
+                case "depth":
+                    camera.capture()
+                    return camera.depth.numpy()[0].copy(), time.monotonic()
+                case "place":
+                    hand.place_object((0.0, 0.0, 0.0, 1.0))
+            return None
+
+        return answer
 
 
 def main() -> None:
     """Entry point of ``python -m vd.deploy.twin.twin``."""
     command = tyro.cli(TwinCommand, prog="python -m vd.deploy.twin.twin", description=__doc__)
     try:
-        sys.exit(command.run())
+        command.serve()
+    except KeyboardInterrupt:
+        pass
     except (ValueError, OSError) as error:
         sys.exit(f"vd.deploy.twin.twin: {error}")
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -31,19 +31,25 @@ def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> No
 
 
 @dataclass(frozen=True)
-class SimCommand:
-    """Control steps per second, memory and start-up of the simulation under a policy's actions."""
+class Measurement:
+    """What the measurements of simulation, contacts and camera have in common."""
 
-    envs: tuple[int, ...] = (4096, 8192, 16384)
-    """Numbers of environments to measure."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets, mixed over the environments."""
     device: str = "auto"
     """Warp device; auto is the first GPU, or else the CPU."""
-    policy: str = "dclaw4-table"
-    """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
     json: Path | None = None
     """Write the rows to this file as JSON."""
+
+
+@dataclass(frozen=True)
+class SimCommand(Measurement):
+    """Control steps per second, memory and start-up of the simulation under a policy's actions."""
+
+    envs: tuple[int, ...] = (4096, 8192, 16384)
+    """Numbers of environments to measure."""
+    policy: str = "dclaw4-table"
+    """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
 
     def run(self) -> int:
         """Measure and print."""
@@ -59,22 +65,16 @@ class SimCommand:
         task = dataclasses.replace(trained_task(teacher), objects=self.objects)
         tasks = (dataclasses.replace(task, num_envs=envs) for envs in self.envs)
         rows = (measure(cfg, device, teacher=teacher) for cfg in tasks)
-        report(map(dataclasses.asdict, rows), device, self.json)
+        report(rows, device, self.json)
         return 0
 
 
 @dataclass(frozen=True)
-class PhysicsCommand:
+class PhysicsCommand(Measurement):
     """Contact quality: objects at rest, a pinched cube."""
 
-    objects: tuple[str, ...] = ("procedural-150-seed0",)
-    """Object sets to drop on the table."""
     seed: int = 0
-    """Of the orientations they are dropped in."""
-    device: str = "cpu"
-    """Warp device."""
-    json: Path | None = None
-    """Write everything to this file as JSON."""
+    """Of the orientations in which objects are dropped on the table."""
 
     def run(self) -> int:
         """Measure and print."""
@@ -83,36 +83,30 @@ class PhysicsCommand:
         from vd.bench.physics import pinch, rest
         from vd.sim.cfg import SimCfg
 
-        cfg = SimCfg()
-        results = rest(load_set(list(self.objects)), cfg, device=self.device, seed=self.seed)
+        cfg, device = SimCfg(), resolve_device(self.device)
+        results = rest(load_set(list(self.objects)), cfg, device=device, seed=self.seed)
         moving = [r for r in results if not r.rests]
         row = {
             "objects": len(results),
             "at_rest_share": 1.0 - len(moving) / len(results),
             "deepest_contact_m": max(r.penetration for r in results),
             "moving": [dataclasses.asdict(r) for r in moving],
-            "pinch": dataclasses.asdict(pinch(load_set("cube")[0], cfg, device=self.device)),
+            "pinch": dataclasses.asdict(pinch(load_set("cube")[0], cfg, device=device)),
         }
-        report([row], self.device, self.json)
+        report([row], device, self.json)
         return 0
 
 
 @dataclass(frozen=True)
-class DepthCommand:
+class DepthCommand(Measurement):
     """Depth images and clouds per second, beside Newton's camera at the same size in the same run."""
 
     envs: tuple[int, ...] = (256, 1024, 4096)
     """Numbers of environments to measure; 1 for the figure at deployment on a CPU."""
-    objects: tuple[str, ...] = ("procedural-150-seed0",)
-    """Object sets, mixed over the environments."""
     hand: str = "dclaw4"
     """Hand."""
-    device: str = "auto"
-    """Warp device; auto is the first GPU, or else the CPU."""
     seed: int = 0
     """Of the poses."""
-    json: Path | None = None
-    """Write the rows to this file as JSON."""
 
     def run(self) -> int:
         """Measure and print."""
@@ -122,7 +116,7 @@ class DepthCommand:
 
         device, objects = resolve_device(self.device), load_set(list(self.objects))
         rows = (measure(objects, envs, device, hand=self.hand, seed=self.seed) for envs in self.envs)
-        report(map(dataclasses.asdict, rows), device, self.json)
+        report(rows, device, self.json)
         return 0
 
 
@@ -157,27 +151,23 @@ class GapCommand:
 
     out: Path = Path("runs/gap-battery")
     """Folder of the results and their tables (summary.md)."""
-    model: str = "dclaw3"
-    """dclaw3 or dclaw4 (one finger), or servo, which is quick."""
-    kinds: tuple[str, ...] = ("single", "none", "pair", "outside")
+    model: Literal["dclaw3", "dclaw4", "servo"] = "dclaw3"
+    """A hand, of which it takes one finger, or servo, which is quick."""
+    kinds: tuple[Literal["single", "none", "pair", "outside"], ...] = ("single", "none", "pair", "outside")
     """Kinds of cases."""
     effects: tuple[str, ...] = ()
     """Effects to hide; all that show on the model by default."""
-    sizes: tuple[int, ...] = (0, 1, 2, 3)
+    sizes: tuple[Literal[0, 1, 2, 3], ...] = (0, 1, 2, 3)
     """Sizes of single effects: gaps of about 1.5, 3, 6 and 12 noise floors."""
     seeds: int = 5
     """Recordings of each effect and size; 40 times as many with nothing hidden, or only another stiffness,
     damping or mass."""
     first_seed: int = 0
     """Seed of the first recording: others than those that the method was tuned on."""
-    cases: int | None = None
-    """Run this many of the cases, a fair sample; all by default."""
     jobs: int = 1
     """Cases at a time, one process and one thread each."""
     device: str = "cpu"
     """Warp device."""
-    keep: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Keep recordings and analyses."""
 
     def run(self) -> int:
         """Run the cases, then write and print the tables."""
@@ -192,9 +182,9 @@ class GapCommand:
             sizes=self.sizes,
             seeds=self.seeds,
             first_seed=self.first_seed,
-        )[: self.cases]
+        )
         device = resolve_device(self.device)
-        results = run_battery(cases, self.out, jobs=max(self.jobs, 1), device=device, keep=self.keep)
+        results = run_battery(cases, self.out, jobs=max(self.jobs, 1), device=device)
         write_text(self.out / "summary.md", markdown(results))
         print(markdown(results))
         return 0
@@ -219,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = tyro.cli(Command, args=arguments, prog="vd-bench", description=__doc__)
     if isinstance(command, GapCommand):
         check_folder(command.out)
-    elif not isinstance(command, ReplayCommand) and command.json is not None:
+    elif isinstance(command, Measurement) and command.json is not None:
         check_file(command.json)
     return command.run()
 

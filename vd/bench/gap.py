@@ -8,20 +8,18 @@ interrupted, resumed and split over machines by kinds.
 
 import itertools
 import json
-import shutil
 import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
-
-import numpy as np
 
 from vd.assets_usd.hands import HANDS
 from vd.bench.gap_score import KINDS, Case, said, score
-from vd.bench.gap_sizes import GAPS, showing
+from vd.bench.gap_sizes import showing
 from vd.bench.hidden_plant import OUTSIDE
 from vd.bench.hide import hide
 from vd.files import make_folder, write_json
@@ -29,8 +27,6 @@ from vd.versions import source_commit
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
 
-MODELS = (*HANDS, "servo")
-"""What the battery is of: one finger of a hand, or a servo on its own, which is quick."""
 PAIR_SIZE = 2
 """Size of both effects of a pair, some six noise floors each: from there on single effects are told apart."""
 NOTHING_A_SEED = 40
@@ -48,10 +44,10 @@ def battery(
     seeds: int = 5,
     first_seed: int = 0,
 ) -> list[Case]:
-    """The cases, in a random order with all kinds mixed in proportion: any first part is a fair sample.
+    """The cases.
 
     Args:
-        model: Of :data:`MODELS`.
+        model: A hand, of which it takes one finger, or ``servo``.
         kinds: Kinds of cases, of :data:`KINDS`.
         effects: Effects to hide; empty: all that show on the model.
         sizes: Sizes of single effects and of those outside the table.
@@ -59,18 +55,11 @@ def battery(
         first_seed: Seed of the first: recordings that the method has not been tuned on.
 
     Raises:
-        ValueError: An unknown model, kind, effect or size.
+        ValueError: An effect is unknown, or cannot show on the model.
     """
-    if model not in MODELS:
-        raise ValueError(f"--model is {model}; choose one of {', '.join(MODELS)}")
     shown = showing(model)
-    for what, given, known in (
-        ("kinds", kinds, KINDS),
-        ("effects", effects, shown),
-        ("sizes", sizes, range(len(GAPS))),
-    ):
-        if unknown := [value for value in given if value not in known]:
-            raise ValueError(f"--{what}: there is no {unknown[0]}; choose from {', '.join(map(str, known))}")
+    if unknown := [name for name in effects if name not in shown]:
+        raise ValueError(f"--effects: there is no {unknown[0]}; choose from {', '.join(shown)}")
     names = tuple(effects) or shown
     changes = ("exact", "base", "mass") if model in HANDS else ("exact", "base")
     numbers = range(first_seed, first_seed + seeds)
@@ -91,21 +80,16 @@ def battery(
         ],
         "outside": sized("outside", tuple(OUTSIDE)),
     }
-    placed = []
-    for group in (cases[kind] for kind in KINDS if kind in kinds):
-        order = np.random.default_rng(0).permutation(len(group))
-        placed += [((i + 0.5) / len(group), group[number]) for i, number in enumerate(order)]
-    return [case for _, case in sorted(placed, key=lambda item: item[0])]
+    return [case for kind in kinds for case in cases[kind]]
 
 
-def run_case(case: Case, folder: Path, device: str = "cpu", keep: bool = False) -> dict[str, Any]:
+def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
     """Make the recording, analyse it, and compare; writes ``folder/CASE.json``.
 
     Args:
         case: The case.
         folder: Folder of results.
         device: Warp device of the analysis.
-        keep: Keep the recording and the analysis beside the result.
 
     Returns:
         What :func:`score` returns, or the traceback under ``error``; with the commit and the processor time
@@ -116,19 +100,19 @@ def run_case(case: Case, folder: Path, device: str = "cpu", keep: bool = False) 
     from vd.gap.torque_unit import in_known_unit
 
     quiet_warp()
-    work, begin = folder / "work" / case.name, time.process_time()
+    begin = time.process_time()
     try:
-        hidden = hide(case.hiding(), work / "recording")
-        hand = load_hand(case.model) if case.model in HANDS else None
-        report = workflow.explain(
-            work / "recording", hand, work / "analysis", seed=case.seed, device=device, workers=1
-        )
+        with TemporaryDirectory() as work:
+            recording = Path(work) / "recording"
+            hidden = hide(case.hiding(), recording)
+            hand = load_hand(case.model) if case.model in HANDS else None
+            report = workflow.explain(
+                recording, hand, Path(work) / "analysis", seed=case.seed, device=device, workers=1
+            )
         result = score(case, in_known_unit(report, hidden.recording).to_dict(), hidden.truth)
     except Exception:  # one case that fails is a figure of the battery, not its end
         result = {"case": asdict(case), "error": traceback.format_exc(limit=6)}
     result |= {"commit": source_commit(), "cpu_s": time.process_time() - begin}
-    if not keep:
-        shutil.rmtree(work, ignore_errors=True)
     write_json(folder / f"{case.name}.json", result)
     return result
 
@@ -139,7 +123,6 @@ def run_battery(
     *,
     jobs: int = 1,
     device: str = "cpu",
-    keep: bool = False,
 ) -> list[dict[str, Any]]:
     """Run the cases that have no result yet, and print a line for each; what failed before comes last.
 
@@ -148,7 +131,6 @@ def run_battery(
         folder: Folder of results.
         jobs: Processes.
         device: Warp device of the analyses.
-        keep: Keep recordings and analyses.
 
     Returns:
         The results of all cases.
@@ -172,7 +154,7 @@ def run_battery(
 
     if waiting:
         _prepare(device, {case.model for case in waiting})
-    work = partial(run_case, folder=folder, device=device, keep=keep)
+    work = partial(run_case, folder=folder, device=device)
     run_tasks(work, waiting, finished, jobs=jobs, limit_s=CASE_LIMIT_S, gpu=device.startswith("cuda"))
     return [result for result in done.values() if result is not None]
 
@@ -191,8 +173,9 @@ def _prepare(device: str, models: set[str]) -> None:
 
 
 def read_result(path: Path) -> dict[str, Any] | None:
-    """The result of a case, or None if it has not been run or was cut short."""
+    """The result of a case, or None if it has not been run, was cut short or is of an earlier version."""
     try:
-        return json.loads(path.read_text())
+        result = json.loads(path.read_text())
     except (OSError, ValueError):
         return None
+    return result if {"found", "error"} & result.keys() else None

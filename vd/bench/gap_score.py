@@ -79,8 +79,9 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
     """Compare a report (``vd-gap-report/1``), in the truth's unit of torque, with the truth.
 
     Returns:
-        The case; verdict; names and sets given; which are right and wrong; gaps in noise floors; relative
-        errors and interval coverage of the parameters of effects named rightly; seconds.
+        The case; verdict; names and sets given; hidden effects that are named, by an effect that stands for
+        them too; names that are wrong; gaps in noise floors; relative errors and interval coverage of the
+        parameters of effects named rightly.
     """
     floor = truth["noise_floor_rad"]
     named = list(dict.fromkeys(effect["name"] for effect in report["effects"]))
@@ -99,7 +100,8 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
     }
     right |= stood_for
     both = SUMS.get(frozenset(case.effects))
-    summed = {*case.effects} if both in named else set()
+    found = {*named} | stood_for | ({*case.effects} if both in named else set())
+    found |= {n for n in case.effects if stands.get(n) in {*named} & right}
     tolerated = right | {n for name in case.effects for n in NEIGHBOURS.get(name, ())}
     held_out = report["held_out"]
     return {
@@ -107,18 +109,12 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
         "verdict": report["verdict"],
         "named": named,
         "sets": sets,
-        "by_convention": [
-            n
-            for n in case.effects
-            if n not in named and (stands.get(n) in {*named} & right or n in stood_for | summed)
-        ],
-        "missed": [n for n in case.effects if n not in named and not any(n in group for group in sets)],
+        "found": [n for n in case.effects if n in found],
         "false": [n for n in named if n not in tolerated],
         "gap": _ratio(report["baseline"]["rmse_rad"], floor),
         "left": _ratio(held_out["identified_rmse_rad"], floor),
         "shrunk": _ratio(held_out["baseline_rmse_rad"], held_out["identified_rmse_rad"]),
         "parameters": _parameters(report, truth),
-        "seconds": report["seconds"],
     }
 
 
@@ -155,47 +151,51 @@ def said(result: Mapping[str, Any]) -> str:
     return ", ".join([*result["named"], *(f"{{{group}}}" for group in sets)]) or "nothing"
 
 
+Results = Sequence[Mapping[str, Any]]
+
+
 @dataclass(frozen=True)
 class Figure:
     """One of the figures to reach.
 
     Attributes:
         what: In words.
-        value: Share of cases in [0, 1], or a median; None if no case says anything.
-        cases: Values behind it.
-        least: Goal: at least this; None: no bound.
-        most: Goal: at most this; None: no bound.
-        share: Whether the value is a share of cases.
+        values: Of the cases: whether each is a hit, or numbers, whose median counts.
+        least: Goal: at least this.
+        most: Goal: at most this.
     """
 
     what: str
-    value: float | None
-    cases: int
-    least: float | None = None
-    most: float | None = None
-    share: bool = False
+    values: Sequence[float]
+    least: float = -math.inf
+    most: float = math.inf
 
     @property
-    def reached(self) -> bool | None:
-        """Whether the value is within its bounds; None without bounds or value."""
-        if self.value is None or self.least is self.most is None:
-            return None
-        low = -math.inf if self.least is None else self.least
-        return low <= self.value <= (math.inf if self.most is None else self.most)
+    def value(self) -> float:
+        """Share of hits, in [0, 1], or the median; NaN without cases."""
+        if not self.values:
+            return math.nan
+        return float(np.mean(self.values) if self._is_share else np.median(self.values))
+
+    @property
+    def reached(self) -> bool:
+        """Whether the value is within its bounds."""
+        return self.least <= self.value <= self.most
+
+    @property
+    def _is_share(self) -> bool:
+        return any(isinstance(value, bool) for value in self.values)
 
     def row(self) -> str:
         """A row of a table."""
 
-        def text(value: float | None) -> str:
-            return "-" if value is None else f"{100 * value:.1f} %" if self.share else f"{value:.3g}"
+        def text(value: float) -> str:
+            return f"{100 * value:.1f} %" if self._is_share else f"{value:.3g}"
 
-        goal = [f"{sign} {text(bound)}" for sign, bound in ((">=", self.least), ("<=", self.most))
-                if bound is not None]  # fmt: skip
-        reached = {True: "yes", False: "no", None: ""}[self.reached]
-        return f"| {self.what} | {', '.join(goal)} | {text(self.value)} | {self.cases} | {reached} |"
-
-
-Results = Sequence[Mapping[str, Any]]
+        bounds = {">=": self.least, "<=": self.most}
+        goal = ", ".join(f"{sign} {text(bound)}" for sign, bound in bounds.items() if math.isfinite(bound))
+        answer = ("-", "") if not self.values else (text(self.value), "yes" if self.reached else "no")
+        return f"| {self.what} | {goal} | {answer[0]} | {len(self.values)} | {answer[1]} |"
 
 
 def figures(results: Results) -> list[Figure]:
@@ -205,88 +205,35 @@ def figures(results: Results) -> list[Figure]:
     good = [r for r in single if "error" not in r]
     parameters = [row for r in good if r["case"]["effects"][0] in r["named"] for row in r["parameters"]]
 
-    def values(key: str, among: Results = good) -> list[float]:
-        return [r[key] for r in among if r.get(key) is not None]
+    def hits(among: Results, says: Callable[[Mapping[str, Any]], bool]) -> list[bool]:
+        return ["error" not in r and says(r) for r in among]
 
     return [
-        _share("first name right", single, _first_right, least=0.95),
-        _share("right, or in the named set", single, lambda r: not r["missed"], least=0.99),
-        _median("size of the set", [_set_size(r) for r in good], most=1.0),
-        _share("single: a wrong name", single, _any_false),
-        _share("nothing hidden: a false name", none, _any_false, most=0.02),
-        _share("nothing hidden: any name at all (mass included)", none, lambda r: bool(r["named"])),
-        _share("two hidden: both named", pair, _all_named, least=0.8),
-        _share("two hidden: one or both, none wrong", pair, _one_and_none_wrong, least=0.98),
-        _share("outside: unknown or neighbours", outside, _unknown_or_near, least=0.9),
-        _share("outside: a confident wrong name", outside, _any_false, most=0.02),
-        _median("relative error of parameters", [row["error"] for row in parameters], most=0.1),
-        _rate("95 % intervals that cover", [row["covered"] for row in parameters], least=0.9, most=0.98),
-        _median("held-out gap: times smaller", values("shrunk"), least=5.0),
-        _median("held-out gap: noise floors left", values("left"), most=1.3),
-        _median("seconds a recording", values("seconds", results)),
-        _rate("cases that failed to run", ["error" in r for r in results], most=0.0),
+        Figure("first name right", hits(single, _first_right), least=0.95),
+        Figure("two hidden: both named", hits(pair, _all_found), least=0.8),
+        Figure(
+            "two hidden: one or both, none wrong",
+            hits(pair, lambda r: bool(r["found"]) and not r["false"]),
+            least=0.98,
+        ),
+        Figure("nothing hidden: no false name", hits(none, lambda r: not r["false"]), least=0.98),
+        Figure("outside: unknown or neighbours", hits(outside, _unknown_or_near), least=0.9),
+        Figure("relative error of parameters", [row["error"] for row in parameters], most=0.1),
+        Figure("95 % intervals that cover", [row["covered"] for row in parameters], least=0.9, most=0.98),
+        Figure("held-out gap: times smaller", [r["shrunk"] for r in good if r["shrunk"]], least=5.0),
+        Figure("held-out gap: noise floors left", [r["left"] for r in good if r["left"]], most=1.3),
     ]
 
 
-def _rate(
-    what: str, hits: Sequence[bool], *, least: float | None = None, most: float | None = None
-) -> Figure:
-    return Figure(what, float(np.mean(hits)) if hits else None, len(hits), least, most, share=True)
-
-
-def _share(
-    what: str,
-    results: Results,
-    says: Callable[[Mapping[str, Any]], bool],
-    *,
-    least: float | None = None,
-    most: float | None = None,
-) -> Figure:
-    """Share of cases; one that failed counts against the goal."""
-    hits = [most is not None if "error" in r else says(r) for r in results]
-    return _rate(what, hits, least=least, most=most)
-
-
-def _median(
-    what: str, values: Sequence[float], *, least: float | None = None, most: float | None = None
-) -> Figure:
-    return Figure(what, float(np.median(values)) if values else None, len(values), least, most)
-
-
-def _any_false(result: Mapping[str, Any]) -> bool:
-    return bool(result["false"])
-
-
 def _first_right(result: Mapping[str, Any]) -> bool:
-    """The named effect, or the first of the set, is the hidden one."""
+    """The named effect, or the first of the set, is the hidden one, or what stands for it."""
     first = result["named"][:1] or [group[0] for group in result["sets"][:1]]
-    return first == list(result["case"]["effects"]) or _conventional(result)
+    hidden = list(result["case"]["effects"])
+    return first == hidden or (_all_found(result) and len(result["named"]) == len(hidden))
 
 
-def _conventional(result: Mapping[str, Any]) -> bool:
-    """What is hidden is named by the effect that stands for it, and by nothing else."""
-    return bool(result["by_convention"]) and len(result["named"]) == len(result["case"]["effects"])
-
-
-def _set_size(result: Mapping[str, Any]) -> float:
-    """Candidates among which the answer leaves the choice: 1 for a name, none counts as all."""
-    truth = result["case"]["effects"][0]
-    if truth in result["named"] or _conventional(result):
-        return 1.0
-    return float(min((len(group) for group in result["sets"] if truth in group), default=len(EFFECTS)))
-
-
-def _found(result: Mapping[str, Any]) -> set[str]:
-    """Hidden effects that are named, by convention too."""
-    return set(result["case"]["effects"]) & {*result["named"], *result["by_convention"]}
-
-
-def _all_named(result: Mapping[str, Any]) -> bool:
-    return len(_found(result)) == len(result["case"]["effects"])
-
-
-def _one_and_none_wrong(result: Mapping[str, Any]) -> bool:
-    return bool(_found(result)) and not result["false"]
+def _all_found(result: Mapping[str, Any]) -> bool:
+    return len(result["found"]) == len(result["case"]["effects"])
 
 
 def _unknown_or_near(result: Mapping[str, Any]) -> bool:
@@ -313,6 +260,6 @@ def markdown(results: Results) -> str:
             answers["failed"] = failed
         told = "; ".join(f"{count} x {answer}" for answer, count in answers.items())
         gap = f"{np.median([r['gap'] or 0.0 for r in good]):.1f}" if good else "-"
-        named = sum(name in _found(r) for r in good)
+        named = sum(name in r["found"] for r in good)
         lines.append(f"| `{name}` | {size} | {gap} | {len(group)} | {named} | {told} |")
     return "\n".join(lines) + "\n"

@@ -107,24 +107,18 @@ def parse_effect(text: str) -> tuple[str, dict[str, float], tuple[str, ...]]:
         Name, the parameters given, and the joints (empty: all).
 
     Raises:
-        ValueError: Unknown name or parameter, or a value that is no finite number.
+        ValueError: A value is no number. What there is to hide, :func:`hide` knows.
     """
     head, _, tail = text.partition(":")
     name, _, joints = head.partition("@")
-    name = name.strip()
-    known = effect_parameters(name)
     values: dict[str, float] = {}
     for item in filter(None, (part.strip() for part in tail.split(","))):
-        key, equals, value = (part.strip() for part in item.partition("="))
-        if key not in known:
-            raise ValueError(f"effect {text!r}: {name} has no parameter {key!r}; it has {', '.join(known)}")
+        key, _, value = (part.strip() for part in item.partition("="))
         try:
-            values[key] = float(value) if equals else math.nan
-        except ValueError:
-            values[key] = math.nan
-        if not math.isfinite(values[key]):
-            raise ValueError(f"effect {text!r}: {key} is {value!r}; write {key}=NUMBER")
-    return name, values, tuple(filter(None, (joint.strip() for joint in joints.split("+"))))
+            values[key] = float(value)
+        except ValueError as error:
+            raise ValueError(f"effect {text!r}: {key} is {value!r}; write {key}=NUMBER") from error
+    return name.strip(), values, tuple(filter(None, (joint.strip() for joint in joints.split("+"))))
 
 
 def effect_parameters(name: str) -> dict[str, float]:

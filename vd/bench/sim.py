@@ -10,7 +10,6 @@ import importlib
 import pkgutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,30 +24,6 @@ if TYPE_CHECKING:
 
 WARM_UP_STEPS = 36
 """Control steps before timing: objects have landed and fingers reached them (3 s)."""
-
-
-@dataclass(frozen=True)
-class SimRow:
-    """One measured configuration."""
-
-    envs: int
-    """Environments side by side."""
-    physics_only: float
-    """Control steps/s of the physics alone, over all environments."""
-    whole_step: float
-    """Control steps/s of the environment's step."""
-    with_policy: float
-    """Control steps/s with the policy's network."""
-    own_kernels: float
-    """Share of our kernels in the device time of a control step, in [0, 1]; 0 on the CPU, not measured."""
-    memory_gb: float
-    """Device memory of simulation and environment [GB]; 0 on the CPU."""
-    start_s: float
-    """From an empty process state to the first finished step, kernels included [s]."""
-    contacts_mean: float
-    """Contacts per environment, mean over environments at the end."""
-    rows_max: int
-    """Most constraint rows in any environment at the end."""
 
 
 def seconds_per_call(
@@ -98,13 +73,7 @@ def own_kernel_names() -> set[str]:
     return names
 
 
-def measure(
-    cfg: ReorientCfg,
-    device: str,
-    *,
-    teacher: "TrainedPolicy",
-    calls: int = 24,
-) -> SimRow:
+def measure(cfg: ReorientCfg, device: str, *, teacher: "TrainedPolicy", calls: int = 24) -> dict[str, float]:
     """Measure one configuration; raises if any contact was lost.
 
     Args:
@@ -112,6 +81,13 @@ def measure(
         device: Warp device.
         teacher: A policy trained in that task, on the device.
         calls: Control steps to time, each way.
+
+    Returns:
+        ``envs``; control steps/s over all of them: ``physics_only``, ``whole_step`` of the environment, and
+        ``with_policy``; ``own_kernels``: share of our kernels in the device time of a step, in [0, 1], and
+        ``memory_gb`` of simulation and environment, both 0 on the CPU; ``start_s`` from an empty process to
+        the first finished step, kernels included; ``contacts_mean`` of an environment at the end;
+        ``rows_max``: most constraint rows in any.
     """
     begin = time.perf_counter()
     on_gpu = device != "cpu"
@@ -144,17 +120,17 @@ def measure(
     data = env.sim.solver.mjw_data
     contacts, rows = float(data.nacon.numpy()[0]), int(np.max(data.nefc.numpy()))
     n = cfg.num_envs
-    return SimRow(
-        envs=n,
-        physics_only=n / physics_s,
-        whole_step=n / step_s,
-        with_policy=n / (policy_s + step_s),
-        own_kernels=own_share(env) if on_gpu else 0.0,
-        memory_gb=memory,
-        start_s=start_s,
-        contacts_mean=contacts / n,
-        rows_max=rows,
-    )
+    return {
+        "envs": n,
+        "physics_only": n / physics_s,
+        "whole_step": n / step_s,
+        "with_policy": n / (policy_s + step_s),
+        "own_kernels": own_share(env) if on_gpu else 0.0,
+        "memory_gb": memory,
+        "start_s": start_s,
+        "contacts_mean": contacts / n,
+        "rows_max": rows,
+    }
 
 
 def free_memory(device: str) -> int:

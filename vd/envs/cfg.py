@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from math import pi
 from typing import Any, ClassVar, Literal
 
-from vd.config import Dropped, Renamed
+from vd.config import Dropped, Renamed, require
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
@@ -142,9 +142,7 @@ class TableCfg:
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        for name in ("away_share", "lift_share"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"table.{name} is {getattr(self, name):g}; it has to lie within 0 and 1")
+        require(self, "table.", "in [0, 1]", "away_share lift_share")
         if not 0.0 < self.away_s[0] <= self.away_s[1]:
             raise ValueError(
                 f"table.away_s is {self.away_s[0]:g} {self.away_s[1]:g}; it has to rise, and be positive"
@@ -185,19 +183,8 @@ class TighteningCfg:
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        for name in (
-            "joint_speed_rad_s",
-            "object_speed_m_s",
-            "object_spin_rad_s",
-            "action_norm",
-            "rotation_rad",
-            "object_weight",
-        ):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(
-                    f"curriculum.tightening.{name} is {getattr(self, name):g}; it has to be positive "
-                    "(a threshold that is not asked for at all is 0 in success)"
-                )
+        thresholds = "joint_speed_rad_s object_speed_m_s object_spin_rad_s action_norm rotation_rad"
+        require(self, "curriculum.tightening.", "positive", f"{thresholds} object_weight")
         if not 0.0 <= self.lower_at <= self.raise_at <= 1.0:
             raise ValueError(
                 f"curriculum.tightening.lower_at is {self.lower_at:g} and raise_at {self.raise_at:g}; "
@@ -320,22 +307,22 @@ class RandomisationCfg:
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        low, high = self.restitution
-        if not 0.0 <= low <= high <= 1.0:
-            raise ValueError(f"randomisation.restitution is {low:g} {high:g}; it has to rise within 0 and 1")
-        for name in ("observation_latency_s", "encoder_latency_s"):
+        for name, most in (
+            ("restitution", 1.0),
+            ("observation_latency_s", MAX_LATENCY_S),
+            ("encoder_latency_s", MAX_LATENCY_S),
+        ):
             low, high = getattr(self, name)
-            if not 0.0 <= low <= high <= MAX_LATENCY_S:
+            if not 0.0 <= low <= high <= most:
                 raise ValueError(
-                    f"randomisation.{name} is {low:g} {high:g}; it has to rise within 0 and {MAX_LATENCY_S:g}"
+                    f"randomisation.{name} is {low:g} {high:g}; it has to rise within 0 and {most:g}"
                 )
         if not 0.0 <= self.observation_jitter_s <= MAX_LATENCY_S:
             raise ValueError(
                 f"randomisation.observation_jitter_s is {self.observation_jitter_s:g}; it has to be in "
                 f"[0, {MAX_LATENCY_S:g}]"
             )
-        if self.force_s <= 0.0:
-            raise ValueError(f"randomisation.force_s is {self.force_s:g}; it has to be positive")
+        require(self, "randomisation.", "positive", "force_s")
         from vd.envs.effects import check_effects  # needs Warp, which settings alone do not
 
         check_effects(self.effects)
@@ -400,20 +387,14 @@ class ReorientCfg:
         self.table.validate()
         if self.start.at_rest and self.start.poses < 1:
             raise ValueError(f"start.at_rest needs start.poses >= 1 (now {self.start.poses})")
-        if self.failures_per_million < 0.0:
-            raise ValueError(f"failures_per_million = {self.failures_per_million}; it is 0 or positive")
-        if self.num_envs < 1:
-            raise ValueError(f"num_envs = {self.num_envs}; at least 1 environment is needed")
+        require(self, "", "positive", "num_envs")
         if self.max_episode_steps < 1:
             raise ValueError(f"episode_s = {self.episode_s} is shorter than one control step")
+        require(self, "", "zero or positive", "failures_per_million table_friction")
+        require(self.goal, "goal.", "positive", "max_angle_rad")
+        require(self.success, "success.", "positive", "rotation_rad")
         if self.fingertip not in ("rigid", "soft"):
             raise ValueError(f"fingertip = {self.fingertip!r}; choose rigid or soft")
-        if self.table_friction < 0.0:
-            raise ValueError(f"table_friction = {self.table_friction}; it must not be negative")
-        if self.goal.max_angle_rad <= 0.0:
-            raise ValueError(f"goal.max_angle_rad = {self.goal.max_angle_rad}; it must be positive")
-        if self.success.rotation_rad <= 0.0:
-            raise ValueError(f"success.rotation_rad = {self.success.rotation_rad}; it must be positive")
         self._check_together()
 
     def _check_together(self) -> None:
