@@ -265,16 +265,15 @@ class TrainingLoop:
         raise NotImplementedError
 
     def _own_state(self) -> dict[str, Any]:
-        """What belongs to this process: its environments."""
-        raise NotImplementedError
+        """What belongs to this process, such as its environments; nothing by default."""
+        return {}
 
     def _load_own_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`_own_state` gave."""
-        raise NotImplementedError
 
     def _misfit(self, ranks: list[dict[str, Any]]) -> str:
         """Why the environments of a checkpoint cannot be restored; empty if they can."""
-        raise NotImplementedError
+        return ""
 
     def _close(self) -> None:
         """Release the environments."""

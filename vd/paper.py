@@ -158,7 +158,6 @@ class CameraConstants:
 class CloudConstants:
     """Point clouds, their voxels and their noise (Methods, point cloud voxelization)."""
 
-    points_per_link: int = source(500, "C", "cached samples of every link with a mesh, the base excepted")
     object_points: int = source(500, "C", "samples of the object, and of the goal")
     voxel_m: float = source(0.005, "P", "point cloud voxelization; true floor, the code truncates")
     jitter_std_m: float = source(0.004, "P", "N(0, 0.004) on point positions")

@@ -165,8 +165,7 @@ class ControlLoop:
     def _ended(self, distance: float, sensed: Sensed, *, first: bool) -> str:
         """``stopped``, ``lost``, or nothing."""
         rule = self._runner.rule
-        near = distance < rule.distance_rad and float(np.linalg.norm(sensed.smoothed)) < rule.action_norm
-        if near and not first:
+        if rule.stops(np.array(distance), np.array(np.linalg.norm(sensed.smoothed))) and not first:
             return "stopped"
         if sensed.object_pose is not None:
             away = np.linalg.norm(sensed.object_pose[:3] - np.array(PAPER.scene.goal_position_m))

@@ -17,6 +17,7 @@ from torch import nn
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.config import to_dict
+from vd.paper import PAPER
 from vd.train.checkpoint import load_checkpoint, save_checkpoint
 from vd.train.config import RunCfg
 from vd.train.loop import TrainingLoop, check_update
@@ -43,7 +44,7 @@ GRAD_NORM = 1.0
 """Gradient norm is clipped to this."""
 LEAST_RATE = 0.02
 """Of the learning rate, at the end of the run."""
-WITHIN_RAD = (0.4, 0.1)
+WITHIN_RAD = (PAPER.success.rotation_rad, PAPER.success.precise_rad)
 """Errors within which the paper counts a goal as reached."""
 SAME_SURFACE_M = 0.004
 """Mean distance of the turned goal to the wanted surface within which both look alike: of a symmetric object
@@ -341,15 +342,6 @@ class AlignTrainer(TrainingLoop):
             "spec": to_dict(self.spec),
             "task": self.task,
         }
-
-    def _own_state(self) -> dict[str, Any]:
-        return {}
-
-    def _load_own_state(self, state: dict[str, Any]) -> None:
-        """Nothing: shapes and episodes are begun anew."""
-
-    def _misfit(self, ranks: list[dict[str, Any]]) -> str:
-        return ""
 
     def _close(self) -> None:
         if self.looks is not None:

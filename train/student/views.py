@@ -152,8 +152,8 @@ def posture_points(hand: HandModel, count: int, device: str) -> torch.Tensor:
     lower, upper = torch.tensor(np.stack([hand.lower, hand.upper]), dtype=torch.float32, device=place)
     joints = lower + (upper - lower) * torch.rand((count, len(lower)), device=place)
     poses = wp.empty((count, len(links)), dtype=wp.transform, device=device)
-    base = BASE_IN_WORLD
-    HandKinematics(hand, link_body=links, base=base, device=device).write(wp.from_torch(joints), poses)
+    kinematics = HandKinematics(hand, link_body=links, base=BASE_IN_WORLD, device=device)
+    kinematics.write(wp.from_torch(joints), poses)
     return HandCloud(hand, link_body=links, device=device)(poses)
 
 

@@ -1,6 +1,7 @@
 """Hidden effects at four sizes: parameters at which the gap is a given multiple of the noise floor.
 
-The gap is what remains after the base parameters have done their best under the paper's excitation.
+The gap is what remains after the base parameters have done their best under the paper's excitation: 1.5, 3, 6
+and 12 noise floors, root mean square.
 """
 
 from collections.abc import Mapping
@@ -10,8 +11,6 @@ import numpy as np
 from vd.bench.hide import effect_parameters
 from vd.kernels.servo.effects import EFFECTS
 
-GAPS = (1.5, 3.0, 6.0, 12.0)
-"""Root-mean-square residual of the refitted base model, in noise floors."""
 WEAKER: Mapping[tuple[str, str], float] = {
     ("acceleration_limit", "a_max_rad_s2"): -1.0,
     ("torque_limit", "tau_max_nm"): -1.0,

@@ -101,6 +101,8 @@ class PlayCfg:
             raise ValueError(
                 f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
             )
+        if self.engine == "mujoco" and self.device.startswith("cuda"):
+            raise ValueError(f"--engine mujoco steps on the CPU, not on {self.device}; leave --device out")
         if self.video is not None and self.video.suffix.lower() != ".mp4":
             raise ValueError(f"--video is {self.video}; use a name that ends in .mp4")
 
@@ -258,7 +260,7 @@ def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
     )
-    if (cfg.engine or ("mujoco" if device == "cpu" else "newton")) == "mujoco":
+    if cfg.engine == "mujoco" or (cfg.engine is None and device == "cpu"):
         task = replace(task, sim=in_mujoco(task.sim, task.sim.physics_hz))
     if cfg.in_air:
         task = replace(task, table=TableCfg(away_share=1.0))

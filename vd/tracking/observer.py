@@ -103,6 +103,7 @@ class Observer:
         self._before = self.finder.pose[:, 0].clone()
         self._fingertips = Fingertips(hand, place)
         self._links = wp.empty((len(world_object), len(links)), dtype=wp.transform, device=device)
+        self._past_links = wp.empty_like(self._links)
         self._base = torch.tensor(BASE_IN_WORLD, dtype=torch.float32, device=place)
         limits = np.stack([hand.lower, hand.upper])
         self._lower, self._upper = torch.tensor(limits, dtype=torch.float32, device=place)
@@ -162,7 +163,7 @@ class Observer:
         """The hand's own points as they were so long ago [s], base frame [N, H, 3]."""
         links = self._links
         if age > 0.0:
-            links = wp.empty_like(links)
+            links = self._past_links
             joints = senses.joint_q - age * senses.joint_qd
             self._kinematics.write(wp.from_torch(joints.contiguous()), links)
         return self._hand_cloud(links)

@@ -26,7 +26,8 @@ WAVES = (1.5, 3.0, 6.0, 12.0)
 PAIRS_AT_ONCE = 4096
 """Pairs of clouds compared at a time: what the tokens of more take counts in gigabytes."""
 SHARE = 0.3
-"""Share of the latest look in the average of predicted errors."""
+"""Share of the latest look in the average of predicted errors. With ``STAY`` tuned on looks at validation
+objects: flips between hypotheses fall from 13 to 3 %. Half and twice of either are not tried."""
 STAY = 0.8
 """Another hypothesis must be expected to err less by a fifth to be believed: of an object that looks the same
 in several orientations all err alike, and to change from one to the other is no motion that it makes."""
