@@ -33,7 +33,6 @@ from vd.kernels.task.shapes import (
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 from vd.sim.replay import replay
-from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE
 from vd.sim.simulator import SimulationError
 
 WORLDS = 4
@@ -320,31 +319,6 @@ def test_objects_weigh_what_their_files_say_where_nothing_is_drawn(tmp_path):
     assert env.randomiser.object_mass.numpy() == pytest.approx(0.25)
 
 
-def test_restitution_is_drawn_and_saved_and_reaches_the_contacts(device):
-    bouncy = RandomisationCfg(restitution=(0.5, 0.9))
-    env = make(device, num_envs=16, randomisation=bouncy)
-    drawn = env.sim.restitution
-    table = drawn.table.numpy()
-    assert len(np.unique(table)) == 16 and table.min() >= 0.5 and table.max() <= 0.9
-    velocity = env.sim.joint_qd.numpy().copy()
-    velocity[:, -4] = -1.0  # the object's, downward
-    env.sim.joint_qd.assign(velocity)
-    env.sim.restitution.apply(env.sim.joint_qd)
-    kind = env.sim._geom_kind.numpy()
-    ratio = env.sim.solver.mjw_model.geom_solref.numpy()[..., 1]
-    assert (ratio[kind == SHAPE_TABLE] < 0.25).all() and (ratio[kind == SHAPE_OBJECT] > 0.9).all()
-    run(env, 10)
-    state = env.state_dict()
-    expected = run(env, 5, seed=2)
-    other = make(device, num_envs=16, randomisation=bouncy)
-    other.load_state_dict(state)
-    np.testing.assert_array_equal(other.sim.restitution.table.numpy(), drawn.table.numpy())
-    if device == "cpu":
-        assert np.array_equal(run(other, 5, seed=2), expected)
-    with pytest.raises(ValueError, match=r"randomisation\.restitution"):
-        make(device, num_envs=16, randomisation=RandomisationCfg()).load_state_dict(state)
-
-
 def tightening(**changes) -> CurriculumCfg:
     """A curriculum whose thresholds tighten."""
     return CurriculumCfg(tightening=TighteningCfg(enabled=True, **changes))
@@ -353,10 +327,6 @@ def tightening(**changes) -> CurriculumCfg:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"randomisation": RandomisationCfg(restitution=(0.5, 1.2))},
-            r"randomisation\.restitution is 0\.5 1",
-        ),
         ({"randomisation": RandomisationCfg(observation_latency_s=(0.7, 0.7))}, "observation_latency_s"),
         ({"table": TableCfg(away_share=0.3, away_s=(3.0, 1.0))}, r"table\.away_s"),
         ({"sim": SimCfg(physics_hz=100.0)}, r"sim\.physics_hz"),

@@ -451,7 +451,6 @@ class ReorientEnv:
 
     def _arrays(self) -> dict[str, wp.array]:
         """What changes from step to step: simulation, episodes, randomisation, random streams."""
-        restitution = self.sim.restitution
         return {
             **self.motion(),
             "smoothed": self.smoothed,
@@ -464,7 +463,6 @@ class ReorientEnv:
             "rng": self.state.rng,
             **self.observer.stateful(),
             **self.randomiser.stateful(),
-            **({} if restitution is None else restitution.stateful()),
         }
 
     def close(self) -> None:

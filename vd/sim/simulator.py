@@ -17,7 +17,6 @@ from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
 from vd.sim.pair_order import sort_pairs
-from vd.sim.restitution import Restitution
 from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
 
 # Faster than any joint (8 rad/s) or dropped object (2 m/s) can be; an object that spins faster than
@@ -56,7 +55,6 @@ class Simulator:
         *,
         servo_rows: np.ndarray | None = None,
         servo_seed: int = 0,
-        restitution: bool = False,
     ):
         """Build the solver of a scene.
 
@@ -66,7 +64,6 @@ class Simulator:
             servo_rows: Parameters of every joint's servo, shape [D, P] or [N, D, P]
                 (:mod:`vd.kernels.servo.actuators`); the solver's plain drives by default.
             servo_seed: Seed of the random delays and losses of commands.
-            restitution: Whether contacts can bounce; see :attr:`restitution`.
         """
         cfg.validate()
         self.scene, self.cfg = scene, cfg
@@ -98,10 +95,6 @@ class Simulator:
         """Joint speed limits [rad/s], shape [D]."""
         geom_shape = self.solver.mjc_geom_to_newton_shape.numpy()
         self._geom_kind = array(np.where(geom_shape >= 0, scene.shape_kind[geom_shape], 0).astype(np.int32))
-        self.restitution: Restitution | None = None
-        """Coefficients of restitution, zero until written; None: contacts stay as they are."""
-        if restitution:
-            self.restitution = Restitution(self.solver, self._geom_kind, len(scene.hand.velocity_limit))
         self.table_force = wp.zeros(n, dtype=float, device=self.device)
         """Normal force between object and table at the end of the control step [N], shape [N]."""
         self.overflow = wp.zeros(n, dtype=wp.int32, device=self.device)
@@ -178,8 +171,6 @@ class Simulator:
             if ours and self.servo is not None:
                 self.servo.receive()
                 self.servo.drive(*here[1:3])
-            if ours and self.restitution is not None:
-                self.restitution.apply(here[2])
             self.solver.step(
                 here[0], there[0], self.control, None, self.cfg.physics_dt, observables=self._observables
             )
