@@ -18,7 +18,6 @@ commands:
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
   bundle     write a policy as it is deployed     vd-train bundle tracking.pt bundles/first
-  curves     draw the curves of a run             vd-train curves runs/first
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset gpu
 Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
@@ -38,6 +37,7 @@ GONE = {
     "follow": _TRACKER,
     "noise": "no training needed it",
     "profile": "no training needed it",
+    "curves": "tensorboard --logdir RUN draws the curves of runs",
     "precompile": "kernels stay in the folder that WARP_CACHE_PATH names, from one start to the next",
 }
 """Commands that are no more, and what to do, or why."""
@@ -50,7 +50,6 @@ COMMANDS = {
     "average": ("vd.train.average", "average_command"),
     "export": ("vd.train.export", "export_command"),
     "bundle": ("vd.train.export", "bundle_command"),
-    "curves": ("vd.train.curves", "curves_command"),
 }
 """Module and function of each command: it takes its flags and ``time.monotonic()`` of the start, and returns
 the exit status."""

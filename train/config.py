@@ -91,7 +91,7 @@ class RunCfg:
         "stagger": True,
     }
     out: Path = Path("runs/teacher")
-    """Folder for configuration, checkpoints, curves and TensorBoard files."""
+    """Folder for configuration, checkpoints and TensorBoard files."""
     device: str = "auto"
     """cpu, cuda:0, ... or auto: the first GPU, else the CPU (under torchrun: each process its own GPU)."""
     max_steps: int = 10_000_000_000

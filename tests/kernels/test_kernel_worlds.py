@@ -56,8 +56,8 @@ def test_overflow_bits_stick_and_others_do_not_count(device):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e3])
 @pytest.mark.parametrize("where", ["q", "qd"])
-def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
-    worlds, good, bad = 3, 5.0, 1
+def test_guard_counts_the_bad_steps_of_each_world(device, where, value):
+    worlds, bad = 3, 1
     q, qd = np.zeros((worlds, 4)), np.zeros((worlds, 3))
     if where == "q" and np.isfinite(value):
         pytest.skip("positions have no bound")
@@ -65,21 +65,11 @@ def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
     failures, failed = (
         device_array(values, int, device) for values in (np.zeros(worlds), [SENTINEL] * worlds)
     )
-    dumps = [device_array(np.full((worlds, n), np.nan), float, device) for n in (4, 3, 2)]
-
-    def guard(start: float, q: np.ndarray, qd: np.ndarray) -> None:
-        before = [np.full((worlds, n), start) for n in (4, 3, 2)]
-        launch(guard_kernel, worlds, [q, qd, *before, 500.0, failures, *dumps, failed], device)
-
-    guard(good, q, qd)
-    np.testing.assert_array_equal(failed.numpy(), [0, 1, 0])
-    guard(good + 1.0, 0.0 * np.nan_to_num(q, posinf=0.0), 0.0 * np.nan_to_num(qd, posinf=0.0))
-    np.testing.assert_array_equal(failed.numpy(), 0)
-    guard(good + 2.0, q, qd)
+    for scale, expected in ((1.0, [0, 1, 0]), (0.0, [0, 0, 0]), (1.0, [0, 1, 0])):
+        state = (q, qd) if scale else (np.zeros_like(q), np.zeros_like(qd))
+        launch(guard_kernel, worlds, [*state, 500.0, failures, failed], device)
+        np.testing.assert_array_equal(failed.numpy(), expected)
     np.testing.assert_array_equal(failures.numpy(), [0, 2, 0])
-    for dump in dumps:
-        assert (dump.numpy()[bad] == good).all(), "frozen at the first step that failed"
-        assert (dump.numpy()[[0, 2]] == good + 2.0).all(), "good worlds go on"
 
 
 @EXAMPLES

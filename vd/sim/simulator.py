@@ -109,14 +109,7 @@ class Simulator:
         self.after_physics_step: Callable[[wp.array, wp.array, wp.array, wp.array], None] | None = None
         """Called in every physics step with the new positions, velocities and link poses and velocities,
         shape [N, *]; device work only."""
-        self._start_q, self._start_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
-        self.failed_from = {
-            "joint_q": wp.clone(self.joint_q),
-            "joint_qd": wp.clone(self.joint_qd),
-            "target": wp.clone(self.target),
-        }
-        """Positions, velocities and joint targets from which a world's first step that failed began, shape
-        [N, *]; of a world in which none did those of the last."""
+        self._start_q = wp.clone(self.joint_q)
         if servo_rows is not None:
             self.target = wp.clone(self.target)  # the drives' references become the servos' output
             self.servo = JointServo(
@@ -136,7 +129,6 @@ class Simulator:
         (:attr:`vd.sim.engine.WarpSolver.captured`).
         """
         wp.copy(self._start_q, self.joint_q)
-        wp.copy(self._start_qd, self.joint_qd)
         wp.copy(self._next_body_force, self.body_force)
         if self.servo is not None:
             self.servo.send(self.target)
@@ -147,8 +139,8 @@ class Simulator:
         launch(
             guard_kernel,
             self.num_envs,
-            [self.joint_q, self.joint_qd, self._start_q, self._start_qd, self.target, MAX_SPEED],
-            [self.failures, *self.failed_from.values(), self.failed],
+            [self.joint_q, self.joint_qd, MAX_SPEED],
+            [self.failures, self.failed],
         )
 
     def put_back(self, step_count: wp.array, last_step: int) -> None:
@@ -266,6 +258,5 @@ class Simulator:
             raise SimulationError(
                 f"{len(worlds)} of {self.num_envs} environments left the finite numbers or "
                 f"exceeded {MAX_SPEED:g} m/s or rad/s (first: world {worlds[0]}, object {name}). "
-                "Replay the saved dump with "
-                "`vd-bench replay DUMP`; then raise sim.physics_hz or sim.contact_time_constant_s"
+                "Raise sim.physics_hz or sim.contact_time_constant_s"
             )
