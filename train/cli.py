@@ -13,7 +13,6 @@ commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --out runs/first
   student    learn to see without a mesh          vd-train student --teacher dclaw3-table --objects SET
   tracker    let it act by a camera, learn nothing vd-train tracker dclaw3-table --objects SET
-  average    mean weights of several teachers     vd-train average runs/a runs/b --out policy.pt
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
@@ -37,6 +36,7 @@ GONE = {
     "follow": _TRACKER,
     "noise": "no training needed it",
     "profile": "no training needed it",
+    "average": "it gained too little (docs/lessons.md)",
     "curves": "tensorboard --logdir RUN draws the curves of runs",
     "precompile": "kernels stay in the folder that WARP_CACHE_PATH names, from one start to the next",
 }
@@ -47,7 +47,6 @@ COMMANDS = {
     "teacher": ("vd.train.teacher", "teacher_command"),
     "student": ("vd.train.student.cli", "student_command"),
     "tracker": ("vd.train.tracker", "tracker_command"),
-    "average": ("vd.train.average", "average_command"),
     "export": ("vd.train.export", "export_command"),
     "bundle": ("vd.train.export", "bundle_command"),
 }
