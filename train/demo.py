@@ -18,6 +18,7 @@ from typing import Any
 import tyro
 
 from vd import interrupt
+from vd.config import require
 from vd.evaluate.agents import check_names
 from vd.files import atomic_path, check_folder
 from vd.paper import PAPER
@@ -284,8 +285,7 @@ def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; returns the exit status: 1 if a part failed."""
     cfg = tyro.cli(DemoCfg, args=arguments, prog="python -m vd.train.demo")
-    if cfg.minutes <= 0.0:
-        raise ValueError(f"--minutes is {cfg.minutes}; it has to be positive")
+    require(cfg, "--", "positive", "minutes")
     check_names([CAMERA_POLICY], [])
     check_folder(cfg.out)
     if cfg.out.is_dir() and any(cfg.out.iterdir()) and not (cfg.out / "index.html").is_file():

@@ -17,6 +17,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel, compose, invert
+from vd.config import require
 from vd.deploy.camera.camera import CameraError, object_place
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
@@ -64,8 +65,7 @@ class CalibrateCfg(HandOptions):
 
 def calibrate(cfg: CalibrateCfg) -> int:
     """Take views, solve, write the layer; 1 if the result is too uncertain."""
-    if not cfg.side_m > 0.0 or cfg.count < 1:
-        raise ValueError("--side-m and --count have to be positive")
+    require(cfg, "--", "positive", "side_m count")
     hand, _ = read_hand_and_joints(cfg)
     fingers = cfg.fingers or tuple(range(hand.num_fingers))
     if not all(0 <= f < hand.num_fingers for f in fingers) or len(set(fingers)) != len(fingers):
