@@ -130,14 +130,7 @@ def run(cfg: RunCfg) -> int:
     hand, _ = read_hand_and_joints(cfg)
     item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
     tolerance = cfg.tolerance_rad
-    runner = load_runner(
-        name,
-        cfg.hand,
-        hand,
-        item,
-        tolerance_rad=tolerance,
-        seed=cfg.seed,
-    )
+    runner = load_runner(name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed)
     if not runner.calibrated:
         print(
             f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that distance; "
@@ -242,12 +235,7 @@ def _pursue(
     return int(reason == "lost")
 
 
-def warm_up(
-    runner: "PolicyRunner",
-    pose: np.ndarray,
-    goal: np.ndarray,
-    camera: Camera | None,
-) -> None:
+def warm_up(runner: "PolicyRunner", pose: np.ndarray, goal: np.ndarray, camera: Camera | None) -> None:
     """Let the policy decide a few times on what is seen now; the run begins without that.
 
     The object may not be between the fingers yet.

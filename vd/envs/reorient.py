@@ -226,11 +226,6 @@ class ReorientEnv:
             self._hold_graph = capture.graph
         wp.capture_launch(self._hold_graph)
 
-    def launch_physics(self) -> None:
-        """Apply the action and run the solver's steps, nothing else (for benchmarks)."""
-        self._apply_action()
-        self.sim.physics_only()
-
     def _apply_action(self) -> None:
         p, sim = self.parameters, self.sim
         action = self.action

@@ -132,7 +132,7 @@ class Simulator:
         wp.copy(self._next_body_force, self.body_force)
         if self.servo is not None:
             self.servo.send(self.target)
-        self._physics_steps(ours=True)
+        self._physics_steps()
         if self.servo is not None:
             self.servo.measure()
         self._table_contact()
@@ -152,29 +152,24 @@ class Simulator:
             [self.joint_q, self.joint_qd, step_count],
         )
 
-    def _physics_steps(self, *, ours: bool) -> None:
-        """The physics steps of one control step, with our additions; states end where they began."""
+    def _physics_steps(self) -> None:
+        """The physics steps of one control step, with what surrounds them; states end where they began."""
         here = self.state, self.joint_q, self.joint_qd, self.body_q, self.body_qd
         there = self._next, *self._next_arrays
         for step in range(self.cfg.substeps):
-            if ours and step == self.force_steps:
+            if step == self.force_steps:
                 wp.copy(self.body_force, self.lasting_force)
                 wp.copy(self._next_body_force, self.lasting_force)
-            if ours and self.servo is not None:
+            if self.servo is not None:
                 self.servo.receive()
                 self.servo.drive(*here[1:3])
             self.solver.step(
                 here[0], there[0], self.control, None, self.cfg.physics_dt, observables=self._observables
             )
-            if ours:
-                self._limit_and_collect(here[1], *there[1:3])
-                if self.after_physics_step is not None:
-                    self.after_physics_step(*there[1:])
+            self._limit_and_collect(here[1], *there[1:3])
+            if self.after_physics_step is not None:
+                self.after_physics_step(*there[1:])
             here, there = there, here
-
-    def physics_only(self) -> None:
-        """The solver's share of a control step, nothing of ours (for benchmarks)."""
-        self._physics_steps(ours=False)
 
     def _limit_and_collect(self, previous_q: wp.array2d, q: wp.array2d, qd: wp.array2d) -> None:
         # The solver knows no joint velocity limits.
