@@ -153,20 +153,14 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     from tqdm import tqdm
 
     from vd.evaluate.cfg import LOG_EVERY_S
-    from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
+    from vd.play.video import GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
     env, policy = _open(cfg, trained, num_envs=cfg.cells)
     envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
-    renderer = Renderer(
-        env.hand,
-        [env.objects[env.world_object[world]] for world in envs],
-        width=width,
-        height=height,
-        goal_size=round(GOAL_SHARE * height),
-        device=env.device,
-    )
+    items = [env.objects[env.world_object[world]] for world in envs]
+    renderer = Renderer(env.hand, items, width=width, height=height, device=env.device)
     rate = env.cfg.sim.control_hz
     steps = max(1, round(cfg.seconds * rate))
     frames: Iterable[Any] = record(env, policy, renderer, envs, steps)

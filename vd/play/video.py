@@ -20,8 +20,6 @@ from vd.render import Picture, Renderer
 
 # Size of a cell's picture [pixel]: alone, and in a grid.
 SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)
-# Side of the goal's picture, as a share of the cell's height.
-GOAL_SHARE = 0.36
 STRIP_HEIGHT = 80
 MARGIN = 10
 # Error curve: as long as an episode of the paper.
