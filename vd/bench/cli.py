@@ -1,4 +1,4 @@
-"""``vd-bench``: measure speed, physics and gap workflow; rates are ratios within one run."""
+"""``vd-bench``: measure speed, physics, depth camera and gap workflow; rates are ratios within one run."""
 
 import dataclasses
 import json
@@ -17,7 +17,6 @@ from vd.warp_quiet import quiet_warp
 
 GONE = {
     "student": "vd-deploy POLICY --twin tells its times",
-    "depth": "docs/results.md#speed has its figures",
     "replay": "the message names the setting to change",
 }
 """Measurements that are no more, and what is there instead."""
@@ -39,7 +38,7 @@ def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> No
 
 @dataclass(frozen=True)
 class Measurement:
-    """What the measurements of simulation and contacts have in common."""
+    """What the measurements of simulation, contacts and camera have in common."""
 
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets, mixed over the environments."""
@@ -105,6 +104,29 @@ class PhysicsCommand(Measurement):
 
 
 @dataclass(frozen=True)
+class DepthCommand(Measurement):
+    """Depth images and clouds per second, beside Newton's camera at the same size in the same run."""
+
+    envs: tuple[int, ...] = (256, 1024, 4096)
+    """Numbers of environments to measure; 1 for the figure at deployment on a CPU."""
+    hand: str = "dclaw4"
+    """Hand."""
+    seed: int = 0
+    """Of the poses."""
+
+    def run(self) -> int:
+        """Measure and print."""
+        quiet_warp()
+        from vd.assets_usd.objects.sets import load_set
+        from vd.bench.depth import measure
+
+        device, objects = resolve_device(self.device), load_set(list(self.objects))
+        rows = (measure(objects, envs, device, hand=self.hand, seed=self.seed) for envs in self.envs)
+        report(rows, device, self.json)
+        return 0
+
+
+@dataclass(frozen=True)
 class GapCommand:
     """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
 
@@ -156,6 +178,7 @@ class GapCommand:
 Command = (
     Annotated[SimCommand, tyro.conf.subcommand("sim")]
     | Annotated[PhysicsCommand, tyro.conf.subcommand("physics")]
+    | Annotated[DepthCommand, tyro.conf.subcommand("depth")]
     | Annotated[GapCommand, tyro.conf.subcommand("gap")]
 )
 
