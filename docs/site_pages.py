@@ -52,7 +52,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 def on_page_content(html: str, **_: Any) -> str:
     """Show a film where a page links to one."""
-    return re.sub(r'<a href="([^"]+\.mp4)">(.*?)</a>', r'<video controls muted src="\1" title="\2"></video>', html)
+    return re.sub(r'<a href="([^"]+\.mp4)">(.*?)</a>', r'\2 <video controls muted src="\1"></video>', html)
 
 
 def commands() -> str:
