@@ -82,7 +82,7 @@ def _help(main: Callable[[], object], script: str, words: Sequence[str]) -> str:
     lines = shown.getvalue().replace("``", "").strip().splitlines()
     if not lines:
         raise ValueError(f"`{script} {' '.join(words)} {flag}` prints nothing")
-    return "\n".join(line.rstrip() if line.startswith(" ") else textwrap.fill(line, COLUMNS) for line in lines)
+    return "\n".join(line.rstrip() if line[:1] == " " else textwrap.fill(line, COLUMNS) for line in lines)
 
 
 def _subcommands(text: str) -> Iterator[str]:
