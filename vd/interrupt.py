@@ -90,7 +90,7 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
             if renamed:
                 print(f"{name}: {renamed}", file=sys.stderr)
                 return USAGE_ERROR
-            if given and not {"-h", "--help"} & set(given):
+            if given and not {"-h", "--help", "--help-all"} & set(given):
                 print(f"{name}: starting", file=sys.stderr, flush=True)  # what it imports takes seconds
             warnings.formatwarning = format_warning
             with _terminated():
