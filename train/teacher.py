@@ -71,7 +71,6 @@ def build_teacher(
     torch.set_float32_matmul_precision("high")
     physics = coarser(cfg.env.sim) if cfg.run.coarse_physics else cfg.env.sim
     simulation = ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank, sim=physics), device)
-    simulation.dump_dir = cfg.run.out
     runner = TeacherRunner(
         ReorientVecEnv(simulation),
         cfg.ppo,
@@ -125,7 +124,9 @@ def _train(cfg: TeacherCfg, say: Callable[[str], None], started: float) -> int:
             f"done before are more than --max-steps {cfg.run.max_steps}; raise it"
         )
     else:
-        say(f"done: {folder}/{POLICY_NAME} is the best policy, vd-train curves {folder} draws the curves")
+        say(
+            f"done: {folder}/{POLICY_NAME} is the best policy, tensorboard --logdir {folder} draws the curves"
+        )
     return 0
 
 

@@ -47,6 +47,8 @@ GONE = {
     "--ppo.optimizer": "Adam is the only one",
     "--agent": "name zero or random in place of a policy",
     "--allegro": "the comparison is in docs/results.md",
+    "--env.randomisation.restitution": "contacts are damped springs (docs/limitations.md)",
+    "--keep-every": "weight averaging gained too little (docs/lessons.md)",
     "--shard": "give each machine other --kinds",
     "--collect": "give the same command again: it runs what is missing and prints the tables",
     "--depth.focal-noise": "a calibrated camera knows its focal length",

@@ -1,4 +1,4 @@
-"""vd-bench: measure speed, physics, depth camera and gap workflow; rates are ratios within one run."""
+"""vd-bench: measure speed, physics and gap workflow; rates are ratios within one run."""
 
 import dataclasses
 import json
@@ -14,6 +14,13 @@ from vd import interrupt
 from vd.device import resolve_device
 from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
+
+GONE = {
+    "student": "vd-deploy POLICY --twin tells its times",
+    "depth": "docs/results.md#speed has its figures",
+    "replay": "the message names the setting to change",
+}
+"""Measurements that are no more, and what is there instead."""
 
 
 def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> None:
@@ -32,7 +39,7 @@ def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> No
 
 @dataclass(frozen=True)
 class Measurement:
-    """What the measurements of simulation, contacts and camera have in common."""
+    """What the measurements of simulation and contacts have in common."""
 
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets, mixed over the environments."""
@@ -98,50 +105,6 @@ class PhysicsCommand(Measurement):
 
 
 @dataclass(frozen=True)
-class DepthCommand(Measurement):
-    """Depth images and clouds per second, beside Newton's camera at the same size in the same run."""
-
-    envs: tuple[int, ...] = (256, 1024, 4096)
-    """Numbers of environments to measure; 1 for the figure at deployment on a CPU."""
-    hand: str = "dclaw4"
-    """Hand."""
-    seed: int = 0
-    """Of the poses."""
-
-    def run(self) -> int:
-        """Measure and print."""
-        quiet_warp()
-        from vd.assets_usd.objects.sets import load_set
-        from vd.bench.depth import measure
-
-        device, objects = resolve_device(self.device), load_set(list(self.objects))
-        rows = (measure(objects, envs, device, hand=self.hand, seed=self.seed) for envs in self.envs)
-        report(rows, device, self.json)
-        return 0
-
-
-@dataclass(frozen=True)
-class ReplayCommand:
-    """Replay the control step in which a state left the finite numbers, physics step by physics step."""
-
-    dump: Annotated[Path, tyro.conf.Positional]
-    """File written when the run stopped."""
-    device: str = "cpu"
-    """Warp device."""
-
-    def run(self) -> int:
-        """Replay and print."""
-        if not self.dump.is_file():
-            raise ValueError(f"there is no file {self.dump}; give the dump that the stopped run has named")
-        quiet_warp()
-        from vd.sim.replay import replay
-
-        for line in replay(self.dump, device=self.device):
-            print(line)
-        return 0
-
-
-@dataclass(frozen=True)
 class GapCommand:
     """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
 
@@ -193,9 +156,7 @@ class GapCommand:
 Command = (
     Annotated[SimCommand, tyro.conf.subcommand("sim")]
     | Annotated[PhysicsCommand, tyro.conf.subcommand("physics")]
-    | Annotated[DepthCommand, tyro.conf.subcommand("depth")]
     | Annotated[GapCommand, tyro.conf.subcommand("gap")]
-    | Annotated[ReplayCommand, tyro.conf.subcommand("replay")]
 )
 
 
@@ -203,8 +164,8 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-bench``; returns the exit status."""
     given = sys.argv[1:] if arguments is None else arguments
-    if given[:1] == ["student"]:
-        print("vd-bench: 'student' is no more: vd-deploy POLICY --twin tells its times", file=sys.stderr)
+    if given and given[0] in GONE:
+        print(f"vd-bench: {given[0]!r} is no more: {GONE[given[0]]}", file=sys.stderr)
         return interrupt.USAGE_ERROR
     command = tyro.cli(Command, args=arguments, prog="vd-bench", description=__doc__)
     if isinstance(command, GapCommand):
