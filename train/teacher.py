@@ -20,6 +20,9 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.train.runner import TeacherRunner
 
+CPU_ENVS = 1024
+"""Most environments of which a CPU simulates an iteration within a minute."""
+
 BUILDING = "building the environments (the first start compiles the kernels: a minute or two) ..."
 
 
@@ -49,6 +52,8 @@ def build_teacher(
         raise ValueError("--init-stage says where a run with --init begins; leave it out, or give --init")
     if cfg.init is None and cfg.ppo.imitation_iterations:
         raise ValueError("--ppo.imitation-iterations imitates the policy that --init names; give --init too")
+    if device == "cpu" and cfg.env.num_envs > CPU_ENVS:
+        say(f"{cfg.env.num_envs} environments take a CPU minutes an iteration; --num-envs asks for fewer")
     say(BUILDING)
 
     import torch

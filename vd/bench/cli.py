@@ -1,4 +1,4 @@
-"""``vd-bench``: measure speed, physics, depth camera and gap workflow; rates are ratios within one run."""
+"""vd-bench: measure speed, physics, depth camera and gap workflow; rates are ratios within one run."""
 
 import dataclasses
 import json
