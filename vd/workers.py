@@ -39,6 +39,7 @@ def run_tasks(
     jobs: int,
     limit_s: float,
     gpu: bool = False,
+    threads: int = 1,
 ) -> None:
     """Run ``work`` on every task in fresh processes, each with one thread of linear algebra.
 
@@ -50,13 +51,14 @@ def run_tasks(
         jobs: Processes.
         limit_s: Longest time of a task [s].
         gpu: Whether the workers may see a GPU; a context each would fill it.
+        threads: OpenMP's threads of a worker.
     """
     waiting = deque(tasks)
     # A pool for each process: one that dies takes its pool along.
     idle = [_worker() for _ in range(min(jobs, len(tasks)))]
     running: dict[Future[Any], tuple[Any, ProcessPoolExecutor, float]] = {}
     try:
-        with _environment(gpu):
+        with _environment(gpu, threads):
             while waiting or running:
                 while idle and waiting:
                     worker, task = idle.pop(), waiting.popleft()
@@ -110,9 +112,9 @@ def _kill(worker: ProcessPoolExecutor) -> None:
 
 
 @contextmanager
-def _environment(gpu: bool) -> Iterator[None]:
+def _environment(gpu: bool, threads: int) -> Iterator[None]:
     """What processes started meanwhile inherit."""
-    change = dict.fromkeys(SINGLE, "1")
+    change = dict.fromkeys(SINGLE, "1") | {"OMP_NUM_THREADS": str(threads)}
     if not gpu:
         change["CUDA_VISIBLE_DEVICES"] = ""
     before = {name: os.environ.get(name) for name in change}

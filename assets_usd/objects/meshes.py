@@ -67,12 +67,7 @@ def scales_that_fit(sides: Sequence[float], width: float) -> tuple[float, float]
 def scale_of(
     settings: ImportSettings, vertices: np.ndarray, declared: float | None
 ) -> tuple[float, list[str], list[str]]:
-    """Factor to metres for vertices [V, 3] in a file's unit (``declared``, m); notes and warnings.
-
-    Raises:
-        MeshError: The size is to be kept and the unit is not known.
-    """
-    settings.check_unit(declared)
+    """Factor to metres for vertices [V, 3] in a file's unit (``declared``, m); notes and warnings."""
     sides, width = np.ptp(vertices, axis=0), mean_width(vertices)
     unit = UNITS_M.get(settings.units, declared)
     if not settings.keep_size or unit is None:

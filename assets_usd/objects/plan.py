@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vd.assets_usd.objects.model import object_files, read_origin
-from vd.assets_usd.objects.reading import KINDS, MESH_SUFFIXES
-from vd.assets_usd.objects.sets import built_in_models, objects_dir
+from vd.assets_usd.objects.reading import MESH_SUFFIXES
+from vd.assets_usd.objects.sets import is_built_in, objects_dir
 from vd.assets_usd.objects.settings import MeshError
 
 GENERIC_WORDS = frozenset(
@@ -109,7 +109,7 @@ def _meshes_below(folder: Path) -> list[Path]:
         and path.suffix.lower() in MESH_SUFFIXES
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     )
-    usd = [path for path in files if KINDS[path.suffix.lower()] == "usd"]
+    usd = [path for path in files if path.suffix.lower().startswith(".usd")]
     left_out = {path for path in usd if read_origin(path) is not None}
     for path in usd:
         if path not in left_out:
@@ -180,18 +180,14 @@ def plan_jobs(meshes: Iterable[Path], out: Path, licence: str) -> list[Job]:
     return jobs
 
 
-def check_target(job: Job, unchanged: bool) -> None:
+def check_target(job: Job) -> None:
     """Refuse to write over what is not this mesh's own object.
-
-    Args:
-        job: The mesh.
-        unchanged: Whether the object that is there was made from the same content.
 
     Raises:
         MeshError: Names both, and the remedy.
     """
     target = Path(job.target)
-    if unchanged or not target.exists():
+    if not target.exists():
         return
     origin = read_origin(target)
     if origin is None:
@@ -211,13 +207,6 @@ def check_target(job: Job, unchanged: bool) -> None:
     )
 
 
-def gone_objects(out: Path) -> dict[Path, str]:
-    """Object files of a set whose mesh file is no longer there, and that file's path."""
-    origins = {path: read_origin(path) for path in object_files(out)} if out.is_dir() else {}
-    files = {path: origin[1] for path, origin in origins.items() if origin and origin[1]}
-    return {path: file for path, file in files.items() if not Path(file).exists()}
-
-
 def default_set(paths: Sequence[Path]) -> Path:
     """Folder in the asset cache for the objects of these paths: named after the folder that holds them all.
 
@@ -229,7 +218,7 @@ def default_set(paths: Sequence[Path]) -> Path:
     name = object_name(above) if above.is_file() else plain
     folder = objects_dir() / name
     other = f"say where with --out, such as --out {objects_dir() / f'my-{name}'}"
-    if built_in_models(name) is not None:
+    if is_built_in(name):
         raise MeshError(f"{name!r} is the name of a built-in object set; {other}")
     for path in object_files(folder) if folder.is_dir() else ():
         origin = read_origin(path)

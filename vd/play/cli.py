@@ -25,7 +25,7 @@ from vd.sim.cfg import Engine, in_mujoco
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
-    from vd.play.replay import ReplaySession
+    from vd.play.replay import Replay
     from vd.play.session import Session
 
 VIDEO_SECONDS = 10.0
@@ -110,34 +110,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cfg.validate()
     if cfg.video is not None:
         check_file(cfg.video)
-    if is_log(cfg.agent_name):
-        quiet_warp()
-        return replay(cfg)
-    check_names([cfg.agent_name], cfg.objects, cfg.hand)
+    recorded = is_log(cfg.agent_name)
+    if not recorded:
+        check_names([cfg.agent_name], cfg.objects, cfg.hand)
     quiet_warp()
-    if cfg.video is not None:
-        frames = record_video(cfg, cfg.video)
-        print(f"{cfg.video} ({frames} frames)")
+    if recorded:
+        from vd.hand_log import read_log
+        from vd.play.replay import Replay, film
+
+        log = read_log(cfg.agent_name)
+        if cfg.video is None:
+            shown = Replay(log)
+            serve(lambda: shown, cfg)
+            return 0
+        frames = film(log, cfg.video)
     else:
-        serve(cfg)
-    return 0
-
-
-def replay(cfg: PlayCfg) -> int:
-    """Show the log of a run; returns the exit status.
-
-    Raises:
-        LogError: The log cannot be used.
-    """
-    from vd.hand_log import read_log
-    from vd.play.replay import Replay, ReplaySession, film
-
-    log = read_log(cfg.agent_name)
-    if cfg.video is None:
-        shown = Replay(log)
-        _serve(lambda: ReplaySession(shown), cfg)
-        return 0
-    frames = film(log, cfg.video)
+        if cfg.video is None:
+            trained = _policy(cfg)
+            serve(lambda: open_session(cfg, trained), cfg)
+            return 0
+        frames = record_video(cfg, cfg.video)
     print(f"{cfg.video} ({frames} frames)")
     return 0
 
@@ -172,13 +164,8 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     return count
 
 
-def serve(cfg: PlayCfg) -> None:
+def serve(open_it: "Callable[[], Session | Replay]", cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C; the page is there, and says so, while the scene is being built."""
-    trained = _policy(cfg)
-    _serve(lambda: open_session(cfg, trained), cfg)
-
-
-def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> None:
     from vd.play.viewer import PlayViewer, open_page
 
     page = open_page(host=cfg.host, port=cfg.port)
@@ -188,7 +175,7 @@ def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> No
         try:
             PlayViewer(session, page).run()
         finally:
-            session.env.close()
+            session.close()
     finally:
         page.viewer.close()
 

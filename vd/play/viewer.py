@@ -17,7 +17,7 @@ import warp as wp
 from newton.viewer import ViewerViser
 
 from vd.paper import PAPER
-from vd.play.replay import ReplaySession
+from vd.play.replay import Replay
 from vd.play.session import Session
 from vd.play.video import Snapshot
 from vd.render import OUT_OF_SIGHT, Camera, PictureModel
@@ -57,10 +57,10 @@ class PlayViewer:
         page: Where, of :func:`open_page`.
     """
 
-    def __init__(self, session: Session | ReplaySession, page: Page):
+    def __init__(self, session: Session | Replay, page: Page):
         self.session = session
         self.viewer = page.viewer
-        self.camera = Camera.for_hand(session.env.hand)
+        self.camera = Camera.for_hand(session.hand)
         self._events: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._models: dict[str, PictureModel] = {}
         self._ghost = BESIDE
@@ -78,7 +78,7 @@ class PlayViewer:
 
     def run(self, *, steps: int | None = None) -> None:
         """Step in real time until the viewer is closed, or ``steps`` control steps were made."""
-        period = 1.0 / self.session.env.cfg.sim.control_hz
+        period = 1.0 / self.session.control_hz
         done, due = 0, time.monotonic()
         while self.viewer.is_running() and (steps is None or done < steps):
             done += self.update()
@@ -114,9 +114,8 @@ class PlayViewer:
         """Show the model of the chosen object; models are kept, since building one takes a second."""
         name = self.session.object_name
         if name not in self._models:
-            env = self.session.env
-            item = env.objects[self.session.object_names.index(name)]
-            self._models[name] = PictureModel(env.hand, [item], device="cpu", ghost_in_scene=True)
+            item = self.session.objects[self.session.object_names.index(name)]
+            self._models[name] = PictureModel(self.session.hand, [item], ghost_in_scene=True)
         self._pictured = self._models[name]
         self.viewer.set_model(self._pictured.model)
 
