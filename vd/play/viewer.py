@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from html import escape
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -26,27 +26,7 @@ from vd.render import OUT_OF_SIGHT, Camera, PictureModel
 GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
 # The viewer's camera stands this much farther than that of videos: a browser window has panels around it.
 CAMERA_DISTANCE = 1.25
-WAITING = "**Compiling kernels and building the scene.** The first start takes minutes."
 BESIDE, ON_OBJECT, HIDDEN = "beside the hand", "on the object", "hidden"
-
-
-class Page(NamedTuple):
-    """Where a viewer draws, and what it says there before."""
-
-    viewer: ViewerViser
-    notice: Any
-
-
-def open_page(*, host: str = "127.0.0.1", port: int = 8080, verbose: bool = True) -> Page:
-    """A page that says what is being waited for, until a :class:`PlayViewer` shows something on it.
-
-    Args:
-        host: Address to serve on; ``127.0.0.1`` keeps it on this machine.
-        port: Port to serve on; the next free one is taken if it is in use.
-        verbose: Print the address.
-    """
-    viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=verbose)
-    return Page(viewer, viewer.server.gui.add_markdown(WAITING, order=-2.0))
 
 
 class PlayViewer:
@@ -54,12 +34,16 @@ class PlayViewer:
 
     Args:
         session: What runs.
-        page: Where, of :func:`open_page`.
+        host: Address to serve on; ``127.0.0.1`` keeps it on this machine.
+        port: Port to serve on; the next free one is taken if it is in use.
+        verbose: Print the address.
     """
 
-    def __init__(self, session: Session | Replay, page: Page):
+    def __init__(
+        self, session: Session | Replay, *, host: str = "127.0.0.1", port: int = 8080, verbose: bool = True
+    ):
         self.session = session
-        self.viewer = page.viewer
+        self.viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=verbose)
         self.camera = Camera.for_hand(session.hand)
         self._events: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._models: dict[str, PictureModel] = {}
@@ -69,7 +53,6 @@ class PlayViewer:
         self._build_panel()
         self.viewer.set_reset_callback(self.session.reset)
         self.draw()
-        page.notice.remove()
 
     @property
     def url(self) -> str:
