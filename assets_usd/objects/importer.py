@@ -28,8 +28,8 @@ from vd.assets_usd.objects.model import (
     ObjectError,
     ObjectModel,
     build_model,
-    read_hash,
     read_object,
+    stored_facts,
     write_object,
 )
 from vd.assets_usd.objects.plan import Job, check_target, find_meshes, plan_jobs
@@ -250,7 +250,7 @@ def _without_work(job: Job, settings: ImportSettings) -> ImportResult | None:
         content = content_hash(job, settings)
     except MeshError as error:
         return ImportResult(job, "refused", str(error))
-    if target.is_file() and read_hash(target) == content:
+    if target.is_file() and stored_facts(target).get("contentHash") == content:
         return ImportResult(job, "cached", model=read_object(target))
     check_target(job)
     return None

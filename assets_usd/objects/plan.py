@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vd.assets_usd.objects.model import object_files, read_origin
+from vd.assets_usd.objects.model import object_files, stored_facts
 from vd.assets_usd.objects.reading import MESH_SUFFIXES
 from vd.assets_usd.objects.sets import is_built_in, objects_dir
 from vd.assets_usd.objects.settings import MeshError
@@ -110,7 +110,7 @@ def _meshes_below(folder: Path) -> list[Path]:
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     )
     usd = [path for path in files if path.suffix.lower().startswith(".usd")]
-    left_out = {path for path in usd if read_origin(path) is not None}
+    left_out = {path for path in usd if stored_facts(path)}
     for path in usd:
         if path not in left_out:
             left_out |= _parts_of_usd(path)
@@ -189,13 +189,13 @@ def check_target(job: Job) -> None:
     target = Path(job.target)
     if not target.exists():
         return
-    origin = read_origin(target)
-    if origin is None:
+    facts = stored_facts(target)
+    if not facts:
         raise MeshError(
             f"{target} is there and no object of vd-assets, or a damaged one; remove it, or import into "
             "another folder (--out)"
         )
-    source, file = origin
+    source, file = str(facts.get("source", "")), str(facts.get("file", ""))
     # Objects of versions that recorded no file are told by the name in their source.
     if file and os.path.realpath(file) == os.path.realpath(job.source):
         return
@@ -221,7 +221,7 @@ def default_set(paths: Sequence[Path]) -> Path:
     if is_built_in(name):
         raise MeshError(f"{name!r} is the name of a built-in object set; {other}")
     for path in object_files(folder) if folder.is_dir() else ():
-        origin = read_origin(path)
-        if origin and origin[1] and not Path(origin[1]).is_relative_to(above):
-            raise MeshError(f"the set {folder} holds objects from elsewhere ({origin[1]}); {other}")
+        file = stored_facts(path).get("file")
+        if file and not Path(file).is_relative_to(above):
+            raise MeshError(f"the set {folder} holds objects from elsewhere ({file}); {other}")
     return folder

@@ -12,7 +12,7 @@ from vd.assets_usd.objects.model import (
     ObjectModel,
     object_files,
     read_object,
-    read_origin,
+    stored_facts,
     write_object,
 )
 from vd.files import make_folder, writing
@@ -63,7 +63,8 @@ def write_set(folder: Path, models: list[ObjectModel]) -> list[Path]:
     """
     targets = [Path(folder) / f"{model.name}.usd" for model in models]
     for target, model in zip(targets, models, strict=True):
-        if target.exists() and read_origin(target) != (model.source, model.file):
+        there = stored_facts(target) if target.exists() else {"source": model.source, "file": model.file}
+        if (there.get("source"), there.get("file")) != (model.source, model.file):
             raise ObjectError(f"{target} is there and another object; write to another folder (--out)")
     return [write_object(target, model) for target, model in zip(targets, models, strict=True)]
 
