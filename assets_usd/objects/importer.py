@@ -121,6 +121,7 @@ def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
 
 def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     """Import one mesh in this process (CoACD runs in a child). A mesh that is refused is a result."""
+    quiet_warp()
     try:
         model = _object_of(job, settings)
         write_object(Path(job.target), model)
@@ -173,11 +174,6 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
     )
 
 
-def _import_quietly(settings: ImportSettings, job: Job) -> ImportResult:
-    quiet_warp()
-    return import_mesh(job, settings)
-
-
 def import_meshes(
     paths: Iterable[Path],
     out: Path,
@@ -225,7 +221,7 @@ def import_meshes(
         finish(result)
     workers = max(min(jobs or os.cpu_count() or 1, len(todo)), 1)
     run_tasks(
-        partial(_import_quietly, settings),
+        partial(import_mesh, settings=settings),
         todo,
         lambda job, result, why: finish(result or ImportResult(job, "refused", f"no import: {why}")),
         jobs=workers,
