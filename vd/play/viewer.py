@@ -20,13 +20,12 @@ from vd.paper import PAPER
 from vd.play.replay import Replay
 from vd.play.session import Session
 from vd.play.video import Snapshot
-from vd.render import OUT_OF_SIGHT, Camera, PictureModel
+from vd.render import Camera, PictureModel
 
 # Where the goal's object floats, in the camera's right and up [m]: left of the hand, for panels are right.
 GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
 # The viewer's camera stands this much farther than that of videos: a browser window has panels around it.
 CAMERA_DISTANCE = 1.25
-BESIDE, ON_OBJECT, HIDDEN = "beside the hand", "on the object", "hidden"
 
 
 class PlayViewer:
@@ -47,7 +46,8 @@ class PlayViewer:
         self.camera = Camera.for_hand(session.hand)
         self._events: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._models: dict[str, PictureModel] = {}
-        self._ghost = BESIDE
+        x, y, _ = GHOST_RIGHT * self.camera.rotation[:, 0]
+        self._ghost = float(x), float(y), GHOST_HEIGHT
         self._show_object()
         self._set_camera()
         self._build_panel()
@@ -81,8 +81,7 @@ class PlayViewer:
     def draw(self) -> None:
         """Send the present state to the browser."""
         shot = self.session.snapshot
-        ghost = self._ghost_position(shot)
-        self._pictured.pose(shot.joint_q[None], shot.goal_quat[None], ghost, table=shot.table)
+        self._pictured.pose(shot.joint_q[None], shot.goal_quat[None], self._ghost, table=shot.table)
         self.viewer.begin_frame(shot.time_s)
         self.viewer.log_state(self._pictured.state)
         self.viewer.log_scalar("orientation error [rad]", shot.error_rad)
@@ -111,31 +110,17 @@ class PlayViewer:
             yaw=math.degrees(math.atan2(forward[1], forward[0])),
         )
 
-    def _ghost_position(self, shot: Snapshot) -> tuple[float, float, float]:
-        if self._ghost == HIDDEN:
-            return OUT_OF_SIGHT[:3]
-        if self._ghost == ON_OBJECT:
-            x, y, z = (float(value) for value in shot.joint_q[-7:-4])
-            return x, y, z
-        right = self.camera.rotation[:, 0]
-        return float(GHOST_RIGHT * right[0]), float(GHOST_RIGHT * right[1]), GHOST_HEIGHT
-
     def _build_panel(self) -> None:
         gui, session = self.viewer.server.gui, self.session
         with gui.add_folder("Policy", order=-1.0):
             self._status = gui.add_html(status_html(session.snapshot))
             chosen = gui.add_dropdown("Object", session.object_names, initial_value=session.object_name)
-            ghost = gui.add_dropdown("Goal", (BESIDE, ON_OBJECT, HIDDEN), initial_value=self._ghost)
             new_goal = gui.add_button("New goal")
 
         @chosen.on_update
         def _(event: Any) -> None:
             if event.client_id is not None:
                 self._events.put(partial(self._choose_object, chosen.value))
-
-        @ghost.on_update
-        def _(_event: Any) -> None:
-            self._ghost = ghost.value
 
         @new_goal.on_click
         def _(_event: Any) -> None:
