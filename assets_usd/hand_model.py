@@ -8,14 +8,24 @@ pose is a row ``(x, y, z, qx, qy, qz, qw)``.
 
 import math
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pxr import Gf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import CameraModel, CollisionShape, HandError, HandModel
+from vd.assets_usd.hand_data import (
+    CameraModel,
+    CollisionShape,
+    HandError,
+    HandModel,
+    MotorModel,
+    Workspace,
+    compose,
+)
 from vd.assets_usd.hand_layer import add_layer, read_servo
 
 __all__ = ["CameraModel", "CollisionShape", "HandError", "HandModel", "open_stage", "read_hand"]
@@ -23,8 +33,9 @@ __all__ = ["CameraModel", "CollisionShape", "HandError", "HandModel", "open_stag
 OPTICAL_FROM_USD = Rotation.from_euler("x", 180, degrees=True)
 """A USD camera looks along -z with +y up; the optical frame along +z with +y down."""
 
-LINK_NAME = re.compile(r"f(\d+)_l([1-3])")
-JOINTS_PER_FINGER = 3
+LINK_NAME = re.compile(r"f(\d+)_l(\d+)")
+MAX_JOINTS = 6
+"""Most joints of a finger: of the hands that there are, none has more than five."""
 ORTHONORMAL_TOLERANCE = 1e-5
 """Allowed scale or shear in the transform of a link, above the rounding of single precision."""
 
@@ -55,13 +66,14 @@ def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) 
         raise HandError(f"{path}: the stage has no default prim; set it to the hand's root prim")
     variants = root.GetVariantSet("fingertip")
     kinds = variants.GetVariantNames()
-    if fingertip not in kinds:
+    if fingertip not in kinds and not (not kinds and fingertip == "rigid"):
         raise HandError(
             f"{path}: {root.GetPath()} has no variant {fingertip!r} in its set 'fingertip': "
             f"choose one of {', '.join(kinds) or 'none (add the variant)'}"
         )
     with Usd.EditContext(stage, stage.GetSessionLayer()):
-        variants.SetVariantSelection(fingertip)
+        if kinds:
+            variants.SetVariantSelection(fingertip)
     if layer is not None:
         add_layer(stage, Path(layer))
     return stage
@@ -126,28 +138,35 @@ class _Reader:
         self._check_units()
         if not self.root.HasAPI(UsdPhysics.ArticulationRootAPI):
             raise self.fail(self.root, "PhysicsArticulationRootAPI is missing", "apply it to the root prim")
-        fingers = self._fingers()
-        self._refuse_unknown(fingers)
-        order = [(f, i) for f in range(fingers) for i in range(1, JOINTS_PER_FINGER + 1)]
+        counts = self._fingers()
+        self._refuse_unknown(counts)
+        order = [(f, i) for f, count in enumerate(counts) for i in range(1, count + 1)]
         links = ("base", *(f"f{f}_l{i}" for f, i in order))
         joints = [self.prim(f"f{f}_j{i}") for f, i in order]
         bodies = [self.prim(name) for name in links]
         index = {body.GetPath(): i for i, body in enumerate(bodies)}
         masses = [self._mass(body) for body in bodies]
         frames = [self._joint_frames(joint, index) for joint in joints]
-        drives = np.array([self._drive(joint) for joint in joints])
+        mimic = [self._mimic(joint, joints) for joint in joints]
+        drives = np.array(
+            [self._drive(joint, driven=row[0] < 0) for joint, row in zip(joints, mimic, strict=True)]
+        )
+        self._check_mimic(joints, [row[0] for row in mimic])
         baseline = dict(zip(("kp", "kd", "velocity_limit", "inertia"), drives.T[[2, 3, 5, 6]], strict=True))
         servo, servo_interval = read_servo(joints, baseline, self.layer or self.path)
-        tip_prims = [self.prim(f"f{f}_l{JOINTS_PER_FINGER}/f{f}_tip") for f in range(fingers)]
-        points = [(f"f{f}_motor", self.prim(f"base/f{f}_motor_points"), 0) for f in range(fingers)]
-        points += [(links[i], self.prim(f"{links[i]}/points"), i) for i in range(1, len(links))]
-        points.sort(key=lambda entry: (int(entry[0][1 : entry[0].index("_")]), entry[2]))
+        tip_prims = [self.prim(f"f{f}_l{count}/f{f}_tip") for f, count in enumerate(counts)]
+        points = self._point_prims(links)
+        ends = np.cumsum([0, *counts])
+        camera = self.stage.GetPrimAtPath(self.root.GetPath().AppendPath("base/camera"))
         return HandModel(
             name=self.root.GetName(),
             fingertip=self.fingertip,
             path=self.path,
             layer=self.layer,
-            num_fingers=fingers,
+            fingers=tuple(slice(int(a), int(b)) for a, b in pairwise(ends)),
+            mount=self._mount(),
+            palm=self._direction("vd:palm"),
+            workspace=self._workspace(),
             link_names=links,
             joint_names=tuple(joint.GetName() for joint in joints),
             joint_parent=np.array([frame[0] for frame in frames]),
@@ -162,6 +181,11 @@ class _Reader:
             effort=drives[:, 4],
             velocity_limit=drives[:, 5],
             armature=drives[:, 6],
+            start=self._start(joints, drives),
+            mimic=np.array([row[0] for row in mimic]),
+            mimic_factor=np.array([row[1] for row in mimic]),
+            mimic_offset=np.array([row[2] for row in mimic]),
+            motors=self._motors(joints),
             servo=servo,
             servo_interval=servo_interval,
             link_mass=np.array([mass for mass, _, _ in masses]),
@@ -169,7 +193,7 @@ class _Reader:
             link_inertia=np.array([inertia for _, _, inertia in masses]),
             tip_link=np.array([index[prim.GetParent().GetPath()] for prim in tip_prims]),
             tip_frame=np.array([self._relative(prim, prim.GetParent()) for prim in tip_prims]),
-            camera=self._camera(self.prim("base/camera"), bodies[0]),
+            mounted_camera=self._camera(camera, bodies[0]) if camera else None,
             point_names=tuple(name for name, _, _ in points),
             point_link=np.array([link for _, _, link in points]),
             link_points=self._points([prim for _, prim, _ in points]),
@@ -186,35 +210,138 @@ class _Reader:
             if unit != 1.0:
                 raise self.fail("/", f"'{name}' is {unit}", "author the hand in metres and kilograms")
 
-    def _fingers(self) -> int:
-        """The number of fingers, numbered without gaps."""
-        matches = [LINK_NAME.fullmatch(child.GetName()) for child in self.root.GetChildren()]
-        found = sorted({int(match[1]) for match in matches if match})
-        if not found or found != list(range(len(found))):
+    def _fingers(self) -> list[int]:
+        """Joints of each finger, by the names of its links, which have no gaps."""
+        found: dict[int, list[int]] = {}
+        for child in self.root.GetChildren():
+            if match := LINK_NAME.fullmatch(child.GetName()):
+                found.setdefault(int(match[1]), []).append(int(match[2]))
+        counts = [len(found.get(finger, ())) for finger in range(len(found))]
+        if not counts or 0 in counts or any(sorted(n) != [*range(1, len(n) + 1)] for n in found.values()):
+            names = ", ".join(f"f{f}_l{i}" for f in sorted(found) for i in sorted(found[f])) or "no links"
             raise self.fail(
                 self.root,
-                f"fingers {found} found",
-                "name links f0_l1 to f0_l3, f1_l1 and so on, without gaps",
+                f"fingers {sorted(found)} found, of {names}",
+                "name links f0_l1, f0_l2 and so on from the palm, f1_l1 ..., without gaps",
             )
-        return len(found)
+        if max(counts) > MAX_JOINTS:
+            finger = counts.index(max(counts))
+            raise self.fail(
+                self.root,
+                f"finger {finger} has {max(counts)} joints",
+                f"weld joints until it has {MAX_JOINTS} at most",
+            )
+        return counts
 
-    def _refuse_unknown(self, fingers: int) -> None:
+    def _refuse_unknown(self, counts: list[int]) -> None:
         """Refuse links and joints that the model would leave out."""
-        known = {"base"} | {f"f{f}_{kind}{i}" for f in range(fingers) for kind in "lj" for i in (1, 2, 3)}
-        more = [
-            prim
-            for prim in Usd.PrimRange(self.root)
-            if (prim.HasAPI(UsdPhysics.RigidBodyAPI) or prim.IsA(UsdPhysics.Joint))
-            and not prim.IsA(UsdPhysics.FixedJoint)
-            and not (prim.GetParent() == self.root and prim.GetName() in known)
-        ]
-        if more:
-            names = ", ".join(prim.GetName() for prim in more)
-            raise self.fail(
-                self.root,
-                f"has links or joints besides those of fingers with {JOINTS_PER_FINGER} joints: {names}",
-                f"only such fingers are supported so far; weld what is beyond f0_l{JOINTS_PER_FINGER} to it",
+        numbers = [f"{i + 1}" for i in range(MAX_JOINTS)]
+        known = {"base"} | {f"f{f}_{k}{i}" for f, n in enumerate(counts) for i in numbers[:n] for k in "lj"}
+        for prim in Usd.PrimRange(self.root):
+            if not (prim.HasAPI(UsdPhysics.RigidBodyAPI) or prim.IsA(UsdPhysics.Joint)):
+                continue
+            if prim.IsA(UsdPhysics.FixedJoint) and not all(
+                prim.GetRelationship(f"physics:body{side}").GetTargets() for side in (0, 1)
+            ):
+                continue  # it fixes the hand to the world
+            if prim.GetParent() != self.root or prim.GetName() not in known:
+                raise self.fail(
+                    prim,
+                    "is a link or joint besides those of the fingers, f0_l1 and f0_j1 and so on",
+                    "rename it if it is a finger's, weld it to its link if it is fixed, or remove it",
+                )
+
+    def _mount(self) -> np.ndarray:
+        """Pose of the base in the world [7]."""
+        place = self._vector("vd:mount:position")
+        return np.concatenate([place, _xyzw(self.value(self.root, "vd:mount:orientation"))])
+
+    def _vector(self, attribute: str, size: int = 3) -> np.ndarray:
+        """A vector of the root [size], finite."""
+        vector = np.array(self.value(self.root, attribute), dtype=float)
+        if vector.shape != (size,) or not np.isfinite(vector).all():
+            raise self.fail(self.root, f"'{attribute}' is {vector}", f"{size} finite numbers")
+        return vector
+
+    def _direction(self, attribute: str) -> np.ndarray:
+        """A unit vector of the root [3]."""
+        vector = self._vector(attribute)
+        if not np.linalg.norm(vector) > 0.0:
+            raise self.fail(self.root, f"'{attribute}' is {vector}", "give it a direction")
+        return np.asarray(vector / np.linalg.norm(vector))
+
+    def _workspace(self) -> Workspace:
+        low, high = self._vector("vd:workspace:size", 2)
+        if not 0.0 < low <= high:
+            raise self.fail(self.root, f"'vd:workspace:size' is ({low}, {high})", "smallest first, above 0")
+        return Workspace(
+            drop_m=tuple(self._vector("vd:workspace:drop").tolist()),
+            goal_m=tuple(self._vector("vd:workspace:goal").tolist()),
+            fall_m=self.number(self.root, "vd:workspace:fall", positive=True),
+            size_m=(float(low), float(high)),
+        )
+
+    def _start(self, joints: list[Usd.Prim], drives: np.ndarray) -> np.ndarray:
+        """Angles at the start [D] [rad]; they are within the limits."""
+        start = np.array([self.number(joint, "vd:start") for joint in joints])
+        for joint, angle, (low, high) in zip(joints, start, drives[:, :2], strict=True):
+            if not low - ORTHONORMAL_TOLERANCE <= angle <= high + ORTHONORMAL_TOLERANCE:
+                raise self.fail(
+                    joint,
+                    f"'vd:start' is {angle:g} rad",
+                    f"choose one within its limits, {low:.3f} and {high:.3f} rad",
+                )
+        return start
+
+    def _mimic(self, joint: Usd.Prim, joints: list[Usd.Prim]) -> tuple[int, float, float]:
+        """The joint that a joint follows, or -1, with factor and offset [rad]."""
+        targets = joint.GetRelationship("newton:mimicJoint").GetTargets()
+        if not targets:
+            return -1, 1.0, 0.0
+        paths = [other.GetPath() for other in joints]
+        if len(targets) != 1 or targets[0] not in paths:
+            named = [str(target) for target in targets]
+            raise self.fail(joint, f"'newton:mimicJoint' is {named}", "point it at one joint of the hand")
+        factor = self.number(joint, "newton:mimicCoef1")
+        return paths.index(targets[0]), factor, math.radians(self.number(joint, "newton:mimicCoef0"))
+
+    def _check_mimic(self, joints: list[Usd.Prim], leaders: list[int]) -> None:
+        for joint, leader in zip(joints, leaders, strict=True):
+            if leader >= 0 and leaders[leader] >= 0:
+                name = joints[leader].GetName()
+                raise self.fail(joint, f"follows {name}, which follows another", "follow that one")
+
+    def _motors(self, joints: list[Usd.Prim]) -> tuple[MotorModel | None, ...]:
+        """The motor of each joint that says which it has; no two have one ID."""
+        motors: list[MotorModel | None] = []
+        for joint in joints:
+            if not joint.GetAuthoredPropertiesInNamespace("vd:motor"):
+                motors.append(None)
+                continue
+            motor = MotorModel(
+                model=str(self.value(joint, "vd:motor:model")),
+                id=int(self.value(joint, "vd:motor:id")),
+                sign=self.number(joint, "vd:motor:sign"),
+                offset_rad=self.number(joint, "vd:motor:offset"),
+                gear=self.number(joint, "vd:motor:gear", positive=True),
             )
+            if abs(motor.sign) != 1.0:
+                raise self.fail(joint, f"'vd:motor:sign' is {motor.sign:g}", "it is 1, or -1")
+            if motor.id in [other.id for other in motors if other]:
+                raise self.fail(joint, f"'vd:motor:id' {motor.id} is another joint's too", "change one")
+            motors.append(motor)
+        return tuple(motors)
+
+    def _point_prims(self, links: tuple[str, ...]) -> list[tuple[str, Usd.Prim, int]]:
+        """Name, prim and link of the sets of surface samples; those of the base may be missing."""
+        root = self.root.GetPath()
+        found = [("base", self.stage.GetPrimAtPath(f"{root}/base/points"), 0)]
+        for index, link in enumerate(links[1:], 1):
+            if link.endswith("_l1"):
+                motor = link.replace("_l1", "_motor")
+                found.append((motor, self.stage.GetPrimAtPath(f"{root}/base/{motor}_points"), 0))
+            found.append((link, self.prim(f"{link}/points"), index))
+        return [(name, prim, link) for name, prim, link in found if prim]
 
     def _relative(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
         """Pose [7] of a prim in the frame of an ancestor; a scale is dropped, shear is refused."""
@@ -270,16 +397,16 @@ class _Reader:
             raise self.fail(joint, "joins other links than its name says", f"join {parent} and {child}")
         return links[0], links[1], frames[0], frames[1]
 
-    def _drive(self, joint: Usd.Prim) -> tuple[float, ...]:
-        """Limits, kp, kd, effort, velocity limit and armature, in radians."""
+    def _drive(self, joint: Usd.Prim, *, driven: bool) -> tuple[float, ...]:
+        """Limits, kp, kd, effort, velocity limit and armature, in radians; gains only if ``driven``."""
         lower = self.number(joint, "physics:lowerLimit")
         upper = self.number(joint, "physics:upperLimit")
         if lower >= upper:
             raise self.fail(
                 joint, f"'physics:lowerLimit' {lower} is not below 'physics:upperLimit' {upper}", "swap"
             )
-        stiffness = self.number(joint, "drive:angular:physics:stiffness", positive=True)
-        damping = self.number(joint, "drive:angular:physics:damping", positive=True)
+        stiffness = self.number(joint, "drive:angular:physics:stiffness", positive=driven)
+        damping = self.number(joint, "drive:angular:physics:damping", positive=driven)
         return (
             math.radians(lower),
             math.radians(upper),
@@ -336,11 +463,23 @@ class _Reader:
         frame = self._relative(prim, body)
         matrix, _ = self.cache.ComputeRelativeTransform(prim, body)
         scale = np.linalg.norm(np.array(matrix)[:3, :3], axis=1)
-        kind = str(prim.GetTypeName())
+        kind, vertices = str(prim.GetTypeName()), np.zeros((0, 3))
         size: tuple[float, ...]
         if kind == "Cube":
             half = self.number(prim, "size", positive=True) / 2.0
             size = tuple(float(half * s) for s in scale)
+        elif kind == "Mesh":
+            if prim.GetAttribute("physics:approximation").Get() != UsdPhysics.Tokens.convexHull:
+                raise self.fail(
+                    prim,
+                    "'physics:approximation' is not convexHull",
+                    "split the mesh into convex parts and give each PhysicsMeshCollisionAPI with it",
+                )
+            corners = np.array(self.value(prim, "points"), dtype=float) * scale
+            vertices = corners[ConvexHull(corners).vertices]
+            low, high = vertices.min(axis=0), vertices.max(axis=0)
+            frame = compose(frame, np.array([*(low + high) / 2.0, 0.0, 0.0, 0.0, 1.0]))
+            vertices, size = vertices - (low + high) / 2.0, tuple(((high - low) / 2.0).tolist())
         elif kind in ("Sphere", "Capsule", "Cylinder"):
             if np.abs(scale - 1.0).max() > ORTHONORMAL_TOLERANCE:
                 raise self.fail(prim, f"is scaled by {scale}", "put the size into its radius and height")
@@ -350,7 +489,9 @@ class _Reader:
                 upright = np.roll(np.eye(3), "XYZ".index(self.value(prim, "axis")) - 2, axis=1)
                 frame[3:] = (Rotation.from_quat(frame[3:]) * Rotation.from_matrix(upright)).as_quat()
         else:
-            raise self.fail(prim, f"is a {kind}", "collide with a Cube, Sphere, Capsule or Cylinder")
+            raise self.fail(
+                prim, f"is a {kind}", "collide with a Cube, Sphere, Capsule, Cylinder or convex Mesh"
+            )
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
         if not material:
             raise self.fail(prim, "no physics material is bound", "bind one with friction")
@@ -358,9 +499,10 @@ class _Reader:
         return CollisionShape(
             path=str(prim.GetPath()),
             link=link,
-            kind="box" if kind == "Cube" else kind.lower(),
+            kind={"Cube": "box", "Mesh": "hull"}.get(kind, kind.lower()),
             size=size,
             frame=frame,
+            vertices=vertices,
             friction=self.number(surface, "physics:dynamicFriction"),
             restitution=self.number(surface, "physics:restitution"),
             stiffness=self.number(surface, "newton:contactStiffness", positive=True),

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, compose
+from vd.assets_usd.hand_data import HandModel, compose
 from vd.envs.cfg import ObservationCfg, View
 from vd.envs.parts import observation_parts
 from vd.kernels.task.dynamics import JOINT_CHANNELS, SCALARS
@@ -87,7 +87,7 @@ def symmetry_frames(hand: HandModel, observation: ObservationCfg, view: View) ->
 
 def _tips(hand: HandModel, angles: np.ndarray) -> np.ndarray:
     """Fingertip poses in the world frame with these angles [3] in all fingers [F, 7]."""
-    return compose(np.array(BASE_IN_WORLD), hand.tip_poses(np.tile(angles, hand.num_fingers)))
+    return compose(hand.mount, hand.tip_poses(np.tile(angles, hand.num_fingers)))
 
 
 def _turn(step: int, fingers: int) -> np.ndarray:

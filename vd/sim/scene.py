@@ -1,4 +1,4 @@
-"""Build the scene of the paper in Newton: a downward hand over a table, an object in each world.
+"""Build the scene in Newton: a hand over a table, an object in each world.
 
 World frame: z up, table top at z = 0, all worlds at one origin. SI units, quaternions xyzw.
 """
@@ -11,7 +11,6 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD
 from vd.assets_usd.hand_model import HandModel, open_stage
 from vd.assets_usd.objects.model import ObjectModel
 from vd.paper import PAPER
@@ -62,7 +61,7 @@ class Scene:
     bodies_per_world: int
     """B."""
     link_body: np.ndarray
-    """Body index within a world of every hand link, base first, shape [3F + 1]."""
+    """Body index within a world of every hand link, base first, shape [D + 1]."""
     object_body: int
     """Body index within a world of the object."""
     shape_kind: np.ndarray
@@ -74,11 +73,6 @@ class Scene:
     def num_envs(self) -> int:
         """N."""
         return len(self.world_object)
-
-
-def hand_mount() -> wp.transform:
-    """Pose of the hand's base in the world: palm down, turned pi about +y."""
-    return wp.transform(*BASE_IN_WORLD)
 
 
 def assign_objects(num_envs: int, num_objects: int) -> np.ndarray:
@@ -125,7 +119,7 @@ def shape_cfg(cfg: SimCfg, friction: float, *, visual: bool = False) -> newton.M
 
 
 def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBuilder:
-    """The hand alone, mounted over the table, with the project's contact settings.
+    """The hand alone, where it is mounted, with the project's contact settings.
 
     Args:
         hand: The hand; its file is read again by Newton, with the same fingertip variant.
@@ -136,7 +130,7 @@ def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBu
     builder.default_shape_cfg = shape_cfg(cfg, PAPER.materials.friction)
     builder.add_usd(
         open_stage(hand.path, hand.fingertip, hand.layer),
-        xform=hand_mount(),
+        xform=wp.transform(*hand.mount),
         floating=False,
         enable_self_collisions=True,
         load_sites=False,
@@ -198,7 +192,13 @@ def scaled_mesh(vertices: np.ndarray, faces: np.ndarray, scale: float) -> newton
 
 
 def add_object(
-    builder: newton.ModelBuilder, item: ObjectModel, cfg: SimCfg, *, scale: float, visuals: bool
+    builder: newton.ModelBuilder,
+    item: ObjectModel,
+    cfg: SimCfg,
+    *,
+    at: Sequence[float] = (0.0, 0.0, 0.0),
+    scale: float,
+    visuals: bool,
 ) -> int:
     """Add a free object made of its convex parts; returns its body index.
 
@@ -206,11 +206,12 @@ def add_object(
         builder: The world's builder.
         item: The object; its frame's origin is its centre of mass.
         cfg: Contact settings.
+        at: Where it is [m].
         scale: Uniform factor on its size. The mass stays; the inertia follows the size.
         visuals: Add the visual mesh too.
     """
     body = builder.add_body(
-        xform=wp.transform(wp.vec3(*PAPER.scene.object_start_m), wp.quat_identity()),
+        xform=wp.transform(wp.vec3(*at), wp.quat_identity()),
         mass=item.mass_kg,
         inertia=wp.mat33(*(item.inertia_matrix * scale**2).flatten()),
         label=OBJECT_LABEL,
@@ -284,7 +285,7 @@ def build_scene(
             world = new_builder()
             world.add_builder(hand_builder)
             add_table(world, cfg, visible=visuals)
-            add_object(world, item, cfg, scale=float(scale), visuals=visuals)
+            add_object(world, item, cfg, at=hand.workspace.drop_m, scale=float(scale), visuals=visuals)
             scene.replicate(world, int(copies))
             worlds.append((world, int(copies)))
     model = scene.finalize(device=device)

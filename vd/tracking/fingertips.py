@@ -6,7 +6,7 @@ G fingers, D joints, three of each finger. World frame: z up; quaternions xyzw.
 import numpy as np
 import torch
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, compose, invert
+from vd.assets_usd.hand_data import HandModel, compose, invert
 from vd.kernels.task.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER
 from vd.quaternions import product, rotated
 
@@ -29,7 +29,7 @@ class Fingertips:
         order = np.arange(hand.num_joints).reshape(-1, JOINTS_PER_FINGER)
         frames = np.empty((len(order), JOINTS_PER_FINGER + 1, 7))
         for finger, joints in enumerate(order):
-            before, links = np.array(BASE_IN_WORLD), [0, *hand.joint_child[joints]]
+            before, links = hand.mount, [0, *hand.joint_child[joints]]
             if list(hand.joint_parent[joints]) != links[:-1] or hand.tip_link[finger] != links[-1]:
                 raise ValueError(f"the joints of finger {finger} of {hand.name} are no chain to its tip")
             for number, joint in enumerate(joints):
