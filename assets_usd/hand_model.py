@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -155,6 +155,7 @@ class _Reader:
         baseline = dict(zip(("kp", "kd", "velocity_limit", "inertia"), drives.T[[2, 3, 5, 6]], strict=True))
         servo, servo_interval = read_servo(joints, baseline, self.layer or self.path)
         tip_prims = [self.prim(f"f{f}_l{count}/f{f}_tip") for f, count in enumerate(counts)]
+        tips = {prim.GetParent().GetPath() for prim in tip_prims}
         points = self._point_prims(links)
         ends = np.cumsum([0, *counts])
         camera = self.stage.GetPrimAtPath(self.root.GetPath().AppendPath("base/camera"))
@@ -197,7 +198,7 @@ class _Reader:
             point_names=tuple(name for name, _, _ in points),
             point_link=np.array([link for _, _, link in points]),
             link_points=self._points([prim for _, prim, _ in points]),
-            shapes=tuple(shape for i, body in enumerate(bodies) for shape in self._shapes(body, i)),
+            shapes=tuple(shape for i, body in enumerate(bodies) for shape in self._shapes(body, i, tips)),
         )
 
     def _check_units(self) -> None:
@@ -333,14 +334,14 @@ class _Reader:
         return tuple(motors)
 
     def _point_prims(self, links: tuple[str, ...]) -> list[tuple[str, Usd.Prim, int]]:
-        """Name, prim and link of the sets of surface samples; those of the base may be missing."""
+        """Name, prim and link of the sets of surface samples, as far as links have them."""
         root = self.root.GetPath()
         found = [("base", self.stage.GetPrimAtPath(f"{root}/base/points"), 0)]
         for index, link in enumerate(links[1:], 1):
             if link.endswith("_l1"):
                 motor = link.replace("_l1", "_motor")
                 found.append((motor, self.stage.GetPrimAtPath(f"{root}/base/{motor}_points"), 0))
-            found.append((link, self.prim(f"{link}/points"), index))
+            found.append((link, self.stage.GetPrimAtPath(f"{root}/{link}/points"), index))
         return [(name, prim, link) for name, prim, link in found if prim]
 
     def _relative(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
@@ -451,11 +452,12 @@ class _Reader:
                     f"'points' has shape {samples.shape}",
                     f"{len(sets[0])} finite points, as many on each link",
                 )
-        return np.stack(sets)
+        return np.stack(sets) if sets else np.zeros((0, 0, 3), dtype=np.float32)
 
-    def _shapes(self, body: Usd.Prim, link: int) -> list[CollisionShape]:
+    def _shapes(self, body: Usd.Prim, link: int, tips: set[Sdf.Path]) -> list[CollisionShape]:
+        """Colliders of a link; only those with fingertips need one."""
         prims = [prim for prim in Usd.PrimRange(body) if prim.HasAPI(UsdPhysics.CollisionAPI)]
-        if not prims:
+        if not prims and body.GetPath() in tips:
             raise self.fail(body, "has no collider", "apply PhysicsCollisionAPI to a primitive below it")
         return [self._shape(prim, body, link) for prim in prims]
 

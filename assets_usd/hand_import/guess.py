@@ -68,7 +68,7 @@ def take_stance(tree: Tree, said: Description) -> Stance:
 
 
 def _text(values: np.ndarray) -> str:
-    return "(" + ", ".join(f"{round(float(v), 3):g}" for v in values) + ")"
+    return "(" + ", ".join(f"{round(float(v), 3) + 0.0:g}" for v in values) + ")"
 
 
 def _complete_drives(tree: Tree) -> None:

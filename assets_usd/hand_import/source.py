@@ -190,9 +190,8 @@ def _bounded(value: float) -> float:
 def _read_mjcf(path: Path) -> Source:
     import mujoco
 
-    spec = mujoco.MjSpec.from_file(str(path))
-    model = spec.compile()
-    source = Source(path, spec.modelname or path.stem, [], [])
+    model = mujoco.MjModel.from_xml_path(str(path))
+    source = Source(path, model.names.split(b"\0")[0].decode() or path.stem, [], [])
     for i in range(1, model.nbody):
         turn = Rotation.from_quat(model.body_iquat[i][[1, 2, 3, 0]]).as_matrix()
         source.links.append(
@@ -232,10 +231,10 @@ def _mjcf_joints(model, body: int, source: Source) -> None:  # type: ignore[no-u
     link = source.links[body - 1].name
     names = [model.joint(i).name or f"the joint of {link}" for i in range(first, first + count)]
     if parent < 0:
-        if count and model.jnt_type[first] != mujoco.mjtJoint.mjJNT_FREE:
-            source.problems.append(f"{link}, the root, moves by {', '.join(names)}; remove these joints")
-        elif count:
-            source.notes.append(f"{link}, the root, is free in the file; it is fixed here")
+        if count:
+            source.notes.append(
+                f"{link} is free to move in the file, by {', '.join(names)}; here it is fixed"
+            )
         return
     if count == 0:
         source.joints.append(Joint(f"weld of {link}", "fixed", parent, body - 1, parent_frame=place))
@@ -305,32 +304,40 @@ def _mjcf_actuators(model, source: Source) -> None:  # type: ignore[no-untyped-d
     import mujoco
 
     joints = {joint.name: joint for joint in source.joints}
+    by_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+    idle = sorted(set(range(model.ntendon)) - set(model.actuator_trnid[by_tendon, 0]))
+    if idle:
+        names = ", ".join(model.tendon(i).name for i in idle)
+        source.notes.append(f"tendons without a motor are left out: {names}")
     for i in range(model.nu):
-        target, gear = model.actuator_trnid[i, 0], abs(float(model.actuator_gear[i, 0])) or 1.0
-        kind = mujoco.mjtTrn(model.actuator_trntype[i])
-        if kind == mujoco.mjtTrn.mjTRN_JOINT:
-            moved = [model.joint(target).name]
-        elif kind == mujoco.mjtTrn.mjTRN_TENDON:
-            first, count = model.tendon_adr[target], model.tendon_num[target]
-            wraps = range(first, first + count)
-            if any(model.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
-                source.problems.append(
-                    f"{model.tendon(target).name} is a tendon over sites; model its joints"
-                )
-                continue
-            moved = [model.joint(model.wrap_objid[w]).name for w in wraps]
-            if count > 1:
-                source.coupled.append((model.tendon(target).name, moved))
-        else:
-            source.problems.append(f"{model.actuator(i).name} moves no joint; remove it")
-            continue
-        strongest = model.actuator_forcerange[i] if model.actuator_forcelimited[i] else np.array([math.nan])
-        for name in moved:
-            if (joint := joints.get(name)) is None:
-                continue
-            if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE:
+        gear, affine = abs(float(model.actuator_gear[i, 0])) or 1.0, int(mujoco.mjtBias.mjBIAS_AFFINE)
+        strongest = float(np.abs(model.actuator_forcerange[i]).max())
+        for joint in (joints[name] for name in _moved(model, i, source) if name in joints):
+            if model.actuator_biastype[i] == affine:
                 joint.kp = float(model.actuator_gainprm[i, 0]) * gear**2
                 damping = -float(model.actuator_biasprm[i, 2]) * gear**2
                 joint.kd = damping + (0.0 if math.isnan(joint.kd) else joint.kd) or math.nan
-            if np.isfinite(strongest).all():
-                joint.effort = float(np.abs(strongest).max()) * gear
+            if model.actuator_forcelimited[i]:
+                joint.effort = strongest * gear
+
+
+def _moved(model, actuator: int, source: Source) -> list[str]:  # type: ignore[no-untyped-def]
+    """Joints that an actuator moves; those of a tendon go on the list of what is coupled."""
+    import mujoco
+
+    kind, target = model.actuator_trntype[actuator], model.actuator_trnid[actuator, 0]
+    if kind == mujoco.mjtTrn.mjTRN_JOINT:
+        return [model.joint(target).name]
+    wraps = range(0)
+    if kind == mujoco.mjtTrn.mjTRN_TENDON:
+        wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
+    if not wraps or any(model.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
+        name = model.actuator(actuator).name or f"actuator {actuator}"
+        source.problems.append(
+            f"{name} pulls at no joint but over sites; give its joints motors of their own"
+        )
+        return []
+    moved = [model.joint(model.wrap_objid[w]).name for w in wraps]
+    if len(moved) > 1:
+        source.coupled.append((model.tendon(target).name, moved))
+    return moved

@@ -110,6 +110,7 @@ class _Grower:
                 moved[joint.child] = parent = len(links)
                 links.append(self._welded(joint.child))
             tips.append(self._tip(chain[-1].child))
+        self.fail()
         tree = Tree(links, joints, counts, tips, IDENTITY, self.notes)
         self._check_followers(tree)
         self._check_numbers(tree)
@@ -213,7 +214,8 @@ class _Grower:
         if len(wrist) > MOST_WRIST:
             names = ", ".join(f"{name}: 0" for name in wrist)
             self.problems.append(
-                f"{len(wrist)} joints come before the fingers: an arm; give the hand alone, or hold: {{{names}}}"
+                f"{len(wrist)} joints come before the fingers: an arm; give the hand alone, or say "
+                f"hold: {{{names}}}"
             )
         elif wrist:
             self.notes.append(f"{', '.join(wrist)} come before the fingers and are held at 0 (hold)")
@@ -365,11 +367,12 @@ class _Grower:
                     f"{joint.name} has the limits {joint.lower:g} and {joint.upper:g} rad; give it some: "
                     f"limits: {{{joint.name}: [-1.6, 1.6]}}"
                 )
-            if not joint.effort > 0.0 and joint.mimic is None:
-                self.problems.append(
-                    f"{joint.name} has no torque limit; give it one: "
-                    f"drives: {{{joint.name}: {{effort: 1.0}}}}, or drive: {{effort: 1.0}} for all"
-                )
+        weak = [joint.name for joint in tree.joints if not joint.effort > 0.0 and joint.mimic is None]
+        if weak:
+            self.problems.append(
+                f"{', '.join(weak)}: no torque limit in the file; say drive: {{effort: 1.0}} (N m) or "
+                f"drives: {{{weak[0]}: {{effort: 1.0}}}}; or mimic or hold, where there is no motor"
+            )
         for link in tree.links:
             for shape in link.shapes:
                 if shape.collides and shape.kind not in (
