@@ -65,14 +65,14 @@ class Author:
         UsdPhysics.ArticulationRootAPI.Apply(root)
         self._describe(root)
         self._materials()
-        start = self.tree.forward_kinematics(np.zeros(len(self.tree.joints)))
+        poses = self.tree.forward_kinematics(np.zeros(len(self.tree.joints)))
         for number, link in enumerate(self.tree.links):
-            self._link(number, link, start[number])
+            self._link(number, link, poses[number])
         for number, joint in enumerate(self.tree.joints):
             self._joint(number, joint)
         for finger, joints in enumerate(self.tree.finger_joints()):
-            path = f"{self.root}/{self.names[joints[-1] + 1]}/f{finger}_tip"
-            site = UsdGeom.Sphere.Define(stage, path)
+            at = f"{self.root}/{self.names[joints[-1] + 1]}/f{finger}_tip"
+            site = UsdGeom.Sphere.Define(stage, at)
             site.CreateRadiusAttr(0.001)
             site.CreatePurposeAttr(UsdGeom.Tokens.guide)
             _apply(site.GetPrim(), "NewtonSiteAPI")

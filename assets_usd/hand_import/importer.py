@@ -5,6 +5,7 @@ import tempfile
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -150,7 +151,7 @@ def overlaps(hand: HandModel, near: set[tuple[int, int]]) -> dict[tuple[int, int
     return found
 
 
-def _add_geom(spec, number: int, shape: CollisionShape, pose: np.ndarray) -> None:  # type: ignore[no-untyped-def]
+def _add_geom(spec: Any, number: int, shape: CollisionShape, pose: np.ndarray) -> None:
     import mujoco
 
     wxyz = pose[[6, 3, 4, 5]]

@@ -90,7 +90,7 @@ def hand_sheet(hand: HandModel, sources: list[str], path: Path) -> Path:
     figure = Figure((13.0, 4.6 + 0.14 * hand.num_joints), dpi=110)
     text = 0.14 * (hand.num_joints + 2) / figure.get_figheight()
     for column, (name, (elevation, azimuth)) in enumerate(VIEWS.items()):
-        axes = figure.add_axes((column / 3.0, text, 1.0 / 3.0, 0.92 - text), projection="3d")
+        axes: Any = figure.add_axes((column / 3.0, text, 1.0 / 3.0, 0.92 - text), projection="3d")
         _draw(axes, hand, links, joints)
         axes.view_init(elevation, azimuth)
         axes.set_title(name, fontsize=8)

@@ -7,6 +7,7 @@ import math
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,7 +35,7 @@ class Shape:
     faces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int32))
     split: bool = False
     """Whether a mesh is cut into convex parts."""
-    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    colour: tuple[float, ...] = (0.6, 0.6, 0.6)
 
 
 @dataclass
@@ -190,7 +191,7 @@ def _bounded(value: float) -> float:
 def _read_mjcf(path: Path) -> Source:
     import mujoco
 
-    model = mujoco.MjModel.from_xml_path(str(path))
+    model: Any = mujoco.MjModel.from_xml_path(str(path))
     source = Source(path, model.names.split(b"\0")[0].decode() or path.stem, [], [])
     for i in range(1, model.nbody):
         turn = Rotation.from_quat(model.body_iquat[i][[1, 2, 3, 0]]).as_matrix()
@@ -203,11 +204,11 @@ def _read_mjcf(path: Path) -> Source:
             )
         )
         _mjcf_joints(model, i, source)
-    for i in np.flatnonzero(model.geom_bodyid > 0):
-        source.links[model.geom_bodyid[i] - 1].shapes.append(_mjcf_shape(model, i))
-    for i in np.flatnonzero(model.site_bodyid > 0):
-        pose = _pose(model.site_pos[i], model.site_quat[i])
-        source.links[model.site_bodyid[i] - 1].sites[model.site(i).name] = pose
+    for geom in np.flatnonzero(model.geom_bodyid > 0):
+        source.links[model.geom_bodyid[geom] - 1].shapes.append(_mjcf_shape(model, geom))
+    for site in np.flatnonzero(model.site_bodyid > 0):
+        pose = _pose(model.site_pos[site], model.site_quat[site])
+        source.links[model.site_bodyid[site] - 1].sites[model.site(site).name] = pose
     for signature in model.exclude_signature:
         bodies = signature >> 16, signature & 0xFFFF
         if min(bodies) > 0:
@@ -222,7 +223,7 @@ def _pose(position: np.ndarray, wxyz: np.ndarray) -> np.ndarray:
     return np.concatenate([position, wxyz[[1, 2, 3, 0]]])
 
 
-def _mjcf_joints(model, body: int, source: Source) -> None:  # type: ignore[no-untyped-def]
+def _mjcf_joints(model: Any, body: int, source: Source) -> None:
     """The joint of a body: none is a fixed one, more than one are none that a hand has."""
     import mujoco
 
@@ -260,7 +261,7 @@ def _mjcf_joints(model, body: int, source: Source) -> None:  # type: ignore[no-u
         joint.effort = float(np.abs(model.jnt_actfrcrange[first]).max())
 
 
-def _mjcf_shape(model, geom: int) -> Shape:  # type: ignore[no-untyped-def]
+def _mjcf_shape(model: Any, geom: int) -> Shape:
     import mujoco
 
     kind = mujoco.mjtGeom(model.geom_type[geom]).name[7:].lower()
@@ -280,7 +281,7 @@ def _mjcf_shape(model, geom: int) -> Shape:  # type: ignore[no-untyped-def]
     return shape
 
 
-def _mjcf_equalities(model, source: Source) -> None:  # type: ignore[no-untyped-def]
+def _mjcf_equalities(model: Any, source: Source) -> None:
     """Couplings of two joints by a line are joints that follow; all others are problems."""
     import mujoco
 
@@ -299,7 +300,7 @@ def _mjcf_equalities(model, source: Source) -> None:  # type: ignore[no-untyped-
             joints[one].mimic = other, float(data[1]), float(data[0])
 
 
-def _mjcf_actuators(model, source: Source) -> None:  # type: ignore[no-untyped-def]
+def _mjcf_actuators(model: Any, source: Source) -> None:
     """Gains and torque limits of the joints that actuators turn, by themselves or by a tendon of several."""
     import mujoco
 
@@ -321,7 +322,7 @@ def _mjcf_actuators(model, source: Source) -> None:  # type: ignore[no-untyped-d
                 joint.effort = strongest * gear
 
 
-def _moved(model, actuator: int, source: Source) -> list[str]:  # type: ignore[no-untyped-def]
+def _moved(model: Any, actuator: int, source: Source) -> list[str]:
     """Joints that an actuator moves; those of a tendon go on the list of what is coupled."""
     import mujoco
 

@@ -1,6 +1,7 @@
 """A source welded to what a hand is: a base and fingers, each a chain of revolute joints."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -121,7 +122,7 @@ class _Grower:
         joints = [joint.name for joint in self.source.joints if joint.kind != "fixed"]
         links = [link.name for link in self.source.links]
         said = self.said
-        named = {
+        named: dict[str, Iterable[str]] = {
             "hold": said.hold,
             "mimic": said.mimic,
             "limits": said.limits,
@@ -133,8 +134,9 @@ class _Grower:
             for name in names:
                 if name not in joints:
                     self.problems.append(f"{entry}: there is no joint {name}; there are {', '.join(joints)}")
-        for entry, linked in (("mass", said.mass), ("tips", said.tips), ("parts", said.parts)):
-            for name in linked:
+        linked: dict[str, Iterable[str]] = {"mass": said.mass, "tips": said.tips, "parts": said.parts}
+        for entry, names in linked.items():
+            for name in names:
                 if name not in links:
                     self.problems.append(f"{entry}: there is no link {name}; there are {', '.join(links)}")
 
