@@ -258,6 +258,21 @@ class HandModel:
         return len(self.joint_names)
 
     @property
+    def joints_per_finger(self) -> int:
+        """Joints of every finger.
+
+        Raises:
+            HandError: Its fingers differ.
+        """
+        counts = [finger.stop - finger.start for finger in self.fingers]
+        if len(set(counts)) > 1:
+            raise HandError(
+                f"{self.path}: the fingers of {self.name} have {counts} joints; what was asked for needs "
+                "equal fingers: observe goals in the world frame (observation.view), without a camera"
+            )
+        return counts[0]
+
+    @property
     def actuated(self) -> np.ndarray:
         """Joints that have a motor, and an action of the policy, int [A]."""
         return np.flatnonzero(self.mimic < 0)

@@ -3,6 +3,7 @@
 import itertools
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -18,6 +19,8 @@ from vd.assets_usd.hand_data import HandError, HandModel
 from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hand_model import open_stage
 from vd.assets_usd.hands import load_hand
+from vd.envs.cfg import ObservationCfg, ReorientCfg
+from vd.envs.reorient import ReorientEnv
 
 REAL = ("leap", "allegro")
 
@@ -365,3 +368,39 @@ def test_leap_and_allegro_are_imported_with_their_descriptions(tmp_path, shared_
     if name == "leap":
         assert [motor and motor.id for motor in hand.motors] == [int(source) for source in done.sources]
         assert not done.warnings
+
+
+@pytest.mark.parametrize("colliders", [1, 6])
+def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
+    """Of many colliders, as LEAP has, MuJoCo's masks hold who meets whom by the groups of fingers alone."""
+    parts = [
+        re.sub(r"<collision>.*?</collision>", lambda found: colliders * found[0], part) for part in PARTS
+    ]
+    hand = import_hand(write_urdf(tmp_path, parts), tmp_path / "out").hand
+    cfg = ReorientCfg(hand=str(hand.path), objects=("cube",), num_envs=4)
+    env = ReorientEnv(cfg, "cpu")
+    assert len(np.unique(env.scene.world_scale)) > 1, "worlds differ, and so need masks"
+    assert (env.num_actions, env.num_observations) == (6, 3 * 6 + 13 * 2 + 21)
+    model, geoms = env.sim.solver.mj_model, {}
+    for geom in range(model.ngeom):
+        name = model.body(model.geom_bodyid[geom]).name.removeprefix("_toy_")
+        geoms.setdefault(name, []).append((model.geom_contype[geom], model.geom_conaffinity[geom]))
+
+    def meet(one: str, other: str) -> bool:
+        pairs = itertools.product(geoms[one], geoms[other])
+        met = {bool(a[0] & b[1] or a[1] & b[0]) for a, b in pairs}
+        assert len(met) == 1
+        return met.pop()
+
+    links = sorted(name for name in geoms if name.startswith("f"))
+    for one, other in itertools.combinations(links, 2):
+        assert meet(one, other) == (one[:2] != other[:2]), (one, other)
+    assert not meet("base", "f0_l1") and meet("base", "f1_l4") and meet("object", "f1_l4")
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        env.step(wp.array(rng.uniform(-1.0, 1.0, (4, 6)), dtype=float))
+    q = env.sim.joint_q.numpy()
+    assert np.isfinite(env.observation.numpy()).all()
+    np.testing.assert_allclose(q[:, 5], 0.8 * q[:, 4] + 0.05, atol=0.01)
+    with pytest.raises(HandError, match=r"the fingers of toy have \[2, 4\] joints.*observation.view"):
+        ReorientEnv(replace(cfg, observation=ObservationCfg(view="goal")), "cpu")

@@ -59,7 +59,9 @@ def test_a_teacher_observes_them_so(name):
         env.step(env.action)
     joints = env.num_actions
     position, velocity = (wp.to_torch(state)[:, :joints] for state in (env.sim.joint_q, env.sim.joint_qd))
-    observed = wp.to_torch(env.observation)[:, teacher_observation_slices(env.num_fingers)["fingertips"]]
+    observed = wp.to_torch(env.observation)[
+        :, teacher_observation_slices(env.num_fingers, env.num_actions)["fingertips"]
+    ]
     tips = Fingertips(env.hand)
     torch.testing.assert_close(tips(position, velocity), observed, atol=2e-5, rtol=1e-4)
     env.close()

@@ -67,10 +67,10 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
     warnings = _suspicious(tree)
     with tempfile.TemporaryDirectory() as scratch:
         author = Author(tree, stance, said, name)
-        near = sorted({(joint.parent, joint.child) for joint in tree.joints} | _apart(source, tree))
-        target = author.write(Path(scratch), Path(path).name, near)
+        near = _untouched(source, tree)
+        target = author.write(Path(scratch), Path(path).name, sorted(near))
         hand = read_hand(target)
-        deep = overlaps(hand, set(near))
+        deep = overlaps(hand, near)
         if deep:
             author = Author(tree, stance, said, name)
             target = author.write(Path(scratch), Path(path).name, sorted({*near, *deep}))
@@ -120,12 +120,18 @@ def _suspicious(tree: Tree) -> list[str]:
     ]
 
 
-def _apart(source: Source, tree: Tree) -> set[tuple[int, int]]:
-    """Pairs of links whose contact is off in the source."""
+def _untouched(source: Source, tree: Tree) -> set[tuple[int, int]]:
+    """Pairs of links whose contact is off: of one finger, the base and first links, and those of the source.
+
+    Each pair of links apart costs MuJoCo, which has 32 bits for who meets whom, so a finger is one in this.
+    """
     number = {link.name: i for i, link in enumerate(tree.links)}
     number |= {name: i for i, link in enumerate(tree.links) for name in link.sites if name not in number}
-    pairs = {tuple(sorted((number.get(a, 0), number.get(b, 0)))) for a, b in source.apart}
-    return {(a, b) for a, b in pairs if a != b}
+    pairs = {(0, joint.child) for joint in tree.joints if joint.parent == 0}
+    for joints in tree.finger_joints():
+        pairs |= set(combinations([joint + 1 for joint in joints], 2))
+    named = [sorted((number.get(a, 0), number.get(b, 0))) for a, b in source.apart]
+    return pairs | {(a, b) for a, b in named if a != b}
 
 
 def overlaps(hand: HandModel, near: set[tuple[int, int]]) -> dict[tuple[int, int], float]:

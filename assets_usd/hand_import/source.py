@@ -205,7 +205,7 @@ def _read_mjcf(path: Path) -> Source:
         )
         _mjcf_joints(model, i, source)
     for geom in np.flatnonzero(model.geom_bodyid > 0):
-        source.links[model.geom_bodyid[geom] - 1].shapes.append(_mjcf_shape(model, geom))
+        source.links[model.geom_bodyid[geom] - 1].shapes.append(_mjcf_shape(model, int(geom)))
     for site in np.flatnonzero(model.site_bodyid > 0):
         pose = _pose(model.site_pos[site], model.site_quat[site])
         source.links[model.site_bodyid[site] - 1].sites[model.site(site).name] = pose

@@ -129,7 +129,7 @@ def derive_interface(
 def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
     """The vector that a teacher's layers see; tracking and vision policies make it of joints and camera."""
     seen = task.observation
-    slices = teacher_observation_slices(hand.num_fingers)
+    slices = teacher_observation_slices(hand.num_fingers, hand.num_joints)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}
     if seen.shape != "none":
         end = slices["previous_action"].stop

@@ -5,6 +5,7 @@ World frame: z up, table top at z = 0, all worlds at one origin. SI units, quate
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import newton
 import numpy as np
@@ -39,6 +40,8 @@ OBJECT_GROUP = -1
 """Collision group of an object's parts: with all but each other. Of one body they never touch, but in a group
 with the rest every pair of them takes room in MuJoCo's 32 bits, and from about 20 parts there is none."""
 TABLE_LABEL = "table"
+MASKED_SHAPES = 33
+"""Most shapes whose filters fit into MuJoCo's masks whatever they are."""
 
 
 @dataclass
@@ -137,6 +140,7 @@ def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBu
         load_visual_shapes=visuals,
         hide_collision_shapes=True,
     )
+    _group_fingers(builder, hand)
     tips = {shape.path for shape in hand.shapes if shape.fingertip}
     for shape in range(builder.shape_count):
         if not builder.shape_flags[shape] & newton.ShapeFlags.COLLIDE_SHAPES:
@@ -149,6 +153,26 @@ def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBu
         for key, value in attributes.items():
             builder.custom_attributes[key].values[shape] = value
     return builder
+
+
+def _group_fingers(builder: newton.ModelBuilder, hand: HandModel) -> None:
+    """Put each finger whose links never touch each other into a collision group.
+
+    That says nothing new, but to the compiler of MuJoCo's masks: of what is filtered pair by pair, more than
+    33 shapes may not fit into their 32 bits.
+    """
+    colliding = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES]
+    if len(colliding) <= MASKED_SHAPES:
+        return
+    names = [label.rsplit("/", 1)[-1] for label in builder.body_label]
+    apart = set(builder.shape_collision_filter_pairs)
+    for finger, joints in enumerate(hand.fingers):
+        links = [hand.link_names[hand.joint_child[joint]] for joint in range(joints.start, joints.stop)]
+        shapes = [i for i in colliding if names[builder.shape_body[i]] in links]
+        pairs = [(a, b) for a, b in combinations(shapes, 2) if builder.shape_body[a] != builder.shape_body[b]]
+        if apart.issuperset(pairs):
+            for shape in shapes:
+                builder.shape_collision_group[shape] = OBJECT_GROUP - 1 - finger
 
 
 def add_table(builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool) -> None:

@@ -107,8 +107,8 @@ class Observer:
         self._base = torch.tensor(hand.mount, dtype=torch.float32, device=place)
         limits = np.stack([hand.lower, hand.upper])
         self._lower, self._upper = torch.tensor(limits, dtype=torch.float32, device=place)
-        self._columns = teacher_observation_slices(hand.num_fingers)
-        self._size, state = num_observations, teacher_observation_size(hand.num_fingers)
+        self._columns = teacher_observation_slices(hand.num_fingers, hand.num_joints)
+        self._size, state = num_observations, teacher_observation_size(hand.num_fingers, hand.num_joints)
         self._columns["shape"] = slice(state, num_observations)
         self._shapes = ShapeObserver(
             array(np.stack([item.surface_points for item in objects]), wp.vec3),
