@@ -1,4 +1,4 @@
-"""``vd-assets``: name and import hands, author objects, import meshes, draw contact sheets."""
+"""vd-assets: name and import hands, author objects, import meshes, draw contact sheets."""
 
 import re
 import sys

@@ -89,7 +89,7 @@ class SuccessConstants:
     object_speed_m_s: float = source(0.04, "P", "norm of v")
     object_spin_rad_s: float = source(0.5, "P", "norm of omega")
     action_norm: float = source(1.0, "C", "norm of the smoothed action; threshold only in the code")
-    fall_m: float = source(0.15, "P", "p-bar, eq. 5; distance from goal_position_m, not squared")
+    fall_m: float = source(0.15, "P", "p-bar, eq. 5; distance from where objects are handled, not squared")
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,6 @@ class RandomisationConstants:
     link_mass_scale: tuple[float, float] = source((0.8, 1.2), "P", "Table S3")
     friction: tuple[float, float] = source((0.24, 1.6), "P", "Table S3, robot and objects")
     table_friction: tuple[float, float] = source((0.05, 1.0), "P", "Table S3")
-    restitution: tuple[float, float] = source((0.0, 1.0), "P", "Table S3")
     object_scale: tuple[float, float] = source((0.95, 1.05), "P", "Table S3")
     object_mass_kg: tuple[float, float] = source((0.009, 0.324), "P", "Table S3")
     force_probability: float = source(0.2, "P", "per control step")
