@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -22,10 +22,9 @@ from vd.assets_usd.hand_data import (
     CollisionShape,
     HandError,
     HandModel,
-    MotorModel,
-    Workspace,
     compose,
 )
+from vd.assets_usd.hand_description import EARLIER_START, Described, xyzw
 from vd.assets_usd.hand_layer import add_layer, read_servo
 
 __all__ = ["CameraModel", "CollisionShape", "HandError", "HandModel", "open_stage", "read_hand"]
@@ -93,45 +92,13 @@ def read_hand(path: Path, *, fingertip: str = "rigid", layer: Path | None = None
     return _Reader(Path(path), fingertip, None if layer is None else Path(layer)).read()
 
 
-class _Reader:
+class _Reader(Described):
     """One reading of one file; every method raises :class:`HandError`."""
 
     def __init__(self, path: Path, fingertip: str, layer: Path | None):
-        self.path = path
+        super().__init__(path, open_stage(path, fingertip, layer), layer)
         self.fingertip = fingertip
-        self.layer = layer
-        self.stage = open_stage(path, fingertip, layer)
-        self.root = self.stage.GetDefaultPrim()
         self.cache = UsdGeom.XformCache()
-
-    def fail(self, where: Any, what: str, remedy: str) -> HandError:
-        """The error to raise for a prim or a path."""
-        prim = where.GetPath() if isinstance(where, Usd.Prim) else where
-        file = f"{self.path} with the layer {self.layer}" if self.layer else str(self.path)
-        return HandError(f"{file}: {prim}: {what}; {remedy}")
-
-    def prim(self, relative: str) -> Usd.Prim:
-        """The prim at a path below the root."""
-        path = self.root.GetPath().AppendPath(relative)
-        prim = self.stage.GetPrimAtPath(path)
-        if not prim:
-            raise self.fail(path, "the prim is missing", "add it, or export the hand again")
-        return prim
-
-    def value(self, prim: Usd.Prim, attribute: str) -> Any:
-        """The value of an attribute, which must have been authored."""
-        found = prim.GetAttribute(attribute)
-        if not found or not found.HasAuthoredValue():
-            raise self.fail(prim, f"'{attribute}' is not authored", "give it a value")
-        return found.Get()
-
-    def number(self, prim: Usd.Prim, attribute: str, *, positive: bool = False) -> float:
-        """The value of a scalar attribute: finite, and above zero where that is asked for."""
-        number = float(self.value(prim, attribute))
-        if not math.isfinite(number) or (positive and number <= 0.0):
-            wanted = "positive" if positive else "finite"
-            raise self.fail(prim, f"'{attribute}' is {number}", f"it must be {wanted}")
-        return number
 
     def read(self) -> HandModel:
         """The whole hand."""
@@ -139,6 +106,7 @@ class _Reader:
         if not self.root.HasAPI(UsdPhysics.ArticulationRootAPI):
             raise self.fail(self.root, "PhysicsArticulationRootAPI is missing", "apply it to the root prim")
         counts = self._fingers()
+        self.earlier = self.earlier and set(counts) == {len(EARLIER_START)}
         self._refuse_unknown(counts)
         order = [(f, i) for f, count in enumerate(counts) for i in range(1, count + 1)]
         links = ("base", *(f"f{f}_l{i}" for f, i in order))
@@ -147,11 +115,11 @@ class _Reader:
         index = {body.GetPath(): i for i, body in enumerate(bodies)}
         masses = [self._mass(body) for body in bodies]
         frames = [self._joint_frames(joint, index) for joint in joints]
-        mimic = [self._mimic(joint, joints) for joint in joints]
+        mimic = [self.mimic(joint, joints) for joint in joints]
         drives = np.array(
             [self._drive(joint, driven=row[0] < 0) for joint, row in zip(joints, mimic, strict=True)]
         )
-        self._check_mimic(joints, [row[0] for row in mimic])
+        self.check_mimic(joints, [row[0] for row in mimic])
         baseline = dict(zip(("kp", "kd", "velocity_limit", "inertia"), drives.T[[2, 3, 5, 6]], strict=True))
         servo, servo_interval = read_servo(joints, baseline, self.layer or self.path)
         tip_prims = [self.prim(f"f{f}_l{count}/f{f}_tip") for f, count in enumerate(counts)]
@@ -165,9 +133,9 @@ class _Reader:
             path=self.path,
             layer=self.layer,
             fingers=tuple(slice(int(a), int(b)) for a, b in pairwise(ends)),
-            mount=self._mount(),
-            palm=self._direction("vd:palm"),
-            workspace=self._workspace(),
+            mount=self.mount(),
+            palm=self.direction("vd:palm"),
+            workspace=self.workspace(),
             link_names=links,
             joint_names=tuple(joint.GetName() for joint in joints),
             joint_parent=np.array([frame[0] for frame in frames]),
@@ -182,11 +150,11 @@ class _Reader:
             effort=drives[:, 4],
             velocity_limit=drives[:, 5],
             armature=drives[:, 6],
-            start=self._start(joints, drives),
+            start=self.start(joints, drives),
             mimic=np.array([row[0] for row in mimic]),
             mimic_factor=np.array([row[1] for row in mimic]),
             mimic_offset=np.array([row[2] for row in mimic]),
-            motors=self._motors(joints),
+            motors=self.motors(joints),
             servo=servo,
             servo_interval=servo_interval,
             link_mass=np.array([mass for mass, _, _ in masses]),
@@ -252,87 +220,6 @@ class _Reader:
                     "rename it if it is a finger's, weld it to its link if it is fixed, or remove it",
                 )
 
-    def _mount(self) -> np.ndarray:
-        """Pose of the base in the world [7]."""
-        place = self._vector("vd:mount:position")
-        return np.concatenate([place, _xyzw(self.value(self.root, "vd:mount:orientation"))])
-
-    def _vector(self, attribute: str, size: int = 3) -> np.ndarray:
-        """A vector of the root [size], finite."""
-        vector = np.array(self.value(self.root, attribute), dtype=float)
-        if vector.shape != (size,) or not np.isfinite(vector).all():
-            raise self.fail(self.root, f"'{attribute}' is {vector}", f"{size} finite numbers")
-        return vector
-
-    def _direction(self, attribute: str) -> np.ndarray:
-        """A unit vector of the root [3]."""
-        vector = self._vector(attribute)
-        if not np.linalg.norm(vector) > 0.0:
-            raise self.fail(self.root, f"'{attribute}' is {vector}", "give it a direction")
-        return np.asarray(vector / np.linalg.norm(vector))
-
-    def _workspace(self) -> Workspace:
-        low, high = self._vector("vd:workspace:size", 2)
-        if not 0.0 < low <= high:
-            raise self.fail(self.root, f"'vd:workspace:size' is ({low}, {high})", "smallest first, above 0")
-        return Workspace(
-            drop_m=tuple(self._vector("vd:workspace:drop").tolist()),
-            goal_m=tuple(self._vector("vd:workspace:goal").tolist()),
-            fall_m=self.number(self.root, "vd:workspace:fall", positive=True),
-            size_m=(float(low), float(high)),
-        )
-
-    def _start(self, joints: list[Usd.Prim], drives: np.ndarray) -> np.ndarray:
-        """Angles at the start [D] [rad]; they are within the limits."""
-        start = np.array([self.number(joint, "vd:start") for joint in joints])
-        for joint, angle, (low, high) in zip(joints, start, drives[:, :2], strict=True):
-            if not low - ORTHONORMAL_TOLERANCE <= angle <= high + ORTHONORMAL_TOLERANCE:
-                raise self.fail(
-                    joint,
-                    f"'vd:start' is {angle:g} rad",
-                    f"choose one within its limits, {low:.3f} and {high:.3f} rad",
-                )
-        return start
-
-    def _mimic(self, joint: Usd.Prim, joints: list[Usd.Prim]) -> tuple[int, float, float]:
-        """The joint that a joint follows, or -1, with factor and offset [rad]."""
-        targets = joint.GetRelationship("newton:mimicJoint").GetTargets()
-        if not targets:
-            return -1, 1.0, 0.0
-        paths = [other.GetPath() for other in joints]
-        if len(targets) != 1 or targets[0] not in paths:
-            named = [str(target) for target in targets]
-            raise self.fail(joint, f"'newton:mimicJoint' is {named}", "point it at one joint of the hand")
-        factor = self.number(joint, "newton:mimicCoef1")
-        return paths.index(targets[0]), factor, math.radians(self.number(joint, "newton:mimicCoef0"))
-
-    def _check_mimic(self, joints: list[Usd.Prim], leaders: list[int]) -> None:
-        for joint, leader in zip(joints, leaders, strict=True):
-            if leader >= 0 and leaders[leader] >= 0:
-                name = joints[leader].GetName()
-                raise self.fail(joint, f"follows {name}, which follows another", "follow that one")
-
-    def _motors(self, joints: list[Usd.Prim]) -> tuple[MotorModel | None, ...]:
-        """The motor of each joint that says which it has; no two have one ID."""
-        motors: list[MotorModel | None] = []
-        for joint in joints:
-            if not joint.GetAuthoredPropertiesInNamespace("vd:motor"):
-                motors.append(None)
-                continue
-            motor = MotorModel(
-                model=str(self.value(joint, "vd:motor:model")),
-                id=int(self.value(joint, "vd:motor:id")),
-                sign=self.number(joint, "vd:motor:sign"),
-                offset_rad=self.number(joint, "vd:motor:offset"),
-                gear=self.number(joint, "vd:motor:gear", positive=True),
-            )
-            if abs(motor.sign) != 1.0:
-                raise self.fail(joint, f"'vd:motor:sign' is {motor.sign:g}", "it is 1, or -1")
-            if motor.id in [other.id for other in motors if other]:
-                raise self.fail(joint, f"'vd:motor:id' {motor.id} is another joint's too", "change one")
-            motors.append(motor)
-        return tuple(motors)
-
     def _point_prims(self, links: tuple[str, ...]) -> list[tuple[str, Usd.Prim, int]]:
         """Name, prim and link of the sets of surface samples, as far as links have them."""
         root = self.root.GetPath()
@@ -368,7 +255,7 @@ class _Reader:
                 f"'physics:diagonalInertia' is {moments}",
                 "three positive moments, none above the sum of two",
             )
-        axes = Rotation.from_quat(_xyzw(self.value(body, "physics:principalAxes"))).as_matrix()
+        axes = Rotation.from_quat(xyzw(self.value(body, "physics:principalAxes"))).as_matrix()
         return mass, com, axes @ np.diag(moments) @ axes.T
 
     def _axis(self, joint: Usd.Prim) -> np.ndarray:
@@ -390,7 +277,7 @@ class _Reader:
                 raise self.fail(joint, f"'physics:body{side}' is {names}", "point it at one link of the hand")
             links.append(index[targets[0]])
             position = np.array(self.value(joint, f"physics:localPos{side}"), dtype=float)
-            frames.append(np.concatenate([position, _xyzw(self.value(joint, f"physics:localRot{side}"))]))
+            frames.append(np.concatenate([position, xyzw(self.value(joint, f"physics:localRot{side}"))]))
         finger, number = re.findall(r"\d+", joint.GetName())
         child = self.root.GetPath().AppendChild(f"f{finger}_l{number}")
         parent = self.root.GetPath().AppendChild("base" if number == "1" else f"f{finger}_l{int(number) - 1}")
@@ -512,9 +399,3 @@ class _Reader:
             gap=self.number(prim, "newton:contactGap"),
             fingertip=surface.GetName() == "fingertip_surface",
         )
-
-
-def _xyzw(quaternion: Gf.Quatf) -> np.ndarray:
-    """A USD quaternion as a unit quaternion xyzw [4], in double precision."""
-    components = np.array([*quaternion.GetImaginary(), quaternion.GetReal()], dtype=float)
-    return np.asarray(components / np.linalg.norm(components))

@@ -31,8 +31,6 @@ class Tree:
     """Joints of each finger."""
     tips: list[np.ndarray | None]
     """Fingertip in the last link of each finger [7], where the source marks one."""
-    origin: np.ndarray
-    """Base in the frame of the source's root link [7]."""
     notes: list[str] = field(default_factory=list)
 
     def forward_kinematics(self, q: np.ndarray) -> np.ndarray:
@@ -112,7 +110,7 @@ class _Grower:
                 links.append(self._welded(joint.child))
             tips.append(self._tip(chain[-1].child))
         self.fail()
-        tree = Tree(links, joints, counts, tips, IDENTITY, self.notes)
+        tree = Tree(links, joints, counts, tips, self.notes)
         self._check_followers(tree)
         self._check_numbers(tree)
         self.fail()
