@@ -53,6 +53,6 @@ def test_views_are_chosen_seen_and_acted_in_as_in_the_simulator(env, maps):
 
 def test_a_rotation_by_more_than_half_a_turn_is_in_the_view_of_the_shorter_one(env, maps):
     observation = torch.zeros(50, env.num_observations)
-    columns = teacher_observation_slices(env.num_fingers)["relative_orientation"]
+    columns = teacher_observation_slices(env.num_fingers, env.num_actions)["relative_orientation"]
     observation[:, columns] = torch.from_numpy(Rotation.random(50, random_state=0).as_quat()).float()
     assert torch.equal(maps.choose(observation), maps.choose(-observation))

@@ -31,7 +31,7 @@ class FrameMaps:
         self._factor, self._offset, self._sign, self._sector = (
             array(v, torch.float32) for v in (tables.factor, tables.offset, tables.sign, tables.sector)
         )
-        self._turn = teacher_observation_slices(hand.num_fingers)["relative_orientation"]
+        self._turn = teacher_observation_slices(hand.num_fingers, hand.num_joints)["relative_orientation"]
 
     def choose(self, observation: torch.Tensor) -> torch.Tensor:
         """Frames [..] of observations [.., O]: the axis of the wanted rotation is in their sector."""

@@ -290,7 +290,7 @@ class _Round:
                     *(wp.array(count, dtype=wp.int32, device=env.device) for count in counts)
                 )
             env.hold()
-            away = env.object_pose()[envs, :3] - np.array(PAPER.scene.goal_position_m)
+            away = env.object_pose()[envs, :3] - np.array(env.hand.workspace.goal_m)
             lost |= ~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_m)  # not a number is lost too
         place = self._place(envs)
         error = rotation_angle(unit_quats(env.object_pose()[envs, 3:7]), self._trace.goal_quat[place])
