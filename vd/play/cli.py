@@ -95,9 +95,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         frames = film(log, cfg.video)
     else:
         if cfg.video is None:
+            opened = _open(cfg, num_envs=1)
             from vd.play.session import Session
 
-            serve(Session(*_open(cfg, num_envs=1), seed=cfg.seed), cfg)
+            serve(Session(*opened, seed=cfg.seed), cfg)
             return 0
         frames = record_video(cfg, cfg.video)
     print(f"{cfg.video} ({frames} frames)")
@@ -111,13 +112,13 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
         ValueError: A setting, object set or policy cannot be used.
         FileNotFoundError: There is no such policy.
     """
+    env, policy = _open(cfg, num_envs=cfg.cells)
     from tqdm import tqdm
 
     from vd.evaluate.cfg import LOG_EVERY_S
     from vd.play.video import GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
-    env, policy = _open(cfg, num_envs=cfg.cells)
     envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
     items = [env.objects[env.world_object[world]] for world in envs]
