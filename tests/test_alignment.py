@@ -228,6 +228,16 @@ def test_losses_are_least_at_the_truth_and_fall(scenes):
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in runner.network.parameters())
 
 
+def test_goals_turned_by_the_network_keep_their_label(scenes):
+    runner = make_runner(scenes, cfg=replace(QUICK, searched_share=1.0))
+    pairs = runner.pairs()
+    turned = runner.searched(pairs)
+    assert not torch.allclose(turned.rotation, pairs.rotation, atol=1e-2)
+    for name in ("goal", "surface"):
+        place = [getattr(each, name) @ each.rotation.transpose(-1, -2) for each in (pairs, turned)]
+        torch.testing.assert_close(*place, atol=1e-5, rtol=0.0)
+
+
 def test_a_run_measures_goes_on_and_leaves_a_network(scenes, tmp_path):
     runner = make_runner(scenes, out=tmp_path, steps=96)
     runner.learn(2)
