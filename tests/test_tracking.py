@@ -194,9 +194,10 @@ def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
     policy = load_tracking(path)
     assert sees_clouds(open_policy(name, "cpu")) and is_tracking(path) and path.stat().st_size < 5.2e6
     assert policy.spec.calibrated_on and "/" not in policy.spec.teacher + policy.spec.calibrated_on
-    teacher = load_policy(find_policy(policy.spec.teacher))
-    observation = torch.randn(5, teacher.num_observations)
-    assert torch.equal(policy.teacher.act(observation), teacher.act(observation))
+    if policy.kind == "tracking":  # the layers of others may be of a teacher that is not installed
+        teacher = load_policy(find_policy(policy.spec.teacher))
+        observation = torch.randn(5, teacher.num_observations)
+        assert torch.equal(policy.teacher.act(observation), teacher.act(observation))
 
 
 def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):
