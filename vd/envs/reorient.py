@@ -14,6 +14,7 @@ import warp as wp
 
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
+from vd.envs.handed import HandedOver, success_ends
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.setup import SETTLE_S, rest_poses, table_steps
@@ -91,6 +92,10 @@ class ReorientEnv:
         self._table_steps: wp.array | None = None
         if cfg.table.away_share > 0.0:
             self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device)
+        self._handed: HandedOver | None = None
+        if cfg.table.handed_share > 0.0:
+            self._handed = HandedOver(state, self._reset_q, self._table_steps)
+        self._ends = success_ends(state)
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
@@ -148,7 +153,7 @@ class ReorientEnv:
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         reset_q = np.tile(PAPER.scene.reset_joint_rad, f)
-        self._reset_q = wp.array(reset_q, dtype=float, device=self.device)
+        self._reset_q: wp.array = wp.array(reset_q, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, reset_q)
 
     def _find_rest_poses(self) -> wp.array:
@@ -273,7 +278,11 @@ class ReorientEnv:
         self._end_episodes()
         self._launch(record_step_kernel, [sim.joint_q, self.num_actions], [self.object_pose_end])
         self.randomiser.redraw(self._reset)
-        self._reset_envs()
+        command = None
+        if self._handed is not None:
+            self._handed.hand_over(self.success, self.fell, self._reset, self.step_count)
+            command = sim.target
+        self._reset_envs(command=command)
         self.observe()
 
     def _judge(self) -> None:
@@ -324,7 +333,7 @@ class ReorientEnv:
                 self.success,
                 self.fell,
                 self.max_episode_steps,
-                int(self.cfg.success_ends_episode),
+                self._ends,
                 self.step_count,
                 self.goal_steps,
                 self.goal_counts,
@@ -332,8 +341,13 @@ class ReorientEnv:
             [self.timed_out, self.done, self._reset, self._new_goal],
         )
 
-    def _reset_envs(self, *, use_start: bool = False, use_goal: bool = False) -> None:
-        """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too."""
+    def _reset_envs(
+        self, *, use_start: bool = False, use_goal: bool = False, command: wp.array | None = None
+    ) -> None:
+        """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too.
+
+        ``command`` is what servos have been told so far [rad], shape [N, *]; the positions by default.
+        """
         sim, p = self.sim, self.parameters
         self._launch(
             reset_kernel,
@@ -368,7 +382,7 @@ class ReorientEnv:
         sim.solver.reset(sim.state, world_mask=self._env_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
         if sim.servo is not None:
-            sim.servo.reset(self._reset)
+            sim.servo.reset(self._reset, command=command)
         self.observer.begin(self._reset)
 
     def observe(self) -> None:
@@ -465,6 +479,7 @@ class ReorientEnv:
             **self.observer.stateful(),
             **self.randomiser.stateful(),
             **({} if restitution is None else restitution.stateful()),
+            **({} if self._handed is None else self._handed.stateful()),
         }
 
     def close(self) -> None:
