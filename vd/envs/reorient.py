@@ -193,6 +193,21 @@ class ReorientEnv:
         self.randomiser.push()
         self.observe()
 
+    def give_goals(self, envs: np.ndarray, goal_quat: np.ndarray) -> None:
+        """Give new goals to some environments in the middle of their episodes; the observation is fresh.
+
+        Args:
+            envs: Their numbers, shape [E].
+            goal_quat: Goal orientations, xyzw, shape [E, 4].
+        """
+        mask, goals = np.zeros(self.num_envs, np.int32), self.goal_quat.numpy()
+        mask[envs], goals[envs] = 1, goal_quat
+        self._reset.zero_()
+        self._new_goal.assign(mask)
+        self._given_goal.assign(goals)
+        self._reset_envs(use_goal=True)
+        self.observe()
+
     def step(self, action: Any) -> None:
         """Simulate one control step; environments that end are reset, and the observation is fresh.
 
