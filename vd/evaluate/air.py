@@ -1,8 +1,8 @@
 """In the air, goal after goal: the table goes, and only then come the goals that count.
 
-The paper's in-air test is mostly won before the table goes. Here a policy has the table for 2 s, as there, and
-1 s to hold the object without it. Then it gets goals, each drawn once the last is reached. What comes after
-a stop is simulated apart, as in :mod:`vd.evaluate.trace`. K objects, M episodes; quaternions xyzw.
+The paper's in-air test is mostly won before the table goes. Here a policy has the table for 2 s, as there,
+and 1 s to hold the object without it. Then it gets goals, each drawn once the last is reached. What comes
+after a stop is simulated apart, as in :mod:`vd.evaluate.trace`. K objects, M episodes; quaternions xyzw.
 """
 
 import zlib
