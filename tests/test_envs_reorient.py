@@ -149,6 +149,21 @@ ANYTHING = SuccessCfg(
 )
 
 
+def test_a_goal_given_in_the_middle_is_seen_at_once_and_moves_nothing():
+    env, goal = make(), np.array([[0.0, 0.0, np.sin(0.3), np.cos(0.3)]])
+    run(env, 5)
+    before, steps, q = env.goal_quat.numpy().copy(), env.step_count.numpy().copy(), env.sim.joint_q.numpy()
+    env.give_goals(np.array([1]), goal)
+    np.testing.assert_array_equal(env.sim.joint_q.numpy(), q)
+    np.testing.assert_array_equal(env.step_count.numpy(), steps)
+    np.testing.assert_allclose(np.abs((env.goal_quat.numpy()[1] * goal).sum()), 1.0, atol=1e-6)
+    np.testing.assert_array_equal(env.goal_quat.numpy()[[0, 2, 3]], before[[0, 2, 3]])
+    columns = teacher_observation_slices(3)["goal_orientation"]
+    seen = env.observation.numpy()[:, columns]
+    np.testing.assert_allclose(np.abs((seen[1] * goal).sum()), 1.0, atol=1e-6)
+    assert not env.smoothed.numpy()[1].any() and env.smoothed.numpy()[0].any()
+
+
 def test_a_success_gives_a_new_goal_without_a_reset():
     env = make(success=ANYTHING)
     before = env.goal_quat.numpy().copy()

@@ -15,21 +15,11 @@ import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from vd.evaluate.goals import AIR_HOLD_S, ALONE_S, GOAL_S, IN_A_ROW
+from vd.evaluate.result import Agent, InAir, Protocol, Row, row_of
 from vd.evaluate.rollout import draw_goals, unit_quats
-from vd.evaluate.statistics import rotation_angle
-from vd.evaluate.trace import Way, air_table_steps, drawn_rounds, keep_motion, motion, out_of_hand
-from vd.paper import PAPER
-
-GOALS = 3
-"""Goals in a row (ours)."""
-GOAL_S = 12.0
-"""Time for each [s]: for the first what is left of the paper's 15 s."""
-ALONE_S = 1.0
-"""Time from the table's going to the first goal [s] (ours)."""
-HOLD_S = 30.0
-"""For how long a hand holds its object where it reached the first goal [s] (ours)."""
-AIR_S = PAPER.scene.air_table_s + ALONE_S + GOALS * GOAL_S
-"""Length of an episode [s]."""
+from vd.evaluate.statistics import choose_unit, rate_intervals, rotation_angle, symmetric_error
+from vd.evaluate.trace import Episode, Way, air_table_steps, drawn_rounds, keep_motion, motion, out_of_hand
 
 
 @dataclass(frozen=True)
@@ -37,26 +27,41 @@ class AirTrace:
     """What became of the episodes.
 
     Attributes:
+        start_quat: Orientation of the object when the first goal was drawn; at the reset if it was lost
+            before [K, M, 4].
+        goal_quat: The first goal [K, M, 4].
+        end_quat: Orientation at its stop, or at the end [K, M, 4].
+        steps: Steps from there to there [K, M].
+        stopped: Whether the policy was stopped, at the first goal or not, bool [K, M].
         held: Whether the object was still there when the first goal was drawn, bool [K, M].
         reached: Goals reached, one after the other, int [K, M].
         lost: Whether the object was lost, bool [K, M].
-        let_go: Of objects with which the first goal was reached, whether they were lost within HOLD_S of
+        let_go: Of objects with which the first goal was reached, whether they were lost within AIR_HOLD_S of
             holding: 0 or 1; NaN for the others [K, M].
     """
 
+    start_quat: np.ndarray
+    goal_quat: np.ndarray
+    end_quat: np.ndarray
+    steps: np.ndarray
+    stopped: np.ndarray
     held: np.ndarray
     reached: np.ndarray
     lost: np.ndarray
     let_go: np.ndarray
 
+    def of(self, objects: Sequence[int]) -> "AirTrace":
+        """The episodes of some objects."""
+        return AirTrace(**{name: value[list(objects)] for name, value in vars(self).items()})
+
 
 def air_turns(names: Sequence[str], episodes: int, *, seed: int, max_goal_angle: float) -> np.ndarray:
-    """Rotations from where objects are to their goals [K, M, GOALS, 4], by name, seed and episode alone."""
+    """Rotations from where objects are to their goals [K, M, IN_A_ROW, 4], by name, seed and episode."""
     turns = []
     for name in names:
-        rng = np.random.default_rng([seed, zlib.crc32(name.encode()), GOALS])
-        at = np.tile([0.0, 0.0, 0.0, 1.0], (episodes * GOALS, 1))
-        turns.append(draw_goals(at, rng, max_goal_angle).reshape(episodes, GOALS, 4))
+        rng = np.random.default_rng([seed, zlib.crc32(name.encode()), IN_A_ROW])
+        at = np.tile([0.0, 0.0, 0.0, 1.0], (episodes * IN_A_ROW, 1))
+        turns.append(draw_goals(at, rng, max_goal_angle).reshape(episodes, IN_A_ROW, 4))
     return np.stack(turns)
 
 
@@ -85,6 +90,11 @@ def record_in_air(
     """
     shape = turns.shape[:2]
     trace = AirTrace(
+        start_quat=np.zeros((*shape, 4)),
+        goal_quat=np.zeros((*shape, 4)),
+        end_quat=np.zeros((*shape, 4)),
+        steps=np.zeros(shape, dtype=int),
+        stopped=np.zeros(shape, dtype=bool),
         held=np.zeros(shape, dtype=bool),
         reached=np.zeros(shape, dtype=int),
         lost=np.zeros(shape, dtype=bool),
@@ -98,6 +108,62 @@ def record_in_air(
     return trace
 
 
+def judge_in_air(
+    trace: AirTrace, protocol: Protocol, objects: list[Any], agent: Agent, *, group: str, condition: str = ""
+) -> list[Row]:
+    """The row of one policy, stopped in its own way, from its episodes with the objects of one group."""
+    stopped_by, (rule, _) = agent.own_way(protocol.stop_tolerance_rad)
+    unit, first = choose_unit(len(objects)), trace.reached > 0
+    exact = rotation_angle(trace.end_quat, trace.goal_quat)
+    pairs = zip(trace.end_quat, trace.goal_quat, objects, strict=True)
+    error = np.stack([symmetric_error(end, goal, item.symmetry) for end, goal, item in pairs])
+    before = rotation_angle(trace.start_quat, trace.goal_quat)
+    episodes = tuple(
+        Episode(
+            object_index=k,
+            start_quat=tuple(trace.start_quat[k, m].tolist()),
+            goal_quat=tuple(trace.goal_quat[k, m].tolist()),
+            start_error_rad=float(before[k, m]),
+            error_rad=float(error[k, m]),
+            exact_error_rad=float(exact[k, m]),
+            steps=int(trace.steps[k, m]),
+            stopped=bool(trace.stopped[k, m]),
+            fell=bool(trace.lost[k, m] and not trace.stopped[k, m]),
+        )
+        for k, m in np.ndindex(*trace.steps.shape)
+    )
+    near = trace.stopped & (error <= protocol.stop_tolerance_rad)
+    held, symmetric, in_a_row = rate_intervals(np.stack([trace.held, near, trace.reached == IN_A_ROW]), unit)
+    row = row_of(
+        episodes,
+        protocol,
+        objects,
+        agent,
+        group=group,
+        condition=condition,
+        stopped_by=stopped_by,
+        rule=rule,
+        ours="",
+        held=None,
+        symmetric=symmetric,
+        precise=None,
+        prediction=None,
+        in_air=InAir(
+            held=held,
+            first=_share(first, trace.held),
+            in_a_row=in_a_row,
+            lost=_share(trace.lost, trace.held),
+            let_go=_share(trace.let_go, first),
+        ),
+    )
+    return [row]
+
+
+def _share(of: np.ndarray, among: np.ndarray) -> float | None:
+    """Mean of ``of`` where ``among`` holds; None where it does nowhere."""
+    return float(of[among].mean()) if among.any() else None
+
+
 class _Flight:
     """One episode in every environment that has one: ``numbers`` [N], place among its object's, else -1."""
 
@@ -108,6 +174,9 @@ class _Flight:
         # Steps since the present goal was given; -1: none of the air yet.
         self._age = np.full(env.num_envs, -1)
         self._kept = motion(env, copy=True)
+        quat = unit_quats(env.object_pose()[self._all, 3:7])
+        for array in (trace.start_quat, trace.goal_quat, trace.end_quat):
+            array[self._of(self._all)] = quat
 
     def run(self, policy: Any, turns: np.ndarray, on_step: Callable[[], object]) -> None:
         """Go to the ends, then hold what reached its first goal."""
@@ -115,14 +184,14 @@ class _Flight:
         hz = env.cfg.sim.control_hz
         table, most = air_table_steps(hz), round(GOAL_S * hz)
         first = table + round(ALONE_S * hz)
-        for step in range(first + GOALS * most):
+        for step in range(first + IN_A_ROW * most):
             if step == table:
                 env.sim.place_table(present=False)
             due = self._act(policy)
             on_step()
             self._age[self._age >= 0] += 1
             trace.lost[self._of(self._envs[env.fell.numpy()[self._envs] != 0])] = True
-            self._go_on((env.done.numpy() == 0) & (trace.reached[self._place] < GOALS))
+            self._go_on((env.done.numpy() == 0) & (trace.reached[self._place] < IN_A_ROW))
             if step == first - 1:
                 due = self._envs
                 trace.held[self._of(due)] = True
@@ -132,6 +201,9 @@ class _Flight:
                 goal = turn * Rotation.from_quat(env.object_pose()[due, 3:7])
                 env.give_goals(due, goal.as_quat())
                 self._age[due] = 0
+                if step == first - 1:
+                    trace.start_quat[self._of(due)] = unit_quats(env.object_pose()[due, 3:7])
+                    trace.goal_quat[self._of(due)] = goal.as_quat()
             self._go_on(self._age < most)
             if not len(self._envs):
                 break
@@ -153,14 +225,19 @@ class _Flight:
         if by == "predicted":
             policy.active = torch.zeros(env.num_envs, dtype=torch.bool, device=smoothed.device)
             policy.active[torch.from_numpy(self._envs).to(smoothed.device)] = True
-        true = rotation_angle(unit_quats(env.object_pose()[:, 3:7]), unit_quats(env.goal_quat.numpy()))
+        quat = unit_quats(env.object_pose()[:, 3:7])
+        true = rotation_angle(quat, unit_quats(env.goal_quat.numpy()))
         action = policy.act(wp.to_torch(env.observation))
         seen = policy.predicted.cpu().numpy() if by == "predicted" else true
         stops = rule.stops(seen, norm) & (self._age > 0)
+        trace = self._trace
+        first = self._envs[(self._age >= 0)[self._envs] & (trace.reached[self._of(self._envs)] == 0)]
+        trace.end_quat[self._of(first)], trace.steps[self._of(first)] = quat[first], self._age[first]
+        trace.stopped[self._of(first)] = stops[first]
         self._go_on(~stops | (true <= self._tolerance))
         reached = self._envs[stops[self._envs]]
-        self._trace.reached[self._of(reached)] += 1
-        keep_motion(env, self._kept, reached[self._trace.reached[self._of(reached)] == 1])
+        trace.reached[self._of(reached)] += 1
+        keep_motion(env, self._kept, reached[trace.reached[self._of(reached)] == 1])
         env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
         return reached
 
@@ -171,7 +248,7 @@ class _Flight:
             live.copy_(self._kept[name])
         held = self._all[self._trace.reached[self._of(self._all)] > 0]
         lost = np.zeros(env.num_envs, dtype=bool)
-        for _ in range(round(HOLD_S * env.cfg.sim.control_hz)):
+        for _ in range(round(AIR_HOLD_S * env.cfg.sim.control_hz)):
             env.hold()
             lost |= out_of_hand(env)
         self._trace.let_go[self._of(held)] = lost[held]
