@@ -19,7 +19,7 @@ from vd.evaluate.goals import AIR_HOLD_S, ALONE_S, GOAL_S, IN_A_ROW
 from vd.evaluate.result import Agent, InAir, Protocol, Row, row_of
 from vd.evaluate.rollout import draw_goals, unit_quats
 from vd.evaluate.statistics import choose_unit, rate_intervals, rotation_angle, symmetric_error
-from vd.evaluate.trace import Episode, Way, air_table_steps, drawn_rounds, keep_motion, motion, out_of_hand
+from vd.evaluate.trace import Episode, Way, air_table_steps, copy_motion, drawn_rounds, motion_of, out_of_hand
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class _Flight:
         self._envs = self._all = np.flatnonzero(numbers >= 0)
         # Steps since the present goal was given; -1: none of the air yet.
         self._age = np.full(env.num_envs, -1)
-        self._kept = motion(env, copy=True)
+        self._kept = motion_of(env, copy=True)
         quat = unit_quats(env.object_pose()[self._all, 3:7])
         for array in (trace.start_quat, trace.goal_quat, trace.end_quat):
             array[self._of(self._all)] = quat
@@ -237,18 +237,20 @@ class _Flight:
         self._go_on(~stops | (true <= self._tolerance))
         reached = self._envs[stops[self._envs]]
         trace.reached[self._of(reached)] += 1
-        keep_motion(env, self._kept, reached[trace.reached[self._of(reached)] == 1])
+        copy_motion(self._kept, motion_of(env), reached[trace.reached[self._of(reached)] == 1])
         env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
         return reached
 
     def _hold(self) -> None:
         """Go on from where the first goals were reached, with the last targets."""
         env = self._env
-        for name, live in motion(env).items():
-            live.copy_(self._kept[name])
+        live = motion_of(env)
+        copy_motion(live, self._kept, np.arange(env.num_envs))
         held = self._all[self._trace.reached[self._of(self._all)] > 0]
         lost = np.zeros(env.num_envs, dtype=bool)
         for _ in range(round(AIR_HOLD_S * env.cfg.sim.control_hz)):
             env.hold()
-            lost |= out_of_hand(env)
+            away = out_of_hand(env)
+            lost |= away
+            copy_motion(live, self._kept, np.flatnonzero(away))  # or it would fall for half a minute
         self._trace.let_go[self._of(held)] = lost[held]

@@ -202,7 +202,7 @@ def drawn_rounds(
     return drawn
 
 
-def motion(env: Any, *, copy: bool = False) -> dict[str, torch.Tensor]:
+def motion_of(env: Any, *, copy: bool = False) -> dict[str, torch.Tensor]:
     """What moves, with a row for each environment, sharing the environment's memory or copied."""
     found = {}
     for name, array in env.motion().items():
@@ -212,11 +212,11 @@ def motion(env: Any, *, copy: bool = False) -> dict[str, torch.Tensor]:
     return found
 
 
-def keep_motion(env: Any, kept: dict[str, torch.Tensor], envs: np.ndarray) -> None:
-    """Copy the motion of some environments, by number, into ``kept``, which :func:`motion` gave."""
-    for name, live in motion(env).items():
-        rows = torch.from_numpy(envs).to(live.device)
-        kept[name][rows] = live[rows]
+def copy_motion(out: dict[str, torch.Tensor], motion: dict[str, torch.Tensor], envs: np.ndarray) -> None:
+    """Copy the motion of some environments, by number, of what :func:`motion_of` gave."""
+    for name, values in motion.items():
+        rows = torch.from_numpy(envs).to(values.device)
+        out[name][rows] = values[rows]
 
 
 def out_of_hand(env: Any) -> np.ndarray:
@@ -232,7 +232,7 @@ class _Round:
         self._env, self._trace, self._numbers, self._table_steps = env, trace, numbers, table_steps
         self._objects = np.asarray(env.world_object)
         # The state in which each way to stop ends an environment, after how many steps; -1: not yet.
-        self._stopped = {way: (np.full(env.num_envs, -1), motion(env, copy=True)) for way in trace.held}
+        self._stopped = {way: (np.full(env.num_envs, -1), motion_of(env, copy=True)) for way in trace.held}
 
     def run(self, policy: Any, on_step: Callable[[], object]) -> None:
         """Go to the ends, then go on from the stops that are to be held."""
@@ -290,7 +290,7 @@ class _Round:
             if step == 0 or not len(chosen):
                 continue
             after[chosen] = step
-            keep_motion(self._env, state, chosen)
+            copy_motion(state, motion_of(self._env), chosen)
 
     def _hold(self, way: Way) -> None:
         """Go on from the stops with the last targets, and write down what came of them."""
@@ -298,7 +298,7 @@ class _Round:
         envs = np.flatnonzero(after >= 0)
         if not len(envs):
             return
-        for name, live in motion(env).items():
+        for name, live in motion_of(env).items():
             live.copy_(state[name])
         lost = np.zeros(len(envs), dtype=bool)
         for step in range(round(HOLD_S * env.cfg.sim.control_hz)):
