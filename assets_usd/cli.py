@@ -1,4 +1,4 @@
-"""``vd-assets``: name the hands, author objects, import meshes, draw contact sheets."""
+"""vd-assets: name the hands, author objects, import meshes, draw contact sheets."""
 
 import re
 import sys

@@ -50,6 +50,11 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return re.sub(r"<!-- generated: (\w+) -->", lambda mark: GENERATED[mark[1]](), markdown)
 
 
+def on_page_content(html: str, **_: Any) -> str:
+    """Show a film where a page links to one."""
+    return re.sub(r'<a href="([^"]+\.mp4)">(.*?)</a>', r'\2 <video controls muted src="\1"></video>', html)
+
+
 def commands() -> str:
     """Every command and subcommand with its own help text."""
     parts = []
@@ -74,10 +79,10 @@ def _help(main: Callable[[], object], script: str, words: Sequence[str]) -> str:
         contextlib.suppress(SystemExit),
     ):
         main()
-    lines = shown.getvalue().strip().splitlines()
+    lines = shown.getvalue().replace("``", "").strip().splitlines()
     if not lines:
         raise ValueError(f"`{script} {' '.join(words)} {flag}` prints nothing")
-    return "\n".join(textwrap.fill(line, COLUMNS) if line[:1].isalpha() else line.rstrip() for line in lines)
+    return "\n".join(line.rstrip() if line[:1] == " " else textwrap.fill(line, COLUMNS) for line in lines)
 
 
 def _subcommands(text: str) -> Iterator[str]:

@@ -42,9 +42,9 @@ def test_physics_report_names_what_moves(tmp_path):
     assert report["pinch"]["creep"] < 0.2e-3
 
 
-def test_a_dump_that_is_not_there_is_told_by_its_name(tmp_path, capsys):
-    assert main(["replay", str(tmp_path / "none.json")]) == 1
-    assert "there is no file" in capsys.readouterr().err
+def test_measurements_of_earlier_versions_are_told(capsys):
+    assert main(["replay", "none.json"]) == 2
+    assert "'replay' is no more" in capsys.readouterr().err
 
 
 def test_depth_images_of_both_cameras_are_counted(tmp_path, capsys, monkeypatch):

@@ -13,7 +13,6 @@ import pytest
 import tyro
 from gap_reports import rubbing_servo, servo_report
 from test_evaluate_trace import compared
-from test_page import PNG
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.loop.log import LogWriter
@@ -71,7 +70,6 @@ LEAVE = {
     "vd-gap run": leave_report,
     "vd-deploy": leave_flight,
     "vd-train teacher": leave_training,
-    "vd-train curves": lambda line: option(line, "--out").write_bytes(PNG),
 }
 """What stands in for each command: it leaves the files that the page is made of."""
 

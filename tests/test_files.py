@@ -103,7 +103,6 @@ def commands(taken: str) -> dict[str, list[str]]:
         "vd-train": ["teacher", "--preset", "gpu", "--out", taken],
         "vd-train ": ["student", "--teacher", "dclaw4-cube", "--out", taken],
         "vd-train  ": ["export", "x.pt", f"{taken}/x.pt"],
-        "vd-train   ": ["average", "a", "b", "--out", f"{taken}/x.pt"],
         "vd-train    ": ["bundle", "dclaw4-cube", f"{taken}/x"],
         "vd-train     ": ["tracker", "dclaw4-table", "--objects", "cube", "--out", f"{taken}/x.pt"],
         "vd-eval": ["zero", "--out", taken],

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 
@@ -45,6 +46,20 @@ def test_a_command_that_only_knows_that_it_was_interrupted_ends_so_too(number):
     with pytest.raises(SystemExit) as end:
         exits()
     assert end.value.code == STATUS[number]
+
+
+@pytest.mark.parametrize("number", STATUS)
+def test_a_signal_that_arrives_in_a_finaliser_is_not_lost(number):
+    class Finalised:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), number)
+
+    @interrupt.command("vd-some")
+    def works() -> None:
+        Finalised()
+        time.sleep(10.0)
+
+    assert works() == STATUS[number]
 
 
 def test_a_flag_of_an_earlier_version_is_refused_with_its_name_of_today(capsys):

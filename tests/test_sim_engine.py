@@ -100,6 +100,3 @@ def test_an_evaluation_says_whose_physics_it_was(tmp_path):
 def test_what_the_engine_cannot_do_is_refused():
     with pytest.raises(ValueError, match=r"--engine mujoco steps on the CPU.*leave --device out"):
         EvalCfg(policies=("zero",), engine="mujoco", device="cuda:0").validate()
-    bouncy = dataclasses.replace(CONDITIONS["s3"], restitution=(0.0, 1.0))
-    with pytest.raises(ValueError, match=r"restitution.*set it to 0 0"):
-        ReorientCfg(sim=FINE, randomisation=bouncy).validate()

@@ -59,13 +59,13 @@ def test_three_and_three_more_equal_six(tmp_path, schedule):
     assert resumed.env.env.stage.difficulty == whole.env.env.stage.difficulty
 
 
-def test_keeps_the_last_some_for_good_and_the_best_since_two_episodes_are_over(tmp_path):
-    runner = make_runner(tmp_path, save_every=1, keep_every=2)
+def test_keeps_the_last_and_the_best_since_two_episodes_are_over(tmp_path):
+    runner = make_runner(tmp_path, save_every=1)
     runner._window = GoalWindow(2)
     runner.learn(1)
     assert load_checkpoint(find_checkpoint(tmp_path, "best"))["iter"] == 1, "before, it is the latest"
     runner.learn(5)
-    assert [p.name for p in list_checkpoints(tmp_path)] == [f"model_000000{i}.pt" for i in (2, 4, 5, 6)]
+    assert [p.name for p in list_checkpoints(tmp_path)] == [f"model_000000{i}.pt" for i in (4, 5, 6)]
     best = load_checkpoint(find_checkpoint(tmp_path, "best"))
     scores = [
         (row["task/difficulty"], row["success_per_goal"] or 0.0, row["mean_reward"])
@@ -131,7 +131,7 @@ def test_limits_of_steps_and_time(tmp_path):
 
 
 @pytest.mark.parametrize("where", ["observation", "reward"])
-def test_nan_from_the_simulation_stops_before_the_update(tmp_path, where):
+def test_nan_from_the_simulation_stops_and_is_not_saved(tmp_path, where):
     env = DummyEnv(num_envs=16)
     runner = make_runner(tmp_path, env=env, save_every=1)
     step = env.step
@@ -144,11 +144,8 @@ def test_nan_from_the_simulation_stops_before_the_update(tmp_path, where):
             getattr(env, where).assign(values)
 
     env.step = poisoned
-    with pytest.raises(
-        TrainingDivergedError, match=rf"{where}s.*not finite in 1 environments \(first: \[3\]\)"
-    ):
+    with pytest.raises(TrainingDivergedError, match=r"iteration 2: .*not finite.*--resume"):
         runner.learn(5)
-    assert all(torch.isfinite(w).all() for w in _weights(runner).values())
     assert find_checkpoint(tmp_path, "latest").name == "model_0000001.pt"
 
 

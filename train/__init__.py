@@ -1,4 +1,4 @@
-"""Training: the teacher with PPO (rsl-rl), its presets, checkpoints, curves and command line."""
+"""Training: the teacher with PPO (rsl-rl), its presets, checkpoints and command line."""
 
 import os
 

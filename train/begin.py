@@ -33,12 +33,11 @@ _SENSES = ("hand", "fingertip", "hand_layer", "sim", "action", "observation")
 """Parts of a task that say what a policy's observations and actions mean."""
 
 
-def find_start(name: str, flag: str = "--init") -> Path:
+def find_start(name: str) -> Path:
     """The file that ``--init`` names: an installed policy, a file, or the best checkpoint of a run's folder.
 
     Args:
         name: What is named.
-        flag: What asked for it, for messages.
 
     Raises:
         FileNotFoundError: There is none.
@@ -54,9 +53,9 @@ def find_start(name: str, flag: str = "--init") -> Path:
     try:
         path = find_policy(name)
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"{flag}: {error}") from error
+        raise FileNotFoundError(f"--init: {error}") from error
     if is_bundle(path):
-        raise ValueError(f"{flag}: {name} is a bundle; give the policy or checkpoint that it was made from")
+        raise ValueError(f"--init: {name} is a bundle; give the policy or checkpoint that it was made from")
     return path
 
 

@@ -82,18 +82,16 @@ def _newest_sound(files: list[Path], network: str) -> Path:
     )
 
 
-def prune_checkpoints(run_dir: Path, newest: int, every: int | None = None) -> None:
+def prune_checkpoints(run_dir: Path, newest: int) -> None:
     """Delete old periodic checkpoints, and what a killed run left half-written.
 
     Args:
         run_dir: Folder of the run.
         newest: Iteration of the newest; what a run that went on from an older one finds after it, stays.
-        every: Keep those after every so many iterations, besides the newest; None: no others.
     """
     numbered = [(int(path.stem.removeprefix("model_")), path) for path in list_checkpoints(run_dir)]
-    for number, path in [pair for pair in numbered if pair[0] <= newest][:-KEEP_LAST]:
-        if every is None or number % every:
-            path.unlink(missing_ok=True)
+    for _, path in [pair for pair in numbered if pair[0] <= newest][:-KEEP_LAST]:
+        path.unlink(missing_ok=True)
     for path in (run_dir / CHECKPOINT_FOLDER).glob(".*.pt"):
         path.unlink(missing_ok=True)
 

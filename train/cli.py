@@ -13,12 +13,10 @@ commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --out runs/first
   student    learn to see without a mesh          vd-train student --teacher dclaw3-table --objects SET
   tracker    let it act by a camera, learn nothing vd-train tracker dclaw3-table --objects SET
-  average    mean weights of several teachers     vd-train average runs/a runs/b --out policy.pt
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
   bundle     write a policy as it is deployed     vd-train bundle tracking.pt bundles/first
-  curves     draw the curves of a run             vd-train curves runs/first
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset gpu
 Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
@@ -38,6 +36,8 @@ GONE = {
     "follow": _TRACKER,
     "noise": "no training needed it",
     "profile": "no training needed it",
+    "average": "it gained too little (docs/lessons.md)",
+    "curves": "tensorboard --logdir RUN draws the curves of runs",
     "precompile": "kernels stay in the folder that WARP_CACHE_PATH names, from one start to the next",
 }
 """Commands that are no more, and what to do, or why."""
@@ -47,10 +47,8 @@ COMMANDS = {
     "teacher": ("vd.train.teacher", "teacher_command"),
     "student": ("vd.train.student.cli", "student_command"),
     "tracker": ("vd.train.tracker", "tracker_command"),
-    "average": ("vd.train.average", "average_command"),
     "export": ("vd.train.export", "export_command"),
     "bundle": ("vd.train.export", "bundle_command"),
-    "curves": ("vd.train.curves", "curves_command"),
 }
 """Module and function of each command: it takes its flags and ``time.monotonic()`` of the start, and returns
 the exit status."""

@@ -88,10 +88,11 @@ class RunCfg:
     RETIRED: ClassVar[dict[str, Any]] = {
         "run_dir": Renamed("out"),
         "keep_last": 3,
+        "keep_every": Dropped(None),
         "stagger": True,
     }
     out: Path = Path("runs/teacher")
-    """Folder for configuration, checkpoints, curves and TensorBoard files."""
+    """Folder for configuration, checkpoints and TensorBoard files."""
     device: str = "auto"
     """cpu, cuda:0, ... or auto: the first GPU, else the CPU (under torchrun: each process its own GPU)."""
     max_steps: int = 10_000_000_000
@@ -103,9 +104,6 @@ class RunCfg:
     keep the task's own, and are judged in it."""
     save_every: int = 100
     """Iterations between checkpoints."""
-    keep_every: int | None = None
-    """Keep those after every so many iterations besides the last three and the best, a multiple of
-    --save-every: vd-train average takes their mean."""
     tensorboard: bool = True
     """Write TensorBoard files (tensorboard --logdir RUN-DIR)."""
 
@@ -120,16 +118,8 @@ class RunCfg:
         return (time.monotonic() if started is None else started) + 60.0 * self.max_minutes
 
     def validate(self) -> None:
-        """Refuse limits that are none, and checkpoints to be kept that are never written.
-
-        Raises:
-            ValueError: The flag, its value and what it has to be.
-        """
-        require(self, "--", "positive", "max_steps max_minutes save_every keep_every")
-        if self.keep_every is not None and self.keep_every % self.save_every:
-            raise ValueError(
-                f"--keep-every is {self.keep_every}; give a multiple of --save-every {self.save_every}"
-            )
+        """Raise ValueError naming the flag, its value and what it has to be."""
+        require(self, "--", "positive", "max_steps max_minutes save_every")
 
 
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:

@@ -18,8 +18,9 @@ from typing import Any
 import tyro
 
 from vd import interrupt
+from vd.config import require
 from vd.evaluate.agents import check_names
-from vd.files import check_folder
+from vd.files import atomic_path, check_folder
 from vd.paper import PAPER
 
 CAMERA_POLICY = "dclaw4-tracking"
@@ -228,16 +229,30 @@ class Demo:
         seed = ("--seed", str(self.cfg.seed))
         words = ("vd-train", "teacher", "--preset", "cpu-demo", *seed, "--max-minutes", f"{minutes:.2f}")
         part.run([*words, "--out", run])
-        part.run(
-            ["vd-train", "curves", run, "--out", curves],
-            ["vd-play", run, "--cells", "4", "--seconds", str(FILM_S), *seed, "--video", film],
-        )
+        part.run(["vd-play", run, "--cells", "4", "--seconds", str(FILM_S), *seed, "--video", film])
         from vd.train.metrics import PROGRESS_FILE, read_progress
 
         rows = [row for row in read_progress(run / PROGRESS_FILE) if row["goals_per_episode"] is not None]
         goals = [row["goals_per_episode"] for row in rows]
+        draw_curve([row["env_steps"] for row in rows], goals, curves)
         shown = {"film": film, "curves": curves, "low": min(goals), "last": goals[-1]}
         return shown | {"steps": rows[-1]["env_steps"]}
+
+
+def draw_curve(steps: Sequence[int], goals: Sequence[float], path: Path) -> None:
+    """Draw goals an episode against control steps, as a PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(8, 3), constrained_layout=True)
+    axis.plot(steps, goals)
+    axis.set(xlabel="control steps", ylabel="goals an episode")
+    axis.grid(alpha=0.3)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+    plt.close(figure)
 
 
 def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:
@@ -270,8 +285,7 @@ def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; returns the exit status: 1 if a part failed."""
     cfg = tyro.cli(DemoCfg, args=arguments, prog="python -m vd.train.demo")
-    if cfg.minutes <= 0.0:
-        raise ValueError(f"--minutes is {cfg.minutes}; it has to be positive")
+    require(cfg, "--", "positive", "minutes")
     check_names([CAMERA_POLICY], [])
     check_folder(cfg.out)
     if cfg.out.is_dir() and any(cfg.out.iterdir()) and not (cfg.out / "index.html").is_file():

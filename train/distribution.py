@@ -47,10 +47,6 @@ class BoundedStdGaussian(_Drawn, HeteroscedasticGaussianDistribution):
         self, output_dim: int, init_std: float = 0.5, std_range: tuple[float, float] = (0.02, 1.0)
     ) -> None:
         low, high = std_range
-        if not 0.0 < low < init_std < high:
-            raise ValueError(
-                f"the std range {low} to {high} has to be positive and hold the initial std {init_std} inside"
-            )
         super().__init__(output_dim, init_std=init_std, std_range=std_range, std_type="log")
         self._log_ceiling = math.log(high)
         # No part of a checkpoint: it follows from the settings and the stage of the curriculum.

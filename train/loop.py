@@ -139,7 +139,7 @@ class TrainingLoop:
         path = checkpoint_path(self.run.out, self.iteration)
         save_checkpoint(path, state)
         self._save_policy(path, state)
-        prune_checkpoints(self.run.out, self.iteration, self.run.keep_every)
+        prune_checkpoints(self.run.out, self.iteration)
 
     def run_to_end(self) -> bool:
         """Train, and release everything; whether it came to its own end, rather than being interrupted."""

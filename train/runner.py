@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torch import nn
 
 from vd.config import to_dict
@@ -22,10 +21,10 @@ from vd.train.checkpoint import (
 )
 from vd.train.config import ACTIVATION, PolicyCfg, PpoCfg, RunCfg, validate
 from vd.train.imitate import IMITATED, Imitation
-from vd.train.loop import TrainingDivergedError, TrainingLoop, check_update
+from vd.train.loop import TrainingLoop, check_update
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.ppo import make_learner
-from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv, all_values
+from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 
 POLICY_NAME = "policy.pt"
 """The best policy so far, in the run's folder: what vd-eval, vd-play and deployment read."""
@@ -206,8 +205,8 @@ class TeacherRunner(TrainingLoop):
                 observation, rewards, dones, extras = self.env.step(actions)
                 self.alg.process_env_step(observation, rewards, dones, extras)
                 self._means.add(extras["log"])
-            self._check_rollout(observation)
             self.alg.compute_returns(observation)
+        self.env.env.check()  # what the simulation made of a step comes before what an update makes of that
         return True
 
     def _update(self) -> dict[str, float]:
@@ -219,28 +218,6 @@ class TeacherRunner(TrainingLoop):
         self.critic_warmup = max(0, self.critic_warmup - 1)
         check_update(losses, self._networks, f"{LOWER_RATES}, or raise the lower end of --policy.std-range")
         return losses
-
-    def _check_rollout(self, latest: TensorDict) -> None:
-        """Stop before an update on values that are not finite, and say what made them so."""
-        storage = self.alg.storage
-        values = {  # in the order in which a step makes them
-            "observations": torch.cat((all_values(storage.observations), all_values(latest)[None])),
-            "values": storage.values,
-            "actions": storage.actions,
-            "rewards": storage.rewards,
-        }
-        if all(torch.stack([torch.isfinite(value).all() for value in values.values()]).tolist()):
-            return
-        bad = {name: ~torch.isfinite(value).all(dim=2) for name, value in values.items()}  # [T, N]
-        name = min(bad, key=lambda name: [*bad[name].any(dim=1).tolist(), True].index(True))
-        envs = bad[name].any(dim=0).nonzero().flatten()
-        remedy = f"the networks gave them: {LOWER_RATES}"
-        if name in ("observations", "rewards"):
-            self.env.env.check()  # says more, if the simulation is the cause
-            remedy = "the simulation gave them: raise --env.sim.physics-hz or lower --env.action.scale-rad-s"
-        raise TrainingDivergedError(
-            f"{name} not finite in {len(envs)} environments (first: {envs[:8].tolist()}); {remedy}"
-        )
 
     def _new_window(self) -> GoalWindow:
         # Two episodes, so that a window never misses the time-outs of environments that run in step.

@@ -20,6 +20,9 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.train.runner import TeacherRunner
 
+CPU_ENVS = 1024
+"""Most environments of which a CPU simulates an iteration within a minute."""
+
 BUILDING = "building the environments (the first start compiles the kernels: a minute or two) ..."
 
 
@@ -49,6 +52,8 @@ def build_teacher(
         raise ValueError("--init-stage says where a run with --init begins; leave it out, or give --init")
     if cfg.init is None and cfg.ppo.imitation_iterations:
         raise ValueError("--ppo.imitation-iterations imitates the policy that --init names; give --init too")
+    if device == "cpu" and cfg.env.num_envs > CPU_ENVS:
+        say(f"{cfg.env.num_envs} environments take a CPU minutes an iteration; --num-envs asks for fewer")
     say(BUILDING)
 
     import torch
@@ -66,7 +71,6 @@ def build_teacher(
     torch.set_float32_matmul_precision("high")
     physics = coarser(cfg.env.sim) if cfg.run.coarse_physics else cfg.env.sim
     simulation = ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank, sim=physics), device)
-    simulation.dump_dir = cfg.run.out
     runner = TeacherRunner(
         ReorientVecEnv(simulation),
         cfg.ppo,
@@ -120,7 +124,9 @@ def _train(cfg: TeacherCfg, say: Callable[[str], None], started: float) -> int:
             f"done before are more than --max-steps {cfg.run.max_steps}; raise it"
         )
     else:
-        say(f"done: {folder}/{POLICY_NAME} is the best policy, vd-train curves {folder} draws the curves")
+        say(
+            f"done: {folder}/{POLICY_NAME} is the best policy, tensorboard --logdir {folder} draws the curves"
+        )
     return 0
 
 

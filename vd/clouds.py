@@ -9,8 +9,7 @@ import warp as wp
 
 from vd.assets_usd.hand_data import HandModel
 from vd.kernels.launch import launch
-from vd.kernels.sensor.kinematics import Joints, forward_kinematics_kernel
-from vd.kernels.sensor.link_points import link_points_kernel
+from vd.kernels.sensor.kinematics import Joints, forward_kinematics_kernel, link_points_kernel
 
 
 class HandCloud:

@@ -143,10 +143,15 @@ def read_log(path: str | Path) -> HandLog:
     found = run.get("format") if isinstance(run, dict) else None
     if found != LOG_FORMAT:
         raise LogError(f"{path / RUN_FILE}: format is {found!r}; this version reads {LOG_FORMAT!r}")
-    return HandLog(path, run, _columns(path / STEPS_FILE), _events(path / EVENTS_FILE))
+    return HandLog(path, run, read_columns(path / STEPS_FILE), _events(path / EVENTS_FILE))
 
 
-def _columns(file: Path) -> dict[str, np.ndarray]:
+def read_columns(file: Path) -> dict[str, np.ndarray]:
+    """Columns [T] of a CSV file of numbers, by name; a last row that was cut short is left out.
+
+    Raises:
+        LogError: There is no such file, or it holds something else.
+    """
     if not file.is_file():
         raise LogError(f"{file} is missing; copy the whole folder again")
     with file.open(newline="") as stream:
@@ -154,7 +159,7 @@ def _columns(file: Path) -> dict[str, np.ndarray]:
     if rows and len(rows[-1]) < len(header):  # the last row of a log that was cut short
         rows.pop()
     if not rows:
-        raise LogError(f"{file} has no steps")
+        raise LogError(f"{file} has no rows")
     try:
         values = np.array([[float(cell) for cell in row] for row in rows])
     except ValueError as error:

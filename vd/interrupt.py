@@ -30,6 +30,8 @@ PARENT_S = 0.5
 """Between two looks at the parent [s]."""
 ENDING_S = 5.0
 """Time for a process to leave things in order before it is asked again, or killed [s]."""
+AGAIN_S = 0.1
+"""Until a signal that a finaliser swallowed comes again [s]."""
 
 RENAMED = {
     "--output": "--out",
@@ -45,6 +47,8 @@ GONE = {
     "--ppo.optimizer": "Adam is the only one",
     "--agent": "name zero or random in place of a policy",
     "--allegro": "the comparison is in docs/results.md",
+    "--env.randomisation.restitution": "contacts are damped springs (docs/limitations.md)",
+    "--keep-every": "weight averaging gained too little (docs/lessons.md)",
     "--shard": "give each machine other --kinds",
     "--collect": "give the same command again: it runs what is missing and prints the tables",
     "--depth.focal-noise": "a calibrated camera knows its focal length",
@@ -88,7 +92,7 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
             if renamed:
                 print(f"{name}: {renamed}", file=sys.stderr)
                 return USAGE_ERROR
-            if given and not {"-h", "--help"} & set(given):
+            if given and not {"-h", "--help", "--help-all"} & set(given):
                 print(f"{name}: starting", file=sys.stderr, flush=True)  # what it imports takes seconds
             warnings.formatwarning = format_warning
             with _terminated():
@@ -153,8 +157,20 @@ def _terminated() -> Iterator[None]:
         raise Terminated
 
     note(0)
-    with handled(terminate, signal.SIGTERM, signal.SIGHUP):
-        yield
+    before, sys.unraisablehook = sys.unraisablehook, _come_again
+    try:
+        with handled(terminate, signal.SIGTERM, signal.SIGHUP):
+            yield
+    finally:
+        sys.unraisablehook = before
+
+
+def _come_again(lost: Any) -> None:
+    """Have a signal come again that arrived in a finaliser, where Python drops what is raised."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        threading.Timer(AGAIN_S, os.kill, (os.getpid(), _last or signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def end_with_parent(parent: int) -> None:

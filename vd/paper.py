@@ -107,7 +107,6 @@ class RandomisationConstants:
     link_mass_scale: tuple[float, float] = source((0.8, 1.2), "P", "Table S3")
     friction: tuple[float, float] = source((0.24, 1.6), "P", "Table S3, robot and objects")
     table_friction: tuple[float, float] = source((0.05, 1.0), "P", "Table S3")
-    restitution: tuple[float, float] = source((0.0, 1.0), "P", "Table S3")
     object_scale: tuple[float, float] = source((0.95, 1.05), "P", "Table S3")
     object_mass_kg: tuple[float, float] = source((0.009, 0.324), "P", "Table S3")
     force_probability: float = source(0.2, "P", "per control step")

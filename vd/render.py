@@ -36,6 +36,8 @@ IN_PLACE, OUT_OF_SIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -100.0,
 cheaper way to hide one shape."""
 BALL_SHARE = 0.8
 """Share of the picture's height that the ball takes at which a camera is aimed."""
+GOAL_SHARE = 0.36
+"""Side of the goal's picture, as a share of the height of the scene's."""
 SKY, GROUND = (0.42, 0.43, 0.46), (0.22, 0.21, 0.20)
 
 
@@ -185,7 +187,7 @@ class Renderer:
         objects: The object of each cell, length C.
         width: Width of a cell's picture [pixel].
         height: Height of a cell's picture [pixel].
-        goal_size: Side of the square picture of the goal [pixel].
+        goal_size: Side of the square picture of the goal [pixel]; GOAL_SHARE of the height by default.
         camera: Where from.
         device: Warp device; the CPU is quick enough for video (see ``tests/test_render.py``).
     """
@@ -197,7 +199,7 @@ class Renderer:
         *,
         width: int = 640,
         height: int = 400,
-        goal_size: int = 144,
+        goal_size: int | None = None,
         camera: Camera | None = None,
         device: str = "cpu",
     ):
@@ -212,7 +214,7 @@ class Renderer:
         radius = max(float(np.linalg.norm(item.vertices, axis=1).max()) for item in objects)
         goal_camera = self.camera.aimed_at((0.0, 0.0, 0.0), radius)
         self._scene_view = _View(self._sensor, self.camera, (width, height), range(cells), device)
-        goals, square = range(cells, 2 * cells), (goal_size, goal_size)
+        goals, square = range(cells, 2 * cells), (goal_size or round(GOAL_SHARE * height),) * 2
         self._goal_view = _View(self._sensor, goal_camera, square, goals, device)
 
     def render(

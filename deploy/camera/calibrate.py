@@ -2,14 +2,13 @@
 
 Print markers (--print-markers), stick marker k flat to the last link of finger k so that it faces the camera
 at the start pose, and run. The torque goes off. A picture is taken whenever the fingers rest and show
-something new. Views are kept in a folder and can be solved again without the hand (--views). The result is a
-layer over the hand's USD, for vd-deploy --camera-layer.
+something new. The result is a layer over the hand's USD, for vd-deploy --camera-layer.
 """
 
 import json
 import sys
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -17,8 +16,8 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert
-from vd.config import from_dict
+from vd.assets_usd.hand_data import HandModel, compose, invert
+from vd.config import require
 from vd.deploy.camera.camera import CameraError, object_place
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
@@ -27,11 +26,9 @@ from vd.deploy.hardware.answers import BusError
 from vd.deploy.hardware.check import confirm
 from vd.deploy.hardware.connect import HandOptions, connect, read_hand_and_joints
 from vd.deploy.hardware.motion import reset_pose
-from vd.files import atomic_path, make_folder, write_json
+from vd.files import check_file
 from vd.paper import PAPER
 
-FORMAT = "vd-calibration-views/1"
-VIEWS_FILE = "views.json"
 SIDE_M = 0.020
 """Side of a marker [m]: with its white border 27 mm, as wide as the last link of a D'Claw."""
 IMAGE_S = 1.0
@@ -52,8 +49,6 @@ class CalibrateCfg(HandOptions):
 
     out: Path = Path("camera.usda")
     """Layer to write."""
-    views: Path | None = None
-    """Solve these views again, without a hand: the folder that an earlier run left beside its --out."""
     fingers: tuple[int, ...] = ()
     """Fingers that carry a marker, from 0; all by default. Marker k is on finger k."""
     count: int = 10
@@ -68,52 +63,17 @@ class CalibrateCfg(HandOptions):
     """Do not ask before the torque goes off."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """One picture and the joints at it."""
-
-    joint_q: np.ndarray
-    """Angles [rad] [D]."""
-    image: np.ndarray
-    """Brightness, uint8 [H, W]."""
-
-
-@dataclass(frozen=True)
-class _View:
-    """An entry of the file of the views."""
-
-    image: str
-    joint_q: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class _ViewsFile:
-    """The file of the views."""
-
-    format: str
-    hand: str
-    side_m: float
-    lens: Intrinsics
-    views: tuple[_View, ...]
-
-
 def calibrate(cfg: CalibrateCfg) -> int:
     """Take views, solve, write the layer; 1 if the result is too uncertain."""
-    if not cfg.side_m > 0.0 or cfg.count < 1:
-        raise ValueError("--side-m and --count have to be positive")
+    require(cfg, "--", "positive", "side_m count")
     hand, _ = read_hand_and_joints(cfg)
     fingers = cfg.fingers or tuple(range(hand.num_fingers))
     if not all(0 <= f < hand.num_fingers for f in fingers) or len(set(fingers)) != len(fingers):
         raise ValueError(f"--fingers {fingers}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")
     if cfg.print_markers is not None:
         return _print_markers(cfg.print_markers, fingers, cfg.side_m)
-    if cfg.views is not None:
-        lens, side_m, shots = read_views(cfg.views, hand)
-    else:
-        (lens, shots), side_m = take(cfg, fingers), cfg.side_m
-        save_views(cfg.out.with_suffix(".views"), hand, lens, side_m, shots)
-    views = views_of(hand, lens, side_m, shots, fingers)
-    print(f"{len(views)} views of markers in {len(shots)} pictures")
+    check_file(cfg.out)  # a person's work is not to be lost
+    views = take(cfg, fingers)
     thought = np.concatenate([hand.camera.position, hand.camera.quaternion])
     found = solve(views, thought, {finger: seat(hand, finger, thought) for finger in fingers})
     error_m = found.point_error(object_place())
@@ -141,15 +101,15 @@ def _print_markers(folder: Path, fingers: tuple[int, ...], side_m: float) -> int
     return 0
 
 
-def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[Shot]]:
-    """Take pictures of fingers that a person moves: lens and pictures.
+def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
+    """The markers in pictures of fingers that a person moves; of a finger that waits only the first.
 
     Raises:
         BusError: A motor does not answer.
         CameraError: The camera does not serve.
     """
     if cfg.twin:
-        raise CameraError("a twin has no camera that sees markers; give --port, or --views of an earlier run")
+        raise CameraError("a twin has no camera that sees markers; give --port")
     with ExitStack() as stack:
         camera = RealSense(find_device(cfg.camera.serial), cfg.camera, infrared=True)
         stack.callback(camera.close)
@@ -159,23 +119,26 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[
         if failed := bus.torque(False):
             raise BusError(next(iter(failed.values())))
         print("Bend one finger after the other, its marker to the camera; turn it all ways, hold it still.")
-        shots: list[Shot] = []
-        seen = np.zeros(len(fingers), dtype=int)
-        while seen.min() < cfg.count:
+        poses: dict[int, list[np.ndarray]] = {number: [] for number in fingers}
+        tip, finger, corners = [], [], []
+        while min(map(len, poses.values())) < cfg.count:
             before = joints.to_joint(bus.read_state().position)
             image = camera.read(IMAGE_S).image
             after = joints.to_joint(bus.read_state().position)
             if np.abs(after - before).max() > STILL_RAD:
                 continue
-            more = [*shots, Shot(0.5 * (before + after), image)]
-            views = views_of(hand, camera.intrinsics, cfg.side_m, more, fingers)
-            now = np.array([np.count_nonzero(views.finger == finger) for finger in fingers])
-            if now.sum() > seen.sum():
-                shots, seen = more, now
-                said = ", ".join(map(str, seen))
-                print(f"\r{said} of {cfg.count} views of each finger", end="", file=sys.stderr, flush=True)
+            joint_q = 0.5 * (before + after)
+            for number, square in find_markers(image).items():
+                own = joint_q[3 * number : 3 * number + 3]
+                if number in poses and all(np.abs(own - other).max() > SAME_RAD for other in poses[number]):
+                    poses[number].append(own)
+                    tip.append(hand.tip_poses(joint_q)[number])
+                    finger.append(number)
+                    corners.append(square)
+            said = ", ".join(str(len(kept)) for kept in poses.values())
+            print(f"\r{said} of {cfg.count} views of each finger", end="", file=sys.stderr, flush=True)
         print(file=sys.stderr)
-        return camera.intrinsics, shots
+        return Views(np.array(tip), np.array(finger), np.array(corners), camera.intrinsics, cfg.side_m)
 
 
 def seat(hand: HandModel, finger: int, camera: np.ndarray) -> np.ndarray:
@@ -186,72 +149,6 @@ def seat(hand: HandModel, finger: int, camera: np.ndarray) -> np.ndarray:
     right = Rotation.from_quat(camera[3:]).apply([1.0, 0.0, 0.0])
     turn, _ = Rotation.align_vectors([normal, right], [[0, 0, 1], [1, 0, 0]], weights=[np.inf, 1.0])
     return compose(invert(tip), np.concatenate([tip[:3] + SEAT_M * normal, turn.as_quat()]))
-
-
-def views_of(
-    hand: HandModel, lens: Intrinsics, side_m: float, shots: list[Shot], fingers: tuple[int, ...]
-) -> Views:
-    """The markers in the pictures, as views to solve; of a finger that waits only the first."""
-    tip, finger, corners = [], [], []
-    seen: dict[int, list[np.ndarray]] = {number: [] for number in fingers}
-    for shot in shots:
-        poses = hand.tip_poses(shot.joint_q)
-        for number, square in find_markers(shot.image).items():
-            own = shot.joint_q[3 * number : 3 * number + 3]
-            if number in seen and all(np.abs(own - other).max() > SAME_RAD for other in seen[number]):
-                seen[number].append(own)
-                tip.append(poses[number])
-                finger.append(number)
-                corners.append(square)
-    rows = np.array(tip).reshape(-1, 7), np.array(finger, dtype=int), np.array(corners).reshape(-1, 4, 2)
-    return Views(*rows, lens, side_m)
-
-
-def save_views(folder: Path, hand: HandModel, lens: Intrinsics, side_m: float, shots: list[Shot]) -> None:
-    """Keep the pictures and the joints."""
-    from PIL import Image
-
-    make_folder(folder)
-    rows = []
-    for number, shot in enumerate(shots):
-        name = f"view-{number:03d}.png"
-        with atomic_path(folder / name) as temporary:
-            Image.fromarray(shot.image).save(temporary)
-        rows.append({"image": name, "joint_q": [float(q) for q in shot.joint_q]})
-    record = {"format": FORMAT, "hand": hand.name, "side_m": side_m, "lens": asdict(lens), "views": rows}
-    write_json(folder / VIEWS_FILE, record)
-
-
-def read_views(folder: Path, hand: HandModel) -> tuple[Intrinsics, float, list[Shot]]:
-    """Lens, side of the markers [m] and pictures of a folder.
-
-    Raises:
-        ValueError: The folder holds no views, or none of this hand; names the file.
-    """
-    from PIL import Image
-
-    file = Path(folder) / VIEWS_FILE
-    try:
-        record = from_dict(_ViewsFile, json.loads(file.read_text()), where="the file")
-        if record.format != FORMAT:
-            raise ValueError(f"its format is {record.format!r}, not {FORMAT!r}")
-        if record.hand != hand.name:
-            raise ValueError(f"it is of {record.hand}, not of {hand.name}; give --hand {record.hand}")
-        lens, shots = record.lens, []
-        for row in record.views:
-            with Image.open(Path(folder) / row.image) as picture:
-                image = np.array(picture.convert("L"))
-            if image.shape != (lens.height, lens.width) or len(row.joint_q) != hand.num_joints:
-                raise ValueError(f"{row.image} has another size than the lens, or other joints than the hand")
-            shots.append(Shot(np.array(row.joint_q), image))
-        return lens, record.side_m, shots
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise ValueError(
-            f"--views {folder}: there is no {error.filename}; give the folder .views that an earlier run "
-            "left beside its --out, or leave --views out to take new ones"
-        ) from error
-    except (OSError, TypeError, ValueError) as error:  # of JSON, fields and pictures too
-        raise ValueError(f"{file} holds no views to solve ({error}); take them again") from error
 
 
 def write_layer(path: Path, hand: HandModel, found: HandEye, error_m: float) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vd.assets_usd.hand_data import Intrinsics
+from vd.config import require
 from vd.deploy.camera.camera import CameraError, Frame, StaleCamera
 
 MILLISECOND = 1e-3
@@ -38,8 +39,7 @@ class RealSenseCfg:
 
     def validate(self) -> None:
         """Raise ``ValueError`` naming field and remedy."""
-        if min(self.width, self.height, self.fps) < 1:
-            raise ValueError("camera.width, height and fps must be positive")
+        require(self, "camera.", "positive", "width height fps")
         if not 1 <= self.decimation <= 8:
             raise ValueError(f"camera.decimation = {self.decimation}; choose 1 (off) to 8")
         if self.record is not None and self.record.suffix != ".db3":

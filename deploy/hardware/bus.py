@@ -37,7 +37,7 @@ from vd.deploy.hardware.control_table import (
     table,
     to_counts,
 )
-from vd.deploy.hardware.packets import BROADCAST, MAX_ID, STATUS_BYTES, Instruction, Packet, encode, numbers
+from vd.deploy.hardware.packets import BROADCAST, STATUS_BYTES, Instruction, Packet, encode, numbers
 from vd.deploy.hardware.port import BAUD_RATE, WAIT_S, open_port, pseudo, sdk
 from vd.deploy.hardware.registers import MotorSettings, different
 
@@ -73,7 +73,6 @@ class MotorBus:
 
     Raises:
         BusError: The port cannot be opened, or another program has it.
-        ValueError: IDs or model that cannot be.
     """
 
     def __init__(
@@ -87,10 +86,6 @@ class MotorBus:
         clock: Clock = MONOTONIC,
     ):
         """Open the port."""
-        if model not in MODELS:
-            raise ValueError(f"no motor {model!r}; choose of {', '.join(MODELS)}")
-        if not ids or len(set(ids)) != len(ids) or not all(0 <= id <= MAX_ID for id in ids):
-            raise ValueError(f"ids are {list(ids)}; give each motor's own, within 0 and {MAX_ID}")
         self.ids, self.model, self.clock = tuple(ids), MODELS[model], clock
         self._items = table(self.model)
         self._sdk = sdk()

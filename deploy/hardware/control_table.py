@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass
 from enum import IntFlag
 
+import numpy as np
+
 COUNTS_PER_TURN = 4096
 CENTRE = 2048
 """Count of the middle of the range, the zero of all angles here."""
@@ -70,6 +72,10 @@ class Model:
     supply_v: float
     torque_nm_per_a: float
     """Stall torque over stall current."""
+
+    def current_of(self, torque_nm: np.ndarray) -> np.ndarray:
+        """Currents for torques [A], no larger than the motor's largest."""
+        return np.minimum(torque_nm / self.torque_nm_per_a, self.current_limit * self.current_unit_a)
 
 
 MODELS = {

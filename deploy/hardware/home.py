@@ -6,6 +6,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from vd.config import require
 from vd.deploy.hardware.check import ready
 from vd.deploy.hardware.connect import HandOptions, connect
 from vd.deploy.hardware.motion import move, reset_pose
@@ -32,8 +33,7 @@ class HomeCfg(HandOptions):
 
 def home(cfg: HomeCfg) -> int:
     """Move; 1 if the hand did not come there."""
-    if not cfg.speed > 0.0:
-        raise ValueError(f"--speed is {cfg.speed}; it has to be above 0")
+    require(cfg, "--", "positive", "speed")
     with connect(cfg) as connection:
         pose = reset_pose(connection.hand.num_fingers)
         ready(connection, f"The hand will move to its start at {cfg.speed:g} rad/s.", yes=cfg.yes)

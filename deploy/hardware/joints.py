@@ -83,7 +83,7 @@ class Joints:
         """
         motor = MODELS[model]
         ends = np.sort(np.stack([self.to_motor(hand.lower), self.to_motor(hand.upper)]), axis=0)
-        first, last = to_angle(0), to_angle(4095)
+        first, last, current = to_angle(0), to_angle(4095), motor.current_of(hand.effort)
         result = {}
         for axis, id in enumerate(self.ids):
             low, high = float(ends[0, axis]), float(ends[1, axis])
@@ -92,9 +92,8 @@ class Joints:
                     f"{self.names[axis]}, motor {id}: its range is {low:.2f} to {high:.2f} rad of the motor, "
                     f"which turns from {first:.2f} to {last:.2f}; mount it nearer its middle, or mend offset"
                 )
-            strongest = motor.current_limit * motor.current_unit_a
             result[id] = MotorSettings(
-                current_limit_a=min(float(hand.effort[axis]) / motor.torque_nm_per_a, strongest),
+                current_limit_a=float(current[axis]),
                 velocity_limit_rad_s=min(
                     float(hand.velocity_limit[axis]), LARGEST_VELOCITY_LIMIT * RAD_S_PER_COUNT
                 ),

@@ -1,6 +1,5 @@
 """Record motions for vd-gap: the paper's steps and sines, or a plan of vd-gap's, finger by finger."""
 
-import csv
 import itertools
 import json
 import sys
@@ -14,6 +13,7 @@ import numpy as np
 import tyro
 from scipy.stats import theilslopes
 
+from vd.config import require
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.bus import MotorBus
@@ -26,6 +26,7 @@ from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
 from vd.deploy.timely import undisturbed
 from vd.files import check_folder
+from vd.hand_log import read_columns
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
@@ -164,20 +165,17 @@ def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], hand
     """The motion of a plan's entry, whose file is in ``folder``."""
     from vd.gap.excitations import Excitation
 
-    with (folder / entry["file"]).open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    time_s = np.array([float(row["t"]) for row in rows])
-    command = np.tile(0.5 * (hand.lower + hand.upper), (len(rows), 1))
+    columns = read_columns(folder / entry["file"])
+    command = np.tile(0.5 * (hand.lower + hand.upper), (len(columns["t"]), 1))
     enabled = np.ones(command.shape, dtype=bool)
     for name in joints:
         if name not in hand.joint_names:
             raise ValueError(f"the hand has no joint {name}")
         column = hand.joint_names.index(name)
-        command[:, column] = [float(row[f"command.{name}"]) for row in rows]
-        enabled[:, column] = [row.get(f"enabled.{name}", "1") == "1" for row in rows]
-    excitation = Excitation(
-        entry["excitation"], tuple(entry["joints"]), time_s, command, entry["conditions"], enabled
-    )
+        command[:, column] = columns[f"command.{name}"]
+        enabled[:, column] = columns.get(f"enabled.{name}", np.ones(len(command))) > 0.0
+    joints = tuple(entry["joints"])
+    excitation = Excitation(entry["excitation"], joints, columns["t"], command, entry["conditions"], enabled)
     return _motion("plan_" + Path(entry["file"]).name, excitation, hand)
 
 
@@ -289,8 +287,7 @@ def record(cfg: RecordCfg) -> int:
     """Record what is not recorded yet."""
     from vd.gap.recording import write_recording
 
-    if not cfg.rate_hz > 0.0:
-        raise ValueError(f"--rate-hz is {cfg.rate_hz}; it has to be above 0")
+    require(cfg, "--", "positive", "rate_hz")
     check_folder(cfg.out)
     hand, _ = read_hand_and_joints(cfg)
     joints = joints_of(hand, cfg.fingers)

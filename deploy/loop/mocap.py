@@ -52,68 +52,63 @@ def read_mocap(path: Path, body: str | None = None) -> Mocap:
     path = Path(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = list(csv.reader(stream))
-        if rows and rows[0] and rows[0][0].strip().lower() == "format version":
-            time_s, pose = _optitrack(rows, body)
-        else:
-            time_s, pose = _plain(rows)
+            rows = [[cell.strip() for cell in row] for row in csv.reader(stream) if row] or [[""]]
+        of_optitrack = rows[0][0].lower() == "format version"
+        values = _optitrack(rows, body) if of_optitrack else _plain(rows)
+        mocap = Mocap(path, values[:, 0], values[:, 1:])
+        if len(values) < 2 or not (np.diff(mocap.time_s) > 0.0).all():  # NaN does not rise
+            raise ValueError("there must be at least two samples, and times must rise; export it again")
+        length = np.linalg.norm(mocap.pose[mocap.tracked, 3:], axis=1)
+        if (np.abs(length - 1.0) > UNIT_TOLERANCE).any():
+            raise ValueError("a quaternion's length is not 1; export rotations as quaternions")
     except (OSError, ValueError, csv.Error) as error:  # of text and numbers too
         raise MocapError(f"{path}: {error}") from error
-    if len(time_s) < 2 or not np.isfinite(time_s).all() or not (np.diff(time_s) > 0.0).all():
-        raise MocapError(f"{path}: there must be at least two samples, and times must rise; export it again")
-    mocap = Mocap(path, time_s, pose)
-    wrong = np.abs(np.linalg.norm(pose[mocap.tracked, 3:], axis=1) - 1.0) > UNIT_TOLERANCE
-    if wrong.any():
-        raise MocapError(f"{path}: a quaternion's length is not 1; export rotations as quaternions")
     return mocap
 
 
 def _numbers(rows: Sequence[Sequence[str]], columns: Sequence[int]) -> np.ndarray:
     """Cells of some columns as numbers, empty ones NaN [T, C]."""
-    values = [[row[column].strip() if column < len(row) else "" for column in columns] for row in rows if row]
-    return np.array([[float(cell or "nan") for cell in row] for row in values]).reshape(-1, len(columns))
+    values = [[float(row[c] or "nan") if c < len(row) else np.nan for c in columns] for row in rows]
+    return np.array(values).reshape(-1, len(columns))
 
 
-def _plain(rows: list[list[str]]) -> tuple[np.ndarray, np.ndarray]:
-    header = [cell.strip().lower() for cell in rows[0]] if rows else []
-    missing = [name for name in PLAIN if name not in header]
-    if missing:
-        raise MocapError(
+def _plain(rows: list[list[str]]) -> np.ndarray:
+    """Times and poses [T, 8] of the plain layout."""
+    header = [cell.lower() for cell in rows[0]]
+    if missing := [name for name in PLAIN if name not in header]:
+        raise ValueError(
             f"there is no column {missing[0]!r}; the first line must name {', '.join(PLAIN)} "
             "(and tracked), or the file be OptiTrack's export"
         )
     values = _numbers(rows[1:], [header.index(name) for name in PLAIN])
-    time_s, pose = values[:, 0], values[:, 1:]
     if "tracked" in header:
-        pose[_numbers(rows[1:], [header.index("tracked")])[:, 0] < 0.5] = np.nan
-    return time_s, pose
+        values[_numbers(rows[1:], [header.index("tracked")])[:, 0] < 0.5, 1:] = np.nan
+    return values
 
 
-def _optitrack(rows: list[list[str]], body: str | None) -> tuple[np.ndarray, np.ndarray]:
-    head = {
-        key.strip().lower(): value.strip() for key, value in zip(rows[0][::2], rows[0][1::2], strict=False)
-    }
-    if head.get("rotation type", "quaternion").lower() != "quaternion":
-        raise MocapError(f"rotations are {head['rotation type']}; export them as quaternions")
-    unit = head.get("length units", "meters").lower()
+def _optitrack(rows: list[list[str]], body: str | None) -> np.ndarray:
+    """Times and poses [T, 8] of OptiTrack's layout."""
+    head = {key.lower(): value.lower() for key, value in zip(rows[0][::2], rows[0][1::2], strict=False)}
+    turns, unit = head.get("rotation type", "quaternion"), head.get("length units", "meters")
+    if turns != "quaternion":
+        raise ValueError(f"rotations are {turns}; export them as quaternions")
     if unit not in UNITS_M:
-        raise MocapError(f"lengths are in {unit!r}; export them in {' or '.join(UNITS_M)}")
-    names = next((row for row in rows if len(row) > 1 and "Name" in row[:2]), None)
-    start = next((i for i, row in enumerate(rows) if row and row[0].strip() == "Frame"), 0)
+        raise ValueError(f"lengths are in {unit!r}; export them in {' or '.join(UNITS_M)}")
+    names = next((row for row in rows if "Name" in row[:2]), None)
+    start = next((i for i, row in enumerate(rows) if row[0] == "Frame"), 0)
     if names is None or start == 0:
-        raise MocapError("no rows Name and Frame in the head; export it from Motive again")
+        raise ValueError("no rows Name and Frame in the head; export it from Motive again")
     found: dict[str, dict[tuple[str, str], int]] = {}
     for column, (name, kind, axis) in enumerate(zip(names, rows[start - 1], rows[start], strict=False)):
-        key = (kind.strip().lower(), axis.strip().lower())
-        found.setdefault(name.strip(), {}).setdefault(key, column)
+        found.setdefault(name, {}).setdefault((kind.lower(), axis.lower()), column)
     wanted = [("position", axis) for axis in "xyz"] + [("rotation", axis) for axis in "xyzw"]
     bodies = {name: columns for name, columns in found.items() if all(key in columns for key in wanted)}
     if body is None and len(bodies) == 1:
         body = next(iter(bodies))
     if body not in bodies:
-        raise MocapError(
+        raise ValueError(
             f"it has the rigid bodies {', '.join(bodies) or '(none)'}; name one of them with --body"
         )
     values = _numbers(rows[start + 1 :], [1, *(bodies[body][key] for key in wanted)])
     values[:, 1:4] *= UNITS_M[unit]
-    return values[:, 0], values[:, 1:]
+    return values

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
+from vd.config import require
 from vd.deploy.camera.camera import Camera
 from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.finding import Finding
@@ -99,10 +100,8 @@ class RunCfg(HandOptions):
         check_names([] if self.policy is None else [self.policy], [self.object], self.hand)
         from vd.deploy.loop.goals import SCAN_SUFFIXES
 
-        if self.random_goals < 1:
-            raise ValueError("--random-goals has to be at least 1")
-        if not self.episode_s > 0.0 or self.hold_s < 0.0:
-            raise ValueError("--episode-s has to be positive, and --hold-s must not be negative")
+        require(self, "--", "positive", "random_goals episode_s")
+        require(self, "--", "zero or positive", "hold_s")
         if self.realistic and not self.twin:
             raise ValueError("--realistic is for --twin")
         if self.twin and Path(self.object).suffix.lower() in SCAN_SUFFIXES:
@@ -131,14 +130,7 @@ def run(cfg: RunCfg) -> int:
     hand, _ = read_hand_and_joints(cfg)
     item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
     tolerance = cfg.tolerance_rad
-    runner = load_runner(
-        name,
-        cfg.hand,
-        hand,
-        item,
-        tolerance_rad=tolerance,
-        seed=cfg.seed,
-    )
+    runner = load_runner(name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed)
     if not runner.calibrated:
         print(
             f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that distance; "
@@ -243,12 +235,7 @@ def _pursue(
     return int(reason == "lost")
 
 
-def warm_up(
-    runner: "PolicyRunner",
-    pose: np.ndarray,
-    goal: np.ndarray,
-    camera: Camera | None,
-) -> None:
+def warm_up(runner: "PolicyRunner", pose: np.ndarray, goal: np.ndarray, camera: Camera | None) -> None:
     """Let the policy decide a few times on what is seen now; the run begins without that.
 
     The object may not be between the fingers yet.

@@ -88,11 +88,6 @@ class Score:
     """Share of the trials that stopped within each tolerance [rad], the discarded ones apart."""
 
     @property
-    def errors(self) -> np.ndarray:
-        """Errors at the stops [rad]."""
-        return np.array([trial.error_rad for trial in self.trials if trial.error_rad is not None])
-
-    @property
     def scored(self) -> int:
         """Trials that were not discarded."""
         return sum(not trial.discarded for trial in self.trials)
@@ -155,13 +150,11 @@ def score_run(log: HandLog, mocap: Mocap, symmetry: np.ndarray, *, offset_s: flo
         if tracked and stop.outcome == "stopped":
             error = float(symmetric_error(mocap.pose[row, 3:], np.array(stop.goal_quat), symmetry))
         trials.append(Trial(stop.goal, stop.time_s, stop.outcome, tracked, error, stop.distance))
-    kept = [trial for trial in trials if not trial.discarded]
-    errors = np.array([np.inf if trial.error_rad is None else trial.error_rad for trial in kept])
+    kept = [trial.error_rad for trial in trials if not trial.discarded]
+    errors = np.array([np.inf if error is None else error for error in kept])
     found = errors[np.isfinite(errors)]
-    rates = []
-    if len(kept):
-        outcomes = np.stack([errors <= tolerance for tolerance in TOLERANCES_RAD])[:, None, :]
-        rates = rate_intervals(outcomes, "episode")
+    within = errors <= np.array(TOLERANCES_RAD)[:, None]
+    rates = rate_intervals(within[:, None, :], "episode") if kept else []
     return Score(
         log.path,
         mocap.path,
@@ -186,9 +179,9 @@ def lines(result: Score) -> list[str]:
         f"{result.scored} trials scored, {discarded} discarded since the markers were lost at the stop"
     )
     if result.median is not None:
-        m = result.median
+        m, stops = result.median, sum(trial.error_rad is not None for trial in result.trials)
         rows.append(
-            f"median error at {len(result.errors)} stops: {m.value:.2f} rad ({np.degrees(m.value):.0f} deg), "
+            f"median error at {stops} stops: {m.value:.2f} rad ({np.degrees(m.value):.0f} deg), "
             f"95 % {m.low:.2f} to {m.high:.2f}"
         )
     for tolerance, share in result.within:

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
+from vd.config import require
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.control_table import Model
 from vd.paper import PAPER
@@ -51,13 +52,9 @@ class SafetyCfg:
 
     def __post_init__(self) -> None:
         """Refuse numbers that would switch a limit off by accident."""
-        positive = ("step_rad", "velocity_share", "current_share", "current_s", "temperature_c", "lost_s")
-        for name in (*positive, "misses", "stale_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"safety.{name} is {getattr(self, name)}; it has to be above 0")
-        for name in ("margin_rad", "watchdog_s", "hold_s"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"safety.{name} is {getattr(self, name)}; it must not be negative")
+        limits = "step_rad velocity_share current_share current_s temperature_c lost_s misses stale_s"
+        require(self, "safety.", "positive", limits)
+        require(self, "safety.", "zero or positive", "margin_rad watchdog_s hold_s")
 
 
 class Limits:
@@ -72,9 +69,7 @@ class Limits:
         self.lower, self.upper = hand.lower + cfg.margin_rad, hand.upper - cfg.margin_rad
         if (self.lower >= self.upper).any():
             raise ValueError(f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider")
-        strongest = motor.current_limit * motor.current_unit_a
-        torque_current = np.minimum(hand.effort / motor.torque_nm_per_a, strongest)
-        self._current = cfg.current_share * torque_current
+        self._current = cfg.current_share * motor.current_of(hand.effort)
         self._velocity = cfg.velocity_share * hand.velocity_limit
         self._strained_since = np.full(len(self._names), np.inf)
 

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from vd import interrupt
 from vd.deploy.hardware.control_table import MODELS
 from vd.deploy.hardware.packets import MAX_ID
 from vd.deploy.timely import undisturbed
@@ -230,16 +231,12 @@ class TwinCommand:
         return answer
 
 
-def main() -> None:
-    """Entry point of ``python -m vd.deploy.twin.twin``."""
-    command = tyro.cli(TwinCommand, prog="python -m vd.deploy.twin.twin", description=__doc__)
-    try:
-        command.serve()
-    except KeyboardInterrupt:
-        pass
-    except (ValueError, OSError) as error:
-        sys.exit(f"vd.deploy.twin.twin: {error}")
+@interrupt.command("vd.deploy.twin.twin")
+def main() -> int:
+    """Entry point of ``python -m vd.deploy.twin.twin``; returns the exit status."""
+    tyro.cli(TwinCommand, prog="python -m vd.deploy.twin.twin", description=__doc__).serve()
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,7 +1,6 @@
-"""Forward kinematics of a hand: joint positions to link poses, without a simulator.
+"""Link poses of a hand from its joint positions, without a simulator, and the cloud that its links carry.
 
-For a robot's own clouds and for scenes that are not simulated. Metres, radians, quaternions xyzw.
-N rows, D joints, B bodies a row.
+Metres, radians, quaternions xyzw. N rows, D joints, B bodies a row, H samples of the hand.
 """
 
 import warp as wp
@@ -42,3 +41,21 @@ def forward_kinematics_kernel(
         body_q_out[row, joints.child[joint]] = wp.transform_multiply(
             pose, wp.transform_inverse(joints.child_frame[joint])
         )
+
+
+@wp.kernel
+def link_points_kernel(
+    # Model:
+    points: wp.array[wp.vec3],  # [H] samples of the hand, each in the frame of its link [m]
+    body: wp.array[int],  # [H] link of each sample, a column of ``body_q_in``
+    base_body: int,  # the hand's base, likewise
+    # In:
+    body_q_in: wp.array2d[wp.transform],  # [N, B] poses in the world frame
+    # Out:
+    points_out: wp.array2d[wp.vec3],  # [N, H] points in the base frame [m]
+):
+    """Carry every sample into the hand's base frame: P' = P R^T + p. Launch: [N, H]."""
+    row, sample = wp.tid()
+    to_base = wp.transform_inverse(body_q_in[row, base_body])
+    link = wp.transform_multiply(to_base, body_q_in[row, body[sample]])
+    points_out[row, sample] = wp.transform_point(link, points[sample])

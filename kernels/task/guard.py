@@ -30,23 +30,13 @@ def guard_kernel(
     # In:
     joint_q: wp.array2d[float],  # [N, D + 7] positions after the step
     joint_qd: wp.array2d[float],  # [N, D + 6] velocities after the step
-    start_q: wp.array2d[float],  # [N, D + 7] positions before the step
-    start_qd: wp.array2d[float],  # [N, D + 6] velocities before the step
-    target: wp.array2d[float],  # [N, T] joint targets of the step
     max_speed: float,  # speed [m/s or rad/s] that no joint or object reaches
     # In/Out:
     failures: wp.array[wp.int32],  # [N] steps that failed so far
-    dump_q: wp.array2d[float],  # [N, D + 7] positions before the first step that failed
-    dump_qd: wp.array2d[float],  # [N, D + 6] velocities before it
-    dump_target: wp.array2d[float],  # [N, T] joint targets of it
     # Out:
     failed_out: wp.array[wp.int32],  # [N] 1 where this step failed
 ):
-    """Flag worlds whose state is not finite or faster than ``max_speed``; keep the last good start.
-
-    The dump of a world is overwritten every control step as long as it is good, and frozen at the
-    start of the first control step that failed, so that this step can be replayed.
-    """
+    """Flag worlds whose state is not finite or faster than ``max_speed``."""
     world = wp.tid()
     failed = wp.int32(0)
     for i in range(joint_q.shape[1]):
@@ -56,16 +46,7 @@ def guard_kernel(
         if not wp.isfinite(joint_qd[world, i]) or wp.abs(joint_qd[world, i]) > max_speed:
             failed = 1
     failed_out[world] = failed
-    before = failures[world]
-    failures[world] = before + failed
-    if before != 0:
-        return
-    for i in range(dump_q.shape[1]):
-        dump_q[world, i] = start_q[world, i]
-    for i in range(dump_qd.shape[1]):
-        dump_qd[world, i] = start_qd[world, i]
-    for i in range(dump_target.shape[1]):
-        dump_target[world, i] = target[world, i]
+    failures[world] = failures[world] + failed
 
 
 @wp.kernel

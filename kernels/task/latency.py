@@ -12,6 +12,19 @@ from vd.kernels.rng import next_stream, uniform
 
 wp.set_module_options({"enable_backward": False})
 
+
+@wp.struct
+class StateArrays:
+    """What observations are made of."""
+
+    measured_q: wp.array2d[float]  # [N, *] hand joints as their encoders report them [rad]
+    measured_qd: wp.array2d[float]  # [N, *] velocities likewise [rad/s]
+    joint_q: wp.array2d[float]  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_qd: wp.array2d[float]  # [N, D + 6] hand joints [rad/s], object linear and angular velocity
+    body_q: wp.array2d[wp.transform]  # [N, B] link poses in the world frame
+    body_qd: wp.array2d[wp.spatial_vector]  # [N, B] link velocities in the world frame
+
+
 LINK_VALUES = 13
 """Values of a fingertip's link in a row: position 3, quaternion 4, linear 3 and angular velocity 3."""
 
@@ -27,28 +40,23 @@ def write_state(
     world: int,
     joints: int,
     tip_body: wp.array[int],
-    measured_q: wp.array2d[float],
-    measured_qd: wp.array2d[float],
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
-    body_q: wp.array2d[wp.transform],
-    body_qd: wp.array2d[wp.spatial_vector],
+    now: StateArrays,
     ring: wp.array2d[float],
 ):
     """Write a world's present state to a row of the ring."""
     for i in range(joints):
-        ring[row, i] = measured_q[world, i]
-        ring[row, joints + i] = measured_qd[world, i]
+        ring[row, i] = now.measured_q[world, i]
+        ring[row, joints + i] = now.measured_qd[world, i]
     column = 2 * joints
-    for i in range(joint_q.shape[1]):
-        ring[row, column + i] = joint_q[world, i]
-    column += joint_q.shape[1]
-    for i in range(joint_qd.shape[1]):
-        ring[row, column + i] = joint_qd[world, i]
-    column += joint_qd.shape[1]
+    for i in range(now.joint_q.shape[1]):
+        ring[row, column + i] = now.joint_q[world, i]
+    column += now.joint_q.shape[1]
+    for i in range(now.joint_qd.shape[1]):
+        ring[row, column + i] = now.joint_qd[world, i]
+    column += now.joint_qd.shape[1]
     for finger in range(tip_body.shape[0]):
-        pose = body_q[world, tip_body[finger]]
-        twist = body_qd[world, tip_body[finger]]
+        pose = now.body_q[world, tip_body[finger]]
+        twist = now.body_qd[world, tip_body[finger]]
         column = write_vec3(row, column, wp.transform_get_translation(pose), ring)
         column = write_quat(row, column, wp.transform_get_rotation(pose), ring)
         column = write_vec3(row, column, wp.spatial_top(twist), ring)
@@ -62,12 +70,7 @@ def record_state_kernel(
     slots: int,  # rows of each world, L
     tip_body: wp.array[int],  # [G] link of each fingertip, an index within a world
     # In:
-    measured_q_in: wp.array2d[float],  # [N, *] hand joints as their encoders report them [rad]
-    measured_qd_in: wp.array2d[float],  # [N, *] velocities likewise [rad/s]
-    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
-    joint_qd_in: wp.array2d[float],  # [N, D + 6] hand joints [rad/s], object linear and angular velocity
-    body_q_in: wp.array2d[wp.transform],  # [N, B] link poses in the world frame
-    body_qd_in: wp.array2d[wp.spatial_vector],  # [N, B] link velocities in the world frame
+    now: StateArrays,  # the present state
     # In/Out:
     head: wp.array[int],  # [N] slot written last
     # Out:
@@ -77,19 +80,7 @@ def record_state_kernel(
     world = wp.tid()
     slot = (head[world] + 1) % slots
     head[world] = slot
-    write_state(
-        world * slots + slot,
-        world,
-        joints,
-        tip_body,
-        measured_q_in,
-        measured_qd_in,
-        joint_q_in,
-        joint_qd_in,
-        body_q_in,
-        body_qd_in,
-        ring_out,
-    )
+    write_state(world * slots + slot, world, joints, tip_body, now, ring_out)
 
 
 @wp.kernel
@@ -102,12 +93,7 @@ def begin_latency_kernel(
     encoder_latency: wp.vec2,  # range of that of joints and fingertips [s]
     # In:
     mask_in: wp.array[int],  # [N] 1 where an episode begins
-    measured_q_in: wp.array2d[float],  # as in :func:`record_state_kernel`, and the five after it
-    measured_qd_in: wp.array2d[float],  # likewise
-    joint_q_in: wp.array2d[float],  # likewise
-    joint_qd_in: wp.array2d[float],  # likewise
-    body_q_in: wp.array2d[wp.transform],  # likewise
-    body_qd_in: wp.array2d[wp.spatial_vector],  # likewise
+    now: StateArrays,  # the present state
     # In/Out:
     rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
@@ -127,19 +113,7 @@ def begin_latency_kernel(
     encoder_latency_out[world] = wp.lerp(encoder_latency[0], encoder_latency[1], share)
     rng[world] = next_stream(state, world)
     for slot in range(slots):
-        write_state(
-            world * slots + slot,
-            world,
-            joints,
-            tip_body,
-            measured_q_in,
-            measured_qd_in,
-            joint_q_in,
-            joint_qd_in,
-            body_q_in,
-            body_qd_in,
-            ring_out,
-        )
+        write_state(world * slots + slot, world, joints, tip_body, now, ring_out)
 
 
 @wp.func
@@ -165,12 +139,7 @@ def recall_state_kernel(
     # In/Out:
     rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    measured_q_out: wp.array2d[float],  # as in :func:`record_state_kernel`, and the five after it
-    measured_qd_out: wp.array2d[float],  # likewise
-    joint_q_out: wp.array2d[float],  # likewise
-    joint_qd_out: wp.array2d[float],  # likewise
-    body_q_out: wp.array2d[wp.transform],  # likewise
-    body_qd_out: wp.array2d[wp.spatial_vector],  # likewise
+    seen_out: StateArrays,  # arrays to write
 ):
     """Object and hand as they were their latency ago, of the nearest physics step. Launch: [N]."""
     world = wp.tid()
@@ -182,21 +151,21 @@ def recall_state_kernel(
     seen = aged_row(world, latency, physics_dt, slots, head_in)
     row = aged_row(world, encoder_latency_in[world], physics_dt, slots, head_in)
     for i in range(joints):
-        measured_q_out[world, i] = ring_in[row, i]
-        measured_qd_out[world, i] = ring_in[row, joints + i]
+        seen_out.measured_q[world, i] = ring_in[row, i]
+        seen_out.measured_qd[world, i] = ring_in[row, joints + i]
     column = 2 * joints
-    for i in range(joint_q_out.shape[1]):
-        joint_q_out[world, i] = ring_in[wp.where(i < joints, row, seen), column + i]
-    column += joint_q_out.shape[1]
-    for i in range(joint_qd_out.shape[1]):
-        joint_qd_out[world, i] = ring_in[wp.where(i < joints, row, seen), column + i]
-    column += joint_qd_out.shape[1]
+    for i in range(seen_out.joint_q.shape[1]):
+        seen_out.joint_q[world, i] = ring_in[wp.where(i < joints, row, seen), column + i]
+    column += seen_out.joint_q.shape[1]
+    for i in range(seen_out.joint_qd.shape[1]):
+        seen_out.joint_qd[world, i] = ring_in[wp.where(i < joints, row, seen), column + i]
+    column += seen_out.joint_qd.shape[1]
     for finger in range(tip_body.shape[0]):
         body = tip_body[finger]
-        body_q_out[world, body] = wp.transform(
+        seen_out.body_q[world, body] = wp.transform(
             read_vec3(row, column, ring_in), read_quat(row, column + 3, ring_in)
         )
-        body_qd_out[world, body] = wp.spatial_vector(
+        seen_out.body_qd[world, body] = wp.spatial_vector(
             read_vec3(row, column + 7, ring_in), read_vec3(row, column + 10, ring_in)
         )
         column += wp.static(LINK_VALUES)

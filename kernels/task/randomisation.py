@@ -121,33 +121,6 @@ def draw_servo_kernel(
 
 
 @wp.kernel
-def draw_restitution_kernel(
-    # Model:
-    bounds: wp.vec2,  # range of each
-    # In:
-    mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
-    # In/Out:
-    rng: wp.array[wp.uint32],  # [N] random stream of each world
-    # Out:
-    hand_out: wp.array[float],  # [N] restitution of all hand shapes
-    object_out: wp.array[float],  # [N] restitution of the object
-    table_out: wp.array[float],  # [N] restitution of the table
-):
-    """Draw the coefficients of restitution of the masked worlds (Table S3). Launch: [N]."""
-    world = wp.tid()
-    if mask_in[world] == 0:
-        return
-    state = rng[world]
-    state, of_hand = uniform(state, bounds)
-    state, of_object = uniform(state, bounds)
-    state, of_table = uniform(state, bounds)
-    hand_out[world] = of_hand
-    object_out[world] = of_object
-    table_out[world] = of_table
-    rng[world] = next_stream(state, world)
-
-
-@wp.kernel
 def draw_masses_kernel(
     # Model:
     params: wp.array[RandomisationParams],  # [1] ranges

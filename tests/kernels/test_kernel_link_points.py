@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, floats, indices, launch, pose_matrix, transforms
 
-from vd.kernels.sensor.link_points import link_points_kernel
+from vd.kernels.sensor.kinematics import link_points_kernel
 
 
 @st.composite

@@ -12,7 +12,6 @@ from vd.kernels.task.randomisation import (
     disturbance_force_kernel,
     draw_dynamics_kernel,
     draw_masses_kernel,
-    draw_restitution_kernel,
     draw_servo_kernel,
 )
 from vd.paper import PAPER
@@ -208,12 +207,3 @@ def test_disturbance_has_the_paper_s_rate_and_magnitude_and_any_direction(device
     for axis in range(3):  # Archimedes: each coordinate of a uniform direction is uniform
         assert stats.kstest(direction[:, axis], stats.uniform(-1, 2).cdf).pvalue > ALPHA
     np.testing.assert_allclose(direction.T @ direction / len(direction), np.eye(3) / 3, atol=0.02)
-
-
-def test_restitution_is_that_of_table_s3_and_drawn_for_each_body(device):
-    worlds = 20_000
-    inputs = [wp.vec2(*DR.restitution), np.ones(worlds, int), streams(worlds, 2, device)]
-    drawn = launch(draw_restitution_kernel, worlds, inputs, device, *[worlds] * 3)
-    for values in drawn:
-        assert_uniform(values, (0.0, 1.0))
-    assert_uncorrelated(np.stack(drawn, axis=1), 0.05)

@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, SENTINEL, device_array, floats, indices, launch
+from kernel_oracle import EXAMPLES, SENTINEL, device_array, launch
 
-from vd.kernels.task.contacts import pair_force_kernel, restitution_kernel
+from vd.kernels.task.contacts import pair_force_kernel
 from vd.kernels.task.environments import (
     redraw_mask_kernel,
     write_friction_kernel,
@@ -56,8 +56,8 @@ def test_overflow_bits_stick_and_others_do_not_count(device):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e3])
 @pytest.mark.parametrize("where", ["q", "qd"])
-def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
-    worlds, good, bad = 3, 5.0, 1
+def test_guard_counts_the_bad_steps_of_each_world(device, where, value):
+    worlds, bad = 3, 1
     q, qd = np.zeros((worlds, 4)), np.zeros((worlds, 3))
     if where == "q" and np.isfinite(value):
         pytest.skip("positions have no bound")
@@ -65,21 +65,11 @@ def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
     failures, failed = (
         device_array(values, int, device) for values in (np.zeros(worlds), [SENTINEL] * worlds)
     )
-    dumps = [device_array(np.full((worlds, n), np.nan), float, device) for n in (4, 3, 2)]
-
-    def guard(start: float, q: np.ndarray, qd: np.ndarray) -> None:
-        before = [np.full((worlds, n), start) for n in (4, 3, 2)]
-        launch(guard_kernel, worlds, [q, qd, *before, 500.0, failures, *dumps, failed], device)
-
-    guard(good, q, qd)
-    np.testing.assert_array_equal(failed.numpy(), [0, 1, 0])
-    guard(good + 1.0, 0.0 * np.nan_to_num(q, posinf=0.0), 0.0 * np.nan_to_num(qd, posinf=0.0))
-    np.testing.assert_array_equal(failed.numpy(), 0)
-    guard(good + 2.0, q, qd)
+    for scale, expected in ((1.0, [0, 1, 0]), (0.0, [0, 0, 0]), (1.0, [0, 1, 0])):
+        state = (q, qd) if scale else (np.zeros_like(q), np.zeros_like(qd))
+        launch(guard_kernel, worlds, [*state, 500.0, failures, failed], device)
+        np.testing.assert_array_equal(failed.numpy(), expected)
     np.testing.assert_array_equal(failures.numpy(), [0, 2, 0])
-    for dump in dumps:
-        assert (dump.numpy()[bad] == good).all(), "frozen at the first step that failed"
-        assert (dump.numpy()[[0, 2]] == good + 2.0).all(), "good worlds go on"
 
 
 @EXAMPLES
@@ -131,49 +121,3 @@ def test_a_force_and_a_share_of_the_weight_act_on_the_object_alone(device):
     np.testing.assert_allclose(body_force.numpy()[:, 4, :3], carried, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(body_force.numpy()[lightened == 0, 4, :3], force[lightened == 0])
     assert not body_force.numpy()[:, :4].any() and not body_force.numpy()[:, 4, 3:].any()
-
-
-OTHER, TABLE, OBJECT, HAND = 0, 1, 2, 3
-LOWEST = 0.05
-
-
-def references(device, nominal, kind, qd, coefficients, threshold=0.2, column=3):
-    """Launch; returns references [N, G, 2], NaN where the kernel wrote nothing."""
-    inputs = [nominal, kind, TABLE, HAND, column, threshold, LOWEST, qd, *coefficients]
-    return launch(restitution_kernel, kind.shape, inputs, device, kind.shape)[0]
-
-
-def oracle_ratio(e):
-    """Solve e = exp(-pi z / sqrt(1 - z^2)) for z by bisection, in [LOWEST, 1]."""
-    low, high = 0.0, 1.0
-    if e <= 0.0:
-        return 1.0
-    for _ in range(60):
-        z = 0.5 * (low + high)
-        low, high = (z, high) if np.exp(-np.pi * z / np.sqrt(1.0 - z * z)) > e else (low, z)
-    return float(np.clip(0.5 * (low + high), LOWEST, 1.0))
-
-
-@EXAMPLES
-@given(data=st.data())
-def test_references_are_those_of_the_damped_spring(device, data):
-    worlds, geoms = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 5))
-    kind = data.draw(indices((worlds, geoms), 4))
-    nominal = data.draw(floats((worlds, geoms, 2), 0.01, 1.0))
-    qd = data.draw(floats((worlds, 9), -0.3, 0.3))
-    coefficients = data.draw(floats((3, worlds), 0.0, 1.0))
-    out = references(device, nominal, kind, qd, coefficients)
-    speed = np.linalg.norm(qd[:, 3:6].astype(float), axis=1)
-    for w in range(worlds):
-        if abs(speed[w] - 0.2) < 1e-6:
-            continue  # either side of the threshold in single precision
-        for g in range(geoms):
-            if kind[w, g] not in (TABLE, HAND):
-                assert np.isnan(out[w, g]).all()
-                continue
-            own = coefficients[2 if kind[w, g] == TABLE else 0, w]
-            ratio = oracle_ratio(0.5 * (own + coefficients[1, w])) if speed[w] > 0.2 else 1.0
-            expected = [nominal[w, g, 0] / ratio, nominal[w, g, 1] * ratio]
-            np.testing.assert_allclose(out[w, g], expected, rtol=2e-5)
-            # The stiffness, which sets how deep a resting object sinks, stays.
-            assert np.prod(out[w, g]) == pytest.approx(np.prod(nominal[w, g]), rel=1e-5)

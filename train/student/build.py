@@ -143,7 +143,6 @@ def _looks(
     from vd.train.vec_env import ReorientVecEnv
 
     simulation = ReorientEnv(task, device)
-    simulation.dump_dir = cfg.run.out
     env = ReorientVecEnv(simulation)
     # Or all episodes would time out at once.
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, env.max_episode_length)

@@ -65,7 +65,7 @@ def student_command(arguments: list[str], started: float) -> int:
     if not runner.run_to_end():
         say(f"saved in {folder}; go on with: vd-train student --out {folder} --resume")
         return interrupt.INTERRUPTED
-    say(f"done: {folder}/{ALIGNMENT_NAME} is the network, vd-train curves {folder} draws the curves")
+    say(f"done: {folder}/{ALIGNMENT_NAME} is the network, tensorboard --logdir {folder} draws the curves")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""``vd-bench``: measure speed, physics, depth camera and gap workflow; rates are ratios within one run."""
+"""vd-bench: measure speed, physics, depth camera and gap workflow; rates are ratios within one run."""
 
 import dataclasses
 import json
@@ -14,6 +14,12 @@ from vd import interrupt
 from vd.device import resolve_device
 from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
+
+GONE = {
+    "student": "vd-deploy POLICY --twin tells its times",
+    "replay": "the message names the setting to change",
+}
+"""Measurements that are no more, and what is there instead."""
 
 
 def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> None:
@@ -121,27 +127,6 @@ class DepthCommand(Measurement):
 
 
 @dataclass(frozen=True)
-class ReplayCommand:
-    """Replay the control step in which a state left the finite numbers, physics step by physics step."""
-
-    dump: Annotated[Path, tyro.conf.Positional]
-    """File written when the run stopped."""
-    device: str = "cpu"
-    """Warp device."""
-
-    def run(self) -> int:
-        """Replay and print."""
-        if not self.dump.is_file():
-            raise ValueError(f"there is no file {self.dump}; give the dump that the stopped run has named")
-        quiet_warp()
-        from vd.sim.replay import replay
-
-        for line in replay(self.dump, device=self.device):
-            print(line)
-        return 0
-
-
-@dataclass(frozen=True)
 class GapCommand:
     """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
 
@@ -195,7 +180,6 @@ Command = (
     | Annotated[PhysicsCommand, tyro.conf.subcommand("physics")]
     | Annotated[DepthCommand, tyro.conf.subcommand("depth")]
     | Annotated[GapCommand, tyro.conf.subcommand("gap")]
-    | Annotated[ReplayCommand, tyro.conf.subcommand("replay")]
 )
 
 
@@ -203,8 +187,8 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-bench``; returns the exit status."""
     given = sys.argv[1:] if arguments is None else arguments
-    if given[:1] == ["student"]:
-        print("vd-bench: 'student' is no more: vd-deploy POLICY --twin tells its times", file=sys.stderr)
+    if given and given[0] in GONE:
+        print(f"vd-bench: {given[0]!r} is no more: {GONE[given[0]]}", file=sys.stderr)
         return interrupt.USAGE_ERROR
     command = tyro.cli(Command, args=arguments, prog="vd-bench", description=__doc__)
     if isinstance(command, GapCommand):

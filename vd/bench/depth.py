@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
-from vd.bench.sim import captured, seconds_per_call
+from vd.bench.sim import seconds_per_call
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
@@ -34,6 +34,13 @@ LEAST_TIME_S = 1.0
 
 NEWTON_FROM_OPTICAL = Rotation.from_euler("x", 180, degrees=True)
 """Newton's cameras look along -z with +y up; the optical frame along +z with +y down."""
+
+
+def captured(function: Any, device: str) -> Any:
+    """``function`` as the launch of one graph."""
+    with wp.ScopedCapture(device=device) as capture:
+        function()
+    return lambda: wp.capture_launch(capture.graph)
 
 
 def bench_scene(

@@ -1,8 +1,7 @@
 """``vd-bench sim``: control steps per second, memory and start-up, all measured in one run.
 
-Physics only replays the solver's steps of a control step; the whole step adds actions, observations, rewards,
-resets and randomisation; with a policy adds its network. States come from a teacher's mean actions, in
-contact, in the task of its training.
+The whole step has physics, actions, observations, rewards, resets and randomisation; with a policy adds its
+network. States come from a teacher's mean actions, in contact, in the task of its training.
 """
 
 import gc
@@ -41,13 +40,6 @@ def seconds_per_call(
     return elapsed / calls
 
 
-def captured(function: Any, device: str) -> Any:
-    """``function`` as the launch of one graph."""
-    with wp.ScopedCapture(device=device) as capture:
-        function()
-    return lambda: wp.capture_launch(capture.graph)
-
-
 def own_share(env: ReorientEnv) -> float:
     """Share of our kernels in the device time of one control step on a GPU, by a timer around every launch.
 
@@ -83,7 +75,7 @@ def measure(cfg: ReorientCfg, device: str, *, teacher: "TrainedPolicy", calls: i
         calls: Control steps to time, each way.
 
     Returns:
-        ``envs``; control steps/s over all of them: ``physics_only``, ``whole_step`` of the environment, and
+        ``envs``; control steps/s over all of them: ``whole_step`` of the environment, and
         ``with_policy``; ``own_kernels``: share of our kernels in the device time of a step, in [0, 1], and
         ``memory_gb`` of simulation and environment, both 0 on the CPU; ``start_s`` from an empty process to
         the first finished step, kernels included; ``contacts_mean`` of an environment at the end;
@@ -115,14 +107,12 @@ def measure(cfg: ReorientCfg, device: str, *, teacher: "TrainedPolicy", calls: i
     # The same policy acts in all of them, so that the hand moves and pushes alike.
     policy_s = seconds_per_call(policy, calls, device)
     step_s = seconds_per_call(lambda: env.step(env.action), calls, device, before=policy)
-    physics_s = seconds_per_call(captured(env.launch_physics, device), calls, device, before=policy)
     env.check()
     data = env.sim.solver.mjw_data
     contacts, rows = float(data.nacon.numpy()[0]), int(np.max(data.nefc.numpy()))
     n = cfg.num_envs
     return {
         "envs": n,
-        "physics_only": n / physics_s,
         "whole_step": n / step_s,
         "with_policy": n / (policy_s + step_s),
         "own_kernels": own_share(env) if on_gpu else 0.0,

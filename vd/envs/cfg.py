@@ -241,7 +241,7 @@ class CurriculumCfg:
 class RandomisationCfg:
     """Table S3 and the disturbance force."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"nominal_share": Dropped(0.0)}
+    RETIRED: ClassVar[dict[str, Any]] = {"nominal_share": Dropped(0.0), "restitution": [0.0, 0.0]}
     enabled: bool = True
     """Randomise at all."""
     stiffness_scale: tuple[float, float] = PAPER.randomisation.stiffness_scale
@@ -254,10 +254,6 @@ class RandomisationCfg:
     """Friction coefficients of hand and object."""
     table_friction: tuple[float, float] = PAPER.randomisation.table_friction
     """Friction coefficients of the table."""
-    restitution: tuple[float, float] = (0.0, 0.0)
-    """Coefficients of restitution of hand, object and table. 0 1 is Table S3; 0 0, the default, leaves the
-    contacts as they are, as they were for all reported runs. Pairs get the mean, at most 0.88, and only
-    objects faster than 0.2 m/s bounce (vd/sim/restitution.py)."""
     object_scale: tuple[float, float] = PAPER.randomisation.object_scale
     """Factors on the size of the object."""
     object_scale_count: int = 3
@@ -305,26 +301,17 @@ class RandomisationCfg:
     """Gains, contact frictions and constant errors are drawn anew at the first reset after this time [s]: the
     solver takes them once a second. Servos (``effects``) and latency are drawn at every reset."""
 
-    @property
-    def bounces(self) -> bool:
-        """Whether any contact has restitution."""
-        return self.enabled and self.restitution[1] > 0.0
-
     def force_steps(self, sim: SimCfg) -> int:
         """Physics steps for which a new force acts."""
         return min(sim.substeps, max(1, round(self.force_s * sim.physics_hz)))
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        for name, most in (
-            ("restitution", 1.0),
-            ("observation_latency_s", MAX_LATENCY_S),
-            ("encoder_latency_s", MAX_LATENCY_S),
-        ):
+        for name in ("observation_latency_s", "encoder_latency_s"):
             low, high = getattr(self, name)
-            if not 0.0 <= low <= high <= most:
+            if not 0.0 <= low <= high <= MAX_LATENCY_S:
                 raise ValueError(
-                    f"randomisation.{name} is {low:g} {high:g}; it has to rise within 0 and {most:g}"
+                    f"randomisation.{name} is {low:g} {high:g}; it has to rise within 0 and {MAX_LATENCY_S:g}"
                 )
         if not 0.0 <= self.observation_jitter_s <= MAX_LATENCY_S:
             raise ValueError(
@@ -404,14 +391,10 @@ class ReorientCfg:
         require(self.success, "success.", "positive", "rotation_rad")
         if self.fingertip not in ("rigid", "soft"):
             raise ValueError(f"fingertip = {self.fingertip!r}; choose rigid or soft")
-        self._check_together()
+        self._check_tightening()
 
-    def _check_together(self) -> None:
-        """Refuse contacts that the engine lacks, and a tightening that would loosen or do nothing."""
-        if self.sim.engine == "mujoco" and self.randomisation.bounces:
-            raise ValueError(
-                "randomisation.restitution: sim.engine mujoco has none; set it to 0 0, or take newton"
-            )
+    def _check_tightening(self) -> None:
+        """Refuse a tightening that would loosen or do nothing."""
         tightening = self.curriculum.tightening
         if not tightening.enabled:
             return

@@ -1,12 +1,14 @@
 """The state as a policy sees it: of the present, or as old as the latencies that its episode has drawn."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import warp as wp
 
 from vd.envs.task_state import TaskState
 from vd.kernels.task.latency import (
+    StateArrays,
     begin_latency_kernel,
     recall_state_kernel,
     record_state_kernel,
@@ -52,21 +54,20 @@ class SeenState:
 
     def record(self, joint_q: wp.array, joint_qd: wp.array, body_q: wp.array, body_qd: wp.array) -> None:
         """Remember the state after a physics step, shapes [N, *]. Device work only."""
-        state, now = self._state, [*self._measured(joint_q, joint_qd), joint_q, joint_qd, body_q, body_qd]
-        state.launch(record_state_kernel, [*self._model, *now], [self._head, self._ring])
+        now = self._now(joint_q, joint_qd, body_q, body_qd)
+        self._state.launch(record_state_kernel, [*self._model, now], [self._head, self._ring])
 
     def begin(self, mask: wp.array) -> None:
         """Draw the latencies of the environments of ``mask`` [N], whose past is their present state."""
         if not self.is_late:
             return
         state, sim = self._state, self._state.sim
-        measured = self._measured(sim.joint_q, sim.joint_qd)
-        now = [*measured, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
+        now = self._now(sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd)
         random = state.cfg.randomisation
         ranges = [wp.vec2(*random.observation_latency_s), wp.vec2(*random.encoder_latency_s)]
         state.launch(
             begin_latency_kernel,
-            [*self._model, *ranges, mask, *now, state.rng],
+            [*self._model, *ranges, mask, now, state.rng],
             [self.latency, self.encoder_latency, self._ring],
         )
 
@@ -76,7 +77,7 @@ class SeenState:
             state = self._state
             times = [state.cfg.sim.physics_dt, state.cfg.randomisation.observation_jitter_s]
             inputs = [*times, self.latency, self.encoder_latency, self._head, self._ring]
-            state.launch(recall_state_kernel, [*self._model, *inputs], [state.rng, *self.arrays])
+            state.launch(recall_state_kernel, [*self._model, *inputs], [state.rng, _packed(self.arrays)])
 
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint, by name."""
@@ -86,9 +87,19 @@ class SeenState:
         late = self._state.cfg.randomisation.encoder_latency_s[1] > 0.0
         return here | ({"encoder_latency": self.encoder_latency} if late else {})
 
-    def _measured(self, joint_q: wp.array, joint_qd: wp.array) -> tuple[wp.array, wp.array]:
-        servo = self._state.sim.servo
-        if servo is None:
-            return joint_q, joint_qd
-        servo.measure()  # once a control step otherwise
-        return servo.measured_q, servo.measured_qd
+    def _now(self, joint_q: wp.array, joint_qd: wp.array, *bodies: wp.array) -> StateArrays:
+        """A state, with the joints as their encoders report them."""
+        measured, servo = (joint_q, joint_qd), self._state.sim.servo
+        if servo is not None:
+            servo.measure()  # once a control step otherwise
+            measured = servo.measured_q, servo.measured_qd
+        return _packed([*measured, joint_q, joint_qd, *bodies])
+
+
+def _packed(arrays: Sequence[wp.array]) -> StateArrays:
+    """Arrays in the order of :attr:`SeenState.arrays`, as kernels take them."""
+    packed = StateArrays()
+    names = "measured_q", "measured_qd", "joint_q", "joint_qd", "body_q", "body_qd"
+    for name, array in zip(names, arrays, strict=True):
+        setattr(packed, name, array)
+    return packed

@@ -20,7 +20,6 @@ from vd.kernels.task.randomisation import (
     disturbance_force_kernel,
     draw_dynamics_kernel,
     draw_masses_kernel,
-    draw_restitution_kernel,
     draw_servo_kernel,
 )
 from vd.paper import PAPER
@@ -131,7 +130,7 @@ class Randomiser:
         self._draw_servos(mask)
 
     def _draw_dynamics(self, mask: wp.array) -> None:
-        """Draw gains, frictions, restitution and constant errors."""
+        """Draw gains, frictions and constant errors."""
         state = self._state
         ranges = self._kp_scale, self._kd_scale, state.parameters.randomisation
         state.launch(
@@ -147,13 +146,6 @@ class Randomiser:
                 self.observation_offset,
             ],
         )
-        if state.sim.restitution is not None:
-            drawn = state.sim.restitution
-            state.launch(
-                draw_restitution_kernel,
-                [wp.vec2(*state.cfg.randomisation.restitution), mask, state.rng],
-                [drawn.hand, drawn.object, drawn.table],
-            )
 
     def _draw_servos(self, mask: wp.array) -> None:
         """Draw delays, friction, backlash and the like: the servos read them in every physics step."""

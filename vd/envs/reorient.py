@@ -5,7 +5,6 @@ physics is Warp kernels; a step copies nothing to the host, and it is one captur
 What a step does stands in :meth:`ReorientEnv.launch_step`, in its order.
 """
 
-from pathlib import Path
 from typing import Any
 
 import newton
@@ -28,8 +27,6 @@ from vd.kernels.task.resets import episode_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.task.success import success_kernel
 from vd.paper import PAPER
-from vd.sim.replay import save_failed_step
-from vd.sim.simulator import SimulationError
 
 FAILURES_AT_FIRST = 10.0
 """Steps of environments that may fail beside those that ``failures_per_million`` allows (ours): one object
@@ -100,8 +97,6 @@ class ReorientEnv:
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
         self.parameters.set_stage(self.stage)
-        self.dump_dir = Path()
-        """Where :meth:`check` saves the step that failed."""
         self._graph: Any = None
         self._hold_graph: Any = None
         self._kernels_loaded = False
@@ -250,11 +245,6 @@ class ReorientEnv:
                 self.sim.step()
             self._hold_graph = capture.graph
         wp.capture_launch(self._hold_graph)
-
-    def launch_physics(self) -> None:
-        """Apply the action and run the solver's steps, nothing else (for benchmarks)."""
-        self._apply_action()
-        self.sim.physics_only()
 
     def _apply_action(self) -> None:
         p, sim = self.parameters, self.sim
@@ -416,28 +406,10 @@ class ReorientEnv:
         return self.sim.joint_q.numpy()[:, self.num_actions : self.num_actions + 7].copy()
 
     def check(self) -> None:
-        """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or too many steps failed.
-
-        The first control step that failed is saved in ``dump_dir`` for ``vd-bench replay``.
-        """
+        """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or too many steps failed."""
         rate = self.cfg.failures_per_million
         expected = rate * 1e-6 * self._own_steps * self.num_envs
-        tolerated = FAILURES_AT_FIRST + expected if rate > 0.0 else 0.0
-        try:
-            self.sim.check(tolerated)
-        except SimulationError as error:
-            cfg = self.cfg
-            path = save_failed_step(
-                self.sim,
-                self.dump_dir,
-                hand=cfg.hand,
-                fingertip=cfg.fingertip,
-                hand_layer=cfg.hand_layer,
-                objects=cfg.objects,
-            )
-            if path is None:
-                raise
-            raise SimulationError(f"{error} (dump: {path})") from error
+        self.sim.check(FAILURES_AT_FIRST + expected if rate > 0.0 else 0.0)
 
     def failed_steps(self) -> int:
         """Steps of environments that failed and were put back (:attr:`ReorientCfg.failures_per_million`)."""
@@ -480,7 +452,6 @@ class ReorientEnv:
 
     def _arrays(self) -> dict[str, wp.array]:
         """What changes from step to step: simulation, episodes, randomisation, random streams."""
-        restitution = self.sim.restitution
         return {
             **self.motion(),
             "smoothed": self.smoothed,
@@ -493,7 +464,6 @@ class ReorientEnv:
             "rng": self.state.rng,
             **self.observer.stateful(),
             **self.randomiser.stateful(),
-            **({} if restitution is None else restitution.stateful()),
             **({} if self._handed is None else self._handed.stateful()),
         }
 

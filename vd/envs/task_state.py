@@ -105,7 +105,6 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
         cfg.sim,
         servo_rows=ranges[:, :, 1] if needs_servo(ranges) else None,
         servo_seed=cfg.seed,
-        restitution=cfg.randomisation.bounces,
     )
     n = cfg.num_envs
     goal = wp.zeros(n, dtype=wp.quat, device=device)

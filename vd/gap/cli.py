@@ -1,4 +1,4 @@
-"""``vd-gap``: where simulation and measurement disagree, which effect is missing, and how much it closes."""
+"""vd-gap: where simulation and measurement disagree, which effect is missing, and how much it closes."""
 
 import json
 import sys

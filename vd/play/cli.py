@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from vd import interrupt
+from vd.config import require
 from vd.device import resolve_device
 from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, check_names, episode_limit_s, start_at_rest
 from vd.evaluate.cfg import POLICY_HELP
@@ -91,12 +92,7 @@ class PlayCfg:
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
         start_at_rest(self.at_rest, self.no_at_rest)
-        if self.cells < 1:
-            raise ValueError(f"--cells is {self.cells}; at least 1 is needed")
-        if not self.seconds > 0.0:
-            raise ValueError(f"--seconds is {self.seconds}; it must be positive")
-        if not self.limit_s > 0.0:
-            raise ValueError(f"--episode-s is {self.episode_s}; it must be positive")
+        require(self, "--", "positive", "cells seconds episode_s")
         if self.max_goal_angle is not None and not 0.0 < self.max_goal_angle <= math.pi + 1e-6:
             raise ValueError(
                 f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
@@ -157,20 +153,14 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     from tqdm import tqdm
 
     from vd.evaluate.cfg import LOG_EVERY_S
-    from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
+    from vd.play.video import GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
     env, policy = _open(cfg, trained, num_envs=cfg.cells)
     envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
-    renderer = Renderer(
-        env.hand,
-        [env.objects[env.world_object[world]] for world in envs],
-        width=width,
-        height=height,
-        goal_size=round(GOAL_SHARE * height),
-        device=env.device,
-    )
+    items = [env.objects[env.world_object[world]] for world in envs]
+    renderer = Renderer(env.hand, items, width=width, height=height, device=env.device)
     rate = env.cfg.sim.control_hz
     steps = max(1, round(cfg.seconds * rate))
     frames: Iterable[Any] = record(env, policy, renderer, envs, steps)

@@ -11,7 +11,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.assets_usd.objects.sets import load_set
 from vd.hand_log import HandLog, LogError
-from vd.play.video import GOAL_SHARE, SINGLE_CELL, Composer, Snapshot, write_frames
+from vd.play.video import SINGLE_CELL, Composer, Snapshot, write_frames
 from vd.render import OUT_OF_SIGHT, Renderer
 
 
@@ -93,13 +93,7 @@ def film(log: HandLog, path: Path) -> int:
         LogError: Hand or object are not here.
     """
     shown, (width, height) = Replay(log), SINGLE_CELL
-    renderer = Renderer(
-        shown.hand,
-        [shown.item],
-        width=width,
-        height=height,
-        goal_size=round(GOAL_SHARE * height),
-    )
+    renderer = Renderer(shown.hand, [shown.item], width=width, height=height)
     return write_frames(path, shown.frames(renderer), shown.control_hz)
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,6 @@ from vd.render import Picture, Renderer
 
 # Size of a cell's picture [pixel]: alone, and in a grid.
 SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)
-# Side of the goal's picture, as a share of the cell's height.
-GOAL_SHARE = 0.36
 STRIP_HEIGHT = 80
 MARGIN = 10
 # Error curve: as long as an episode of the paper.
@@ -31,7 +30,7 @@ INK, SOFT, LINE, STRIP = (28, 35, 48), (110, 119, 134), (205, 211, 220), (250, 2
 GREEN, RED, BLUE = (0, 140, 100), (205, 70, 20), (0, 114, 178)
 GOAL_EDGE = (89, 173, 107)
 # H.264 quality of libx264 (0 lossless, 51 worst): no visible blocks at this size, about 0.5 MB for 10 s.
-VIDEO_CRF, VIDEO_SUFFIX = 22, ".mp4"
+VIDEO_CRF = 22
 
 
 @dataclass(frozen=True)
@@ -261,39 +260,32 @@ def write_frames(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
 
     Args:
         path: ``.mp4``.
-        frames: RGB bytes [height, width, 3], all of one size.
+        frames: RGB bytes [height, width, 3], all of one size, one at least.
         fps: Frames per second.
 
     Returns:
         The number of frames taken.
-
-    Raises:
-        ValueError: Another suffix, or no frames.
     """
     import imageio_ffmpeg
 
-    if path.suffix.lower() != VIDEO_SUFFIX:
-        raise ValueError(f"{path}: cannot write '{path.suffix}' files; use {VIDEO_SUFFIX}")
+    rest, count = iter(frames), 0
+    first = next(rest)
     with atomic_path(path) as temporary:
-        writer, count = None, 0
-        for frame in frames:
-            if writer is None:
-                writer = imageio_ffmpeg.write_frames(
-                    str(temporary),
-                    (frame.shape[1], frame.shape[0]),
-                    fps=fps,
-                    codec="libx264",
-                    pix_fmt_out="yuv420p",
-                    quality=None,
-                    macro_block_size=2,
-                    ffmpeg_log_level="error",
-                    output_params=["-crf", str(VIDEO_CRF), "-movflags", "+faststart"],
-                )
-                writer.send(None)
+        writer = imageio_ffmpeg.write_frames(
+            str(temporary),
+            (first.shape[1], first.shape[0]),
+            fps=fps,
+            codec="libx264",
+            pix_fmt_out="yuv420p",
+            quality=None,
+            macro_block_size=2,
+            ffmpeg_log_level="error",
+            output_params=["-crf", str(VIDEO_CRF), "-movflags", "+faststart"],
+        )
+        writer.send(None)
+        for frame in chain([first], rest):
             writer.send(np.ascontiguousarray(frame))
             count += 1
-        if writer is None:
-            raise ValueError(f"{path}: there are no frames to write")
         writer.close()
         # The writer does not say if it failed.
         written, _ = imageio_ffmpeg.count_frames_and_secs(str(temporary))

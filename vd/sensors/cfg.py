@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-from vd.config import Dropped
+from vd.config import Dropped, require
 from vd.paper import PAPER
 
 BASELINE_M, FOCAL_PX = 0.055, 1024.2
@@ -67,13 +67,9 @@ class DepthSensorCfg:
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        for name in ("disparity_std_px", "disparity_step_px", "min_range_m"):
-            if getattr(self, name) < 0.0:
-                raise ValueError(f"sensor.{name} = {getattr(self, name)}; it must not be negative")
-        if self.edge_jump_m <= 0.0:
-            raise ValueError(f"sensor.edge_jump_m = {self.edge_jump_m}; it must be positive")
-        if min(self.edge_dropout, self.flying, self.dropout) < 0.0 or self.dropout > 1.0:
-            raise ValueError("sensor.edge_dropout, flying and dropout are shares: choose them in [0, 1]")
+        require(self, "sensor.", "zero or positive", "disparity_std_px disparity_step_px min_range_m")
+        require(self, "sensor.", "positive", "edge_jump_m")
+        require(self, "sensor.", "in [0, 1]", "edge_dropout flying dropout")
         if self.edge_dropout + self.flying > 1.0:
             raise ValueError(
                 f"sensor.edge_dropout + sensor.flying = {self.edge_dropout + self.flying}; "
@@ -113,11 +109,8 @@ class DepthCameraCfg:
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         self.sensor.validate()
-        if self.points < 0:
-            raise ValueError(f"points = {self.points} must not be negative")
+        require(self, "", "zero or positive", "points position_noise_m rotation_noise_rad")
         if self.crop_m[0] > self.crop_m[1]:
             raise ValueError(f"crop_m = {self.crop_m}; name the lower height first")
         if not 0.0 <= self.latency_s[0] <= self.latency_s[1]:
             raise ValueError(f"latency_s = {self.latency_s}; name two times, none negative, the least first")
-        if min(self.position_noise_m, self.rotation_noise_rad) < 0.0:
-            raise ValueError("position_noise_m and rotation_noise_rad must not be negative")

@@ -17,7 +17,6 @@ from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
 from vd.sim.pair_order import sort_pairs
-from vd.sim.restitution import Restitution
 from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
 
 # Faster than any joint (8 rad/s) or dropped object (2 m/s) can be; an object that spins faster than
@@ -56,7 +55,6 @@ class Simulator:
         *,
         servo_rows: np.ndarray | None = None,
         servo_seed: int = 0,
-        restitution: bool = False,
     ):
         """Build the solver of a scene.
 
@@ -66,7 +64,6 @@ class Simulator:
             servo_rows: Parameters of every joint's servo, shape [D, P] or [N, D, P]
                 (:mod:`vd.kernels.servo.actuators`); the solver's plain drives by default.
             servo_seed: Seed of the random delays and losses of commands.
-            restitution: Whether contacts can bounce; see :attr:`restitution`.
         """
         cfg.validate()
         self.scene, self.cfg = scene, cfg
@@ -98,10 +95,6 @@ class Simulator:
         """Joint speed limits [rad/s], shape [D]."""
         geom_shape = self.solver.mjc_geom_to_newton_shape.numpy()
         self._geom_kind = array(np.where(geom_shape >= 0, scene.shape_kind[geom_shape], 0).astype(np.int32))
-        self.restitution: Restitution | None = None
-        """Coefficients of restitution, zero until written; None: contacts stay as they are."""
-        if restitution:
-            self.restitution = Restitution(self.solver, self._geom_kind, len(scene.hand.velocity_limit))
         self.table_force = wp.zeros(n, dtype=float, device=self.device)
         """Normal force between object and table at the end of the control step [N], shape [N]."""
         self.overflow = wp.zeros(n, dtype=wp.int32, device=self.device)
@@ -116,14 +109,7 @@ class Simulator:
         self.after_physics_step: Callable[[wp.array, wp.array, wp.array, wp.array], None] | None = None
         """Called in every physics step with the new positions, velocities and link poses and velocities,
         shape [N, *]; device work only."""
-        self._start_q, self._start_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
-        self.failed_from = {
-            "joint_q": wp.clone(self.joint_q),
-            "joint_qd": wp.clone(self.joint_qd),
-            "target": wp.clone(self.target),
-        }
-        """Positions, velocities and joint targets from which a world's first step that failed began, shape
-        [N, *]; of a world in which none did those of the last."""
+        self._start_q = wp.clone(self.joint_q)
         if servo_rows is not None:
             self.target = wp.clone(self.target)  # the drives' references become the servos' output
             self.servo = JointServo(
@@ -143,19 +129,18 @@ class Simulator:
         (:attr:`vd.sim.engine.WarpSolver.captured`).
         """
         wp.copy(self._start_q, self.joint_q)
-        wp.copy(self._start_qd, self.joint_qd)
         wp.copy(self._next_body_force, self.body_force)
         if self.servo is not None:
             self.servo.send(self.target)
-        self._physics_steps(ours=True)
+        self._physics_steps()
         if self.servo is not None:
             self.servo.measure()
         self._table_contact()
         launch(
             guard_kernel,
             self.num_envs,
-            [self.joint_q, self.joint_qd, self._start_q, self._start_qd, self.target, MAX_SPEED],
-            [self.failures, *self.failed_from.values(), self.failed],
+            [self.joint_q, self.joint_qd, MAX_SPEED],
+            [self.failures, self.failed],
         )
 
     def put_back(self, step_count: wp.array, last_step: int) -> None:
@@ -167,31 +152,24 @@ class Simulator:
             [self.joint_q, self.joint_qd, step_count],
         )
 
-    def _physics_steps(self, *, ours: bool) -> None:
-        """The physics steps of one control step, with our additions; states end where they began."""
+    def _physics_steps(self) -> None:
+        """The physics steps of one control step, with what surrounds them; states end where they began."""
         here = self.state, self.joint_q, self.joint_qd, self.body_q, self.body_qd
         there = self._next, *self._next_arrays
         for step in range(self.cfg.substeps):
-            if ours and step == self.force_steps:
+            if step == self.force_steps:
                 wp.copy(self.body_force, self.lasting_force)
                 wp.copy(self._next_body_force, self.lasting_force)
-            if ours and self.servo is not None:
+            if self.servo is not None:
                 self.servo.receive()
                 self.servo.drive(*here[1:3])
-            if ours and self.restitution is not None:
-                self.restitution.apply(here[2])
             self.solver.step(
                 here[0], there[0], self.control, None, self.cfg.physics_dt, observables=self._observables
             )
-            if ours:
-                self._limit_and_collect(here[1], *there[1:3])
-                if self.after_physics_step is not None:
-                    self.after_physics_step(*there[1:])
+            self._limit_and_collect(here[1], *there[1:3])
+            if self.after_physics_step is not None:
+                self.after_physics_step(*there[1:])
             here, there = there, here
-
-    def physics_only(self) -> None:
-        """The solver's share of a control step, nothing of ours (for benchmarks)."""
-        self._physics_steps(ours=False)
 
     def _limit_and_collect(self, previous_q: wp.array2d, q: wp.array2d, qd: wp.array2d) -> None:
         # The solver knows no joint velocity limits.
@@ -275,6 +253,5 @@ class Simulator:
             raise SimulationError(
                 f"{len(worlds)} of {self.num_envs} environments left the finite numbers or "
                 f"exceeded {MAX_SPEED:g} m/s or rad/s (first: world {worlds[0]}, object {name}). "
-                "Replay the saved dump with "
-                "`vd-bench replay DUMP`; then raise sim.physics_hz or sim.contact_time_constant_s"
+                "Raise sim.physics_hz or sim.contact_time_constant_s"
             )
