@@ -60,7 +60,8 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         raise ValueError(
             "the saved environment has other servos, frames, memory, latency or grasps; resume with "
             "hand_layer, observation, table, randomisation.effects and observation_latency_s, "
-            "encoder_latency_s of the checkpoint, or from one without environments (vd-train export --resumable)"
+            "encoder_latency_s of the checkpoint, or from one without environments "
+            "(vd-train export --resumable)"
         )
     for name, array in here.items():
         saved = arrays[name]
