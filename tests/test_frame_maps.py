@@ -40,7 +40,7 @@ def env(request):
 
 @pytest.fixture
 def maps(env):
-    return FrameMaps(env.hand, env.cfg.observation)
+    return FrameMaps(env.hand, replace(env.cfg.observation, dynamics="critic"))  # who is not asked here
 
 
 def test_views_are_chosen_seen_and_acted_in_as_in_the_simulator(env, maps):
