@@ -82,6 +82,11 @@ class FakeEnv:
         self._quat[envs] = object_quat
         self.step_count.numpy()[envs] = 0
 
+    def give_goals(self, envs, goal_quat):
+        """Give new goals to some environments."""
+        self.goal_quat.numpy()[envs] = goal_quat
+        self._publish()
+
     def step(self, action):
         """Turn the objects for one control step."""
         a = action.numpy()

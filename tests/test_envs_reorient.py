@@ -20,7 +20,7 @@ from vd.envs.cfg import (
     TighteningCfg,
 )
 from vd.envs.reorient import ReorientEnv
-from vd.envs.setup import ALWAYS, must_lift, table_steps
+from vd.envs.setup import ALWAYS, chosen, table_steps
 from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
 from vd.kernels.task.shapes import (
     EXTENT_CENTRE_M,
@@ -106,11 +106,33 @@ def test_tables_leave_their_share_of_worlds_in_time():
     assert (after[lost] < before[lost] - 0.02).all() and np.allclose(after[~lost], before[~lost], atol=2e-3)
 
 
+def test_episodes_begin_in_the_grasps_in_which_goals_were_reached():
+    """Anything is a success while it falls: then the next episode begins there, without its table."""
+    table = TableCfg(away_share=0.5, away_s=(0.25, 0.25), handed_share=0.25)
+    cfg = {"table": table, "success": ANYTHING, "num_envs": 8, "success_ends_episode": True, "episode_s": 1.0}
+    env = make(**cfg, randomisation=RandomisationCfg(effects={"command_delay.delay_s": (0.02, 0.06)}))
+    handed = chosen(env.cfg, 0.25) == 1
+    begun = np.zeros(8, int)
+    for _ in range(24):
+        before = env.step_count.numpy().copy()
+        env.step(env.action)
+        after = env.step_count.numpy()
+        again = (after == 3) & (before != 2)
+        begun += again
+        for world in np.flatnonzero(again):
+            held = env.sim.servo.stateful()["servo_held"].numpy()[world]
+            np.testing.assert_array_equal(held, env.sim.target.numpy()[world, :9])
+    assert (begun[handed] > 0).all() and not begun[~handed].any()
+    other = make(**cfg, randomisation=env.cfg.randomisation)
+    other.load_state_dict(env.state_dict())
+    np.testing.assert_array_equal(run(other, 12), run(env, 12))
+
+
 def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
     """Objects at rest on the table, each at its goal: half of the environments must lift theirs."""
     loose = SuccessCfg(rotation_rad=4.0, joint_speed_rad_s=0.0, action_norm=0.0)
     env = make(table=TableCfg(lift_share=0.5), success=loose, num_envs=8)
-    lift = must_lift(env.cfg) == 1
+    lift = chosen(env.cfg, 0.5) == 1
     reached = np.zeros(8, dtype=int)
     for _ in range(24):
         env.step(env.action)
@@ -122,6 +144,21 @@ def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
 ANYTHING = SuccessCfg(
     rotation_rad=4.0, joint_speed_rad_s=0.0, object_speed_m_s=0.0, object_spin_rad_s=0.0, action_norm=0.0
 )
+
+
+def test_a_goal_given_in_the_middle_is_seen_at_once_and_moves_nothing():
+    env, goal = make(), np.array([[0.0, 0.0, np.sin(0.3), np.cos(0.3)]])
+    run(env, 5)
+    before, steps, q = env.goal_quat.numpy().copy(), env.step_count.numpy().copy(), env.sim.joint_q.numpy()
+    env.give_goals(np.array([1]), goal)
+    np.testing.assert_array_equal(env.sim.joint_q.numpy(), q)
+    np.testing.assert_array_equal(env.step_count.numpy(), steps)
+    np.testing.assert_allclose(np.abs((env.goal_quat.numpy()[1] * goal).sum()), 1.0, atol=1e-6)
+    np.testing.assert_array_equal(env.goal_quat.numpy()[[0, 2, 3]], before[[0, 2, 3]])
+    columns = teacher_observation_slices(3)["goal_orientation"]
+    seen = env.observation.numpy()[:, columns]
+    np.testing.assert_allclose(np.abs((seen[1] * goal).sum()), 1.0, atol=1e-6)
+    assert not env.smoothed.numpy()[1].any() and env.smoothed.numpy()[0].any()
 
 
 def test_a_success_gives_a_new_goal_without_a_reset():
@@ -316,6 +353,7 @@ def tightening(**changes) -> CurriculumCfg:
     [
         ({"randomisation": RandomisationCfg(observation_latency_s=(0.7, 0.7))}, "observation_latency_s"),
         ({"table": TableCfg(away_share=0.3, away_s=(3.0, 1.0))}, r"table\.away_s"),
+        ({"table": TableCfg(away_share=0.3, handed_share=0.4)}, r"raise table\.away_share"),
         ({"sim": SimCfg(physics_hz=100.0)}, r"sim\.physics_hz"),
         ({"curriculum": tightening(action_norm=0.0)}, r"curriculum\.tightening\.action_norm is 0"),
         ({"curriculum": tightening(object_weight=0.1)}, r"give table\.lift_share"),

@@ -36,7 +36,7 @@ from vd.vision.alignment import AlignmentNetwork
 from vd.vision.cfg import AlignmentCfg
 from vd.vision.saved import AlignmentSpec, alignment_export
 
-TRACKERS = [name for name in SHIPPED_POLICIES if name.endswith("-tracking")]
+TRACKERS = [name for name in SHIPPED_POLICIES if name.endswith(("-tracking", "-vision"))]
 WORLDS = 12
 EXACT = RandomisationCfg(enabled=False)
 CLOSE_RAD = 0.15
@@ -195,11 +195,12 @@ def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_ca
 def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
     path = SHIPPED_POLICIES[name]
     policy = load_tracking(path)
-    assert sees_clouds(open_policy(name, "cpu")) and is_tracking(path) and path.stat().st_size < 2.6e6
+    assert sees_clouds(open_policy(name, "cpu")) and is_tracking(path) and path.stat().st_size < 5.2e6
     assert policy.spec.calibrated_on and "/" not in policy.spec.teacher + policy.spec.calibrated_on
-    teacher = load_policy(find_policy(policy.spec.teacher))
-    observation = torch.randn(5, teacher.num_observations)
-    assert torch.equal(policy.teacher.act(observation), teacher.act(observation))
+    if policy.kind == "tracking":  # the layers of others may be of a teacher that is not installed
+        teacher = load_policy(find_policy(policy.spec.teacher))
+        observation = torch.randn(5, teacher.num_observations)
+        assert torch.equal(policy.teacher.act(observation), teacher.act(observation))
 
 
 def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):

@@ -5,6 +5,8 @@ from the rotation as it is known: a teacher acts as well so, and nothing has to 
 observation, D actions. World frame: z up; quaternions xyzw.
 """
 
+from dataclasses import replace
+
 import torch
 
 from vd.assets_usd.hand_data import HandModel
@@ -26,7 +28,8 @@ class FrameMaps:
         def array(values: object, dtype: torch.dtype) -> torch.Tensor:
             return torch.as_tensor(values).to(device=device, dtype=dtype)
 
-        tables = symmetry_frames(hand, seen, seen.view)
+        actors = replace(seen, dynamics="none")  # what a critic is told besides, only a simulator knows
+        tables = symmetry_frames(hand, actors, seen.view)
         self._source, self._joints = (array(v, torch.long) for v in (tables.source, tables.joints))
         self._factor, self._offset, self._sign, self._sector = (
             array(v, torch.float32) for v in (tables.factor, tables.offset, tables.sign, tables.sector)

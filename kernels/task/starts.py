@@ -94,7 +94,7 @@ def start_depth_kernel(
             is, shape [N, C].
     """
     world, place, chunk = wp.tid()
-    if reset_in[world] == 0:
+    if reset_in[world] != 1:
         return
     position = read_vec3(world, object_column, joint_q_in) + places[place]
     orientation = read_quat(world, object_column + 3, joint_q_in)
@@ -135,7 +135,7 @@ def move_start_kernel(
         joint_q: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
     """
     world = wp.tid()
-    if reset_in[world] == 0:
+    if reset_in[world] != 1:
         return
     best = wp.int32(0)
     for place in range(1, places.shape[0]):

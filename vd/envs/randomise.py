@@ -76,6 +76,7 @@ class Randomiser:
         self._inertia_varies = bool(np.any(inertia[..., 0] != inertia[..., 1]))
         self._shape_kind = wp.array(scene.shape_kind, dtype=wp.int32, device=device)
         self._nominal_friction = wp.clone(model.shape_material_mu)
+        self._places = wp.clone(state.sim.solver.mjw_data.geom_xpos)
         self._model_kp = model.joint_target_ke.reshape((n, -1))
         self._model_kd = model.joint_target_kd.reshape((n, -1))
         self._draw_masses()
@@ -236,7 +237,11 @@ class Randomiser:
             [model.shape_material_mu],
             dim=model.shape_count,
         )
+        # The solver then puts fixed shapes back to where the model has them: tables that were taken away.
+        places = state.sim.solver.mjw_data.geom_xpos
+        wp.copy(self._places, places)
         state.sim.solver.notify_model_changed(flags)
+        wp.copy(places, self._places)
 
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint. Masses are drawn from the seed alone and need no saving."""

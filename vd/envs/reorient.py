@@ -13,6 +13,7 @@ import warp as wp
 
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
+from vd.envs.handed import HandedOver, success_ends
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.setup import SETTLE_S, rest_poses, table_steps
@@ -87,6 +88,10 @@ class ReorientEnv:
         self._table_steps: wp.array | None = None
         if cfg.table.away_share > 0.0:
             self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device)
+        self._handed: HandedOver | None = None
+        if cfg.table.handed_share > 0.0:
+            self._handed = HandedOver(state, self._reset_q, self._table_steps)
+        self._ends = success_ends(state)
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
@@ -142,7 +147,7 @@ class ReorientEnv:
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         reset_q = self.hand.start
-        self._reset_q = wp.array(reset_q, dtype=float, device=self.device)
+        self._reset_q: wp.array = wp.array(reset_q, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, reset_q)
 
     def _find_rest_poses(self) -> wp.array:
@@ -180,6 +185,21 @@ class ReorientEnv:
         self.randomiser.draw(self._reset)
         self._reset_envs(use_start=object_quat is not None, use_goal=goal_quat is not None)
         self.randomiser.push()
+        self.observe()
+
+    def give_goals(self, envs: np.ndarray, goal_quat: np.ndarray) -> None:
+        """Give new goals to some environments in the middle of their episodes; the observation is fresh.
+
+        Args:
+            envs: Their numbers, shape [E].
+            goal_quat: Goal orientations, xyzw, shape [E, 4].
+        """
+        mask, goals = np.zeros(self.num_envs, np.int32), self.goal_quat.numpy()
+        mask[envs], goals[envs] = 1, goal_quat
+        self._reset.zero_()
+        self._new_goal.assign(mask)
+        self._given_goal.assign(goals)
+        self._reset_envs(use_goal=True)
         self.observe()
 
     def step(self, action: Any) -> None:
@@ -262,7 +282,11 @@ class ReorientEnv:
         self._end_episodes()
         self._launch(record_step_kernel, [sim.joint_q, self.num_actions], [self.object_pose_end])
         self.randomiser.redraw(self._reset)
-        self._reset_envs()
+        command = None
+        if self._handed is not None:
+            self._handed.hand_over(self.success, self.fell, self._reset, self.step_count)
+            command = sim.target
+        self._reset_envs(command=command)
         self.observe()
 
     def _judge(self) -> None:
@@ -313,7 +337,7 @@ class ReorientEnv:
                 self.success,
                 self.fell,
                 self.max_episode_steps,
-                int(self.cfg.success_ends_episode),
+                self._ends,
                 self.step_count,
                 self.goal_steps,
                 self.goal_counts,
@@ -321,8 +345,13 @@ class ReorientEnv:
             [self.timed_out, self.done, self._reset, self._new_goal],
         )
 
-    def _reset_envs(self, *, use_start: bool = False, use_goal: bool = False) -> None:
-        """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too."""
+    def _reset_envs(
+        self, *, use_start: bool = False, use_goal: bool = False, command: wp.array | None = None
+    ) -> None:
+        """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too.
+
+        ``command`` is what servos have been told so far [rad], shape [N, *]; the positions by default.
+        """
         sim, p = self.sim, self.parameters
         self._launch(
             reset_kernel,
@@ -357,7 +386,7 @@ class ReorientEnv:
         sim.solver.reset(sim.state, world_mask=self._env_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
         if sim.servo is not None:
-            sim.servo.reset(self._reset)
+            sim.servo.reset(self._reset, command=command)
         self.observer.begin(self._reset)
 
     def observe(self) -> None:
@@ -434,6 +463,7 @@ class ReorientEnv:
             "rng": self.state.rng,
             **self.observer.stateful(),
             **self.randomiser.stateful(),
+            **({} if self._handed is None else self._handed.stateful()),
         }
 
     def close(self) -> None:

@@ -31,13 +31,12 @@ def table_steps(cfg: ReorientCfg) -> np.ndarray:
     return np.where(away, steps, ALWAYS).astype(np.int32)
 
 
-def must_lift(cfg: ReorientCfg) -> np.ndarray:
-    """1 where success asks that the object does not touch the table, int32, shape [N].
+def chosen(cfg: ReorientCfg, share: float) -> np.ndarray:
+    """1 in a share of the environments, int32, shape [N].
 
-    Environments are chosen in the order of :func:`table_steps`: of two shares the smaller is a part of the
-    larger.
+    They are chosen in the order of :func:`table_steps`: of two shares the smaller is a part of the larger.
     """
-    n, share = cfg.num_envs, cfg.table.lift_share
+    n = cfg.num_envs
     return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
 
 

@@ -58,9 +58,10 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
     arrays.pop("goals_reached", None)
     if arrays.keys() != here.keys():
         raise ValueError(
-            "the saved environment has other servos, frames, memory or latency; resume with hand_layer, "
-            "observation, randomisation.effects and observation_latency_s, encoder_latency_s of the "
-            "checkpoint, or from one without environments (vd-train export --resumable)"
+            "the saved environment has other servos, frames, memory, latency or grasps; resume with "
+            "hand_layer, observation, table, randomisation.effects and observation_latency_s, "
+            "encoder_latency_s of the checkpoint, or from one without environments "
+            "(vd-train export --resumable)"
         )
     for name, array in here.items():
         saved = arrays[name]

@@ -18,7 +18,7 @@ BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
 
 SHIPPED_POLICIES = {path.stem: path for path in sorted((Path(__file__).parents[1] / "policies").glob("*.pt"))}
-"""Trained policies that are installed with the package, by name: ``<hand>-<task>``."""
+"""Trained policies that are installed with the package, by name: ``<hand>`` or ``<hand>-<task>``."""
 
 REPLACED = {
     "dclaw3-student": "dclaw3-tracking",

@@ -2,6 +2,8 @@
 
 import math
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +16,7 @@ from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
+    from vd.evaluate.air import AirTrace
     from vd.evaluate.goals import Goals
     from vd.evaluate.result import Agent, Protocol, Result
     from vd.evaluate.trace import Trace
@@ -44,6 +47,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
 
     from vd.assets_usd.objects.sets import set_files
     from vd.envs.reorient import ReorientEnv
+    from vd.evaluate.air import judge_in_air
     from vd.evaluate.result import Result, judge
     from vd.tracking.symmetry import with_symmetries
     from vd.versions import installed_versions
@@ -69,12 +73,13 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
         actor, agent = actor_of(
             name, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
         )
-        trace = run_episodes(cfg, env, actor, agent)
+        trace: Any = (run_in_air if cfg.air_goals else run_episodes)(cfg, env, actor, agent)
         for group, sets in groups.items():
             chosen = [files.index(file) for file in set_files(sets)]
             objects = [env.objects[number] for number in chosen]
             protocol = _protocol(cfg, wanted, sets, agent.sees)
-            rows += judge(trace.of(chosen), protocol, objects, agent, group=group, condition=condition)
+            judged = judge_in_air if cfg.air_goals else judge
+            rows += judged(trace.of(chosen), protocol, objects, agent, group=group, condition=condition)
     env.close()
     software = {"device": wp.get_device(device).name} | installed_versions(_PACKAGES)
     result = Result(tuple(rows), software)
@@ -128,6 +133,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
         at_rest=task.start.at_rest,
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
         in_air=cfg.in_air,
+        air_goals=cfg.air_goals,
         table_friction=cfg.table_friction,
         goals=cfg.goals,
         sensor_errors=cfg.sensor_errors and sees == "rendered clouds",
@@ -166,35 +172,62 @@ def actor_of(
 
 def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "Trace":
     """All episodes of one policy, with a progress bar."""
-    import numpy as np
-    from tqdm import tqdm
-
-    from vd.evaluate.rollout import draw_starts_and_goals
     from vd.evaluate.trace import air_table_steps, record
 
-    starts, goals = None, None
-    if not env.cfg.start.at_rest:
-        drawn = [
-            draw_starts_and_goals(item.name, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle)
-            for item in env.objects
-        ]
-        starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
-    rounds = math.ceil(cfg.episodes / (env.num_envs // len(env.objects)))
-    refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
-    title = Path(agent.policy).name or agent.policy
-    with tqdm(total=rounds * env.max_episode_steps, unit="step", desc=title, mininterval=refresh) as bar:
+    with _progress(cfg, env, agent) as on_step:
         trace = record(
             env,
             actor,
             cfg.episodes,
-            starts=starts,
-            goals=goals,
+            **_drawn(cfg, env),
             table_steps=air_table_steps(env.cfg.sim.control_hz) if cfg.in_air else None,
             held=[way for way in agent.ways_to_stop(cfg.stop_tolerance).values() if way[1] != "success"],
-            on_step=bar.update,
+            on_step=on_step,
         )
     env.check()
     return trace
+
+
+def run_in_air(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "AirTrace":
+    """The same with ``--air-goals``."""
+    from vd.evaluate.air import air_turns, record_in_air
+
+    names = [item.name for item in env.objects]
+    turns = air_turns(names, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle)
+    way, tolerance = agent.own_way(cfg.stop_tolerance)[1], cfg.stop_tolerance
+    with _progress(cfg, env, agent) as on_step:
+        trace = record_in_air(
+            env, actor, turns, way, tolerance=tolerance, **_drawn(cfg, env), on_step=on_step
+        )
+    env.check()
+    return trace
+
+
+def _drawn(cfg: EvalCfg, env: Any) -> dict[str, Any]:
+    """Starts and goals [K, M, 4] of all objects by these names; none: the environment draws them."""
+    import numpy as np
+
+    from vd.evaluate.rollout import draw_starts_and_goals
+
+    if env.cfg.start.at_rest:
+        return {}
+    drawn = [
+        draw_starts_and_goals(item.name, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle)
+        for item in env.objects
+    ]
+    return {name: np.stack([pair[i] for pair in drawn]) for i, name in enumerate(("starts", "goals"))}
+
+
+@contextmanager
+def _progress(cfg: EvalCfg, env: Any, agent: "Agent") -> "Iterator[Callable[[], object]]":
+    """A progress bar over the steps of one policy; what is to be called after each."""
+    from tqdm import tqdm
+
+    rounds = math.ceil(cfg.episodes / (env.num_envs // len(env.objects)))
+    refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
+    title = Path(agent.policy).name or agent.policy
+    with tqdm(total=rounds * env.max_episode_steps, unit="step", desc=title, mininterval=refresh) as bar:
+        yield bar.update
 
 
 def envs_for(num_objects: int, episodes: int, device: str, *, camera: bool = False) -> int:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vd.evaluate.goals import AIR_HOLD_S
 from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row
 from vd.evaluate.statistics import Interval
 from vd.evaluate.trace import HOLD_S
@@ -26,6 +27,7 @@ _RUN_FILES = ("policy.pt",)
 _NAMES = ("policy", "objects", "stopped by")
 _HEADER = (*_NAMES, "success", f"and held {HOLD_S:g} s", "within 0.1 rad", "lost")
 _BESIDE_HEADER = (*_NAMES, "up to symmetry", "median error [rad]", "time [s]")
+_AIR_HEADER = ("policy", "objects", "held", "first goal", "three in a row", "lost", "let go")
 _OBJECT_HEADER = ("object", *OUTCOMES, "up to symmetry", "median error [rad]")
 _BOUND_HEADER = ("policy", "objects", "bound [rad]", "near and seen so", "said and right", "mean error [rad]")
 GREY = "#8a8f98"
@@ -104,6 +106,8 @@ def write_page(
         success=success,
         beside=beside,
         hold_s=f"{HOLD_S:g}",
+        air=_air_table(headlines, short),
+        air_hold_s=f"{AIR_HOLD_S:g}",
         differences=_differences(result, short),
         figures=figures,
         missing=[(condition, shown_name(policy), why) for condition, policy, why in result.missing],
@@ -129,6 +133,8 @@ def terminal_text(result: Result) -> str:
         # Only the first figure has its interval here: a line has to fit.
         cut = [[*row[: WORDS + 1], *(cell.split(" (")[0] for cell in row[WORDS + 1 :])] for row in rows]
         parts.append(aligned([header, *cut], words=WORDS))
+    header, rows = _air_table(result.rows, short)
+    parts += [aligned([header, *rows], words=2)] if rows else []
     if len(result.policies) == 1 and not suite:
         for row in result.rows:
             if row.headline:
@@ -195,7 +201,7 @@ def _tables(result: Result, short: dict[str, str]) -> tuple[Table, Table]:
                 *names,
                 percent(outcomes["success"]),
                 held,
-                percent(row.precise),
+                "not tried" if row.precise is None else percent(row.precise),
                 percent(outcomes["object falls"]),
             )
         )
@@ -217,12 +223,30 @@ def _object_table(row: Row) -> Table:
     ]
 
 
+def share(value: float | None) -> str:
+    """``12.3 %``, or that there is none."""
+    return "none" if value is None else f"{100 * value:.1f} %"
+
+
+def _air_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
+    """What became of goals in a row in the air."""
+    return _AIR_HEADER, [
+        (
+            short[row.policy],
+            _where(row),
+            percent(air.held),
+            share(air.first),
+            percent(air.in_a_row),
+            share(air.lost),
+            share(air.let_go),
+        )
+        for row in rows
+        if (air := row.in_air) is not None
+    ]
+
+
 def _bound_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     """What predictions are worth at each bound."""
-
-    def share(value: float | None) -> str:
-        return "none" if value is None else f"{100 * value:.1f} %"
-
     return _BOUND_HEADER, [
         (
             short[row.policy],
@@ -274,7 +298,8 @@ def asked(protocols: Sequence[Protocol]) -> str:
     rest = "at rest on the table, as the environment draws them"
     table = "" if protocol.table_friction is None else f" of friction {protocol.table_friction:g}"
     parts = (
-        f"{hands} {'in the air' if protocol.in_air else 'on the table'}{table}",
+        f"{hands} {'in the air' if protocol.in_air or protocol.air_goals else 'on the table'}{table}",
+        *(["goal after goal"] if protocol.air_goals else []),
         f"{protocol.episodes} episodes of {protocol.episode_s:g} s for each object, seed {protocol.seed}",
         f"starts {rest if protocol.at_rest else 'dropped into the hand, uniform on SO(3)'}",
         f"goals {goals}",

@@ -72,6 +72,8 @@ class Protocol:
     """Goals only turn the object about the vertical."""
     in_air: bool = False
     """The table is taken away once the hand had time to grasp."""
+    air_goals: bool = False
+    """The same, and only then come the goals that count, in a row."""
     table_friction: float | None = None
     """Coefficient of the table if it is not the nominal one."""
     goals: Goals = "mesh"
@@ -118,6 +120,22 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class InAir:
+    """Goal after goal in the air (:mod:`vd.evaluate.air`)."""
+
+    held: Interval
+    """Share of episodes in which the object was still held when the first goal was drawn."""
+    first: float | None
+    """Share of these in which it was reached; None, here and below: of none."""
+    in_a_row: Interval
+    """Share of episodes in which all goals were reached."""
+    lost: float | None
+    """Share of those that were held in which the object was lost on the way."""
+    let_go: float | None
+    """Share of the objects with which the first goal was reached that holding still lost."""
+
+
+@dataclass(frozen=True)
 class Row:
     """One policy on one group of objects in one condition, under one way to stop."""
 
@@ -145,14 +163,16 @@ class Row:
     symmetric: Interval
     """Share of episodes stopped within the tolerance of what looks like the goal; where the true distance
     decides, it is that distance."""
-    precise: Interval
-    """Share of episodes that stop within 0.1 rad of the very goal, by the rule for that."""
+    precise: Interval | None
+    """Share of episodes that stop within 0.1 rad of the very goal, by the rule for that; None: not tried."""
     prediction: Prediction | None
     """What its predictions are worth; None: they do not stop it."""
     warnings: dict[str, str]
     """By name of an object: what its import says may be wrong with it."""
     episodes: tuple[Episode, ...]
-    """K x M, object by object."""
+    """K x M, object by object; of goals in a row those of the first."""
+    in_air: InAir | None = None
+    """What became of goals in a row, if there were any."""
 
     @property
     def successes(self) -> np.ndarray:
@@ -266,40 +286,37 @@ class Agent:
         }
         return ways if own.action_norm == norm else ways | {("prediction", OWN_NORM): (own, "predicted")}
 
+    def own_way(self, tolerance_rad: float) -> tuple[StoppedBy, Way]:
+        """The way of the headline, and its name."""
+        (stopped_by, _), way = next(iter(self.ways_to_stop(tolerance_rad).items()))
+        return stopped_by, way
+
 
 def judge(
     trace: Trace, protocol: Protocol, objects: list[Any], agent: Agent, *, group: str, condition: str = ""
 ) -> list[Row]:
     """Rows of one policy, one for each way to stop, from its episodes with the objects of one group."""
     rows, tolerance, precise = [], protocol.stop_tolerance_rad, PAPER.success.precise_rad
-    near = agent.ways_to_stop(precise)
-    names, unit = tuple(item.name for item in objects), choose_unit(len(objects))
+    near, unit = agent.ways_to_stop(precise), choose_unit(len(objects))
 
     def share(episodes: np.ndarray) -> Interval:
         return rate_intervals(episodes[None], unit)[0]
 
     for (stopped_by, ours), (rule, by) in agent.ways_to_stop(tolerance).items():
-        episodes, count = trace.episodes(rule, by), protocol.episodes
         # A rule that has the paper's bound of the norm for 0.1 rad has no other of its own for it.
         near_rule, _ = near.get((stopped_by, ours), (agent.rules(precise), by))
         held = trace.held.get((rule, by))
         rows.append(
-            Row(
-                policy=agent.policy,
-                kind=agent.kind,
-                sees=agent.sees,
+            row_of(
+                trace.episodes(rule, by),
+                protocol,
+                objects,
+                agent,
                 group=group,
                 condition=condition,
                 stopped_by=stopped_by,
                 rule=rule,
                 ours=ours,
-                protocol=protocol,
-                object_names=names,
-                overall=summarise("all", episodes, protocol, unit),
-                per_object=tuple(
-                    summarise(name, episodes[k * count : (k + 1) * count], protocol, "episode")
-                    for k, name in enumerate(names)
-                ),
                 held=None
                 if held is None
                 else share(_stopped_within(trace, rule, by, trace.exact, tolerance) & (held <= tolerance)),
@@ -308,11 +325,31 @@ def judge(
                 ),
                 precise=share(_stopped_within(trace, near_rule, by, trace.exact, precise)),
                 prediction=_prediction(trace) if by == "predicted" else None,
-                warnings={item.name: "; ".join(item.warnings) for item in objects if item.warnings},
-                episodes=episodes,
             )
         )
     return rows
+
+
+def row_of(
+    episodes: tuple[Episode, ...], protocol: Protocol, objects: list[Any], agent: Agent, **rest: Any
+) -> Row:
+    """A row from its episodes; ``rest`` are the fields that they do not give."""
+    names, count = tuple(item.name for item in objects), protocol.episodes
+    return Row(
+        policy=agent.policy,
+        kind=agent.kind,
+        sees=agent.sees,
+        protocol=protocol,
+        object_names=names,
+        overall=summarise("all", episodes, protocol, choose_unit(len(objects))),
+        per_object=tuple(
+            summarise(name, episodes[k * count : (k + 1) * count], protocol, "episode")
+            for k, name in enumerate(names)
+        ),
+        warnings={item.name: "; ".join(item.warnings) for item in objects if item.warnings},
+        episodes=episodes,
+        **rest,
+    )
 
 
 def summarise(name: str, episodes: tuple[Episode, ...], protocol: Protocol, unit: Unit) -> Summary:

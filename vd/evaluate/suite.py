@@ -106,8 +106,19 @@ ROBUST = tuple(
         by_camera=name not in ("observation-late", "all-late", "pose-error"),
     )
     for name, changed in CHANGED.items()
+) + tuple(
+    Condition(
+        f"air-{name}",
+        "held-out",
+        20,
+        4,
+        f"goals in the air; {CHANGED[name][0].lower()}{CHANGED[name][1:]}",
+        {"air_goals": True, "condition": name},
+        quick=False,
+    )
+    for name in ("nominal", "mixed")
 )
-"""What ``--suite robust`` runs: one thing changed in each, but in the first four."""
+"""What ``--suite robust`` runs: one thing changed in each, but in the first four and the last."""
 SUITES = {"paper": CONDITIONS, "robust": ROBUST}
 
 

@@ -278,10 +278,12 @@ def robust_table(
             if row is None:
                 continue
             change = NOTHING
-            if nominal not in (None, row):
+            if nominal not in (None, row) and row.in_air is None:
                 change = points(paired_difference(row.successes, nominal.successes, row.overall.unit))
             rates = (row.overall.outcomes["success"], row.precise, row.overall.outcomes["object falls"])
-            success, precise, lost = (share_text(r.value, r.low, r.high) for r in rates)
+            success, precise, lost = (
+                NOTHING if r is None else share_text(r.value, r.low, r.high) for r in rates
+            )
             told = {"condition": condition.name, "changed": condition.shown, "policy": short[policy]}
             figures = {"success": success, "points from nominal": change, "within 0.1 rad": precise}
             table.append(told | figures | {"lost": lost})

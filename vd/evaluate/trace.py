@@ -163,7 +163,6 @@ def record(
         held: What stops is to be held for HOLD_S.
         on_step: Called after every control step.
     """
-    world_object = np.asarray(env.world_object)
     shape = (len(env.objects), episodes)
 
     def blank() -> np.ndarray:
@@ -181,12 +180,7 @@ def record(
         still=np.zeros((*shape, env.max_episode_steps + 1), dtype=bool),
         held={way: np.full(shape, np.nan) for way in held},
     )
-    rounds, drawn = episode_rounds(world_object, *shape), []
-    for numbers in rounds:
-        chosen = world_object, np.maximum(numbers, 0)
-        env.reset(*(None if quat is None else quat[chosen].astype(np.float32) for quat in (starts, goals)))
-        drawn.append(env.state_dict())
-    for numbers, state in zip(rounds, drawn, strict=True):
+    for numbers, state in drawn_rounds(env, episodes, starts, goals):
         if table_steps is not None:
             env.sim.place_table(present=True)
         env.load_state_dict(state)
@@ -196,6 +190,41 @@ def record(
     return trace
 
 
+def drawn_rounds(
+    env: Any, episodes: int, starts: np.ndarray | None, goals: np.ndarray | None
+) -> list[tuple[np.ndarray, dict[str, Any]]]:
+    """Episode number of each environment, -1 for none [N], and its state at the begin, for every round."""
+    world_object, drawn = np.asarray(env.world_object), []
+    for numbers in episode_rounds(world_object, len(env.objects), episodes):
+        chosen = world_object, np.maximum(numbers, 0)
+        env.reset(*(None if quat is None else quat[chosen].astype(np.float32) for quat in (starts, goals)))
+        drawn.append((numbers, env.state_dict()))
+    return drawn
+
+
+def motion_of(env: Any, *, copy: bool = False) -> dict[str, torch.Tensor]:
+    """What moves, with a row for each environment, sharing the environment's memory or copied."""
+    found = {}
+    for name, array in env.motion().items():
+        rows = wp.to_torch(array).view(env.num_envs, -1)
+        rows = rows.view(torch.int32) if rows.dtype == torch.uint32 else rows  # the other has no index
+        found[name] = rows.clone() if copy else rows
+    return found
+
+
+def copy_motion(out: dict[str, torch.Tensor], motion: dict[str, torch.Tensor], envs: np.ndarray) -> None:
+    """Copy the motion of some environments, by number, of what :func:`motion_of` gave."""
+    for name, values in motion.items():
+        rows = torch.from_numpy(envs).to(values.device)
+        out[name][rows] = values[rows]
+
+
+def out_of_hand(env: Any) -> np.ndarray:
+    """Whether each object is where it counts as lost, bool [N]; what is not a number is lost too."""
+    away = env.object_pose()[:, :3] - np.array(env.hand.workspace.goal_m)
+    return np.asarray(~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_m))
+
+
 class _Round:
     """One episode in every environment that has one: ``numbers`` [N], place among its object's, else -1."""
 
@@ -203,7 +232,7 @@ class _Round:
         self._env, self._trace, self._numbers, self._table_steps = env, trace, numbers, table_steps
         self._objects = np.asarray(env.world_object)
         # The state in which each way to stop ends an environment, after how many steps; -1: not yet.
-        self._stopped = {way: (np.full(env.num_envs, -1), self._motion(copy=True)) for way in trace.held}
+        self._stopped = {way: (np.full(env.num_envs, -1), motion_of(env, copy=True)) for way in trace.held}
 
     def run(self, policy: Any, on_step: Callable[[], object]) -> None:
         """Go to the ends, then go on from the stops that are to be held."""
@@ -252,15 +281,6 @@ class _Round:
             error = symmetric_error(quat[rows], goal[rows], self._env.objects[k].symmetry)
             trace.error[k, numbers[rows], step] = error
 
-    def _motion(self, *, copy: bool = False) -> dict[str, torch.Tensor]:
-        """What moves, with a row for each environment, sharing the environment's memory or copied."""
-        found = {}
-        for name, array in self._env.motion().items():
-            rows = wp.to_torch(array).view(self._env.num_envs, -1)
-            rows = rows.view(torch.int32) if rows.dtype == torch.uint32 else rows  # the other has no index
-            found[name] = rows.clone() if copy else rows
-        return found
-
     def _keep_stops(self, envs: np.ndarray, step: int) -> None:
         """Keep the states of environments that are stopped after ``step`` steps."""
         place = (*self._place(envs), step)
@@ -270,9 +290,7 @@ class _Round:
             if step == 0 or not len(chosen):
                 continue
             after[chosen] = step
-            for name, live in self._motion().items():
-                rows = torch.from_numpy(chosen).to(live.device)
-                state[name][rows] = live[rows]
+            copy_motion(state, motion_of(self._env), chosen)
 
     def _hold(self, way: Way) -> None:
         """Go on from the stops with the last targets, and write down what came of them."""
@@ -280,7 +298,7 @@ class _Round:
         envs = np.flatnonzero(after >= 0)
         if not len(envs):
             return
-        for name, live in self._motion().items():
+        for name, live in motion_of(env).items():
             live.copy_(state[name])
         lost = np.zeros(len(envs), dtype=bool)
         for step in range(round(HOLD_S * env.cfg.sim.control_hz)):
@@ -290,8 +308,7 @@ class _Round:
                     *(wp.array(count, dtype=wp.int32, device=env.device) for count in counts)
                 )
             env.hold()
-            away = env.object_pose()[envs, :3] - np.array(env.hand.workspace.goal_m)
-            lost |= ~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_m)  # not a number is lost too
+            lost |= out_of_hand(env)[envs]
         place = self._place(envs)
         error = rotation_angle(unit_quats(env.object_pose()[envs, 3:7]), self._trace.goal_quat[place])
         self._trace.held[way][place] = np.where(lost, np.pi, error)

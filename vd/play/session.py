@@ -54,9 +54,9 @@ class Session:
         return self.snapshot
 
     def new_goal(self) -> Snapshot:
-        """Give every environment a new goal; nothing else changes, so policies see it after the next step."""
+        """Give every environment a new goal; nothing else changes."""
         env = self.env
         goals = draw_goals(env.object_pose()[:, 3:7].astype(float), self._rng, env.cfg.goal.max_angle_rad)
-        env.goal_quat.assign(goals.astype(np.float32))
+        env.give_goals(np.arange(env.num_envs), goals)
         self.snapshot = self._watcher.read(stepped=False)[0]
         return self.snapshot

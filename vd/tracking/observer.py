@@ -51,8 +51,6 @@ class Found:
     """[m/s] [N, 3]; zero where it is not known."""
     spin: torch.Tensor
     """Angular velocity [rad/s] [N, 3]; zero where it is not known."""
-    error: torch.Tensor
-    """Angle by which the orientation is expected to be wrong [rad] [N]; zero of known shapes."""
 
 
 class Observer:
@@ -157,7 +155,7 @@ class Observer:
             self._shapes.observe(pose, 0, self._links, wanted, wp.from_torch(observation), first)
         for name, values in parts.items():
             observation[:, self._columns[name]] = values
-        return observation, torch.hypot(angle, found.error)
+        return observation, angle
 
     def _hand_points(self, age: float, senses: Senses) -> torch.Tensor:
         """The hand's own points as they were so long ago [s], base frame [N, H, 3]."""
@@ -188,7 +186,6 @@ class Observer:
             position=base[:3] + rotated(turn, pose[:, :3]),
             velocity=moves * rotated(turn, pose[:, :3] - before[:, :3]),
             spin=moves * 2.0 * rotated(turn, step[:, :3] * step[:, 3:].sign()),  # of a small angle
-            error=followed.error,
         )
         before.copy_(pose)
         return found

@@ -1,0 +1,125 @@
+"""Goal after goal in the air: what is counted; with a test double of the environment."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from fake_env import FakeObject
+from scipy.spatial.transform import Rotation
+from test_evaluate_page import read_page
+from test_evaluate_trace import STEP_RAD, HeldEnv, drawn, protocol
+
+from vd.evaluate.air import air_turns, judge_in_air, record_in_air
+from vd.evaluate.cfg import EvalCfg
+from vd.evaluate.goals import AIR_S
+from vd.evaluate.page import terminal_text, write_page
+from vd.evaluate.result import Agent, Result
+from vd.evaluate.statistics import rotation_angle
+from vd.stopping import StoppingRule
+
+OBJECTS = (FakeObject("a"), FakeObject("b"))
+EPISODES = 4
+
+
+class AirEnv(HeldEnv):
+    """Remembers which goals were given when."""
+
+    def __init__(self, **settings):
+        self.given = []
+        super().__init__(
+            OBJECTS, num_envs=len(OBJECTS) * EPISODES, max_episode_steps=round(12 * AIR_S), **settings
+        )
+
+    def give_goals(self, envs, goal_quat):
+        """As of the environment."""
+        self.given.append((int(self.step_count.numpy().max()), list(envs)))
+        super().give_goals(envs, goal_quat)
+
+
+class Seeker:
+    """Turns every object to its goal by STEP_RAD a step; may predict the distance, by so much too small."""
+
+    def __init__(self, env, blind_rad=None):
+        self.env, self.blind_rad = env, blind_rad
+        if blind_rad is not None:
+            self.predicted = torch.zeros(env.num_envs)
+
+    def act(self, observation):
+        """Turn on."""
+        quat, goal = (Rotation.from_quat(observation[:, i : i + 4].numpy()) for i in (0, 4))
+        turn = (goal * quat.inv()).as_rotvec()
+        angle = np.linalg.norm(turn, axis=1, keepdims=True)
+        if self.blind_rad is not None:
+            self.predicted[:] = torch.as_tensor(angle[:, 0] - self.blind_rad)
+        action = torch.zeros((self.env.num_envs, self.env.num_actions))
+        action[:, :3] = torch.as_tensor(12.0 * turn / np.maximum(angle, 1e-9) * np.minimum(angle, STEP_RAD))
+        wp.to_torch(self.env.smoothed)[:] = 0.5 * action
+        return action
+
+
+def flown(blind_rad=None, **settings):
+    """What became of the episodes, the environment, and where the goals were."""
+    env = AirEnv(**settings)
+    turns = air_turns([item.name for item in OBJECTS], EPISODES, seed=2, max_goal_angle=np.pi)
+    policy, by = Seeker(env, blind_rad), "exact" if blind_rad is None else "predicted"
+    way = StoppingRule(), by
+    trace = record_in_air(env, policy, turns, way, tolerance=0.4, **drawn(OBJECTS, EPISODES))
+    return trace, env, turns
+
+
+def row_of(trace, **agent):
+    """The only row, of a policy that is stopped in its own way."""
+    who = Agent("p", "teacher", "state", lambda _: StoppingRule(), predicts=False, **agent)
+    (row,) = judge_in_air(trace, protocol(EPISODES), list(OBJECTS), who, group="held-out")
+    return row
+
+
+def test_goals_follow_one_another_once_the_table_is_gone():
+    trace, env, turns = flown(lost=(1,))
+    assert env.tables[:2] == [(0, True), (24, False)] and env.tables[-1][1]
+    assert trace.held.all() and (trace.reached == 3).all() and not trace.lost.any()
+    assert env.given[0] == (36, list(range(8))), "all get the first goal at once"
+    assert sum(len(envs) for _, envs in env.given) == 3 * 8 and len(env.given) > 3, "and others as they come"
+    angle = Rotation.from_quat(turns[:, :, 0].reshape(-1, 4)).magnitude().reshape(2, 4)
+    np.testing.assert_allclose(rotation_angle(trace.start_quat, trace.goal_quat), angle, atol=1e-5)
+    np.testing.assert_array_equal(trace.steps, np.maximum(1, np.floor((angle - 0.4) / STEP_RAD) + 1))
+    error = rotation_angle(trace.end_quat, trace.goal_quat)
+    assert trace.stopped.all() and (error < 0.4).all()
+    np.testing.assert_array_equal(trace.let_go, [[0, 1, 0, 0], [0, 0, 0, 0]])
+    row = row_of(trace)
+    assert row.successes.all() and row.in_air.in_a_row.value == 1.0 and row.in_air.let_go == 1 / 8
+
+
+def test_what_is_lost_before_or_after_the_first_goal_was_drawn_is_told_apart(tmp_path):
+    trace, _, _ = flown(fall_at={0: 20, 5: 37})
+    np.testing.assert_array_equal(trace.lost, [[True, False, False, False], [False, True, False, False]])
+    np.testing.assert_array_equal(trace.held, [[False, True, True, True], [True] * 4])
+    row = row_of(trace)
+    assert row.overall.outcomes["success"].value == row.in_air.in_a_row.value == 6 / 8
+    assert row.overall.outcomes["object falls"].value == 2 / 8
+    assert (row.in_air.first, row.in_air.lost) == pytest.approx((6 / 7, 1 / 7))
+    assert np.isnan(trace.let_go[0, 0]) and row.in_air.let_go == 0.0
+    result = Result((row,))
+    write_page(result, tmp_path / "eval.html")
+    for text in (
+        read_page(tmp_path / "eval.html")[0].replace("\N{NO-BREAK SPACE}", " "),
+        terminal_text(result),
+    ):
+        assert "14.3 %" in text and "85.7 %" in text
+    result.write(tmp_path / "eval.json")
+    assert Result.read(tmp_path / "eval.json") == result
+
+
+def test_a_stop_away_from_the_goal_ends_the_row():
+    trace, env, _ = flown(blind_rad=0.5)
+    assert trace.held.all() and len(env.given) == 1 and not trace.lost.any()
+    far = rotation_angle(trace.start_quat, trace.goal_quat) > 1.0
+    assert far.any() and trace.stopped.all() and not trace.reached[far].any()
+    assert row_of(trace).overall.outcomes["orientation error"].value >= far.mean()
+
+
+def test_its_times_are_its_own():
+    for other in ({"in_air": True}, {"episode_s": 3.0}):
+        with pytest.raises(ValueError, match="leave --in-air and --episode-s out"):
+            EvalCfg(policies=("zero",), air_goals=True, **other).validate()
+    assert EvalCfg(air_goals=True).limit_s == 39.0
