@@ -21,7 +21,7 @@ from vd.train.cli import main as train
 from vd.vision.alignment import AlignmentNetwork
 from vd.vision.cfg import AlignmentCfg
 
-TEACHER = "dclaw3-table"
+TEACHER = "dclaw3"
 PLACED = (0.5, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)
 """Where a training put its camera."""
 

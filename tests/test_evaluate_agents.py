@@ -61,7 +61,7 @@ def test_what_is_not_there_is_refused_with_the_names_there_are(tmp_path, capsys)
         assert f"{missing}: no such hand layer" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("policy", ["dclaw4-table", "dclaw4-tracking"])
+@pytest.mark.parametrize("policy", ["dclaw4", "dclaw4-tracking"])
 def test_another_hand_is_refused_before_anything_is_built(policy, tmp_path, capsys, monkeypatch):
     from vd.envs import reorient
     from vd.play.cli import main as play

@@ -90,6 +90,6 @@ def test_the_terminal_shows_every_rule_every_object_of_a_single_policy_and_every
 
 
 def test_names_are_as_short_as_they_can_be():
-    names = ("runs/a/stage1/policy.pt", "runs/a/stage2/policy.pt", "dclaw3-table")
-    assert list(labels(names).values()) == ["stage1", "stage2", "dclaw3-table"]
+    names = ("runs/a/stage1/policy.pt", "runs/a/stage2/policy.pt", "dclaw3")
+    assert list(labels(names).values()) == ["stage1", "stage2", "dclaw3"]
     assert labels(("runs/a/policy.pt",)) == {"runs/a/policy.pt": "a"}

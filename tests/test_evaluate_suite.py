@@ -28,7 +28,7 @@ from vd.evaluate.suite import (
 from vd.evaluate.trace import Episode
 from vd.paper import PAPER, ResultConstants
 
-TEACHER, CAMERA = "dclaw3-table", "dclaw3-tracking"
+TEACHER, CAMERA = "dclaw3", "dclaw3-tracking"
 OBJECTS = ("training=cube", "held-out=cube", "symmetric=cube")
 """Sets that need no authoring; the test double looks at none of them."""
 OF_TEACHERS = [c.name for c in CONDITIONS if c.objects != "validation" and "goals" not in c.settings]

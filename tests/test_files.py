@@ -63,7 +63,7 @@ def test_an_error_of_the_writer_itself_stays_what_it_is(tmp_path):
 
 def test_a_bundle_that_does_not_fit_is_not_there(tmp_path):
     load_hand("dclaw3")  # authored on first use
-    policy = open_policy("dclaw3-table", "cpu")
+    policy = open_policy("dclaw3", "cpu")
     with small_files(LIMIT), pytest.raises(OutputError, match=r"cannot write .*first: File too large"):
         write_bundle(policy, tmp_path / "first")
     assert not list(tmp_path.iterdir())
@@ -104,7 +104,7 @@ def commands(taken: str) -> dict[str, list[str]]:
         "vd-train ": ["student", "--teacher", "dclaw4-cube", "--out", taken],
         "vd-train  ": ["export", "x.pt", f"{taken}/x.pt"],
         "vd-train    ": ["bundle", "dclaw4-cube", f"{taken}/x"],
-        "vd-train     ": ["tracker", "dclaw4-table", "--objects", "cube", "--out", f"{taken}/x.pt"],
+        "vd-train     ": ["tracker", "dclaw4", "--objects", "cube", "--out", f"{taken}/x.pt"],
         "vd-eval": ["zero", "--out", taken],
         "vd-play": ["zero", "--video", f"{taken}/x.mp4"],
         "vd-gap": ["run", "recording", "--out", taken],

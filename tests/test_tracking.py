@@ -236,7 +236,7 @@ def test_what_has_no_checkpoints_does_not_speak_of_resuming(monkeypatch, capsys)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("vd.train.tracker.tracker_command", interrupted)
-    assert vd_train(["tracker", "dclaw3-table"]) == 130
+    assert vd_train(["tracker", "dclaw3"]) == 130
     assert "stopped at once\n" in capsys.readouterr().err
 
 
@@ -331,12 +331,12 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
 
     monkeypatch.setattr("vd.evaluate.compare.run_episodes", spy)
     path = tmp_path / "tracking.pt"
-    flags = ["tracker", "dclaw3-table", "--objects", "cube", "--episodes", "1", "--device", "cpu"]
+    flags = ["tracker", "dclaw3", "--objects", "cube", "--episodes", "1", "--device", "cpu"]
     flags += ["--out", str(path)]
     assert vd_train(flags) == 0
     policy, cfg = load_tracking(path), asked[-1]
     assert policy.spec.calibrated_on == "cube: 1 episodes, goals by points, tolerance 0.4 rad, seed 1000"
-    assert policy.spec.teacher == "dclaw3-table" and policy.spec.precise is not None
+    assert policy.spec.teacher == "dclaw3" and policy.spec.precise is not None
     assert 0.0 < policy.spec.stopping.action_norm < 1.0
     assert cfg.sensor_errors and cfg.goals == "points"
     assert "Of 1 episodes" in capsys.readouterr().out

@@ -198,7 +198,7 @@ def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it
 
 
 def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys):
-    assert find_start("dclaw3-table") == SHIPPED_POLICIES["dclaw3-table"]
+    assert find_start("dclaw3") == SHIPPED_POLICIES["dclaw3"]
     make_runner(tmp_path).learn(1)
     assert find_start(str(tmp_path)) == tmp_path / "checkpoints" / BEST_NAME, "it has the optimiser"
     assert find_start(str(tmp_path / "policy.pt")) == tmp_path / "policy.pt"
@@ -211,7 +211,7 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("name", ["dclaw3-table", "dclaw4-table"])
+@pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])
 def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
     cfg = parse_teacher(["--init", name, "--objects", "cube", "--num-envs", "8"])
     state = load_checkpoint(SHIPPED_POLICIES[name])

@@ -11,7 +11,7 @@ from vd.train.cli import main
 onnxruntime = pytest.importorskip("onnxruntime", reason="pip install 'visual-dexterity[export]'")
 
 
-@pytest.mark.parametrize("name", ["dclaw3-table", "dclaw4-cube"], ids=["state-dependent", "gaussian"])
+@pytest.mark.parametrize("name", ["dclaw3", "dclaw4-cube"], ids=["state-dependent", "gaussian"])
 def test_onnxruntime_gives_the_same_actions_for_any_number_of_worlds(tmp_path, name, capsys):
     assert main(["export", str(SHIPPED_POLICIES[name]), str(tmp_path / "policy.onnx")]) == 0
     assert "the same actions within" in capsys.readouterr().out

@@ -28,16 +28,16 @@ SHARED = Path(os.environ.get("VD_SHARED", ROOT.parent / "shared"))
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 # Evaluations by their name in the reference: what vd-eval is told.
 TEACHERS = {
-    "dclaw3-table": ("dclaw3-table",),
-    "dclaw3-table, mixed": ("dclaw3-table", "--condition", "mixed"),
-    "dclaw4-table": ("dclaw4-table",),
+    "dclaw3": ("dclaw3",),
+    "dclaw3, mixed": ("dclaw3", "--condition", "mixed"),
+    "dclaw4": ("dclaw4",),
     "dclaw4-cube": ("dclaw4-cube",),
-    "dclaw4-air": ("dclaw4-air", "--in-air"),
+    "dclaw4, in the air": ("dclaw4", "--in-air"),
 }
 TRACKING = {
-    "dclaw3-tracking": ("dclaw3-tracking", "dclaw3-table"),
-    "dclaw4-air-tracking": ("dclaw4-air-tracking",),
+    "dclaw3-tracking": ("dclaw3-tracking", "dclaw3"),
     "dclaw4-tracking": ("dclaw4-tracking",),
+    "dclaw4-vision": ("dclaw4-vision", "--goals", "points"),
 }
 EPISODES = {"teachers": 8, "tracking": 2}
 """Of each object; eight by camera would take half an hour."""
@@ -112,7 +112,7 @@ def tasks() -> dict[str, Any]:
 
     found = {f"preset {name}": preset().env for name, preset in PRESETS.items()}
     found |= {f"policy {n}": trained_task(open_teacher(n, "cpu")) for n in {w[0] for w in TEACHERS.values()}}
-    table, four = found["policy dclaw3-table"], found["policy dclaw4-table"]
+    table, four = found["policy dclaw3"], found["policy dclaw4"]
     found |= {f"condition {name}": replace(table, randomisation=drawn) for name, drawn in CONDITIONS.items()}
     for view, base in (("world", table), ("mirrored", table)):
         found[f"view {view} {base.hand}"] = replace(base, observation=replace(base.observation, view=view))

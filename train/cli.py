@@ -11,8 +11,8 @@ USAGE = """usage: vd-train COMMAND [flags]
 
 commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --out runs/first
-  student    learn to see without a mesh          vd-train student --teacher dclaw3-table --objects SET
-  tracker    let it act by a camera, learn nothing vd-train tracker dclaw3-table --objects SET
+  student    learn to see without a mesh          vd-train student --teacher dclaw3 --objects SET
+  tracker    let it act by a camera, learn nothing vd-train tracker dclaw3 --objects SET
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx

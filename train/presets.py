@@ -39,7 +39,7 @@ class TeacherCfg:
     a new run where there is none."""
     init: str | None = None
     """Begin a new run with networks, curriculum and counters of another: the name of an installed policy
-    (dclaw3-table), a policy, a checkpoint or a run's folder. Of a policy without a critic or an optimiser the
+    (dclaw3), a policy, a checkpoint or a run's folder. Of a policy without a critic or an optimiser the
     critic learns alone first. Without --preset its task and its networks are
     this run's defaults. It may have observed less: what is new starts without effect."""
     init_stage: tuple[float, float] | None = None

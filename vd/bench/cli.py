@@ -54,7 +54,7 @@ class SimCommand(Measurement):
 
     envs: tuple[int, ...] = (4096, 8192, 16384)
     """Numbers of environments to measure."""
-    policy: str = "dclaw4-table"
+    policy: str = "dclaw4"
     """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
 
     def run(self) -> int:

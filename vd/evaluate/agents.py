@@ -23,12 +23,16 @@ SHIPPED_POLICIES = {path.stem: path for path in sorted((Path(__file__).parents[1
 REPLACED = {
     "dclaw3-student": "dclaw3-tracking",
     "dclaw4-table-student": "dclaw4-tracking",
-    "dclaw4-student": "dclaw4-air-tracking",
-    "dclaw3-procedural": "dclaw3-table",
+    "dclaw4-student": "dclaw4-tracking",
+    "dclaw4-air-tracking": "dclaw4-tracking",
+    "dclaw3-procedural": "dclaw3",
+    "dclaw3-table": "dclaw3",
+    "dclaw4-table": "dclaw4",
+    "dclaw4-air": "dclaw4",
 }
 """Names of policies that were installed once, and what to take instead."""
 
-DEFAULT_POLICY = "dclaw4-table"
+DEFAULT_POLICY = "dclaw4"
 DEFAULT_HAND = "dclaw4"
 NO_LAYER = "none"
 """What --hand-layer is to be for the hand as it is, whatever the training."""

@@ -38,7 +38,7 @@ class PlayCfg:
     Starts and goals are as trained; without a policy objects drop, and goals are all of SO(3).
 
     The folder of a log that vd-deploy wrote in place of the policy replays that run, all of it, whatever the
-    other settings of the simulation. Without arguments it shows dclaw4-table.
+    other settings of the simulation. Without arguments it shows dclaw4.
     """
 
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = DEFAULT_POLICY
