@@ -1,4 +1,4 @@
-"""vd-assets: name the hands, author objects, import meshes, draw contact sheets."""
+"""vd-assets: name and import hands, author objects, import meshes, draw contact sheets."""
 
 import re
 import sys
@@ -30,6 +30,22 @@ class Hand:
     """Hands; all of them by default."""
     out: Path | None = None
     """Folder to copy them to."""
+
+
+@dataclass(frozen=True)
+class HandImport:
+    """Import a hand from a URDF or MJCF; `vd-assets hand import FILE` is the same.
+
+    Fixed joints are welded; fingers, tips and palm are found, and what the file does not say is guessed and
+    printed. Beside the USD lies a picture, <name>.png. Commands then take the hand by its name.
+    """
+
+    file: tyro.conf.Positional[Path]
+    """URDF or MJCF, with its meshes where it says."""
+    describe: str | None = None
+    """YAML with what the file does not say, or the name of a built-in one: leap, allegro."""
+    out: Path | None = None
+    """Folder to write to; by default one of the asset cache, named after the hand."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +97,7 @@ class Show:
 
 Command = (
     Annotated[Hand, tyro.conf.subcommand("hand")]
+    | Annotated[HandImport, tyro.conf.subcommand("hand-import")]
     | Annotated[Objects, tyro.conf.subcommand("objects")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[Show, tyro.conf.subcommand("show")]
@@ -118,6 +135,19 @@ def run_hand(command: Hand) -> int:
             write_text(target, text)
             path = target
         print(path)
+    return 0
+
+
+def run_hand_import(command: HandImport) -> int:
+    """Import a hand."""
+    from vd.assets_usd.hand_import.importer import import_hand
+    from vd.assets_usd.hand_import.sheet import hand_sheet, joint_table
+
+    done = import_hand(command.file, command.out, command.describe)
+    print("\n".join([*done.notes, *(f"warning: {text}" for text in done.warnings)]))
+    print(joint_table(done.hand, done.sources))
+    hand_sheet(done.hand, done.sources, done.hand.path.with_suffix(".png"))
+    print(f"{done.hand.path}; look at {done.hand.path.with_suffix('.png').name} beside it")
     return 0
 
 
@@ -220,13 +250,18 @@ def run_show(command: Show) -> int:
 @interrupt.command("vd-assets")
 def main() -> int:
     """Run ``vd-assets``; returns the exit status."""
-    command = tyro.cli(Command, prog="vd-assets", description=__doc__)
+    words = sys.argv[1:]
+    if words[:2] == ["hand", "import"]:
+        words[:2] = ["hand-import"]
+    command = tyro.cli(Command, args=words, prog="vd-assets", description=__doc__)
     if isinstance(command, Show):
         check_file(command.out)
     elif command.out is not None:
         check_folder(command.out)
     if isinstance(command, Hand):
         return run_hand(command)
+    if isinstance(command, HandImport):
+        return run_hand_import(command)
     if isinstance(command, Objects):
         return run_objects(command)
     return run_import(command) if isinstance(command, Import) else run_show(command)

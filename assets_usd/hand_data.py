@@ -11,11 +11,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vd.paper import PAPER
-
-BASE_IN_WORLD = (0.0, 0.0, PAPER.scene.hand_height_m, 0.0, 1.0, 0.0, 0.0)
-"""Pose of a hand's base over its table: palm down, turned pi about +y."""
-
 
 class HandError(ValueError):
     """A USD file that is not a hand, or no layer of it; says which file, prim, attribute, and what to do."""
@@ -96,15 +91,17 @@ class CameraModel(Intrinsics):
 
 @dataclass(frozen=True, eq=False)
 class CollisionShape:
-    """A collision primitive.
+    """A convex collider.
 
     Attributes:
         path: Prim path, which is also the label of the shape in Newton.
         link: Index of its link.
-        kind: ``box``, ``sphere``, ``capsule`` or ``cylinder``.
-        size: Half extents of a box; (radius,) of a sphere; (radius, half the length without the caps)
-            of a capsule; (radius, half height) of a cylinder [m]. The last two lie along z of ``frame``.
-        frame: Pose in the link frame [7].
+        kind: ``box``, ``sphere``, ``capsule``, ``cylinder`` or ``hull``.
+        size: Half extents of a box, or of the box around a hull; (radius,) of a sphere; (radius, half the
+            length without the caps) of a capsule; (radius, half height) of a cylinder [m]. The last two lie
+            along z of ``frame``.
+        frame: Pose in the link frame [7]; of a hull that of the box around it.
+        vertices: Corners of a hull in ``frame`` [V, 3] [m]; of other kinds [0, 3].
         friction: Coefficient of (dynamic) friction.
         restitution: Coefficient of restitution.
         stiffness: Newton's contact stiffness.
@@ -118,6 +115,7 @@ class CollisionShape:
     kind: str
     size: tuple[float, ...]
     frame: np.ndarray
+    vertices: np.ndarray
     friction: float
     restitution: float
     stiffness: float
@@ -126,18 +124,52 @@ class CollisionShape:
     fingertip: bool
 
 
+@dataclass(frozen=True)
+class Workspace:
+    """Where a hand handles objects, and which. World frame: z up, table top at z = 0."""
+
+    drop_m: tuple[float, float, float]
+    """Where an object is when an episode starts [m]."""
+    goal_m: tuple[float, float, float]
+    """Where it is handled; an object that is far from there is lost [m]."""
+    fall_m: float
+    """Distance from there at which it is [m]."""
+    size_m: tuple[float, float]
+    """Smallest and largest longest side of an object that fits the hand [m]."""
+
+
+@dataclass(frozen=True)
+class MotorModel:
+    """The motor of a joint: its angle is ``sign * gear * q + offset_rad``."""
+
+    model: str
+    """Name of the maker: ``XM430-W210``."""
+    id: int
+    """On the bus."""
+    sign: float = 1.0
+    """1 or -1: which way it turns."""
+    offset_rad: float = 0.0
+    """Its angle where the joint is at zero [rad], from the middle of its turn."""
+    gear: float = 1.0
+    """Its turns for one of the joint."""
+
+
 @dataclass(frozen=True, eq=False)
 class HandModel:
-    """A hand as read from USD; F fingers, D = 3F joints, L = D + 1 links (``base`` is link 0).
+    """A hand as read from USD; F fingers of 1 to 6 joints, D joints, L = D + 1 links (``base`` is link 0).
 
-    Joints and links are ordered by finger and from the palm: ``f0_j1, f0_j2, f0_j3, f1_j1, ...``.
+    Joints and links are ordered by finger and from the palm: ``f0_j1, f0_j2, ..., f1_j1, ...``. Joints are
+    all that move, those included that follow another one and have no motor.
 
     Attributes:
         name: Name of the hand.
         fingertip: Selected kind of fingertip.
         path: The file it was read from.
         layer: The layer over it with an identified servo model, if any (:mod:`vd.assets_usd.hand_layer`).
-        num_fingers: F.
+        fingers: Each finger's joints, as columns [F].
+        mount: Pose of the base in the world [7].
+        palm: Where the palm looks, a unit vector in the base frame [3].
+        workspace: Where it handles objects.
         link_names: Names of the links [L].
         joint_names: Names of the joints [D].
         joint_parent: Index of each joint's parent link [D].
@@ -152,6 +184,11 @@ class HandModel:
         effort: Torque limits [D] [N m].
         velocity_limit: Speed limits [D] [rad/s].
         armature: Rotor inertia about each axis [D] [kg m^2].
+        start: Angles at the start of an episode [D] [rad].
+        mimic: Joint that each follows, or -1, int [D].
+        mimic_factor: Its angle is that of the joint it follows times this, [D],
+        mimic_offset: plus this [D] [rad].
+        motors: Motor of each joint, as far as the file says it [D].
         servo: Servo model of each joint [D, P], P = PARAMETER_COLUMNS of :mod:`vd.kernels.servo.actuators`:
             drive, speed limit, armature, and every effect that the USD authors; SI units, radians.
         servo_interval: 95 % interval (low, high) of each number of ``servo`` [D, P, 2], NaN where none is
@@ -161,19 +198,23 @@ class HandModel:
         link_inertia: Inertia about the centre of mass in the link frames [L, 3, 3] [kg m^2].
         tip_link: Index of the link of each site [F].
         tip_frame: Pose of each site in its link [F, 7].
-        camera: The depth camera.
-        point_names: What each set of surface samples covers [P]; ``f0_motor, f0_l1, f0_l2, f0_l3, ...``.
-            P = 4F: the palm itself is not sampled, as in the paper's released code.
-        point_link: Link whose frame each set is in [P]; the first motors are fixed to link 0.
+        mounted_camera: The depth camera, if it has one.
+        point_names: What each set of surface samples covers [P]: every link of the fingers, and what the file
+            samples of the base: its first motors (``f0_motor``), not the palm, of D'Claw hands, as in the
+            paper's released code; or all of it (``base``).
+        point_link: Link whose frame each set is in [P].
         link_points: Surface samples [P, 500, 3] [m].
-        shapes: Collision primitives.
+        shapes: Colliders.
     """
 
     name: str
     fingertip: str
     path: Path
     layer: Path | None
-    num_fingers: int
+    fingers: tuple[slice, ...]
+    mount: np.ndarray
+    palm: np.ndarray
+    workspace: Workspace
     link_names: tuple[str, ...]
     joint_names: tuple[str, ...]
     joint_parent: np.ndarray
@@ -188,6 +229,11 @@ class HandModel:
     effort: np.ndarray
     velocity_limit: np.ndarray
     armature: np.ndarray
+    start: np.ndarray
+    mimic: np.ndarray
+    mimic_factor: np.ndarray
+    mimic_offset: np.ndarray
+    motors: tuple[MotorModel | None, ...]
     servo: np.ndarray
     servo_interval: np.ndarray
     link_mass: np.ndarray
@@ -195,16 +241,68 @@ class HandModel:
     link_inertia: np.ndarray
     tip_link: np.ndarray
     tip_frame: np.ndarray
-    camera: CameraModel
+    mounted_camera: CameraModel | None
     point_names: tuple[str, ...]
     point_link: np.ndarray
     link_points: np.ndarray
     shapes: tuple[CollisionShape, ...]
 
     @property
+    def num_fingers(self) -> int:
+        """F."""
+        return len(self.fingers)
+
+    @property
     def num_joints(self) -> int:
         """D."""
         return len(self.joint_names)
+
+    @property
+    def joints_per_finger(self) -> int:
+        """Joints of every finger.
+
+        Raises:
+            HandError: Its fingers differ.
+        """
+        counts = [finger.stop - finger.start for finger in self.fingers]
+        if len(set(counts)) > 1:
+            raise HandError(
+                f"{self.path}: the fingers of {self.name} have {counts} joints; what was asked for needs "
+                "equal fingers: observe goals in the world frame (observation.view), without a camera"
+            )
+        return counts[0]
+
+    @property
+    def actuated(self) -> np.ndarray:
+        """Joints that have a motor, and an action of the policy, int [A]."""
+        return np.flatnonzero(self.mimic < 0)
+
+    @property
+    def camera(self) -> CameraModel:
+        """The depth camera.
+
+        Raises:
+            HandError: It has none.
+        """
+        if self.mounted_camera is None:
+            raise HandError(f"{self.path}: {self.name} has no camera; add the prim base/camera (hand.md)")
+        return self.mounted_camera
+
+    @property
+    def goal_in_base(self) -> np.ndarray:
+        """Where objects are handled, in the base frame [m] [3]."""
+        place = np.array([*self.workspace.goal_m, 0.0, 0.0, 0.0, 1.0])
+        return compose(invert(self.mount), place)[:3]
+
+    @property
+    def down(self) -> np.ndarray:
+        """Down, a unit vector in the base frame [3]."""
+        return np.asarray(Rotation.from_quat(self.mount[3:]).as_matrix().T @ [0.0, 0.0, -1.0])
+
+    @property
+    def palm_up(self) -> bool:
+        """Whether objects rest in the hand."""
+        return bool(self.palm @ self.down < 0.0)
 
     def forward_kinematics(self, q: np.ndarray) -> np.ndarray:
         """Poses of all links in the base frame.

@@ -32,6 +32,8 @@ LAYER_FORMAT = "vd-hand-layer/1"
 """What ``customLayerData`` of a layer says it is."""
 
 NAMESPACE = "vd"
+DESCRIPTION_GROUPS = ("start", "source", "motor")
+"""Attributes ``vd:<group>`` and ``vd:<group>:...`` of joints that describe the hand, not its servo model."""
 BASELINE_GROUP = "baseline"
 """In the place of an effect's name: intervals of the drive, whose values are in USD's own attributes."""
 INTERVAL = ":ci95"
@@ -264,6 +266,8 @@ def _authored(where: str, joint: Usd.Prim) -> Iterator[tuple[str, _Number, bool,
     for attribute in joint.GetAuthoredPropertiesInNamespace(NAMESPACE):
         name = attribute.GetName()
         group = name.split(":")[1]
+        if group in DESCRIPTION_GROUPS:
+            continue
         if group not in _NUMBERS:
             raise HandError(f"{where}: '{name}': no effect is called {group!r}; one of {', '.join(EFFECTS)}")
         known = {number.attribute: (number, False) for number in _NUMBERS[group].values()}

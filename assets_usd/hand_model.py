@@ -8,14 +8,23 @@ pose is a row ``(x, y, z, qx, qy, qz, qw)``.
 
 import math
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import CameraModel, CollisionShape, HandError, HandModel
+from vd.assets_usd.hand_data import (
+    CameraModel,
+    CollisionShape,
+    HandError,
+    HandModel,
+    compose,
+)
+from vd.assets_usd.hand_description import EARLIER_START, Described, xyzw
 from vd.assets_usd.hand_layer import add_layer, read_servo
 
 __all__ = ["CameraModel", "CollisionShape", "HandError", "HandModel", "open_stage", "read_hand"]
@@ -23,8 +32,9 @@ __all__ = ["CameraModel", "CollisionShape", "HandError", "HandModel", "open_stag
 OPTICAL_FROM_USD = Rotation.from_euler("x", 180, degrees=True)
 """A USD camera looks along -z with +y up; the optical frame along +z with +y down."""
 
-LINK_NAME = re.compile(r"f(\d+)_l([1-3])")
-JOINTS_PER_FINGER = 3
+LINK_NAME = re.compile(r"f(\d+)_l(\d+)")
+MAX_JOINTS = 6
+"""Most joints of a finger: of the hands that there are, none has more than five."""
 ORTHONORMAL_TOLERANCE = 1e-5
 """Allowed scale or shear in the transform of a link, above the rounding of single precision."""
 
@@ -55,13 +65,14 @@ def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) 
         raise HandError(f"{path}: the stage has no default prim; set it to the hand's root prim")
     variants = root.GetVariantSet("fingertip")
     kinds = variants.GetVariantNames()
-    if fingertip not in kinds:
+    if fingertip not in kinds and not (not kinds and fingertip == "rigid"):
         raise HandError(
             f"{path}: {root.GetPath()} has no variant {fingertip!r} in its set 'fingertip': "
             f"choose one of {', '.join(kinds) or 'none (add the variant)'}"
         )
     with Usd.EditContext(stage, stage.GetSessionLayer()):
-        variants.SetVariantSelection(fingertip)
+        if kinds:
+            variants.SetVariantSelection(fingertip)
     if layer is not None:
         add_layer(stage, Path(layer))
     return stage
@@ -81,73 +92,50 @@ def read_hand(path: Path, *, fingertip: str = "rigid", layer: Path | None = None
     return _Reader(Path(path), fingertip, None if layer is None else Path(layer)).read()
 
 
-class _Reader:
+class _Reader(Described):
     """One reading of one file; every method raises :class:`HandError`."""
 
     def __init__(self, path: Path, fingertip: str, layer: Path | None):
-        self.path = path
+        super().__init__(path, open_stage(path, fingertip, layer), layer)
         self.fingertip = fingertip
-        self.layer = layer
-        self.stage = open_stage(path, fingertip, layer)
-        self.root = self.stage.GetDefaultPrim()
         self.cache = UsdGeom.XformCache()
-
-    def fail(self, where: Any, what: str, remedy: str) -> HandError:
-        """The error to raise for a prim or a path."""
-        prim = where.GetPath() if isinstance(where, Usd.Prim) else where
-        file = f"{self.path} with the layer {self.layer}" if self.layer else str(self.path)
-        return HandError(f"{file}: {prim}: {what}; {remedy}")
-
-    def prim(self, relative: str) -> Usd.Prim:
-        """The prim at a path below the root."""
-        path = self.root.GetPath().AppendPath(relative)
-        prim = self.stage.GetPrimAtPath(path)
-        if not prim:
-            raise self.fail(path, "the prim is missing", "add it, or export the hand again")
-        return prim
-
-    def value(self, prim: Usd.Prim, attribute: str) -> Any:
-        """The value of an attribute, which must have been authored."""
-        found = prim.GetAttribute(attribute)
-        if not found or not found.HasAuthoredValue():
-            raise self.fail(prim, f"'{attribute}' is not authored", "give it a value")
-        return found.Get()
-
-    def number(self, prim: Usd.Prim, attribute: str, *, positive: bool = False) -> float:
-        """The value of a scalar attribute: finite, and above zero where that is asked for."""
-        number = float(self.value(prim, attribute))
-        if not math.isfinite(number) or (positive and number <= 0.0):
-            wanted = "positive" if positive else "finite"
-            raise self.fail(prim, f"'{attribute}' is {number}", f"it must be {wanted}")
-        return number
 
     def read(self) -> HandModel:
         """The whole hand."""
         self._check_units()
         if not self.root.HasAPI(UsdPhysics.ArticulationRootAPI):
             raise self.fail(self.root, "PhysicsArticulationRootAPI is missing", "apply it to the root prim")
-        fingers = self._fingers()
-        self._refuse_unknown(fingers)
-        order = [(f, i) for f in range(fingers) for i in range(1, JOINTS_PER_FINGER + 1)]
+        counts = self._fingers()
+        self.earlier = self.earlier and set(counts) == {len(EARLIER_START)}
+        self._refuse_unknown(counts)
+        order = [(f, i) for f, count in enumerate(counts) for i in range(1, count + 1)]
         links = ("base", *(f"f{f}_l{i}" for f, i in order))
         joints = [self.prim(f"f{f}_j{i}") for f, i in order]
         bodies = [self.prim(name) for name in links]
         index = {body.GetPath(): i for i, body in enumerate(bodies)}
         masses = [self._mass(body) for body in bodies]
         frames = [self._joint_frames(joint, index) for joint in joints]
-        drives = np.array([self._drive(joint) for joint in joints])
+        mimic = [self.mimic(joint, joints) for joint in joints]
+        drives = np.array(
+            [self._drive(joint, driven=row[0] < 0) for joint, row in zip(joints, mimic, strict=True)]
+        )
+        self.check_mimic(joints, [row[0] for row in mimic])
         baseline = dict(zip(("kp", "kd", "velocity_limit", "inertia"), drives.T[[2, 3, 5, 6]], strict=True))
         servo, servo_interval = read_servo(joints, baseline, self.layer or self.path)
-        tip_prims = [self.prim(f"f{f}_l{JOINTS_PER_FINGER}/f{f}_tip") for f in range(fingers)]
-        points = [(f"f{f}_motor", self.prim(f"base/f{f}_motor_points"), 0) for f in range(fingers)]
-        points += [(links[i], self.prim(f"{links[i]}/points"), i) for i in range(1, len(links))]
-        points.sort(key=lambda entry: (int(entry[0][1 : entry[0].index("_")]), entry[2]))
+        tip_prims = [self.prim(f"f{f}_l{count}/f{f}_tip") for f, count in enumerate(counts)]
+        tips = {prim.GetParent().GetPath() for prim in tip_prims}
+        points = self._point_prims(links)
+        ends = np.cumsum([0, *counts])
+        camera = self.stage.GetPrimAtPath(self.root.GetPath().AppendPath("base/camera"))
         return HandModel(
             name=self.root.GetName(),
             fingertip=self.fingertip,
             path=self.path,
             layer=self.layer,
-            num_fingers=fingers,
+            fingers=tuple(slice(int(a), int(b)) for a, b in pairwise(ends)),
+            mount=self.mount(),
+            palm=self.direction("vd:palm"),
+            workspace=self.workspace(),
             link_names=links,
             joint_names=tuple(joint.GetName() for joint in joints),
             joint_parent=np.array([frame[0] for frame in frames]),
@@ -162,6 +150,11 @@ class _Reader:
             effort=drives[:, 4],
             velocity_limit=drives[:, 5],
             armature=drives[:, 6],
+            start=self.start(joints, drives),
+            mimic=np.array([row[0] for row in mimic]),
+            mimic_factor=np.array([row[1] for row in mimic]),
+            mimic_offset=np.array([row[2] for row in mimic]),
+            motors=self.motors(joints),
             servo=servo,
             servo_interval=servo_interval,
             link_mass=np.array([mass for mass, _, _ in masses]),
@@ -169,11 +162,11 @@ class _Reader:
             link_inertia=np.array([inertia for _, _, inertia in masses]),
             tip_link=np.array([index[prim.GetParent().GetPath()] for prim in tip_prims]),
             tip_frame=np.array([self._relative(prim, prim.GetParent()) for prim in tip_prims]),
-            camera=self._camera(self.prim("base/camera"), bodies[0]),
+            mounted_camera=self._camera(camera, bodies[0]) if camera else None,
             point_names=tuple(name for name, _, _ in points),
             point_link=np.array([link for _, _, link in points]),
             link_points=self._points([prim for _, prim, _ in points]),
-            shapes=tuple(shape for i, body in enumerate(bodies) for shape in self._shapes(body, i)),
+            shapes=tuple(shape for i, body in enumerate(bodies) for shape in self._shapes(body, i, tips)),
         )
 
     def _check_units(self) -> None:
@@ -186,35 +179,57 @@ class _Reader:
             if unit != 1.0:
                 raise self.fail("/", f"'{name}' is {unit}", "author the hand in metres and kilograms")
 
-    def _fingers(self) -> int:
-        """The number of fingers, numbered without gaps."""
-        matches = [LINK_NAME.fullmatch(child.GetName()) for child in self.root.GetChildren()]
-        found = sorted({int(match[1]) for match in matches if match})
-        if not found or found != list(range(len(found))):
+    def _fingers(self) -> list[int]:
+        """Joints of each finger, by the names of its links, which have no gaps."""
+        found: dict[int, list[int]] = {}
+        for child in self.root.GetChildren():
+            if match := LINK_NAME.fullmatch(child.GetName()):
+                found.setdefault(int(match[1]), []).append(int(match[2]))
+        counts = [len(found.get(finger, ())) for finger in range(len(found))]
+        if not counts or 0 in counts or any(sorted(n) != [*range(1, len(n) + 1)] for n in found.values()):
+            names = ", ".join(f"f{f}_l{i}" for f in sorted(found) for i in sorted(found[f])) or "no links"
             raise self.fail(
                 self.root,
-                f"fingers {found} found",
-                "name links f0_l1 to f0_l3, f1_l1 and so on, without gaps",
+                f"fingers {sorted(found)} found, of {names}",
+                "name links f0_l1, f0_l2 and so on from the palm, f1_l1 ..., without gaps",
             )
-        return len(found)
+        if max(counts) > MAX_JOINTS:
+            finger = counts.index(max(counts))
+            raise self.fail(
+                self.root,
+                f"finger {finger} has {max(counts)} joints",
+                f"weld joints until it has {MAX_JOINTS} at most",
+            )
+        return counts
 
-    def _refuse_unknown(self, fingers: int) -> None:
+    def _refuse_unknown(self, counts: list[int]) -> None:
         """Refuse links and joints that the model would leave out."""
-        known = {"base"} | {f"f{f}_{kind}{i}" for f in range(fingers) for kind in "lj" for i in (1, 2, 3)}
-        more = [
-            prim
-            for prim in Usd.PrimRange(self.root)
-            if (prim.HasAPI(UsdPhysics.RigidBodyAPI) or prim.IsA(UsdPhysics.Joint))
-            and not prim.IsA(UsdPhysics.FixedJoint)
-            and not (prim.GetParent() == self.root and prim.GetName() in known)
-        ]
-        if more:
-            names = ", ".join(prim.GetName() for prim in more)
-            raise self.fail(
-                self.root,
-                f"has links or joints besides those of fingers with {JOINTS_PER_FINGER} joints: {names}",
-                f"only such fingers are supported so far; weld what is beyond f0_l{JOINTS_PER_FINGER} to it",
-            )
+        numbers = [f"{i + 1}" for i in range(MAX_JOINTS)]
+        known = {"base"} | {f"f{f}_{k}{i}" for f, n in enumerate(counts) for i in numbers[:n] for k in "lj"}
+        for prim in Usd.PrimRange(self.root):
+            if not (prim.HasAPI(UsdPhysics.RigidBodyAPI) or prim.IsA(UsdPhysics.Joint)):
+                continue
+            if prim.IsA(UsdPhysics.FixedJoint) and not all(
+                prim.GetRelationship(f"physics:body{side}").GetTargets() for side in (0, 1)
+            ):
+                continue  # it fixes the hand to the world
+            if prim.GetParent() != self.root or prim.GetName() not in known:
+                raise self.fail(
+                    prim,
+                    "is a link or joint besides those of the fingers, f0_l1 and f0_j1 and so on",
+                    "rename it if it is a finger's, weld it to its link if it is fixed, or remove it",
+                )
+
+    def _point_prims(self, links: tuple[str, ...]) -> list[tuple[str, Usd.Prim, int]]:
+        """Name, prim and link of the sets of surface samples, as far as links have them."""
+        root = self.root.GetPath()
+        found = [("base", self.stage.GetPrimAtPath(f"{root}/base/points"), 0)]
+        for index, link in enumerate(links[1:], 1):
+            if link.endswith("_l1"):
+                motor = link.replace("_l1", "_motor")
+                found.append((motor, self.stage.GetPrimAtPath(f"{root}/base/{motor}_points"), 0))
+            found.append((link, self.stage.GetPrimAtPath(f"{root}/{link}/points"), index))
+        return [(name, prim, link) for name, prim, link in found if prim]
 
     def _relative(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
         """Pose [7] of a prim in the frame of an ancestor; a scale is dropped, shear is refused."""
@@ -240,7 +255,7 @@ class _Reader:
                 f"'physics:diagonalInertia' is {moments}",
                 "three positive moments, none above the sum of two",
             )
-        axes = Rotation.from_quat(_xyzw(self.value(body, "physics:principalAxes"))).as_matrix()
+        axes = Rotation.from_quat(xyzw(self.value(body, "physics:principalAxes"))).as_matrix()
         return mass, com, axes @ np.diag(moments) @ axes.T
 
     def _axis(self, joint: Usd.Prim) -> np.ndarray:
@@ -262,7 +277,7 @@ class _Reader:
                 raise self.fail(joint, f"'physics:body{side}' is {names}", "point it at one link of the hand")
             links.append(index[targets[0]])
             position = np.array(self.value(joint, f"physics:localPos{side}"), dtype=float)
-            frames.append(np.concatenate([position, _xyzw(self.value(joint, f"physics:localRot{side}"))]))
+            frames.append(np.concatenate([position, xyzw(self.value(joint, f"physics:localRot{side}"))]))
         finger, number = re.findall(r"\d+", joint.GetName())
         child = self.root.GetPath().AppendChild(f"f{finger}_l{number}")
         parent = self.root.GetPath().AppendChild("base" if number == "1" else f"f{finger}_l{int(number) - 1}")
@@ -270,16 +285,16 @@ class _Reader:
             raise self.fail(joint, "joins other links than its name says", f"join {parent} and {child}")
         return links[0], links[1], frames[0], frames[1]
 
-    def _drive(self, joint: Usd.Prim) -> tuple[float, ...]:
-        """Limits, kp, kd, effort, velocity limit and armature, in radians."""
+    def _drive(self, joint: Usd.Prim, *, driven: bool) -> tuple[float, ...]:
+        """Limits, kp, kd, effort, velocity limit and armature, in radians; gains only if ``driven``."""
         lower = self.number(joint, "physics:lowerLimit")
         upper = self.number(joint, "physics:upperLimit")
         if lower >= upper:
             raise self.fail(
                 joint, f"'physics:lowerLimit' {lower} is not below 'physics:upperLimit' {upper}", "swap"
             )
-        stiffness = self.number(joint, "drive:angular:physics:stiffness", positive=True)
-        damping = self.number(joint, "drive:angular:physics:damping", positive=True)
+        stiffness = self.number(joint, "drive:angular:physics:stiffness", positive=driven)
+        damping = self.number(joint, "drive:angular:physics:damping", positive=driven)
         return (
             math.radians(lower),
             math.radians(upper),
@@ -324,11 +339,12 @@ class _Reader:
                     f"'points' has shape {samples.shape}",
                     f"{len(sets[0])} finite points, as many on each link",
                 )
-        return np.stack(sets)
+        return np.stack(sets) if sets else np.zeros((0, 0, 3), dtype=np.float32)
 
-    def _shapes(self, body: Usd.Prim, link: int) -> list[CollisionShape]:
+    def _shapes(self, body: Usd.Prim, link: int, tips: set[Sdf.Path]) -> list[CollisionShape]:
+        """Colliders of a link; only those with fingertips need one."""
         prims = [prim for prim in Usd.PrimRange(body) if prim.HasAPI(UsdPhysics.CollisionAPI)]
-        if not prims:
+        if not prims and body.GetPath() in tips:
             raise self.fail(body, "has no collider", "apply PhysicsCollisionAPI to a primitive below it")
         return [self._shape(prim, body, link) for prim in prims]
 
@@ -336,11 +352,23 @@ class _Reader:
         frame = self._relative(prim, body)
         matrix, _ = self.cache.ComputeRelativeTransform(prim, body)
         scale = np.linalg.norm(np.array(matrix)[:3, :3], axis=1)
-        kind = str(prim.GetTypeName())
+        kind, vertices = str(prim.GetTypeName()), np.zeros((0, 3))
         size: tuple[float, ...]
         if kind == "Cube":
             half = self.number(prim, "size", positive=True) / 2.0
             size = tuple(float(half * s) for s in scale)
+        elif kind == "Mesh":
+            if prim.GetAttribute("physics:approximation").Get() != UsdPhysics.Tokens.convexHull:
+                raise self.fail(
+                    prim,
+                    "'physics:approximation' is not convexHull",
+                    "split the mesh into convex parts and give each PhysicsMeshCollisionAPI with it",
+                )
+            corners = np.array(self.value(prim, "points"), dtype=float) * scale
+            vertices = corners[ConvexHull(corners).vertices]
+            low, high = vertices.min(axis=0), vertices.max(axis=0)
+            frame = compose(frame, np.array([*(low + high) / 2.0, 0.0, 0.0, 0.0, 1.0]))
+            vertices, size = vertices - (low + high) / 2.0, tuple(((high - low) / 2.0).tolist())
         elif kind in ("Sphere", "Capsule", "Cylinder"):
             if np.abs(scale - 1.0).max() > ORTHONORMAL_TOLERANCE:
                 raise self.fail(prim, f"is scaled by {scale}", "put the size into its radius and height")
@@ -350,7 +378,9 @@ class _Reader:
                 upright = np.roll(np.eye(3), "XYZ".index(self.value(prim, "axis")) - 2, axis=1)
                 frame[3:] = (Rotation.from_quat(frame[3:]) * Rotation.from_matrix(upright)).as_quat()
         else:
-            raise self.fail(prim, f"is a {kind}", "collide with a Cube, Sphere, Capsule or Cylinder")
+            raise self.fail(
+                prim, f"is a {kind}", "collide with a Cube, Sphere, Capsule, Cylinder or convex Mesh"
+            )
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
         if not material:
             raise self.fail(prim, "no physics material is bound", "bind one with friction")
@@ -358,9 +388,10 @@ class _Reader:
         return CollisionShape(
             path=str(prim.GetPath()),
             link=link,
-            kind="box" if kind == "Cube" else kind.lower(),
+            kind={"Cube": "box", "Mesh": "hull"}.get(kind, kind.lower()),
             size=size,
             frame=frame,
+            vertices=vertices,
             friction=self.number(surface, "physics:dynamicFriction"),
             restitution=self.number(surface, "physics:restitution"),
             stiffness=self.number(surface, "newton:contactStiffness", positive=True),
@@ -368,9 +399,3 @@ class _Reader:
             gap=self.number(prim, "newton:contactGap"),
             fingertip=surface.GetName() == "fingertip_surface",
         )
-
-
-def _xyzw(quaternion: Gf.Quatf) -> np.ndarray:
-    """A USD quaternion as a unit quaternion xyzw [4], in double precision."""
-    components = np.array([*quaternion.GetImaginary(), quaternion.GetReal()], dtype=float)
-    return np.asarray(components / np.linalg.norm(components))

@@ -1,7 +1,9 @@
-"""Hands by name, as the rest of the project asks for them: USD files of this package, or of anyone."""
+"""Hands by name, as the rest of the project asks for them: of this package, imported, or USD files."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from vd.assets_usd.cache import assets_dir
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
@@ -12,35 +14,43 @@ HANDS = ("dclaw3", "dclaw4")
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 
 
+def imported_folder(name: str) -> Path:
+    """Where a hand of this name is imported to, unless another folder is named."""
+    return assets_dir() / "hands" / name
+
+
 def check_hand_name(name: str) -> None:
     """Refuse a hand that :func:`load_hand` would not find, without reading it.
 
     Raises:
         ValueError: No hand has this name, or there is no such file.
     """
-    if name in HANDS or (name.endswith(USD_SUFFIXES) and Path(name).is_file()):
-        return
-    raise ValueError(
-        f"no hand is called {name!r}: choose one of {', '.join(HANDS)}, or give a hand's USD file"
-    )
+    if not (name.endswith(USD_SUFFIXES) and Path(name).is_file()):
+        hand_usd(name)
 
 
 def hand_usd(name: str) -> Path:
-    """The USD file of a hand of the package.
+    """The USD file of a hand of the package, or of one that was imported.
 
     Raises:
         ValueError: No hand has this name.
     """
-    if name not in HANDS:
-        raise ValueError(f"no hand is called {name!r}: choose one of {', '.join(HANDS)}")
-    return Path(__file__).parent / "usd" / f"{name}.usda"
+    if name in HANDS:
+        return Path(__file__).parent / "usd" / f"{name}.usda"
+    imported = imported_folder(name) / f"{name}.usda"
+    if name.isidentifier() and imported.is_file():
+        return imported
+    raise ValueError(
+        f"no hand is called {name!r}: choose one of {', '.join(HANDS)}, give a hand's USD file, or import "
+        "one (vd-assets hand import)"
+    )
 
 
 def load_hand(name: str, fingertip: str = "rigid", layer: str | Path | None = None) -> "HandModel":
     """Read a hand by name or by the path of its USD.
 
     Args:
-        name: ``dclaw3``, ``dclaw4``, or a file.
+        name: ``dclaw3``, ``dclaw4``, an imported hand, or a file.
         fingertip: Variant of the fingertips, ``rigid`` or ``soft``.
         layer: Layer over the hand with an identified servo model (``identified.usda``).
 

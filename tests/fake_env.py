@@ -33,7 +33,7 @@ class FakeEnv:
         hand=None,
     ):
         self.objects = list(objects)
-        self.hand = hand or SimpleNamespace(name="dclaw3")
+        self.hand = hand or SimpleNamespace(name="dclaw3", workspace=SimpleNamespace(goal_m=(0.0, 0.0, 0.08)))
         self.device = "cpu"
         self.num_envs = n = num_envs
         self.num_actions, self.num_observations = 9, 8

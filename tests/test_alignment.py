@@ -122,19 +122,16 @@ def test_a_first_look_finds_any_rotation_and_later_ones_improve_it():
     torch.testing.assert_close(found.position, torch.full((12, 3), 0.11))
 
 
-def test_another_hypothesis_takes_over_and_a_reset_begins_anew():
+def test_a_reset_begins_anew():
     truth = torch.tensor(Rotation.random(2, random_state=2).as_matrix(), dtype=torch.float32)
     network = NearSighted(truth)
     goal, seen = clouds(torch.arange(2.0))
-    aligner = Aligner(network, goal, SearchCfg(restart_looks=2))
+    aligner = Aligner(network, goal)
     aligner.look(seen)
     network.truth = truth @ Rotation.from_euler("x", 2.0).as_matrix().astype(np.float32)  # it was wrong
     aligner.reset(torch.tensor([True, False]))
     first = turn_angle(aligner.look(seen).rotation.transpose(-1, -2) @ network.truth)
     assert first[0] < 0.2 and first[1] > 0.5
-    for _ in range(60):
-        later = turn_angle(aligner.look(seen).rotation.transpose(-1, -2) @ network.truth)
-    assert later.max() < 0.05
 
 
 def test_a_pose_is_that_of_the_frame_of_the_goals_points():
@@ -153,7 +150,6 @@ def test_a_pose_is_that_of_the_frame_of_the_goals_points():
     found = Rotation.from_quat(finder.pose[:2, 0, 3:].numpy())
     off = (found * Rotation.from_matrix(truth.numpy()).inv()).magnitude()
     assert off.max() < 0.2
-    assert finder.error[1] == pytest.approx(off[1], abs=1e-3) and finder.error[0] > off[0], "an average"
     mean = finder.pose[:2, 0, :3].numpy() + found.apply(0.5 * points.mean(axis=0))
     np.testing.assert_allclose(mean, np.tile([0.11, 0.21, 0.31], (2, 1)), atol=1e-3)
 
@@ -165,24 +161,27 @@ def test_points_are_chosen_evenly_whatever_their_number():
         assert len(often) == count and often.min() >= 512 // count - 1 and often.max() <= 512 // count + 2
 
 
-def test_of_orientations_that_look_alike_one_is_taken_and_stays():
+def test_of_orientations_that_look_alike_one_stays_until_another_fits_better():
     """The network is right about all of four turns."""
     turns = Rotation.from_rotvec(np.outer([0.0, 0.5, 1.0, 1.5], [0.0, 0.0, np.pi])).as_matrix()
-    turns = turns.astype(np.float32)
+    turns, worse = turns.astype(np.float32), torch.zeros(4)
 
     class Alike(NearSighted):
         def compare(self, goal, seen):
             """To the nearest of the turns, with errors that tremble."""
             axes = torch.nn.functional.normalize((goal - goal[:, 3:])[:, :3], dim=-1).transpose(-1, -2)
             left = torch.tensor(turns) @ axes[:, None].transpose(-1, -2)
-            best = left[torch.arange(len(left)), turn_angle(left).argmin(dim=1)]
-            return Residual(best, torch.zeros(len(left), 3), 0.1 + 0.01 * torch.rand(len(left)))
+            nearest = turn_angle(left).argmin(dim=1)
+            error = 0.1 + 0.01 * torch.rand(len(left)) + worse[nearest]
+            return Residual(left[torch.arange(len(left)), nearest], torch.zeros(len(left), 3), error)
 
     goal, seen = clouds(torch.zeros(4))
-    aligner = Aligner(Alike(torch.eye(3)[None]), goal, SearchCfg(kept=3, restart_looks=2))
+    aligner = Aligner(Alike(torch.eye(3)[None]), goal, SearchCfg(kept=24))
     first = aligner.look(seen).rotation
     for _ in range(12):
         torch.testing.assert_close(aligner.look(seen).rotation, first, atol=1e-5, rtol=0.0)
+    worse[:3] = 0.1  # of all but the last
+    torch.testing.assert_close(aligner.look(seen).rotation[0], torch.tensor(turns[3]), atol=1e-5, rtol=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -226,6 +225,16 @@ def test_losses_are_least_at_the_truth_and_fall(scenes):
         runner.optimizer.step()
     assert loss.item() < 0.8 * first
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in runner.network.parameters())
+
+
+def test_goals_turned_by_the_network_keep_their_label(scenes):
+    runner = make_runner(scenes, cfg=replace(QUICK, searched_share=1.0))
+    pairs = runner.pairs()
+    turned = runner.searched(pairs)
+    assert not torch.allclose(turned.rotation, pairs.rotation, atol=1e-2)
+    for name in ("goal", "surface"):
+        place = [getattr(each, name) @ each.rotation.transpose(-1, -2) for each in (pairs, turned)]
+        torch.testing.assert_close(*place, atol=1e-5, rtol=0.0)
 
 
 def test_a_run_measures_goes_on_and_leaves_a_network(scenes, tmp_path):

@@ -44,7 +44,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.interrupt": (),
     "vd.kernels": ("vd.kernels",),
     "vd.warp_quiet": (),
-    "vd.assets_usd": (*LEAVES, "vd.warp_quiet", "vd.kernels", "vd.assets_usd"),
+    "vd.assets_usd": (*LEAVES, "vd.config", "vd.warp_quiet", "vd.kernels", "vd.assets_usd"),
     "vd.sim": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim"),
     "vd.clouds": (*LEAVES, "vd.kernels", "vd.assets_usd"),
     "vd.quaternions": (),

@@ -126,7 +126,7 @@ def test_another_hand_is_refused_by_field(teacher_bundle, hand, capsys):
 
 def test_another_camera_is_refused_unless_the_policy_has_its_own(tmp_path, hand):
     moved = replace(
-        hand, camera=replace(hand.camera, position=hand.camera.position + np.array([0.0, 0.0, 0.02]))
+        hand, mounted_camera=replace(hand.camera, position=hand.camera.position + np.array([0.0, 0.0, 0.02]))
     )
     write_bundle(make_tracking(), tmp_path / "own")
     with pytest.raises(ContractError, match=r"camera\.pose_in_base\[2\] is .*write it for this one"):
@@ -134,7 +134,7 @@ def test_another_camera_is_refused_unless_the_policy_has_its_own(tmp_path, hand)
     write_bundle(make_tracking(PLACED), tmp_path / "placed")
     check_hand(read_contract(tmp_path / "placed"), moved, "it")
     with pytest.raises(ContractError, match=r"camera\.fx is .* here"):
-        zoomed = replace(hand, camera=replace(hand.camera, fx=300.0))
+        zoomed = replace(hand, mounted_camera=replace(hand.camera, fx=300.0))
         check_hand(read_contract(tmp_path / "placed"), zoomed, "it")
 
 

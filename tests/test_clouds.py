@@ -1,5 +1,7 @@
 """Clouds of hands: what is authored in USD, carried by poses that joint positions give."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -7,7 +9,6 @@ import warp as wp
 from vd.assets_usd.hand_data import compose
 from vd.assets_usd.hands import load_hand
 from vd.clouds import HandCloud, HandKinematics
-from vd.sim.scene import hand_mount
 
 
 @pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])
@@ -16,12 +17,12 @@ def test_poses_and_points_are_those_of_the_hand(name, device):
     generator = np.random.default_rng(0)
     q = generator.uniform(hand.lower, hand.upper, (20, hand.num_joints))
     links = generator.permutation(len(hand.link_names) + 2)[: len(hand.link_names)]
-    base = compose(np.array(hand_mount()), np.array([0.1, 0, 0, 0, 0, 0, 1.0]))
-    kinematics = HandKinematics(hand, link_body=links, base=base, device=device)
+    hand = replace(hand, mount=compose(hand.mount, np.array([0.1, 0, 0, 0, 0, 0, 1.0])))
+    kinematics = HandKinematics(hand, link_body=links, device=device)
     body_q = wp.full((20, len(links) + 2), wp.transform(*[np.nan] * 7), dtype=wp.transform, device=device)
     kinematics.write(wp.array(q, dtype=float, device=device), body_q)
     poses, in_base = body_q.numpy(), hand.forward_kinematics(q)
-    expected = compose(base, in_base)
+    expected = compose(hand.mount, in_base)
     np.testing.assert_allclose(poses[:, links, :3], expected[..., :3], atol=1e-6)
     aligned = np.abs(np.sum(poses[:, links, 3:] * expected[..., 3:], axis=-1))
     np.testing.assert_allclose(aligned, 1.0, atol=1e-6)

@@ -17,11 +17,10 @@ from vd.assets_usd.hand_data import HandError, Intrinsics, compose, invert
 from vd.assets_usd.hands import load_hand
 from vd.deploy.camera import calibrate as command
 from vd.deploy.camera.calibrate import CalibrateCfg, calibrate, seat
-from vd.deploy.camera.camera import Frame, object_place
+from vd.deploy.camera.camera import Frame
 from vd.deploy.camera.hand_eye import HandEyeError, Views, marker_corners, refine, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, picture_of
 from vd.deploy.hardware.joints import uncalibrated
-from vd.deploy.hardware.motion import reset_pose
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed (extra: hardware)")
 
@@ -58,7 +57,7 @@ def camera(hand):
 def poses(hand, lens, camera):
     """Joints of the hand, one finger bent after the other to show its marker: of the first, of all."""
     generator = np.random.default_rng(0)
-    waiting = reset_pose(3)
+    waiting = hand.start
     rows = []
     for finger in range(3):
         axes, marker = slice(3 * finger, 3 * finger + 3), seat(hand, finger, camera)
@@ -102,7 +101,7 @@ def views(hand, camera, lens, joints, fingers, *, noise_px=0.0, joint_rad=0.0, s
 
 def misplaced(camera, truth):
     """By how much what is where objects are seems moved to a camera [7] that is at another place [3] [m]."""
-    point = object_place()
+    point = load_hand("dclaw3").goal_in_base
     return compose(camera, compose(invert(truth), np.array([*point, 0.0, 0.0, 0.0, 1.0])))[:3] - point
 
 
@@ -149,7 +148,7 @@ def test_noisy_views_err_as_predicted(hand, camera, lens, poses):
         found = refine(seen, camera, marker)
         covered.append(np.abs(off(camera, found.camera)) < found.half_width)
         errors.append(np.linalg.norm(misplaced(found.camera, camera)))
-        predicted.append(found.point_error(object_place()))
+        predicted.append(found.point_error(hand.goal_in_base))
     share = np.mean(covered)
     assert 0.90 < share < 0.995, share  # 240 correlated components; the sandwich is known to be careful
     assert np.quantile(errors, 0.95) < 1.3 * np.median(predicted)

@@ -11,7 +11,8 @@ from vd.assets_usd.hands import load_hand
 from vd.deploy.camera.camera import Frame, StaleCamera
 from vd.deploy.camera.check_camera import camera_findings
 
-PLACE = load_hand("dclaw3").camera
+HAND = load_hand("dclaw3")
+PLACE = HAND.camera
 
 
 @dataclass
@@ -39,7 +40,7 @@ class Camera:
 
 
 def look(camera: Camera, place=PLACE) -> dict[str, tuple[bool, str]]:
-    found = camera_findings(camera, place, fps=30.0, clock=camera.clock)
+    found = camera_findings(camera, place, HAND.goal_in_base, fps=30.0, clock=camera.clock)
     return {one.what.removeprefix("camera "): (one.ok, one.found) for one in found}
 
 

@@ -22,7 +22,6 @@ from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.hardware import check, home, record
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
 from vd.deploy.hardware.joints import uncalibrated
-from vd.deploy.hardware.motion import reset_pose
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import StoppedError
 from vd.deploy.twin.faults import BEFORE, MOVING, try_fault, try_preflight
@@ -47,7 +46,7 @@ def line(hand, monkeypatch):
     """What commands connect to: motors on a simulated line, where nothing is late on a busy machine."""
     joints = uncalibrated(hand)
     with simulated_bus(hand, joints) as (motors, bus):
-        motors.plant.position[:] = reset_pose(3) + 0.1
+        motors.plant.position[:] = hand.start + 0.1
 
         @contextlib.contextmanager
         def connect(options, **twin_options):
@@ -143,9 +142,9 @@ def test_a_hand_stopped_by_a_signal_ends_its_command_so(line, on_the_way, number
     assert not any(motor.get("torque_enable") for motor in line.motors)
 
 
-def test_home_comes_to_the_reset_pose(line, capsys):
+def test_home_comes_to_the_start_pose(line, hand, capsys):
     assert home.home(home.HomeCfg(port=PORT, yes=True, speed=1.0, safety=QUICK)) == 0
-    np.testing.assert_allclose(line.plant.position, reset_pose(3), atol=0.01)
+    np.testing.assert_allclose(line.plant.position, hand.start, atol=0.01)
     assert "farthest from its place" in capsys.readouterr().out
 
 

@@ -12,7 +12,6 @@ from vd.deploy.hardware.joints import CalibrationError, Joints, read_joints, unc
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.deploy.twin.plant import Drive
 from vd.kernels.servo.actuators import COULOMB_TORQUE
-from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
 MODEL = "XM430-W210"
@@ -47,7 +46,7 @@ def drives(joints: Joints, goal: np.ndarray | None) -> list[Drive]:
 
 def test_the_hand_goes_where_its_motors_drive_and_falls_without_them(hand, turned):
     plant = NewtonHand(hand, turned)
-    reset = np.tile(PAPER.scene.reset_joint_rad, 3)
+    reset = hand.start
     np.testing.assert_allclose(turned.to_joint(plant.read()[0]), reset, atol=1e-6)
     goal = reset + np.tile([0.1, 0.2, 0.3], 3)
     for _ in range(60):
@@ -124,7 +123,7 @@ def test_goals_and_readings_do_not_wait_for_steps(hand, effect):
         hand = replace(hand, servo=servo)
     coarse, fine = (NewtonHand(hand, joints, SimCfg(physics_hz=hz)) for hz in (480.0, 3840.0))
     rng = np.random.default_rng(0)
-    reset = np.tile(PAPER.scene.reset_joint_rad, 3)
+    reset = hand.start
     errors, speeds = [], []
     for step in range(60):
         goal = reset + 0.3 * np.sin(0.4 * step) * np.tile([1.0, 1.0, -1.0], 3)

@@ -14,7 +14,6 @@ from vd.deploy.hardware import check
 from vd.deploy.hardware.connect import MOTOR, Connection
 from vd.deploy.hardware.control_table import MODELS, table
 from vd.deploy.hardware.joints import uncalibrated
-from vd.deploy.hardware.motion import reset_pose
 from vd.deploy.hardware.registers import REGISTERS
 
 FACTORY = {name: item.initial for name, item in table(MODELS[MOTOR]).items()}
@@ -43,7 +42,7 @@ def rig(monkeypatch):
     joints = uncalibrated(hand)
     monkeypatch.setattr(check, "CYCLES", 1)
     with simulated_bus(hand, joints) as (line, bus):
-        line.plant.position[:] = reset_pose(3) + 0.1
+        line.plant.position[:] = hand.start + 0.1
         bus.clock.sleep(0.02)
         yield Rig(hand, joints, line, bus)
 

@@ -14,7 +14,7 @@ from simulated_hand import energised, push, simulated_bus
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.hardware.joints import Joints, uncalibrated
-from vd.deploy.hardware.motion import move, reset_pose
+from vd.deploy.hardware.motion import move
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import WATCH_S, SafeHand, StoppedError
 from vd.deploy.timely import undisturbed
@@ -26,6 +26,7 @@ STEP_S = PERIOD_S + EXCHANGE_S
 HOLD_S = 0.05
 """What a hold may take: two units of the motors' own watchdog, and an exchange. A control period is 83 ms."""
 QUICK = SafetyCfg(hold_s=0.05)
+START = load_hand("dclaw3").start
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def joints(hand) -> Joints:
 @pytest.fixture
 def both(hand, joints):
     with simulated_bus(hand, joints) as (line, bus):
-        line.plant.position[:] = joints.to_motor(reset_pose(3))
+        line.plant.position[:] = joints.to_motor(START)
         bus.clock.sleep(0.01)
         yield line, bus
 
@@ -61,11 +62,11 @@ def bus(both):
 
 def test_it_moves_in_the_joints_frame_and_ends_with_torque_off(bus, line, hand, joints):
     said = []
-    goal = reset_pose(3) + 0.2
+    goal = START + 0.2
     with SafeHand(bus, joints, hand, QUICK, said.append) as safe:
         assert energised(line) == []
         start = safe.arm()
-        np.testing.assert_allclose(start.position, reset_pose(3), atol=0.001)
+        np.testing.assert_allclose(start.position, START, atol=0.001)
         assert len(energised(line)) == 9 and push(line).max() < 0.002
         worst = move(safe, goal, 1.0)
         assert worst.max() < 0.15  # the lag of 0.1 s at 1 rad/s, and a step of the goal
@@ -129,7 +130,7 @@ def run_until_stopped(safe: SafeHand, target: np.ndarray, seconds: float = 5.0) 
     ids=["cable", "heat", "restart", "torque", "starved", "ctrl-c", "hangup"],
 )
 def test_faults_stop_the_hand_in_time_and_are_named(bus, line, hand, joints, fault, reason, found_s):
-    target = reset_pose(3) + 0.3
+    target = START + 0.3
     with SafeHand(bus, joints, hand, QUICK) as safe:
         safe.arm()
         assert run_until_stopped(safe, target, 0.3) == "nothing stopped it"
@@ -151,10 +152,10 @@ def test_on_a_lost_bus_what_presses_on_an_obstacle_is_let_go(bus, line, hand, jo
     with SafeHand(bus, joints, hand, QUICK) as safe:
         safe.arm()
         safe.read()
-        safe.command(reset_pose(3) + 0.3)
+        safe.command(START + 0.3)
         line.plant.blocked[:] = True
         line.faults.lose = 1.0
-        assert "lost the bus" in run_until_stopped(safe, reset_pose(3) + 0.3)
+        assert "lost the bus" in run_until_stopped(safe, START + 0.3)
         assert safe.report.held_s - safe.report.detected_s < HOLD_S
         assert push(line).max() < 0.002
 
@@ -183,7 +184,7 @@ def test_deadlines_and_images_stop_the_hand(bus, hand, joints):
         safe.arm()
         shown = bus.clock.now()
         safe.image_at(shown)
-        assert "image is" in run_until_stopped(safe, reset_pose(3))
+        assert "image is" in run_until_stopped(safe, START)
         assert 0.0 < safe.report.detected_s - shown - QUICK.stale_s < 2 * WATCH_S
     with SafeHand(bus, joints, hand, QUICK) as safe:
         safe.arm()
@@ -195,7 +196,7 @@ def test_a_loop_that_stands_is_stopped_by_the_watchdog(bus, hand, joints):
     with SafeHand(bus, joints, hand, QUICK) as safe:
         safe.arm()
         safe.read()
-        safe.command(reset_pose(3) + 0.3)
+        safe.command(START + 0.3)
         begin = bus.clock.now()
         safe.beat()
         bus.clock.sleep(1.0)
@@ -208,7 +209,7 @@ def test_a_loop_that_stands_is_stopped_by_the_watchdog(bus, hand, joints):
 def test_motors_stop_by_themselves_if_the_driver_dies(bus, line, hand, joints):
     safe = SafeHand(bus, joints, hand, SafetyCfg())  # no block: nothing of ours stops it
     safe.arm()
-    safe.command(reset_pose(3) + 0.3)
+    safe.command(START + 0.3)
     bus.clock.sleep(0.29)
     assert {motor.get("bus_watchdog") for motor in line.motors} == {15}
     bus.clock.sleep(0.03)
@@ -227,7 +228,7 @@ def test_an_exception_stops_the_hand(bus, line, hand, joints):
     with pytest.raises(ZeroDivisionError):
         with SafeHand(bus, joints, hand, QUICK, said.append) as safe:
             safe.arm()
-            safe.command(reset_pose(3) + 0.3)
+            safe.command(START + 0.3)
             _ = 1 / 0
     assert safe.report.held_s - safe.report.detected_s < EXCHANGE_S
     assert energised(line) == [] and said == ["stopped: ZeroDivisionError: division by zero; torque off"]
@@ -236,7 +237,7 @@ def test_an_exception_stops_the_hand(bus, line, hand, joints):
 def test_the_hand_can_be_left_holding(bus, line, hand, joints):
     with SafeHand(bus, joints, hand, SafetyCfg(then="hold")) as safe:
         safe.arm()
-        safe.command(reset_pose(3) + 0.3)
+        safe.command(START + 0.3)
     assert len(energised(line)) == 9
     bus.clock.sleep(0.3)
     assert push(line).max() < 0.002

@@ -17,7 +17,6 @@ from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sensors.depth_cloud import CameraCloud
-from vd.sim.scene import hand_mount
 
 WORLDS = 3
 EDGE_BEND = 0.001
@@ -79,9 +78,9 @@ def test_image_is_that_of_newtons_camera(device, scenes):
     assert np.ptp(seen) > 0.1, "the picture shows a hand, not a table alone"
 
 
-def image_points(camera_model, depth):
+def image_points(hand, depth):
     """World points [H, W, 3] of a depth image at the camera of the USD."""
-    m, mount = camera_model, hand_mount()
+    m, mount = hand.camera, wp.transform(*hand.mount)
     v, u = np.mgrid[: m.height, : m.width] + 0.5
     rays = np.stack([(u - m.cx) / m.fx, (v - m.cy) / m.fy, np.ones_like(u)], axis=-1)
     base = Rotation.from_quat(m.quaternion).apply((rays * depth[..., None]).reshape(-1, 3)) + m.position
@@ -98,7 +97,7 @@ def test_cloud_is_the_crop_of_the_image_in_the_frame_of_the_base(device, scenes)
     assert points.shape == (WORLDS, PAPER.camera.points, 3)
     low, high = PAPER.camera.crop_m
     for world in range(WORLDS):
-        base, in_world = image_points(scene.hand.camera, depth[world].astype(float))
+        base, in_world = image_points(scene.hand, depth[world].astype(float))
         kept = (depth[world] > 0) & (in_world[..., 2] >= low) & (in_world[..., 2] <= high)
         assert abs(kept.sum() - count[world]) <= 2, "single precision at the crop's edge"
         assert 1000 < count[world] < PAPER.camera.points
@@ -175,7 +174,7 @@ def test_clouds_do_not_know_that_the_camera_has_moved(device, scenes):
         away = moved[world] - nominal
         turn, place = Rotation.from_quat(base[world, 3:]), base[world, :3]
         depth = host(camera.depth)[world].astype(float)
-        seen = image_points(scene.hand.camera, depth)[0][depth > 0]
+        seen = image_points(scene.hand, depth)[0][depth > 0]
         assert cKDTree(seen).query(cloud)[0].max() < 1e-5
         assert np.median(cKDTree(seen + away).query(cloud)[0]) > 1e-4, "it would lie elsewhere"
         heights = (turn.apply(cloud) + place)[:, 2]
@@ -229,7 +228,7 @@ def test_a_real_cameras_image_makes_the_same_cloud(device, scenes):
     scene, state = scenes(device)
     simulated = make(scene, state)
     simulated.capture()
-    real = CameraCloud(scene.hand.camera, device=device)
+    real = CameraCloud(scene.hand.camera, scene.hand.mount, device=device)
     points, count = real.make(host(simulated.depth)[0])
     assert host(count)[0] == host(simulated.count)[0]
     np.testing.assert_allclose(host(points)[0], host(simulated.points)[0], atol=1e-6)

@@ -169,7 +169,7 @@ def test_a_success_gives_a_new_goal_without_a_reset():
     assert (env.step_count.numpy() == 3).all(), "the episode goes on"
     after = env.goal_quat.numpy()
     assert not np.allclose(before, after)
-    columns = teacher_observation_slices(3)["goal_orientation"]
+    columns = teacher_observation_slices(3, 9)["goal_orientation"]
     assert np.allclose(env.observation.numpy()[:, columns], after), "the observation shows the new goal"
 
 
@@ -191,7 +191,7 @@ def test_time_out_resets_and_says_so():
     run(env, 1)
     assert env.timed_out.numpy().all() and env.done.numpy().all()
     assert (env.step_count.numpy() == 0).all()
-    columns = teacher_observation_slices(3)["joint_velocity"]
+    columns = teacher_observation_slices(3, 9)["joint_velocity"]
     assert np.abs(env.observation.numpy()[:, columns]).max() == 0.0, "the observation is of the new episode"
 
 
@@ -302,11 +302,11 @@ def test_the_shape_is_seen_behind_the_state_and_changes_nothing_else(device):
     random = RandomisationCfg(enabled=True, observation_noise_mean=0.0, observation_noise_std=0.0)
     env = make(device, **seeing, randomisation=random)
     run(env, 3)
-    state = teacher_observation_size(3)
+    state = teacher_observation_size(3, 9)
     observation = env.observation.numpy()
     assert env.num_observations == observation.shape[1] == state + shape_observation_size(3)
     slices = shape_observation_slices(3)
-    tips = observation[:, teacher_observation_slices(3)["fingertips"]].reshape(-1, 3, 13)[..., :3]
+    tips = observation[:, teacher_observation_slices(3, 9)["fingertips"]].reshape(-1, 3, 13)[..., :3]
     vectors = SHAPE_UNIT_M * observation[:, state:][:, slices["surface"]].reshape(-1, 3, 3)
     extents = EXTENT_CENTRE_M + SHAPE_UNIT_M * observation[:, state:][:, slices["extent"]]
     pose, goal = env.object_pose(), env.goal_quat.numpy()

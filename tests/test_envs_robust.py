@@ -52,7 +52,7 @@ def test_object_and_hand_are_seen_as_old_as_each_is_and_what_is_true_is_paid(obj
     present = run(make(observation=observation), 7)
     random = late(max(1e-9, object_late * STEP_S), hand_late * STEP_S)
     then = run(make(observation=observation, randomisation=random), 7)
-    parts = teacher_observation_slices(3)
+    parts = teacher_observation_slices(3, 9)
     ages = np.full(present["seen"].shape[2], object_late)
     for name in ("joint_position", "joint_velocity", "fingertips"):
         ages[parts[name]] = hand_late
@@ -81,7 +81,7 @@ def test_the_nearest_surface_is_from_present_fingertips_to_the_late_object():
     exact.sim.joint_q.assign(joint_q[-2])
     exact.sim.body_q.assign(body_q[-1])
     exact.observe()
-    columns = slice(teacher_observation_slices(3)["previous_action"].stop, None)
+    columns = slice(teacher_observation_slices(3, 9)["previous_action"].stop, None)
     exact.goal_quat.assign(env.goal_quat)
     exact.observe()
     np.testing.assert_allclose(
@@ -91,7 +91,7 @@ def test_the_nearest_surface_is_from_present_fingertips_to_the_late_object():
 
 def test_a_latency_between_steps_is_that_of_the_nearest_physics_step():
     env, present = make(randomisation=late(0.4 * STEP_S)), make()
-    parts, q = teacher_observation_slices(3)["object_position"], present.num_actions
+    parts, q = teacher_observation_slices(3, 9)["object_position"], present.num_actions
     past: list[np.ndarray] = []
     present.step = lambda _: present.launch_step()  # a captured graph would not call back
     present.sim.after_physics_step = lambda joint_q, *_: past.append(joint_q.numpy()[:, q : q + 3].copy())
@@ -103,7 +103,7 @@ def test_jitter_makes_the_object_older_in_each_step_by_another_time():
     present = run(make(), 3)["seen"]
     random = late(1e-9, observation_jitter_s=1.9 * STEP_S)
     seen = run(make(randomisation=random), 3)["seen"]
-    parts = teacher_observation_slices(3)
+    parts = teacher_observation_slices(3, 9)
     place, joints = parts["object_position"], parts["joint_position"]
     np.testing.assert_array_equal(seen[..., joints], present[..., joints])
     height = present[:, :, place.start + 2]
@@ -117,7 +117,7 @@ def test_encoders_are_read_late_and_then_seen_late():
     effects = {"read_delay.delay_s": (STEP_S, STEP_S)}
     read = run(make(randomisation=dataclasses.replace(EXACT, effects=effects)), 6)["seen"]
     seen = run(make(randomisation=late(0.0, STEP_S, effects=effects)), 6)["seen"]
-    joints = teacher_observation_slices(3)["joint_position"]
+    joints = teacher_observation_slices(3, 9)["joint_position"]
     np.testing.assert_allclose(seen[2:, :, joints], read[1:-1, :, joints], atol=1e-6)
 
 
@@ -139,7 +139,7 @@ def test_every_episode_draws_its_latency_and_forgets_the_one_before():
     assert after[1] != before[1] and np.array_equal(after[[0, 2]], before[[0, 2]])
     seen = env.observation.numpy()
     start = make().observation.numpy()
-    joints = teacher_observation_slices(3)["joint_position"]
+    joints = teacher_observation_slices(3, 9)["joint_position"]
     np.testing.assert_allclose(seen[1, joints], start[1, joints], atol=1e-6)
 
 
@@ -253,7 +253,7 @@ def test_a_force_gives_its_impulse_in_the_time_it_acts(force_s, share, sim):
 def test_an_object_is_believed_off_by_the_same_all_through_an_episode_and_anew_in_the_next():
     wrong = (0.005, 0.1)
     env = make(randomisation=dataclasses.replace(EXACT, object_pose_error=wrong), episode_s=0.5)
-    parts = teacher_observation_slices(3)
+    parts = teacher_observation_slices(3, 9)
     env.step_count.assign(np.array([0, 4, 0], dtype=np.int32))
     errors = []
     for _ in range(3):

@@ -83,7 +83,7 @@ def test_identified_gains_reach_the_solver_without_a_servo(layer):
 def test_the_policy_sees_and_acts_on_what_the_encoder_reports(layer):
     step = SimCfg().control_dt
     env = make(layer(encoder_bias={"bias_rad": 0.05}, read_delay={"delay_s": step}))
-    column = teacher_observation_slices(3)["joint_position"]
+    column = teacher_observation_slices(3, 9)["joint_position"]
     lower, upper = env.hand.lower, env.hand.upper
     past = [joints(env)]
     for _ in range(4):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, compose
+from vd.assets_usd.hand_data import HandModel, compose
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
@@ -19,10 +19,7 @@ DEEP_M = 0.001
 def hand_depth(hand: HandModel, item: ObjectModel, poses: np.ndarray) -> list[float]:
     """How deep a convex part of an object is in a shape of the hand after a reset [m], at poses [n, 7]."""
     spec = mujoco.MjSpec()
-    links = compose(
-        np.array(BASE_IN_WORLD),
-        hand.forward_kinematics(np.tile(PAPER.scene.reset_joint_rad, hand.num_fingers)),
-    )
+    links = compose(hand.mount, hand.forward_kinematics(hand.start))
     for shape in hand.shapes:
         pose = compose(links[shape.link], shape.frame)
         size = [*shape.size, 0.0][:3]
@@ -54,13 +51,13 @@ def test_no_finger_is_inside_an_object_that_starts_in_the_orientation_that_is_as
     poses = env.object_pose()
     np.testing.assert_array_equal(poses[:, 3:], drawn)
     as_drawn = poses.copy()
-    as_drawn[:, :3] = PAPER.scene.object_start_m
+    as_drawn[:, :3] = env.hand.workspace.drop_m
     before, after = (
         np.concatenate([hand_depth(env.hand, o, p[[i]]) for i, o in enumerate(env.objects)])
         for p in (as_drawn, poses)
     )
     assert (before > DEEP_M).mean() > {"dclaw3": 0.25, "dclaw4": 0.01}[hand]
     assert after.max() < DEEP_M
-    away = np.linalg.norm(poses[:, :3] - PAPER.scene.object_start_m, axis=1)
+    away = np.linalg.norm(poses[:, :3] - env.hand.workspace.drop_m, axis=1)
     noise = np.sqrt(3.0) * PAPER.scene.object_start_noise_m
     assert (away < noise + 1e-6)[before < 1e-9].mean() > 0.8, "what is free starts as in the paper"

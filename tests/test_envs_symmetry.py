@@ -34,7 +34,7 @@ def with_signs_of(reference: np.ndarray, observation: np.ndarray, fingers: int) 
     """The observation with the object's quaternions, of either sign, in that of the reference."""
     observation = observation.copy()
     for name in ("object_orientation", "goal_orientation", "relative_orientation"):
-        columns = teacher_observation_slices(fingers)[name]
+        columns = teacher_observation_slices(fingers, 3 * fingers)[name]
         sign = np.sign((observation[:, columns] * reference[:, columns]).sum(axis=1, keepdims=True))
         observation[:, columns] *= sign
     return observation

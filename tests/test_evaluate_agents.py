@@ -27,7 +27,7 @@ def task_of(policy, **changes):
 def test_installed_policies_load_and_act(name):
     policy = open_policy(name, "cpu")
     assert name.split("-")[0] == policy.task["hand"], "the name begins with the hand"
-    layers = policy.teacher if policy.kind == "tracking" else policy
+    layers = policy if policy.kind == "teacher" else policy.teacher
     action = layers.act(torch.zeros(3, layers.num_observations))
     assert action.shape == (3, layers.num_actions) and torch.isfinite(action).all()
     assert not any("/" in item for item in policy.task["objects"]), "a path of the machine it was trained on"

@@ -13,7 +13,6 @@ from vd.gap.chain import GRAVITY_M_S2, chains
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators as servo
-from vd.sim.scene import hand_mount
 
 
 def trajectory(name, command, *, conditions=None, time=None, position=None, joints=None, enabled=None):
@@ -137,7 +136,7 @@ def test_a_finger_droops_as_its_weight_asks(hand):
     (chain,) = chains(data, hand)
     assert chain.joints == ("f1_j1", "f1_j2", "f1_j3") and list(chain.columns) == [1, 2, 0]
     rest = Rollouts(chain, data).predict(chain.start_row[None])[0, -1]
-    down = Rotation.from_quat(np.array(hand_mount())[3:]).inv().apply([0.0, 0.0, -1.0])
+    down = Rotation.from_quat(hand.mount[3:]).inv().apply([0.0, 0.0, -1.0])
 
     def potential(q):
         full = np.zeros(hand.num_joints)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import newton
 import numpy as np
 import pytest
 import trimesh
@@ -164,13 +165,18 @@ def edited(path: Path, folder: Path, change: Callable[[Usd.Stage, str], None]) -
     return copy
 
 
+def prim_at(stage: Usd.Stage, root: str, prim: str) -> Usd.Prim:
+    """The prim below the root, or the root for no name."""
+    return stage.GetPrimAtPath(f"{root}/{prim}" if prim else root)
+
+
 def setting(prim: str, attribute: str, value: object) -> Callable[[Usd.Stage, str], None]:
-    return lambda stage, root: stage.GetPrimAtPath(f"{root}/{prim}").GetAttribute(attribute).Set(value)
+    return lambda stage, root: prim_at(stage, root, prim).GetAttribute(attribute).Set(value)
 
 
 def clearing(prim: str, attribute: str) -> Callable[[Usd.Stage, str], None]:
     def change(stage: Usd.Stage, root: str) -> None:
-        stage.GetPrimAtPath(f"{root}/{prim}").RemoveProperty(attribute)
+        prim_at(stage, root, prim).RemoveProperty(attribute)
 
     return change
 
@@ -190,15 +196,42 @@ def aiming(prim: str, relationship: str, target: str) -> Callable[[Usd.Stage, st
     return change
 
 
-def fourth_joints(stage: Usd.Stage, root: str) -> None:
-    """One more link and joint on each finger, copied from the third."""
-    layer = stage.GetRootLayer()
-    for finger in range(4):
-        for kind in "lj":
-            Sdf.CopySpec(layer, f"{root}/f{finger}_{kind}3", layer, f"{root}/f{finger}_{kind}4")
-        joint = stage.GetPrimAtPath(f"{root}/f{finger}_j4")
-        for side, link in enumerate((3, 4)):
-            joint.GetRelationship(f"physics:body{side}").SetTargets([Sdf.Path(f"{root}/f{finger}_l{link}")])
+def longer(joints: int) -> Callable[[Usd.Stage, str], None]:
+    """The first finger with so many joints, copies of the third; the last bends as much as the one before."""
+
+    def change(stage: Usd.Stage, root: str) -> None:
+        layer = stage.GetRootLayer()
+        for number in range(4, joints + 1):
+            for kind in "lj":
+                Sdf.CopySpec(layer, f"{root}/f0_{kind}3", layer, f"{root}/f0_{kind}{number}")
+            joint = stage.GetPrimAtPath(f"{root}/f0_j{number}")
+            for side in (0, 1):
+                link = Sdf.Path(f"{root}/f0_l{number - 1 + side}")
+                joint.GetRelationship(f"physics:body{side}").SetTargets([link])
+            joint.GetAttribute("vd:motor:id").Set(100 + number)
+        follow(joint, f"{root}/f0_j{joints - 1}")
+
+    return change
+
+
+def follow(joint: Usd.Prim, leader: str) -> None:
+    for name in ("physics:stiffness", "physics:damping"):
+        joint.GetAttribute(f"drive:angular:{name}").Set(0.0)
+    joint.ApplyAPI("NewtonMimicAPI")
+    joint.CreateRelationship("newton:mimicJoint").SetTargets([Sdf.Path(leader)])
+    joint.CreateAttribute("newton:mimicCoef0", Sdf.ValueTypeNames.Float).Set(10.0)
+    joint.CreateAttribute("newton:mimicCoef1", Sdf.ValueTypeNames.Float).Set(0.5)
+
+
+def following_in_turn(stage: Usd.Stage, root: str) -> None:
+    for number in (2, 3):
+        follow(stage.GetPrimAtPath(f"{root}/f0_j{number}"), f"{root}/f0_j{number - 1}")
+
+
+def fixed_link(stage: Usd.Stage, root: str) -> None:
+    joint = UsdPhysics.FixedJoint.Define(stage, f"{root}/weld")
+    joint.CreateBody0Rel().SetTargets([Sdf.Path(f"{root}/base")])
+    joint.CreateBody1Rel().SetTargets([Sdf.Path(f"{root}/f0_l1")])
 
 
 def mesh_collider(stage: Usd.Stage, root: str) -> None:
@@ -209,8 +242,7 @@ def mesh_collider(stage: Usd.Stage, root: str) -> None:
     ("change", "prim", "words"),
     [
         (removing("f1_j2"), "f1_j2", ("missing", "export the hand again")),
-        (removing("f1_l1"), "f1_l1", ("missing",)),
-        (removing("base/camera"), "base/camera", ("missing",)),
+        (removing("f1_l1"), "dclaw4", ("f1_l2", "without gaps")),
         (removing("f0_l3/f0_tip"), "f0_tip", ("missing",)),
         (clearing("f0_j1", "newton:velocityLimit"), "f0_j1", ("newton:velocityLimit", "not authored")),
         (clearing("f0_l2", "physics:mass"), "f0_l2", ("physics:mass", "not authored")),
@@ -229,8 +261,16 @@ def mesh_collider(stage: Usd.Stage, root: str) -> None:
         (aiming("f0_j2", "physics:body1", "f1_l2"), "f0_j2", ("joins other links", "f0_l2")),
         (aiming("f0_j2", "physics:body1", "camera"), "f0_j2", ("physics:body1", "one link")),
         (setting("f0_l2/points", "points", [Gf.Vec3f(0)] * 3), "f0_l2/points", ("points", "(3, 3)")),
-        (fourth_joints, "dclaw4", ("f0_j4", "f3_j4", "3 joints", "supported so far")),
-        (mesh_collider, "f0_l1/visual/servo", ("Mesh", "Capsule")),
+        (longer(7), "dclaw4", ("finger 0 has 7 joints", "weld")),
+        (following_in_turn, "f0_j3", ("follows f0_j2, which follows another",)),
+        (fixed_link, "weld", ("besides those of the fingers", "weld it")),
+        (mesh_collider, "f0_l1/visual/servo", ("physics:approximation", "convex parts")),
+        (setting("f0_j2", "vd:start", 3.0), "f0_j2", ("vd:start", "within its limits")),
+        (setting("f0_j2", "vd:motor:id", 10), "f0_j2", ("vd:motor:id", "another joint's")),
+        (setting("f0_j2", "vd:motor:sign", 0.5), "f0_j2", ("vd:motor:sign", "or -1")),
+        (setting("", "vd:palm", Gf.Vec3d(0)), "dclaw4", ("vd:palm", "direction")),
+        (setting("", "vd:workspace:size", Gf.Vec2d(2, 1)), "dclaw4", ("vd:workspace:size", "smallest first")),
+        (clearing("", "vd:mount:position"), "dclaw4", ("vd:mount:position", "not authored")),
         (lambda stage, root: UsdGeom.SetStageMetersPerUnit(stage, 0.01), "/", ("metersPerUnit", "metres")),
         (lambda stage, root: UsdGeom.SetStageUpAxis(stage, "Y"), "/", ("upAxis", "z up")),
     ],
@@ -248,6 +288,39 @@ def test_broken_hand_is_refused_with_the_reason(
     message = str(caught.value)
     for word in (str(broken), prim, *words):
         assert word in message
+
+
+def test_fingers_may_differ_and_joints_follow_others(tmp_path: Path, four_fingers: HandModel) -> None:
+    hand = read_hand(edited(four_fingers.path, tmp_path, longer(5)))
+    assert hand.fingers == (slice(0, 5), slice(5, 8), slice(8, 11), slice(11, 14))
+    assert hand.joint_names[:6] == ("f0_j1", "f0_j2", "f0_j3", "f0_j4", "f0_j5", "f1_j1")
+    assert hand.num_joints == 14 and hand.link_names[hand.tip_link[0]] == "f0_l5"
+    assert hand.mimic[4] == 3 and (np.delete(hand.mimic, 4) == -1).all()
+    assert (hand.mimic_factor[4], hand.mimic_offset[4]) == pytest.approx((0.5, np.radians(10.0)))
+    assert list(hand.actuated) == [0, 1, 2, 3, *range(5, 14)]
+    builder = newton.ModelBuilder()
+    builder.add_usd(open_stage(hand.path), floating=False)
+    assert builder.joint_mimic_joint[5] == 4, "Newton couples them too; its first joint fixes the base"
+    assert builder.joint_mimic_coeffs[5] == pytest.approx((np.radians(10.0), 0.5))
+
+
+def test_a_file_of_an_earlier_version_is_mounted_as_it_was(tmp_path: Path, four_fingers: HandModel) -> None:
+    def older(stage: Usd.Stage, root: str) -> None:
+        for prim in stage.Traverse():
+            for found in prim.GetAuthoredPropertiesInNamespace("vd"):
+                if prim.GetName() != "camera":
+                    prim.RemoveProperty(found.GetName())
+
+    hand = read_hand(edited(four_fingers.path, tmp_path, older))
+    for name in ("mount", "palm", "start"):
+        np.testing.assert_array_equal(getattr(hand, name), getattr(four_fingers, name))
+    assert hand.workspace == four_fingers.workspace and hand.motors == (None,) * 12
+
+
+def test_a_camera_is_optional_until_it_is_needed(tmp_path: Path, four_fingers: HandModel) -> None:
+    blind = read_hand(edited(four_fingers.path, tmp_path, removing("base/camera")))
+    with pytest.raises(HandError, match=r"broken\.usda: dclaw4 has no camera; add the prim"):
+        blind.camera.at(None)
 
 
 def test_missing_and_foreign_files_are_refused(tmp_path: Path, four_fingers: HandModel) -> None:

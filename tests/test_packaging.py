@@ -18,7 +18,7 @@ from vd.evaluate.agents import SHIPPED_POLICIES
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PACKAGE_DIRS: dict[str, str] = PROJECT["tool"]["setuptools"]["package-dir"]
-MAX_POLICY_BYTES = 3 * 2**20
+MAX_POLICY_BYTES = 5 * 2**20
 
 
 def installed_names() -> set[str]:

@@ -9,7 +9,6 @@ import warp as wp
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.kernels.servo import actuators as servo
-from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import build_scene
 from vd.sim.simulator import Simulator
@@ -17,7 +16,7 @@ from vd.sim.simulator import Simulator
 CFG = dataclasses.replace(SimCfg(), control_hz=60.0)
 HAND = load_hand("dclaw3")
 D = HAND.num_joints
-START = np.tile(PAPER.scene.reset_joint_rad, D // 3).astype(np.float32)
+START = HAND.start.astype(np.float32)
 STEPS = 10
 
 

@@ -45,7 +45,7 @@ def test_free_fall(cube):
     seconds = 0.5
     scene.run(seconds)
     pose, velocity = scene.body(0)
-    fallen = PAPER.scene.object_start_m[2] - pose[0, 2]
+    fallen = -pose[0, 2]
     # Semi-implicit Euler falls one half step further than the closed form.
     assert fallen == pytest.approx(0.5 * GRAVITY * seconds**2, rel=2.0 * CFG.physics_dt / seconds)
     assert velocity[0, 2] == pytest.approx(-GRAVITY * seconds, rel=1e-4)
@@ -114,7 +114,7 @@ def test_step_response_of_a_joint_is_the_pd_closed_form(joint):
     builder = new_builder()
     builder.add_world(world)
     scene = SmallScene(builder, CFG, "cpu")
-    start = np.tile(PAPER.scene.reset_joint_rad, 4).astype(np.float32)
+    start = hand.start.astype(np.float32)
     scene.state.joint_q.assign(start)
     target = start.copy()
     step = 0.2
@@ -189,7 +189,7 @@ def test_energy_does_not_grow(cube):
     """A cube tumbling on the table only loses mechanical energy (samples may ripple by contact springs)."""
     world, builder = new_builder(), new_builder()
     add_table(world, CFG, visible=False)
-    body = add_object(world, cube, CFG, scale=1.0, visuals=False)
+    body = add_object(world, cube, CFG, at=(0.0, 0.0, 0.12), scale=1.0, visuals=False)
     start = world.joint_qd_start[world.joint_child.index(body)]
     world.joint_qd[start : start + 6] = [0.3, 0.1, 0.0, 3.0, -6.0, 2.0]
     builder.add_world(world)
@@ -237,6 +237,6 @@ def test_importing_keeps_every_collider_and_mount():
     state = model.state()
     newton.eval_fk(model, model.joint_q, model.joint_qd, state)
     base = state.body_q.numpy()[0]
-    assert base[:3] == pytest.approx([0.0, 0.0, PAPER.scene.hand_height_m])
+    assert base[:3] == pytest.approx([0.0, 0.0, 0.25])
     down = wp.quat_rotate(wp.quat(*base[3:]), wp.vec3(0.0, 0.0, 1.0))
     assert down[2] == pytest.approx(-1.0)

@@ -36,7 +36,7 @@ from vd.vision.alignment import AlignmentNetwork
 from vd.vision.cfg import AlignmentCfg
 from vd.vision.saved import AlignmentSpec, alignment_export
 
-TRACKERS = [name for name in SHIPPED_POLICIES if name.endswith("-tracking")]
+TRACKERS = [name for name in SHIPPED_POLICIES if name.endswith(("-tracking", "-vision"))]
 WORLDS = 12
 EXACT = RandomisationCfg(enabled=False)
 CLOSE_RAD = 0.15
@@ -87,7 +87,10 @@ def test_it_observes_what_its_teacher_does(env):
     """All but the object is the environment's own; the object is found near where it is."""
     senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()), observer_of(env)
     observed, angle = observer(replace(senses.read(), fresh=torch.ones(3, dtype=torch.bool)))
-    true, columns = wp.to_torch(env.world_observation), teacher_observation_slices(env.num_fingers)
+    true, columns = (
+        wp.to_torch(env.world_observation),
+        teacher_observation_slices(env.num_fingers, env.num_actions),
+    )
     for name in ("joint_position", "joint_velocity", "fingertips", "previous_action"):
         torch.testing.assert_close(observed[:, columns[name]], true[:, columns[name]], atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(
@@ -139,7 +142,7 @@ def teacher(request):
     hand, view = request.param.split()
     observation = ObservationCfg(view=view)
     task = ReorientCfg(hand=hand, objects=("cube",), num_envs=1, observation=observation)
-    columns = teacher_observation_slices(load_hand(hand).num_fingers)
+    columns = teacher_observation_slices(load_hand(hand).num_fingers, load_hand(hand).num_joints)
     spec = PolicySpec(
         columns["previous_action"].stop, columns["joint_position"].stop, (16, 8), "elu", "gaussian", True
     )
@@ -165,7 +168,7 @@ def observations(teacher: TrainedPolicy, angle: torch.Tensor) -> torch.Tensor:
     world = torch.randn(WORLDS, teacher.num_observations)
     half = 0.5 * angle[:, None]
     axis = torch.nn.functional.normalize(torch.randn(WORLDS, 3), dim=-1)
-    columns = teacher_observation_slices(teacher.num_actions // 3)
+    columns = teacher_observation_slices(teacher.num_actions // 3, teacher.num_actions)
     world[:, columns["relative_orientation"]] = torch.cat([half.sin() * axis, half.cos()], dim=-1)
     return world
 
@@ -179,7 +182,7 @@ def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_ca
     decision, maps = tracker.step(None), tracker._maps
     assert torch.equal(decision.angle, angle)
     seen = world if maps is None else maps.take(world, maps.choose(world))
-    told, columns = seen.clone(), teacher_observation_slices(teacher.num_actions // 3)
+    told, columns = seen.clone(), teacher_observation_slices(teacher.num_actions // 3, teacher.num_actions)
     for name in UNSEEN:
         told[:, columns[name]] = teacher.network.offset[:, columns[name]]
     action = teacher.act(told)
@@ -192,11 +195,12 @@ def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_ca
 def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
     path = SHIPPED_POLICIES[name]
     policy = load_tracking(path)
-    assert sees_clouds(open_policy(name, "cpu")) and is_tracking(path) and path.stat().st_size < 2.6e6
+    assert sees_clouds(open_policy(name, "cpu")) and is_tracking(path) and path.stat().st_size < 5.2e6
     assert policy.spec.calibrated_on and "/" not in policy.spec.teacher + policy.spec.calibrated_on
-    teacher = load_policy(find_policy(policy.spec.teacher))
-    observation = torch.randn(5, teacher.num_observations)
-    assert torch.equal(policy.teacher.act(observation), teacher.act(observation))
+    if policy.kind == "tracking":  # the layers of others may be of a teacher that is not installed
+        teacher = load_policy(find_policy(policy.spec.teacher))
+        observation = torch.randn(5, teacher.num_observations)
+        assert torch.equal(policy.teacher.act(observation), teacher.act(observation))
 
 
 def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):

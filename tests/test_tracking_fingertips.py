@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel
+from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
@@ -19,7 +19,6 @@ from vd.kernels.task.observations import FINGERTIP_VALUES, teacher_observation_s
 from vd.tracking.fingertips import Fingertips
 
 HANDS = ("dclaw3", "dclaw4")
-BASE = BASE_IN_WORLD
 STEP_S = 1e-5
 """Step of the differences that velocities are compared with [s]."""
 
@@ -28,8 +27,8 @@ hand_named = cache(load_hand)
 
 def oracle(hand: HandModel, joint_q: np.ndarray) -> list[tuple[np.ndarray, Rotation]]:
     """Places and orientations of the tips in the world [G] of joint positions [D]."""
-    poses, mount = hand.tip_poses(joint_q), Rotation.from_quat(BASE[3:])
-    return [(BASE[:3] + mount.apply(pose[:3]), mount * Rotation.from_quat(pose[3:])) for pose in poses]
+    poses, mount = hand.tip_poses(joint_q), Rotation.from_quat(hand.mount[3:])
+    return [(hand.mount[:3] + mount.apply(pose[:3]), mount * Rotation.from_quat(pose[3:])) for pose in poses]
 
 
 @pytest.mark.parametrize("name", HANDS)
@@ -60,7 +59,9 @@ def test_a_teacher_observes_them_so(name):
         env.step(env.action)
     joints = env.num_actions
     position, velocity = (wp.to_torch(state)[:, :joints] for state in (env.sim.joint_q, env.sim.joint_qd))
-    observed = wp.to_torch(env.observation)[:, teacher_observation_slices(env.num_fingers)["fingertips"]]
+    observed = wp.to_torch(env.observation)[
+        :, teacher_observation_slices(env.num_fingers, env.num_actions)["fingertips"]
+    ]
     tips = Fingertips(env.hand)
     torch.testing.assert_close(tips(position, velocity), observed, atol=2e-5, rtol=1e-4)
     env.close()

@@ -1,6 +1,5 @@
 """Point clouds and link poses of hands, from joint positions."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -44,13 +43,12 @@ class HandCloud:
 class HandKinematics:
     """Poses of a hand's links from joint positions, on the device, in place of a simulator's."""
 
-    def __init__(self, hand: HandModel, *, link_body: np.ndarray, base: Sequence[float], device: str):
+    def __init__(self, hand: HandModel, *, link_body: np.ndarray, device: str):
         """Put the joints on the device.
 
         Args:
             hand: The hand.
             link_body: Column of each link in the poses, base first, shape [L].
-            base: Pose of the base in the world frame: position [m], quaternion xyzw, [7].
             device: Warp device.
         """
         self.device = device
@@ -65,7 +63,7 @@ class HandKinematics:
         joints.parent_frame = array(hand.joint_parent_frame, wp.transform)
         joints.child_frame = array(hand.joint_child_frame, wp.transform)
         self._joints, self._base_body = joints, int(link_body[0])
-        self._base = wp.transform(*(float(value) for value in base))
+        self._base = wp.transform(*(float(value) for value in hand.mount))
 
     def write(self, joint_q: wp.array, body_q: wp.array) -> None:
         """Write link poses in the world frame, shape [N, B], for positions [rad], shape [N, >= D]."""

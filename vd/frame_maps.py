@@ -28,12 +28,13 @@ class FrameMaps:
         def array(values: object, dtype: torch.dtype) -> torch.Tensor:
             return torch.as_tensor(values).to(device=device, dtype=dtype)
 
-        tables = symmetry_frames(hand, replace(seen, dynamics="none"), seen.view)  # of what the actor reads
+        actors = replace(seen, dynamics="none")  # what a critic is told besides, only a simulator knows
+        tables = symmetry_frames(hand, actors, seen.view)
         self._source, self._joints = (array(v, torch.long) for v in (tables.source, tables.joints))
         self._factor, self._offset, self._sign, self._sector = (
             array(v, torch.float32) for v in (tables.factor, tables.offset, tables.sign, tables.sector)
         )
-        self._turn = teacher_observation_slices(hand.num_fingers)["relative_orientation"]
+        self._turn = teacher_observation_slices(hand.num_fingers, hand.num_joints)["relative_orientation"]
 
     def choose(self, observation: torch.Tensor) -> torch.Tensor:
         """Frames [..] of observations [.., O]: the axis of the wanted rotation is in their sector."""

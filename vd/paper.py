@@ -10,8 +10,8 @@ Tags used in ``source(...)``:
 * ``U``: the public four-finger URDF of that code,
 * ``D``: derived from the above; the derivation is in the text.
 
-Dimensions, limits, masses and gains of the hands are not here: they live in
-their USD files, ``assets_usd/usd``, with their sources.
+Dimensions, limits, masses and gains of the hands are not here, nor their mount, start pose and workspace:
+they live in their USD files, ``assets_usd/usd``, with their sources.
 """
 
 from dataclasses import dataclass, field, fields
@@ -40,11 +40,7 @@ class SceneConstants:
     air_table_s: float = source(2.0, "P", "in-air test: the table is taken away after 24 control steps")
     table_size_m: tuple[float, float, float] = source((0.6, 0.6, 0.1), "C", "fixed box")
     table_top_m: float = source(0.0, "C", "table box centred at z = -0.05")
-    hand_height_m: float = source(0.25, "C", "base frame at (0, 0, 0.25), rotated pi about +y")
-    reset_joint_rad: tuple[float, float, float] = source((0.0, 0.8, -1.1), "C", "initial q of every finger")
-    object_start_m: tuple[float, float, float] = source((0.0, 0.0, 0.12), "C", "object reset position")
     object_start_noise_m: float = source(0.01, "C", "uniform, per axis")
-    goal_position_m: tuple[float, float, float] = source((0.0, 0.0, 0.08), "C", "used by the fall test only")
 
 
 @dataclass(frozen=True)
@@ -93,7 +89,7 @@ class SuccessConstants:
     object_speed_m_s: float = source(0.04, "P", "norm of v")
     object_spin_rad_s: float = source(0.5, "P", "norm of omega")
     action_norm: float = source(1.0, "C", "norm of the smoothed action; threshold only in the code")
-    fall_m: float = source(0.15, "P", "p-bar, eq. 5; distance from goal_position_m, not squared")
+    fall_m: float = source(0.15, "P", "p-bar, eq. 5; distance from where objects are handled, not squared")
 
 
 @dataclass(frozen=True)

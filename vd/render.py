@@ -20,9 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
-from vd.sim.scene import TABLE_LABEL, add_object, build_hand, hand_mount, new_builder, show_table
+from vd.sim.scene import TABLE_LABEL, add_object, build_hand, new_builder, show_table
 
 # Packed as the renderer packs its bytes: A B G R. Signed, or its kernel compiles with warnings.
 BACKGROUND = 0xFFEBE1D8 - (1 << 32)
@@ -59,8 +58,8 @@ class Camera:
     def for_hand(hand: HandModel) -> "Camera":
         """The default camera, turned about the vertical to look through the nearest gap between fingers."""
         camera = Camera()
-        tips = hand.tip_poses(np.tile(PAPER.scene.reset_joint_rad, hand.num_fingers))[:, :3]
-        tips = Rotation.from_quat(hand_mount().q).apply(tips)
+        tips = hand.tip_poses(hand.start)[:, :3]
+        tips = Rotation.from_quat(hand.mount[3:]).apply(tips)
         azimuth = np.sort(np.arctan2(tips[:, 1], tips[:, 0]))
         gaps = azimuth + 0.5 * np.diff(azimuth, append=azimuth[0] + 2 * np.pi)
         here = math.atan2(camera.eye[1], camera.eye[0])

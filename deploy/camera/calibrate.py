@@ -18,14 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel, compose, invert
 from vd.config import require
-from vd.deploy.camera.camera import CameraError, object_place
+from vd.deploy.camera.camera import CameraError
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.hardware.answers import BusError
 from vd.deploy.hardware.check import confirm
 from vd.deploy.hardware.connect import HandOptions, connect, read_hand_and_joints
-from vd.deploy.hardware.motion import reset_pose
 from vd.files import check_file
 from vd.paper import PAPER
 
@@ -76,7 +75,7 @@ def calibrate(cfg: CalibrateCfg) -> int:
     views = take(cfg, fingers)
     thought = np.concatenate([hand.camera.position, hand.camera.quaternion])
     found = solve(views, thought, {finger: seat(hand, finger, thought) for finger in fingers})
-    error_m = found.point_error(object_place())
+    error_m = found.point_error(hand.goal_in_base)
     write_layer(cfg.out, hand, found, error_m)
     print("\n".join(report(hand, found, views, error_m)))
     print(f"written to {cfg.out}; vd-deploy --camera-layer {cfg.out}")
@@ -143,7 +142,7 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
 
 def seat(hand: HandModel, finger: int, camera: np.ndarray) -> np.ndarray:
     """Pose in the tip's frame [7] of a marker that faces a camera [7] when the hand is at its start."""
-    tip = hand.tip_poses(reset_pose(hand.num_fingers))[finger]
+    tip = hand.tip_poses(hand.start)[finger]
     normal = camera[:3] - tip[:3]
     normal /= np.linalg.norm(normal)
     right = Rotation.from_quat(camera[3:]).apply([1.0, 0.0, 0.0])

@@ -5,8 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, Intrinsics, compose, invert
-from vd.paper import PAPER
+from vd.assets_usd.hand_data import Intrinsics
 
 
 class CameraError(RuntimeError):
@@ -43,9 +42,3 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Stop the camera; no :meth:`read` after this."""
-
-
-def object_place() -> np.ndarray:
-    """Where objects are handled, in the hand's base [m] [3]."""
-    place = np.array([*PAPER.scene.goal_position_m, 0.0, 0.0, 0.0, 1.0])
-    return compose(invert(np.array(BASE_IN_WORLD)), place)[:3]

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vd.assets_usd.hand_data import CameraModel
-from vd.deploy.camera.camera import Camera, CameraError, object_place
+from vd.deploy.camera.camera import Camera, CameraError
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.finding import Finding, finding
 
@@ -27,7 +27,7 @@ DEPTH_SHARE = 0.5
 
 
 def camera_findings(
-    camera: Camera, place: CameraModel, *, fps: float, clock: Clock = MONOTONIC
+    camera: Camera, place: CameraModel, around: np.ndarray, *, fps: float, clock: Clock = MONOTONIC
 ) -> Iterator[Finding]:
     """Look at a camera.
 
@@ -36,6 +36,7 @@ def camera_findings(
     Args:
         camera: The camera, started.
         place: Where it is taken to be, and its range.
+        around: Where objects are handled, in the base frame [m] [3].
         fps: Images a second that it was asked for.
         clock: Time.
     """
@@ -53,8 +54,9 @@ def camera_findings(
     yield Finding("camera streams", True, f"{len(frames)} images of {width} x {height}")
     yield _rate(np.array([frame.time_s for frame in frames]), float(np.median(ages)), fps)
     seen = camera.intrinsics.seen_from(place)
-    yield _lens(seen)
-    yield _depth(np.stack([frame.image for frame in frames]), seen)
+    spot = seen.project(around)
+    yield _lens(seen, spot)
+    yield _depth(np.stack([frame.image for frame in frames]), seen, spot)
 
 
 def _rate(times: np.ndarray, age: float, fps: float) -> Finding:
@@ -69,10 +71,10 @@ def _rate(times: np.ndarray, age: float, fps: float) -> Finding:
     return finding("camera rate", wrong, right)
 
 
-def _lens(seen: CameraModel) -> Finding:
+def _lens(seen: CameraModel, spot: np.ndarray) -> Finding:
     wide = 2.0 * math.degrees(math.atan2(0.5 * seen.width, seen.fx))
     lens = f"{seen.width} x {seen.height}, f {seen.fx:.1f} {seen.fy:.1f} px, {wide:.0f} deg wide"
-    column, row, depth = seen.project(object_place())
+    column, row, depth = spot
     if depth > 0.0 and 0.0 <= column < seen.width and 0.0 <= row < seen.height:
         where = f"the object's place is at {column:.0f}, {row:.0f}, {depth:.2f} m away"
         return Finding("camera lens", True, f"{lens}; {where}")
@@ -80,10 +82,10 @@ def _lens(seen: CameraModel) -> Finding:
     return Finding("camera lens", False, f"{lens}; {remedy}")
 
 
-def _depth(images: np.ndarray, seen: CameraModel) -> Finding:
+def _depth(images: np.ndarray, seen: CameraModel, spot: np.ndarray) -> Finding:
     """Share of the pixels [N, H, W] with depth, in all and where the object is handled."""
     valid = (images >= seen.near) & (images <= seen.far)
-    column, row, depth = seen.project(object_place())
+    column, row, depth = spot
     half = AROUND_M * np.array([seen.fx, seen.fy]) / abs(depth)
     first = np.maximum(np.round(np.array([column, row]) - half), 0).astype(int)
     last = np.maximum(np.round(np.array([column, row]) + half), 0).astype(int)

@@ -313,7 +313,7 @@ def camera_preflight(cfg: CheckCfg, connection: Connection) -> Iterator[Finding]
         return
     with contextlib.closing(camera):
         fps = PAPER.scene.control_hz if twin is not None else cfg.camera.fps
-        yield from camera_findings(camera, place, fps=fps)
+        yield from camera_findings(camera, place, hand.goal_in_base, fps=fps)
 
 
 def check(cfg: CheckCfg) -> int:

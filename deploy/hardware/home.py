@@ -9,7 +9,7 @@ import tyro
 from vd.config import require
 from vd.deploy.hardware.check import ready
 from vd.deploy.hardware.connect import HandOptions, connect
-from vd.deploy.hardware.motion import move, reset_pose
+from vd.deploy.hardware.motion import move
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
 
@@ -35,7 +35,7 @@ def home(cfg: HomeCfg) -> int:
     """Move; 1 if the hand did not come there."""
     require(cfg, "--", "positive", "speed")
     with connect(cfg) as connection:
-        pose = reset_pose(connection.hand.num_fingers)
+        pose = connection.hand.start
         ready(connection, f"The hand will move to its start at {cfg.speed:g} rad/s.", yes=cfg.yes)
         with SafeHand(connection.bus, connection.joints, connection.hand, cfg.safety) as safe:
             safe.arm()

@@ -5,17 +5,11 @@ import math
 import numpy as np
 
 from vd.deploy.safety.safety import SafeHand
-from vd.paper import PAPER
 
 MOVE_S = 0.04
 """Time between the goals of a slow movement."""
 SETTLE_STEPS = 10
 """Steps at its end."""
-
-
-def reset_pose(fingers: int) -> np.ndarray:
-    """Angles of the joints at the start of an episode [rad], shape [3 F]."""
-    return np.tile(np.asarray(PAPER.scene.reset_joint_rad), fingers)
 
 
 def move(safe: SafeHand, goal: np.ndarray, speed: float) -> np.ndarray:

@@ -168,7 +168,7 @@ class ControlLoop:
         if rule.stops(np.array(distance), np.array(np.linalg.norm(sensed.smoothed))) and not first:
             return "stopped"
         if sensed.object_pose is not None:
-            away = np.linalg.norm(sensed.object_pose[:3] - np.array(PAPER.scene.goal_position_m))
+            away = np.linalg.norm(sensed.object_pose[:3] - np.array(self._safe.hand.workspace.goal_m))
             if away > PAPER.success.fall_m:
                 return "lost"
         return ""

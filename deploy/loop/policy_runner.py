@@ -110,7 +110,9 @@ class TrackingRunner(PolicyRunner):
         super().__init__(trained_task(policy), policy.spec.rule_for(tolerance_rad))
         self.kind = policy.kind
         self.calibrated, depth = policy.spec.calibrated_for(tolerance_rad), policy.spec.depth
-        self._cloud = partial(CameraCloud, points=depth.points, crop_m=depth.crop_m, seed=seed)
+        self._cloud = partial(
+            CameraCloud, mount=hand.mount, points=depth.points, crop_m=depth.crop_m, seed=seed
+        )
         self._tracker_of = partial(Tracker, policy, hand, [item])
         self._fresh = True
         self.look_by(hand.camera.at(policy.spec.camera))

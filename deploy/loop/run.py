@@ -20,7 +20,7 @@ from vd.deploy.camera.camera import Camera
 from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.finding import Finding
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
-from vd.deploy.hardware.motion import MOVE_S, move, reset_pose
+from vd.deploy.hardware.motion import MOVE_S, move
 from vd.deploy.hardware.registers import D_GAIN, P_GAIN
 from vd.deploy.loop.run_page import goal_results, summary_line, write_page
 from vd.deploy.safety.limits import SafetyCfg
@@ -181,7 +181,7 @@ def _pursue(
     from vd.deploy.loop.loop import ControlLoop, summary
 
     hand, twin, hz = connection.hand, connection.twin, runner.task.sim.control_hz
-    pose = reset_pose(hand.num_fingers)
+    pose = hand.start
     with contextlib.ExitStack() as stack:
         camera: Camera | None = None
         seen: Iterable[Finding] = ()
@@ -190,7 +190,9 @@ def _pursue(
             stack.callback(camera.close)
             where = runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
             runner.look_by(camera.intrinsics.seen_from(where))
-            seen = camera_findings(camera, runner.camera, fps=cfg.camera.fps if twin is None else hz)
+            seen = camera_findings(
+                camera, runner.camera, hand.goal_in_base, fps=cfg.camera.fps if twin is None else hz
+            )
         warm_up(runner, pose, goals[0], camera)
         stack.enter_context(undisturbed(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals."

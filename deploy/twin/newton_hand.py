@@ -17,7 +17,6 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.deploy.hardware.joints import Joints
 from vd.deploy.twin.plant import P_GAIN_UNIT, Drive
 from vd.kernels.task.actions import limit_joint_velocity_kernel
-from vd.paper import PAPER
 from vd.sim.actuators import JointServo, has_effects
 from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
@@ -61,7 +60,7 @@ class NewtonHand:
         self._state, self._next = self._model.state(), self._model.state()
         self._control = self._model.control()
         self._axes = hand.num_joints
-        self._target = np.tile(PAPER.scene.reset_joint_rad, hand.num_fingers)
+        self._target = hand.start
         self._held = np.full(self._axes, np.nan, dtype=np.float32)
         self._limits = wp.zeros(self._axes, dtype=float, device="cpu")
         self._pair_s, self._rest = 2.0 * cfg.physics_dt, 0.0
@@ -104,7 +103,7 @@ class NewtonHand:
 
     def place_object(self, quat: Sequence[float]) -> None:
         """Put the object where an episode starts, at rest, turned as wanted (xyzw); it falls from there."""
-        self._write(self._state.joint_q, [*PAPER.scene.object_start_m, *quat], self._axes)
+        self._write(self._state.joint_q, [*self.hand.workspace.drop_m, *quat], self._axes)
         self._write(self._state.joint_qd, np.zeros(6), self._axes)
         # The solver warm-starts from the last accelerations, which mean nothing after a jump.
         self._solver.reset(self._state, flags=newton.StateFlags(0))

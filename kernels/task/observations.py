@@ -1,7 +1,7 @@
 """The teacher's observation: state of hand and object, goal, previous action, with sensor noise.
 
-World frame (z up), metres, radians, quaternions xyzw. G fingers, D = 3 G joints; O = 22 G + 21 values:
-the paper's 19 G + 21 and the previous action.
+World frame (z up), metres, radians, quaternions xyzw. G fingers, D joints; O = 3 D + 13 G + 21 values: of the
+paper's hands, with three joints a finger, 19 G + 21 and the previous action.
 """
 
 import warp as wp
@@ -12,14 +12,12 @@ from vd.kernels.transforms import canonical, rotation_difference
 
 wp.set_module_options({"enable_backward": False})
 
-JOINTS_PER_FINGER = 3
 FINGERTIP_VALUES = 13
 """Position 3, quaternion 4, linear velocity 3, angular velocity 3."""
 
 
-def teacher_observation_slices(fingers: int) -> dict[str, slice]:
-    """Columns of each part of the observation, in order, for a hand of ``fingers`` fingers."""
-    joints = JOINTS_PER_FINGER * fingers
+def teacher_observation_slices(fingers: int, joints: int) -> dict[str, slice]:
+    """Columns of each part of the observation, in order, for a hand of so many fingers and joints in all."""
     sizes = {
         "joint_position": joints,
         "joint_velocity": joints,
@@ -35,9 +33,9 @@ def teacher_observation_slices(fingers: int) -> dict[str, slice]:
     return consecutive(sizes)
 
 
-def teacher_observation_size(fingers: int) -> int:
-    """Number of values in the observation: 22 G + 21."""
-    return teacher_observation_slices(fingers)["previous_action"].stop
+def teacher_observation_size(fingers: int, joints: int) -> int:
+    """Number of values in the observation: 3 D + 13 G + 21."""
+    return teacher_observation_slices(fingers, joints)["previous_action"].stop
 
 
 @wp.struct

@@ -45,7 +45,7 @@ def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
         "body_qd": draw(floats((worlds, bodies, 6), -3, 3)),
         "goal": draw(goals(orientation)),
         "smoothed": draw(floats((worlds, joints), -1, 1)),
-        "offset": draw(floats((worlds, teacher_observation_size(fingers)), -0.01, 0.01)),
+        "offset": draw(floats((worlds, teacher_observation_size(fingers, 3 * fingers)), -0.01, 0.01)),
     }
 
 
@@ -63,7 +63,7 @@ def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=T
     model = [scene[name] for name in ("lower", "upper", "tip_body", "tip_offset", "body_com")]
     names = ["measured_q", "measured_qd", "q", "qd", "body_q", "body_qd", "goal", "smoothed", "offset"]
     inputs = [*model, params, *(scene[name] for name in names), rng]
-    shape = (worlds, teacher_observation_size(len(scene["tip_body"])))
+    shape = (worlds, teacher_observation_size(len(scene["tip_body"]), 3 * len(scene["tip_body"])))
     return launch(teacher_observation_kernel, worlds, inputs, device, shape)[0], rng.numpy()
 
 
@@ -104,8 +104,8 @@ def expected_observation(scene):
 
 def measured(fingers):
     """Mask of the columns that a sensor measures."""
-    slices = teacher_observation_slices(fingers)
-    mask = np.ones(teacher_observation_size(fingers), bool)
+    slices = teacher_observation_slices(fingers, 3 * fingers)
+    mask = np.ones(teacher_observation_size(fingers, 3 * fingers), bool)
     mask[slices["goal_orientation"]] = False
     mask[slices["previous_action"]] = False
     return mask
@@ -119,7 +119,7 @@ def test_observation_matches_the_oracle(device, scene, file_axes):
     expected = expected_observation(scene)
     mask = measured(len(scene["tip_body"]))
     expected[:, mask] += scene["offset"][:, mask]
-    slices = teacher_observation_slices(len(scene["tip_body"]))
+    slices = teacher_observation_slices(len(scene["tip_body"]), 3 * len(scene["tip_body"]))
     for name in ("object_orientation", "goal_orientation"):
         expected[:, slices[name]] *= file_axes
     np.testing.assert_allclose(out, expected, rtol=1e-5, atol=1e-5)
@@ -131,7 +131,7 @@ def test_canonical_orientations_do_not_tell_which_quaternion_they_came_from(devi
     scene["offset"][:] = 0.0
     out, _ = observe(device, scene, canonical=True)
     expected = expected_observation(scene)
-    slices = teacher_observation_slices(len(scene["tip_body"]))
+    slices = teacher_observation_slices(len(scene["tip_body"]), 3 * len(scene["tip_body"]))
     for name in ("object_orientation", "goal_orientation", "relative_orientation"):
         for row in expected[:, slices[name]]:
             first = next(v for v in row[[3, 0, 1, 2]] if abs(v) > 1e-7)
@@ -169,7 +169,7 @@ def uniform_scene(fingers, worlds):
         "body_q": np.tile(pose, (joints, 1)),
         "body_qd": np.zeros((joints, 6)),
         "goal": pose[3:],
-        "offset": np.zeros(teacher_observation_size(fingers)),
+        "offset": np.zeros(teacher_observation_size(fingers, 3 * fingers)),
         **dict.fromkeys(("measured_q", "measured_qd", "smoothed"), np.zeros(joints)),
     }
     hand = {"lower": np.full(joints, -2.0), "upper": np.full(joints, 2.0), "tip_body": np.arange(fingers)}

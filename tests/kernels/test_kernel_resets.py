@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from vd.kernels.task.resets import HANDED, episode_kernel, hand_over_kernel, reset_kernel
 from vd.paper import PAPER
 
-START = np.array(PAPER.scene.object_start_m)
+START = np.array([0.0, 0.0, 0.12])
 NOISE = PAPER.scene.object_start_noise_m
 
 
@@ -71,7 +71,7 @@ class World:
     def __init__(self, device, worlds, fingers=3, seed=0, orientation=None):
         self.device, self.joints = device, 3 * fingers
         joints = self.joints
-        self.reset_q = np.tile(PAPER.scene.reset_joint_rad, fingers).astype(np.float32)
+        self.reset_q = np.tile([0.0, 0.8, -1.1], fingers).astype(np.float32)
         q = np.random.default_rng(1).normal(size=(worlds, joints + 7)).astype(np.float32)
         q[:, joints + 3 :] /= np.linalg.norm(q[:, joints + 3 :], axis=1, keepdims=True)
         if orientation is not None:

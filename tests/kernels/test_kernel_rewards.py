@@ -9,6 +9,8 @@ from vd.kernels.task.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, REWAR
 from vd.kernels.task.success import success_kernel
 from vd.paper import PAPER
 
+GOAL_M = (0.0, 0.0, 0.08)
+"""Where objects are handled."""
 REWARD = {
     "success": PAPER.reward.success,
     "rotation": PAPER.reward.rotation,
@@ -35,7 +37,7 @@ SUCCESS = {
     "action_norm": PAPER.success.action_norm,
     "table_contact_force": PAPER.reward.table_contact_force_n,
     "fall_distance": PAPER.success.fall_m,
-    "fall_center": wp.vec3(*PAPER.scene.goal_position_m),
+    "fall_center": wp.vec3(*GOAL_M),
 }
 STILLNESS = ("joint_speed", "object_speed", "object_spin", "action_norm")
 
@@ -43,7 +45,7 @@ STILLNESS = ("joint_speed", "object_speed", "object_spin", "action_norm")
 def rest(fingers=3, worlds=1):
     """Worlds that stand still at their goal, in the middle of the space, with every tip at the object."""
     joints = 3 * fingers
-    pose = [*PAPER.scene.goal_position_m, 0.0, 0.0, 0.0, 1.0]
+    pose = [*GOAL_M, 0.0, 0.0, 0.0, 1.0]
     return {
         "q": np.tile(np.append(np.zeros(joints), pose), (worlds, 1)),
         "qd": np.zeros((worlds, joints + 6)),
@@ -129,7 +131,7 @@ def states(draw: st.DrawFn) -> dict[str, np.ndarray]:
     orientation = draw(quaternions((worlds,)))
     speed = draw(st.sampled_from([0.0, 0.02, 1.0]))
     hand = draw(floats((worlds, joints)))
-    position = draw(floats((worlds, 3), -0.12, 0.12)) + np.array(PAPER.scene.goal_position_m)
+    position = draw(floats((worlds, 3), -0.12, 0.12)) + np.array(GOAL_M)
     return {
         "q": np.concatenate([hand, position, orientation], axis=1).astype(np.float32),
         "qd": (speed * draw(floats((worlds, joints + 6)))).astype(np.float32),

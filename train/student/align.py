@@ -7,7 +7,7 @@ stage 1 others are what a camera saw in simulation while the policy acted (:mod:
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -254,8 +254,25 @@ class AlignTrainer(TrainingLoop):
             return pairs
         return joined(pairs, self.looks.pairs(simulated, cfg.points, **shares))
 
+    @torch.no_grad()
+    def searched(self, pairs: Pairs) -> Pairs:
+        """Pairs of which some goals are turned as the network says, once or twice: as a search meets them.
+
+        Among random rotations those that it wrongly holds for right are rare, and these it has to tell.
+        """
+        goal, rotation, surface = pairs.goal.clone(), pairs.rotation.clone(), pairs.surface.clone()
+        rows = torch.randperm(len(goal), device=goal.device)[: round(self.cfg.searched_share * len(goal))]
+        for some in (rows, rows[::2]):
+            with self._half:
+                back = self.network(goal[some], pairs.seen[some]).rotation.transpose(-1, -2)
+            for turned in (goal, rotation, surface):
+                turned[some] = turned[some] @ back
+        return replace(pairs, goal=goal, rotation=rotation, surface=surface)
+
     def _step(self, done: float) -> dict[str, torch.Tensor]:
         pairs = self.pairs()
+        if self.cfg.searched_share > 0.0:
+            pairs = self.searched(pairs)
         with self._half:
             found = self._compare(pairs.goal, pairs.seen)
         losses, error = alignment_losses(found, pairs)

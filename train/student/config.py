@@ -51,6 +51,9 @@ class AlignCfg:
     """Points of each cloud."""
     near_share: float = 0.5
     """Share of pairs that are less than 0.9 rad apart, as in later passes; others are anywhere."""
+    searched_share: float = 0.5
+    """Share of pairs whose goals are first turned as the network says, half of them twice: from where a
+    search ends it learns which ends are wrong."""
     scan_share: float = 0.25
     """Share of goals as from scans: 4 mm of noise, and a fifth of the surface missing."""
     validation: tuple[str, ...] = ()
@@ -71,7 +74,7 @@ class AlignCfg:
         positive = "batch steps learning_rate shapes hands points validate_every views"
         require(self, "--align.", "positive", positive)
         require(self, "--align.", "zero or positive", "warmup_steps fresh_shapes")
-        require(self, "--align.", "in [0, 1]", "near_share scan_share")
+        require(self, "--align.", "in [0, 1]", "near_share searched_share scan_share")
         self.network.validate()
         if self.points < max(self.network.tokens, self.network.neighbours):
             raise ValueError(

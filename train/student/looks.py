@@ -10,7 +10,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD
 from vd.evaluate.tracking import TrackingActor
 from vd.quaternions import product, rotated, rotation_distance
 from vd.tracking.policy import TrackingPolicy
@@ -43,7 +42,7 @@ class SimulatedLooks:
         simulation, place = env.env, surfaces.device
         self._actor = TrackingActor(simulation, policy, goals="points", sensor_errors=True, seed=seed)
         self._pose = wp.to_torch(simulation.sim.body_q)[:, simulation.scene.object_body]
-        self._base = torch.tensor(BASE_IN_WORLD, dtype=torch.float32, device=place)
+        self._base = torch.tensor(simulation.hand.mount, dtype=torch.float32, device=place)
         self._object = torch.tensor(np.asarray(simulation.scene.world_object), device=place)
         self._scale = torch.tensor(np.asarray(simulation.scene.world_scale), device=place).float()
         self._seen = torch.empty((cfg.kept, SEEN_POINTS, 3), dtype=torch.half, device=place)

@@ -14,7 +14,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 from torch.nn.functional import normalize
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, compose, invert
+from vd.assets_usd.hand_data import HandModel, compose, invert
 from vd.clouds import HandCloud, HandKinematics
 from vd.train.student.shapes import drawn, random_matrices, uniform
 from vd.vision.rotations import matrices, rotations_about, two_columns
@@ -87,7 +87,7 @@ class Hands:
 
         corners = np.array(OBJECT_RANGE_M).T
         poses = np.concatenate([corners, np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))], axis=1)
-        box = np.sort(compose(invert(np.array(BASE_IN_WORLD)), poses)[:, :3], axis=0)
+        box = np.sort(compose(invert(hand.mount), poses)[:, :3], axis=0)
         self.box = tensor(box)
         """Corners of where objects are [2, 3]."""
         self.count = count
@@ -152,7 +152,7 @@ def posture_points(hand: HandModel, count: int, device: str) -> torch.Tensor:
     lower, upper = torch.tensor(np.stack([hand.lower, hand.upper]), dtype=torch.float32, device=place)
     joints = lower + (upper - lower) * torch.rand((count, len(lower)), device=place)
     poses = wp.empty((count, len(links)), dtype=wp.transform, device=device)
-    kinematics = HandKinematics(hand, link_body=links, base=BASE_IN_WORLD, device=device)
+    kinematics = HandKinematics(hand, link_body=links, device=device)
     kinematics.write(wp.from_torch(joints), poses)
     return HandCloud(hand, link_body=links, device=device)(poses)
 

@@ -17,7 +17,6 @@ from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.bench.sim import seconds_per_call
-from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sim.cfg import SimCfg
@@ -71,8 +70,7 @@ def bench_scene(
 def pose(scene: Scene, state: Any, generator: np.random.Generator) -> None:
     """Give every world of a state random joints and a random pose of its object."""
     n, d = scene.num_envs, scene.hand.num_joints
-    reset = np.tile(PAPER.scene.reset_joint_rad, scene.hand.num_fingers)
-    joints = reset + JOINT_SPREAD_RAD * generator.standard_normal((n, d))
+    joints = scene.hand.start + JOINT_SPREAD_RAD * generator.standard_normal((n, d))
     position = OBJECT_SPREAD_M * generator.standard_normal((n, 3)) + [0.0, 0.0, OBJECT_HEIGHT_M]
     quat = Rotation.random(n, random_state=generator).as_quat()
     joints = np.clip(joints, scene.hand.lower, scene.hand.upper)

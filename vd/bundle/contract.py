@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel
+from vd.assets_usd.hand_data import HandModel
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.kernels.task.observations import teacher_observation_slices
@@ -109,7 +109,7 @@ def derive_interface(
             "joint_names": hand.joint_names,  # in the order of joint positions and actions
             "lower_rad": _floats(hand.lower),
             "upper_rad": _floats(hand.upper),
-            "base_in_world": _floats(BASE_IN_WORLD),
+            "base_in_world": _floats(hand.mount),
         },
         # smoothed = ema_alpha clip(action) + (1 - ema_alpha) smoothed, zero at the start;
         # target = clamp(q + smoothed scale_rad_s / control_hz, lower, upper), q as measured.
@@ -129,7 +129,7 @@ def derive_interface(
 def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
     """The vector that a teacher's layers see; tracking and vision policies make it of joints and camera."""
     seen = task.observation
-    slices = teacher_observation_slices(hand.num_fingers)
+    slices = teacher_observation_slices(hand.num_fingers, hand.num_joints)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}
     if seen.shape != "none":
         end = slices["previous_action"].stop

@@ -34,7 +34,7 @@ class Observer:
         """Allocate for what ``drawn`` has drawn; ``shapes`` also where they are not observed."""
         self._state, self._drawn = state, drawn
         cfg, n, device = state.cfg.observation, state.num_envs, state.device
-        self.parts = observation_parts(cfg, state.num_fingers)
+        self.parts = observation_parts(cfg, state.num_fingers, state.num_actions)
         self.num_observations = actor_size(self.parts)
         self.seen = SeenState(state)
         self._pose_error = PoseError(state)
@@ -50,7 +50,7 @@ class Observer:
         if shapes:
             items = state.surface_points, state.world_object, state.world_scale
             self.shapes = ShapeObserver(*items, state.fingers.tip_body, state.fingers.tip_offset)
-        slices = teacher_observation_slices(state.num_fingers)
+        slices = teacher_observation_slices(state.num_fingers, state.num_actions)
         self._body_com = wp.clone(state.sim.model.body_com[: state.scene.bodies_per_world])
         hand, materials = state.hand, PAPER.materials
         self._gains = [wp.array(gain, dtype=float, device=device) for gain in (hand.kp, hand.kd)]

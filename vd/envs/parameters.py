@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from vd.assets_usd.hand_data import Workspace
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, blend
 from vd.kernels.task.actions import ActionParams
@@ -29,12 +30,11 @@ class TaskParameters:
     Arrays because a CUDA graph bakes scalar arguments in; a curriculum writes into them instead.
     """
 
-    def __init__(self, cfg: ReorientCfg, device: Any):
+    def __init__(self, cfg: ReorientCfg, workspace: Workspace, device: Any):
         """Put the configuration at full difficulty on ``device``."""
-        self.cfg = cfg
+        self.cfg, self._workspace = cfg, workspace
         random = cfg.randomisation
         on = 1.0 if random.enabled else 0.0
-        scene = PAPER.scene
 
         def array(struct_type: Any, **values: Any) -> wp.array:
             struct = struct_type()
@@ -60,7 +60,7 @@ class TaskParameters:
             for noise in (on, 0.0)
         )
         self.start = array(
-            StartParams, position=wp.vec3(*scene.object_start_m), noise=scene.object_start_noise_m
+            StartParams, position=wp.vec3(*workspace.drop_m), noise=PAPER.scene.object_start_noise_m
         )
         self.force = array(
             ForceParams,
@@ -133,7 +133,7 @@ class TaskParameters:
             action_norm=threshold(success.action_norm, loose.action_norm),
             table_contact_force=PAPER.reward.table_contact_force_n,
             fall_distance=success.fall_m,
-            fall_center=np.array(PAPER.scene.goal_position_m, dtype=np.float32),
+            fall_center=np.array(self._workspace.goal_m, dtype=np.float32),
         )
         self._write(
             "goal",

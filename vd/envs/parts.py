@@ -3,19 +3,18 @@
 from vd.envs.cfg import ObservationCfg
 from vd.kernels.columns import consecutive
 from vd.kernels.task.dynamics import dynamics_size
-from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
+from vd.kernels.task.observations import teacher_observation_size
 from vd.kernels.task.shapes import shape_observation_size
 
 
-def observation_parts(cfg: ObservationCfg, fingers: int) -> dict[str, slice]:
+def observation_parts(cfg: ObservationCfg, fingers: int, joints: int) -> dict[str, slice]:
     """Columns of the parts of an observation, in order, those included that only the critic reads.
 
     state, shape, dynamics, present (state and shape without latency and noise); parts that are off are
     missing.
     """
-    joints = teacher_observation_slices(fingers)["joint_position"].stop
     told = cfg.dynamics != "none"
-    state = teacher_observation_size(fingers)
+    state = teacher_observation_size(fingers, joints)
     shape = shape_observation_size(fingers) if cfg.shape != "none" else 0
     sizes = {
         "state": state,

@@ -52,7 +52,7 @@ class Randomiser:
         """Object mass [kg], shape [N]."""
         self.action_offset = zeros(n, d)
         # Not of the shape's values, which no sensor measures.
-        self.observation_offset = zeros(n, teacher_observation_size(state.num_fingers))
+        self.observation_offset = zeros(n, teacher_observation_size(state.num_fingers, state.num_actions))
         self.force = zeros(n, dtype=wp.vec3)
         """Disturbance force on the object [N], world frame, shape [N]."""
         self._no_force = zeros(n, dtype=wp.vec3)

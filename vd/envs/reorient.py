@@ -26,7 +26,6 @@ from vd.kernels.task.guard import void_step_kernel
 from vd.kernels.task.resets import episode_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.task.success import success_kernel
-from vd.paper import PAPER
 
 FAILURES_AT_FIRST = 10.0
 """Steps of environments that may fail beside those that ``failures_per_million`` allows (ours): one object
@@ -34,7 +33,7 @@ in an unlucky start fails in the first step, again whenever the run is started a
 
 
 class ReorientEnv:
-    """N environments, each with a hand (F fingers, D = 3F joints), a table and an object to reorient.
+    """N environments, each with a hand (F fingers, D joints), a table and an object to reorient.
 
     All arrays are Warp arrays on ``device``; ``wp.to_torch`` views them without copying.
     """
@@ -109,7 +108,7 @@ class ReorientEnv:
 
     def _allocate(self) -> None:
         """Arrays of what a step decides, and of its counts."""
-        n, d, f = self.num_envs, self.num_actions, self.num_fingers
+        n, d = self.num_envs, self.num_actions
 
         zeros = self.state.zeros
 
@@ -147,7 +146,7 @@ class ReorientEnv:
         self._env_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
-        reset_q = np.tile(PAPER.scene.reset_joint_rad, f)
+        reset_q = self.hand.start
         self._reset_q: wp.array = wp.array(reset_q, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, reset_q)
 
@@ -161,7 +160,7 @@ class ReorientEnv:
                 self.sim.step()
             self.check()
             dropped.append(self.object_pose())
-        poses = rest_poses(np.stack(dropped, axis=1), self.cfg.success.fall_m)
+        poses = rest_poses(np.stack(dropped, axis=1), self.hand.workspace, self.cfg.success.fall_m)
         return wp.array(poses, dtype=wp.transform, device=self.device)
 
     # Stepping

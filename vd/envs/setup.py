@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from vd.assets_usd.hand_data import Workspace
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
-from vd.paper import PAPER
 
 ALWAYS = 2**31 - 1
 """Last step of a table that stays."""
@@ -40,19 +40,20 @@ def chosen(cfg: ReorientCfg, share: float) -> np.ndarray:
     return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
 
 
-def rest_poses(dropped: np.ndarray, fall_m: float) -> np.ndarray:
+def rest_poses(dropped: np.ndarray, workspace: Workspace, fall_m: float) -> np.ndarray:
     """Where the objects came to lie, of those drops that stayed in the claw, float, shape [N, K, 7].
 
     A drop that left it is replaced by one of the same environment that did not, or, if all did, by the start.
 
     Args:
         dropped: Poses after K drops, position [m] and quaternion xyzw, shape [N, K, 7].
+        workspace: Of the hand.
         fall_m: Distance from the goal position at which an object counts as lost [m].
     """
     count = dropped.shape[1]
-    inside = np.linalg.norm(dropped[:, :, :3] - PAPER.scene.goal_position_m, axis=2) < fall_m
+    inside = np.linalg.norm(dropped[:, :, :3] - workspace.goal_m, axis=2) < fall_m
     # Choose, for every slot, the slot itself or the first good one of the world.
     slot = np.where(inside, np.arange(count), np.argmax(inside, axis=1)[:, None])
     poses = np.take_along_axis(dropped, slot[:, :, None], axis=1)
-    poses[~inside.any(axis=1)] = [*PAPER.scene.object_start_m, 0.0, 0.0, 0.0, 1.0]
+    poses[~inside.any(axis=1)] = [*workspace.drop_m, 0.0, 0.0, 0.0, 1.0]
     return poses

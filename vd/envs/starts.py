@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, CollisionShape, compose
+from vd.assets_usd.hand_data import CollisionShape, compose
 from vd.envs.task_state import TaskState
 from vd.kernels.task.starts import (
     APART_M,
@@ -27,7 +27,7 @@ class FreeStarts:
     def __init__(self, state: TaskState, reset_q: np.ndarray):
         self._state = state
         device, shapes = state.device, state.hand.shapes
-        links = compose(np.array(BASE_IN_WORLD), state.hand.forward_kinematics(reset_q))
+        links = compose(state.hand.mount, state.hand.forward_kinematics(reset_q))
         poses = np.array([compose(links[shape.link], shape.frame) for shape in shapes])
         half, radius = zip(*map(rounded_box, shapes), strict=True)
         self._hand = OpenHand()

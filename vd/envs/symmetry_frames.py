@@ -9,11 +9,11 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, compose
+from vd.assets_usd.hand_data import HandModel, compose
 from vd.envs.cfg import ObservationCfg, View
 from vd.envs.parts import observation_parts
 from vd.kernels.task.dynamics import JOINT_CHANNELS, SCALARS
-from vd.kernels.task.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER, teacher_observation_slices
+from vd.kernels.task.observations import FINGERTIP_VALUES, teacher_observation_slices
 from vd.kernels.task.shapes import extent_directions, shape_observation_slices
 
 TERMS = 4
@@ -65,21 +65,22 @@ def symmetry_frames(hand: HandModel, observation: ObservationCfg, view: View) ->
         ValueError: The fingers are not spaced evenly about the vertical, or the hand is not its own mirror
             image.
     """
-    fingers, tips = hand.num_fingers, _tips(hand, np.zeros(JOINTS_PER_FINGER))
+    fingers, each = hand.num_fingers, hand.joints_per_finger
+    tips = _tips(hand, np.zeros(each))
     turns = [_turn(step, fingers) for step in range(fingers)]
     if view == "mirrored":
         mirror = _mirror(hand, tips)
         turns += [turn @ mirror for turn in turns]
     direction = SECTOR + UP if view == "mirrored" else SECTOR
-    maps = np.stack([_observation_map(observation, tips, turn) for turn in turns])
+    maps = np.stack([_observation_map(observation, tips, each, turn) for turn in turns])
     source = np.argsort(-np.abs(maps), axis=2, kind="stable")[:, :, :TERMS]
-    order = [_joint_source(_finger_source(tips, turn.T)) for turn in turns]
+    order = [_joint_source(_finger_source(tips, turn.T), each) for turn in turns]
     return SymmetryFrames(
         source=source,
         factor=np.take_along_axis(maps, source, axis=2),
         offset=np.stack([_observation_offset(hand, observation, turn) for turn in turns]),
         joints=np.stack(order),
-        sign=np.stack([_joint_signs(turn, fingers) for turn in turns]),
+        sign=np.stack([_joint_signs(turn, fingers, each) for turn in turns]),
         # An axis of rotation looks the other way in a mirror.
         sector=np.stack([np.linalg.det(turn) * turn.T @ direction for turn in turns]),
     )
@@ -87,7 +88,7 @@ def symmetry_frames(hand: HandModel, observation: ObservationCfg, view: View) ->
 
 def _tips(hand: HandModel, angles: np.ndarray) -> np.ndarray:
     """Fingertip poses in the world frame with these angles [3] in all fingers [F, 7]."""
-    return compose(np.array(BASE_IN_WORLD), hand.tip_poses(np.tile(angles, hand.num_fingers)))
+    return compose(hand.mount, hand.tip_poses(np.tile(angles, hand.num_fingers)))
 
 
 def _turn(step: int, fingers: int) -> np.ndarray:
@@ -104,6 +105,8 @@ def _mirror(hand: HandModel, tips: np.ndarray) -> np.ndarray:
     across = np.array([-tips[0, 1], tips[0, 0], 0.0]) / np.linalg.norm(tips[0, :2])
     mirror = np.eye(3) - 2.0 * np.outer(across, across)
     refusal = f"{hand.name} is not its own mirror image; set observation.view to goal, which turns it only"
+    if hand.joints_per_finger != len(MIRROR_SIGNS):
+        raise ValueError(refusal)
     try:
         source = _finger_source(tips, mirror)
     except ValueError as error:
@@ -129,14 +132,14 @@ def _finger_source(tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return source
 
 
-def _joint_source(fingers: np.ndarray) -> np.ndarray:
-    """Joints of the fingers, in their order [D]."""
-    return (JOINTS_PER_FINGER * fingers[:, None] + np.arange(JOINTS_PER_FINGER)).ravel()
+def _joint_source(fingers: np.ndarray, each: int) -> np.ndarray:
+    """Joints of the fingers with so many ``each``, in their order [D]."""
+    return (each * fingers[:, None] + np.arange(each)).ravel()
 
 
-def _joint_signs(turn: np.ndarray, fingers: int) -> np.ndarray:
+def _joint_signs(turn: np.ndarray, fingers: int, each: int) -> np.ndarray:
     """Factors on joints in a frame [D]."""
-    return np.tile(MIRROR_SIGNS if np.linalg.det(turn) < 0.0 else np.ones(JOINTS_PER_FINGER), fingers)
+    return np.tile(MIRROR_SIGNS if np.linalg.det(turn) < 0.0 else np.ones(each), fingers)
 
 
 def _observation_offset(hand: HandModel, observation: ObservationCfg, turn: np.ndarray) -> np.ndarray:
@@ -145,31 +148,35 @@ def _observation_offset(hand: HandModel, observation: ObservationCfg, turn: np.n
     An angle is observed as it lies between its limits, from -1 to 1; of one that is turned round these are
     the limits of the other side.
     """
-    parts = observation_parts(observation, hand.num_fingers)
+    parts = observation_parts(observation, hand.num_fingers, hand.num_joints)
     offset = np.zeros(max(columns.stop for columns in parts.values()))
     lower, upper = np.asarray(hand.lower), np.asarray(hand.upper)
-    turned_round = _joint_signs(turn, hand.num_fingers) < 0.0
-    columns = teacher_observation_slices(hand.num_fingers)["joint_position"]
+    turned_round = _joint_signs(turn, hand.num_fingers, hand.joints_per_finger) < 0.0
+    columns = teacher_observation_slices(hand.num_fingers, hand.num_joints)["joint_position"]
     for part in {"state", "present"} & parts.keys():
         offset[parts[part]][columns] = np.where(turned_round, -2.0 * (upper + lower) / (upper - lower), 0.0)
     return offset
 
 
-def _observation_map(observation: ObservationCfg, tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def _observation_map(
+    observation: ObservationCfg, tips: np.ndarray, each: int, turn: np.ndarray
+) -> np.ndarray:
     """Matrix [A, A] from an observation in the world frame to that of a frame.
 
     Args:
         observation: What is observed.
         tips: Fingertip poses with all angles zero, shape [F, 7].
+        each: Joints of each finger.
         turn: Turn or reflection [3, 3] of the world that makes the frame.
     """
-    parts = observation_parts(observation, len(tips))
     count, fingers = len(tips), _finger_source(tips, turn)
+    parts = observation_parts(observation, count, each * count)
     quaternion = _orientation_map(turn)
     axial = np.linalg.det(turn) * turn  # rotations look the other way in a mirror
     conjugation = np.eye(4)
     conjugation[:3, :3] = axial
-    joints = _joint_signs(turn, count)[:, None] * np.eye(JOINTS_PER_FINGER * count)[_joint_source(fingers)]
+    order = _joint_source(fingers, each)
+    joints = _joint_signs(turn, count, each)[:, None] * np.eye(each * count)[order]
     tip_blocks = np.zeros((count, FINGERTIP_VALUES, count, FINGERTIP_VALUES))
     for finger, old in enumerate(fingers):
         # q and -q are the same orientation, but a fingertip never shows the other one.
@@ -189,7 +196,7 @@ def _observation_map(observation: ObservationCfg, tips: np.ndarray, turn: np.nda
         "fingertips": tip_blocks.reshape(count * FINGERTIP_VALUES, -1),
         "previous_action": joints,
     }
-    slices = teacher_observation_slices(count)
+    slices = teacher_observation_slices(count, each * count)
     if "shape" in parts:
         directions = np.array(extent_directions(count))
         back = directions @ turn

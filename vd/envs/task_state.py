@@ -118,7 +118,7 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
         scene=scene,
         sim=sim,
         fingers=Fingers(hand, scene, sim),
-        parameters=TaskParameters(cfg, device),
+        parameters=TaskParameters(cfg, hand.workspace, device),
         servo_ranges=ranges,
         measured_q=sim.joint_q if sim.servo is None else sim.servo.measured_q,
         measured_qd=sim.joint_qd if sim.servo is None else sim.servo.measured_qd,

@@ -17,8 +17,6 @@ from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
 
 GRAVITY_M_S2 = 9.81
 """Acceleration of gravity, the simulator's."""
-DOWN_IN_BASE = np.array([0.0, 0.0, 1.0])
-"""Down in a hand's base frame: palm down, as :func:`vd.sim.scene.hand_mount` has it."""
 JOINTS_PER_FINGER = 3
 FREE = 1.0e6
 """A position [rad] that no joint and a torque [N m] that no drive reaches: the bound of one that has none."""
@@ -231,7 +229,7 @@ def _finger(
         mass=mass,
         com=com,
         inertia=inertia,
-        gravity=GRAVITY_M_S2 * DOWN_IN_BASE,
+        gravity=GRAVITY_M_S2 * hand.down,
         lower=hand.lower[joints],
         upper=hand.upper[joints],
         effort=hand.effort[joints],

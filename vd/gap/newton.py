@@ -16,7 +16,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_model import HandModel
-from vd.gap.chain import DOWN_IN_BASE, GRAVITY_M_S2
+from vd.gap.chain import GRAVITY_M_S2
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import STREAM_BITS
 from vd.kernels.launch import count_kernel, launch
@@ -267,7 +267,7 @@ def gravity_load(hand: HandModel, q: np.ndarray) -> np.ndarray:
     poses = hand.forward_kinematics(moved)
     turns = Rotation.from_quat(poses[..., 3:].reshape(-1, 4))
     arms = turns.apply(np.broadcast_to(hand.link_com, (*poses.shape[:-1], 3)).reshape(-1, 3))
-    fallen = (poses[..., :3] + arms.reshape(poses[..., :3].shape)) @ DOWN_IN_BASE
+    fallen = (poses[..., :3] + arms.reshape(poses[..., :3].shape)) @ hand.down
     work = GRAVITY_M_S2 * fallen @ hand.link_mass
     plus, minus = np.split(work, 2, axis=1)
     return (plus - minus) / (2.0 * GRADIENT_STEP)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import warp as wp
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, compose
+from vd.assets_usd.hand_data import CameraModel, compose
 from vd.kernels.launch import launch
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.sensor.depth_cloud import (
@@ -99,6 +99,7 @@ class CameraCloud:
     def __init__(
         self,
         camera: CameraModel,
+        mount: np.ndarray,
         *,
         points: int = PAPER.camera.points,
         crop_m: tuple[float, float] = PAPER.camera.crop_m,
@@ -107,14 +108,14 @@ class CameraCloud:
     ):
         """Prepare a cloud of at most K ``points`` within heights ``crop_m`` [m]; ``seed`` is of their choice.
 
-        The camera's pose is that in the hand's base.
+        The camera's pose is that in the hand's base, whose own in the world is ``mount`` [7].
         """
         self.cloud = DepthCloud(camera.height, camera.width, 1, points=points, crop_m=crop_m, device=device)
         self.depth = wp.zeros((1, camera.height, camera.width), dtype=float, device=device)
         """The image [m], 0 for none, shape [1, H, W]."""
         self._views = make_views(camera, 1, device)
         extrinsics = np.concatenate([camera.position, camera.quaternion])
-        in_world = compose(np.array(BASE_IN_WORLD), extrinsics)
+        in_world = compose(mount, extrinsics)
         self._extrinsics = wp.array(extrinsics[None], dtype=wp.transform, device=device)
         self._camera_q = wp.array(in_world[None], dtype=wp.transform, device=device)
         self._rng = wp.empty(1, dtype=wp.uint32, device=device)

@@ -1,17 +1,17 @@
-"""Build the scene of the paper in Newton: a downward hand over a table, an object in each world.
+"""Build the scene in Newton: a hand over a table, an object in each world.
 
 World frame: z up, table top at z = 0, all worlds at one origin. SI units, quaternions xyzw.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD
 from vd.assets_usd.hand_model import HandModel, open_stage
 from vd.assets_usd.objects.model import ObjectModel
 from vd.paper import PAPER
@@ -40,6 +40,8 @@ OBJECT_GROUP = -1
 """Collision group of an object's parts: with all but each other. Of one body they never touch, but in a group
 with the rest every pair of them takes room in MuJoCo's 32 bits, and from about 20 parts there is none."""
 TABLE_LABEL = "table"
+MASKED_SHAPES = 33
+"""Most shapes whose filters fit into MuJoCo's masks whatever they are."""
 
 
 @dataclass
@@ -62,7 +64,7 @@ class Scene:
     bodies_per_world: int
     """B."""
     link_body: np.ndarray
-    """Body index within a world of every hand link, base first, shape [3F + 1]."""
+    """Body index within a world of every hand link, base first, shape [D + 1]."""
     object_body: int
     """Body index within a world of the object."""
     shape_kind: np.ndarray
@@ -74,11 +76,6 @@ class Scene:
     def num_envs(self) -> int:
         """N."""
         return len(self.world_object)
-
-
-def hand_mount() -> wp.transform:
-    """Pose of the hand's base in the world: palm down, turned pi about +y."""
-    return wp.transform(*BASE_IN_WORLD)
 
 
 def assign_objects(num_envs: int, num_objects: int) -> np.ndarray:
@@ -125,7 +122,7 @@ def shape_cfg(cfg: SimCfg, friction: float, *, visual: bool = False) -> newton.M
 
 
 def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBuilder:
-    """The hand alone, mounted over the table, with the project's contact settings.
+    """The hand alone, where it is mounted, with the project's contact settings.
 
     Args:
         hand: The hand; its file is read again by Newton, with the same fingertip variant.
@@ -136,13 +133,14 @@ def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBu
     builder.default_shape_cfg = shape_cfg(cfg, PAPER.materials.friction)
     builder.add_usd(
         open_stage(hand.path, hand.fingertip, hand.layer),
-        xform=hand_mount(),
+        xform=wp.transform(*hand.mount),
         floating=False,
         enable_self_collisions=True,
         load_sites=False,
         load_visual_shapes=visuals,
         hide_collision_shapes=True,
     )
+    _group_fingers(builder, hand)
     tips = {shape.path for shape in hand.shapes if shape.fingertip}
     for shape in range(builder.shape_count):
         if not builder.shape_flags[shape] & newton.ShapeFlags.COLLIDE_SHAPES:
@@ -155,6 +153,26 @@ def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBu
         for key, value in attributes.items():
             builder.custom_attributes[key].values[shape] = value
     return builder
+
+
+def _group_fingers(builder: newton.ModelBuilder, hand: HandModel) -> None:
+    """Put each finger whose links never touch each other into a collision group.
+
+    That says nothing new, but to the compiler of MuJoCo's masks: of what is filtered pair by pair, more than
+    33 shapes may not fit into their 32 bits.
+    """
+    colliding = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES]
+    if len(colliding) <= MASKED_SHAPES:
+        return
+    names = [label.rsplit("/", 1)[-1] for label in builder.body_label]
+    apart = set(builder.shape_collision_filter_pairs)
+    for finger, joints in enumerate(hand.fingers):
+        links = [hand.link_names[hand.joint_child[joint]] for joint in range(joints.start, joints.stop)]
+        shapes = [i for i in colliding if names[builder.shape_body[i]] in links]
+        pairs = [(a, b) for a, b in combinations(shapes, 2) if builder.shape_body[a] != builder.shape_body[b]]
+        if apart.issuperset(pairs):
+            for shape in shapes:
+                builder.shape_collision_group[shape] = OBJECT_GROUP - 1 - finger
 
 
 def add_table(builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool) -> None:
@@ -198,7 +216,13 @@ def scaled_mesh(vertices: np.ndarray, faces: np.ndarray, scale: float) -> newton
 
 
 def add_object(
-    builder: newton.ModelBuilder, item: ObjectModel, cfg: SimCfg, *, scale: float, visuals: bool
+    builder: newton.ModelBuilder,
+    item: ObjectModel,
+    cfg: SimCfg,
+    *,
+    at: Sequence[float] = (0.0, 0.0, 0.0),
+    scale: float,
+    visuals: bool,
 ) -> int:
     """Add a free object made of its convex parts; returns its body index.
 
@@ -206,11 +230,12 @@ def add_object(
         builder: The world's builder.
         item: The object; its frame's origin is its centre of mass.
         cfg: Contact settings.
+        at: Where it is [m].
         scale: Uniform factor on its size. The mass stays; the inertia follows the size.
         visuals: Add the visual mesh too.
     """
     body = builder.add_body(
-        xform=wp.transform(wp.vec3(*PAPER.scene.object_start_m), wp.quat_identity()),
+        xform=wp.transform(wp.vec3(*at), wp.quat_identity()),
         mass=item.mass_kg,
         inertia=wp.mat33(*(item.inertia_matrix * scale**2).flatten()),
         label=OBJECT_LABEL,
@@ -284,7 +309,7 @@ def build_scene(
             world = new_builder()
             world.add_builder(hand_builder)
             add_table(world, cfg, visible=visuals)
-            add_object(world, item, cfg, scale=float(scale), visuals=visuals)
+            add_object(world, item, cfg, at=hand.workspace.drop_m, scale=float(scale), visuals=visuals)
             scene.replicate(world, int(copies))
             worlds.append((world, int(copies)))
     model = scene.finalize(device=device)

@@ -1,13 +1,13 @@
 """Where the fingertips are and how they move, from the joints.
 
-G fingers, D joints, three of each finger. World frame: z up; quaternions xyzw.
+G fingers, D joints, as many of each finger. World frame: z up; quaternions xyzw.
 """
 
 import numpy as np
 import torch
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, compose, invert
-from vd.kernels.task.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER
+from vd.assets_usd.hand_data import HandModel, compose, invert
+from vd.kernels.task.observations import FINGERTIP_VALUES
 from vd.quaternions import product, rotated
 
 
@@ -20,16 +20,16 @@ class Fingertips:
         dtype: Of the geometry.
 
     Raises:
-        ValueError: Its joints are no chains of three from the base to each fingertip.
+        ValueError: Its fingers differ, or its joints are no chains from the base to each fingertip.
     """
 
     def __init__(
         self, hand: HandModel, device: str | torch.device = "cpu", *, dtype: torch.dtype = torch.float32
     ) -> None:
-        order = np.arange(hand.num_joints).reshape(-1, JOINTS_PER_FINGER)
-        frames = np.empty((len(order), JOINTS_PER_FINGER + 1, 7))
+        order = np.arange(hand.num_joints).reshape(-1, hand.joints_per_finger)
+        frames = np.empty((len(order), hand.joints_per_finger + 1, 7))
         for finger, joints in enumerate(order):
-            before, links = np.array(BASE_IN_WORLD), [0, *hand.joint_child[joints]]
+            before, links = hand.mount, [0, *hand.joint_child[joints]]
             if list(hand.joint_parent[joints]) != links[:-1] or hand.tip_link[finger] != links[-1]:
                 raise ValueError(f"the joints of finger {finger} of {hand.name} are no chain to its tip")
             for number, joint in enumerate(joints):
@@ -55,7 +55,7 @@ class Fingertips:
         turn = torch.cat([self._axis * half.sin(), half.cos()], dim=-1)
         pose = self._frame[:, 0].expand(len(position), -1, -1)
         spin, moment = torch.zeros_like(pose[..., :3]), torch.zeros_like(pose[..., :3])
-        for joint in range(JOINTS_PER_FINGER):
+        for joint in range(self._axis.shape[1]):
             place, orientation = pose[..., :3], product(pose[..., 3:], turn[..., joint, :])
             axis = rate[..., joint, :] * rotated(orientation, self._axis[:, joint].expand_as(place))
             spin, moment = spin + axis, moment + torch.linalg.cross(axis, place)

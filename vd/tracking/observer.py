@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, HandModel
+from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.clouds import HandCloud, HandKinematics
 from vd.envs.shapes import ShapeObserver
@@ -51,8 +51,6 @@ class Found:
     """[m/s] [N, 3]; zero where it is not known."""
     spin: torch.Tensor
     """Angular velocity [rad/s] [N, 3]; zero where it is not known."""
-    error: torch.Tensor
-    """Angle by which the orientation is expected to be wrong [rad] [N]; zero of known shapes."""
 
 
 class Observer:
@@ -90,7 +88,7 @@ class Observer:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         envs: dict[str, Any] = {"world_object": world_object, "world_scale": world_scale, "device": device}
-        self._kinematics = HandKinematics(hand, link_body=links, base=BASE_IN_WORLD, device=device)
+        self._kinematics = HandKinematics(hand, link_body=links, device=device)
         self._hand_cloud = HandCloud(hand, link_body=links, device=device)
         self._ages = (0.0,) if alignment is None else AGES_S
         self.finder: Registration | GoalFinder
@@ -104,11 +102,11 @@ class Observer:
         self._fingertips = Fingertips(hand, place)
         self._links = wp.empty((len(world_object), len(links)), dtype=wp.transform, device=device)
         self._past_links = wp.empty_like(self._links)
-        self._base = torch.tensor(BASE_IN_WORLD, dtype=torch.float32, device=place)
+        self._base = torch.tensor(hand.mount, dtype=torch.float32, device=place)
         limits = np.stack([hand.lower, hand.upper])
         self._lower, self._upper = torch.tensor(limits, dtype=torch.float32, device=place)
-        self._columns = teacher_observation_slices(hand.num_fingers)
-        self._size, state = num_observations, teacher_observation_size(hand.num_fingers)
+        self._columns = teacher_observation_slices(hand.num_fingers, hand.num_joints)
+        self._size, state = num_observations, teacher_observation_size(hand.num_fingers, hand.num_joints)
         self._columns["shape"] = slice(state, num_observations)
         self._shapes = ShapeObserver(
             array(np.stack([item.surface_points for item in objects]), wp.vec3),
@@ -157,7 +155,7 @@ class Observer:
             self._shapes.observe(pose, 0, self._links, wanted, wp.from_torch(observation), first)
         for name, values in parts.items():
             observation[:, self._columns[name]] = values
-        return observation, torch.hypot(angle, found.error)
+        return observation, angle
 
     def _hand_points(self, age: float, senses: Senses) -> torch.Tensor:
         """The hand's own points as they were so long ago [s], base frame [N, H, 3]."""
@@ -188,7 +186,6 @@ class Observer:
             position=base[:3] + rotated(turn, pose[:, :3]),
             velocity=moves * rotated(turn, pose[:, :3] - before[:, :3]),
             spin=moves * 2.0 * rotated(turn, step[:, :3] * step[:, 3:].sign()),  # of a small angle
-            error=followed.error,
         )
         before.copy_(pose)
         return found

@@ -95,7 +95,6 @@ class Registration:
     Attributes:
         pose: Kept poses of the object in the base frame, the one that is believed first, [N, K, 7].
         misfit: Their misfits, averaged over time [m^2], [N, K].
-        error: Angle by which the first is expected to be wrong [rad] [N]: none, which nobody tells.
         most: Points seen of the object that are looked at, at most.
         looks: How often each environment's object was seen since it was begun anew, [N] int32.
     """
@@ -162,7 +161,6 @@ class Registration:
         self.pose = torch.zeros((envs, KEPT, 7), device=place)
         self.pose[..., 6] = 1.0
         self.misfit = torch.zeros((envs, KEPT), device=place)
-        self.error = torch.zeros(envs, device=place)
         self.looks = torch.zeros(envs, dtype=torch.int32, device=place)
         self._kept = [wp.from_torch(self.pose, dtype=wp.transform), wp.from_torch(self.misfit)]
         self._worlds = torch.arange(envs, dtype=torch.int32, device=place)

@@ -25,9 +25,6 @@ WAVES = (1.5, 3.0, 6.0, 12.0)
 """Frequencies at which a token knows its place [rad per CLOUD_M]: half a wave is from 17 to 2 cm."""
 PAIRS_AT_ONCE = 4096
 """Pairs of clouds compared at a time: what the tokens of more take counts in gigabytes."""
-SHARE = 0.3
-"""Share of the latest look in the average of predicted errors. With ``STAY`` tuned on looks at validation
-objects: flips between hypotheses fall from 13 to 3 %. Half and twice of either are not tried."""
 STAY = 0.8
 """Another hypothesis must be expected to err less by a fifth to be believed: of an object that looks the same
 in several orientations all err alike, and to change from one to the other is no motion that it makes."""
@@ -152,15 +149,13 @@ class Alignment:
     """From the goal to the object, matrices [N, 3, 3]."""
     position: torch.Tensor
     """Where the goal's mean lies on the object, in the frame of what is seen [m] [N, 3]."""
-    error: torch.Tensor
-    """Angle by which the rotation is expected to be wrong, averaged over looks [rad] [N]."""
 
 
 class Aligner:
     """Finds the rotation from goals to objects, and follows it from look to look.
 
     A first look begins from the 24 rotations of a cube: none is farther than 1.1 rad from one of them. Later
-    looks improve what is kept.
+    looks improve the best that it came to.
 
     Args:
         network: The trained network.
@@ -174,12 +169,11 @@ class Aligner:
         self._goal = goal - goal.mean(dim=1, keepdim=True)
         self._near = network.neighbours(self._goal)
         self._kept = torch.eye(3, device=goal.device).repeat(len(goal), self._cfg.kept, 1, 1)  # best first
-        self._errors = torch.full(self._kept.shape[:2], torch.nan, device=goal.device)  # averages; NaN: none
-        self._looks = torch.zeros(len(goal), dtype=torch.long, device=goal.device)
+        self._known = torch.zeros(len(goal), dtype=torch.bool, device=goal.device)
 
     def reset(self, rows: torch.Tensor) -> None:
         """Forget what is known of objects, a mask or indices."""
-        self._looks[rows] = 0
+        self._known[rows] = False
 
     @torch.no_grad()
     def look(self, seen: torch.Tensor, rows: torch.Tensor | None = None) -> Alignment:
@@ -193,20 +187,16 @@ class Aligner:
         mean = seen.mean(dim=1)
         seen = seen - mean[:, None]
         tokens = self.network.encode(seen, SEEN, self.network.neighbours(seen))
-        new = self._looks[rows] == 0
+        new = ~self._known[rows]
         if bool(new.any()):
             self._begin(rows[new], tokens[new])
-        self._restart(rows[~new])
         found, offset, error = self._improve(rows, tokens, self._kept[rows])
-        before = self._errors[rows]
-        error = torch.where(before.isnan(), error, before.lerp(error, SHARE))
-        stay = torch.where(new[:, None], 1.0, STAY)
-        order = torch.cat([stay * error[:, :1], error[:, 1:]], dim=1).argsort(dim=1)
+        error[:, 0] *= torch.where(new, 1.0, STAY)
+        order = error.argsort(dim=1)
         self._kept[rows] = found = found.take_along_dim(order[:, :, None, None], dim=1)
-        self._errors[rows] = error = error.take_along_dim(order, dim=1)
-        self._looks[rows] += 1
+        self._known[rows] = True
         offset = offset.take_along_dim(order[:, :1, None], dim=1)[:, 0]
-        return Alignment(found[:, 0], mean + offset, error[:, 0])
+        return Alignment(found[:, 0], mean + offset)
 
     def _begin(self, rows: torch.Tensor, tokens: torch.Tensor) -> None:
         """Keep the best that starts come to."""
@@ -215,17 +205,6 @@ class Aligner:
             found, _, error = self._improve(rows, tokens, found)
         best = error.topk(self._cfg.kept, dim=1, largest=False).indices
         self._kept[rows] = found.take_along_dim(best[:, :, None, None], dim=1)
-        self._errors[rows] = torch.nan
-
-    def _restart(self, rows: torch.Tensor) -> None:
-        """Now and then begin anew with the last hypothesis, if it is the worse, relative to the best."""
-        if self._cfg.kept < 2:
-            return
-        looks, errors = self._looks[rows], self._errors[rows]
-        due = (looks % self._cfg.restart_looks == 0) & (errors[:, -1] > errors[:, 0])
-        turn = (looks // self._cfg.restart_looks) % (len(self._starts) - 1) + 1  # not the best itself
-        self._kept[rows[due], -1] = (self._starts[turn] @ self._kept[rows, 0])[due]
-        self._errors[rows[due], -1] = torch.nan
 
     def _improve(
         self, rows: torch.Tensor, seen: torch.Tensor, rotations: torch.Tensor

@@ -1,6 +1,9 @@
 """Settings of the network that sees, and of how it is asked."""
 
 from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+from vd.config import Dropped
 
 SEEN_POINTS = 512
 """Points of what is seen that a policy looks at: as many as its network learns from."""
@@ -36,9 +39,8 @@ class AlignmentCfg:
 class SearchCfg:
     """How rotations are searched for with that network."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"restart_looks": Dropped(3)}
     passes: int = 2
     """Passes that each of the 24 starts of a first look takes."""
     kept: int = 2
     """Hypotheses kept from look to look: the best, and others that may turn out better."""
-    restart_looks: int = 3
-    """Looks after which the last hypothesis begins anew elsewhere: a start has come as near as it will."""

@@ -35,7 +35,6 @@ class GoalFinder:
 
     Attributes:
         pose: Of the cloud's frame in the base frame [N, 1, 7].
-        error: Angle by which its orientation is expected to be wrong [rad] [N].
         looks: How often each environment's object was seen since it was begun anew, [N] int32.
         most: Points seen of the object that are looked at.
         share: Which they are, as shares of all that are seen, in order [most].
@@ -61,7 +60,6 @@ class GoalFinder:
         self.share = (GOLDEN * torch.arange(SEEN_POINTS, device=device)) % 1.0
         self.pose = torch.zeros((envs, 1, 7), device=device)
         self.pose[..., 6] = 1.0
-        self.error = torch.full((envs,), torch.pi, device=device)
         self.looks = torch.zeros(envs, dtype=torch.int32, device=device)
         self.seen = torch.zeros((envs, SEEN_POINTS, 3), device=device)
         self.seen_now = torch.zeros(envs, dtype=torch.bool, device=device)
@@ -86,7 +84,6 @@ class GoalFinder:
         found = self._aligner.look(points, rows)
         place = found.position - (found.rotation @ self._mean[rows, :, None]).squeeze(-1)
         self.pose[rows, 0] = torch.cat([place, quaternions(found.rotation)], dim=1)
-        self.error[rows] = found.error
         self.looks[rows] += 1
 
     def _crowded(self, seen: torch.Tensor, count: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,0 +1,1 @@
+"""Hands from URDF and MJCF: read, welded to fingers, authored as USD."""

@@ -1,0 +1,318 @@
+"""A welded hand as USD (docs/reference/hand.md): numbers as text, meshes in a crate beside it."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_data import MotorModel, canonical_quat, compose, invert
+from vd.assets_usd.hand_import.description import Description
+from vd.assets_usd.hand_import.guess import Stance
+from vd.assets_usd.hand_import.source import Joint, Link, Shape
+from vd.assets_usd.hand_import.tree import Tree, shape_box
+from vd.assets_usd.objects.geometry import convex_hull, principal_axes, simplify_hull, surface_points
+
+HULL_VERTICES = 32
+"""Most corners of a collider: contacts of more take longer and feel the same."""
+POINTS = 500
+"""Samples of a link's surface, as of the D'Claw's."""
+GAP_M = 0.002
+SURFACES = {"surface": (2500.0, 100.0), "fingertip_surface": (2500.0, 100.0)}
+"""Contact stiffness and damping of each material: MuJoCo's default, 20 ms and critically damped."""
+RESTITUTION = 0.5
+
+
+def prim_name(name: str) -> str:
+    """A name that USD takes."""
+    name = re.sub(r"\W", "_", name)
+    return name if name and not name[0].isdigit() else f"hand_{name}"
+
+
+class Author:
+    """Writes one hand into a stage of two layers."""
+
+    def __init__(self, tree: Tree, stance: Stance, said: Description, name: str):
+        self.tree, self.stance, self.said = tree, stance, said
+        self.names = ["base"]
+        self.joints = []
+        for finger, joints in enumerate(tree.finger_joints()):
+            self.names += [f"f{finger}_l{i + 1}" for i in range(len(joints))]
+            self.joints += [f"f{finger}_j{i + 1}" for i in range(len(joints))]
+        self.root = f"/{name}"
+        self.layer = Sdf.Layer.CreateAnonymous(".usda")
+        self.meshes = Sdf.Layer.CreateAnonymous(".usdc")
+        self.layer.subLayerPaths.append(self.meshes.identifier)
+        self.stage = Usd.Stage.Open(self.layer)
+
+    def write(self, folder: Path, source: str, apart: list[tuple[int, int]]) -> Path:
+        """Write ``<name>.usda`` and ``<name>_meshes.usdc``.
+
+        Args:
+            folder: Where to; it exists.
+            source: What it was made from, for people.
+            apart: Pairs of links whose contacts are off.
+        """
+        stage, name = self.stage, self.root[1:]
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+        root = UsdGeom.Xform.Define(stage, self.root).GetPrim()
+        stage.SetDefaultPrim(root)
+        root.SetDocumentation(f"{name}, imported from {source}")
+        UsdPhysics.ArticulationRootAPI.Apply(root)
+        self._describe(root)
+        self._materials()
+        poses = self.tree.forward_kinematics(np.zeros(len(self.tree.joints)))
+        for number, link in enumerate(self.tree.links):
+            self._link(number, link, poses[number])
+        for number, joint in enumerate(self.tree.joints):
+            self._joint(number, joint)
+        for finger, joints in enumerate(self.tree.finger_joints()):
+            at = f"{self.root}/{self.names[joints[-1] + 1]}/f{finger}_tip"
+            site = UsdGeom.Sphere.Define(stage, at)
+            site.CreateRadiusAttr(0.001)
+            site.CreatePurposeAttr(UsdGeom.Tokens.guide)
+            _apply(site.GetPrim(), "NewtonSiteAPI")
+            _place(site, self.stance.tips[finger])
+        for one, other in apart:
+            api = UsdPhysics.FilteredPairsAPI.Apply(stage.GetPrimAtPath(f"{self.root}/{self.names[one]}"))
+            api.CreateFilteredPairsRel().AddTarget(f"{self.root}/{self.names[other]}")
+        path = folder / f"{name}.usda"
+        self.meshes.Export(str(folder / f"{name}_meshes.usdc"))
+        numbers = Sdf.Layer.CreateAnonymous(".usda")
+        numbers.TransferContent(self.layer)
+        numbers.subLayerPaths = [f"./{name}_meshes.usdc"]
+        numbers.Export(str(path))
+        return path
+
+    def _describe(self, root: Usd.Prim) -> None:
+        stance, place = self.stance, self.stance.workspace
+        kinds = Sdf.ValueTypeNames
+        for name, kind, value in (
+            ("vd:mount:position", kinds.Double3, Gf.Vec3d(*stance.mount[:3])),
+            ("vd:mount:orientation", kinds.Quatd, _quat(stance.mount[3:])),
+            ("vd:palm", kinds.Double3, Gf.Vec3d(*stance.palm)),
+            ("vd:workspace:drop", kinds.Double3, Gf.Vec3d(*place.drop_m)),
+            ("vd:workspace:goal", kinds.Double3, Gf.Vec3d(*place.goal_m)),
+            ("vd:workspace:fall", kinds.Double, place.fall_m),
+            ("vd:workspace:size", kinds.Double2, Gf.Vec2d(*place.size_m)),
+        ):
+            root.CreateAttribute(name, kind, custom=True).Set(value)
+
+    def _materials(self) -> None:
+        for name, (stiffness, damping) in SURFACES.items():
+            material = UsdShade.Material.Define(self.stage, f"{self.root}/materials/{name}").GetPrim()
+            api = UsdPhysics.MaterialAPI.Apply(material)
+            api.CreateDynamicFrictionAttr(self.said.friction)
+            api.CreateStaticFrictionAttr(self.said.friction)
+            api.CreateRestitutionAttr(RESTITUTION)
+            _apply(material, "NewtonMaterialAPI")
+            _float(material, "newton:contactStiffness", stiffness)
+            _float(material, "newton:contactDamping", damping)
+
+    def _link(self, number: int, link: Link, pose: np.ndarray) -> None:
+        path = f"{self.root}/{self.names[number]}"
+        xform = UsdGeom.Xform.Define(self.stage, path)
+        _place(xform, pose)
+        prim = xform.GetPrim()
+        prim.CreateAttribute("vd:source", Sdf.ValueTypeNames.String, custom=True).Set(link.name)
+        UsdPhysics.RigidBodyAPI.Apply(prim)
+        moments, quaternion = principal_axes(link.inertia)
+        mass = UsdPhysics.MassAPI.Apply(prim)
+        mass.CreateMassAttr(link.mass)
+        mass.CreateCenterOfMassAttr(Gf.Vec3f(*link.com))
+        mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*moments))
+        mass.CreatePrincipalAxesAttr(Gf.Quatf(_quat(quaternion)))
+        UsdGeom.Scope.Define(self.stage, f"{path}/collision").CreatePurposeAttr(UsdGeom.Tokens.guide)
+        colliders = [part for shape in link.shapes if shape.collides for part in convex_parts(shape)]
+        for i, shape in enumerate(colliders):
+            self._collider(f"{path}/collision/c{i}", shape, self._is_tip(number, shape, colliders))
+        drawings = [shape for shape in link.shapes if not shape.collides] or colliders
+        meshes = [shape_mesh(shape) for shape in drawings]
+        for i, (shape, (vertices, faces)) in enumerate(zip(drawings, meshes, strict=True)):
+            mesh = self._mesh(f"{path}/visual/v{i}", vertices, faces)
+            mesh.CreateDisplayColorAttr([Gf.Vec3f(*shape.colour)])
+        if meshes:
+            self._points(f"{path}/points", meshes)
+
+    def _is_tip(self, number: int, shape: Shape, colliders: list[Shape]) -> bool:
+        """Whether a collider is the nearest to a fingertip on its link."""
+        for joints, tip in zip(self.tree.finger_joints(), self.stance.tips, strict=True):
+            if joints[-1] + 1 == number:
+                distance = [_distance(other, tip[:3]) for other in colliders]
+                return _distance(shape, tip[:3]) <= min(distance) + 1e-4
+        return False
+
+    def _collider(self, path: str, shape: Shape, tip: bool) -> None:
+        pose = shape.frame
+        if shape.kind == "box":
+            cube = UsdGeom.Cube.Define(self.stage, path)
+            cube.CreateSizeAttr(1.0)
+            _place(cube, pose, scale=2.0 * np.array(shape.size))
+        elif shape.kind == "sphere":
+            UsdGeom.Sphere.Define(self.stage, path).CreateRadiusAttr(shape.size[0])
+        elif shape.kind in ("capsule", "cylinder"):
+            kind = UsdGeom.Capsule if shape.kind == "capsule" else UsdGeom.Cylinder
+            solid = kind.Define(self.stage, path)
+            solid.CreateRadiusAttr(shape.size[0])
+            solid.CreateHeightAttr(2.0 * shape.size[1])
+            solid.CreateAxisAttr("Z")
+        else:
+            hull = simplify_hull(convex_hull(shape_mesh(shape)[0]), HULL_VERTICES)
+            middle = (hull.vertices.min(axis=0) + hull.vertices.max(axis=0)) / 2.0
+            mesh = self._mesh(path, hull.vertices - middle, hull.faces)
+            pose = np.array([*middle, 0.0, 0.0, 0.0, 1.0])
+            UsdPhysics.MeshCollisionAPI.Apply(mesh.GetPrim()).CreateApproximationAttr("convexHull")
+        prim = self.stage.GetPrimAtPath(path)
+        if shape.kind != "box":
+            _place(UsdGeom.Xformable(prim), pose)
+        UsdPhysics.CollisionAPI.Apply(prim)
+        _apply(prim, "NewtonCollisionAPI")
+        _float(prim, "newton:contactGap", GAP_M)
+        _float(prim, "newton:contactMargin", 0.0)
+        material = UsdShade.Material.Get(
+            self.stage, f"{self.root}/materials/{'fingertip_surface' if tip else 'surface'}"
+        )
+        UsdShade.MaterialBindingAPI.Apply(prim).Bind(
+            material, UsdShade.Tokens.weakerThanDescendants, "physics"
+        )
+
+    def _mesh(self, path: str, vertices: np.ndarray, faces: np.ndarray) -> UsdGeom.Mesh:
+        mesh = UsdGeom.Mesh.Define(self.stage, path)
+        mesh.CreateSubdivisionSchemeAttr("none")
+        with Usd.EditContext(self.stage, self.meshes):
+            mesh.CreatePointsAttr(vertices.astype(np.float32))
+            mesh.CreateFaceVertexIndicesAttr(faces.astype(np.int32).ravel())
+            mesh.CreateFaceVertexCountsAttr(np.full(len(faces), 3, dtype=np.int32))
+            mesh.CreateExtentAttr(np.stack([vertices.min(axis=0), vertices.max(axis=0)]).astype(np.float32))
+        return mesh
+
+    def _points(self, path: str, meshes: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        """Samples of what is drawn of a link."""
+        starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
+        vertices = np.concatenate([vertices for vertices, _ in meshes])
+        faces = np.concatenate([faces + first for (_, faces), first in zip(meshes, starts, strict=False)])
+        points = UsdGeom.Points.Define(self.stage, path)
+        points.CreatePurposeAttr(UsdGeom.Tokens.guide)
+        points.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
+        with Usd.EditContext(self.stage, self.meshes):
+            points.CreatePointsAttr(surface_points(vertices, faces, POINTS))
+
+    def _joint(self, number: int, joint: Joint) -> None:
+        path = f"{self.root}/{self.joints[number]}"
+        revolute = UsdPhysics.RevoluteJoint.Define(self.stage, path)
+        prim = revolute.GetPrim()
+        # UsdPhysics knows axes x, y and z alone: both frames turn until x is the axis.
+        turn = Rotation.align_vectors([joint.axis], [[1.0, 0.0, 0.0]])[0].as_quat()
+        turned = np.array([0.0, 0.0, 0.0, *turn])
+        frames = compose(joint.parent_frame, turned), compose(joint.child_frame, turned)
+        revolute.CreateAxisAttr("X")
+        revolute.CreateBody0Rel().SetTargets([f"{self.root}/{self.names[joint.parent]}"])
+        revolute.CreateBody1Rel().SetTargets([f"{self.root}/{self.names[joint.child]}"])
+        revolute.CreateLocalPos0Attr(Gf.Vec3f(*frames[0][:3]))
+        revolute.CreateLocalRot0Attr(Gf.Quatf(_quat(frames[0][3:])))
+        revolute.CreateLocalPos1Attr(Gf.Vec3f(*frames[1][:3]))
+        revolute.CreateLocalRot1Attr(Gf.Quatf(_quat(frames[1][3:])))
+        revolute.CreateLowerLimitAttr(float(np.degrees(joint.lower)))
+        revolute.CreateUpperLimitAttr(float(np.degrees(joint.upper)))
+        drive = UsdPhysics.DriveAPI.Apply(prim, "angular")
+        drive.CreateTypeAttr("force")
+        drive.CreateTargetPositionAttr(0.0)
+        drive.CreateStiffnessAttr(float(np.radians(joint.kp)))
+        drive.CreateDampingAttr(float(np.radians(joint.kd)))
+        drive.CreateMaxForceAttr(joint.effort)
+        _apply(prim, "NewtonJointAPI")
+        _float(prim, "newton:armature", joint.armature)
+        _float(prim, "newton:velocityLimit", float(np.degrees(joint.velocity)))
+        if joint.mimic is not None:
+            leader, factor, offset = joint.mimic
+            names = [other.name for other in self.tree.joints]
+            _apply(prim, "NewtonMimicAPI")
+            prim.CreateRelationship("newton:mimicJoint").SetTargets(
+                [f"{self.root}/{self.joints[names.index(leader)]}"]
+            )
+            _float(prim, "newton:mimicCoef0", float(np.degrees(offset)))
+            _float(prim, "newton:mimicCoef1", factor)
+        kinds = Sdf.ValueTypeNames
+        prim.CreateAttribute("vd:source", kinds.String, custom=True).Set(joint.name)
+        prim.CreateAttribute("vd:start", kinds.Double, custom=True).Set(float(self.stance.start[number]))
+        if motor := self.said.motors.get(joint.name):
+            self._motor(prim, motor)
+
+    @staticmethod
+    def _motor(prim: Usd.Prim, motor: MotorModel) -> None:
+        kinds = Sdf.ValueTypeNames
+        for name, kind, value in (
+            ("model", kinds.String, motor.model),
+            ("id", kinds.Int, motor.id),
+            ("sign", kinds.Double, motor.sign),
+            ("offset", kinds.Double, motor.offset_rad),
+            ("gear", kinds.Double, motor.gear),
+        ):
+            prim.CreateAttribute(f"vd:motor:{name}", kind, custom=True).Set(value)
+
+
+def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [T, 3] of any shape, in its link."""
+    import trimesh
+
+    match shape.kind:
+        case "mesh":
+            vertices, faces = shape.vertices, shape.faces
+        case "box":
+            made = trimesh.creation.box(2.0 * np.array(shape.size))
+        case "sphere":
+            made = trimesh.creation.icosphere(2, shape.size[0])
+        case "ellipsoid":
+            made = trimesh.creation.icosphere(2).apply_scale(shape.size)
+        case "capsule":
+            made = trimesh.creation.capsule(2.0 * shape.size[1], shape.size[0], count=[16, 16])
+        case _:
+            made = trimesh.creation.cylinder(shape.size[0], 2.0 * shape.size[1], sections=24)
+    if shape.kind != "mesh":
+        vertices, faces = np.array(made.vertices), np.array(made.faces)
+        if shape.kind == "capsule":
+            vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    return shape.frame[:3] + Rotation.from_quat(shape.frame[3:]).apply(vertices), faces
+
+
+def convex_parts(shape: Shape) -> list[Shape]:
+    """A collider, or the parts of one that is to be split."""
+    if shape.kind != "mesh" or not shape.split:
+        return [shape]
+    from vd.assets_usd.objects.decompose import decompose
+    from vd.assets_usd.objects.settings import ImportSettings
+
+    cut = decompose(shape.vertices, shape.faces, ImportSettings(), HULL_VERTICES)
+    return [replace(shape, vertices=hull.vertices, faces=hull.faces) for hull in cut.hulls]
+
+
+def _distance(shape: Shape, point: np.ndarray) -> float:
+    """From a point to the box around a shape [m]."""
+    pose, half = shape_box(shape)
+    local = compose(invert(pose), np.array([*point, 0.0, 0.0, 0.0, 1.0]))[:3]
+    return float(np.linalg.norm(np.maximum(np.abs(local) - half, 0.0)))
+
+
+def _apply(prim: Usd.Prim, schema: str) -> None:
+    """Apply a schema by its name: Newton's are no Python classes."""
+    prim.AddAppliedSchema(schema)
+
+
+def _float(prim: Usd.Prim, name: str, value: float) -> None:
+    prim.CreateAttribute(name, Sdf.ValueTypeNames.Float, custom=False).Set(float(value))
+
+
+def _quat(xyzw: np.ndarray) -> Gf.Quatd:
+    x, y, z, w = (float(v) for v in canonical_quat(np.asarray(xyzw, dtype=float)))
+    return Gf.Quatd(w, x, y, z)
+
+
+def _place(xform: UsdGeom.Xformable, pose: np.ndarray, scale: np.ndarray | None = None) -> None:
+    xform.AddTranslateOp().Set(Gf.Vec3d(*pose[:3]))
+    xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(_quat(pose[3:]))
+    if scale is not None:
+        xform.AddScaleOp().Set(Gf.Vec3f(*scale))

@@ -1,0 +1,247 @@
+"""What a source does not say and a hand has: fingertips, palm, gains, start pose, mount and workspace.
+
+Every guess is a note that begins with "guess:" and names the entry of the description that overrides it.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_data import Workspace, compose
+from vd.assets_usd.hand_import.description import Description
+from vd.assets_usd.hand_import.source import Joint, Link
+from vd.assets_usd.hand_import.tree import Tree, shape_box
+
+FULL_TORQUE_RAD = 0.3
+"""Error at which a guessed gain reaches the torque limit: of a small servo's position mode."""
+SETTLE_S = 0.05
+"""Guessed damping over stiffness."""
+SPEED_RAD_S = 8.0
+ARMATURE_KG_M2 = 0.001
+"""Of a Dynamixel of 50 g."""
+BENT = 0.5
+"""Share of the wider side of its range by which each joint bends to find the palm."""
+TOGETHER = 0.5
+"""Share of their ways that fingers go together when they bend; less, and they close like a claw."""
+SNAP_RAD = 0.5
+"""A direction within this of an axis of the base is that axis."""
+GROUND_M = 0.05
+"""Height of the lowest collider above the ground."""
+SIZES = (0.35, 0.8)
+"""Smallest and largest object for the mean length of the fingers."""
+DROP_M = 0.01
+"""Height of the drop point over the goal."""
+FALL = 1.0
+"""Distance at which an object is lost, likewise."""
+
+
+@dataclass
+class Stance:
+    """Where a hand is and what it does there."""
+
+    tips: list[np.ndarray]
+    """Fingertip in the last link of each finger [7]."""
+    start: np.ndarray
+    """Angles at the start [D] [rad]."""
+    palm: np.ndarray
+    """Where the palm looks, base frame [3]."""
+    mount: np.ndarray
+    """Pose of the base in the world [7]."""
+    workspace: Workspace
+
+
+def take_stance(tree: Tree, said: Description) -> Stance:
+    """Complete a hand by what is described, or else by guesses, which go into its notes."""
+    _complete_drives(tree)
+    tips = _tips(tree)
+    start = _start(tree, said)
+    palm = _palm(tree, tips, said)
+    if said.mount is not None:
+        quaternion = np.array(said.mount.quaternion) / np.linalg.norm(said.mount.quaternion)
+        mount = np.array([*said.mount.position, *quaternion])
+    else:
+        mount = _mount(tree, tips, start, palm)
+        tree.notes.append(f"guess: mounted palm up at {_text(mount)} (mount)")
+    return Stance(tips, start, palm, mount, _workspace(tree, tips, start, palm, mount, said))
+
+
+def _text(values: np.ndarray) -> str:
+    return "(" + ", ".join(f"{round(float(v), 3) + 0.0:g}" for v in values) + ")"
+
+
+def _complete_drives(tree: Tree) -> None:
+    """Gains, speed and inertia of the drives, where neither file nor description has them."""
+    guessed: dict[str, list[str]] = {}
+    by_name = {joint.name: joint for joint in tree.joints}
+    for joint in tree.joints:
+        if joint.mimic is not None:
+            joint.effort = joint.effort if joint.effort > 0.0 else by_name[joint.mimic[0]].effort
+            joint.kp = joint.kd = 0.0
+        values = {
+            "kp": joint.effort / FULL_TORQUE_RAD,
+            "kd": SETTLE_S * (joint.effort / FULL_TORQUE_RAD if math.isnan(joint.kp) else joint.kp),
+            "velocity": SPEED_RAD_S,
+            "armature": ARMATURE_KG_M2,
+        }
+        for name, value in values.items():
+            if math.isnan(getattr(joint, name)):
+                setattr(joint, name, value)
+                guessed.setdefault(name, []).append(f"{value:.3g}")
+    for name, found in guessed.items():
+        span = found[0] if len(set(found)) == 1 else f"{min(found, key=float)} to {max(found, key=float)}"
+        tree.notes.append(f"guess: {name} = {span} of {len(found)} joints (drive, drives)")
+
+
+def _tips(tree: Tree) -> list[np.ndarray]:
+    """Fingertips; of fingers without a mark the corner of a box that is farthest from the last joint."""
+    tips = []
+    for joints, marked in zip(tree.finger_joints(), tree.tips, strict=True):
+        link, joint = tree.links[joints[-1] + 1], tree.joints[joints[-1]]
+        if marked is None:
+            marked = np.array([*_farthest(link, joint), 0.0, 0.0, 0.0, 1.0])
+            where = _text(marked[:3])
+            tree.notes.append(f"guess: the tip of {link.name} is at {where}, what is farthest (tips)")
+        tips.append(marked)
+    return tips
+
+
+def _farthest(link: Link, joint: Joint) -> np.ndarray:
+    """The middle of the end of a link that is farthest from its joint [3]."""
+    boxes = [shape_box(shape) for shape in link.shapes if shape.collides] or [
+        shape_box(shape) for shape in link.shapes
+    ]
+    if not boxes:
+        return np.asarray(2.0 * link.com - joint.child_frame[:3])
+    ends = []
+    for pose, half in boxes:
+        sides = np.concatenate([np.diag(half), -np.diag(half)])
+        ends.append(pose[:3] + Rotation.from_quat(pose[3:]).apply(sides))
+    points = np.concatenate(ends)
+    return np.asarray(points[np.argmax(np.linalg.norm(points - joint.child_frame[:3], axis=1))])
+
+
+def followed(tree: Tree, q: np.ndarray) -> np.ndarray:
+    """Angles with those joints where they are led that follow others [D]."""
+    q, names = q.copy(), [joint.name for joint in tree.joints]
+    for i, joint in enumerate(tree.joints):
+        if joint.mimic is not None:
+            leader, factor, offset = joint.mimic
+            q[i] = factor * q[names.index(leader)] + offset
+    return q
+
+
+def _start(tree: Tree, said: Description) -> np.ndarray:
+    """The pose that is described; elsewhere open: zero, or the limit nearest to it."""
+    angles = [said.start.get(j.name, float(np.clip(0.0, j.lower, j.upper))) for j in tree.joints]
+    if not said.start:
+        tree.notes.append("guess: starts with all joints at zero, or their limit nearest to it (start)")
+    q = followed(tree, np.array(angles))
+    return np.clip(q, [j.lower for j in tree.joints], [j.upper for j in tree.joints])
+
+
+def _tip_points(tree: Tree, tips: list[np.ndarray], q: np.ndarray) -> np.ndarray:
+    """Fingertips in the base [F, 3]."""
+    poses = tree.forward_kinematics(q)
+    last = [joints[-1] + 1 for joints in tree.finger_joints()]
+    return np.stack([compose(poses[link], tip)[:3] for link, tip in zip(last, tips, strict=True)])
+
+
+def _roots(tree: Tree) -> np.ndarray:
+    """First joints of the fingers in the base [F, 3]."""
+    return np.stack([tree.joints[joints[0]].parent_frame[:3] for joints in tree.finger_joints()])
+
+
+def _palm(tree: Tree, tips: list[np.ndarray], said: Description) -> np.ndarray:
+    """Where the palm looks: where the fingertips go when fingers bend; of a claw, where fingers point."""
+    if said.palm is not None:
+        return np.array(said.palm) / np.linalg.norm(said.palm)
+    lower, upper = np.array([[j.lower, j.upper] for j in tree.joints]).T
+    open_q = followed(tree, np.clip(np.zeros(len(lower)), lower, upper))
+    wider = np.where(np.abs(upper) > np.abs(lower), upper, lower)
+    one_sided = np.abs(lower + upper) > 0.2 * (upper - lower)
+    bent_q = followed(tree, np.where(one_sided, open_q + BENT * (wider - open_q), open_q))
+    opened, bent = _tip_points(tree, tips, open_q), _tip_points(tree, tips, bent_q)
+    along = opened - _roots(tree)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    ways = bent - opened
+    ways -= np.sum(ways * along, axis=1, keepdims=True) * along
+    length = np.linalg.norm(ways, axis=1).mean()
+    claw = length < 1e-4 or np.linalg.norm(ways.mean(axis=0)) < TOGETHER * length
+    palm = along.mean(axis=0) if claw else ways.mean(axis=0)
+    palm /= np.linalg.norm(palm)
+    palm = _snapped(palm)
+    reason = "where the fingers point, as of a claw" if claw else "where the tips go when the fingers bend"
+    tree.notes.append(f"guess: the palm looks along {_text(palm)} of the base, {reason} (palm)")
+    return palm
+
+
+def _snapped(direction: np.ndarray) -> np.ndarray:
+    """The axis of the base that is near to a direction [3], or the direction."""
+    axis = np.argmax(np.abs(direction))
+    nearest = np.eye(3)[axis] * np.sign(direction[axis])
+    return nearest if np.arccos(np.clip(direction @ nearest, -1.0, 1.0)) < SNAP_RAD else direction
+
+
+def _mount(tree: Tree, tips: list[np.ndarray], start: np.ndarray, palm: np.ndarray) -> np.ndarray:
+    """Palm up, fingers towards +x, above the ground, with the middle of the hand above the origin."""
+    forward = (_tip_points(tree, tips, start) - _roots(tree)).mean(axis=0)
+    forward -= (forward @ palm) * palm
+    if np.linalg.norm(forward) < 0.01:
+        forward = np.eye(3)[np.argmin(np.abs(palm))]
+        forward -= (forward @ palm) * palm
+    forward = _snapped(forward / np.linalg.norm(forward))
+    forward -= (forward @ palm) * palm
+    forward /= np.linalg.norm(forward)
+    turn = Rotation.from_matrix(np.stack([forward, np.cross(palm, forward), palm]))
+    lowest, poses = math.inf, tree.forward_kinematics(start)
+    for link, pose in zip(tree.links, poses, strict=True):
+        for box, half in (shape_box(shape) for shape in link.shapes if shape.collides):
+            placed = compose(pose, box)
+            reach = np.abs(turn.as_matrix()[2] @ Rotation.from_quat(placed[3:]).as_matrix()) @ half
+            lowest = min(lowest, float(turn.apply(placed[:3])[2] - reach))
+    middle = turn.apply(_middle(tree, tips, start))
+    return np.array([-middle[0], -middle[1], GROUND_M - lowest, *turn.as_quat()])
+
+
+def _middle(tree: Tree, tips: list[np.ndarray], start: np.ndarray) -> np.ndarray:
+    """The middle between the roots of the fingers and their tips [3]."""
+    return np.asarray((_roots(tree).mean(axis=0) + _tip_points(tree, tips, start).mean(axis=0)) / 2.0)
+
+
+def _workspace(
+    tree: Tree,
+    tips: list[np.ndarray],
+    start: np.ndarray,
+    palm: np.ndarray,
+    mount: np.ndarray,
+    said: Description,
+) -> Workspace:
+    """Over the palm, in the middle of roots and tips, half an object away from what collides there."""
+    reach = float(np.linalg.norm(_tip_points(tree, tips, start) - _roots(tree), axis=1).mean())
+    size = said.workspace.size or (SIZES[0] * reach, SIZES[1] * reach)
+    middle = _middle(tree, tips, start)
+    boxes = [shape_box(shape) for shape in tree.links[0].shapes if shape.collides]
+    tops = [
+        float(palm @ pose[:3] + np.abs(palm @ Rotation.from_quat(pose[3:]).as_matrix()) @ half)
+        for pose, half in boxes
+    ]
+    above = max(max(tops, default=0.0) + 0.5 * float(np.mean(size)) - palm @ middle, 0.0)
+    goal = compose(mount, np.array([*(middle + above * palm), 0.0, 0.0, 0.0, 1.0]))[:3]
+    x, y, z = said.workspace.goal or (float(v) for v in goal)
+    place = Workspace(
+        drop_m=said.workspace.drop or (x, y, z + DROP_M),
+        goal_m=(x, y, z),
+        fall_m=said.workspace.fall or FALL * reach,
+        size_m=size,
+    )
+    for name, value in (
+        ("drop", place.drop_m),
+        ("goal", place.goal_m),
+        ("size", place.size_m),
+        ("fall", [place.fall_m]),
+    ):
+        if getattr(said.workspace, name) is None:
+            tree.notes.append(f"guess: {name} {_text(np.array(value))} m (workspace)")
+    return place

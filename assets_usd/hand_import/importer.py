@@ -1,0 +1,199 @@
+"""From a URDF or MJCF to the USD of a hand, checked against its source."""
+
+import shutil
+import tempfile
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_data import CollisionShape, HandError, HandModel, compose
+from vd.assets_usd.hand_import.description import Description, read_description
+from vd.assets_usd.hand_import.guess import Stance, followed, take_stance
+from vd.assets_usd.hand_import.source import Source, read_source
+from vd.assets_usd.hand_import.tree import Tree, grow
+from vd.assets_usd.hand_model import read_hand
+from vd.files import make_folder
+
+SAME_M, SAME_RAD = 1e-6, 1e-5
+"""How far links of the USD may be from those of the source: rounding of single precision."""
+DEEP_M = 0.0005
+"""Colliders that are less than this in each other touch."""
+REACH_M = (0.03, 0.5)
+"""Least and largest distance from the root of a finger to its tip: what is beyond is in another unit."""
+MOST_EFFORT_NM, MOST_MASS_KG = 5.0, 5.0
+"""A joint that is stronger and a hand that is heavier are not believed without a warning."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A hand that was imported."""
+
+    hand: HandModel
+    notes: list[str]
+    """What was taken and guessed."""
+    warnings: list[str]
+    """What a person has to look at."""
+    sources: list[str]
+    """What the file calls the joints [D]."""
+
+
+def import_hand(path: Path, out: Path | None, describe: str | Path | None = None) -> Imported:
+    """Import a hand.
+
+    Args:
+        path: URDF or MJCF.
+        out: Folder to write ``<name>.usda`` and its meshes to; by default one of the asset cache, from which
+            commands take the hand by its name.
+        describe: YAML, or the name of a built-in one (:mod:`vd.assets_usd.hand_import.description`).
+
+    Raises:
+        HandError: The file cannot be imported; says why and what to do.
+    """
+    from vd.assets_usd.hand_import.author import Author, prim_name
+    from vd.assets_usd.hands import HANDS, imported_folder
+
+    said, source = read_description(describe), read_source(path)
+    tree = grow(source, said)
+    stance = take_stance(tree, said)
+    _check_units(source, tree, stance)
+    name = prim_name(said.name or source.name)
+    if name in HANDS:
+        raise HandError(f"{path}: {name} is a hand of the package; give it another name (name)")
+    folder = imported_folder(name) if out is None else out
+    warnings = _suspicious(tree)
+    with tempfile.TemporaryDirectory() as scratch:
+        author = Author(tree, stance, said, name)
+        near = _untouched(source, tree)
+        target = author.write(Path(scratch), Path(path).name, sorted(near))
+        hand = read_hand(target)
+        deep = overlaps(hand, near)
+        if deep:
+            author = Author(tree, stance, said, name)
+            target = author.write(Path(scratch), Path(path).name, sorted({*near, *deep}))
+        for (one, other), depth in sorted(deep.items()):
+            names = f"{tree.links[one].name} and {tree.links[other].name}"
+            warnings.append(
+                f"{names} are {1e3 * depth:.1f} mm in each other at the start; their contact is off, unless "
+                "another start keeps them apart"
+            )
+        _compare(read_hand(target), tree, said)
+        make_folder(folder)
+        for file in Path(scratch).iterdir():
+            shutil.copy(file, folder / file.name)
+    sources = [joint.name for joint in tree.joints]
+    return Imported(read_hand(folder / target.name), tree.notes, warnings, sources)
+
+
+def _check_units(source: Source, tree: Tree, stance: Stance) -> None:
+    """Refuse a hand that is no hand in metres."""
+    poses = tree.forward_kinematics(stance.start)
+    for joints, tip in zip(tree.finger_joints(), stance.tips, strict=True):
+        root = tree.joints[joints[0]].parent_frame[:3]
+        reach = float(np.linalg.norm(compose(poses[joints[-1] + 1], tip)[:3] - root))
+        if not REACH_M[0] <= reach <= REACH_M[1]:
+            raise HandError(
+                f"{source.path}: the finger of {tree.joints[joints[0]].name} is {reach:.3g} m long, not "
+                f"{REACH_M[0]:g} to {REACH_M[1]:g} m: convert the file to metres, or describe its tip (tips)"
+            )
+
+
+def _suspicious(tree: Tree) -> list[str]:
+    """What is possible but seldom meant."""
+    said = []
+    strong = [joint for joint in tree.joints if joint.effort > MOST_EFFORT_NM]
+    if strong:
+        most = max(joint.effort for joint in strong)
+        said.append(
+            f"{len(strong)} joints are as strong as {most:g} N m; is that the motor's torque? (drive)"
+        )
+    mass = sum(link.mass for link in tree.links)
+    if mass > MOST_MASS_KG:
+        said.append(f"the hand weighs {mass:.2f} kg; is that in kilograms?")
+    return said + [
+        f"zero is outside the limits of {joint.name}, {joint.lower:.2f} to {joint.upper:.2f} rad"
+        for joint in tree.joints
+        if not joint.lower <= 0.0 <= joint.upper
+    ]
+
+
+def _untouched(source: Source, tree: Tree) -> set[tuple[int, int]]:
+    """Pairs of links whose contact is off: of one finger, the base and first links, and those of the source.
+
+    Each pair of links apart costs MuJoCo, which has 32 bits for who meets whom, so a finger is one in this.
+    """
+    number = {link.name: i for i, link in enumerate(tree.links)}
+    number |= {name: i for i, link in enumerate(tree.links) for name in link.sites if name not in number}
+    pairs = {(0, joint.child) for joint in tree.joints if joint.parent == 0}
+    for joints in tree.finger_joints():
+        pairs |= set(combinations([joint + 1 for joint in joints], 2))
+    named = [sorted((number.get(a, 0), number.get(b, 0))) for a, b in source.apart]
+    return pairs | {(a, b) for a, b in named if a != b}
+
+
+def overlaps(hand: HandModel, near: set[tuple[int, int]]) -> dict[tuple[int, int], float]:
+    """Pairs of links that are in each other at the start, and how deep [m], but for those ``near``."""
+    import mujoco
+
+    links = hand.forward_kinematics(hand.start)
+    spec = mujoco.MjSpec()
+    for number, shape in enumerate(hand.shapes):
+        pose = compose(links[shape.link], shape.frame)
+        _add_geom(spec, number, shape, pose)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    found: dict[tuple[int, int], float] = {}
+    for i, j in combinations(range(len(hand.shapes)), 2):
+        a, b = sorted((hand.shapes[i].link, hand.shapes[j].link))
+        if a == b or (a, b) in near:
+            continue
+        depth = -mujoco.mj_geomDistance(model, data, i, j, DEEP_M, None)
+        if depth > DEEP_M:
+            found[a, b] = max(depth, found.get((a, b), 0.0))
+    return found
+
+
+def _add_geom(spec: Any, number: int, shape: CollisionShape, pose: np.ndarray) -> None:
+    import mujoco
+
+    wxyz = pose[[6, 3, 4, 5]]
+    if shape.kind == "hull":
+        name = f"hull {number}"
+        mesh = spec.add_mesh(name=name, uservert=shape.vertices.ravel())
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        kind, size = mujoco.mjtGeom.mjGEOM_MESH, [0.0, 0.0, 0.0]
+        spec.worldbody.add_geom(type=kind, meshname=name, pos=pose[:3], quat=wxyz)
+        return
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}")
+    size = [*shape.size, 0.0, 0.0][:3]
+    spec.worldbody.add_geom(type=kind, size=size, pos=pose[:3], quat=wxyz)
+
+
+def _compare(hand: HandModel, tree: Tree, said: Description) -> None:
+    """Hold what was written against what was read: kinematics, masses, limits.
+
+    Raises:
+        HandError: They differ, which is a fault of this program.
+    """
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        q = followed(tree, rng.uniform(hand.lower, hand.upper))
+        have, want = hand.forward_kinematics(q), tree.forward_kinematics(q)
+        apart = np.abs(have[:, :3] - want[:, :3]).max()
+        turned = (Rotation.from_quat(have[:, 3:]).inv() * Rotation.from_quat(want[:, 3:])).magnitude().max()
+        if apart > SAME_M or turned > SAME_RAD:
+            raise HandError(
+                f"{hand.path}: links are {apart:.2g} m and {turned:.2g} rad off their source; report it"
+            )
+    for name, read, wanted in (
+        ("masses", hand.link_mass, [link.mass for link in tree.links]),
+        ("lower limits", hand.lower, [joint.lower for joint in tree.joints]),
+        ("upper limits", hand.upper, [joint.upper for joint in tree.joints]),
+        ("torque limits", hand.effort, [joint.effort for joint in tree.joints]),
+    ):
+        if not np.allclose(read, wanted, rtol=1e-5, atol=1e-6):
+            raise HandError(f"{hand.path}: {name} are not those of the source; report it")

@@ -1,0 +1,403 @@
+"""A source welded to what a hand is: a base and fingers, each a chain of revolute joints."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_data import HandError, compose, invert
+from vd.assets_usd.hand_import.description import Description, Drive
+from vd.assets_usd.hand_import.source import IDENTITY, Joint, Link, Shape, Source
+from vd.assets_usd.hand_model import MAX_JOINTS
+
+MOST_WRIST = 3
+"""Most joints before the fingers that are held without being asked: more are an arm."""
+DENSITY_KG_M3 = 1000.0
+"""Of the colliders of a link whose mass is not said: plastic."""
+
+
+@dataclass
+class Tree:
+    """A hand in its own order: ``base`` first, then the fingers from the palm; D joints, D + 1 links."""
+
+    links: list[Link]
+    """Welded; of each the frame is that of the source's link that moves."""
+    joints: list[Joint]
+    """Parents and children count in ``links``; joint i moves link i + 1."""
+    counts: list[int]
+    """Joints of each finger."""
+    tips: list[np.ndarray | None]
+    """Fingertip in the last link of each finger [7], where the source marks one."""
+    notes: list[str] = field(default_factory=list)
+
+    def forward_kinematics(self, q: np.ndarray) -> np.ndarray:
+        """Poses of all links in the base [L, 7] for joint angles [D] [rad]."""
+        poses = [IDENTITY]
+        for joint, angle in zip(self.joints, q, strict=True):
+            poses.append(compose(poses[joint.parent], joint_pose(joint, angle)))
+        return np.stack(poses)
+
+    def finger_joints(self) -> list[list[int]]:
+        """Joints of each finger."""
+        ends = np.cumsum([0, *self.counts])
+        return [list(range(a, b)) for a, b in pairwise(ends)]
+
+
+def joint_pose(joint: Joint, angle: float) -> np.ndarray:
+    """Pose of a joint's child in its parent [7]."""
+    turn = np.concatenate([np.zeros(3), Rotation.from_rotvec(angle * joint.axis).as_quat()])
+    return compose(compose(joint.parent_frame, turn), invert(joint.child_frame))
+
+
+def grow(source: Source, said: Description) -> Tree:
+    """Weld a source to a hand.
+
+    Raises:
+        HandError: Everything that stands against it, each with a remedy.
+    """
+    return _Grower(source, said).grow()
+
+
+class _Grower:
+    """One source; problems are collected and raised together."""
+
+    def __init__(self, source: Source, said: Description):
+        self.source, self.said = source, said
+        self.notes, self.problems = list(source.notes), list(source.problems)
+        self.out: dict[int, list[int]] = {}
+        for number, joint in enumerate(source.joints):
+            self.out.setdefault(joint.parent, []).append(number)
+        self.held: dict[str, float] = dict(said.hold)
+
+    def fail(self) -> None:
+        """Raise what was found, if anything."""
+        if self.problems:
+            text = "\n".join(f"  - {problem}" for problem in dict.fromkeys(self.problems))
+            raise HandError(f"{self.source.path}: cannot be imported:\n{text}")
+
+    def grow(self) -> Tree:
+        self._check_names()
+        self.fail()
+        self._take_said()
+        self._check_tendons()
+        base, starts = self._palm()
+        self.fail()
+        links, joints = [self._welded(base)], []
+        counts, tips, moved = [], [], {base: 0}
+        for start in starts:
+            chain = self._chain(start)
+            counts.append(len(chain))
+            if len(chain) > MAX_JOINTS:
+                self.problems.append(
+                    f"the finger of {chain[0].name} has {len(chain)} joints; hold some of them"
+                )
+            parent = 0
+            for joint in chain:
+                first = self._first(joint.parent)
+                offset = self._group(first)[joint.parent]
+                joints.append(
+                    replace(
+                        joint,
+                        parent=parent,
+                        child=len(links),
+                        parent_frame=compose(offset, joint.parent_frame),
+                    )
+                )
+                moved[joint.child] = parent = len(links)
+                links.append(self._welded(joint.child))
+            tips.append(self._tip(chain[-1].child))
+        self.fail()
+        tree = Tree(links, joints, counts, tips, self.notes)
+        self._check_followers(tree)
+        self._check_numbers(tree)
+        self.fail()
+        return tree
+
+    def _check_names(self) -> None:
+        joints = [joint.name for joint in self.source.joints if joint.kind != "fixed"]
+        links = [link.name for link in self.source.links]
+        said = self.said
+        named: dict[str, Iterable[str]] = {
+            "hold": said.hold,
+            "mimic": said.mimic,
+            "limits": said.limits,
+            "drives": said.drives,
+            "start": said.start,
+            "motors": said.motors,
+        }
+        for entry, names in named.items():
+            for name in names:
+                if name not in joints:
+                    self.problems.append(f"{entry}: there is no joint {name}; there are {', '.join(joints)}")
+        linked: dict[str, Iterable[str]] = {"mass": said.mass, "tips": said.tips, "parts": said.parts}
+        for entry, names in linked.items():
+            for name in names:
+                if name not in links:
+                    self.problems.append(f"{entry}: there is no link {name}; there are {', '.join(links)}")
+
+    def _take_said(self) -> None:
+        """Put what the description says of joints and links into the source."""
+        said = self.said
+        for joint in self.source.joints:
+            if joint.name in said.mimic:
+                follow = said.mimic[joint.name]
+                joint.mimic = follow.joint, follow.factor, follow.offset_rad
+            if joint.name in said.limits:
+                joint.lower, joint.upper = said.limits[joint.name]
+            for drive in (said.drive, said.drives.get(joint.name, Drive())):
+                for name, value in vars(drive).items():
+                    if not math.isnan(value):
+                        setattr(joint, name, value)
+        for link in self.source.links:
+            if link.name in said.mass:
+                scale = said.mass[link.name] / link.mass if link.mass > 0.0 else 0.0
+                link.mass, link.inertia = said.mass[link.name], link.inertia * scale
+        self.notes += [f"{name} is held at {angle:g} rad, as described" for name, angle in said.hold.items()]
+
+    def _check_tendons(self) -> None:
+        """Joints that a tendon moves together, unless the description says what they do."""
+        said = self.said
+        for tendon, names in self.source.coupled:
+            free = [n for n in names if n not in self.held and n not in said.mimic]
+            if len(free) > 1:
+                first, *rest = free
+                lines = ", ".join(f"{name}: {{joint: {first}}}" for name in rest)
+                self.problems.append(
+                    f"the tendon {tendon} moves {', '.join(free)} together, which no drive of a joint does; "
+                    f"say mimic: {{{lines}}}, or hold: {{{rest[0]}: 0}}"
+                )
+
+    def _is_welded(self, joint: Joint) -> bool:
+        return joint.kind == "fixed" or joint.name in self.held
+
+    def _group(self, first: int) -> dict[int, np.ndarray]:
+        """Links that move with one, and their poses in it [7]."""
+        poses, queue = {first: IDENTITY}, [first]
+        for link in queue:
+            for number in self.out.get(link, ()):
+                joint = self.source.joints[number]
+                if self._is_welded(joint):
+                    angle = self.held.get(joint.name, 0.0) if joint.kind == "revolute" else 0.0
+                    poses[joint.child] = compose(poses[link], joint_pose(joint, angle))
+                    queue.append(joint.child)
+        return poses
+
+    def _first(self, link: int) -> int:
+        """The link with whose frame a link moves."""
+        parents = {joint.child: joint for joint in self.source.joints}
+        while link in parents and self._is_welded(parents[link]):
+            link = parents[link].parent
+        return link
+
+    def _leaving(self, first: int) -> list[Joint]:
+        """Joints that leave a group, in the order of the file."""
+        group = self._group(first)
+        return [j for j in self.source.joints if j.parent in group and not self._is_welded(j)]
+
+    def _palm(self) -> tuple[int, list[Joint]]:
+        """The root and the first joints of the fingers; joints of a wrist become held."""
+        children = {joint.child for joint in self.source.joints}
+        roots = [i for i in range(len(self.source.links)) if i not in children]
+        base = max(roots, key=self._moving)
+        for root in roots:
+            if root != base:
+                self.notes.append(f"{self.source.links[root].name} is no part of the hand and is left out")
+        wrist: list[str] = []
+        starts = self._leaving(base)
+        while len(starts) == 1 and self._branches(starts[0].child):
+            wrist.append(starts[0].name)
+            self.held[starts[0].name] = 0.0
+            starts = self._leaving(base)
+        if len(wrist) > MOST_WRIST:
+            names = ", ".join(f"{name}: 0" for name in wrist)
+            self.problems.append(
+                f"{len(wrist)} joints come before the fingers: an arm; give the hand alone, or say "
+                f"hold: {{{names}}}"
+            )
+        elif wrist:
+            self.notes.append(f"{', '.join(wrist)} come before the fingers and are held at 0 (hold)")
+        if not starts:
+            self.problems.append("no joint moves; a hand has fingers")
+        return base, starts
+
+    def _moving(self, link: int) -> int:
+        """Joints that move below a link."""
+        below = [self.source.joints[n] for n in self.out.get(link, ())]
+        return sum(not self._is_welded(joint) for joint in below) + sum(self._moving(j.child) for j in below)
+
+    def _branches(self, link: int) -> bool:
+        """Whether more than one joint leaves a link or what it carries."""
+        leaving = self._leaving(link)
+        return len(leaving) > 1 or any(self._branches(joint.child) for joint in leaving)
+
+    def _chain(self, start: Joint) -> list[Joint]:
+        """The joints of a finger."""
+        chain = [start]
+        while leaving := self._leaving(chain[-1].child):
+            if len(leaving) > 1:
+                names = ", ".join(joint.name for joint in leaving)
+                link = self.source.links[chain[-1].child].name
+                self.problems.append(
+                    f"{link} moves, and carries the fingers of {names}; hold what moves it: "
+                    f"hold: {{{', '.join(f'{joint.name}: 0' for joint in chain)}}}"
+                )
+                break
+            chain.append(leaving[0])
+        for joint in chain:
+            if joint.kind != "revolute":
+                self.problems.append(
+                    f"{joint.name} is {joint.kind}; only revolute joints move: hold: {{{joint.name}: 0}}"
+                )
+        return chain
+
+    def _welded(self, first: int) -> Link:
+        """A link with all that is fixed to it."""
+        group = self._group(first)
+        parts = [(self.source.links[i], pose) for i, pose in group.items()]
+        whole = Link(self.source.links[first].name)
+        whole.mass = sum(link.mass for link, _ in parts)
+        for link, pose in parts:
+            split = link.name in self.said.parts
+            whole.shapes += [replace(s, frame=compose(pose, s.frame), split=split) for s in link.shapes]
+            whole.sites |= {name: compose(pose, site) for name, site in link.sites.items()}
+            whole.sites |= {link.name: pose} if link is not parts[0][0] else {}
+        if not whole.mass > 0.0:
+            return self._weighed(whole)
+        centres = [pose[:3] + Rotation.from_quat(pose[3:]).apply(link.com) for link, pose in parts]
+        whole.com = sum(link.mass * at for (link, _), at in zip(parts, centres, strict=True)) / whole.mass
+        for (link, pose), at in zip(parts, centres, strict=True):
+            turn, arm = Rotation.from_quat(pose[3:]).as_matrix(), at - whole.com
+            steiner = link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+            whole.inertia = whole.inertia + turn @ link.inertia @ turn.T + steiner
+        return self._possible(whole)
+
+    def _weighed(self, link: Link) -> Link:
+        """A link whose mass nobody says, as the boxes around its colliders are."""
+        boxes = [shape_box(shape) for shape in link.shapes if shape.collides]
+        if not boxes:
+            self.problems.append(
+                f"{link.name} has neither mass nor collider; give it one: mass: {{{link.name}: 0.02}}"
+            )
+            return link
+        masses = np.array([8.0 * np.prod(half) * DENSITY_KG_M3 for _, half in boxes])
+        link.mass = float(masses.sum())
+        link.com = np.array([pose[:3] for pose, _ in boxes]).T @ masses / link.mass
+        for mass, (pose, half) in zip(masses, boxes, strict=True):
+            turn, arm = Rotation.from_quat(pose[3:]).as_matrix(), pose[:3] - link.com
+            own = np.diag(mass / 3.0 * (half @ half - half**2))
+            link.inertia = (
+                link.inertia + turn @ own @ turn.T + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+            )
+        self.notes.append(
+            f"guess: {link.name} has no mass in the file; {link.mass:.3f} kg by its colliders (mass)"
+        )
+        return link
+
+    def _possible(self, link: Link) -> Link:
+        """A link whose moments are those of a body: none above the sum of the others."""
+        moments, axes = np.linalg.eigh(link.inertia)
+        least = 1e-6 * link.mass  # of a ball of 1.6 mm
+        mended = np.maximum(moments, least)
+        mended[0] = max(mended[0], (mended[2] - mended[1]) * 1.001)
+        mended[:2] = np.maximum(mended[:2], mended[0])
+        if np.any(mended > moments * 1.01):
+            text = ", ".join(f"{value:.3g}" for value in moments)
+            self.notes.append(
+                f"no body has the moments {text} kg m2 of {link.name}; raised to "
+                f"{', '.join(f'{value:.3g}' for value in mended)}"
+            )
+        if np.any(mended != moments):
+            link.inertia = axes @ np.diag(mended) @ axes.T
+        return link
+
+    def _tip(self, last: int) -> np.ndarray | None:
+        """The fingertip that is described, or that the source marks, in the last link [7]."""
+        group = self._group(last)
+        for number, pose in group.items():
+            link = self.source.links[number]
+            if link.name in self.said.tips:
+                return compose(pose, np.array([*self.said.tips[link.name], 0.0, 0.0, 0.0, 1.0]))
+        marked = {
+            name: compose(pose, site)
+            for n, pose in group.items()
+            for name, site in self.source.links[n].sites.items()
+        }
+        frames = {self.source.links[n].name: pose for n, pose in group.items() if n != last}
+        for name, pose in (marked | frames).items():
+            if "tip" in name.lower():
+                return np.array([*pose[:3], 0.0, 0.0, 0.0, 1.0])
+        return None
+
+    def _check_followers(self, tree: Tree) -> None:
+        """Joints that follow what is held or missing."""
+        names = [joint.name for joint in tree.joints]
+        by_name = {joint.name: joint for joint in tree.joints}
+        for joint in tree.joints:
+            if joint.mimic is None:
+                continue
+            leader, factor, offset = joint.mimic
+            for _ in tree.joints:  # a joint that follows a follower follows what that does
+                if leader in by_name and (above := by_name[leader].mimic):
+                    leader, factor, offset = above[0], factor * above[1], factor * above[2] + offset
+            joint.mimic = leader, factor, offset
+            if leader in self.held:
+                angle = factor * self.held[leader] + offset
+                self.problems.append(
+                    f"{joint.name} follows {leader}, which is held; hold it too: "
+                    f"hold: {{{joint.name}: {angle:g}}}"
+                )
+            elif leader not in names:
+                self.problems.append(
+                    f"{joint.name} follows {leader}, which is no joint of a finger; say mimic"
+                )
+            elif by_name[leader].mimic is not None:
+                self.problems.append(f"{joint.name} and {leader} follow each other; say mimic")
+            else:
+                how = "as described" if joint.name in self.said.mimic else "as in the file"
+                self.notes.append(f"{joint.name} follows {leader}: {factor:g} q + {offset:g} rad, {how}")
+
+    def _check_numbers(self, tree: Tree) -> None:
+        """Limits and torque limits, which are never guessed."""
+        for joint in tree.joints:
+            if not joint.lower < joint.upper:
+                self.problems.append(
+                    f"{joint.name} has the limits {joint.lower:g} and {joint.upper:g} rad; give it some: "
+                    f"limits: {{{joint.name}: [-1.6, 1.6]}}"
+                )
+        weak = [joint.name for joint in tree.joints if not joint.effort > 0.0 and joint.mimic is None]
+        if weak:
+            self.problems.append(
+                f"{', '.join(weak)}: no torque limit in the file; say drive: {{effort: 1.0}} (N m) or "
+                f"drives: {{{weak[0]}: {{effort: 1.0}}}}; or mimic or hold, where there is no motor"
+            )
+        for link in tree.links:
+            for shape in link.shapes:
+                if shape.collides and shape.kind not in (
+                    "box",
+                    "sphere",
+                    "capsule",
+                    "cylinder",
+                    "mesh",
+                    "ellipsoid",
+                ):
+                    self.problems.append(f"a collider of {link.name} is a {shape.kind}; make it a mesh")
+
+
+def shape_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Pose [7] in the link, and half extents [3], of the box around a shape."""
+    match shape.kind:
+        case "sphere":
+            return shape.frame, np.full(3, shape.size[0])
+        case "capsule":
+            return shape.frame, np.array([shape.size[0], shape.size[0], shape.size[0] + shape.size[1]])
+        case "cylinder":
+            return shape.frame, np.array([shape.size[0], shape.size[0], shape.size[1]])
+        case "mesh":
+            low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
+            middle = np.array([*(low + high) / 2.0, 0.0, 0.0, 0.0, 1.0])
+            return compose(shape.frame, middle), (high - low) / 2.0
+        case _:
+            return shape.frame, np.array(shape.size[:3])

@@ -1,0 +1,406 @@
+"""Hands from URDF and MJCF: what the USD says against what MuJoCo reads in the same file, and refusals."""
+
+import itertools
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import newton
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd import cli
+from vd.assets_usd.hand_data import HandError, HandModel
+from vd.assets_usd.hand_import.importer import import_hand
+from vd.assets_usd.hand_model import open_stage
+from vd.assets_usd.hands import load_hand
+from vd.envs.cfg import ObservationCfg, ReorientCfg
+from vd.envs.reorient import ReorientEnv
+
+REAL = ("leap", "allegro")
+
+
+def link(name: str, length: float, shape: str = "", *, mass: float = 0.03) -> str:
+    """A link along z with its mass in its middle and a box, or another shape."""
+    shape = shape or f'<box size="0.02 0.018 {length}"/>'
+    geometry = f'<origin xyz="0 0 {length / 2}" rpy="0.1 0 0"/><geometry>{shape}</geometry>'
+    inertia = 'ixx="2e-5" iyy="2.2e-5" izz="1e-5" ixy="1e-7" ixz="0" iyz="2e-7"'
+    return (
+        f'<link name="{name}"><inertial><origin xyz="0 0.001 {length / 2}" rpy="0 0.2 0.1"/>'
+        f'<mass value="{mass}"/><inertia {inertia}/></inertial><collision>{geometry}</collision></link>'
+    )
+
+
+def joint(name: str, parent: str, child: str, origin: str, axis: str = "0 1 0", more: str = "") -> str:
+    limit = '<limit lower="-0.2" upper="1.4" effort="0.7" velocity="6"/>'
+    return (
+        f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin {origin}/><axis xyz="{axis}"/>{limit}{more}</joint>'
+    )
+
+
+def fixed(name: str, parent: str, child: str, origin: str) -> str:
+    return joint(name, parent, child, origin).replace("revolute", "fixed")
+
+
+MESH = '<mesh filename="knob.stl" scale="0.001 0.001 0.001"/>'
+MIMIC = '<mimic joint="b3" multiplier="0.8" offset="0.05"/>'
+PARTS = [
+    link("wrist", 0.05, mass=0.3),
+    link("palm", 0.08, mass=0.2),
+    fixed("weld", "wrist", "palm", 'xyz="0 0 0.05" rpy="0 0 0.3"'),
+    link("a_1", 0.05),
+    joint("a1", "palm", "a_1", 'xyz="0 0.03 0.08" rpy="0.2 0 0.1"'),
+    link("a_2", 0.04, MESH),
+    joint("a2", "a_1", "a_2", 'xyz="0 0 0.05"'),
+    '<link name="a_tip"/>',
+    fixed("a3", "a_2", "a_tip", 'xyz="0 0 0.05"'),
+    link("b_1", 0.03),
+    joint("b1", "palm", "b_1", 'xyz="0.01 -0.03 0.08"', "1 0 0.2"),
+    link("b_2", 0.04, '<sphere radius="0.012"/>'),
+    joint("b2", "b_1", "b_2", 'xyz="0 0 0.03" rpy="0 0.1 0"'),
+    link("b_3", 0.03, '<cylinder radius="0.01" length="0.03"/>'),
+    joint("b3", "b_2", "b_3", 'xyz="0 0 0.04"', "0 0.6 0.8"),
+    link("b_4", 0.03),
+    joint("b4", "b_3", "b_4", 'xyz="0 0 0.03"', more=MIMIC),
+]
+"""A hand of 2 and 4 joints, of which the last follows the third, with a fixed frame and a mesh to collide."""
+
+
+def write_urdf(folder: Path, parts: list[str] | None = None) -> Path:
+    trimesh.creation.box((20.0, 16.0, 40.0)).export(folder / "knob.stl")
+    path = folder / "toy.urdf"
+    path.write_text(f'<robot name="toy">{"".join(parts or PARTS)}</robot>')
+    return path
+
+
+def write_mjcf(folder: Path, model: mujoco.MjSpec) -> Path:
+    """The same hand as an MJCF, with what an MJCF has beside: motors, a site, armature, an excluded pair."""
+    for body in model.bodies:
+        for one in body.joints:
+            one.armature, one.damping = 0.002, [0.01, 0.0, 0.0]
+            if one.name == "b4":
+                continue
+            motor = model.add_actuator(name=f"motor {one.name}", target=one.name)
+            motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+            motor.set_to_position(kp=2.0, kv=0.1)
+            motor.forcelimited, motor.forcerange = 1, [-0.7, 0.7]
+    model.body("b_4").add_site(name="b_tip", pos=[0.0, 0.0, 0.031])
+    model.add_exclude(bodyname1="a_1", bodyname2="b_1")
+    coupling = model.add_equality(name="coupling", name1="b4", name2="b3")
+    coupling.type, coupling.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
+    coupling.data[:2] = 0.05, 0.8
+    model.compile()
+    path = folder / "toy.xml"
+    path.write_text(model.to_xml())
+    return path
+
+
+def oracle(path: Path) -> mujoco.MjSpec:
+    """What MuJoCo reads in the file, with frames kept."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.compiler.fusestatic, spec.compiler.balanceinertia = 0, 1
+    return spec
+
+
+@pytest.fixture(scope="module", params=["urdf", "mjcf"])
+def toy(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+    """A source of the toy hand, what was imported of it, and MuJoCo's model."""
+    folder = tmp_path_factory.mktemp(request.param)
+    path = write_urdf(folder)
+    if request.param == "mjcf":
+        path = write_mjcf(folder, oracle(path))
+    return import_hand(path, folder / "out"), oracle(path).compile()
+
+
+def assert_like_mujoco(hand: HandModel, sources: list[str], model: mujoco.MjModel) -> None:
+    """Frames of all links, masses and centres of all that moves, and limits."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    number = [model.joint(name).id for name in sources]
+    for _ in range(5):
+        q = rng.uniform(hand.lower, hand.upper)
+        data.qpos[model.jnt_qposadr[number]] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        links = hand.forward_kinematics(q)
+        bodies = [data.body(model.jnt_bodyid[j]) for j in number]
+        base = data.body(1)
+        turn = Rotation.from_quat(base.xquat[[1, 2, 3, 0]])
+        for pose, body, joint_id in zip(links[1:], bodies, number, strict=True):
+            np.testing.assert_allclose(turn.apply(pose[:3]) + base.xpos, body.xpos, atol=1e-6)
+            off = (turn * Rotation.from_quat(pose[3:])).inv() * Rotation.from_quat(body.xquat[[1, 2, 3, 0]])
+            assert off.magnitude() < 1e-5
+            below = model.body_subtreemass[model.jnt_bodyid[joint_id]]
+            finger = next(
+                f for f in hand.fingers if sources.index(model.joint(joint_id).name) in range(f.start, f.stop)
+            )
+            first = sources.index(model.joint(joint_id).name)
+            assert hand.link_mass[first + 1 : finger.stop + 1].sum() == pytest.approx(below, rel=1e-5)
+        centre = (
+            hand.link_mass[:, None] * (links[:, :3] + Rotation.from_quat(links[:, 3:]).apply(hand.link_com))
+        ).sum(0)
+        centre = turn.apply(centre / hand.link_mass.sum()) + base.xpos
+        np.testing.assert_allclose(centre, data.subtree_com[1], atol=1e-5)
+    np.testing.assert_allclose(np.stack([hand.lower, hand.upper], axis=1), model.jnt_range[number], atol=1e-6)
+
+
+def test_the_usd_is_the_hand_that_mujoco_reads(toy):
+    done, model = toy
+    hand = done.hand
+    assert done.sources == ["a1", "a2", "b1", "b2", "b3", "b4"]
+    assert hand.fingers == (slice(0, 2), slice(2, 6))
+    assert_like_mujoco(hand, done.sources, model)
+    assert list(hand.mimic) == [-1, -1, -1, -1, -1, 4] and list(hand.actuated) == [0, 1, 2, 3, 4]
+    assert (hand.mimic_factor[5], hand.mimic_offset[5]) == pytest.approx((0.8, 0.05))
+    assert (hand.kp[5], hand.kd[5]) == (0.0, 0.0), "what follows has no drive"
+    np.testing.assert_allclose(hand.effort, 0.7)
+    assert hand.start[5] == pytest.approx(0.05) and not hand.start[:5].any()
+    np.testing.assert_allclose(hand.tip_frame[0, :3], [0.0, 0.0, 0.05], atol=1e-7)
+    kinds = [shape.kind for shape in hand.shapes]
+    assert sorted(kinds) == ["box"] * 5 + ["cylinder", "hull", "sphere"]
+    (hull,) = (shape for shape in hand.shapes if shape.kind == "hull")
+    assert trimesh.convex.convex_hull(hull.vertices).volume == pytest.approx(0.02 * 0.016 * 0.04, rel=1e-4)
+    tips = [shape.link for shape in hand.shapes if shape.fingertip]
+    assert tips == list(hand.tip_link)
+    assert hand.palm_up and hand.workspace.drop_m[2] > hand.workspace.goal_m[2] > 0.05
+    heights = [pose[2] for pose in HandWorld(hand).link_poses(hand.start)]
+    assert min(heights) > 0.0, "mounted over the ground"
+
+
+class HandWorld:
+    """The hand's USD as Newton reads it."""
+
+    def __init__(self, hand: HandModel):
+        self.builder = newton.ModelBuilder()
+        self.builder.add_usd(open_stage(hand.path), xform=wp.transform(*hand.mount), floating=False)
+        self.model = self.builder.finalize(device="cpu")
+
+    def link_poses(self, q: np.ndarray) -> np.ndarray:
+        """In the world frame [L, 7]."""
+        state = self.model.state()
+        state.joint_q.assign(q.astype(np.float32))
+        newton.eval_fk(self.model, state.joint_q, state.joint_qd, state)
+        return state.body_q.numpy()
+
+
+def test_newton_reads_the_same(toy):
+    hand, world = toy[0].hand, HandWorld(toy[0].hand)
+    builder = world.builder
+    assert [label.rsplit("/")[-1] for label in builder.body_label] == list(hand.link_names)
+    assert builder.joint_mimic_joint[-1] == 5 and builder.joint_mimic_joint[:-1] == [-1] * 6
+    q = np.random.default_rng(1).uniform(hand.lower, hand.upper)
+    local = hand.forward_kinematics(q)
+    turn = Rotation.from_quat(hand.mount[3:])
+    np.testing.assert_allclose(
+        world.link_poses(q)[:, :3], turn.apply(local[:, :3]) + hand.mount[:3], atol=1e-6
+    )
+    np.testing.assert_allclose(builder.body_mass, hand.link_mass, rtol=1e-6)
+    colliding = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES]
+    assert sorted(builder.shape_body[i] for i in colliding) == [shape.link for shape in hand.shapes]
+
+
+def test_what_an_mjcf_says_of_its_drives_is_taken(tmp_path):
+    path = write_mjcf(tmp_path, oracle(write_urdf(tmp_path)))
+    hand = import_hand(path, tmp_path / "out").hand
+    np.testing.assert_allclose(hand.kp[hand.actuated], 2.0, rtol=1e-6)
+    np.testing.assert_allclose(hand.kd[hand.actuated], 0.11, rtol=1e-6)
+    np.testing.assert_allclose(hand.armature, 0.002, rtol=1e-6)
+    np.testing.assert_allclose(hand.tip_frame[1, :3], [0.0, 0.0, 0.031], atol=1e-7)
+    stage = open_stage(hand.path)
+    apart = stage.GetPrimAtPath("/toy/f0_l1").GetRelationship("physics:filteredPairs").GetTargets()
+    assert "/toy/f1_l1" in map(str, apart)
+
+
+def test_a_description_overrides_what_is_guessed(tmp_path):
+    said = tmp_path / "toy.yaml"
+    said.write_text(
+        "name: other\nhold: {b1: 0.3}\ndrive: {kp: 1.5, armature: 0.004}\ndrives: {a1: {effort: 0.4}}\n"
+        "tips: {b_4: [0, 0, 0.02]}\npalm: [0, 0, 2]\nstart: {b2: 0.5}\n"
+        "limits: {a2: [0, 1]}\nmass: {b_2: 0.06}\n"
+        "mount: {position: [0, 0, 0.3], quaternion: [0, 1, 0, 0]}\nparts: [a_2]\nfriction: 0.6\n"
+        "workspace: {drop: [0, 0, 0.1], size: [0.05, 0.06]}\n"
+        "motors: {b2: {model: XL330-M288, id: 7, sign: -1, offset_rad: 0.1, gear: 2}}\n"
+    )
+    done = import_hand(write_urdf(tmp_path), tmp_path / "out", said)
+    hand = done.hand
+    assert hand.name == "other" and done.sources == ["a1", "a2", "b2", "b3", "b4"]
+    palm = hand.forward_kinematics(np.zeros(5))[0]
+    assert palm.tolist() == [0, 0, 0, 0, 0, 0, 1]
+    assert (hand.kp[0], hand.armature[0], hand.effort[0]) == pytest.approx((1.5, 0.004, 0.4))
+    assert (hand.lower[1], hand.upper[1], hand.start[2]) == pytest.approx((0.0, 1.0, 0.5))
+    np.testing.assert_allclose(hand.tip_frame[1, :3], [0.0, 0.0, 0.02], atol=1e-7)
+    assert hand.palm.tolist() == [0.0, 0.0, 1.0] and not hand.palm_up
+    assert hand.workspace.drop_m == (0.0, 0.0, 0.1) and hand.workspace.size_m == (0.05, 0.06)
+    assert hand.link_mass[3] == pytest.approx(0.06) and hand.shapes[0].friction == pytest.approx(0.6)
+    motor = hand.motors[2]
+    assert motor and (motor.model, motor.id, motor.sign, motor.gear) == ("XL330-M288", 7, -1.0, 2.0)
+    assert hand.motors[0] is None
+    assert not any("palm" in note or "mounted" in note or "drop" in note for note in done.notes)
+
+
+def replaced(old: str, new: str) -> list[str]:
+    assert any(old in part for part in PARTS)
+    return [part.replace(old, new) for part in PARTS]
+
+
+TWO_ON_ONE = [
+    *PARTS,
+    link("c_1", 0.05),
+    joint("c1", "b_1", "c_1", 'xyz="0 -0.03 0"'),
+]
+ARM = [
+    *itertools.chain.from_iterable(
+        [
+            link(f"arm_{i}", 0.1),
+            joint(f"arm{i}", f"arm_{i}", f"arm_{i + 1}" if i < 3 else "wrist", 'xyz="0 0 0.1"'),
+        ]
+        for i in range(4)
+    ),
+    *PARTS,
+]
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        (
+            replaced('name="a2" type="revolute"', 'name="a2" type="prismatic"'),
+            ("a2 is prismatic", "hold: {a2: 0}"),
+        ),
+        (replaced('lower="-0.2" upper="1.4" ', ""), ("a2 has the limits", "limits: {a2")),
+        (TWO_ON_ONE, ("b_1 moves, and carries the fingers of b2, c1", "hold: {b1: 0}")),
+        (ARM, ("an arm", "arm0: 0, arm1: 0")),
+        (replaced('effort="0.7"', 'effort="0"'), ("a1, a2, b1, b2, b3: no torque limit", "drive: {effort")),
+        (replaced('joint="b3"', 'joint="weld"'), ("Follower joint", "FIXED")),
+        (replaced("knob.stl", "gone.stl"), ("gone.stl", "put the file there")),
+        (replaced('xyz="0 0 0.05"', 'xyz="0 0 50"'), ("m long", "convert the file to metres")),
+        ([PARTS[0]], ("no joint moves",)),
+    ],
+    ids=["prismatic", "endless", "branch", "arm", "effort", "mimic", "mesh", "units", "none"],
+)
+def test_what_cannot_be_imported_is_refused_by_name(tmp_path, parts, words):
+    path = write_urdf(tmp_path, parts)
+    with pytest.raises(HandError) as caught:
+        import_hand(path, tmp_path / "out")
+    for word in (str(path), *words):
+        assert word in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_tendon_over_two_joints_is_refused_until_it_is_described(tmp_path):
+    spec = mujoco.MjSpec.from_file(str(write_mjcf(tmp_path, oracle(write_urdf(tmp_path)))))
+    tendon = spec.add_tendon(name="pull")
+    tendon.wrap_joint("a1", 1.0)
+    tendon.wrap_joint("a2", 1.0)
+    for name in ("a1", "a2"):
+        spec.delete(spec.actuator(f"motor {name}"))
+    motor = spec.add_actuator(name="both", target="pull")
+    motor.trntype = mujoco.mjtTrn.mjTRN_TENDON
+    motor.forcelimited, motor.forcerange = 1, [-0.7, 0.7]
+    spec.compile()
+    path = tmp_path / "pulled.xml"
+    path.write_text(spec.to_xml())
+    with pytest.raises(
+        HandError, match=r"tendon pull moves a1, a2 together.*say mimic: \{a2: \{joint: a1\}\}"
+    ):
+        import_hand(path, tmp_path / "out")
+    (tmp_path / "said.yaml").write_text("mimic: {a2: {joint: a1}}")
+    hand = import_hand(path, tmp_path / "out", tmp_path / "said.yaml").hand
+    assert hand.mimic[1] == 0 and hand.actuated.tolist() == [0, 2, 3, 4]
+
+
+def test_impossible_inertia_is_raised_and_said(tmp_path):
+    done = import_hand(write_urdf(tmp_path, replaced('izz="1e-5"', 'izz="9e-5"')), tmp_path / "out")
+    assert any("no body has the moments" in note and "a_1" in note for note in done.notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("palm: [0, 0]", "palm"),
+        ("palms: [0, 0, 1]", "no field palms"),
+        ("hold: {zz: 0}", "there is no joint zz; there are a1"),
+        ("tips: {zz: [0, 0, 0]}", "there is no link zz"),
+        ("[1, 2", "said.yaml"),
+    ],
+)
+def test_a_wrong_description_is_refused(tmp_path, text, words):
+    (tmp_path / "said.yaml").write_text(text)
+    with pytest.raises(HandError, match=words):
+        import_hand(write_urdf(tmp_path), tmp_path / "out", tmp_path / "said.yaml")
+
+
+def test_command_imports_into_the_cache_and_draws_a_sheet(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "cache"))
+    monkeypatch.setattr(sys, "argv", ["vd-assets", "hand", "import", str(write_urdf(tmp_path))])
+    assert cli.main() == 0
+    said = capsys.readouterr().out
+    assert "guess: the palm looks along" in said and "f1_j4  b4" in said and "0.8 x f1_j3" in said
+    hand = load_hand("toy")
+    assert hand.path == tmp_path / "cache" / "hands" / "toy" / "toy.usda" and hand.num_joints == 6
+    from PIL import Image
+
+    image = np.asarray(Image.open(hand.path.with_suffix(".png")).convert("RGB"), dtype=float)
+    assert (np.ptp(image, axis=2) > 40).mean() > 0.01, "links are coloured"
+    monkeypatch.setattr(sys, "argv", ["vd-assets", "hand", "import", str(tmp_path / "knob.stl")])
+    assert cli.main() == 1 and "neither a URDF nor an MJCF" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"'claw'.*import one"):
+        load_hand("claw")
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_leap_and_allegro_are_imported_with_their_descriptions(tmp_path, shared_dir, name):
+    path = shared_dir / "hands" / f"{name}_hand" / f"{name}_hand_right.urdf"
+    if not path.is_file():
+        pytest.skip(f"there is no {path}")
+    done = import_hand(path, tmp_path, name)
+    hand = done.hand
+    assert hand.name == name and hand.fingers == tuple(slice(4 * f, 4 * f + 4) for f in range(4))
+    bare = re.sub(r"<(visual|collision)>.*?</\1>", "", path.read_text(), flags=re.DOTALL)
+    (tmp_path / "bare.urdf").write_text(bare)
+    assert_like_mujoco(hand, done.sources, oracle(tmp_path / "bare.urdf").compile())
+    assert hand.palm_up and hand.palm.tolist() == [1.0, 0.0, 0.0]
+    if name == "leap":
+        assert [motor and motor.id for motor in hand.motors] == [int(source) for source in done.sources]
+        assert not done.warnings
+
+
+@pytest.mark.parametrize("colliders", [1, 6])
+def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
+    """Of many colliders, as LEAP has, MuJoCo's masks hold who meets whom by the groups of fingers alone."""
+    parts = [
+        re.sub(r"<collision>.*?</collision>", lambda found: colliders * found[0], part) for part in PARTS
+    ]
+    hand = import_hand(write_urdf(tmp_path, parts), tmp_path / "out").hand
+    cfg = ReorientCfg(hand=str(hand.path), objects=("cube",), num_envs=4)
+    env = ReorientEnv(cfg, "cpu")
+    assert len(np.unique(env.scene.world_scale)) > 1, "worlds differ, and so need masks"
+    assert (env.num_actions, env.num_observations) == (6, 3 * 6 + 13 * 2 + 21)
+    model, geoms = env.sim.solver.mj_model, {}
+    for geom in range(model.ngeom):
+        name = model.body(model.geom_bodyid[geom]).name.removeprefix("_toy_")
+        geoms.setdefault(name, []).append((model.geom_contype[geom], model.geom_conaffinity[geom]))
+
+    def meet(one: str, other: str) -> bool:
+        pairs = itertools.product(geoms[one], geoms[other])
+        met = {bool(a[0] & b[1] or a[1] & b[0]) for a, b in pairs}
+        assert len(met) == 1
+        return met.pop()
+
+    links = sorted(name for name in geoms if name.startswith("f"))
+    for one, other in itertools.combinations(links, 2):
+        assert meet(one, other) == (one[:2] != other[:2]), (one, other)
+    assert not meet("base", "f0_l1") and meet("base", "f1_l4") and meet("object", "f1_l4")
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        env.step(wp.array(rng.uniform(-1.0, 1.0, (4, 6)), dtype=float))
+    q = env.sim.joint_q.numpy()
+    assert np.isfinite(env.observation.numpy()).all()
+    np.testing.assert_allclose(q[:, 5], 0.8 * q[:, 4] + 0.05, atol=0.01)
+    with pytest.raises(HandError, match=r"the fingers of toy have \[2, 4\] joints.*observation.view"):
+        ReorientEnv(replace(cfg, observation=ObservationCfg(view="goal")), "cpu")
