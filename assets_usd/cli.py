@@ -1,6 +1,5 @@
 """vd-assets: name and import hands, author objects, import meshes, draw contact sheets."""
 
-import re
 import sys
 import time
 from collections import Counter
@@ -211,23 +210,13 @@ def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
         lines.append(f"{hulls:.1f} convex parts on average, {size / 1e6:.1f} MB")
         median = worst[len(worst) // 2].volume_error
         lines.append(f"volume error of the parts: median {median:.1%}, worst {named}")
-        notes = [note for model in worst for note in model.notes]
-        units = Counter(found[1] for note in notes if (found := re.search(r"taken as ([^,]+)", note)))
-        units["m"] += len(worst) - units.total()
-        taken = ", ".join(f"{number} in {unit}" for unit, number in units.items() if number)
-        scaled = sum("scaled by" in note for note in notes)
+        scaled = sum("scaled by" in note for model in worst for note in model.notes)
         lines.append(
-            f"longest side {_span([model.longest_side for model in worst])} m ({taken}; {scaled} of "
-            f"{len(worst)} scaled), mass {_span([model.mass_kg for model in worst])} kg"
+            f"longest side {_span([model.longest_side for model in worst])} m ({scaled} of {len(worst)} "
+            f"scaled), mass {_span([model.mass_kg for model in worst])} kg"
         )
     lines += [f"warning {name}: {words}" for name, model in good.items() for words in model.warnings]
     lines += [f"refused {r.job.source}: {r.reason}" for r in results if r.status == "refused"]
-    lines += [
-        f"{r.job.name} stays in the set, although its mesh {r.job.source} is gone; remove {r.job.target} if "
-        "it shall go"
-        for r in results
-        if r.status == "gone"
-    ]
     return "\n".join(lines)
 
 

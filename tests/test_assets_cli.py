@@ -82,7 +82,7 @@ def test_an_imported_cube_is_not_taken_for_the_built_in_one(
     assert "built-in" in error and f"--out {out}" in error and not (cache / "objects").exists()
     assert run(monkeypatch, "import", mesh, "--out", out, "--units", "m", "--mass", "0.2") == 0
     text = capsys.readouterr().out
-    assert "longest side 0.12 m (1 in m; 0 of 1 scaled), mass 0.2 kg" in text
+    assert "longest side 0.12 m (0 of 1 scaled), mass 0.2 kg" in text
     assert load_set("my-cube")[0].longest_side == pytest.approx(0.12)
 
 

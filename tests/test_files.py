@@ -48,7 +48,7 @@ def test_a_file_that_cannot_grow_is_named_and_the_old_one_stays(tmp_path, name):
     path.write_bytes(b"old")
     with (
         small_files(LIMIT),
-        pytest.raises(OutputError, match=rf"cannot write .*{name}: the file would be"),
+        pytest.raises(OutputError, match=rf"cannot write .*{name}: File too large; free some space"),
     ):
         write(path)
     assert path.read_bytes() == b"old"
@@ -64,7 +64,7 @@ def test_an_error_of_the_writer_itself_stays_what_it_is(tmp_path):
 def test_a_bundle_that_does_not_fit_is_not_there(tmp_path):
     load_hand("dclaw3")  # authored on first use
     policy = open_policy("dclaw3-table", "cpu")
-    with small_files(LIMIT), pytest.raises(OutputError, match=r"cannot write .*first: .*the file would be"):
+    with small_files(LIMIT), pytest.raises(OutputError, match=r"cannot write .*first: File too large"):
         write_bundle(policy, tmp_path / "first")
     assert not list(tmp_path.iterdir())
 
@@ -78,17 +78,17 @@ def refused(*cases):
 def test_folders_that_cannot_be_made_are_refused_before_anything_is_written(tmp_path, capsys):
     (tmp_path / "file").touch()
     refused(
-        (check_folder, tmp_path / "file/a/b", ".*file is a file; choose another"),
-        (check_folder, tmp_path / "file", "it is a file; choose another folder"),
-        (make_folder, tmp_path / "file", "it is a file"),
-        (check_file, tmp_path, "it is a folder; name a file"),
+        (check_folder, tmp_path / "file/a/b", ".*file is a file; choose another path"),
+        (check_folder, tmp_path / "file", "Not a directory; choose another path"),
+        (make_folder, tmp_path / "file", "File exists"),
+        (check_file, tmp_path, "Is a directory"),
         (check_file, tmp_path / "file/a.png", ".*file is a file"),
     )
     with somebody_else() as folder:
         refused(
-            (check_folder, folder / "run/a", "you may not write there; choose another folder, or"),
-            (make_folder, folder / "run", "you may not write there"),
-            (lambda path: write_text(path, ""), folder / "a.txt", "you may not write there"),
+            (check_folder, folder / "run/a", "Permission denied"),
+            (make_folder, folder / "run", "Permission denied"),
+            (lambda path: write_text(path, ""), folder / "a.txt", "Permission denied"),
         )
     check_folder(tmp_path / "new" / "folder")
     check_file(tmp_path / "new.txt")
@@ -132,5 +132,5 @@ def test_every_command_says_so_at_once(tmp_path, command, monkeypatch, capsys):
         status = end.code
     text = capsys.readouterr().err + str(status)
     assert status
-    assert "cannot write" in text and "file is a file; choose another folder" in text
+    assert "cannot write" in text and "file is a file; choose another path" in text
     assert "Traceback" not in text and not list(tmp_path.glob("file/*"))

@@ -82,11 +82,11 @@ def imported(tmp_path_factory: pytest.TempPathFactory):
 
 REFUSALS = {
     "empty": "empty file",
-    "cloud": "not a mesh: 9 points and no faces|empty: no faces",
+    "cloud": "not a mesh, or cut short: 9 points and no faces",
     "nan": "1 of 4 vertices are NaN or infinite",
     "flat": "degenerate: flat",
     "needle": "degenerate: flat.*give it thickness",
-    "junk": "neither mesh nor points|empty",
+    "junk": "neither mesh nor points|not a mesh",
     "notes": r"unsupported type \.txt; use \.obj, \.stl, \.ply, \.glb, \.usd",
 }
 

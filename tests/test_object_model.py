@@ -80,7 +80,7 @@ def test_rewritten_file_is_read_anew(tmp_path: Path, example: procedural.ObjectM
     assert read_object(path).licence == "other"
 
 
-def test_bad_files_are_named(tmp_path: Path, example: procedural.ObjectModel):
+def test_bad_files_are_named(tmp_path: Path):
     with pytest.raises(ObjectError, match=r"gone\.usd: no such object file"):
         read_object(tmp_path / "gone.usd")
     junk = tmp_path / "junk.usd"
@@ -91,10 +91,6 @@ def test_bad_files_are_named(tmp_path: Path, example: procedural.ObjectModel):
     foreign.write_text('#usda 1.0\n(defaultPrim = "a")\ndef Xform "a" {}\n')
     with pytest.raises(ObjectError, match=r"foreign\.usda: formatVersion is None.*vd-assets import"):
         read_object(foreign)
-    with pytest.raises(ObjectError, match="no valid prim name"):
-        write_object(tmp_path / "x.usd", replace(example, name="1 2"))
-    with pytest.raises(ObjectError, match="suffix"):
-        write_object(tmp_path / "x.obj", example)
 
 
 def test_load_set_takes_files_folders_and_names(tmp_path: Path, cache: Path, example: procedural.ObjectModel):

@@ -115,19 +115,12 @@ def test_cells_show_different_objects_first():
     [
         ({"cells": 0}, "--cells is 0"),
         ({"seconds": 0.0}, "--seconds"),
-        ({"max_goal_angle": 4.0}, "--max-goal-angle is 4.0"),
-        ({"episode_s": 0.0}, "--episode-s is 0.0"),
         ({"video": Path("a.gif")}, "ends in .mp4"),
     ],
 )
 def test_bad_settings_are_refused_by_flag(fields, message):
     with pytest.raises(ValueError, match=message):
         PlayCfg(policy="zero", **fields).validate()
-
-
-def test_episodes_in_the_air_are_longer_unless_asked_otherwise():
-    assert PlayCfg().limit_s == 10.0 and PlayCfg(in_air=True).limit_s == 15.0
-    assert PlayCfg(in_air=True, episode_s=4.0).limit_s == 4.0
 
 
 @pytest.mark.slow

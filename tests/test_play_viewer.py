@@ -16,7 +16,7 @@ from viser import GuiEvent
 
 from vd.assets_usd.hands import load_hand
 from vd.play.session import Session
-from vd.play.viewer import HIDDEN, PlayViewer, open_page
+from vd.play.viewer import PlayViewer
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
@@ -36,7 +36,7 @@ PATIENCE_S = 300.0
 def player():
     objects = [box("brick", [0.09, 0.05, 0.03]), box("stick", [0.14, 0.02, 0.02])]
     env = FakeEnv(objects, num_envs=2, max_episode_steps=10_000, tolerance=-1.0, hand=load_hand("dclaw3"))
-    viewer = PlayViewer(Session(env, Turn(1.0)), open_page(verbose=False))
+    viewer = PlayViewer(Session(env, Turn(1.0)), verbose=False)
     yield viewer
     viewer.close()
 
@@ -92,6 +92,5 @@ def test_controls_reach_the_simulation(player):
     assert not np.allclose(session.snapshot.goal_quat, goal)
     use(player, "Object", "stick")
     assert session.object_name == "stick" and "stick" in player._status.content
-    use(player, "Goal", HIDDEN)
     use(player, "Reset")
     assert session.snapshot.time_s == 0.0

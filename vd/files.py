@@ -10,25 +10,8 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-ELSEWHERE = "choose another folder"
-_NO_SPACE = {
-    errno.ENOSPC: ("its disk is full", f"free some space, or {ELSEWHERE}"),
-    errno.EDQUOT: ("your quota of its disk is used up", f"free some space, or {ELSEWHERE}"),
-    errno.EFBIG: (
-        "the file would be larger than is allowed here",
-        f"raise the limit (ulimit -f), or {ELSEWHERE}",
-    ),
-    errno.EIO: ("its disk fails", ELSEWHERE),
-}
-"""What can go wrong while a file grows, and the remedy."""
-_REASONS = _NO_SPACE | {
-    errno.EROFS: ("it is on a disk that is read-only", ELSEWHERE),
-    errno.EACCES: ("you may not write there", f"{ELSEWHERE}, or change its permissions"),
-    errno.EPERM: ("you may not write there", f"{ELSEWHERE}, or change its permissions"),
-    errno.EISDIR: ("it is a folder", "name a file"),
-    errno.EEXIST: ("it is a file", ELSEWHERE),
-    errno.ENAMETOOLONG: ("its name is too long", "choose a shorter one"),
-}
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+"""What can go wrong while a file grows."""
 PROBE_BYTES = 1 << 20
 """What is written to ask whether a disk still takes something. Writers give up within a block of the end."""
 
@@ -39,13 +22,11 @@ class OutputError(OSError):
 
 def output_error(path: Path, error: OSError) -> OutputError:
     """``error``, met while ``path`` was to be written, in words."""
-    path = Path(path)
-    there = _nearest(path)
-    if there != path and not there.is_dir():
-        reason, remedy = f"{there} is a file", ELSEWHERE
-    else:
-        unknown = (error.strerror or str(error) or type(error).__name__, ELSEWHERE)
-        reason, remedy = _REASONS.get(error.errno or 0, unknown)
+    there = _nearest(Path(path))
+    reason = os.strerror(error.errno) if error.errno else str(error) or type(error).__name__
+    if there != Path(path) and not there.is_dir():
+        reason = f"{there} is a file"
+    remedy = f"{'free some space, or ' if error.errno in _FULL else ''}choose another path"
     result = OutputError(f"cannot write {path}: {reason}; {remedy}")
     result.errno = error.errno
     return result
@@ -71,7 +52,7 @@ def check_folder(folder: Path) -> None:
     """Refuse a folder that can be neither written to nor made; nothing is written."""
     there = _nearest(Path(folder))
     if not there.is_dir():
-        raise output_error(folder, OSError(errno.EEXIST, ""))
+        raise output_error(folder, OSError(errno.ENOTDIR, ""))
     if not os.access(there, os.W_OK | os.X_OK, effective_ids=True):
         read_only = os.statvfs(there).f_flag & os.ST_RDONLY
         raise output_error(folder, OSError(errno.EROFS if read_only else errno.EACCES, ""))
@@ -108,7 +89,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
             yield temporary
         except Exception as error:
             # Writers in other languages lose the reason, so the disk is asked.
-            told = isinstance(error, OSError) and error.errno in _NO_SPACE
+            told = isinstance(error, OSError) and error.errno in _FULL
             reason = error if told else _refusal(temporary)
             if isinstance(reason, OSError):
                 raise output_error(path, reason) from error

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import newton
 import numpy as np
@@ -93,14 +94,11 @@ class Camera:
         return replace(self, eye=_vector(eye), target=_vector(point))
 
 
-@dataclass(frozen=True)
-class Picture:
-    """What the camera saw of one cell, RGB bytes."""
+class Picture(NamedTuple):
+    """What the camera saw of one cell, RGB bytes, and the object in the goal's orientation, seen likewise."""
 
-    scene: np.ndarray
-    """Hand and object, shape [height, width, 3]."""
-    goal: np.ndarray
-    """The object in the goal's orientation, seen from the same direction, shape [size, size, 3]."""
+    scene: np.ndarray  # [height, width, 3]
+    goal: np.ndarray  # [size, size, 3]
 
 
 class PictureModel:
@@ -209,12 +207,23 @@ class Renderer:
         self._sensor = SensorCamera(self.pictured.model)
         self._sensor.create_default_light(enable_shadows=True, direction=_light(self.camera))
         self._sensor.set_ambient_light(SKY, GROUND)
-        self._config = SensorCamera.RenderConfig(enable_shadows=True)
         radius = max(float(np.linalg.norm(item.vertices, axis=1).max()) for item in objects)
+        square = (goal_size or round(GOAL_SHARE * height),) * 2
+
+        def view(camera: Camera, size: tuple[int, int], first_world: int) -> dict[str, Any]:
+            """What the sensor wants to know, and its buffers, to draw one world for each cell."""
+            worlds = list(range(first_world, first_world + cells))
+            return {
+                "camera_transforms": wp.array([camera.transform] * cells, dtype=wp.transformf, device=device),
+                "camera_rays": SensorCamera.compute_camera_rays_pinhole(
+                    *size, camera_fov=camera.fov, device=device
+                ),
+                "color_image": self._sensor.allocate_image_color(cells, *size),
+                "world_indices": wp.array(worlds, dtype=wp.int32, device=device),
+            }
+
         goal_camera = self.camera.aimed_at((0.0, 0.0, 0.0), radius)
-        self._scene_view = _View(self._sensor, self.camera, (width, height), range(cells), device)
-        goals, square = range(cells, 2 * cells), (goal_size or round(GOAL_SHARE * height),) * 2
-        self._goal_view = _View(self._sensor, goal_camera, square, goals, device)
+        self._views = view(self.camera, (width, height), 0), view(goal_camera, square, cells)
 
     def render(
         self, joint_q: np.ndarray, goal_quat: np.ndarray, table: np.ndarray | bool = True
@@ -230,11 +239,19 @@ class Renderer:
             C pictures.
         """
         self.pictured.pose(joint_q, goal_quat, table=table)
-        state = self.pictured.state
+        state, drawn = self.pictured.state, []
         self.pictured.model.bvh_refit_shapes(state)
-        scenes = self._scene_view.draw(state, self._config)
-        goals = self._goal_view.draw(state, self._config)
-        return [Picture(scene, goal) for scene, goal in zip(scenes, goals, strict=True)]
+        for view in self._views:
+            self._sensor.update(
+                state,
+                **view,
+                clear_data=SensorCamera.ClearData(clear_color=BACKGROUND),
+                render_config=SensorCamera.RenderConfig(enable_shadows=True),
+            )
+            # On the CPU a view of the buffer that the next frame overwrites.
+            packed = view["color_image"].numpy().copy()
+            drawn.append(packed.view(np.uint8).reshape(*packed.shape, 4)[..., :3])
+        return [Picture(scene, goal) for scene, goal in zip(*drawn, strict=True)]
 
 
 def _vector(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
@@ -243,42 +260,6 @@ def _vector(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
 
 
 def _light(camera: Camera) -> wp.vec3:
-    right, backward = camera.rotation[:, 0], camera.rotation[:, 2] * [1.0, 1.0, 0.0]
-    forward = -backward / np.linalg.norm(backward)
-    direction = (
-        LIGHT_DIRECTION[0] * right + LIGHT_DIRECTION[1] * forward + LIGHT_DIRECTION[2] * np.array([0, 0, 1.0])
-    )
-    return wp.normalize(wp.vec3(*direction))
-
-
-class _View:
-    """One camera over several environments, with its buffers."""
-
-    def __init__(
-        self,
-        sensor: SensorCamera,
-        camera: Camera,
-        size: tuple[int, int],
-        envs: Sequence[int],
-        device: str,
-    ):
-        self._sensor = sensor
-        self._rays = SensorCamera.compute_camera_rays_pinhole(*size, camera_fov=camera.fov, device=device)
-        self._transforms = wp.array([camera.transform] * len(envs), dtype=wp.transformf, device=device)
-        self._worlds = wp.array(list(envs), dtype=wp.int32, device=device)
-        self._image = sensor.allocate_image_color(len(envs), *size)
-        self._clear = SensorCamera.ClearData(clear_color=BACKGROUND)
-
-    def draw(self, state: newton.State, config: SensorCamera.RenderConfig) -> np.ndarray:
-        """RGB bytes of every world, shape [environments, height, width, 3]."""
-        self._sensor.update(
-            state,
-            self._transforms,
-            self._rays,
-            color_image=self._image,
-            world_indices=self._worlds,
-            clear_data=self._clear,
-            render_config=config,
-        )
-        packed = self._image.numpy().copy()  # on the CPU a view of the buffer that the next frame overwrites
-        return packed.view(np.uint8).reshape(*packed.shape, 4)[..., :3]
+    up = np.array([0.0, 0.0, 1.0])
+    right = camera.rotation[:, 0]
+    return wp.normalize(wp.vec3(*(LIGHT_DIRECTION @ np.stack([right, np.cross(up, right), up]))))

@@ -4,12 +4,12 @@ import os
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Any
+from unittest.mock import patch
 
 from vd.interrupt import end_with_parent
 
@@ -39,6 +39,7 @@ def run_tasks(
     jobs: int,
     limit_s: float,
     gpu: bool = False,
+    threads: int = 1,
 ) -> None:
     """Run ``work`` on every task in fresh processes, each with one thread of linear algebra.
 
@@ -50,13 +51,15 @@ def run_tasks(
         jobs: Processes.
         limit_s: Longest time of a task [s].
         gpu: Whether the workers may see a GPU; a context each would fill it.
+        threads: OpenMP's threads of a worker.
     """
     waiting = deque(tasks)
     # A pool for each process: one that dies takes its pool along.
     idle = [_worker() for _ in range(min(jobs, len(tasks)))]
     running: dict[Future[Any], tuple[Any, ProcessPoolExecutor, float]] = {}
     try:
-        with _environment(gpu):
+        inherited = dict.fromkeys(SINGLE, "1") | {SINGLE[0]: str(threads)}
+        with patch.dict(os.environ, inherited if gpu else inherited | {"CUDA_VISIBLE_DEVICES": ""}):
             while waiting or running:
                 while idle and waiting:
                     worker, task = idle.pop(), waiting.popleft()
@@ -107,21 +110,3 @@ def _kill(worker: ProcessPoolExecutor) -> None:
     for process in list((worker._processes or {}).values()):
         process.kill()
     worker.shutdown(wait=False, cancel_futures=True)
-
-
-@contextmanager
-def _environment(gpu: bool) -> Iterator[None]:
-    """What processes started meanwhile inherit."""
-    change = dict.fromkeys(SINGLE, "1")
-    if not gpu:
-        change["CUDA_VISIBLE_DEVICES"] = ""
-    before = {name: os.environ.get(name) for name in change}
-    os.environ.update(change)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

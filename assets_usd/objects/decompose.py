@@ -1,5 +1,6 @@
 """Convex decomposition of a mesh: CoACD in a child process with a limit of processor time."""
 
+import multiprocessing
 import os
 import resource
 import signal
@@ -11,7 +12,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from vd.assets_usd.objects.children import ChildError, in_child
 from vd.assets_usd.objects.geometry import (
     SLIVER_THICKNESS,
     Hull,
@@ -22,6 +22,7 @@ from vd.assets_usd.objects.geometry import (
     simplify_hull,
 )
 from vd.assets_usd.objects.settings import LEAST_THRESHOLD, ImportSettings, MeshError
+from vd.interrupt import end_with_parent
 
 HULL_VERTICES = 32
 """Most vertices of a part."""
@@ -90,17 +91,48 @@ def _coacd_parts(
     return [np.asarray(v, dtype=np.float64) for v, _ in parts]
 
 
-def _within_limits(seconds: float, *arguments: Any) -> list[np.ndarray] | str:
-    """CoACD in this process, which its limit of processor time ends; the parts, or why there are none."""
+def _answer(pipe: Any, parent: int, seconds: float, *arguments: Any) -> None:
+    """CoACD in this process, which its limit of processor time ends, or the end of its parent."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once: CoACD does not listen
+    end_with_parent(parent)
     limit = int(time.process_time()) + max(1, round(seconds))
     resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     os.environ["OMP_WAIT_POLICY"] = "passive"  # threads that wait for each other take no processor time
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
-        return _coacd_parts(*arguments) or "CoACD returned no part"
+        pipe.send(_coacd_parts(*arguments) or "CoACD returned no part")
     except Exception as error:  # the reason travels to the parent
-        return f"{type(error).__name__}: {error}"
+        pipe.send(f"{type(error).__name__}: {error}")
+
+
+def _parts_or_reason(seconds: float, *arguments: Any) -> list[np.ndarray] | str:
+    """CoACD's parts, or why there are none, from a child process: it may hang or crash.
+
+    Raises:
+        MeshError: It hangs.
+    """
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=_answer, args=(sender, os.getpid(), seconds, *arguments))
+    child.start()
+    sender.close()
+    try:
+        if receiver.poll(HANG_S * seconds):
+            return receiver.recv()
+        raise MeshError(
+            f"CoACD hangs: no result within {HANG_S * seconds:g} s, though allowed only {seconds:g} s of "
+            "processor time; import it again"
+        )
+    except EOFError:
+        child.join()
+        if child.exitcode == -signal.SIGXCPU:
+            return f"no result after {seconds:g} s of processor time (--time-limit)"
+        return f"CoACD ended with exit code {child.exitcode}"
+    finally:
+        child.kill()
+        child.join()
+        receiver.close()
 
 
 def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ...]:
@@ -135,21 +167,9 @@ def decompose(
     Raises:
         MeshError: CoACD hangs.
     """
-    limit, hang = settings.time_limit, HANG_S * settings.time_limit
-    arguments = limit, vertices, faces, settings, max_vertices
-    try:
-        parts = in_child(_within_limits, *arguments, start="fork", limit_s=hang)
-        hulls = () if isinstance(parts, str) else tidy_hulls(parts, max_vertices)
-        why = parts if isinstance(parts, str) else "it gave only slivers"
-    except ChildError as error:
-        if error.code is None:
-            raise MeshError(
-                f"CoACD hangs: no result within {hang:g} s, though allowed only {limit:g} s of processor "
-                "time; import it again"
-            ) from error
-        hulls, why = (), f"CoACD ended with exit code {error.code}"
-        if error.code == -signal.SIGXCPU:
-            why = f"no result after {limit:g} s of processor time (--time-limit)"
+    parts = _parts_or_reason(settings.time_limit, vertices, faces, settings, max_vertices)
+    hulls = () if isinstance(parts, str) else tidy_hulls(parts, max_vertices)
+    why = parts if isinstance(parts, str) else "it gave only slivers"
     if hulls:
         return Decomposition(hulls, "coacd")
     hull = simplify_hull(convex_hull(vertices), max_vertices)

@@ -2,19 +2,16 @@
 
 import hashlib
 import json
-import multiprocessing
 import os
-import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from vd.assets_usd.objects.bodies import body_of, cavity_share, error_of_parts
-from vd.assets_usd.objects.children import ChildError, in_child
 from vd.assets_usd.objects.decompose import (
     GOOD_ERROR,
     HANG_S,
@@ -31,16 +28,17 @@ from vd.assets_usd.objects.model import (
     ObjectError,
     ObjectModel,
     build_model,
-    read_hash,
     read_object,
+    stored_facts,
     write_object,
 )
-from vd.assets_usd.objects.plan import Job, check_target, find_meshes, gone_objects, plan_jobs
+from vd.assets_usd.objects.plan import Job, check_target, find_meshes, plan_jobs
 from vd.assets_usd.objects.reading import declared_unit, load_mesh, mesh_kind
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.settings import ImportSettings, MeshError
 from vd.files import make_folder
 from vd.warp_quiet import quiet_warp
+from vd.workers import run_tasks
 
 IMPORT_VERSION = 5
 """Part of every content hash: raise it when the import computes something else."""
@@ -53,11 +51,8 @@ MAX_ERROR, MAX_OFFSET = 1.0, 0.03
 on average, than this share of the longest side: 4 mm of 13 cm, where fingertips have a radius of 10 mm. Of
 thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as parts differs by its volume."""
 
-WORKER_OVERHEAD_S = 600.0
-"""Wall-clock time that a child gets beside its runs of CoACD before it is taken to hang."""
-
-POLL_S = 0.1
-"""Between two looks whether all children have ended."""
+OVERHEAD_S = 600.0
+"""Wall-clock time that a mesh gets beside its runs of CoACD before it is taken to hang."""
 
 
 @dataclass(frozen=True)
@@ -66,14 +61,13 @@ class ImportResult:
 
     Attributes:
         job: The mesh, and what was to be made of it.
-        status: ``imported``, ``cached`` (nothing to do) or ``refused``; ``gone`` of an object whose mesh file
-            is gone (it stays in the set).
+        status: ``imported``, ``cached`` (nothing to do) or ``refused``.
         reason: Why it was refused.
         model: The object, if it was imported now or earlier.
     """
 
     job: Job
-    status: Literal["imported", "cached", "refused", "gone"]
+    status: Literal["imported", "cached", "refused"]
     reason: str = ""
     model: ObjectModel | None = None
 
@@ -127,6 +121,7 @@ def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
 
 def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     """Import one mesh in this process (CoACD runs in a child). A mesh that is refused is a result."""
+    quiet_warp()
     try:
         model = _object_of(job, settings)
         write_object(Path(job.target), model)
@@ -179,21 +174,6 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
     )
 
 
-def _import_quietly(job: Job, settings: ImportSettings) -> ImportResult:
-    quiet_warp()
-    return import_mesh(job, settings)
-
-
-def _import_in_child(job: Job, settings: ImportSettings) -> ImportResult:
-    """Import one mesh in a child of its own."""
-    # A busy machine is no reason: processor time is limited, this only ends what hangs.
-    limit = RUNS * HANG_S * settings.time_limit + WORKER_OVERHEAD_S
-    try:
-        return in_child(_import_quietly, job, settings, start="spawn", limit_s=limit)
-    except ChildError as error:
-        return ImportResult(job, "refused", f"the import ended with {error}; what it said is above")
-
-
 def import_meshes(
     paths: Iterable[Path],
     out: Path,
@@ -202,10 +182,10 @@ def import_meshes(
     jobs: int = 0,
     progress: Callable[[ImportResult, int, int], None] | None = None,
 ) -> list[ImportResult]:
-    """Import meshes, several at a time, each in a process of its own.
+    """Import meshes, several at a time, in processes of their own: none that hangs or crashes stops others.
 
-    An object file whose content hash still holds is left alone, unless its mesh has moved, so that an
-    interrupted import goes on where it stopped.
+    An object file whose content hash still holds is left alone, so that an interrupted import goes on where
+    it stopped.
 
     Args:
         paths: Files and folders.
@@ -215,7 +195,7 @@ def import_meshes(
         progress: Called after each mesh with its result, the number done and the number of all.
 
     Returns:
-        One result per mesh, in the order of the meshes, then one for each object whose mesh is gone.
+        One result per mesh, in the order of the meshes.
 
     Raises:
         MeshError: A path does not exist or holds no mesh, two meshes would have one name, or an object would
@@ -226,7 +206,6 @@ def import_meshes(
     settings.check()
     out = Path(out)
     plan = plan_jobs(find_meshes([Path(p) for p in paths]), out, settings.licence)
-    gone = gone_objects(out)
     results: dict[str, ImportResult] = {}
 
     def finish(result: ImportResult) -> None:
@@ -234,25 +213,28 @@ def import_meshes(
         if progress:
             progress(result, len(results), len(plan))
 
-    known = {job.name: _without_work(job, settings, moved=Path(job.target) in gone) for job in plan}
+    known = {job.name: _without_work(job, settings) for job in plan}
     todo = [job for job in plan if known[job.name] is None]
     new = not out.exists()
     make_folder(out)
     for result in filter(None, known.values()):
         finish(result)
-    _import_in_children(todo, settings, jobs or os.cpu_count() or 1, finish)
+    workers = max(min(jobs or os.cpu_count() or 1, len(todo)), 1)
+    run_tasks(
+        partial(import_mesh, settings=settings),
+        todo,
+        lambda job, result, why: finish(result or ImportResult(job, "refused", f"no import: {why}")),
+        jobs=workers,
+        # A busy machine is no reason: processor time is limited, this only ends what hangs.
+        limit_s=RUNS * HANG_S * settings.time_limit + OVERHEAD_S,
+        threads=max((os.cpu_count() or 1) // workers, 1),
+    )
     if new and not any(out.iterdir()):  # all were refused
         out.rmdir()
-    written = {Path(job.target) for job in todo}
-    stale = [
-        ImportResult(Job(file, path.stem, str(path)), "gone")
-        for path, file in gone.items()
-        if path not in written
-    ]
-    return [*(results[job.name] for job in plan), *stale]
+    return [results[job.name] for job in plan]
 
 
-def _without_work(job: Job, settings: ImportSettings, *, moved: bool) -> ImportResult | None:
+def _without_work(job: Job, settings: ImportSettings) -> ImportResult | None:
     """The result of a mesh that needs no work: it is refused, or its object is there and unchanged.
 
     Raises:
@@ -264,29 +246,7 @@ def _without_work(job: Job, settings: ImportSettings, *, moved: bool) -> ImportR
         content = content_hash(job, settings)
     except MeshError as error:
         return ImportResult(job, "refused", str(error))
-    current = target.is_file() and read_hash(target) == content
-    check_target(job, current)
-    if not current or moved:
-        return None
-    return ImportResult(job, "cached", model=read_object(target))
-
-
-def _import_in_children(
-    todo: list[Job], settings: ImportSettings, jobs: int, finish: Callable[[ImportResult], None]
-) -> None:
-    """Import meshes in so many children at a time; none is left when this is interrupted."""
-    workers = max(min(jobs, len(todo)), 1)
-    threads = str(max((os.cpu_count() or 1) // workers, 1))
-    os.environ |= {"OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": "1"}  # which children inherit
-    with ThreadPoolExecutor(workers) as pool:
-        pending = [pool.submit(_import_in_child, job, settings) for job in todo]
-        try:
-            for future in as_completed(pending):
-                finish(future.result())
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            while any(future.running() for future in pending):
-                for child in multiprocessing.active_children():
-                    child.terminate()
-                time.sleep(POLL_S)
-            raise
+    if target.is_file() and stored_facts(target).get("contentHash") == content:
+        return ImportResult(job, "cached", model=read_object(target))
+    check_target(job)
+    return None

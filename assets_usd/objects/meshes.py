@@ -67,21 +67,20 @@ def scales_that_fit(sides: Sequence[float], width: float) -> tuple[float, float]
 def scale_of(
     settings: ImportSettings, vertices: np.ndarray, declared: float | None
 ) -> tuple[float, list[str], list[str]]:
-    """Factor to metres for vertices [V, 3] in a file's unit (``declared``, m); notes and warnings.
-
-    Raises:
-        MeshError: The size is to be kept and the unit is not known.
-    """
-    settings.check_unit(declared)
+    """Factor to metres for vertices [V, 3] in a file's unit (``declared``, m); notes and warnings."""
     sides, width = np.ptp(vertices, axis=0), mean_width(vertices)
     unit = UNITS_M.get(settings.units, declared)
     if not settings.keep_size or unit is None:
         factor, note = choose_scale(sides, width, unit)
         return factor, [note] if note else [], []
-    size = f"{sides.max() * unit:.3f} m"
-    problem = misfit(sides * unit, width * unit)
-    warnings = [f"does not fit the hand at its real size of {size}: {problem}"] if problem else []
-    return unit, [f"taken as {unit_name(unit)}, real size kept: {size}"], warnings
+    size, (least, most) = f"{sides.max() * unit:.3f} m", scales_that_fit(sides, width)
+    misfit = (
+        f"does not fit the hand at its real size of {size}, mean width {width * unit:.3f} m: longest side "
+        f"{LONGEST_SIDE_M[0]:g} to {LONGEST_SIDE_M[1]:g} m, mean width at most {MEAN_WIDTH_M:g} m, shortest "
+        f"side at least {THINNEST_M:g} m"
+    )
+    notes = [f"taken as {unit_name(unit)}, real size kept: {size}"]
+    return unit, notes, [] if least <= unit <= most else [misfit]
 
 
 def mass_of(settings: ImportSettings, volume: float) -> tuple[float, list[str], list[str]]:
@@ -107,20 +106,6 @@ def mass_of(settings: ImportSettings, volume: float) -> tuple[float, list[str], 
 def unit_name(unit: float) -> str:
     """Name of a unit of so many metres."""
     return next((name for name, metres in UNITS_M.items() if metres == unit), f"{unit:g} m")
-
-
-def misfit(sides: np.ndarray, width: float) -> str:
-    """What of a shape [3], [m] does not fit the hand, by the bounds of this module; empty if it fits."""
-    low, high = LONGEST_SIDE_M
-    longest, shortest = float(max(sides)), float(min(sides))
-    found = []
-    if not low <= longest <= high:
-        found.append(f"longest side {longest:.3f} m, of {low:g} to {high:g}")
-    if width > MEAN_WIDTH_M:
-        found.append(f"mean width {width:.3f} m, of {MEAN_WIDTH_M:g} at most")
-    if shortest < THINNEST_M:
-        found.append(f"shortest side {shortest:.3f} m, of {THINNEST_M:g} at least")
-    return ", ".join(found)
 
 
 def choose_scale(sides: Sequence[float], width: float, unit: float | None = None) -> tuple[float, str]:

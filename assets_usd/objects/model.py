@@ -131,12 +131,7 @@ def build_model(
         points: Surface points [500, 3] in the same frame.
         mass_kg: Mass; the inertia is scaled to it.
         **fields: The remaining fields of :class:`ObjectModel`.
-
-    Raises:
-        ObjectError: The solid has no volume.
     """
-    if not solid.volume > 0.0:
-        raise ObjectError(f"{name}: the solid has no volume")
     moments, quat = principal_axes(solid.inertia * (mass_kg / solid.volume))
     return ObjectModel(
         name=name,
@@ -178,17 +173,10 @@ def write_object(path: Path, model: ObjectModel) -> Path:
 
     Returns:
         The path.
-
-    Raises:
-        ObjectError: The name is no valid prim name or the suffix is not a USD one.
     """
-    from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+    from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
     path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise ObjectError(f"{path}: the suffix must be one of {', '.join(SUFFIXES)}")
-    if not Sdf.Path.IsValidIdentifier(model.name):
-        raise ObjectError(f"{path}: name {model.name!r} is no valid prim name; use letters, digits and _")
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -267,16 +255,9 @@ def is_object(stage: Any) -> bool:
     return bool(_custom(stage.GetRootLayer()))
 
 
-def read_origin(path: Path) -> tuple[str, str] | None:
-    """``source`` and ``file`` of an object file of any version; None if it is no object file of ours."""
-    data = _custom(_layer(path))
-    return (str(data.get("source", "")), str(data.get("file", ""))) if data else None
-
-
-def read_hash(path: Path) -> str | None:
-    """The content hash of an object file of this version, or None."""
-    data = _custom(_layer(path))
-    return str(data["contentHash"]) if data.get("formatVersion") == FORMAT_VERSION else None
+def stored_facts(path: Path) -> dict[str, Any]:
+    """Custom data of an object file of any version, by names in camel case; empty of any other file."""
+    return _custom(_layer(path))
 
 
 def read_object(path: Path) -> ObjectModel:

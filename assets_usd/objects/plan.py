@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vd.assets_usd.objects.model import object_files, read_origin
-from vd.assets_usd.objects.reading import KINDS, MESH_SUFFIXES
-from vd.assets_usd.objects.sets import built_in_models, objects_dir
+from vd.assets_usd.objects.model import object_files, stored_facts
+from vd.assets_usd.objects.reading import MESH_SUFFIXES
+from vd.assets_usd.objects.sets import is_built_in, objects_dir
 from vd.assets_usd.objects.settings import MeshError
 
 GENERIC_WORDS = frozenset(
@@ -109,8 +109,8 @@ def _meshes_below(folder: Path) -> list[Path]:
         and path.suffix.lower() in MESH_SUFFIXES
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     )
-    usd = [path for path in files if KINDS[path.suffix.lower()] == "usd"]
-    left_out = {path for path in usd if read_origin(path) is not None}
+    usd = [path for path in files if path.suffix.lower().startswith(".usd")]
+    left_out = {path for path in usd if stored_facts(path)}
     for path in usd:
         if path not in left_out:
             left_out |= _parts_of_usd(path)
@@ -180,26 +180,22 @@ def plan_jobs(meshes: Iterable[Path], out: Path, licence: str) -> list[Job]:
     return jobs
 
 
-def check_target(job: Job, unchanged: bool) -> None:
+def check_target(job: Job) -> None:
     """Refuse to write over what is not this mesh's own object.
-
-    Args:
-        job: The mesh.
-        unchanged: Whether the object that is there was made from the same content.
 
     Raises:
         MeshError: Names both, and the remedy.
     """
     target = Path(job.target)
-    if unchanged or not target.exists():
+    if not target.exists():
         return
-    origin = read_origin(target)
-    if origin is None:
+    facts = stored_facts(target)
+    if not facts:
         raise MeshError(
             f"{target} is there and no object of vd-assets, or a damaged one; remove it, or import into "
             "another folder (--out)"
         )
-    source, file = origin
+    source, file = str(facts.get("source", "")), str(facts.get("file", ""))
     # Objects of versions that recorded no file are told by the name in their source.
     if file and os.path.realpath(file) == os.path.realpath(job.source):
         return
@@ -209,13 +205,6 @@ def check_target(job: Job, unchanged: bool) -> None:
         f"{job.source} would be written over {target}, which was made from {file or source}; "
         "rename the mesh, import it into another set (--out), or remove the object"
     )
-
-
-def gone_objects(out: Path) -> dict[Path, str]:
-    """Object files of a set whose mesh file is no longer there, and that file's path."""
-    origins = {path: read_origin(path) for path in object_files(out)} if out.is_dir() else {}
-    files = {path: origin[1] for path, origin in origins.items() if origin and origin[1]}
-    return {path: file for path, file in files.items() if not Path(file).exists()}
 
 
 def default_set(paths: Sequence[Path]) -> Path:
@@ -229,10 +218,10 @@ def default_set(paths: Sequence[Path]) -> Path:
     name = object_name(above) if above.is_file() else plain
     folder = objects_dir() / name
     other = f"say where with --out, such as --out {objects_dir() / f'my-{name}'}"
-    if built_in_models(name) is not None:
+    if is_built_in(name):
         raise MeshError(f"{name!r} is the name of a built-in object set; {other}")
     for path in object_files(folder) if folder.is_dir() else ():
-        origin = read_origin(path)
-        if origin and origin[1] and not Path(origin[1]).is_relative_to(above):
-            raise MeshError(f"the set {folder} holds objects from elsewhere ({origin[1]}); {other}")
+        file = stored_facts(path).get("file")
+        if file and not Path(file).is_relative_to(above):
+            raise MeshError(f"the set {folder} holds objects from elsewhere ({file}); {other}")
     return folder

@@ -1,8 +1,6 @@
 """Mesh files: what a file is, and its triangles."""
 
-import json
 import re
-import struct
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,49 +9,17 @@ import numpy as np
 
 from vd.assets_usd.objects.settings import MeshError
 
-KINDS = {
-    ".obj": "obj",
-    ".stl": "stl",
-    ".ply": "ply",
-    ".glb": "glb",
-    ".usd": "usd",
-    ".usda": "usd",
-    ".usdc": "usd",
-    ".usdz": "usd",
-}
-"""Kind of mesh by suffix."""
-
-MESH_SUFFIXES = tuple(KINDS)
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".usd", ".usda", ".usdc", ".usdz")
 
 HEAD_BYTES = 65536
 """Bytes in which a file says what it is."""
 
-_EXPORT = "export it as STL, OBJ, PLY or GLB from the program that made it"
-_UNPACK = "unpack it and import what is in it"
-
 _FOREIGN = (
     (rb"version https://git-lfs", "a Git LFS pointer, not the mesh itself; fetch the mesh with git lfs pull"),
     (rb"\s*(<!doctype html|<html)", "a web page, not a mesh: the download failed; download it again"),
-    (rb"\s*ISO-10303-21", f"a STEP file: exact surfaces, no triangles; {_EXPORT}"),
-    (rb"\s*(CASCADE Topology|DBRep_DrawableShape)", f"a BREP file: exact surfaces, no triangles; {_EXPORT}"),
-    (rb"\x1f\x8b|BZh|\xfd7zXZ|\x28\xb5\x2f\xfd|7z\xbc\xaf|Rar!", f"a compressed archive; {_UNPACK}"),
-    (rb"(?s).{257}ustar", f"a tar archive; {_UNPACK}"),
-    (rb"DRACO", f"a Draco compressed mesh; {_EXPORT}"),
-    (rb"Kaydara FBX|; FBX", f"an FBX file; {_EXPORT}"),
-    (rb"BLENDER", "a Blender file; export it as STL, OBJ, PLY or GLB from Blender"),
-    (rb"(?s)\s*<\?xml.{0,400}<COLLADA", f"a COLLADA file; {_EXPORT}"),
+    (rb"\x1f\x8b|BZh|\xfd7zXZ|\x28\xb5\x2f\xfd|7z\xbc\xaf|Rar!", "an archive; unpack it"),
 )
-"""Beginnings of files that are no mesh of a supported kind, and what to do with them."""
-
-_FOREIGN_SUFFIXES = {
-    ".igs": f"an IGES file: exact surfaces, no triangles; {_EXPORT}",
-    ".iges": f"an IGES file: exact surfaces, no triangles; {_EXPORT}",
-    ".gltf": "a glTF with its data in other files; export it as one .glb",
-}
-"""The same for what has no such beginning."""
-
-_COMPRESSIONS = {"KHR_draco_mesh_compression": "Draco", "EXT_meshopt_compression": "meshopt"}
-"""Extensions of glTF without which no triangle can be read."""
+"""Beginnings of what has the name of a mesh and is none, and what to do with it."""
 
 
 def mesh_kind(path: Path) -> str:
@@ -69,36 +35,16 @@ def mesh_kind(path: Path) -> str:
         head = stream.read(HEAD_BYTES)
     if not head:
         raise MeshError("empty file")
-    suffix = path.suffix.lower()
     for beginning, what in _FOREIGN:
         if re.match(beginning, head, re.IGNORECASE):
             raise MeshError(what)
-    if suffix in _FOREIGN_SUFFIXES:
-        raise MeshError(_FOREIGN_SUFFIXES[suffix])
-    kind = KINDS.get(suffix)
-    if head.startswith(b"PK\x03\x04") and suffix != ".usdz":
-        raise MeshError(f"a 3MF file; {_EXPORT}" if suffix == ".3mf" else f"a zip archive; {_UNPACK}")
-    if kind is None:
-        raise MeshError(f"unsupported type {suffix or '(no suffix)'}; use {', '.join(MESH_SUFFIXES)}")
-    if kind == "glb":
-        _refuse_compressed(path)
-    return kind
-
-
-def _refuse_compressed(path: Path) -> None:
-    """Refuse a binary glTF whose triangles need an extension that is not read."""
-    with path.open("rb") as stream:
-        header = stream.read(20)
-        length = struct.unpack_from("<I", header, 12)[0] if len(header) == 20 else 0
-        try:
-            required = json.loads(stream.read(length)).get("extensionsRequired", ())
-        except ValueError:  # reading it says so
-            return
-    for extension in _COMPRESSIONS.keys() & required:
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
         raise MeshError(
-            f"a GLB with {_COMPRESSIONS[extension]} compression ({extension}), which is not read; "
-            "export it again without compression"
+            f"unsupported type {suffix or '(no suffix)'}; use {', '.join(MESH_SUFFIXES)}: export a CAD or "
+            "scene file from the program that made it, and unpack an archive"
         )
+    return suffix[1:4]  # usdz is a usd
 
 
 def declared_unit(path: Path) -> float | None:
@@ -122,8 +68,8 @@ def load_mesh(path: Path) -> Any:
     """
     mesh = load_points(path)
     if not len(mesh.faces):
-        points = len(mesh.vertices)
-        raise MeshError(f"not a mesh: {points} points and no faces" if points else "empty: no faces")
+        points = f"{len(mesh.vertices)} points and " if len(mesh.vertices) else ""
+        raise MeshError(f"not a mesh, or cut short: {points}no faces; get it again, or export it again")
     return mesh
 
 
@@ -154,7 +100,8 @@ def load_points(path: Path) -> Any:
 def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
-    declared = declared_faces(path, kind)
+    with path.open("rb") as stream:  # of a text of points fewer would be read without a word
+        said = re.search(rb"element\s+face\s+(\d+)", stream.read(HEAD_BYTES)) if kind == "ply" else None
     try:
         # Textures and materials are not needed, and missing ones must not stop the import.
         loaded = trimesh.load(path, file_type=kind, process=False, skip_materials=True)
@@ -163,26 +110,12 @@ def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
         faces = np.asarray(getattr(mesh, "faces", ()), dtype=np.int64).reshape(-1, 3)
     except Exception as error:  # parsers raise anything on a broken file
         raise MeshError(f"neither mesh nor points: {type(error).__name__}: {error}") from error
-    if len(faces) < declared:
+    if said and len(faces) < int(said.group(1)):
         raise MeshError(
-            f"declares {declared} faces, of which {len(faces)} could be read: cut short or damaged; "
-            "get it again, or export it again"
+            f"declares {int(said.group(1))} faces, of which {len(faces)} could be read: cut short or "
+            "damaged; get it again, or export it again"
         )
     return vertices, faces
-
-
-def declared_faces(path: Path, kind: str) -> int:
-    """Least number of triangles that a file says it has; 0 for kinds that do not say."""
-    if kind == "ply":
-        with path.open("rb") as stream:
-            said = re.search(rb"element\s+face\s+(\d+)", stream.read(HEAD_BYTES))
-        return int(said.group(1)) if said else 0
-    if kind == "stl":
-        data = path.read_bytes()
-        count = int(struct.unpack_from("<I", data, 80)[0]) if len(data) >= 84 else 0
-        text = b"\0" not in data[:HEAD_BYTES] and len(data) != 84 + 50 * count
-        return len(re.findall(rb"\bfacet\s+normal\b", data, re.IGNORECASE)) if text else count
-    return 0
 
 
 def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:

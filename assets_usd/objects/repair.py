@@ -31,7 +31,7 @@ APART = 0.02
 """Pieces whose boxes are farther from each other than this share of the longest side are apart: 2 mm of
 10 cm. Models put together from pieces touch or overlap."""
 
-MOST_PIECES = 2000
+MOST_PIECES = 5000
 """A surface of more pieces is torn, and no collection of bodies."""
 
 OTHER_BODIES = 0.05
@@ -107,7 +107,9 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
     if not len(mesh.faces):
-        raise MeshError(f"degenerate: all {before} faces have no area")
+        raise MeshError(
+            f"degenerate: all {before} faces have no area; a GLB is to be exported without compression"
+        )
     if len(mesh.faces) < before:
         notes.append(f"removed {before - len(mesh.faces)} degenerate or duplicate faces")
     mesh = _largest_body(_without_strays(_opened_seams(mesh), notes, warnings), warnings)
@@ -121,11 +123,9 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
         notes.append("fixed winding")
         trimesh.repair.fix_winding(mesh)
     mesh = _filled_holes(mesh, notes)
-    mesh, cavity_vertices, cavity_faces = _turned_outward(mesh, warnings)
-    pieces = convex_pieces(mesh)
+    cavity_vertices = mesh.vertices
+    mesh, pieces, cavity_faces = _turned_outward(mesh, notes, warnings)
     closed = bool(mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0.0)
-    if pieces:
-        notes.append(f"{len(pieces)} convex piece{'s' if len(pieces) > 1 else ''}: nothing to decompose")
     return RepairedMesh(
         np.asarray(mesh.vertices, dtype=np.float64),
         np.asarray(mesh.faces, dtype=np.int32),
@@ -166,45 +166,19 @@ def _opened_seams(mesh: Any) -> Any:
     return trimesh.Trimesh(vertices, corner.reshape(-1, 3), process=False)
 
 
-@dataclass(frozen=True)
-class _Pieces:
-    """The connected pieces of a mesh.
-
-    Attributes:
-        of_face: Piece of each face [T].
-        faces: Faces of each piece.
-        low: Lower corner of the box of each [P, 3].
-        high: Upper corner [P, 3].
-        area: Area of each [P].
-        closed: Which are closed [P].
-        volume: Signed volume of each, 0 of open ones [P].
-    """
-
-    of_face: np.ndarray
-    faces: list[np.ndarray]
-    low: np.ndarray
-    high: np.ndarray
-    area: np.ndarray
-    closed: np.ndarray
-    volume: np.ndarray
-
-
-def _pieces(mesh: Any) -> _Pieces:
-    """The connected pieces of a ``trimesh.Trimesh``."""
+def _pieces(mesh: Any) -> tuple[np.ndarray, list[Any]]:
+    """Piece of each face [T], and the connected pieces; a torn surface counts as one."""
     import trimesh
 
     of_face = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
-    number = of_face.max() + 1
-    area = np.bincount(of_face, triangle_areas(mesh.vertices, mesh.faces), number)
-    open_edges = np.bincount(mesh.edges_unique_inverse)[mesh.edges_unique_inverse] != 2
-    closed = np.bincount(of_face[mesh.edges_face], open_edges, number) == 0
-    corner = mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0)
-    six_volume = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))
-    order = np.argsort(of_face, kind="stable")
-    faces = np.split(mesh.faces[order], np.cumsum(np.bincount(of_face))[:-1])
-    low, high = (np.array([b(mesh.vertices[f.ravel()], axis=0) for f in faces]) for b in (np.min, np.max))
-    volume = np.where(closed, np.bincount(of_face, six_volume, number) / 6.0, 0.0)
-    return _Pieces(of_face, faces, low, high, area, closed, volume)
+    if of_face.max() >= MOST_PIECES:
+        return np.zeros_like(of_face), [mesh]
+    return of_face, mesh.split(only_watertight=False, repair=False)
+
+
+def _volumes(pieces: list[Any]) -> np.ndarray:
+    """Signed volume of each piece, 0 of open ones [P]."""
+    return np.array([piece.volume if piece.is_watertight else 0.0 for piece in pieces])
 
 
 def _kept(mesh: Any, keep: np.ndarray) -> Any:
@@ -217,81 +191,70 @@ def _kept(mesh: Any, keep: np.ndarray) -> Any:
 
 def _without_strays(mesh: Any, notes: list[str], warnings: list[str]) -> Any:
     """The mesh without its strays; there is a warning if these made it longer."""
-    pieces = _pieces(mesh)
-    stray = (pieces.area < STRAY_AREA * pieces.area.sum()) & (
-        np.abs(pieces.volume) <= STRAY_VOLUME * np.abs(pieces.volume).sum()
-    )
-    if not stray.any() or pieces.area[stray].sum() > STRAYS_AREA * pieces.area.sum():
+    of_face, pieces = _pieces(mesh)
+    area, volume = np.array([piece.area for piece in pieces]), np.abs(_volumes(pieces))
+    stray = (area < STRAY_AREA * area.sum()) & (volume <= STRAY_VOLUME * volume.sum())
+    if not stray.any() or area[stray].sum() > STRAYS_AREA * area.sum():
         return mesh
-    kept = _kept(mesh, ~stray[pieces.of_face])
+    kept = _kept(mesh, ~stray[of_face])
     words = f"removed {stray.sum()} stray piece{'s' if stray.sum() > 1 else ''} of surface"
-    longest = [float(np.ptp(each.vertices, axis=0).max()) for each in (mesh, kept)]
-    if longest[0] > (1.0 + APART) * longest[1]:
-        warnings.append(f"{words}, which made it {longest[0] / longest[1]:.3g} times as long")
+    longer = mesh.extents.max() / kept.extents.max()
+    if longer > 1.0 + APART:
+        warnings.append(f"{words}, which made it {longer:.3g} times as long")
     else:
         notes.append(words)
     return kept
 
 
 def _largest_body(mesh: Any, warnings: list[str]) -> Any:
-    """The mesh without bodies that are apart from its largest.
+    """The mesh without bodies that are apart from its largest, by the volume of their convex hulls.
+
+    Pieces belong to one body if their boxes touch, or nearly so.
 
     Raises:
         MeshError: They are too large to be debris.
     """
-    while True:
-        body, volume = _bodies(mesh)
-        if len(volume) == 1:
-            return mesh
-        largest = int(np.argmax(volume))
-        share = 1.0 - volume[largest] / max(volume.sum(), 1e-300)
-        if share > OTHER_BODIES:
-            raise MeshError(
-                f"{len(volume)} bodies apart from each other, of which the largest has "
-                f"{100 * (1 - share):.0f} % of the volume: an object is one rigid body; import each alone, "
-                "or join them"
-            )
-        warnings.append(
-            f"left out {len(volume) - 1} piece{'s' if len(volume) > 2 else ''} apart from the largest body, "
-            f"{100 * share:.1f} % of the volume"
-        )
-        # Debris far away makes all else look near: look again without it.
-        mesh = _kept(mesh, body == largest)
-
-
-def _bodies(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Body of each face [T], and of each body the volume of its convex hull, which open ones have too.
-
-    Pieces belong to one body if their boxes touch, or nearly so.
-    """
     import trimesh
 
-    pieces = _pieces(mesh)
-    number = len(pieces.area)
-    if number > MOST_PIECES:
-        return np.zeros(len(mesh.faces), dtype=int), np.ones(1)
-    low, high = pieces.low, pieces.high + APART * float(np.ptp(mesh.vertices, axis=0).max())
+    of_face, pieces = _pieces(mesh)
+    low, high = np.stack([piece.bounds for piece in pieces], axis=1)
+    high = high + APART * mesh.extents.max()
     near = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
-    body = trimesh.graph.connected_component_labels(np.argwhere(near), node_count=number)
-    of_face = body[pieces.of_face]
-    corners = [mesh.vertices[mesh.faces[of_face == b].ravel()] for b in range(body.max() + 1)]
-    return of_face, np.array([hull_volume(points) for points in corners])
+    of_face = trimesh.graph.connected_component_labels(np.argwhere(near), node_count=len(pieces))[of_face]
+    number = of_face.max() + 1
+    if number == 1:
+        return mesh
+    volume = np.array([hull_volume(mesh.triangles[of_face == k].reshape(-1, 3)) for k in range(number)])
+    share = 1.0 - volume.max() / max(volume.sum(), 1e-300)
+    if share > OTHER_BODIES:
+        raise MeshError(
+            f"{number} bodies apart from each other, of which the largest has {100 * (1 - share):.0f} % of "
+            "the volume: an object is one rigid body; import each alone, or join them"
+        )
+    warnings.append(
+        f"left out {number - 1} piece{'s' if number > 2 else ''} apart from the largest body, "
+        f"{100 * share:.1f} % of the volume"
+    )
+    # Debris far away makes all else look near: look again without it.
+    return _largest_body(_kept(mesh, of_face == np.argmax(volume)), warnings)
 
 
-def _containers(mesh: Any, pieces: _Pieces) -> dict[int, int]:
-    """Of each piece that lies wholly in a closed one: the smallest such one."""
-    groups, low, high = pieces.faces, pieces.low, pieces.high
-    found: dict[int, int] = {}
-    for outer in np.argsort(np.abs(pieces.volume))[::-1]:  # smaller ones last: they overrule
-        if not pieces.closed[outer]:
-            continue
+def _containers(pieces: list[Any], volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The largest and the smallest closed piece in which each lies wholly, [P] each; itself if in none."""
+    largest, smallest = np.arange(len(pieces)), np.arange(len(pieces))
+    low, high = np.stack([piece.bounds for piece in pieces], axis=1)
+    for outer in np.argsort(np.abs(volume))[::-1]:
+        if not volume[outer]:
+            break
+        faces = pieces[outer].faces
+        surface = faces if volume[outer] > 0.0 else faces[:, ::-1]
         for inner in np.flatnonzero((low > low[outer]).all(axis=1) & (high < high[outer]).all(axis=1)):
-            corners = np.unique(groups[inner])
-            some = mesh.vertices[corners[:: max(1, len(corners) // INSIDE_SAMPLES)]]
-            surface = groups[outer] if pieces.volume[outer] > 0.0 else groups[outer][:, ::-1]
-            if inside(mesh.vertices, surface, some).all():
-                found[int(inner)] = int(outer)
-    return found
+            corners = pieces[inner].vertices
+            some = corners[:: max(1, len(corners) // INSIDE_SAMPLES)]
+            if inside(pieces[outer].vertices, surface, some).all():
+                smallest[inner] = outer
+                largest[inner] = outer if largest[inner] == inner else largest[inner]
+    return largest, smallest
 
 
 def _filled_holes(mesh: Any, notes: list[str]) -> Any:
@@ -324,59 +287,53 @@ def _filled_holes(mesh: Any, notes: list[str]) -> Any:
     return trimesh.Trimesh(vertices, np.concatenate([mesh.faces, fans]), process=False)
 
 
-def _turned_outward(mesh: Any, warnings: list[str]) -> tuple[Any, np.ndarray, np.ndarray]:
-    """The outer surface with its closed pieces wound outward, and vertices and faces of the cavities in it.
+def _turned_outward(
+    mesh: Any, notes: list[str], warnings: list[str]
+) -> tuple[Any, tuple[Hull, ...], np.ndarray]:
+    """The outer surface with its closed pieces wound outward, its convex pieces, and the cavities' faces.
 
     A closed piece in another is a cavity if it is wound the other way round, and else inside of the solid.
     What is in a cavity is solid again.
     """
     import trimesh
 
-    pieces = _pieces(mesh)
-    inner = _containers(mesh, pieces)
-    side = np.sign(pieces.volume)
-    for piece in inner:  # as if the outermost piece were wound outward
-        side[piece] *= np.sign(pieces.volume[_outermost(piece, inner)])
-    side[np.setdiff1d(np.arange(len(side)), list(inner))] = 1.0
-    borders = [piece for piece, outer in inner.items() if side[piece] * side[outer] < 0.0]
+    of_face, pieces = _pieces(mesh)
+    volume = _volumes(pieces)
+    largest, smallest = _containers(pieces, volume)
     faces = mesh.faces.copy()
-    turned = (side * pieces.volume < 0.0)[pieces.of_face]
+    turned = (volume[largest] < 0.0)[of_face]  # as if the outermost piece were wound outward
     faces[turned] = faces[turned][:, ::-1]
-    outer = ~np.isin(pieces.of_face, list(inner))
-    whole = np.abs(pieces.volume[~np.isin(np.arange(len(side)), list(inner))]).sum()
-    hollow = -(side * np.abs(pieces.volume))[borders].sum()
+    within = smallest != np.arange(len(pieces))
+    border = within & (volume * volume[smallest] < 0.0)
+    whole = np.abs(volume[~within]).sum()
+    hollow = -(volume * np.sign(volume[largest]))[border].sum()
     if hollow > CAVITY * whole:
         warnings.append(
             f"has a closed cavity of {100 * hollow / whole:.0f} % of its volume: mass and inertia are "
             "those of the hollow body, its convex parts are full"
         )
-    if np.abs(pieces.volume[[k for k in inner if k not in borders]]).sum() > CAVITY * whole:
+    if np.abs(volume[within & ~border]).sum() > CAVITY * whole:
         warnings.append(
             "a closed surface inside of another is wound like it, and taken as solid: if it is a cavity, "
             "turn its faces round"
         )
-    kept = trimesh.Trimesh(mesh.vertices, faces[outer], process=False)
+    kept = trimesh.Trimesh(mesh.vertices, faces[~within[of_face]], process=False)
     kept.remove_unreferenced_vertices()
-    return kept, mesh.vertices, faces[np.isin(pieces.of_face, borders)]
+    hulls = _convex_hulls([piece for piece, inner in zip(pieces, within, strict=True) if not inner])
+    if hulls:
+        notes.append(f"{len(hulls)} convex piece{'s' if len(hulls) > 1 else ''}: nothing to decompose")
+    return kept, hulls, faces[border[of_face]]
 
 
-def _outermost(piece: int, inner: dict[int, int]) -> int:
-    while piece in inner:
-        piece = inner[piece]
-    return piece
-
-
-def convex_pieces(mesh: Any) -> tuple[Hull, ...]:
-    """Convex hulls of a ``trimesh.Trimesh``'s connected pieces; none unless all are closed and convex."""
+def _convex_hulls(pieces: list[Any]) -> tuple[Hull, ...]:
+    """Convex hulls of pieces; none unless all are closed and convex."""
     hulls = []
-    for piece in mesh.split(only_watertight=False):
-        if not piece.is_watertight:
-            return ()
+    for piece in pieces:
         try:
             hull = convex_hull(piece.vertices)
         except ValueError:
             return ()
-        if abs(mesh_volume(piece.vertices, piece.faces)) < CONVEX * mesh_volume(*hull):
+        if not piece.is_watertight or abs(piece.volume) < CONVEX * mesh_volume(*hull):
             return ()
         hulls.append(hull)
     return tuple(hulls)

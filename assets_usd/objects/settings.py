@@ -1,8 +1,9 @@
 """How meshes are imported: the options of ``vd-assets import``."""
 
 from dataclasses import dataclass
-from math import inf
 from typing import Literal
+
+from vd.config import require
 
 LEAST_THRESHOLD = 0.01
 """CoACD takes no smaller one."""
@@ -44,7 +45,7 @@ class ImportSettings:
         """Refuse what cannot be meant.
 
         Raises:
-            MeshError: Names the option.
+            ValueError: Names the option.
         """
         if self.density is not None and self.mass is not None:
             raise MeshError("--density and --mass both give the mass; leave one out")
@@ -53,18 +54,9 @@ class ImportSettings:
             raise MeshError(
                 f"--density {self.density:g}: {low:g} to {high:g} kg/m3 are possible; water has 1000"
             )
-        if self.mass is not None and not 0.0 < self.mass < inf:
-            raise MeshError(f"--mass {self.mass:g}: give the mass in kg, above 0")
-        for option, value, least, most in (
-            ("--max-hulls", self.max_hulls, 1, inf),
-            ("--threshold", self.threshold, LEAST_THRESHOLD, 1.0),
-            ("--mcts-iterations", self.mcts_iterations, 1, inf),
-            ("--time-limit", self.time_limit, 1, inf),
-        ):
-            if not least <= value <= most:
-                raise MeshError(
-                    f"{option} {value:g}: give {least:g}{f' to {most:g}' if most < inf else ' or more'}"
-                )
+        if not LEAST_THRESHOLD <= self.threshold <= 1.0:
+            raise MeshError(f"--threshold {self.threshold:g}: give {LEAST_THRESHOLD:g} to 1")
+        require(self, "--", "positive", "mass max_hulls mcts_iterations time_limit")
 
     def check_unit(self, declared: float | None) -> None:
         """Refuse to keep the size of a mesh whose unit (``declared``, m) is not known.

@@ -3,11 +3,9 @@
 ``vd-play LOG`` replays a run on a hand.
 """
 
-import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,16 +14,16 @@ import tyro
 from vd import interrupt
 from vd.config import require
 from vd.device import resolve_device
-from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, check_names, episode_limit_s, start_at_rest
+from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, check_names, episode_limit_s
 from vd.evaluate.cfg import POLICY_HELP
 from vd.files import check_file
 from vd.hand_log import is_log
 from vd.paper import PAPER
-from vd.sim.cfg import Engine, in_mujoco
+from vd.sim.cfg import in_mujoco
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
-    from vd.play.replay import ReplaySession
+    from vd.play.replay import Replay
     from vd.play.session import Session
 
 VIDEO_SECONDS = 10.0
@@ -37,11 +35,13 @@ FAST_WORLDS_CPU = 16
 class PlayCfg:
     """Watch a policy: in the browser, or as a video made without a display or GPU.
 
+    Starts and goals are as trained; without a policy objects drop, and goals are all of SO(3).
+
     The folder of a log that vd-deploy wrote in place of the policy replays that run, all of it, whatever the
     other settings of the simulation. Without arguments it shows dclaw4-table.
     """
 
-    policy: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = None
+    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = DEFAULT_POLICY
     hand: str | None = None
     """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
     hand_layer: Annotated[str | None, tyro.conf.arg(help=LAYER_HELP)] = None
@@ -59,46 +59,16 @@ class PlayCfg:
     """Address of the viewer; 0.0.0.0 lets other machines look."""
     seed: int = 0
     """Seed of starts and goals."""
-    max_goal_angle: float | None = None
-    """Goals are within this angle [rad] of the object's orientation; pi is all of SO(3). By default as
-    trained, and pi without a policy."""
-    at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Start at rest on the table; the default is as trained, and a drop for zero and random."""
-    no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Start from a drop, whatever the training."""
-    stop_tolerance: float = PAPER.success.rotation_rad
-    """Error [rad] at which a goal counts as reached, with fingers and object still."""
-    episode_s: float | None = None
-    """Time after which an environment starts anew [s]; 10 by default, 15 with --in-air."""
     in_air: tyro.conf.FlagCreatePairsOff[bool] = False
     """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
     randomise: bool = False
     """Randomise dynamics and add noise and disturbances as in training."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
-    engine: Engine | None = None
-    """Physics of newton, or MuJoCo's own: the default on a CPU, where newton first compiles for a minute."""
-
-    @property
-    def agent_name(self) -> str:
-        """Which agent begins."""
-        return self.policy or DEFAULT_POLICY
-
-    @property
-    def limit_s(self) -> float:
-        """Time limit of an episode [s]."""
-        return episode_limit_s(self.episode_s, in_air=self.in_air)
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
-        start_at_rest(self.at_rest, self.no_at_rest)
-        require(self, "--", "positive", "cells seconds episode_s")
-        if self.max_goal_angle is not None and not 0.0 < self.max_goal_angle <= math.pi + 1e-6:
-            raise ValueError(
-                f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
-            )
-        if self.engine == "mujoco" and self.device.startswith("cuda"):
-            raise ValueError(f"--engine mujoco steps on the CPU, not on {self.device}; leave --device out")
+        require(self, "--", "positive", "cells seconds")
         if self.video is not None and self.video.suffix.lower() != ".mp4":
             raise ValueError(f"--video is {self.video}; use a name that ends in .mp4")
 
@@ -110,34 +80,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cfg.validate()
     if cfg.video is not None:
         check_file(cfg.video)
-    if is_log(cfg.agent_name):
-        quiet_warp()
-        return replay(cfg)
-    check_names([cfg.agent_name], cfg.objects, cfg.hand)
+    recorded = is_log(cfg.policy)
+    if not recorded:
+        check_names([cfg.policy], cfg.objects, cfg.hand)
     quiet_warp()
-    if cfg.video is not None:
-        frames = record_video(cfg, cfg.video)
-        print(f"{cfg.video} ({frames} frames)")
+    if recorded:
+        from vd.hand_log import read_log
+        from vd.play.replay import Replay, film
+
+        log = read_log(cfg.policy)
+        if cfg.video is None:
+            serve(Replay(log), cfg)
+            return 0
+        frames = film(log, cfg.video)
     else:
-        serve(cfg)
-    return 0
+        if cfg.video is None:
+            opened = _open(cfg, num_envs=1)
+            from vd.play.session import Session
 
-
-def replay(cfg: PlayCfg) -> int:
-    """Show the log of a run; returns the exit status.
-
-    Raises:
-        LogError: The log cannot be used.
-    """
-    from vd.hand_log import read_log
-    from vd.play.replay import Replay, ReplaySession, film
-
-    log = read_log(cfg.agent_name)
-    if cfg.video is None:
-        shown = Replay(log)
-        _serve(lambda: ReplaySession(shown), cfg)
-        return 0
-    frames = film(log, cfg.video)
+            serve(Session(*opened, seed=cfg.seed), cfg)
+            return 0
+        frames = record_video(cfg, cfg.video)
     print(f"{cfg.video} ({frames} frames)")
     return 0
 
@@ -149,14 +112,13 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
         ValueError: A setting, object set or policy cannot be used.
         FileNotFoundError: There is no such policy.
     """
-    trained = _policy(cfg)
+    env, policy = _open(cfg, num_envs=cfg.cells)
     from tqdm import tqdm
 
     from vd.evaluate.cfg import LOG_EVERY_S
     from vd.play.video import GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
-    env, policy = _open(cfg, trained, num_envs=cfg.cells)
     envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
     items = [env.objects[env.world_object[world]] for world in envs]
@@ -172,62 +134,35 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     return count
 
 
-def serve(cfg: PlayCfg) -> None:
-    """Serve the viewer until Ctrl-C; the page is there, and says so, while the scene is being built."""
-    trained = _policy(cfg)
-    _serve(lambda: open_session(cfg, trained), cfg)
+def serve(session: "Session | Replay", cfg: PlayCfg) -> None:
+    """Serve the viewer until Ctrl-C."""
+    from vd.play.viewer import PlayViewer
 
-
-def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> None:
-    from vd.play.viewer import PlayViewer, open_page
-
-    page = open_page(host=cfg.host, port=cfg.port)
-    print(f"open {page.viewer.url} in a browser; Ctrl-C ends it", flush=True)
+    viewer = PlayViewer(session, host=cfg.host, port=cfg.port, verbose=False)
+    print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
     try:
-        session = open_it()
-        try:
-            PlayViewer(session, page).run()
-        finally:
-            session.env.close()
+        viewer.run()
     finally:
-        page.viewer.close()
-
-
-def open_session(cfg: PlayCfg, trained: Any) -> "Session":
-    """The environment and policy behind the viewer."""
-    from vd.play.session import Session
-
-    return Session(*_open(cfg, trained, num_envs=1), seed=cfg.seed)
+        viewer.close()
+        session.close()
 
 
 def spread(world_object: Sequence[int], cells: int) -> list[int]:
     """Environments to show: of different objects first, then more of the same."""
-    seen: dict[int, int] = {}
-    rank = []
-    for world, index in enumerate(world_object):
-        rank.append((seen.get(index, 0), world))
-        seen[index] = seen.get(index, 0) + 1
-    return sorted(world for _, world in islice(sorted(rank), cells))
+    rank = [list(world_object[:world]).count(index) for world, index in enumerate(world_object)]
+    return sorted(sorted(range(len(rank)), key=rank.__getitem__)[:cells])
 
 
-def _policy(cfg: PlayCfg) -> Any:
-    """What is trained; a file that cannot be used, or is of another hand, is told before anything slow."""
-    from vd.evaluate.agents import check_fits, open_policy
-
-    policy = open_policy(cfg.agent_name, resolve_device(cfg.device))
-    check_fits(cfg.agent_name, policy, cfg.hand, cfg.hand_layer)
-    return policy
-
-
-def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
+def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any]:
     """Environment with at least one environment for each object, and what acts in it."""
-    from vd.evaluate.agents import task_for
+    from vd.evaluate.agents import check_fits, open_policy, task_for
 
-    print(
-        f"vd-play: {cfg.agent_name}; building the scene (the first start compiles kernels: minutes)",
-        flush=True,
-    )
     device = resolve_device(cfg.device)
+    trained = open_policy(cfg.policy, device)
+    check_fits(cfg.policy, trained, cfg.hand, cfg.hand_layer)  # before anything slow
+    print(
+        f"vd-play: {cfg.policy}; building the scene (the first start compiles kernels: minutes)", flush=True
+    )
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv
@@ -242,20 +177,18 @@ def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
         objects=cfg.objects,
         num_envs=max(num_envs, count),
         seed=cfg.seed,
-        stop_tolerance_rad=cfg.stop_tolerance,
-        max_goal_angle_rad=cfg.max_goal_angle,
-        episode_s=cfg.limit_s,
+        stop_tolerance_rad=PAPER.success.rotation_rad,
+        episode_s=episode_limit_s(None, in_air=cfg.in_air),
         randomised=cfg.randomise,
         success_ends_episode=False,
-        at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
     )
-    if cfg.engine == "mujoco" or (cfg.engine is None and device == "cpu"):
+    if device == "cpu":  # where newton first compiles for a minute
         task = replace(task, sim=in_mujoco(task.sim, task.sim.physics_hz))
     if cfg.in_air:
         task = replace(task, table=TableCfg(away_share=1.0))
     env = ReorientEnv(task, device)
-    return env, actor_of(cfg.agent_name, trained, env, seed=cfg.seed)[0]
+    return env, actor_of(cfg.policy, trained, env, seed=cfg.seed)[0]
 
 
 if __name__ == "__main__":

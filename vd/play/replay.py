@@ -2,13 +2,11 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import ObjectModel
 from vd.assets_usd.objects.sets import load_set
 from vd.hand_log import HandLog, LogError
 from vd.play.video import SINGLE_CELL, Composer, Snapshot, write_frames
@@ -16,14 +14,14 @@ from vd.render import OUT_OF_SIGHT, Renderer
 
 
 class Replay:
-    """The steps of a log as snapshots.
+    """The steps of a log as snapshots, and stepping through them as through a :class:`.session.Session`.
 
     Args:
-        log: The log.
+        log: The log; it starts over at its end.
 
     Attributes:
         hand: The hand that moved.
-        item: The object.
+        objects: The object.
         snapshots: One for each control step.
 
     Raises:
@@ -31,18 +29,40 @@ class Replay:
     """
 
     def __init__(self, log: HandLog):
-        self.log = log
+        self.log, self._now = log, 0
+        self.control_hz = float(log.run["control_hz"])
         try:
             self.hand: HandModel = load_hand(log.run["hand"])
-            self.item: ObjectModel = load_set(log.run["object"]["set"])[0]
+            self.objects = load_set(log.run["object"]["set"])[:1]
         except (ValueError, FileNotFoundError) as error:
             raise LogError(f"{log.path} cannot be shown: {error}") from error
+        self.object_name = self.objects[0].name
+        self.object_names = [self.object_name]
         self.snapshots = list(self._snapshots())
 
     @property
-    def control_hz(self) -> float:
-        """Control steps a second."""
-        return float(self.log.run["control_hz"])
+    def snapshot(self) -> Snapshot:
+        """What is shown now."""
+        return self.snapshots[self._now]
+
+    def step(self) -> None:
+        """The next control step."""
+        self._now = (self._now + 1) % len(self.snapshots)
+
+    def reset(self) -> None:
+        """Back to the first step."""
+        self._now = 0
+
+    def new_goal(self) -> None:
+        """On to the next goal."""
+        number = self.log.columns["goal"]
+        self._now = int(np.argmax(number > number[self._now]))  # 0 after the last
+
+    def choose_object(self, name: str) -> None:
+        """There is one."""
+
+    def close(self) -> None:
+        """Nothing is held."""
 
     def _snapshots(self) -> Iterator[Snapshot]:
         log, columns = self.log, self.log.columns
@@ -64,7 +84,7 @@ class Replay:
             fell = bool(stop and over and last and stop.outcome == "lost")
             reached, lost = reached + success, lost + fell
             yield Snapshot(
-                name=self.item.name,
+                name=self.object_name,
                 time_s=float(columns["t"][step] - columns["t"][0]),
                 joint_q=np.concatenate([position[step], pose[step]]),
                 goal_quat=log.goals[number],
@@ -93,46 +113,5 @@ def film(log: HandLog, path: Path) -> int:
         LogError: Hand or object are not here.
     """
     shown, (width, height) = Replay(log), SINGLE_CELL
-    renderer = Renderer(shown.hand, [shown.item], width=width, height=height)
+    renderer = Renderer(shown.hand, shown.objects, width=width, height=height)
     return write_frames(path, shown.frames(renderer), shown.control_hz)
-
-
-class ReplaySession:
-    """A replay as the viewer steps through it: what :class:`vd.play.session.Session` is for a simulation.
-
-    Args:
-        replay: The replay; it starts over at its end.
-    """
-
-    def __init__(self, replay: Replay):
-        self._replay, self._next = replay, 0
-        self.env = SimpleNamespace(
-            hand=replay.hand,
-            objects=[replay.item],
-            cfg=SimpleNamespace(sim=SimpleNamespace(control_hz=replay.control_hz)),
-            close=lambda: None,
-        )
-        self.object_name = replay.item.name
-        self.object_names = [self.object_name]
-        self.snapshot = replay.snapshots[0]
-
-    def step(self) -> Snapshot:
-        """The next control step."""
-        self._next = (self._next + 1) % len(self._replay.snapshots)
-        self.snapshot = self._replay.snapshots[self._next]
-        return self.snapshot
-
-    def reset(self) -> Snapshot:
-        """Back to the first step."""
-        self._next = -1
-        return self.step()
-
-    def new_goal(self) -> Snapshot:
-        """On to the next goal."""
-        number = self._replay.log.columns["goal"]
-        later = np.flatnonzero(number > number[self._next])
-        self._next = int(later[0]) - 1 if len(later) else -1
-        return self.step()
-
-    def choose_object(self, name: str) -> None:
-        """There is one."""

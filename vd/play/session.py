@@ -15,10 +15,15 @@ class Session:
         env: An environment with at least one environment for each object.
         policy: What acts.
         seed: Of the goals drawn on demand.
+
+    Attributes:
+        snapshot: What is shown now.
     """
 
     def __init__(self, env: Any, policy: Any, *, seed: int = 0):
         self.env, self._policy = env, policy
+        self.hand, self.objects, self.control_hz = env.hand, env.objects, env.cfg.sim.control_hz
+        self.close = env.close
         self._rng = np.random.default_rng(seed)
         self.object_names = [item.name for item in env.objects]
         self.choose_object(self.object_names[env.world_object[0]])

@@ -244,15 +244,11 @@ def _font(size: int) -> Any:
 
 def _grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
     """Tile equal pictures in rows; the last row is filled with white, and the size made even."""
-    rows = -(-len(cells) // columns)
-    height, width = cells[0].shape[:2]
-    canvas = np.full(
-        (rows * height + rows * height % 2, columns * width + columns * width % 2, 3), 255, np.uint8
-    )
-    for i, cell in enumerate(cells):
-        y, x = (i // columns) * height, (i % columns) * width
-        canvas[y : y + height, x : x + width] = cell
-    return canvas
+    rows, (height, width, _) = -(-len(cells) // columns), cells[0].shape
+    tiles = np.full((rows * columns, height, width, 3), 255, np.uint8)
+    tiles[: len(cells)] = cells
+    grid = tiles.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, -1, 3)
+    return np.pad(grid, [(0, size % 2) for size in grid.shape[:2]] + [(0, 0)], constant_values=255)
 
 
 def write_frames(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:

@@ -10,43 +10,22 @@ import time
 from collections.abc import Callable
 from functools import partial
 from html import escape
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
 from newton.viewer import ViewerViser
 
 from vd.paper import PAPER
-from vd.play.replay import ReplaySession
+from vd.play.replay import Replay
 from vd.play.session import Session
 from vd.play.video import Snapshot
-from vd.render import OUT_OF_SIGHT, Camera, PictureModel
+from vd.render import Camera, PictureModel
 
 # Where the goal's object floats, in the camera's right and up [m]: left of the hand, for panels are right.
 GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
 # The viewer's camera stands this much farther than that of videos: a browser window has panels around it.
 CAMERA_DISTANCE = 1.25
-WAITING = "**Compiling kernels and building the scene.** The first start takes minutes."
-BESIDE, ON_OBJECT, HIDDEN = "beside the hand", "on the object", "hidden"
-
-
-class Page(NamedTuple):
-    """Where a viewer draws, and what it says there before."""
-
-    viewer: ViewerViser
-    notice: Any
-
-
-def open_page(*, host: str = "127.0.0.1", port: int = 8080, verbose: bool = True) -> Page:
-    """A page that says what is being waited for, until a :class:`PlayViewer` shows something on it.
-
-    Args:
-        host: Address to serve on; ``127.0.0.1`` keeps it on this machine.
-        port: Port to serve on; the next free one is taken if it is in use.
-        verbose: Print the address.
-    """
-    viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=verbose)
-    return Page(viewer, viewer.server.gui.add_markdown(WAITING, order=-2.0))
 
 
 class PlayViewer:
@@ -54,22 +33,26 @@ class PlayViewer:
 
     Args:
         session: What runs.
-        page: Where, of :func:`open_page`.
+        host: Address to serve on; ``127.0.0.1`` keeps it on this machine.
+        port: Port to serve on; the next free one is taken if it is in use.
+        verbose: Print the address.
     """
 
-    def __init__(self, session: Session | ReplaySession, page: Page):
+    def __init__(
+        self, session: Session | Replay, *, host: str = "127.0.0.1", port: int = 8080, verbose: bool = True
+    ):
         self.session = session
-        self.viewer = page.viewer
-        self.camera = Camera.for_hand(session.env.hand)
+        self.viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=verbose)
+        self.camera = Camera.for_hand(session.hand)
         self._events: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._models: dict[str, PictureModel] = {}
-        self._ghost = BESIDE
+        x, y, _ = GHOST_RIGHT * self.camera.rotation[:, 0]
+        self._ghost = float(x), float(y), GHOST_HEIGHT
         self._show_object()
         self._set_camera()
         self._build_panel()
         self.viewer.set_reset_callback(self.session.reset)
         self.draw()
-        page.notice.remove()
 
     @property
     def url(self) -> str:
@@ -78,7 +61,7 @@ class PlayViewer:
 
     def run(self, *, steps: int | None = None) -> None:
         """Step in real time until the viewer is closed, or ``steps`` control steps were made."""
-        period = 1.0 / self.session.env.cfg.sim.control_hz
+        period = 1.0 / self.session.control_hz
         done, due = 0, time.monotonic()
         while self.viewer.is_running() and (steps is None or done < steps):
             done += self.update()
@@ -98,8 +81,7 @@ class PlayViewer:
     def draw(self) -> None:
         """Send the present state to the browser."""
         shot = self.session.snapshot
-        ghost = self._ghost_position(shot)
-        self._pictured.pose(shot.joint_q[None], shot.goal_quat[None], ghost, table=shot.table)
+        self._pictured.pose(shot.joint_q[None], shot.goal_quat[None], self._ghost, table=shot.table)
         self.viewer.begin_frame(shot.time_s)
         self.viewer.log_state(self._pictured.state)
         self.viewer.log_scalar("orientation error [rad]", shot.error_rad)
@@ -114,9 +96,8 @@ class PlayViewer:
         """Show the model of the chosen object; models are kept, since building one takes a second."""
         name = self.session.object_name
         if name not in self._models:
-            env = self.session.env
-            item = env.objects[self.session.object_names.index(name)]
-            self._models[name] = PictureModel(env.hand, [item], device="cpu", ghost_in_scene=True)
+            item = self.session.objects[self.session.object_names.index(name)]
+            self._models[name] = PictureModel(self.session.hand, [item], ghost_in_scene=True)
         self._pictured = self._models[name]
         self.viewer.set_model(self._pictured.model)
 
@@ -129,31 +110,17 @@ class PlayViewer:
             yaw=math.degrees(math.atan2(forward[1], forward[0])),
         )
 
-    def _ghost_position(self, shot: Snapshot) -> tuple[float, float, float]:
-        if self._ghost == HIDDEN:
-            return OUT_OF_SIGHT[:3]
-        if self._ghost == ON_OBJECT:
-            x, y, z = (float(value) for value in shot.joint_q[-7:-4])
-            return x, y, z
-        right = self.camera.rotation[:, 0]
-        return float(GHOST_RIGHT * right[0]), float(GHOST_RIGHT * right[1]), GHOST_HEIGHT
-
     def _build_panel(self) -> None:
         gui, session = self.viewer.server.gui, self.session
         with gui.add_folder("Policy", order=-1.0):
             self._status = gui.add_html(status_html(session.snapshot))
             chosen = gui.add_dropdown("Object", session.object_names, initial_value=session.object_name)
-            ghost = gui.add_dropdown("Goal", (BESIDE, ON_OBJECT, HIDDEN), initial_value=self._ghost)
             new_goal = gui.add_button("New goal")
 
         @chosen.on_update
         def _(event: Any) -> None:
             if event.client_id is not None:
                 self._events.put(partial(self._choose_object, chosen.value))
-
-        @ghost.on_update
-        def _(_event: Any) -> None:
-            self._ghost = ghost.value
 
         @new_goal.on_click
         def _(_event: Any) -> None:
