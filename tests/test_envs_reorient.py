@@ -155,7 +155,7 @@ def test_a_goal_given_in_the_middle_is_seen_at_once_and_moves_nothing():
     np.testing.assert_array_equal(env.step_count.numpy(), steps)
     np.testing.assert_allclose(np.abs((env.goal_quat.numpy()[1] * goal).sum()), 1.0, atol=1e-6)
     np.testing.assert_array_equal(env.goal_quat.numpy()[[0, 2, 3]], before[[0, 2, 3]])
-    columns = teacher_observation_slices(3)["goal_orientation"]
+    columns = teacher_observation_slices(3, 9)["goal_orientation"]
     seen = env.observation.numpy()[:, columns]
     np.testing.assert_allclose(np.abs((seen[1] * goal).sum()), 1.0, atol=1e-6)
     assert not env.smoothed.numpy()[1].any() and env.smoothed.numpy()[0].any()
