@@ -30,6 +30,7 @@ GOAL = np.array([0.0, 0.0, 0.0, 1.0])
 class Hand:
     """Joints that are at once where they are told to be; each exchange takes ``work`` seconds."""
 
+    hand = load_hand("dclaw3")
     clock: SimulatedClock
     work: list[float] = field(default_factory=list)
     position: np.ndarray = field(default_factory=lambda: np.tile([0.0, 0.8, -1.1], 3))
