@@ -185,7 +185,8 @@ def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it
         actions, values = runner.alg.actor(observation), runner.alg.critic(observation)[:, 0]
     assert torch.allclose(actions, plain.act(observation["policy"]), atol=1e-6)
     if critic:
-        before = MeanAction(replace(plain.spec, num_actions=1, distribution="gaussian"), plain.critic_weights)
+        weights = load_checkpoint(path)["critic_state_dict"]
+        before = MeanAction(replace(plain.spec, num_actions=1, distribution="gaussian"), weights)
         assert torch.allclose(values, before(observation["policy"])[:, 0], atol=1e-5)
     runner.critic_warmup = 0
     runner.learn(2)

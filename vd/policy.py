@@ -84,7 +84,6 @@ class TrainedPolicy:
         iteration: Iterations it was trained for.
         env_steps: Control steps it was trained for.
         device: Torch device.
-        critic: State of rsl-rl's critic, which sees what the actor does; empty: there is none.
 
     Attributes:
         hand: Name of the hand it moves, as ``task`` says ("" if it does not).
@@ -102,12 +101,11 @@ class TrainedPolicy:
         iteration: int = 0,
         env_steps: int = 0,
         device: str = "cpu",
-        critic: dict[str, torch.Tensor] | None = None,
     ) -> None:
         self.spec, self.task, self.iteration, self.env_steps = spec, task, iteration, env_steps
         self.hand = str(task.get("hand", ""))
         self.num_observations, self.num_actions = spec.num_observations, spec.num_actions
-        self.weights, self.critic_weights = weights, critic or {}
+        self.weights = weights
         self.network = MeanAction(spec, weights).to(device)
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
@@ -236,7 +234,6 @@ def policy_of(state: dict[str, Any], device: str) -> TrainedPolicy:
         iteration=int(state["iter"]),
         env_steps=int(state["env_steps"]),
         device=device,
-        critic=state.get("critic_state_dict"),
     )
 
 

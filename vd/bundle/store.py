@@ -55,7 +55,7 @@ def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
         rules, trained = policy.spec, policy.teacher
         source = _provenance(trained, policy.spec.teacher, to_dict(policy.spec.depth))
         network, camera = {"policy": to_dict(trained.spec)}, policy.spec.camera
-        parts = {"actor": trained.weights, "critic": trained.critic_weights}
+        parts = {"actor": trained.weights}
         if policy.alignment is not None:
             network["alignment"] = to_dict(policy.spec.alignment)
             parts["alignment"] = policy.alignment.state_dict()
@@ -178,10 +178,9 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
 
 
 def _teacher(spec: dict[str, Any], source: Provenance, weights: Tensors, device: str) -> TrainedPolicy:
-    """A teacher; of a tracking policy names of weights say whether they are the actor's or the critic's."""
+    """A teacher; of a camera policy names of weights say which are its actor's."""
     trained = {"policy": spec, "task": source.task, "iter": source.iterations, "env_steps": source.env_steps}
-    actor, critic = _part(weights, "actor.") or weights, _part(weights, "critic.")
-    return policy_of(trained | {"actor_state_dict": actor, "critic_state_dict": critic}, device)
+    return policy_of(trained | {"actor_state_dict": _part(weights, "actor.") or weights}, device)
 
 
 def _part(weights: Tensors, prefix: str) -> Tensors:

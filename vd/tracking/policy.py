@@ -76,8 +76,6 @@ def is_tracking(path: Path) -> bool:
 def tracking_export(policy: TrackingPolicy) -> dict[str, Any]:
     """What :func:`load_tracking` reads."""
     teacher = policy.teacher
-    parts = {"actor_state_dict": teacher.weights, "critic_state_dict": teacher.critic_weights}
-    weights = {key: {name: v.cpu() for name, v in part.items()} for key, part in parts.items() if part}
     network = policy.alignment
     own = {} if network is None else {name: v.cpu() for name, v in network.state_dict().items()}
     return {
@@ -88,7 +86,7 @@ def tracking_export(policy: TrackingPolicy) -> dict[str, Any]:
             "task": teacher.task,
             "iter": teacher.iteration,
             "env_steps": teacher.env_steps,
-            **weights,
+            "actor_state_dict": {name: v.cpu() for name, v in teacher.weights.items()},
         },
         **({"alignment_state_dict": own} if own else {}),
     }
