@@ -18,7 +18,7 @@ from vd.evaluate.agents import SHIPPED_POLICIES
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PACKAGE_DIRS: dict[str, str] = PROJECT["tool"]["setuptools"]["package-dir"]
-MAX_POLICY_BYTES = 5 * 2**20
+MAX_POLICY_BYTES, ALIGNMENT_BYTES = 3 * 2**20, 2**20  # the network of vision policies, beside no critic
 
 
 def installed_names() -> set[str]:
@@ -89,7 +89,8 @@ def test_wheel_holds_modules_policies_and_what_else_is_read(wheel):
         f"vd/policies/{path.name}" for path in SHIPPED_POLICIES.values()
     }
     for name in SHIPPED_POLICIES:  # exports, not checkpoints: those hold optimiser and worlds
-        assert sizes[f"vd/policies/{name}.pt"] < MAX_POLICY_BYTES
+        most = MAX_POLICY_BYTES + (ALIGNMENT_BYTES if name.endswith("-vision") else 0)
+        assert sizes[f"vd/policies/{name}.pt"] < most
 
 
 def test_wheel_runs_from_a_fresh_folder(wheel, tmp_path):
