@@ -195,7 +195,7 @@ def make_quick_scenes():
     return make_scenes(load_set(["cube", "cuboid"]), load_set(["cuboid"]), hands, QUICK)
 
 
-def make_runner(scenes=None, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000, looks=None):
+def make_runner(scenes=None, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000, looks=()):
     """A trainer of a network that is small enough to learn in a second."""
     scenes = make_quick_scenes() if scenes is None else scenes
     torch.manual_seed(seed)
@@ -230,7 +230,7 @@ def test_losses_are_least_at_the_truth_and_fall(scenes):
 def test_goals_turned_by_the_network_keep_their_label(scenes):
     runner = make_runner(scenes, cfg=replace(QUICK, searched_share=1.0))
     pairs = runner.pairs()
-    turned = runner.searched(pairs)
+    turned = runner.searched(pairs, [runner.network.neighbours(c) for c in (pairs.goal, pairs.seen)])
     assert not torch.allclose(turned.rotation, pairs.rotation, atol=1e-2)
     for name in ("goal", "surface"):
         place = [getattr(each, name) @ each.rotation.transpose(-1, -2) for each in (pairs, turned)]

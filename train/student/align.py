@@ -163,7 +163,7 @@ class AlignTrainer(TrainingLoop):
         run: Run settings.
         spec: Description of the network, kept with it.
         task: The environment's configuration as a dictionary, kept with it.
-        looks: What is seen in simulation; None: all pairs are made.
+        looks: What is seen in simulation, by one policy after the other; none: all pairs are made.
         device: Torch device.
         deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
     """
@@ -177,7 +177,7 @@ class AlignTrainer(TrainingLoop):
         *,
         spec: AlignmentSpec,
         task: dict[str, Any],
-        looks: SimulatedLooks | None = None,
+        looks: Sequence[SimulatedLooks] = (),
         device: str,
         deadline: float | None = None,
     ) -> None:
@@ -185,7 +185,9 @@ class AlignTrainer(TrainingLoop):
         self.scenes, self.cfg, self.network, self.looks = scenes, cfg, network, looks
         self.spec, self.task = spec, task
         self.optimizer = torch.optim.AdamW(network.parameters())
-        self._compare: nn.Module | Any = torch.compile(network) if cfg.compile else network
+        self._compare: nn.Module | Any = network
+        if cfg.compile:  # for each size on its own: that of all, and that of the searched ones
+            self._compare = torch.compile(network, dynamic=False)
         self._half = torch.autocast(
             torch.device(self.device).type, torch.bfloat16, enabled=cfg.precision == "bf16"
         )
@@ -224,8 +226,11 @@ class AlignTrainer(TrainingLoop):
 
     def _iterate(self) -> dict[str, Any] | None:
         cfg, seen = self.cfg, dict[str, float]()
-        if self.looks is not None:
-            if (collected := self.looks.collect(self._stopping)) is None:
+        turn = self.iteration % max(1, len(self.looks))
+        for number, look in enumerate(self.looks):
+            if number != turn and len(look):
+                continue
+            if (collected := look.collect(self._stopping)) is None:
                 return None
             seen = self._read(collected)
         if self.iteration:
@@ -247,34 +252,39 @@ class AlignTrainer(TrainingLoop):
         """A batch to learn from."""
         cfg = self.cfg
         shares = {"near": cfg.near_share, "scans": cfg.scan_share}
-        simulated = 0 if self.looks is None else round(self.looks.cfg.share * cfg.batch)
-        made = self.scenes.bank.draw(cfg.batch - simulated)
-        pairs = draw_pairs(self.scenes.hands, made, cfg.points, **shares)
-        if self.looks is None:
-            return pairs
-        return joined(pairs, self.looks.pairs(simulated, cfg.points, **shares))
+        counts = [round(look.cfg.share * cfg.batch / len(self.looks)) for look in self.looks]
+        made = self.scenes.bank.draw(cfg.batch - sum(counts))
+        pairs = [draw_pairs(self.scenes.hands, made, cfg.points, **shares)]
+        for look, count in zip(self.looks, counts, strict=True):
+            pairs.append(look.pairs(count, cfg.points, **shares))
+        return joined(pairs)
 
     @torch.no_grad()
-    def searched(self, pairs: Pairs) -> Pairs:
+    def searched(self, pairs: Pairs, near: Sequence[torch.Tensor]) -> Pairs:
         """Pairs of which some goals are turned as the network says, once or twice: as a search meets them.
+
+        The neighbours of both clouds, ``near``, stay.
 
         Among random rotations those that it wrongly holds for right are rare, and these it has to tell.
         """
         goal, rotation, surface = pairs.goal.clone(), pairs.rotation.clone(), pairs.surface.clone()
         rows = torch.randperm(len(goal), device=goal.device)[: round(self.cfg.searched_share * len(goal))]
-        for some in (rows, rows[::2]):
+        most = math.ceil(0.75 * len(rows))  # of both passes: half of the rows take both
+        for some in (rows[:most], rows[len(rows) - most :]):
             with self._half:
-                back = self.network(goal[some], pairs.seen[some]).rotation.transpose(-1, -2)
+                found = self._compare(goal[some], pairs.seen[some], [index[some] for index in near])
+            back = found.rotation.transpose(-1, -2)
             for turned in (goal, rotation, surface):
                 turned[some] = turned[some] @ back
         return replace(pairs, goal=goal, rotation=rotation, surface=surface)
 
     def _step(self, done: float) -> dict[str, torch.Tensor]:
         pairs = self.pairs()
+        near = [self.network.neighbours(cloud) for cloud in (pairs.goal, pairs.seen)]
         if self.cfg.searched_share > 0.0:
-            pairs = self.searched(pairs)
+            pairs = self.searched(pairs, near)
         with self._half:
-            found = self._compare(pairs.goal, pairs.seen)
+            found = self._compare(pairs.goal, pairs.seen, near)
         losses, error = alignment_losses(found, pairs)
         warm = min(1.0, (self._steps_done + 1) / max(1, self.cfg.warmup_steps))
         rate = self.cfg.learning_rate * warm * max(LEAST_RATE, 0.5 * (1.0 + math.cos(math.pi * done)))
@@ -361,8 +371,8 @@ class AlignTrainer(TrainingLoop):
         }
 
     def _close(self) -> None:
-        if self.looks is not None:
-            self.looks.close()
+        for look in self.looks:
+            look.close()
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:
         save_checkpoint(self.run.out / ALIGNMENT_NAME, alignment_export(state))

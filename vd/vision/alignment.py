@@ -8,6 +8,7 @@ B clouds, P points of a cloud, T tokens, E the width; N objects, H hypotheses. C
 that goal and object share (the world's); a rotation turns the goal onto the object: seen ~ R goal + offset.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -136,10 +137,12 @@ class AlignmentNetwork(nn.Module):
             functional.softplus(found["error"]).squeeze(-1),
         )
 
-    def forward(self, goal: torch.Tensor, seen: torch.Tensor) -> Residual:
-        """What is predicted of clouds about their means [m] [B, P, 3]."""
-        tokens = [self.encode(cloud, i, self.neighbours(cloud)) for i, cloud in enumerate((goal, seen))]
-        return self.compare(*tokens)
+    def forward(
+        self, goal: torch.Tensor, seen: torch.Tensor, near: Sequence[torch.Tensor] | None = None
+    ) -> Residual:
+        """What is predicted of clouds about their means [m] [B, P, 3]; their :meth:`neighbours` if known."""
+        near = near or [self.neighbours(cloud) for cloud in (goal, seen)]
+        return self.compare(self.encode(goal, GOAL, near[0]), self.encode(seen, SEEN, near[1]))
 
 
 @dataclass(frozen=True)
