@@ -88,6 +88,6 @@ class GoalFinder:
 
     def _crowded(self, seen: torch.Tensor, count: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Which points have others beside them [N, M], and how many [N]: edges of depth fly about alone."""
-        apart = torch.cdist(seen, seen).topk(min(CROWD + 1, seen.shape[1]), largest=False).values[..., -1]
-        crowded = (apart < CROWD_M) & (torch.arange(seen.shape[1], device=seen.device) < count[:, None])
+        crowded = (torch.cdist(seen, seen) < CROWD_M).sum(dim=-1) > CROWD
+        crowded &= torch.arange(seen.shape[1], device=seen.device) < count[:, None]
         return crowded.sum(dim=1), crowded.long()
