@@ -16,7 +16,7 @@ from vd.bundle.store import read_bundle, read_contract, write_bundle
 from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy
 from vd.evaluate.cli import main as evaluate
 from vd.policy import load_policy
-from vd.tracking.policy import load_tracking
+from vd.tracking.policy import read_policy
 from vd.train.cli import main as train
 from vd.vision.alignment import AlignmentNetwork
 from vd.vision.cfg import AlignmentCfg
@@ -33,7 +33,7 @@ def hand():
 
 def make_tracking(camera=None):
     """A tracking policy whose training had folders of its machine."""
-    policy = load_tracking(SHIPPED_POLICIES["dclaw3-tracking"])
+    policy = read_policy(SHIPPED_POLICIES["dclaw3-tracking"])
     policy.teacher.task["objects"] = ["/somewhere/mine/training-set", "cube"]
     return replace(policy, spec=replace(policy.spec, camera=camera))
 
@@ -89,7 +89,7 @@ def test_a_vision_policy_comes_back_and_answers_with_its_network(tmp_path):
     torch.manual_seed(0)
     sizes = AlignmentCfg(width=16, layers=1, heads=2, tokens=12)
     network = AlignmentNetwork(sizes).eval().requires_grad_(False)
-    original = load_tracking(SHIPPED_POLICIES["dclaw3-tracking"])
+    original = read_policy(SHIPPED_POLICIES["dclaw3-tracking"])
     original = replace(original, spec=replace(original.spec, alignment=sizes), alignment=network)
     assert write_bundle(original, tmp_path / "vision").kind == "vision"
     found = open_policy(str(tmp_path / "vision"), "cpu")

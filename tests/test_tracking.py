@@ -28,7 +28,7 @@ from vd.kernels.task.shapes import shape_observation_size
 from vd.policy import PolicySpec, TrainedPolicy, load_policy, perceptron
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.tracking.observer import UNSEEN, Observer
-from vd.tracking.policy import TrackingPolicy, TrackingSpec, is_tracking, load_tracking, tracking_export
+from vd.tracking.policy import TrackingPolicy, TrackingSpec, read_policy, tracking_export
 from vd.tracking.tracker import Tracker
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main as vd_train
@@ -46,7 +46,7 @@ CLOSE_RAD = 0.15
 def vision_of(name: str) -> TrackingPolicy:
     """An installed tracking policy that finds its object by a network of random weights."""
     torch.manual_seed(0)
-    policy, sizes = load_tracking(find_policy(name)), AlignmentCfg(width=16, layers=1, heads=2, tokens=12)
+    policy, sizes = read_policy(find_policy(name)), AlignmentCfg(width=16, layers=1, heads=2, tokens=12)
     network = AlignmentNetwork(sizes).eval().requires_grad_(False)
     return replace(policy, spec=replace(policy.spec, alignment=sizes), alignment=network)
 
@@ -194,8 +194,8 @@ def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_ca
 @pytest.mark.parametrize("name", TRACKERS)
 def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
     path = SHIPPED_POLICIES[name]
-    policy = load_tracking(path)
-    assert sees_clouds(open_policy(name, "cpu")) and is_tracking(path)
+    policy = read_policy(path)
+    assert sees_clouds(open_policy(name, "cpu"))
     assert path.stat().st_size < (1.5e6 if policy.kind == "tracking" else 4.2e6), "no critic, no optimiser"
     assert policy.spec.calibrated_on and "/" not in policy.spec.teacher + policy.spec.calibrated_on
     if policy.kind == "tracking":  # the layers of others may be of a teacher that is not installed
@@ -205,14 +205,14 @@ def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
 
 
 def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):
-    policy = load_tracking(SHIPPED_POLICIES["dclaw3-tracking"])
+    policy = read_policy(SHIPPED_POLICIES["dclaw3-tracking"])
     moved = replace(policy, spec=replace(policy.spec, camera=(0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)))
     save_checkpoint(tmp_path / "tracking.pt", tracking_export(moved))
-    assert load_tracking(tmp_path / "tracking.pt").spec == moved.spec
+    assert read_policy(tmp_path / "tracking.pt").spec == moved.spec
     state = torch.load(tmp_path / "tracking.pt", weights_only=True)
     torch.save({**state, "tracking": {"gone": 1}}, tmp_path / "other.pt")
     with pytest.raises(ValueError, match=r"other\.pt: TrackingSpec has no field gone"):
-        load_tracking(tmp_path / "other.pt")
+        read_policy(tmp_path / "other.pt")
 
 
 def test_a_vision_policy_comes_back_with_its_network(tmp_path):
@@ -256,7 +256,7 @@ def test_a_former_command_is_refused_with_the_new_one(command, word, capsys):
 
 
 def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
-    policy = load_tracking(find_policy("dclaw3-tracking"))
+    policy = read_policy(find_policy("dclaw3-tracking"))
     plain, real = (
         TrackingActor(env, policy, sensor_errors=errs)._senses.camera.cfg for errs in (False, True)
     )
@@ -335,19 +335,19 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
     flags = ["tracker", "dclaw3", "--objects", "cube", "--episodes", "1", "--device", "cpu"]
     flags += ["--out", str(path)]
     assert vd_train(flags) == 0
-    policy, cfg = load_tracking(path), asked[-1]
+    policy, cfg = read_policy(path), asked[-1]
     assert policy.spec.calibrated_on == "cube: 1 episodes, goals by points, tolerance 0.4 rad, seed 1000"
     assert policy.spec.teacher == "dclaw3" and policy.spec.precise is not None
     assert 0.0 < policy.spec.stopping.action_norm < 1.0
     assert cfg.sensor_errors and cfg.goals == "points"
     assert "Of 1 episodes" in capsys.readouterr().out
     assert vd_train([*flags, "--in-air"]) == 0
-    assert asked[-1].in_air and "in the air" in load_tracking(path).spec.calibrated_on
+    assert asked[-1].in_air and "in the air" in read_policy(path).spec.calibrated_on
     network, camera = vision_of("dclaw3-tracking").alignment, (0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)
     learned = AlignmentSpec(network=network.cfg, points=512, hand="dclaw4", camera=camera)
     state = {"student_state_dict": network.state_dict(), "spec": to_dict(learned), "iter": 1, "env_steps": 2}
     save_checkpoint(tmp_path / "alignment.pt", alignment_export(state))
     assert vd_train([*flags, "--alignment", str(tmp_path / "alignment.pt")]) == 0
-    assert load_tracking(path).kind == "vision" and load_tracking(path).spec.camera == camera
+    assert read_policy(path).kind == "vision" and read_policy(path).spec.camera == camera
     assert vd_train(["tracker", "dclaw3-tracking", *flags[2:]]) == 1
     assert "give a teacher" in capsys.readouterr().err

@@ -39,6 +39,7 @@ RENAMED = {
     "--goal-s": "--episode-s",
     "--air": "--in-air",
     "--num-worlds": "--num-envs",
+    "--tolerance-rad": "--stop-tolerance",
 }
 """Flags of earlier versions, and what they are called in all commands."""
 GONE = {

@@ -21,6 +21,8 @@ _WEIGHTS = "_state_dict"
 """How the names of what holds weights end."""
 _POINTER = b"version https://git-lfs"
 """How a file begins that git has put in the place of a large one."""
+REMEDY = "copy it again, or give another file of its run"
+"""What to do about a policy that cannot be read."""
 _NORMALISER_EPSILON = 1e-2
 """Added to the running std by the normaliser that trained the actor (rsl-rl's EmpiricalNormalization)."""
 
@@ -155,8 +157,8 @@ def read_state(path: str | Path, device: str = "cpu", *, remedy: str) -> dict[st
     path = Path(path)
     try:
         state = torch.load(path, map_location=device, weights_only=True)
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"there is no file {path}; {remedy}") from error
     except Exception as error:
         raise ValueError(f"{path} {_damage(path, error)}; {remedy}") from error
     if not isinstance(state, dict):
@@ -190,15 +192,6 @@ def _tensors_finite(value: Any) -> Iterator[bool]:
             yield from _tensors_finite(item)
 
 
-def holds(path: Path, part: str) -> bool:
-    """Whether a file of torch is a dictionary with such a key, as far as it can be read."""
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception:  # whoever reads it says what is wrong with it
-        return False
-    return isinstance(state, dict) and part in state
-
-
 def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
     """Rebuild the actor from a checkpoint of ``vd-train`` or from an exported ``policy.pt``.
 
@@ -206,12 +199,11 @@ def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
         FileNotFoundError: There is no such file.
         ValueError: The file is damaged, or not a policy.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no policy at {path}; give a policy.pt or a file of a run's checkpoints folder"
-        )
-    state = read_state(path, device, remedy="copy it again, or give another file of its run")
+    return teacher_in(read_state(path, device, remedy=REMEDY), path, device)
+
+
+def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedPolicy:
+    """The same from what was read of ``path``."""
     if "student_state_dict" in state and "spec" in state:
         raise ValueError(
             f"{path} is a student or its checkpoint, which does not act by itself; vd-train tracker TEACHER "

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vd.evaluate.agents import check_fits, open_policy, sees_clouds, start_at_rest, task_for
+from vd.evaluate.agents import check_fits, open_policy, sees_clouds, task_for
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
 from vd.evaluate.conditions import in_condition
 from vd.sim.cfg import in_mujoco
@@ -102,7 +102,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         episode_s=cfg.limit_s,
         randomised=True,
         success_ends_episode=True,
-        at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
+        at_rest=cfg.rest,
         hand_layer=cfg.hand_layer,
         condition=cfg.randomisation,
     )
