@@ -243,13 +243,13 @@ def test_our_objects_stand_for_the_papers_where_none_are_given_and_the_reduced_s
         (["--suite", "paper", "--jobs", "0"], "--jobs is 0; it has to be positive"),
         (
             ["zero", "--condition", "mixed", "--table-friction", "0"],
-            "and --table-friction exclude each other",
+            "--condition and --table-friction exclude",
         ),
         (["zero", "--at-rest", "--no-at-rest"], "--at-rest and --no-at-rest exclude each other"),
         (["zero", "--air-goals", "--episode-s", "3"], "--air-goals and --episode-s exclude each other"),
         (
             ["dclaw4-cube", "--table-friction", "-1"],
-            "--table-friction is -1.0; it has to be zero or positive",
+            "--table-friction is -1.0; it has to be zero",
         ),
         (["nobody", "--suite", "paper"], "no policy at nobody"),
         (["dclaw4-cube", "--objects", "=a"], "NAME=SET"),

@@ -132,7 +132,7 @@ def test_video_of_the_real_environment(tmp_path):
     flags = ["--hand", "dclaw3", "--video", str(path), "--seconds", "2.084", "--in-air", "--device", "cpu"]
     assert main(["random", *flags]) == 0
     frames = iio.imread(path)
-    assert frames.shape == (26, 480, 640, 3)
+    assert frames.shape == (26, 460, 640, 3)
     first, last = frames[0, :400, :480].astype(int), frames[-1, :400, :480].astype(int)
     assert (np.abs(first - last).sum(axis=2) > 60).sum() > 200  # fingers moved
     corner = slice(340, 390), slice(20, 60)  # of the table, out of the fingers' reach

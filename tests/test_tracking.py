@@ -143,9 +143,8 @@ def teacher(request):
     observation = ObservationCfg(view=view)
     task = ReorientCfg(hand=hand, objects=("cube",), num_envs=1, observation=observation)
     columns = teacher_observation_slices(load_hand(hand).num_fingers, load_hand(hand).num_joints)
-    spec = PolicySpec(
-        columns["previous_action"].stop, columns["joint_position"].stop, (16, 8), "elu", "gaussian", True
-    )
+    sizes = columns["previous_action"].stop, columns["joint_position"].stop, (16, 8)
+    spec = PolicySpec(*sizes, "gaussian", normalise_observations=True)
     torch.manual_seed(0)
     weights = {f"mlp.{name}": value for name, value in perceptron(spec).state_dict().items()}
     weights["obs_normalizer._mean"] = torch.randn(1, spec.num_observations)

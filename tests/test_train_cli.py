@@ -96,7 +96,7 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
         [
             *("--preset", "gpu", "--hand", "dclaw3", "--objects", "cube", "cuboid", "--num_envs=128"),
             *("--seed", "7", "--ppo.epochs", "3", "--env.reward.energy=-1.5", "--out", "runs/x"),
-            *("--max-minutes", "2.5", "--hand-layer", "bench/identified.usda"),
+            *("--max-minutes", "2.5", "--hand-layer", "bench/identified.usda", "--randomise"),
             *("--env.randomisation.effects", "backlash.width_rad", "0", "0.03"),
             *("dead_zone.width_rad", "0", "0.1"),
         ]
@@ -112,6 +112,8 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
     assert cfg.env.reward.energy == -1.5 and cfg.ppo.epochs == 3
     assert cfg.run.out == Path("runs/x") and cfg.run.max_minutes == 2.5
     assert cfg.policy == PRESETS["gpu"]().policy
+    with pytest.raises(ValueError, match=r"--env\.randomisation\.force-s draws nothing; add --randomise"):
+        parse_teacher(["--preset", "gpu", "--env.randomisation.force-s", "0.1"])
 
 
 def test_a_smoke_test_leaves_nothing_and_can_be_done_again(tmp_path, monkeypatch, capsys):

@@ -42,10 +42,7 @@ class Imitation:
         self._optimizer = torch.optim.Adam(learner.actor.parameters())
 
     def update(self, left: float) -> dict[str, float]:
-        """All epochs over the learner's latest rollout.
-
-        Args:
-            left: Share of the imitation that is left, of the rate too.
+        """All epochs over the learner's latest rollout, at ``left``, from 1 to 0, of the rate.
 
         Returns:
             ``imitation``: mean squared error of means and standard deviations of the actions.

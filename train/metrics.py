@@ -50,11 +50,8 @@ class GoalWindow:
     """How goals ended over the last episode's worth of iterations.
 
     Success per goal is a ratio of rare events; a window as long as an episode holds about one ended goal
-    of every environment, and weighs early and late steps of an episode alike.
-
-    Args:
-        length: Iterations in the window.
-        success_ends: Whether a goal that is reached ends its episode (``success_ends_episode``).
+    of every environment, and weighs early and late steps of an episode alike. ``success_ends``: a goal that
+    is reached ends its episode.
     """
 
     def __init__(self, length: int, *, success_ends: bool = False) -> None:

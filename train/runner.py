@@ -19,7 +19,7 @@ from vd.train.checkpoint import (
     saved_worlds,
     without_worlds,
 )
-from vd.train.config import ACTIVATION, PolicyCfg, PpoCfg, RunCfg, validate
+from vd.train.config import PolicyCfg, PpoCfg, RunCfg, validate
 from vd.train.imitate import IMITATED, Imitation
 from vd.train.loop import TrainingLoop, check_update
 from vd.train.metrics import GoalWindow, StepMeans
@@ -35,14 +35,7 @@ LOWER_RATES = "lower --ppo.actor-learning-rate, --ppo.critic-learning-rate or --
 class TeacherRunner(TrainingLoop):
     """Trains the teacher with rsl-rl's PPO.
 
-    Args:
-        env: Vectorised environment.
-        ppo: Algorithm settings.
-        policy: Network settings.
-        run: Run settings.
-        task: The environment's configuration as a dictionary, kept with every policy.
-        device: Torch device of networks and rollouts; the environment's.
-        deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
+    ``task`` is the configuration of the environment, kept with every policy; others as of TrainingLoop.
 
     Attributes:
         new_inputs: Observed values that the networks of the policy that it began from did not read.
@@ -103,11 +96,7 @@ class TeacherRunner(TrainingLoop):
 
         Environments, random states, learning rates and the choice of the best checkpoint are this run's own,
         and so are a critic and an optimiser that the file lacks; then the critic learns alone first. Networks
-        that read less than this run observes are widened.
-
-        Args:
-            path: Checkpoint or exported policy.
-            stage: Difficulty and tightness to begin at, rather than those of the file.
+        that read less than this run observes are widened. With ``stage`` difficulty and tightness are these.
 
         Raises:
             ValueError: The file is damaged, of another hand or of another network.
@@ -230,7 +219,6 @@ class TeacherRunner(TrainingLoop):
             num_observations=self.num_observations,
             num_actions=self.env.num_actions,
             hidden=self.policy_cfg.hidden,
-            activation=ACTIVATION,
             distribution=self.policy_cfg.distribution,
             normalise_observations=self.policy_cfg.normalise_observations,
         )

@@ -31,10 +31,7 @@ def build_teacher(
 ) -> "TeacherRunner":
     """Build environment and learner as ``cfg`` says, save the resolved configuration, and resume if asked.
 
-    Args:
-        cfg: Configuration.
-        started: ``time.monotonic()`` from which ``max_minutes`` counts; now by default.
-        say: Is told when the slow part begins.
+    ``max_minutes`` counts from ``started``; ``say`` is told when the slow part begins.
 
     Raises:
         FileExistsError: The run folder holds another run and ``resume`` is not set.

@@ -44,13 +44,7 @@ class HandKinematics:
     """Poses of a hand's links from joint positions, on the device, in place of a simulator's."""
 
     def __init__(self, hand: HandModel, *, link_body: np.ndarray, device: str):
-        """Put the joints on the device.
-
-        Args:
-            hand: The hand.
-            link_body: Column of each link in the poses, base first, shape [L].
-            device: Warp device.
-        """
+        """Put the joints on the device."""
         self.device = device
 
         def array(values: Any, dtype: Any) -> wp.array:

@@ -6,7 +6,7 @@ Reading a policy needs torch only, no simulator and no rsl-rl, and executes noth
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import torch
 from torch import nn
@@ -14,7 +14,6 @@ from torch import nn
 from vd.config import from_dict
 
 POLICY_FORMAT = "visual-dexterity policy 1"
-_ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "gelu": nn.GELU}
 _STAGE = ("difficulty", "tightness", "tightening")
 """What says how far the curriculum has come, in the state of an environment."""
 _WEIGHTS = "_state_dict"
@@ -41,11 +40,11 @@ class Policy(Protocol):
 class PolicySpec:
     """What is needed to rebuild an actor around its weights: O observations, D actions."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"activation": "elu"}
     num_observations: int
     num_actions: int
     hidden: tuple[int, ...]
     """Widths of the hidden layers."""
-    activation: str
     distribution: str
     """``gaussian``, the network gives the mean, or ``state-dependent``: mean, then std."""
     normalise_observations: bool
@@ -126,13 +125,9 @@ class TrainedPolicy:
 
 
 class BuiltIn:
-    """An agent without a file: every action is zero, or uniform in [-1, 1].
+    """An agent without a file, ``zero`` or ``random``: every action is zero, or uniform in [-1, 1].
 
-    Args:
-        name: ``zero`` or ``random``.
-        num_actions: Actions D.
-        seed: Of random actions, the same for the same seed on the same device.
-        device: Torch device of the observations it will get.
+    Actions of a seed are the same on the same device, that of the observations.
     """
 
     def __init__(self, name: str, num_actions: int, *, seed: int = 0, device: str = "cpu") -> None:
@@ -249,13 +244,11 @@ def policy_export(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def perceptron(spec: PolicySpec) -> nn.Sequential:
-    """The multilayer perceptron with the layer names rsl-rl gives it."""
-    if spec.activation not in _ACTIVATIONS:
-        raise ValueError(f"unknown activation '{spec.activation}'; known: {', '.join(_ACTIVATIONS)}")
+    """The multilayer perceptron with the layer names rsl-rl gives it, ELU between them as in the paper."""
     outputs = spec.num_actions * (2 if spec.distribution == "state-dependent" else 1)
     layers: list[nn.Module] = []
     width = spec.num_observations
     for hidden in spec.hidden:
-        layers += [nn.Linear(width, hidden), _ACTIVATIONS[spec.activation]()]
+        layers += [nn.Linear(width, hidden), nn.ELU()]
         width = hidden
     return nn.Sequential(*layers, nn.Linear(width, outputs))

@@ -83,12 +83,7 @@ class Camera:
         return wp.transform(wp.vec3(*self.eye), wp.quat(*Rotation.from_matrix(self.rotation).as_quat()))
 
     def aimed_at(self, point: Sequence[float], radius: float) -> "Camera":
-        """A camera that looks in the same direction at a ball around ``point``, which fills the picture.
-
-        Args:
-            point: Centre [m].
-            radius: Of the ball [m].
-        """
+        """A camera that looks in the same direction at a ball about ``point`` [m], filling the picture."""
         distance = radius / math.sin(math.atan(BALL_SHARE * math.tan(0.5 * self.fov)))
         eye = np.asarray(point, dtype=float) + distance * self.rotation[:, 2]
         return replace(self, eye=_vector(eye), target=_vector(point))

@@ -194,18 +194,15 @@ class EvalCfg(HandFlags, EpisodeFlags):
             raise ValueError(f"--max-goal-angle is {self.max_goal_angle}; it must be at most pi rad")
         if self.engine == "mujoco" and self.device.startswith("cuda"):
             raise ValueError(f"--engine mujoco steps on the CPU, not on {self.device}; leave --device out")
+        given = [name for name, value in vars(EvalCfg()).items() if getattr(self, name) != value]
         for names in EXCLUSIVE:
-            given = [
-                name for name in names if not (getattr(self, name) is None or getattr(self, name) is False)
-            ]
-            if len(given) > 1:
-                raise ValueError(f"{' and '.join(map(flag, given))} exclude each other; give one of them")
+            if len(both := [flag(name) for name in names if name in given]) > 1:
+                raise ValueError(f"{' and '.join(both)} exclude each other; give one of them")
         if self.suite is None and (self.quick or self.jobs > 1):
             raise ValueError("--quick and --jobs are of a suite; add --suite paper, or leave them out")
-        default = EvalCfg()
-        for name in OF_THE_SUITE if self.suite else ():
-            if getattr(self, name) != getattr(default, name):
-                raise ValueError(f"{flag(name)} is decided by --suite {self.suite}; leave it out")
+        decided = [flag(name) for name in OF_THE_SUITE if self.suite and name in given]
+        if decided:
+            raise ValueError(f"{' and '.join(decided)} is decided by --suite {self.suite}; leave it out")
 
 
 def flag(name: str) -> str:

@@ -102,7 +102,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     env, policy = _open(cfg, num_envs=cfg.cells)
     from tqdm import tqdm
 
-    from vd.play.video import GRID_CELL, SINGLE_CELL, record, write_frames
+    from vd.play.video import GRID_CELL, SINGLE_CELL, drawn, watched, write_frames
     from vd.render import Renderer
 
     envs = spread(env.world_object, cfg.cells)
@@ -111,7 +111,9 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     renderer = Renderer(env.hand, items, width=width, height=height, device=env.device)
     rate = env.cfg.sim.control_hz
     steps = max(1, round(cfg.seconds * rate))
-    frames: Iterable[Any] = record(env, policy, renderer, envs, steps)
+    # On a GPU what others launch would become part of the step's graph.
+    shots = watched(env, policy, envs, steps)
+    frames: Iterable[Any] = drawn(renderer, shots, meanwhile=env.device == "cpu")
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
     frames = tqdm(frames, total=steps + 1, unit="frame", desc="vd-play", mininterval=refresh)
     count = write_frames(path, frames, rate)

@@ -126,9 +126,6 @@ class Observer:
     def __call__(self, senses: Senses) -> tuple[torch.Tensor, torch.Tensor]:
         """Look once.
 
-        Args:
-            senses: What is sensed.
-
         Returns:
             The teacher's observation in the world frame [N, O], and how far the object is expected to be from
             its goal [rad] [N]. Of the orientations in which a known shape looks like the wanted one

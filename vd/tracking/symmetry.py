@@ -46,12 +46,7 @@ _found: dict[bytes, np.ndarray] = {}
 
 
 def symmetries(objects: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
-    """Symmetries of shapes, the identity first: quaternions [S, 4] for each.
-
-    Args:
-        objects: The shapes.
-        device: Warp device.
-    """
+    """Symmetries of shapes, the identity first: quaternions [S, 4] for each."""
     keys = [_key(item) for item in objects]
     unknown = {}
     for key, item in zip(keys, objects, strict=True):
@@ -73,13 +68,7 @@ def with_symmetries(objects: Sequence[ObjectModel], device: str) -> list[ObjectM
 def symmetries_of_worlds(
     objects: Sequence[ObjectModel], world_object: np.ndarray, device: str
 ) -> torch.Tensor:
-    """Symmetries of the object of each environment [N, S, 4], the identity where there are fewer.
-
-    Args:
-        objects: The shapes.
-        world_object: Object of each environment, shape [N].
-        device: Warp device.
-    """
+    """Symmetries of the object of each environment [N, S, 4], the identity where there are fewer."""
     found = symmetries(objects, device)
     turns = np.zeros((len(found), max(map(len, found)), 4), dtype=np.float32)
     turns[..., 3] = 1.0
@@ -89,15 +78,7 @@ def symmetries_of_worlds(
 
 
 def equivalent_goals(goal: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
-    """Orientations that look like the wanted one.
-
-    Args:
-        goal: Wanted orientations [N, 4].
-        turns: Symmetries of each environment's shape [N, S, 4].
-
-    Returns:
-        Orientations [N, S, 4], the wanted one first.
-    """
+    """Orientations [N, S, 4] that look like the wanted one [N, 4], itself first, by its symmetries."""
     return product(goal[:, None].expand_as(turns), turns)
 
 

@@ -30,14 +30,8 @@ class Decision:
 class Tracker:
     """Finds the objects of N hands, and lets the teacher act on them.
 
-    Args:
-        policy: The policy.
-        hand: The hand.
-        objects: The objects, as their shapes are known.
-        camera: What sees them, posed in the base frame.
-        world_object: Object of each hand [N]; the first by default, of one hand.
-        world_scale: Size factor of each hand's object [N]; 1 by default.
-        device: Warp device.
+    ``camera`` is posed in the base frame. By default there is one hand, with the first object in its size;
+    else ``world_object`` and ``world_scale`` [N] tell the objects of the hands, and size factors.
 
     Attributes:
         observer: Finds and follows the objects.
