@@ -203,7 +203,7 @@ def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
         assert torch.equal(policy.teacher.act(observation), teacher.act(observation))
 
 
-def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):
+def test_files_come_back_and_a_damaged_one_is_told(tmp_path):
     policy = read_policy(SHIPPED_POLICIES["dclaw3-tracking"])
     moved = replace(policy, spec=replace(policy.spec, camera=(0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)))
     save_checkpoint(tmp_path / "tracking.pt", tracking_export(moved))
@@ -212,15 +212,11 @@ def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):
     torch.save({**state, "tracking": {"gone": 1}}, tmp_path / "other.pt")
     with pytest.raises(ValueError, match=r"other\.pt: TrackingSpec has no field gone"):
         read_policy(tmp_path / "other.pt")
-
-
-def test_a_vision_policy_comes_back_with_its_network(tmp_path):
-    policy = vision_of("dclaw3-tracking")
-    save_checkpoint(tmp_path / "vision.pt", tracking_export(policy))
+    vision, clouds = vision_of("dclaw3-tracking"), torch.randn(2, 3, 40, 3)
+    save_checkpoint(tmp_path / "vision.pt", tracking_export(vision))
     found = open_policy(str(tmp_path / "vision.pt"), "cpu")
-    assert (found.kind, found.spec) == ("vision", policy.spec) and sees_clouds(found)
-    clouds = torch.randn(2, 3, 40, 3)
-    assert torch.equal(found.alignment(*clouds).rotation, policy.alignment(*clouds).rotation)
+    assert (found.kind, found.spec) == ("vision", vision.spec) and sees_clouds(found)
+    assert torch.equal(found.alignment(*clouds).rotation, vision.alignment(*clouds).rotation)
 
 
 @pytest.mark.parametrize("name", sorted(REPLACED))
@@ -229,29 +225,6 @@ def test_a_former_name_is_refused_with_the_one_to_take(name, capsys, tmp_path):
     assert REPLACED[name] in capsys.readouterr().err
     assert vd_deploy([name, "--twin"]) == 1
     assert REPLACED[name] in capsys.readouterr().err
-
-
-def test_what_has_no_checkpoints_does_not_speak_of_resuming(monkeypatch, capsys):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("vd.train.tracker.tracker_command", interrupted)
-    assert vd_train(["tracker", "dclaw3"]) == 130
-    assert "stopped at once\n" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("command", "word"),
-    [
-        ("calibrate", "vd-train tracker"),
-        ("follow", "vd-train tracker"),
-        ("noise", "'noise' is no more; no training needed it"),
-        ("profile", "'profile' is no more; no training needed it"),
-    ],
-)
-def test_a_former_command_is_refused_with_the_new_one(command, word, capsys):
-    assert vd_train([command, "student.pt"]) == 2
-    assert word in capsys.readouterr().err
 
 
 def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):

@@ -118,7 +118,11 @@ def test_checkpoints_of_a_run_that_went_on_from_an_older_one_are_kept(tmp_path, 
     resumed = make_runner(tmp_path, save_every=1)
     resumed.load(str(checkpoint_path(tmp_path, 3)))
     (tmp_path / "checkpoints" / "model_0000009.pt").touch()
+    torn = tmp_path / "checkpoints" / ".model_0000010.x1.pt"  # of a writer that was killed
+    torn.touch()
+    assert find_checkpoint(tmp_path, "latest").name == "model_0000005.pt"
     resumed.learn(1)
+    assert not torn.exists()
     kept = [path.name for path in list_checkpoints(tmp_path)]
     assert kept == ["model_0000004.pt", "model_0000005.pt", "model_0000009.pt"]
 

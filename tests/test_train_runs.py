@@ -87,16 +87,6 @@ def test_keeps_the_last_and_the_best_since_two_episodes_are_over(tmp_path):
         other.load(str(found))
 
 
-def test_a_killed_writer_is_not_taken_for_a_checkpoint(tmp_path):
-    runner = make_runner(tmp_path, save_every=1)
-    runner.learn(1)
-    torn = tmp_path / "checkpoints" / ".model_0000002.x1.pt"
-    torn.write_bytes(b"torn")
-    assert find_checkpoint(tmp_path, "latest").name == "model_0000001.pt"
-    runner.learn(1)
-    assert not torn.exists()
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_and_the_run_goes_on(tmp_path, number):
     env = DummyEnv(num_envs=16)

@@ -23,7 +23,6 @@ from vd.bench.gap_sizes import showing
 from vd.bench.hidden_plant import OUTSIDE
 from vd.bench.hide import hide
 from vd.files import make_folder, write_json
-from vd.versions import source_commit
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
 
@@ -112,7 +111,7 @@ def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
         result = score(case, in_known_unit(report, hidden.recording).to_dict(), hidden.truth)
     except Exception:  # one case that fails is a figure of the battery, not its end
         result = {"case": asdict(case), "error": traceback.format_exc(limit=6)}
-    result |= {"commit": source_commit(), "cpu_s": time.process_time() - begin}
+    result["cpu_s"] = time.process_time() - begin
     write_json(folder / f"{case.name}.json", result)
     return result
 

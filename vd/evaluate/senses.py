@@ -16,20 +16,16 @@ class EnvironmentSenses:
 
     Args:
         env: The environment; from now on it takes actions in the world's order.
-        model: The camera, posed in the base frame; None: there is none, and no points.
+        model: The camera, posed in the base frame.
         depth: What it sees.
         seed: Of its errors.
     """
 
-    def __init__(self, env: Any, model: CameraModel | None, depth: DepthCameraCfg | None, *, seed: int = 0):
+    def __init__(self, env: Any, model: CameraModel, depth: DepthCameraCfg, *, seed: int = 0):
         self._env, scene = env, env.scene
         env.acts_in_frame = False  # who sees by a camera acts in the world, whatever its teacher does
-        self.camera: DepthCamera | None = None
-        if model is not None:
-            frame_s = env.cfg.sim.control_dt
-            self.camera = DepthCamera.of_scene(
-                scene, env.sim.body_q, depth, model, frame_s=frame_s, seed=seed
-            )
+        frame_s = env.cfg.sim.control_dt
+        self.camera = DepthCamera.of_scene(scene, env.sim.body_q, depth, model, frame_s=frame_s, seed=seed)
         self._steps = wp.to_torch(env.step_count)
 
     def read(self) -> Senses:
@@ -47,8 +43,6 @@ class EnvironmentSenses:
 
     def _see(self, fresh: torch.Tensor) -> torch.Tensor:
         """What the cameras see now [N, K, 3]."""
-        if self.camera is None:
-            return torch.empty((len(fresh), 0, 3), device=fresh.device)
         self.camera.reset(wp.from_torch(fresh.int()))  # a late image must not show what was before a reset
         self.camera.capture()
         # Without a pixel in the crop the cloud is one false point at the origin: it counts for nothing.
