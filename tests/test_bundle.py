@@ -119,7 +119,7 @@ def test_another_hand_is_refused_by_field(teacher_bundle, hand, capsys):
     for part, field, value, message in (
         ("conventions", "quaternion", "wxyz", "conventions.quaternion is 'xyzw' here, but 'wxyz'"),
         ("action", "scale_rad_s", 2.0, "action.scale_rad_s is 3.5 here, but 2 in"),
-        ("observation", "parts", {}, r"observation\.parts\.\w+\[0\] is 0 here, but None in"),
+        ("observation", "parts", {}, r"observation\.parts\.\w+\[0\] is 0 here, but missing in"),
     ):
         changed = contract.interface | {part: contract.interface[part] | {field: value}}
         with pytest.raises(ContractError, match=message):

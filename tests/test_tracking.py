@@ -245,12 +245,10 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
     policy = vision_of("dclaw3-tracking") if kind == "vision" else open_policy("dclaw3-tracking", "cpu")
     task = task_for(
         policy,
-        hand=None,
         objects=("cube",),
         num_envs=1,
         seed=3,
         stop_tolerance_rad=0.4,
-        max_goal_angle_rad=None,
         episode_s=3.0,
         randomised=False,
         success_ends_episode=False,

@@ -162,16 +162,6 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path, capsys):
     assert not (tmp_path / "config.json").exists()
 
 
-def test_init_keeps_the_flags_and_names_a_missing_file(tmp_path, capsys):
-    start = ["--preset", "gpu", "--init", str(tmp_path / "no.pt"), "--env.observation.shape", "full"]
-    cfg = parse_teacher([*start, "--out", str(tmp_path / "run"), "--resume", "auto"])
-    assert cfg.init == str(tmp_path / "no.pt") and cfg.env.observation.shape == "full"
-    assert cfg.ppo == PRESETS["gpu"]().ppo and from_dict(TeacherCfg, to_dict(cfg)) == cfg
-    assert main(["teacher", *start, "--out", str(tmp_path / "run")]) == 1
-    assert "--init: no policy at" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
 def test_unknown_commands_devices_and_missing_files_are_explained(tmp_path, monkeypatch, capsys):
     assert main(["pupil"]) == 2
     assert "no command 'pupil'" in capsys.readouterr().err

@@ -16,10 +16,9 @@ from vd.train.checkpoint import (
     BEST_NAME,
     load_checkpoint,
     save_checkpoint,
-    saved_worlds,
     without_worlds,
 )
-from vd.train.config import PolicyCfg, PpoCfg, RunCfg, validate
+from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 from vd.train.imitate import IMITATED, Imitation
 from vd.train.loop import TrainingLoop, check_update
 from vd.train.metrics import GoalWindow, StepMeans
@@ -45,6 +44,8 @@ class TeacherRunner(TrainingLoop):
         unlike: What observations and actions mean otherwise than to the policy that the run began from.
     """
 
+    env: ReorientVecEnv
+
     def __init__(
         self,
         env: ReorientVecEnv,
@@ -56,9 +57,8 @@ class TeacherRunner(TrainingLoop):
         device: str,
         deadline: float | None = None,
     ) -> None:
-        validate(ppo, policy, run)
-        super().__init__(run, device=device, deadline=deadline)
-        self.env, self.ppo, self.policy_cfg, self.task = env, ppo, policy, task
+        super().__init__(run, device=device, deadline=deadline, env=env)
+        self.ppo, self.policy_cfg, self.task = ppo, policy, task
         self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
         self._means, self._window = StepMeans(), self._new_window()
@@ -237,9 +237,6 @@ class TeacherRunner(TrainingLoop):
             state[IMITATED] = self.imitation.teacher.state_dict()
         return self.alg.save() | state
 
-    def _own_state(self) -> dict[str, Any]:
-        return {"env": self.env.env.state_dict()}
-
     def _take(self, state: dict[str, Any], path: str | Path) -> None:
         """Take over what was read from ``path``."""
         try:
@@ -258,20 +255,6 @@ class TeacherRunner(TrainingLoop):
         self._window.load_state_dict(state["window"])
         self._restore(state)
         self._stagger_due = bool(self.new_episodes)
-
-    def _misfit(self, ranks: list[dict[str, Any]]) -> str:
-        envs = {saved_worlds(rank) for rank in ranks}
-        if envs == {0}:
-            return "it holds no environments"
-        if envs != {self.env.num_envs}:
-            return f"it is of {max(envs)} environments a process, this run has {self.env.num_envs}"
-        return ""
-
-    def _start_anew(self, ranks: list[dict[str, Any]]) -> None:
-        self.env.start_anew(ranks[0]["env"])
-
-    def _load_own_state(self, state: dict[str, Any]) -> None:
-        self.env.env.load_state_dict(state["env"])
 
     def _close(self) -> None:
         self.env.env.close()

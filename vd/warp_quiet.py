@@ -3,6 +3,7 @@
 import ctypes
 import os
 import sys
+from contextlib import suppress
 
 
 def quiet_warp() -> None:
@@ -35,9 +36,7 @@ def quiet_warp() -> None:
 def _has_driver() -> bool:
     """Whether the CUDA driver's library loads, by the names that Warp tries."""
     for name in ("libcuda.so", "libcuda.so.1"):
-        try:
+        with suppress(OSError):
             ctypes.CDLL(name)
-        except OSError:
-            continue
-        return True
+            return True
     return False

@@ -77,14 +77,9 @@ def symmetries_of_worlds(
     return torch.tensor(turns[np.asarray(world_object)], device=wp.device_to_torch(device))
 
 
-def equivalent_goals(goal: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
-    """Orientations [N, S, 4] that look like the wanted one [N, 4], itself first, by its symmetries."""
-    return product(goal[:, None].expand_as(turns), turns)
-
-
 def nearest_goal(orientation: torch.Tensor, goal: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
     """Of the orientations that look like the wanted one the nearest [N, 4]; arguments [N, 4], [N, S, 4]."""
-    goals = equivalent_goals(goal, turns)
+    goals = product(goal[:, None].expand_as(turns), turns)
     angle = rotation_distance(orientation[:, None].expand_as(goals), goals)
     best = angle.argmin(dim=1)
     return goals[torch.arange(len(goals), device=goals.device), best]

@@ -35,9 +35,6 @@ class Tracker:
 
     Attributes:
         observer: Finds and follows the objects.
-
-    Raises:
-        ValueError: The hand has other joints.
     """
 
     def __init__(
@@ -53,11 +50,6 @@ class Tracker:
     ):
         teacher = policy.teacher
         task = from_dict(ReorientCfg, policy.task, where="task of the policy")
-        if hand.num_joints != policy.num_actions:
-            raise ValueError(
-                f"the policy moves {policy.num_actions} joints, the hand {hand.name} has {hand.num_joints}; "
-                "use the hand it was trained for"
-            )
         objects_of = np.zeros(1, dtype=int) if world_object is None else world_object
         self.observer = Observer(
             hand,
