@@ -20,13 +20,13 @@ from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
 from vd.evaluate.agents import REPLACED, SHIPPED_POLICIES, find_policy, open_policy, sees_clouds, task_for
 from vd.evaluate.result import Result
-from vd.evaluate.senses import EnvironmentSenses
 from vd.evaluate.trace import Trace
-from vd.evaluate.tracking import TrackingActor
+from vd.evaluate.tracking import TrackingActor, sensed
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 from vd.policy import PolicySpec, TrainedPolicy, load_policy, perceptron
-from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.cfg import DepthSensorCfg
+from vd.sensors.depth_camera import DepthCamera
 from vd.tracking.observer import UNSEEN, Observer
 from vd.tracking.policy import TrackingPolicy, TrackingSpec, read_policy, tracking_export
 from vd.tracking.tracker import Tracker
@@ -64,6 +64,10 @@ def observer_of(env: ReorientEnv) -> Observer:
     )
 
 
+def camera_of(env: ReorientEnv) -> DepthCamera:
+    return DepthCamera.of_scene(env.scene, env.sim.body_q, frame_s=env.cfg.sim.control_dt)
+
+
 @pytest.fixture(scope="module")
 def env():
     """Cubes that were let go, hands that moved."""
@@ -85,8 +89,8 @@ def env():
 
 def test_it_observes_what_its_teacher_does(env):
     """All but the object is the environment's own; the object is found near where it is."""
-    senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()), observer_of(env)
-    observed, angle = observer(replace(senses.read(), fresh=torch.ones(3, dtype=torch.bool)))
+    camera, observer = camera_of(env), observer_of(env)
+    observed, angle = observer(replace(sensed(env, camera), fresh=torch.ones(3, dtype=torch.bool)))
     true, columns = (
         wp.to_torch(env.world_observation),
         teacher_observation_slices(env.num_fingers, env.num_actions),
@@ -111,7 +115,7 @@ def test_it_observes_what_its_teacher_does(env):
 
 
 def test_the_shape_of_a_true_pose_is_as_the_environment_observes_it(env, monkeypatch):
-    senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()).read(), observer_of(env)
+    senses, observer = sensed(env, camera_of(env)), observer_of(env)
     observer(senses)
     pose = torch.tensor(env.object_pose()[:, :7])
     truly = replace(observer.found, position=pose[:, :3], orientation=pose[:, 3:])
@@ -124,14 +128,14 @@ def test_the_shape_of_a_true_pose_is_as_the_environment_observes_it(env, monkeyp
 
 def test_motion_is_that_between_two_looks():
     env = ReorientEnv(ReorientCfg(num_envs=1, objects=("cube",), seed=1, randomisation=EXACT), "cpu")
-    senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()), observer_of(env)
-    observer(senses.read())
+    camera, observer = camera_of(env), observer_of(env)
+    observer(sensed(env, camera))
     wp.to_torch(env.step_count).fill_(1)
     body_q, item = wp.to_torch(env.sim.body_q), env.scene.object_body
     turn = Rotation.from_rotvec([0.0, 0.0, 0.1])
     body_q[:, item, 3:] = torch.tensor((turn * Rotation.from_quat(body_q[:, item, 3:].numpy())).as_quat())
     body_q[:, item, :3] += torch.tensor([0.01, 0.0, 0.0])
-    observer(senses.read())
+    observer(sensed(env, camera))
     np.testing.assert_allclose(observer.found.velocity[0], [12.0 * 0.01, 0.0, 0.0], atol=0.05)
     np.testing.assert_allclose(observer.found.spin[0], [0.0, 0.0, 12.0 * 0.1], atol=0.5)
 
@@ -229,9 +233,7 @@ def test_a_former_name_is_refused_with_the_one_to_take(name, capsys, tmp_path):
 
 def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
     policy = read_policy(find_policy("dclaw3-tracking"))
-    plain, real = (
-        TrackingActor(env, policy, sensor_errors=errs)._senses.camera.cfg for errs in (False, True)
-    )
+    plain, real = (TrackingActor(env, policy, sensor_errors=errs).camera.cfg for errs in (False, True))
     assert not plain.sensor.enabled and plain.latency_s == (0.0, 0.0) and plain.position_noise_m == 0.0
     assert real.sensor == DepthSensorCfg.realistic() and real.latency_s[1] > real.latency_s[0] > 0.0
     assert real.position_noise_m > 0.0 and real.rotation_noise_rad > 0.0
@@ -261,7 +263,7 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
     for step in range(env.max_episode_steps):
         sensed = state_of(env)
         action = actor.act(wp.to_torch(env.observation))
-        image = actor._senses.camera.depth.numpy()[0].copy()
+        image = actor.camera.depth.numpy()[0].copy()
         decision = runner.decide(replace(sensed, depth=image))
         np.testing.assert_allclose(decision.action, action[0], atol=1e-3, err_msg=f"step {step}")
         assert decision.distance == pytest.approx(float(actor.predicted[0]), abs=1e-4)

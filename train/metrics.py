@@ -130,22 +130,15 @@ class ProgressFile:
                 line = json.dumps(row).encode() + b"\n"
                 while line:
                     line = line[self._file.write(line) :]
+            if self._board is not None:
+                with writing(self._path.with_name(BOARD_FOLDER)):
+                    for key, value in row.items():
+                        if value is not None:
+                            name = key if "/" in key else f"run/{key}"
+                            self._board.add_scalar(name, value, row["iteration"])
         except OSError:
             self._file.truncate(size)  # a line is whole or not there
             self._board = None  # closing it would only say so again
-            raise
-        if self._board is not None:
-            self._write_board(row)
-
-    def _write_board(self, row: dict[str, Any]) -> None:
-        try:
-            with writing(self._path.with_name(BOARD_FOLDER)):
-                for key, value in row.items():
-                    if value is not None:
-                        name = key if "/" in key else f"run/{key}"
-                        self._board.add_scalar(name, value, row["iteration"])
-        except OSError:
-            self._board = None
             raise
 
     def close(self) -> None:

@@ -78,13 +78,8 @@ class MeanAction(nn.Module):
 class TrainedPolicy:
     """The deterministic policy of a trained actor: the mean of its action distribution.
 
-    Args:
-        spec: Shape of the network.
-        weights: State of rsl-rl's actor (``mlp.*`` and, if it normalises, ``obs_normalizer.*``).
-        task: Configuration of the environment it was trained in, as a dictionary.
-        iteration: Iterations it was trained for.
-        env_steps: Control steps it was trained for.
-        device: Torch device.
+    ``weights`` are the state of rsl-rl's actor: ``mlp.*`` and, if it normalises, ``obs_normalizer.*``;
+    ``task`` is the configuration of the environment it was trained in, as a dictionary.
 
     Attributes:
         hand: Name of the hand it moves, as ``task`` says ("" if it does not).

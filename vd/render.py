@@ -172,16 +172,10 @@ class PictureModel:
 
 
 class Renderer:
-    """Draws cells of hand and object with the goal beside each.
+    """Draws cells of hand and object, ``width`` by ``height`` pixels, with the goal beside each.
 
-    Args:
-        hand: The hand; None shows objects alone.
-        objects: The object of each cell, length C.
-        width: Width of a cell's picture [pixel].
-        height: Height of a cell's picture [pixel].
-        goal_size: Side of the square picture of the goal [pixel]; GOAL_SHARE of the height by default.
-        camera: Where from.
-        device: Warp device; the CPU is quick enough for video (see ``tests/test_render.py``).
+    Hand, objects and device are as of :class:`PictureModel`; the CPU is quick enough for video. The picture
+    of the goal is a square with sides of ``goal_size`` pixels, or GOAL_SHARE of the height.
     """
 
     def __init__(
