@@ -68,7 +68,7 @@ def flown(blind_rad=None, **settings):
 
 def row_of(trace, **agent):
     """The only row, of a policy that is stopped in its own way."""
-    who = Agent("p", "teacher", "state", lambda _: StoppingRule(), predicts=False, **agent)
+    who = Agent("p", "teacher", "state", lambda _: StoppingRule(), **agent)
     (row,) = judge_in_air(trace, protocol(EPISODES), list(OBJECTS), who, group="held-out")
     return row
 

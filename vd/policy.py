@@ -18,8 +18,6 @@ _STAGE = ("difficulty", "tightness", "tightening")
 """What says how far the curriculum has come, in the state of an environment."""
 _WEIGHTS = "_state_dict"
 """How the names of what holds weights end."""
-_POINTER = b"version https://git-lfs"
-"""How a file begins that git has put in the place of a large one."""
 REMEDY = "copy it again, or give another file of its run"
 """What to do about a policy that cannot be read."""
 _NORMALISER_EPSILON = 1e-2
@@ -161,15 +159,10 @@ def read_state(path: str | Path, device: str = "cpu", *, remedy: str) -> dict[st
 
 def _damage(path: Path, error: Exception) -> str:
     """What is wrong with a file that torch cannot read."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(len(_POINTER))
-    except OSError as reason:
-        return f"cannot be read ({reason.strerror})"
-    if not head:
+    if isinstance(error, OSError):
+        return f"cannot be read ({error.strerror})"
+    if path.stat().st_size == 0:
         return "is damaged: it is empty"
-    if head == _POINTER:
-        return "is a pointer of Git LFS, not the file itself ('git lfs pull' fetches that)"
     return f"is damaged, or is no file of torch ({(str(error) or type(error).__name__).splitlines()[0]})"
 
 

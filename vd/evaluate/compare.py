@@ -155,9 +155,9 @@ def actor_of(
 
     if policy is None:
         actor = BuiltIn(name, env.num_actions, seed=seed, device=env.device)
-        return actor, Agent(name, name, "nothing", StoppingRule, predicts=False)
+        return actor, Agent(name, name, "nothing", StoppingRule)
     if not sees_clouds(policy):
-        return policy, Agent(name, "teacher", "state", StoppingRule, predicts=False)
+        return policy, Agent(name, "teacher", "state", StoppingRule)
     from vd.workers import one_thread_without_gpu
 
     one_thread_without_gpu(env.device)
@@ -165,7 +165,7 @@ def actor_of(
     from vd.evaluate.tracking import TrackingActor
 
     eyes = TrackingActor(env, policy, **settings)
-    return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for, predicts=True)
+    return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for)
 
 
 def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> Any:

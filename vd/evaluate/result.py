@@ -267,8 +267,6 @@ class Agent:
     """Both as of :class:`Row`."""
     rules: Callable[[float], StoppingRule]
     """Its own rule for a tolerance [rad]."""
-    predicts: bool
-    """Whether it predicts its distance to the goal."""
 
     def ways_to_stop(self, tolerance_rad: float) -> dict[tuple[StoppedBy, str], Way]:
         """The ways to stop it within a tolerance [rad], the headline first, by name and what is ours of it.
@@ -279,7 +277,7 @@ class Agent:
         """
         own, norm = self.rules(tolerance_rad), PAPER.success.action_norm
         true = StoppingRule(tolerance_rad, norm)
-        if not self.predicts:
+        if not self.sees.endswith("clouds"):  # nor predicts
             return {("true distance", ""): (true, "exact"), (SUCCESS, ""): (true, "success")}
         ways: dict[tuple[StoppedBy, str], Way] = {
             ("prediction", ""): (replace(own, action_norm=norm), "predicted"),
