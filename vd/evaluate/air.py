@@ -16,11 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from vd.evaluate.goals import AIR_HOLD_S, ALONE_S, GOAL_S, IN_A_ROW
 from vd.evaluate.result import Agent, InAir, Protocol, Row, row_of
-from vd.evaluate.rollout import advance, draw_goals, unit_quats
+from vd.evaluate.rollout import draw_goals, unit_quats
 from vd.evaluate.statistics import choose_unit, rate_intervals, rotation_angle, share_among, symmetric_error
 from vd.evaluate.trace import (
     Way,
     act_in,
+    advance,
     air_table_steps,
     copy_motion,
     drawn_rounds,

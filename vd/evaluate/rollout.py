@@ -1,11 +1,8 @@
 """Starts and goals of an evaluation, and the rounds in which many environments run them."""
 
 import zlib
-from typing import Any
 
 import numpy as np
-import torch
-import warp as wp
 from scipy.spatial.transform import Rotation
 
 # Points of the inverse of the cumulative distribution of goal angles; linear between them.
@@ -53,11 +50,6 @@ def episode_rounds(world_object: np.ndarray, objects: int, episodes: int) -> lis
     count = int(np.ceil(episodes / share.min()))
     numbers = [turn * share[world_object] + order for turn in range(count)]
     return [np.where(number < episodes, number, -1) for number in numbers]
-
-
-def advance(env: Any, action: torch.Tensor) -> None:
-    """One control step of all environments with actions [N, D]."""
-    env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
 
 
 def unit_quats(quat: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from vd.evaluate.rollout import advance, episode_rounds, unit_quats
+from vd.evaluate.rollout import episode_rounds, unit_quats
 from vd.evaluate.statistics import rotation_angle, symmetric_error
 from vd.paper import PAPER
 from vd.stopping import StoppingRule
@@ -237,6 +237,11 @@ def act_in(env: Any, policy: Any, envs: np.ndarray) -> torch.Tensor:
         policy.active[torch.from_numpy(envs).to(policy.active.device)] = True
     action: torch.Tensor = policy.act(wp.to_torch(env.observation))
     return action
+
+
+def advance(env: Any, action: torch.Tensor) -> None:
+    """One control step of all environments with actions [N, D]."""
+    env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
 
 
 def out_of_hand(env: Any) -> np.ndarray:

@@ -13,8 +13,8 @@ import numpy as np
 import warp as wp
 from PIL import Image, ImageDraw, ImageFont
 
-from vd.evaluate.rollout import advance
 from vd.evaluate.statistics import rotation_angle
+from vd.evaluate.trace import advance
 from vd.files import atomic_path
 from vd.paper import PAPER
 from vd.render import Picture, Renderer
