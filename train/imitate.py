@@ -24,11 +24,8 @@ class Imitation:
     """Lets the actor of a learner imitate itself as it is now.
 
     rsl-rl's Distillation has a loop and a storage of its own and no critic; its loss is repeated here. Adam
-    begins fresh, and that of PPO sees none of these gradients.
-
-    Args:
-        learner: The learner, whose actor has the weights of the policy to imitate. The last that its critic
-            is told is what the actor observes, of the present state.
+    begins fresh, and that of PPO sees none of these gradients. The last that the learner's critic is told is
+    what the actor observes, of the present state.
 
     Attributes:
         teacher: The policy to imitate.

@@ -94,13 +94,9 @@ class GoalWindow:
 
 
 class ProgressFile:
-    """One JSON object per iteration in ``progress.jsonl``, and the same numbers in TensorBoard.
+    """One JSON object per iteration in ``progress.jsonl``, and with ``tensorboard`` the same numbers there.
 
-    Args:
-        run_dir: Folder of the run.
-        tensorboard: Whether to write TensorBoard files too, in ``run_dir/tensorboard``.
-        done: Iterations to keep from an earlier run of this folder; later lines are dropped, since the
-            resumed run writes them anew.
+    Of an earlier run of this folder ``done`` iterations are kept; a resumed run writes later ones anew.
     """
 
     def __init__(self, run_dir: Path, *, tensorboard: bool = True, done: int = 0) -> None:
