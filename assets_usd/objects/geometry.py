@@ -33,11 +33,15 @@ SLIVER_THICKNESS = 2e-3
 """A part thinner than this share of the longest side (0.25 mm of 12 cm) is no solid to collide with."""
 
 
-class Hull(NamedTuple):
-    """A convex polyhedron: ``vertices`` [V, 3] and outward triangles ``faces`` [T, 3]."""
+class Surface(NamedTuple):
+    """Triangles: ``vertices`` [V, 3], and ``faces`` [T, 3], outward where they are closed."""
 
     vertices: np.ndarray
     faces: np.ndarray
+
+
+Hull = Surface
+"""A convex polyhedron."""
 
 
 class Solid(NamedTuple):

@@ -66,6 +66,7 @@ def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
         MeshError: No USD, nothing to read in it, or geometry of a kind that is not read.
     """
     from pxr import UsdGeom
+    from trimesh.util import append_faces
 
     stage = opened(path)
     prims = _shown(stage)
@@ -81,9 +82,7 @@ def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
     ]
     if not parts:
         raise MeshError("no visible mesh below the default prim")
-    start = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    vertices = np.concatenate([vertices for vertices, _ in parts])
-    faces = np.concatenate([faces + first for (_, faces), first in zip(parts, start, strict=False)])
+    vertices, faces = append_faces(*zip(*parts, strict=True))
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         vertices = vertices @ Z_FROM_Y.T
     return vertices, faces

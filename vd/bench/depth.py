@@ -45,15 +45,7 @@ def captured(function: Any, device: str) -> Any:
 def bench_scene(
     objects: list[ObjectModel], envs: int, hand: str, device: str, seed: int
 ) -> tuple[Scene, Any]:
-    """A scene with visual shapes, and a Newton state with random poses.
-
-    Args:
-        objects: Objects to spread over the environments; the first ones if there are fewer environments.
-        envs: Number of environments.
-        hand: Name of a hand.
-        device: Warp device.
-        seed: Of the poses.
-    """
+    """A scene with visual shapes, and a Newton state with random poses; of few environments fewer objects."""
     scene = build_scene(
         hand=load_hand(hand),
         objects=objects[:envs],
@@ -82,12 +74,7 @@ class NewtonCamera:
     """Newton's ray-traced camera with the hand's viewpoint in every world, forward depth only."""
 
     def __init__(self, scene: Scene, camera_q: np.ndarray):
-        """Prepare rays and image.
-
-        Args:
-            scene: Environments, built with visual shapes.
-            camera_q: Optical frames in the world frame, shape [N, 7].
-        """
+        """Prepare rays and image, for optical frames in the world frame, shape [N, 7]."""
         self.model, camera = scene.model, scene.hand.camera
         device = self.model.device
         self.sensor = SensorCamera(self.model, load_textures=False)

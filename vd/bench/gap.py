@@ -44,15 +44,7 @@ def battery(
     seeds: int = 5,
     first_seed: int = 0,
 ) -> list[Case]:
-    """The cases.
-
-    Args:
-        model: A hand, of which it takes one finger, or ``servo``.
-        kinds: Kinds of cases, of :data:`KINDS`.
-        effects: Effects to hide; empty: all that show on the model.
-        sizes: Sizes of single effects and of those outside the table.
-        seeds: Recordings of each effect and size.
-        first_seed: Seed of the first: recordings that the method has not been tuned on.
+    """The cases; arguments as in :class:`vd.bench.cli.GapCommand`.
 
     Raises:
         ValueError: An effect is unknown, or cannot show on the model.
@@ -84,12 +76,7 @@ def battery(
 
 
 def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
-    """Make the recording, analyse it, and compare; writes ``folder/CASE.json``.
-
-    Args:
-        case: The case.
-        folder: Folder of results.
-        device: Warp device of the analysis.
+    """Make the recording, analyse it on a Warp device, and compare; writes ``folder/CASE.json``.
 
     Returns:
         What :func:`score` returns, or the traceback under ``error``; with the commit and the processor time
@@ -118,22 +105,11 @@ def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
 
 
 def run_battery(
-    cases: Sequence[Case],
-    folder: Path,
-    *,
-    jobs: int = 1,
-    device: str = "cpu",
+    cases: Sequence[Case], folder: Path, *, jobs: int = 1, device: str = "cpu"
 ) -> list[dict[str, Any]]:
-    """Run the cases that have no result yet, and print a line for each; what failed before comes last.
+    """Run the cases that have no result in the folder yet, with a line for each; returns the results of all.
 
-    Args:
-        cases: The battery.
-        folder: Folder of results.
-        jobs: Processes.
-        device: Warp device of the analyses.
-
-    Returns:
-        The results of all cases.
+    What failed before comes last.
     """
     make_folder(folder)
     done = {case: read_result(folder / f"{case.name}.json") for case in cases}
