@@ -1,12 +1,12 @@
 """A welded hand as USD (docs/reference/hand.md): numbers as text, meshes in a crate beside it."""
 
-import re
 from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial.transform import Rotation
 from trimesh.util import append_faces
@@ -16,7 +16,9 @@ from vd.assets_usd.hand_import.description import Description
 from vd.assets_usd.hand_import.guess import Stance
 from vd.assets_usd.hand_import.source import Joint, Link, Shape
 from vd.assets_usd.hand_import.tree import Tree, shape_box
+from vd.assets_usd.objects.decompose import decompose
 from vd.assets_usd.objects.geometry import convex_hull, principal_axes, simplify_hull, surface_points
+from vd.assets_usd.objects.settings import ImportSettings
 
 HULL_VERTICES = 32
 """Most corners of a collider: contacts of more take longer and feel the same."""
@@ -26,12 +28,6 @@ GAP_M = 0.002
 SURFACES = {"surface": (2500.0, 100.0), "fingertip_surface": (2500.0, 100.0)}
 """Contact stiffness and damping of each material: MuJoCo's default, 20 ms and critically damped."""
 RESTITUTION = 0.5
-
-
-def prim_name(name: str) -> str:
-    """A name that USD takes."""
-    name = re.sub(r"\W", "_", name)
-    return name if name and not name[0].isdigit() else f"hand_{name}"
 
 
 class Author:
@@ -260,8 +256,6 @@ class Author:
 
 def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and faces [T, 3] of any shape, in its link."""
-    import trimesh
-
     match shape.kind:
         case "mesh":
             vertices, faces = shape.vertices, shape.faces
@@ -286,9 +280,6 @@ def convex_parts(shape: Shape) -> list[Shape]:
     """A collider, or the parts of one that is to be split."""
     if shape.kind != "mesh" or not shape.split:
         return [shape]
-    from vd.assets_usd.objects.decompose import decompose
-    from vd.assets_usd.objects.settings import ImportSettings
-
     cut = decompose(shape.vertices, shape.faces, ImportSettings(), HULL_VERTICES)
     return [replace(shape, vertices=hull.vertices, faces=hull.faces) for hull in cut.hulls]
 

@@ -6,14 +6,18 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from vd.assets_usd.hand_data import HandError, HandModel, compose
+from vd.assets_usd.hand_import.author import Author
 from vd.assets_usd.hand_import.description import read_description
 from vd.assets_usd.hand_import.guess import Stance, take_stance
 from vd.assets_usd.hand_import.source import Source, read_source
 from vd.assets_usd.hand_import.tree import Tree, grow
 from vd.assets_usd.hand_model import read_hand
+from vd.assets_usd.hands import HANDS, imported_folder
+from vd.assets_usd.objects.plan import prim_name
 from vd.files import make_folder
 
 DEEP_M = 0.0005
@@ -49,9 +53,6 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
     Raises:
         HandError: The file cannot be imported; says why and what to do.
     """
-    from vd.assets_usd.hand_import.author import Author, prim_name
-    from vd.assets_usd.hands import HANDS, imported_folder
-
     said, source = read_description(describe), read_source(path)
     tree = grow(source, said)
     stance = take_stance(tree, said)
@@ -126,8 +127,6 @@ def _untouched(source: Source, tree: Tree) -> set[tuple[int, int]]:
 
 def overlaps(hand: HandModel, near: set[tuple[int, int]]) -> dict[tuple[int, int], float]:
     """Pairs of links that are in each other at the start, and how deep [m], but for those ``near``."""
-    import mujoco
-
     links = hand.forward_kinematics(hand.start)
     spec = mujoco.MjSpec()
     for number, shape in enumerate(hand.shapes):

@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel, compose
@@ -29,8 +31,6 @@ def _collider(shape: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def _draw(axes: Any, hand: HandModel, links: np.ndarray, joints: np.ndarray) -> None:
     """Colliders in one colour a link, axes of the joints, fingertips, drop point."""
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
     corners = []
     for shape in hand.shapes:
         vertices, faces = _collider(shape)
@@ -77,8 +77,6 @@ def hand_sheet(hand: HandModel, sources: list[str], path: Path) -> Path:
         sources: What its joints are called in the source [D].
         path: File to write; its suffix says which format.
     """
-    from matplotlib.figure import Figure
-
     links = compose(hand.mount, hand.forward_kinematics(hand.start))
     joints = compose(links[hand.joint_parent], hand.joint_parent_frame)
     figure = Figure((13.0, 4.6 + 0.14 * hand.num_joints), dpi=110)

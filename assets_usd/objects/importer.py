@@ -35,6 +35,7 @@ from vd.assets_usd.objects.plan import Job, check_target, find_meshes, plan_jobs
 from vd.assets_usd.objects.reading import declared_unit, load_mesh, mesh_kind
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.settings import ImportSettings, MeshError
+from vd.assets_usd.objects.usd_mesh import usd_files
 from vd.files import make_folder
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
@@ -76,8 +77,6 @@ def content_hash(job: Job, settings: ImportSettings) -> str:
     """Hash of all that decides the object: bytes of the mesh, name, licence, settings and code version."""
     files = [Path(job.source)]
     if mesh_kind(files[0]) == "usd":
-        from vd.assets_usd.objects.usd_mesh import usd_files
-
         files = usd_files(files[0])
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files))
     parts = {

@@ -4,6 +4,7 @@ Lengths in the unit of the points, in their frame.
 """
 
 import numpy as np
+import trimesh
 import warp as wp
 from scipy.spatial import cKDTree
 from warp.geometry import IsoSurfaceMarchingCubes
@@ -52,8 +53,6 @@ def surface_of_scan(points: np.ndarray, device: str = "cpu") -> Surface:
     Raises:
         ValueError: They enclose nothing.
     """
-    import trimesh
-
     scanned = np.asarray(points, dtype=np.float64)
     points = smooth(scanned)
     noise = float(np.sqrt(np.square(points - scanned).sum(axis=1).mean()))

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.files import atomic_path
@@ -26,8 +28,6 @@ TILE_IN, CAPTION_IN = 1.7, 0.55
 
 def _draw(axes: Any, parts: Sequence[tuple[np.ndarray, np.ndarray]], colours: Sequence[Any]) -> None:
     """Draw meshes so that they fill the axes."""
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
     corners = np.concatenate([vertices[faces] for vertices, faces in parts])
     colour = np.repeat(np.array(colours), [len(faces) for _, faces in parts], axis=0)
     surface = Poly3DCollection(corners, facecolors=colour, edgecolors=colour, linewidths=0.3, shade=True)
@@ -69,8 +69,6 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
     Returns:
         The path.
     """
-    from matplotlib.figure import Figure
-
     errors = [model.volume_error for model in models]
     title = f"{title}, objects: {len(models)}\nvolume error {np.median(errors):.1%}, worst {max(errors):.1%}"
     columns = max(1, round(np.sqrt(len(models) / 2)))

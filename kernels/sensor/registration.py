@@ -292,26 +292,6 @@ def fit_poses_kernel(
 
 
 @wp.kernel
-def take_better_kernel(
-    # In:
-    world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
-    known: int,  # attempts, K
-    # In/Out:
-    pose: wp.array2d[wp.transform],  # [M, >= 2 K] poses: attempt k + K is another one at what k is
-    cost: wp.array2d[float],  # their misfits [m^2], likewise; NEVER of the second ones afterwards
-):
-    """Of each two attempts at the same pose take the better one. Launch: [M, K]."""
-    row, k = wp.tid()
-    if world_in[row] < 0:
-        return
-    again = known + k
-    if cost[row, again] < cost[row, k]:
-        pose[row, k] = pose[row, again]
-        cost[row, k] = cost[row, again]
-    cost[row, again] = NEVER
-
-
-@wp.kernel
 def keep_poses_kernel(
     # Model:
     apart: float,  # least angle between two kept poses [rad]

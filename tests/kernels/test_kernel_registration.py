@@ -16,7 +16,6 @@ from vd.kernels.sensor.registration import (
     nearness_kernel,
     replace_poses_kernel,
     start_poses_kernel,
-    take_better_kernel,
 )
 from vd.kernels.sensor.shape_grids import off_mesh_kernel, shape_distance_kernel
 
@@ -235,25 +234,6 @@ def test_poses_that_fit_no_more_are_put_where_the_points_are_and_stay_turned(dev
             place = scene.placed(world, turn, every, rendered=rendered)
             np.testing.assert_allclose(out[row, c, :3], place, atol=1e-5)
             np.testing.assert_allclose(out[row, c, 3:], before[world, c, 3:], atol=1e-6)
-
-
-@given(seed=seeds)
-@EXAMPLES
-def test_of_two_attempts_the_better_one_is_taken(device, seed):
-    scene = Scene(seed)
-    rows, kept, candidates = len(scene.row_world), 3, 8
-    found, cost = scene.random_poses(rows, candidates), scene.rng.uniform(0.1, 1.0, (rows, candidates))
-    arrays = [device_array(found, wp.transform, device), device_array(cost, float, device)]
-    row_world = np.where(np.arange(rows) == 1, -1, scene.row_world)
-    launch(take_better_kernel, (rows, kept), [row_world, kept, *arrays], device)
-    expected, poses = cost.copy(), found.copy()
-    for row in np.flatnonzero(row_world >= 0):
-        for k in range(kept):
-            best = min((k, k + kept), key=lambda c, row=row: cost[row, c])
-            expected[row, k], poses[row, k] = cost[row, best], found[row, best]
-        expected[row, kept : 2 * kept] = NEVER
-    np.testing.assert_allclose(arrays[1].numpy(), expected, rtol=1e-6)
-    np.testing.assert_allclose(arrays[0].numpy(), poses, atol=1e-6)
 
 
 @given(

@@ -17,12 +17,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from vd.assets_usd.hands import HANDS
+import warp as wp
+
+from vd.assets_usd.hands import HANDS, load_hand
 from vd.bench.gap_score import KINDS, Case, said, score
 from vd.bench.gap_sizes import showing
 from vd.bench.hidden_plant import OUTSIDE
 from vd.bench.hide import hide
 from vd.files import make_folder, write_json
+from vd.gap import workflow
+from vd.gap.torque_unit import in_known_unit
+from vd.kernels.servo import chains
 from vd.versions import source_commit
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
@@ -82,10 +87,6 @@ def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
         What :func:`score` returns, or the traceback under ``error``; with the commit and the processor time
         of this process ``cpu_s`` [s].
     """
-    from vd.assets_usd.hands import load_hand
-    from vd.gap import workflow
-    from vd.gap.torque_unit import in_known_unit
-
     quiet_warp()
     begin = time.process_time()
     try:
@@ -137,15 +138,10 @@ def run_battery(
 
 def _prepare(device: str, models: set[str]) -> None:
     """Fill the caches of kernels and hands before many processes want the same at once."""
-    import warp as wp
-
-    import vd.kernels.servo.chains
-    from vd.assets_usd.hands import load_hand
-
     for model in models & set(HANDS):
         load_hand(model)
     quiet_warp()
-    wp.load_module(vd.kernels.servo.chains, device=device)
+    wp.load_module(chains, device=device)
 
 
 def read_result(path: Path) -> dict[str, Any] | None:

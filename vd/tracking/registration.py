@@ -19,13 +19,13 @@ from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.kernels.launch import launch
 from vd.kernels.sensor.registration import (
+    NEVER,
     Eye,
     fit_poses_kernel,
     keep_poses_kernel,
     nearness_kernel,
     replace_poses_kernel,
     start_poses_kernel,
-    take_better_kernel,
 )
 from vd.kernels.sensor.shape_grids import Shapes, off_mesh_kernel, shape_distance_kernel
 
@@ -255,7 +255,11 @@ class Registration:
         first = wp.from_torch((self.looks * STRIDE) % ROTATIONS)
         self._start(self._found[:, others], envs, first, inputs)
         self._fit(self._found[:, others], self._cost[:, others], envs, STEPS, 1, inputs)
-        launch(take_better_kernel, (len(envs), KEPT), [envs, KEPT], [self._found, self._cost])
+        pose, cost = wp.to_torch(self._found), wp.to_torch(self._cost)
+        better = cost[:, again] < cost[:, known]  # of two attempts at one pose
+        pose[:, known] = torch.where(better[..., None], pose[:, again], pose[:, known])
+        cost[:, known] = torch.where(better, cost[:, again], cost[:, known])
+        cost[:, again] = float(NEVER)
         self._keep(KEPT, envs, self._found, self._cost)
 
     def _start(self, pose: wp.array, envs: wp.array, first: wp.array, inputs: list[wp.array]) -> None:
