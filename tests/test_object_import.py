@@ -55,12 +55,10 @@ def imported(tmp_path_factory: pytest.TempPathFactory):
     box.export(folder / "brick in mm.ply")
     trimesh.creation.box((0.1, 0.05, 0.05)).export(folder / "sub" / "clamp.glb")
     trimesh.creation.annulus(0.05, 0.058, 0.02, sections=16).export(folder / "ring.stl")
-    (folder / "empty.obj").write_text("")
     (folder / "cloud.obj").write_text("".join(f"v {i} {i * i} 1\n" for i in range(9)))
     (folder / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 1\nf 1 2 3\nf 1 2 4\n")
     (folder / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n")
     trimesh.creation.box((100.0, 0.15, 0.15)).export(folder / "needle.stl")
-    (folder / "junk.stl").write_bytes(b"this is no stereolithography file")
     notes = root / "notes.txt"
     notes.write_text("hello")
     with (folder / "objects.csv").open("w", newline="") as stream:
@@ -81,12 +79,10 @@ def imported(tmp_path_factory: pytest.TempPathFactory):
 
 
 REFUSALS = {
-    "empty": "empty file",
     "cloud": "not a mesh, or cut short: 9 points and no faces",
     "nan": "1 of 4 vertices are NaN or infinite",
     "flat": "degenerate: flat",
     "needle": "degenerate: flat.*give it thickness",
-    "junk": "neither mesh nor points|not a mesh",
     "notes": r"unsupported type \.txt; use \.obj, \.stl, \.ply, \.glb, \.usd",
 }
 
