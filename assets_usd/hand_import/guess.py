@@ -229,7 +229,7 @@ def _workspace(tree: Tree, ends: Ends, palm: np.ndarray, mount: np.ndarray, said
     goal = compose(mount, np.array([*(middle + above * palm), 0.0, 0.0, 0.0, 1.0]))[:3]
     x, y, z = said.goal or (float(v) for v in goal)
     drop, fall = said.drop or (x, y, z + DROP_M), said.fall or FALL * reach
-    for name, value in {"drop": drop, "goal": (x, y, z), "size": size, "fall": fall}.items():
+    for name, value in {"drop": drop, "goal": (x, y, z), "size": size, "fall": (fall,)}.items():
         if getattr(said, name) is None:
-            tree.notes.append(f"guess: {name} {_text(np.ravel(value))} m (workspace)")
+            tree.notes.append(f"guess: {name} {_text(np.array(value))} m (workspace)")
     return Workspace(drop, (x, y, z), fall, size)

@@ -122,12 +122,13 @@ class _Grower:
     def _check_names(self) -> None:
         joints = [joint.name for joint in self.source.joints if joint.kind != "fixed"]
         links = [link.name for link in self.source.links]
-        entries = {"joint": ("hold", "mimic", "limits", "drives", "start", "motors")}
-        entries["link"] = ("mass", "tips", "parts")
-        for kind, known in (("joint", joints), ("link", links)):
+        for kind, known, entries in (
+            ("joint", joints, "hold mimic limits drives start motors"),
+            ("link", links, "mass tips parts"),
+        ):
             self.problems += [
                 f"{entry}: there is no {kind} {name}; there are {', '.join(known)}"
-                for entry in entries[kind]
+                for entry in entries.split()
                 for name in getattr(self.said, entry)
                 if name not in known
             ]
@@ -377,7 +378,7 @@ class _Grower:
 def combine(link: Link, parts: list[tuple[float, np.ndarray, np.ndarray]]) -> None:
     """Give a link the mass of parts: mass, centre [3], inertia about it in the link's axes [3, 3] each."""
     link.mass = sum(mass for mass, _, _ in parts)
-    link.com = sum(mass * at for mass, at, _ in parts) / link.mass
+    link.com = np.asarray(sum(mass * at for mass, at, _ in parts)) / link.mass
     for mass, at, inertia in parts:
         arm = at - link.com
         link.inertia = link.inertia + inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
