@@ -195,7 +195,7 @@ def make_quick_scenes():
     return make_scenes(load_set(["cube", "cuboid"]), load_set(["cuboid"]), hands, QUICK)
 
 
-def make_runner(scenes=None, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000, looks=()):
+def make_runner(scenes=None, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000, looks=None):
     """A trainer of a network that is small enough to learn in a second."""
     scenes = make_quick_scenes() if scenes is None else scenes
     torch.manual_seed(seed)

@@ -163,7 +163,7 @@ class AlignTrainer(TrainingLoop):
         run: Run settings.
         spec: Description of the network, kept with it.
         task: The environment's configuration as a dictionary, kept with it.
-        looks: What is seen in simulation, by one policy after the other; none: all pairs are made.
+        looks: What is seen in simulation; None: all pairs are made.
         device: Torch device.
         deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
     """
@@ -177,7 +177,7 @@ class AlignTrainer(TrainingLoop):
         *,
         spec: AlignmentSpec,
         task: dict[str, Any],
-        looks: Sequence[SimulatedLooks] = (),
+        looks: SimulatedLooks | None = None,
         device: str,
         deadline: float | None = None,
     ) -> None:
@@ -226,11 +226,8 @@ class AlignTrainer(TrainingLoop):
 
     def _iterate(self) -> dict[str, Any] | None:
         cfg, seen = self.cfg, dict[str, float]()
-        turn = self.iteration % max(1, len(self.looks))
-        for number, look in enumerate(self.looks):
-            if number != turn and len(look):
-                continue
-            if (collected := look.collect(self._stopping)) is None:
+        if self.looks is not None:
+            if (collected := self.looks.collect(self._stopping)) is None:
                 return None
             seen = self._read(collected)
         if self.iteration:
@@ -252,20 +249,19 @@ class AlignTrainer(TrainingLoop):
         """A batch to learn from."""
         cfg = self.cfg
         shares = {"near": cfg.near_share, "scans": cfg.scan_share}
-        counts = [round(look.cfg.share * cfg.batch / len(self.looks)) for look in self.looks]
-        made = self.scenes.bank.draw(cfg.batch - sum(counts))
-        pairs = [draw_pairs(self.scenes.hands, made, cfg.points, **shares)]
-        for look, count in zip(self.looks, counts, strict=True):
-            pairs.append(look.pairs(count, cfg.points, **shares))
-        return joined(pairs)
+        simulated = 0 if self.looks is None else round(self.looks.cfg.share * cfg.batch)
+        made = self.scenes.bank.draw(cfg.batch - simulated)
+        pairs = draw_pairs(self.scenes.hands, made, cfg.points, **shares)
+        if self.looks is None:
+            return pairs
+        return joined(pairs, self.looks.pairs(simulated, cfg.points, **shares))
 
     @torch.no_grad()
     def searched(self, pairs: Pairs, near: Sequence[torch.Tensor]) -> Pairs:
         """Pairs of which some goals are turned as the network says, once or twice: as a search meets them.
 
-        The neighbours of both clouds, ``near``, stay.
-
-        Among random rotations those that it wrongly holds for right are rare, and these it has to tell.
+        Among random rotations those that it wrongly holds for right are rare, and these it has to tell. The
+        neighbours of both clouds, ``near``, stay.
         """
         goal, rotation, surface = pairs.goal.clone(), pairs.rotation.clone(), pairs.surface.clone()
         rows = torch.randperm(len(goal), device=goal.device)[: round(self.cfg.searched_share * len(goal))]
@@ -371,8 +367,8 @@ class AlignTrainer(TrainingLoop):
         }
 
     def _close(self) -> None:
-        for look in self.looks:
-            look.close()
+        if self.looks is not None:
+            self.looks.close()
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:
         save_checkpoint(self.run.out / ALIGNMENT_NAME, alignment_export(state))

@@ -1,7 +1,7 @@
 """From a configuration to a runner: teacher, environments, network, and where it begins."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -80,8 +80,8 @@ def build_student(
     from vd.workers import one_thread_without_gpu
 
     rank = int(os.environ.get("RANK", "0"))
-    teachers = [load_policy(find_policy(name), device) for name in (cfg.teacher, *cfg.others)]
-    tasks = [student_task(teacher, cfg) for teacher in teachers]
+    teacher = load_policy(find_policy(cfg.teacher), device)
+    task = student_task(teacher, cfg)
     one_thread_without_gpu(device)
     # The network is the same in all processes, what they draw is not.
     torch.manual_seed(cfg.task.seed)
@@ -89,11 +89,10 @@ def build_student(
     network = AlignmentNetwork(cfg.align.network).to(device)
     if cfg.init is not None and checkpoint is None:
         network.load_state_dict(load_alignment(cfg.init, device)[0].state_dict())
-    seed = cfg.task.seed + rank
-    torch.manual_seed(seed)
-    kept = {"task": to_dict(tasks[0]), "device": device, "deadline": cfg.run.deadline(started)}
-    own_tasks = [replace(task, seed=seed) for task in tasks]
-    runner = _trainer(cfg, list(zip(own_tasks, teachers, strict=True)), network, kept)
+    own_task = replace(task, seed=cfg.task.seed + rank)
+    torch.manual_seed(own_task.seed)
+    kept = {"task": to_dict(task), "device": device, "deadline": cfg.run.deadline(started)}
+    runner = _trainer(cfg, own_task, teacher, network, kept)
     if checkpoint is not None:
         runner.load(checkpoint)
     if rank == 0:
@@ -104,7 +103,8 @@ def build_student(
 
 def _trainer(
     cfg: StudentTrainCfg,
-    acting: Sequence[tuple[ReorientCfg, "TrainedPolicy"]],
+    task: ReorientCfg,
+    teacher: "TrainedPolicy",
     network: "AlignmentNetwork",
     kept: dict[str, Any],
 ) -> "AlignTrainer":
@@ -114,13 +114,13 @@ def _trainer(
     from vd.train.student.views import Hands
     from vd.vision.saved import AlignmentSpec
 
-    chosen, device, task = cfg.align, kept["device"], acting[0][0]
+    chosen, device = cfg.align, kept["device"]
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
     hands = Hands(hand, chosen.hands, camera=cfg.camera, device=device)
     held_out = load_set(list(chosen.validation)) if chosen.validation else []
     scenes = make_scenes(load_set(list(task.objects)), held_out, hands, chosen)
     spec = AlignmentSpec(network=chosen.network, points=chosen.points, hand=task.hand, camera=cfg.camera)
-    looks = [_looks(cfg, *each, network, device) for each in acting if cfg.stage == SIMULATED]
+    looks = _looks(cfg, task, teacher, network, device) if cfg.stage == SIMULATED else None
     return AlignTrainer(scenes, network, chosen, cfg.run, spec=spec, looks=looks, **kept)
 
 

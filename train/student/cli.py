@@ -55,8 +55,7 @@ def student_command(arguments: list[str], started: float) -> int:
 
     from vd.evaluate.agents import check_names
 
-    teachers = [name for name in (cfg.teacher, *cfg.others) if name is not None]
-    check_names(teachers, (*cfg.task.objects, *cfg.align.validation))
+    check_names([] if cfg.teacher is None else [cfg.teacher], (*cfg.task.objects, *cfg.align.validation))
     folder, say = cfg.run.out, say_of_main()
     runner = build_student(cfg, started=started, say=say)
     if runner.iteration:

@@ -143,8 +143,6 @@ class StudentTrainCfg:
     teacher: str | None = None
     """Policy that acts, also the source of hand and task: a policy.pt, a run's folder, or the name of an
     installed one."""
-    others: tuple[str, ...] = ()
-    """Policies that act besides, in turn, also of other hands, each in --num-envs environments of its own."""
     init: Path | None = None
     """Network to begin from, the alignment.pt of a run; stage 1 needs one."""
     resume: str | None = None

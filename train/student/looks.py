@@ -50,10 +50,6 @@ class SimulatedLooks:
         self._envs = torch.empty(cfg.kept, dtype=torch.long, device=place)
         self._next, self._full = 0, False
 
-    def __len__(self) -> int:
-        """Looks that are kept."""
-        return len(self._seen) if self._full else self._next
-
     @torch.no_grad()
     def collect(self, stopping: Callable[[], bool]) -> dict[str, torch.Tensor] | None:
         """Some steps of every environment; figures of these, or ``None`` if they were cut short."""
@@ -79,8 +75,8 @@ class SimulatedLooks:
 
     def pairs(self, count: int, points: int, *, near: float, scans: float) -> Pairs:
         """Pairs of looks, drawn from those kept, with goals of the same shapes; clouds of ``points``."""
-        device = self._surfaces.device
-        drawn = torch.randint(len(self), (count,), device=device)
+        device, known = self._surfaces.device, len(self._seen) if self._full else self._next
+        drawn = torch.randint(known, (count,), device=device)
         envs, pose = self._envs[drawn], self._poses[drawn]
         order = torch.randperm(self._surfaces.shape[1], device=device)
         shapes = self._scale[envs, None, None] * self._surfaces[self._object[envs]][:, order]

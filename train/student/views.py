@@ -6,7 +6,6 @@ batch nothing of a hand is left to do but a look into its tables.
 B pairs, P points of a shape, M postures of the hand. All is in the hand's base frame, in metres.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -276,6 +275,6 @@ def with_goals(
     )
 
 
-def joined(parts: Sequence[Pairs]) -> Pairs:
-    """Pairs of all, one after the other."""
-    return Pairs(*(torch.cat([getattr(pairs, f.name) for pairs in parts]) for f in fields(Pairs)))
+def joined(first: Pairs, second: Pairs) -> Pairs:
+    """Pairs of both, one after the other."""
+    return Pairs(*(torch.cat([getattr(pairs, f.name) for pairs in (first, second)]) for f in fields(Pairs)))
