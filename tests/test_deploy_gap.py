@@ -17,7 +17,7 @@ from vd.deploy.clock import Pacer
 from vd.deploy.hardware import record
 from vd.deploy.hardware.connect import Connection
 from vd.deploy.hardware.control_table import TICK_MODULUS
-from vd.deploy.hardware.joints import uncalibrated
+from vd.deploy.hardware.joints import read_joints
 from vd.deploy.hardware.motion import move
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
@@ -70,8 +70,8 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     layer = tmp_path / "late.usda"
     layer.write_text(LAYER)
     hand = load_hand("dclaw4")
-    joints = uncalibrated(hand)
-    motions = record.motions_of(hand, (0,), ("steps_and_sines",))
+    joints = read_joints(hand)
+    motions = record.motions_of(joints, (0,), ("steps_and_sines",))
     chosen = [m for m in motions if m.excitation.joints == ("f0_j1",) and m.excitation.name in KINDS]
 
     @contextlib.contextmanager
@@ -108,7 +108,7 @@ class Waving(PolicyRunner):
 def rollout(folder, plant_hand, episode_s):
     """The log of a run without an object."""
     hand = load_hand("dclaw3")
-    joints = uncalibrated(hand)
+    joints = read_joints(hand)
     plant = NewtonHand(plant_hand, joints, SimCfg(physics_hz=960.0))
     with simulated_bus(hand, joints, plant) as (_, bus):
         run = {"goals": [[0.0, 0.0, 0.0, 1.0]]}

@@ -13,7 +13,7 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 from simulated_hand import energised, push, simulated_bus
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy.hardware.joints import Joints, uncalibrated
+from vd.deploy.hardware.joints import Joints
 from vd.deploy.hardware.motion import move
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import WATCH_S, SafeHand, StoppedError
@@ -37,9 +37,10 @@ def hand():
 @pytest.fixture
 def joints(hand) -> Joints:
     """Some motors turn the other way and are mounted elsewhere."""
-    plain = uncalibrated(hand)
     rng = np.random.default_rng(1)
-    return Joints(plain.names, plain.ids, rng.choice([-1.0, 1.0], 9), rng.uniform(-0.3, 0.3, 9))
+    signs, angles = rng.choice([-1.0, 1.0], 9), rng.uniform(-0.3, 0.3, 9)
+    turned = zip(hand.motors, signs, angles, strict=True)
+    return Joints(hand, tuple(replace(motor, sign=s, offset_rad=o) for motor, s, o in turned))
 
 
 @pytest.fixture

@@ -132,13 +132,14 @@ def register_findings(connection: Connection, tables: Tables) -> Iterator[Findin
     """Compare control tables with what is wanted of them: a finding for each register that differs."""
     bus = connection.bus
     try:
-        settings = connection.joints.settings(connection.hand, bus.model.name)
+        settings = connection.joints.settings()
     except CalibrationError as error:
         yield Finding("registers", False, str(error))
         return
+    models = dict(zip(bus.ids, bus.models, strict=True))
     rows: dict[Register, list[tuple[int, int, int]]] = {}
     for id, found in tables.items():
-        for one, values in different(found, bus.model, settings[id]).items():
+        for one, values in different(found, models[id], settings[id]).items():
             rows.setdefault(one, []).append((id, *values))
     for one, motors in rows.items():
         alike: dict[tuple[int, int], list[str]] = {}
@@ -151,7 +152,7 @@ def register_findings(connection: Connection, tables: Tables) -> Iterator[Findin
                 for (value, wanted), ids in alike.items()
             ]
         )
-        where = " (kept without power)" if kept(bus.model, one) else ""
+        where = " (kept without power)" if kept(one) else ""
         found_is = f"{one.why}: {changes}" if one.remedy else f"{changes}{where}; else {one.why}"
         yield Finding(one.name, not one.remedy, found_is)
     if not rows:
@@ -175,7 +176,7 @@ def write_settings(connection: Connection) -> Finding:
     """Write the registers that differ, with the torque off, and read them back."""
     bus, what = connection.bus, "settings"
     try:
-        bus.configure(connection.joints.settings(connection.hand, bus.model.name))
+        bus.configure(connection.joints.settings())
     except BusError as error:
         return Finding(what, False, str(error))
     return Finding(what, True, "registers written and read back, torque off")
@@ -191,11 +192,10 @@ def _state(connection: Connection) -> Iterator[Finding]:
         if t > COOL_C
     ]
     yield finding("temperature", hot, f"up to {state.temperature.max():.0f} deg C")
-    supply = bus.model.supply_v
     weak = [
-        f"motor {id}: {v:.1f} V, not {supply:g}: check the supply and its wires"
-        for id, v in zip(bus.ids, state.voltage, strict=True)
-        if abs(v - supply) > VOLTAGE_SHARE * supply
+        f"motor {id}: {v:.1f} V, not {model.supply_v:g}: check the supply and its wires"
+        for id, model, v in zip(bus.ids, bus.models, state.voltage, strict=True)
+        if abs(v - model.supply_v) > VOLTAGE_SHARE * model.supply_v
     ]
     yield finding("voltage", weak, f"{state.voltage.min():.1f} to {state.voltage.max():.1f} V")
     q = joints.to_joint(state.position)

@@ -169,7 +169,7 @@ class ControlLoop:
             return "stopped"
         if sensed.object_pose is not None:
             away = np.linalg.norm(sensed.object_pose[:3] - np.array(self._safe.hand.workspace.goal_m))
-            if away > PAPER.success.fall_m:
+            if away > self._safe.hand.workspace.fall_m:
                 return "lost"
         return ""
 

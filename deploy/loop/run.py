@@ -21,7 +21,6 @@ from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.finding import Finding
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
 from vd.deploy.hardware.motion import MOVE_S, move
-from vd.deploy.hardware.registers import D_GAIN, P_GAIN
 from vd.deploy.loop.run_page import goal_results, summary_line, write_page
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand, StoppedError
@@ -140,8 +139,8 @@ def run(cfg: RunCfg) -> int:
     folder = cfg.log or LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
     fault: StoppedError | None = None
     status = 0
-    camera = runner.camera or hand.camera
-    place = (*map(float, camera.position), *map(float, camera.quaternion))
+    camera = runner.camera or hand.mounted_camera
+    place = None if camera is None else (*map(float, camera.position), *map(float, camera.quaternion))
     with connect(
         cfg, object=cfg.object, camera=place, realistic=cfg.realistic, realtime=cfg.realtime
     ) as connection:
@@ -201,7 +200,7 @@ def _pursue(
             folder,
             hand,
             _description(cfg, name, runner, item, goals),
-            servo={"model": cfg.motor, "p_gain": P_GAIN, "d_gain": D_GAIN},
+            servo=connection.joints.servo(),
             truth=twin is not None,
         )
         pacer = Pacer(hz, latest=LATEST)

@@ -12,7 +12,7 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.config import require
 from vd.deploy.hardware.answers import HandState
-from vd.deploy.hardware.control_table import Model
+from vd.deploy.hardware.joints import Joints
 from vd.paper import PAPER
 
 PERIOD_S = 1.0 / PAPER.scene.control_hz
@@ -32,7 +32,7 @@ class SafetyCfg:
     else moves it."""
     current_share: float = 0.8
     """Current over the one for the joints' largest torque at which the hand is stopped, if it lasts; motors
-    shut down by themselves near 1."""
+    shut down by themselves near 1. Motors whose mode limits their current may go on at that limit."""
     current_s: float = 0.5
     """How long [s] a current may be above that."""
     temperature_c: float = 70.0
@@ -64,12 +64,12 @@ class Limits:
         ValueError: The margin leaves a joint no range.
     """
 
-    def __init__(self, hand: HandModel, motor: Model, names: Sequence[str], cfg: SafetyCfg):
+    def __init__(self, hand: HandModel, joints: Joints, names: Sequence[str], cfg: SafetyCfg):
         self._names, self._cfg = tuple(names), cfg
         self.lower, self.upper = hand.lower + cfg.margin_rad, hand.upper - cfg.margin_rad
         if (self.lower >= self.upper).any():
             raise ValueError(f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider")
-        self._current = cfg.current_share * motor.current_of(hand.effort)
+        self._current = np.where(joints.capped, np.inf, cfg.current_share * joints.currents())
         self._velocity = cfg.velocity_share * hand.velocity_limit
         self._strained_since = np.full(len(self._names), np.inf)
 

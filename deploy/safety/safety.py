@@ -97,7 +97,7 @@ class SafeHand:
         """Nothing is sent before :meth:`arm`."""
         self.bus, self.joints, self.hand, self.cfg, self._say = bus, joints, hand, cfg or SafetyCfg(), say
         self._names = [f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)]
-        self.limits = Limits(hand, bus.model, self._names, self.cfg)
+        self.limits = Limits(hand, joints, self._names, self.cfg)
         self.repeated = 0
         """Readings without a sound answer, for which the last state stood in."""
         self.report: StopReport | None = None

@@ -21,13 +21,13 @@ from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import preflight, write_settings
-from vd.deploy.hardware.connect import MOTOR, Connection
-from vd.deploy.hardware.control_table import MODELS, HardwareError
-from vd.deploy.hardware.joints import Joints, uncalibrated
+from vd.deploy.hardware.connect import Connection
+from vd.deploy.hardware.control_table import HardwareError
+from vd.deploy.hardware.joints import Joints, read_joints
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import FINISHED, SafeHand, StoppedError
 from vd.deploy.twin.line import Faults
-from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.motor import Motor, motors_of
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.deploy.twin.plant import Drive, FirstOrderPlant, Plant
 from vd.deploy.twin.twin import Twin
@@ -268,11 +268,11 @@ class Outcome:
 def scene_of(hand: HandModel, joints: Joints, *, blockable: bool = False) -> Iterator[Scene]:
     """A twin that serves, and a configured bus to it."""
     plant: Plant = FirstOrderPlant(len(joints.ids)) if blockable else NewtonHand(hand, joints)
-    motors = [Motor(MODELS[MOTOR], id) for id in joints.ids]
+    motors = motors_of(joints)
     witness = Witness(plant, motors)
-    with Twin(motors, witness, Faults(seed=1)) as twin, MotorBus(twin.path, joints.ids, MOTOR) as bus:
+    with Twin(motors, witness, Faults(seed=1)) as twin, MotorBus(twin.path, joints.ids, joints.models) as bus:
         bus.retries = SETUP_RETRIES
-        bus.configure(joints.settings(hand, MOTOR))
+        bus.configure(joints.settings())
         bus.retries = 1
         yield Scene(twin, bus, witness)
 
@@ -412,7 +412,7 @@ class FaultsCommand:
         """Try all; 1 if one did not end as it has to."""
         quiet_warp()
         hand = load_hand(self.hand)
-        joints = uncalibrated(hand)
+        joints = read_joints(hand)
         trials: dict[str, Callable[[], Outcome]] = {
             **{fault.name: partial(try_fault, fault, hand, joints) for fault in MOVING},
             **{name: partial(try_preflight, name, hand, joints) for name in BEFORE},

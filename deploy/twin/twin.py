@@ -25,11 +25,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from vd import interrupt
-from vd.deploy.hardware.control_table import MODELS
+from vd.deploy.hardware.control_table import motor_model
 from vd.deploy.hardware.packets import MAX_ID
 from vd.deploy.timely import undisturbed
 from vd.deploy.twin.line import Faults, MotorLine
-from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.motor import Motor, motors_of
 from vd.deploy.twin.plant import Plant
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
@@ -145,21 +145,21 @@ class TwinCommand:
     ids: tuple[int, ...] = (10, 11, 12, 20, 21, 22, 30, 31, 32)
     """IDs of the motors, on axes without mass; without --hand."""
     hand: str | None = None
-    """Hand that the motors move, simulated in Newton: dclaw3, dclaw4 or a hand's USD."""
+    """Hand that its motors move, simulated in Newton: dclaw3, dclaw4, an imported hand or a hand's USD."""
     hand_layer: Path | None = None
     """Identified servo model over it (identified.usda), whose effects act."""
     physics_hz: float = PAPER.scene.physics_hz
     """Rate of its simulation."""
     calibration: Path | None = None
-    """Calibration file of that hand's motors; IDs 10, 11, 12, 20, ... by default."""
+    """Calibration file of that hand's motors."""
     object: str | None = None
     """Object on the table, with --hand: name of a built-in set, or a file."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the depth camera in the hand's base frame, position [m] and quaternion xyzw; the hand's own."""
     realistic: bool = False
     """Give the depth images the errors of a real camera."""
-    model: str = "XH430-V210"
-    """Their model."""
+    model: str | None = None
+    """Model of all motors; what the hand's USD says by default, and XH430-V210 without a hand."""
     faults: Annotated[Faults, tyro.conf.arg(name="")] = field(default_factory=Faults)
     realtime: bool = False
     """Run before all ordinary programs, where that is permitted."""
@@ -175,13 +175,14 @@ class TwinCommand:
         Raises:
             ValueError: Options that cannot be.
         """
-        if self.model not in MODELS:
-            raise ValueError(f"--model {self.model}: no such motor; choose of {', '.join(MODELS)}")
         wrong = [id for id in self.ids if not 0 <= id <= MAX_ID]
         if wrong:
             raise ValueError(f"--ids {wrong[0]}: an ID lies within 0 and {MAX_ID}")
-        ids, plant = (self.ids, None) if self.hand is None else self._hand(self.hand)
-        motors = [Motor(MODELS[self.model], id) for id in ids]
+        plant = None if self.hand is None else self._hand(self.hand)
+        if plant is None:
+            motors = [Motor(motor_model(self.model or "XH430-V210"), id) for id in self.ids]
+        else:
+            motors = motors_of(plant.joints)
         tell: Callable[[str], None] = partial(print, flush=True) if pipe is None else pipe.send
         answer = self._beside(plant) if pipe is not None and plant is not None else None
         with (
@@ -191,19 +192,19 @@ class TwinCommand:
             tell(twin.path)  # once it can answer at once: the collector takes a while
             twin.serve()
 
-    def _hand(self, name: str) -> "tuple[tuple[int, ...], NewtonHand]":
-        """The motors and the simulated hand."""
+    def _hand(self, name: str) -> "NewtonHand":
+        """The simulated hand and its motors."""
         from vd.assets_usd.hands import load_hand
-        from vd.deploy.hardware.joints import read_joints, uncalibrated
+        from vd.deploy.hardware.joints import read_joints
         from vd.deploy.loop.goals import one_object
         from vd.deploy.twin.newton_hand import NewtonHand
         from vd.sim.cfg import SimCfg
 
         quiet_warp()
         hand = load_hand(name, layer=self.hand_layer)
-        joints = uncalibrated(hand) if self.calibration is None else read_joints(self.calibration, hand)
+        joints = read_joints(hand, self.calibration, self.model)
         item = None if self.object is None else one_object(self.object)
-        return joints.ids, NewtonHand(hand, joints, SimCfg(physics_hz=self.physics_hz), item=item)
+        return NewtonHand(hand, joints, SimCfg(physics_hz=self.physics_hz), item=item)
 
     def _beside(self, hand: "NewtonHand") -> Callable[[str], Any] | None:
         """What answers requests, of a hand with an object: eyes and a helping hand, which no real one has."""
@@ -212,16 +213,18 @@ class TwinCommand:
         from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
         from vd.sensors.depth_camera import DepthCamera
 
-        sensor = DepthSensorCfg.realistic() if self.realistic else DepthSensorCfg()
-        cfg, place = DepthCameraCfg(points=0, sensor=sensor), hand.hand.camera.at(self.camera)
-        camera = DepthCamera.of_scene(hand.scene, hand.body_q, cfg, place, seed=self.faults.seed)
-        camera.capture()  # loads kernels
+        camera: DepthCamera | None = None
+        if hand.hand.mounted_camera is not None:
+            sensor = DepthSensorCfg.realistic() if self.realistic else DepthSensorCfg()
+            cfg, place = DepthCameraCfg(points=0, sensor=sensor), hand.hand.camera.at(self.camera)
+            camera = DepthCamera.of_scene(hand.scene, hand.body_q, cfg, place, seed=self.faults.seed)
+            camera.capture()  # loads kernels
 
         def answer(request: str) -> Any:
             match request:
                 case "pose":
                     return hand.joint_q[-7:]
-                case "depth":
+                case "depth" if camera is not None:
                     camera.capture()
                     return camera.depth.numpy()[0].copy(), time.monotonic()
                 case "place":
