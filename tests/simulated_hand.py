@@ -15,7 +15,7 @@ from vd.deploy.hardware.bus import BAUD_RATE, MotorBus
 from vd.deploy.hardware.control_table import to_angle
 from vd.deploy.hardware.joints import Joints
 from vd.deploy.twin.line import MotorLine
-from vd.deploy.twin.motor import motors_of
+from vd.deploy.twin.motor import make_motors
 from vd.deploy.twin.plant import Plant
 
 BYTE_S = 10.0 / BAUD_RATE
@@ -86,7 +86,7 @@ def simulated_bus(
     """A line of a hand's motors, and a configured bus to it."""
     clock = SimulatedClock()
     port = SimulatedPort(clock)
-    port.line = line = MotorLine(motors_of(joints), plant, clock=clock, put=port.put)
+    port.line = line = MotorLine(make_motors(joints), plant, clock=clock, put=port.put)
     stop = clock.every(TICK_S, line.go_on)
     with MotorBus(port, joints.ids, joints.models, clock=clock) as bus:
         bus.configure(joints.settings())

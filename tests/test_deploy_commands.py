@@ -50,7 +50,7 @@ def line(hand, monkeypatch):
 
         @contextlib.contextmanager
         def connect(options, **twin_options):
-            yield Connection(hand, joints, bus)
+            yield Connection(joints, bus)
 
         for module in (check, home, record):
             monkeypatch.setattr(module, "connect", connect)
@@ -73,7 +73,7 @@ def test_check_misses_the_camera(line, capsys):
 @pytest.mark.parametrize("name", BEFORE)
 def test_the_preflight_finds(name, hand, monkeypatch):
     monkeypatch.setattr(check, "CYCLES", 1)
-    outcome = try_preflight(name, hand, read_joints(hand))
+    outcome = try_preflight(name, read_joints(hand))
     assert outcome.right, outcome.happened
 
 
@@ -264,7 +264,7 @@ def test_a_payload_needs_somebody_to_hang_it(line, hand, tmp_path):
 
 def test_a_fault_of_the_table_ends_safely(hand):
     fault = next(fault for fault in MOVING if fault.name == "Ctrl-C")
-    outcome = try_fault(fault, hand, read_joints(hand))
+    outcome = try_fault(fault, read_joints(hand))
     assert not outcome.energised and not outcome.pushing and outcome.detected_s is not None
 
 
@@ -284,7 +284,7 @@ def test_options_and_commands_that_cannot_be_are_refused(capsys):
 
 
 @pytest.mark.parametrize(
-    ("twin", "status", "said"), [("--seed no", 2, "seed"), ("--ids 300", 1, "an ID lies")]
+    ("twin", "status", "said"), [("--seed no", 2, "seed"), ("--hand nobody", 1, "no hand is called")]
 )
 def test_a_twin_that_cannot_be_says_why(twin, status, said):
     command = [sys.executable, "-m", "vd.deploy.cli", "check", "--twin", f"--twin-args={twin}"]

@@ -18,7 +18,6 @@ from vd.deploy.hardware import record
 from vd.deploy.hardware.connect import Connection
 from vd.deploy.hardware.control_table import TICK_MODULUS
 from vd.deploy.hardware.joints import read_joints
-from vd.deploy.hardware.motion import move
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop
@@ -78,7 +77,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     def connect(_, **twin_options):
         plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=960.0))
         with simulated_bus(hand, joints, plant) as (_, bus):
-            yield Connection(hand, joints, bus)
+            yield Connection(joints, bus)
 
     monkeypatch.setattr(record, "connect", connect)
     monkeypatch.setattr(record, "motions_of", lambda *_: chosen)
@@ -112,9 +111,9 @@ def rollout(folder, plant_hand, episode_s):
     plant = NewtonHand(plant_hand, joints, SimCfg(physics_hz=960.0))
     with simulated_bus(hand, joints, plant) as (_, bus):
         run = {"goals": [[0.0, 0.0, 0.0, 1.0]]}
-        with SafeHand(bus, joints, hand) as safe:
+        with SafeHand(bus, joints) as safe:
             safe.arm()
-            move(safe, np.tile([0.0, 0.3, -0.5], 3), 0.5)
+            safe.move(np.tile([0.0, 0.3, -0.5], 3), 0.5)
             log = LogWriter(folder, hand, run, servo={}, clock=bus.clock)
             pacer, actions = Pacer(12.0, bus.clock), ActionFilter(hand, ReorientCfg())
             loop = ControlLoop(safe, Waving(bus.clock), actions, pacer, log, episode_s=episode_s, hold_s=0.0)

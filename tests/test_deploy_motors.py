@@ -17,7 +17,6 @@ from vd.deploy.hardware import check
 from vd.deploy.hardware.connect import Connection
 from vd.deploy.hardware.control_table import MODELS
 from vd.deploy.hardware.joints import CalibrationError, read_joints
-from vd.deploy.hardware.motion import move
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop
@@ -45,12 +44,12 @@ def with_motors(motors: tuple[MotorModel, ...]) -> HandModel:
 
 
 class Bending(PolicyRunner):
-    """A policy that bends the second joint of the first finger."""
+    """A policy that bends the third joint of the first finger."""
 
     def decide(self, sensed):
         """One action of one joint."""
         action = np.zeros(len(sensed.joint_q))
-        action[1] = 1.0
+        action[2] = 1.0
         return Decision(action, float("nan"))
 
 
@@ -59,9 +58,9 @@ def fly(hand: HandModel, folder) -> tuple[np.ndarray, list[Motor]]:
     joints = read_joints(hand)
     plant = NewtonHand(hand, joints)
     with simulated_bus(hand, joints, plant) as (line, bus):
-        with SafeHand(bus, joints, hand) as safe:
+        with SafeHand(bus, joints) as safe:
             safe.arm()
-            move(safe, hand.start, 2.0)
+            safe.move(hand.start, 2.0)
             before = plant.joint_q.copy()
             log = LogWriter(folder, hand, {"goals": [list(GOAL)]}, servo=joints.servo(), clock=bus.clock)
             task = ReorientCfg()
@@ -75,7 +74,7 @@ def fly(hand: HandModel, folder) -> tuple[np.ndarray, list[Motor]]:
 
 def assert_bent(moved: np.ndarray) -> None:
     """The joint that was to move did, and the others stayed."""
-    assert moved[1] > 0.3 and np.abs(np.delete(moved, 1)).max() < 0.1
+    assert moved[2] > 0.3 and np.abs(np.delete(moved, 2)).max() < 0.1
 
 
 def test_a_leap_hand_flies_with_the_motors_of_its_file(tmp_path, shared_dir):
@@ -83,9 +82,9 @@ def test_a_leap_hand_flies_with_the_motors_of_its_file(tmp_path, shared_dir):
     if not path.is_file():
         pytest.skip(f"there is no {path}")
     hand = import_hand(path, tmp_path, "leap").hand
-    turned = [replace(motor, sign=-1.0, offset_rad=0.1) if motor.id == 0 else motor for motor in hand.motors]
+    turned = [replace(motor, sign=-1.0, offset_rad=0.1) if motor.id == 2 else motor for motor in hand.motors]
     moved, motors = fly(replace(hand, motors=tuple(turned)), tmp_path / "log")
-    assert_bent(moved)  # of motor 0, which is the second joint: it swings the finger
+    assert_bent(moved)
     assert [motor.id for motor in motors[:4]] == [1, 0, 2, 3]
     items = ("operating_mode", "goal_current", "position_p_gain", "position_i_gain", "position_d_gain")
     told = [[motor.get(name) for name in items] for motor in motors]
@@ -105,7 +104,7 @@ def test_states_are_in_the_units_of_each_model_and_a_wrong_model_is_named(monkey
     with simulated_bus(hand, joints) as (line, bus):
         line.plant.position[:] = joints.to_motor(hand.start)
         bus.clock.sleep(0.02)
-        connection = Connection(hand, joints, bus)
+        connection = Connection(joints, bus)
         bus._states.forget()
         assert [one.found for one in check.preflight(connection) if not one.ok] == []
         position, velocity, torque = line.plant.read()

@@ -25,7 +25,7 @@ class Rig:
     """A hand's motors on a simulated line, with nothing between a test and them."""
 
     def __init__(self, hand, joints, line, bus):
-        self.connection, self.line, self.bus = Connection(hand, joints, bus), line, bus
+        self.connection, self.line, self.bus = Connection(joints, bus), line, bus
         self.motor = line.motors[0]
 
     def findings(self):

@@ -18,7 +18,6 @@ from vd.deploy.finding import Finding, finding, listed, show
 from vd.deploy.hardware.answers import BusError, GarbledError, LateError
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
 from vd.deploy.hardware.joints import CalibrationError
-from vd.deploy.hardware.motion import move
 from vd.deploy.hardware.registers import RESTART, Register, different, kept
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import SafeHand
@@ -248,7 +247,7 @@ def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
         for end in (low, high, home[axis]):
             goal = home.copy()
             goal[axis] = end
-            worst = max(worst, abs(move(safe, goal, RANGE_SPEED_RAD_S)[axis]))
+            worst = max(worst, abs(safe.move(goal, RANGE_SPEED_RAD_S)[axis]))
         ok = worst < FOLLOW_RAD
         why = "" if ok else ": blocked, a wrong sign, or a wrong joint's ID?"
         found = f"{low:.2f} to {high:.2f} rad, at most {worst:.2f} from its goal{why}"
@@ -327,7 +326,7 @@ def check(cfg: CheckCfg) -> int:
             confirm("Every joint will move slowly through its range.", yes=cfg.yes)
             findings += show([write_settings(connection)], quiet=cfg.json)
             _stop_at_wrong(findings)
-            safe = SafeHand(connection.bus, connection.joints, connection.hand, SafetyCfg())
+            safe = SafeHand(connection.bus, connection.joints, SafetyCfg())
             findings += show(sweep(connection, stack.enter_context(safe)), quiet=cfg.json)
     right = all(one.ok for one in findings)
     if cfg.json:

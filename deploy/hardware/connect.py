@@ -44,18 +44,21 @@ class HandOptions:
 class Connection:
     """A hand and the bus to its motors."""
 
-    hand: "HandModel"
-    """The hand, with its layer."""
     joints: "Joints"
-    """Which motor turns which joint."""
+    """Which motor turns which joint of the hand."""
     bus: "MotorBus"
     """Its motors, in the joints' order."""
     twin: "TwinChild | None" = None
     """The twin, if it is one."""
 
+    @property
+    def hand(self) -> "HandModel":
+        """The hand, with its layer."""
+        return self.joints.hand
 
-def read_hand_and_joints(options: HandOptions) -> tuple["HandModel", "Joints"]:
-    """The hand of the options and its motors.
+
+def motors_of(options: HandOptions) -> "Joints":
+    """The motors of the options' hand.
 
     Raises:
         ValueError: Port and twin, motor, hand, layer or calibration cannot be used.
@@ -64,7 +67,7 @@ def read_hand_and_joints(options: HandOptions) -> tuple["HandModel", "Joints"]:
     from vd.deploy.hardware.joints import read_joints
 
     hand = load_hand(options.hand, layer=options.hand_layer)
-    return hand, read_joints(hand, options.calibration, options.motor)
+    return read_joints(hand, options.calibration, options.motor)
 
 
 @contextlib.contextmanager
@@ -84,7 +87,7 @@ def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
     from vd.deploy.twin.child import TwinChild
     from vd.deploy.twin.twin import TwinCommand
 
-    hand, joints = read_hand_and_joints(options)
+    joints = motors_of(options)
     if options.twin == (options.port is not None):
         raise ValueError("give --port, such as /dev/ttyUSB0, or --twin for a simulated hand")
     with contextlib.ExitStack() as stack:
@@ -109,4 +112,4 @@ def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
             stack.callback(twin.close)
             port = twin.path
         bus = MotorBus(port, joints.ids, joints.models, baud_rate=options.baud_rate)
-        yield Connection(hand, joints, stack.enter_context(bus), twin)
+        yield Connection(joints, stack.enter_context(bus), twin)

@@ -18,9 +18,8 @@ from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import ready
-from vd.deploy.hardware.connect import Connection, HandOptions, connect, read_hand_and_joints
+from vd.deploy.hardware.connect import Connection, HandOptions, connect, motors_of
 from vd.deploy.hardware.control_table import RAD_PER_COUNT, TICK_MODULUS
-from vd.deploy.hardware.motion import move
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
 from vd.deploy.timely import undisturbed
@@ -230,7 +229,7 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
         BusError: A gain could not be written.
     """
     excitation, bus = motion.excitation, safe.bus
-    move(safe, excitation.command[0], SPEED_RAD_S)
+    safe.move(excitation.command[0], SPEED_RAD_S)
     gain = int(float(excitation.conditions["p_gain"]))
     _set_gains(bus, {bus.ids[column]: gain for column in columns})
     samples = list[Sample]()
@@ -296,8 +295,8 @@ def record(cfg: RecordCfg) -> int:
 
     require(cfg, "--", "positive", "rate_hz")
     check_folder(cfg.out)
-    hand, motors = read_hand_and_joints(cfg)
-    joints = joints_of(hand, cfg.fingers)
+    motors = motors_of(cfg)
+    joints = joints_of(motors.hand, cfg.fingers)
     if cfg.plan is None:
         motions = motions_of(motors, cfg.fingers, cfg.excitations)
     else:
@@ -347,7 +346,7 @@ def _session(
         question = f"Hang {payload_kg:g} kg at the fingertip of {finger}. {question}"
     ready(connection, question, yes=cfg.yes)
     columns = [connection.joints.names.index(name) for name in joints]
-    with SafeHand(connection.bus, connection.joints, connection.hand, cfg.safety) as safe:
+    with SafeHand(connection.bus, connection.joints, cfg.safety) as safe:
         safe.arm()
         for number, motion in enumerate(motions, 1):
             trajectory = play(safe, motion, columns, cfg.rate_hz)

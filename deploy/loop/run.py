@@ -20,10 +20,9 @@ from vd.deploy.camera.camera import Camera
 from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.finding import Finding
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
-from vd.deploy.hardware.motion import MOVE_S, move
 from vd.deploy.loop.run_page import goal_results, summary_line, write_page
 from vd.deploy.safety.limits import SafetyCfg
-from vd.deploy.safety.safety import SafeHand, StoppedError
+from vd.deploy.safety.safety import MOVE_S, SafeHand, StoppedError
 from vd.deploy.timely import undisturbed
 from vd.evaluate.agents import check_names
 from vd.files import check_folder
@@ -119,14 +118,14 @@ def run(cfg: RunCfg) -> int:
     check_folder(cfg.log or LOGS)
     import torch
 
-    from vd.deploy.hardware.connect import read_hand_and_joints
+    from vd.deploy.hardware.connect import motors_of
     from vd.deploy.loop.goals import make_goals, one_object
     from vd.deploy.loop.policy_runner import load_runner
 
     quiet_warp()
     torch.set_num_threads(1)  # of several, some would wait for one that has no core
     goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
-    hand, _ = read_hand_and_joints(cfg)
+    hand = motors_of(cfg).hand
     item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
     tolerance = cfg.tolerance_rad
     runner = load_runner(name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed)
@@ -207,9 +206,9 @@ def _pursue(
         reason, outcomes = "aborted", list[str]()
         loop: ControlLoop | None = None
         try:
-            with SafeHand(connection.bus, connection.joints, hand, cfg.safety) as safe:
+            with SafeHand(connection.bus, connection.joints, cfg.safety) as safe:
                 safe.arm()
-                move(safe, pose, HOME_RAD_S)
+                safe.move(pose, HOME_RAD_S)
                 place(safe, pose, twin, yes=cfg.yes)
                 loop = ControlLoop(
                     safe,

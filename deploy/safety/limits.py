@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 
-from vd.assets_usd.hand_data import HandModel
 from vd.config import require
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.joints import Joints
@@ -64,8 +63,8 @@ class Limits:
         ValueError: The margin leaves a joint no range.
     """
 
-    def __init__(self, hand: HandModel, joints: Joints, names: Sequence[str], cfg: SafetyCfg):
-        self._names, self._cfg = tuple(names), cfg
+    def __init__(self, joints: Joints, names: Sequence[str], cfg: SafetyCfg):
+        hand, self._names, self._cfg = joints.hand, tuple(names), cfg
         self.lower, self.upper = hand.lower + cfg.margin_rad, hand.upper - cfg.margin_rad
         if (self.lower >= self.upper).any():
             raise ValueError(f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider")

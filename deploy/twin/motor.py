@@ -222,6 +222,6 @@ class Motor:
             self.put("goal_position", self.get("present_position"))
 
 
-def motors_of(joints: Joints) -> list[Motor]:
+def make_motors(joints: Joints) -> list[Motor]:
     """A hand's motors, as they come from the factory but for their IDs."""
     return [Motor(model, id) for model, id in zip(joints.models, joints.ids, strict=True)]

@@ -25,11 +25,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from vd import interrupt
-from vd.deploy.hardware.control_table import motor_model
-from vd.deploy.hardware.packets import MAX_ID
 from vd.deploy.timely import undisturbed
 from vd.deploy.twin.line import Faults, MotorLine
-from vd.deploy.twin.motor import Motor, motors_of
+from vd.deploy.twin.motor import Motor, make_motors
 from vd.deploy.twin.plant import Plant
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
@@ -142,9 +140,7 @@ class Twin(MotorLine):
 class TwinCommand:
     """Serve a bus of simulated motors on a pseudo-terminal until interrupted."""
 
-    ids: tuple[int, ...] = (10, 11, 12, 20, 21, 22, 30, 31, 32)
-    """IDs of the motors, on axes without mass; without --hand."""
-    hand: str | None = None
+    hand: str = "dclaw3"
     """Hand that its motors move, simulated in Newton: dclaw3, dclaw4, an imported hand or a hand's USD."""
     hand_layer: Path | None = None
     """Identified servo model over it (identified.usda), whose effects act."""
@@ -153,13 +149,13 @@ class TwinCommand:
     calibration: Path | None = None
     """Calibration file of that hand's motors."""
     object: str | None = None
-    """Object on the table, with --hand: name of a built-in set, or a file."""
+    """Object on the table or in the hand: name of a built-in set, or a file."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the depth camera in the hand's base frame, position [m] and quaternion xyzw; the hand's own."""
     realistic: bool = False
     """Give the depth images the errors of a real camera."""
     model: str | None = None
-    """Model of all motors; what the hand's USD says by default, and XH430-V210 without a hand."""
+    """Model of all motors, in place of what the hand's USD says."""
     faults: Annotated[Faults, tyro.conf.arg(name="")] = field(default_factory=Faults)
     realtime: bool = False
     """Run before all ordinary programs, where that is permitted."""
@@ -175,16 +171,10 @@ class TwinCommand:
         Raises:
             ValueError: Options that cannot be.
         """
-        wrong = [id for id in self.ids if not 0 <= id <= MAX_ID]
-        if wrong:
-            raise ValueError(f"--ids {wrong[0]}: an ID lies within 0 and {MAX_ID}")
-        plant = None if self.hand is None else self._hand(self.hand)
-        if plant is None:
-            motors = [Motor(motor_model(self.model or "XH430-V210"), id) for id in self.ids]
-        else:
-            motors = motors_of(plant.joints)
+        plant = self._plant()
+        motors = make_motors(plant.joints)
         tell: Callable[[str], None] = partial(print, flush=True) if pipe is None else pipe.send
-        answer = self._beside(plant) if pipe is not None and plant is not None else None
+        answer = None if pipe is None else self._beside(plant)
         with (
             contextlib.closing(Twin(motors, plant, self.faults, pipe, answer)) as twin,
             undisturbed(self.realtime, level=1),
@@ -192,7 +182,7 @@ class TwinCommand:
             tell(twin.path)  # once it can answer at once: the collector takes a while
             twin.serve()
 
-    def _hand(self, name: str) -> "NewtonHand":
+    def _plant(self) -> "NewtonHand":
         """The simulated hand and its motors."""
         from vd.assets_usd.hands import load_hand
         from vd.deploy.hardware.joints import read_joints
@@ -201,7 +191,7 @@ class TwinCommand:
         from vd.sim.cfg import SimCfg
 
         quiet_warp()
-        hand = load_hand(name, layer=self.hand_layer)
+        hand = load_hand(self.hand, layer=self.hand_layer)
         joints = read_joints(hand, self.calibration, self.model)
         item = None if self.object is None else one_object(self.object)
         return NewtonHand(hand, joints, SimCfg(physics_hz=self.physics_hz), item=item)
