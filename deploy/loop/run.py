@@ -1,6 +1,6 @@
 """Drive a hand with a policy: pursue goals one after the other, in one process at 12 Hz, and log every step.
 
-The policy sees joints and a depth camera: a tracking or vision policy.
+The policy sees joints and a depth camera: a tracking or vision policy. A twin tells a teacher the truth.
 """
 
 import contextlib
@@ -54,8 +54,8 @@ class RunCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """Bundle, file or name of a policy that sees by camera; with --twin the installed tracking policy of the
-    hand by default. "zero" is the zero-action baseline."""
+    """Bundle, file or name of a policy that sees by camera, with --twin a teacher too, and by default the
+    installed tracking policy of the hand. "zero" is the zero-action baseline."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj, .glb)."""
     goal: tuple[str, ...] = ()
@@ -128,7 +128,8 @@ def run(cfg: RunCfg) -> int:
     hand = motors_of(cfg).hand
     item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
     tolerance = cfg.tolerance_rad
-    runner = load_runner(name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed)
+    told = cfg.object if cfg.twin else None
+    runner = load_runner(name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told)
     if not runner.calibrated:
         print(
             f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that distance; "

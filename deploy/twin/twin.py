@@ -22,6 +22,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import tyro
 
 from vd import interrupt
@@ -164,9 +165,9 @@ class TwinCommand:
         """Serve until interrupted, or until a pipe's other end is gone.
 
         Args:
-            pipe: Takes the path of the port, which is printed without one. Answers ``pose`` with the object's
-                position [m] and quaternion xyzw [7], ``depth`` with an image [m] [H, W] and its time [s], and
-                ``place``, by which the object is where an episode starts.
+            pipe: Takes the path of the port, which is printed without one. Answers ``object`` with its
+                position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] [13], ``depth`` with an image
+                [m] [H, W] and its time [s], and ``place``, by which the object is where an episode starts.
 
         Raises:
             ValueError: Options that cannot be.
@@ -212,8 +213,8 @@ class TwinCommand:
 
         def answer(request: str) -> Any:
             match request:
-                case "pose":
-                    return hand.joint_q[-7:]
+                case "object":
+                    return np.concatenate([hand.joint_q[-7:], hand.joint_qd[-6:]])
                 case "depth" if camera is not None:
                     camera.capture()
                     return camera.depth.numpy()[0].copy(), time.monotonic()
