@@ -92,12 +92,8 @@ def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_pa
     ("change", "reason"),
     [
         ({"sign": 2}, r"motors\.sign of f0_j2 is 2; it is 1, or -1"),
-        ({"sign": -1.9}, r"motors\.sign of f0_j2 is -1\.9"),
-        ({"sign": True}, r"motors\[1\]\.sign: expected float, got True"),
         ({"id": 10}, r"motors\.id are \[10, 10, 12.*give each motor its own"),
-        ({"id": 11.7}, r"motors\[1\]\.id: expected int, got 11\.7"),
         ({"id": "11"}, r"motors\[1\]\.id: expected int, got '11'"),
-        ({"offset_rad": "0.1"}, r"motors\[1\]\.offset_rad: expected float, got '0\.1'"),
         ({"offset_rad": float("nan")}, r"motors\.offset_rad of f0_j2 is nan"),
         ({"offset": 0.1}, r"motors\[1\] has no field offset; it has id, joint, offset_rad, sign"),
         ({"sign": None}, r"motors\[1\] has no sign; name it"),

@@ -422,7 +422,9 @@ class FaultsCommand:
                 outcomes.append(trial())
                 print(outcomes[-1], flush=True)
         if self.json is not None:
-            write_json(self.json, [asdict(outcome) for outcome in outcomes])
+            never = (float("inf"), float("-inf"))  # no number of JSON
+            rows = [asdict(outcome).items() for outcome in outcomes]
+            write_json(self.json, [{k: None if v in never else v for k, v in row} for row in rows])
         return 0 if all(outcome.right for outcome in outcomes) else 1
 
 
