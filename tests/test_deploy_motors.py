@@ -21,7 +21,7 @@ from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop
 from vd.deploy.loop.policy_runner import Decision, PolicyRunner
-from vd.deploy.safety.safety import SafeHand
+from vd.deploy.safety.safety import SafeHand, StoppedError
 from vd.deploy.twin.motor import Motor
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.envs.cfg import ReorientCfg
@@ -115,6 +115,10 @@ def test_states_are_in_the_units_of_each_model_and_a_wrong_model_is_named(monkey
         np.testing.assert_allclose(state.current[:3], [1.80 / 2, 1.4 / 2, 2.3 / 2], atol=0.0014)
         told = joints.state(state)
         np.testing.assert_allclose(told.position, hand.start, atol=0.002)
+        line.motors[0].temperature = 61.0
+        bus.clock.sleep(0.02)
+        with SafeHand(bus, joints) as safe, pytest.raises(StoppedError, match="motor 3: 61 deg C, over 60"):
+            safe.read()
         line.motors[0] = Motor(MODELS["XL330-M288"], 3)
         (wrong,) = (one.found for one in check.preflight(connection) if not one.ok)
         assert "motor 3 is XL330-M288, not XC330-M288" in wrong

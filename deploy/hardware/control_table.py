@@ -74,7 +74,8 @@ class Model:
     """Least and largest voltage limit [0.1 V]."""
     supply_v: float
     torque_nm_per_a: float
-    """Stall torque over stall current, at the supply's voltage."""
+    """Stall torque over stall current, at the supply's voltage. XL330 and XC330 measure the supply's current,
+    so their torque is a guess."""
     temperature_limit: int = 80
     """Initial limit [deg C]."""
     velocity_most: int = 1023
