@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import newton_usd_schemas  # noqa: F401 - before the first stage, or mimic joints are no schema of it
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -270,6 +269,7 @@ def read_object(path: Path) -> ObjectModel:
     Raises:
         ObjectError: The file is missing, no USD, of another version, or a part is missing.
     """
+    import newton_usd_schemas  # noqa: F401 - before the first stage, or a hand read later loses its mimic joints
     from pxr import Usd, UsdGeom, UsdPhysics
 
     path = Path(path)
