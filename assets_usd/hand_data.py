@@ -103,10 +103,6 @@ class CollisionShape:
         frame: Pose in the link frame [7]; of a hull that of the box around it.
         vertices: Corners of a hull in ``frame`` [V, 3] [m]; of other kinds [0, 3].
         friction: Coefficient of (dynamic) friction.
-        restitution: Coefficient of restitution.
-        stiffness: Newton's contact stiffness.
-        damping: Newton's contact damping.
-        gap: Distance at which contacts are looked for [m].
         fingertip: Whether its material is that of the fingertip variant.
     """
 
@@ -117,10 +113,6 @@ class CollisionShape:
     frame: np.ndarray
     vertices: np.ndarray
     friction: float
-    restitution: float
-    stiffness: float
-    damping: float
-    gap: float
     fingertip: bool
 
 
@@ -152,6 +144,12 @@ class MotorModel:
     """Its angle where the joint is at zero [rad], from the middle of its turn."""
     gear: float = 1.0
     """Its turns for one of the joint."""
+    p_gain: int = 200
+    """Position gain with which it is as stiff as the joint's drive, in its units; by default the paper's."""
+    d_gain: int = 10
+    """Its damping likewise."""
+    current: float = 0.0
+    """Largest current [A] in current-based position control; 0 for plain position control."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,11 +197,9 @@ class HandModel:
         tip_link: Index of the link of each site [F].
         tip_frame: Pose of each site in its link [F, 7].
         mounted_camera: The depth camera, if it has one.
-        point_names: What each set of surface samples covers [P]: every link of the fingers, and what the file
-            samples of the base: its first motors (``f0_motor``), not the palm, of D'Claw hands, as in the
-            paper's released code; or all of it (``base``).
-        point_link: Link whose frame each set is in [P].
-        link_points: Surface samples [P, 500, 3] [m].
+        point_link: Link whose frame each set of surface samples is in [P].
+        link_points: Surface samples [P, 500, 3] [m]: of every link of the fingers, and of the base what the
+            file samples: its first motors, not the palm, of D'Claw hands, as in the paper's released code.
         shapes: Colliders.
     """
 
@@ -242,7 +238,6 @@ class HandModel:
     tip_link: np.ndarray
     tip_frame: np.ndarray
     mounted_camera: CameraModel | None
-    point_names: tuple[str, ...]
     point_link: np.ndarray
     link_points: np.ndarray
     shapes: tuple[CollisionShape, ...]
