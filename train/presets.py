@@ -20,6 +20,7 @@ from vd.envs.cfg import (
     TighteningCfg,
 )
 from vd.paper import PAPER
+from vd.sim.cfg import SimCfg
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 
 TRAINING_SET = ("procedural-150-seed0",)
@@ -31,7 +32,7 @@ class TeacherCfg:
     """Train the teacher: PPO on the simulator's state."""
 
     RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None, "second_view": Dropped(False)}
-    preset: Annotated[str, tyro.conf.arg(metavar="{paper,gpu,cpu-demo}")] = "paper"
+    preset: Annotated[str, tyro.conf.arg(metavar="{paper,gpu,cpu-demo,leap-cube}")] = "paper"
     """Settings to start from; every other flag overrides one of them. By default what learns on this
     machine."""
     resume: str | None = None
@@ -156,6 +157,25 @@ def gpu() -> TeacherCfg:
     )
 
 
+def leap_cube() -> TeacherCfg:
+    """An imported LEAP hand, palm up: a cube of 7 cm, goal after goal in any orientation."""
+    base = gpu()
+    env = replace(
+        base.env,
+        hand="leap",
+        objects=("cube",),
+        num_envs=8192,  # mesh hands fill a GPU sooner
+        episode_s=10.0,  # what falls ends it; what is held meets many goals
+        failures_per_million=20.0,
+        sim=SimCfg(njmax=320, nconmax=48, nccdmax=12),
+        observation=ObservationCfg(shape="full", canonical=True),
+        # Lost is also every goal to come, so a fall costs half of what it does over a table.
+        reward=replace(TOWARDS_GOAL, fall=-150.0),
+        success=replace(base.env.success, rotation_rad=0.2, joint_speed_rad_s=0.8, fall_m=None),
+    )
+    return replace(base, preset="leap-cube", run=replace(base.run, out=Path("runs/leap-cube")), env=env)
+
+
 def cpu_demo() -> TeacherCfg:
     """Minutes on two cores, on an easier task: from rest, goals about the vertical, no stillness test."""
     return TeacherCfg(
@@ -199,6 +219,7 @@ PRESETS: dict[str, Callable[[], TeacherCfg]] = {
     "paper": paper,
     "cpu-demo": cpu_demo,
     "gpu": gpu,
+    "leap-cube": leap_cube,
 }
 """Presets by name."""
 

@@ -160,7 +160,8 @@ class ReorientEnv:
                 self.sim.step()
             self.check()
             dropped.append(self.object_pose())
-        poses = rest_poses(np.stack(dropped, axis=1), self.hand.workspace, self.cfg.success.fall_m)
+        fall_m = self.cfg.success.fall_of(self.hand.workspace)
+        poses = rest_poses(np.stack(dropped, axis=1), self.hand.workspace, fall_m)
         return wp.array(poses, dtype=wp.transform, device=self.device)
 
     # Stepping
@@ -398,6 +399,8 @@ class ReorientEnv:
     def has_table(self) -> np.ndarray:
         """Whether each table was there in the last step, by the task, bool, shape [N] (host copy)."""
         last = self._table_steps
+        if self.hand.palm_up:
+            return np.zeros(self.num_envs, bool)
         return np.ones(self.num_envs, bool) if last is None else self.step_count.numpy() <= last.numpy()
 
     def object_pose(self) -> np.ndarray:
