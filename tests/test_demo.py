@@ -127,7 +127,7 @@ def test_quick_ends_after_the_first_part_and_a_demo_again_replaces_the_one_befor
 
 
 def test_training_gets_what_the_other_parts_leave_and_a_minute_at_least(played, tmp_path):
-    for minutes, expected in (("8", 8.0 - demo.AFTER_TRAINING_MIN), ("1", demo.LEAST_TRAINING_MIN)):
+    for minutes, expected in (("8", 8.0 - demo.AROUND_TRAINING_MIN), ("1", demo.LEAST_TRAINING_MIN)):
         assert main(["--out", str(tmp_path), "--minutes", minutes]) == 0
         (line,) = [line for line in played if "teacher" in line]
         assert float(option(line, "--max-minutes").name) == pytest.approx(expected, abs=0.5)

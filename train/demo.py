@@ -38,8 +38,8 @@ HIDDEN = "backlash:width_rad=0.06"
 """Effect that is hidden in a single servo: a quarter of a finger's time."""
 MISSES = "12"
 """Deadlines missed in a row at which the twin stops: a second, since the machine may do other things too."""
-LEAST_TRAINING_MIN, AFTER_TRAINING_MIN = 1.0, 1.2
-"""Time that training gets at least [min], and that its curve and film take after it."""
+LEAST_TRAINING_MIN, AROUND_TRAINING_MIN = 1.0, 2.4
+"""Time that training gets at least [min], and that its start with cold caches, curve and film take."""
 REFRESH_S = 15
 """Seconds after which a browser reads an unfinished page again."""
 REASON_LINES = 4
@@ -225,7 +225,7 @@ class Demo:
     def training(self, part: Part) -> dict[str, Any]:
         """A small training, with its curve."""
         run, film, curves = part.folder / "run", part.folder / "film.mp4", part.folder / "curves.png"
-        minutes = max(self.cfg.minutes - self.minutes - AFTER_TRAINING_MIN, LEAST_TRAINING_MIN)
+        minutes = max(self.cfg.minutes - self.minutes - AROUND_TRAINING_MIN, LEAST_TRAINING_MIN)
         seed = ("--seed", str(self.cfg.seed))
         words = ("vd-train", "teacher", "--preset", "cpu-demo", *seed, "--max-minutes", f"{minutes:.2f}")
         part.run([*words, "--out", run])
