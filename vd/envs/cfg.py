@@ -351,6 +351,8 @@ class ReorientCfg:
     """Layer over the hand with an identified servo model: identified.usda of vd-gap."""
     objects: tuple[str, ...] = ("cube",)
     """Object sets: names or folders of object USDs."""
+    fit_objects: bool = False
+    """Scale objects as little as makes them fit the hand (the sizes in its USD): sets are made for D'Claw."""
     num_envs: int = 4096
     """Environments simulated side by side."""
     seed: int = 0

@@ -51,14 +51,14 @@ class FreeStarts:
                 state.world_scale,
                 places,
                 -np.inf if state.hand.palm_up else PAPER.scene.table_top_m,
-                state.num_actions,
+                state.num_joints,
                 reset,
                 state.sim.joint_q,
             ],
             [self._depth],
             dim=(*self._depth.shape, CHUNKS),
         )
-        state.launch(move_start_kernel, [places, state.num_actions, reset], [self._depth, state.sim.joint_q])
+        state.launch(move_start_kernel, [places, state.num_joints, reset], [self._depth, state.sim.joint_q])
 
 
 def rounded_box(shape: CollisionShape) -> tuple[tuple[float, ...], float]:

@@ -78,7 +78,7 @@ class TaskState:
         return self.hand.num_fingers
 
     @property
-    def num_actions(self) -> int:
+    def num_joints(self) -> int:
         """D."""
         return self.hand.num_joints
 
@@ -94,6 +94,8 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
         raise ValueError(
             f"{hand.name} looks up, so there is no table: leave table.away_share and table.lift_share at 0"
         )
+    if cfg.fit_objects:
+        objects = [item.fitted(hand.workspace.size_m) for item in objects]
     scene = build_scene(
         hand=hand,
         objects=objects,

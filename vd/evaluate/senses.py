@@ -34,7 +34,7 @@ class EnvironmentSenses:
 
     def read(self) -> Senses:
         """What there is to sense before the next action; later steps change all of it but the points."""
-        env, joints = self._env, self._env.num_actions
+        env, joints = self._env, self._env.num_joints
         fresh = self._steps == 0
         return Senses(
             joint_q=wp.to_torch(env.measured_q)[:, :joints],
