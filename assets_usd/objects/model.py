@@ -114,7 +114,7 @@ class ObjectModel:
         return replace(
             self,
             vertices=self.vertices * np.float32(factor),
-            hulls=tuple((np.asarray(vertices) * factor, faces) for vertices, faces in self.hulls),
+            hulls=tuple(hull._replace(vertices=hull.vertices * np.float32(factor)) for hull in self.hulls),
             inertia=self.inertia * factor**2,
             surface_points=self.surface_points * np.float32(factor),
             scale=self.scale * factor,
