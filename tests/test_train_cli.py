@@ -18,7 +18,8 @@ from vd.train.teacher import BUILDING, build_teacher
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
-def test_every_preset_parses_validates_and_survives_a_file(name):
+def test_every_preset_parses_validates_and_survives_a_file(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path))
     preset = PRESETS[name]()
     assert preset.preset == name
     if preset.env.hand in HANDS:
