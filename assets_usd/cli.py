@@ -30,6 +30,22 @@ class Hand:
     out: Path | None = None
     """Folder to copy them to."""
 
+    def run(self) -> int:
+        """Name or copy hands."""
+        from vd.assets_usd.hands import HANDS, hand_usd
+        from vd.files import write_text
+
+        paths = [hand_usd(name) for name in self.names or HANDS]
+        for path in paths:
+            if self.out is not None:
+                target, text = self.out / path.name, path.read_text()
+                if target.exists() and target.read_text(errors="replace") != text:
+                    raise ValueError(f"{target} is there and another hand; write to another folder (--out)")
+                write_text(target, text)
+                path = target
+            print(path)
+        return 0
+
 
 @dataclass(frozen=True)
 class HandImport:
@@ -45,6 +61,18 @@ class HandImport:
     """YAML with what the file does not say, or the name of a built-in one: leap, allegro."""
     out: Path | None = None
     """Folder to write to; by default one of the asset cache, named after the hand."""
+
+    def run(self) -> int:
+        """Import a hand."""
+        from vd.assets_usd.hand_import.importer import import_hand
+        from vd.assets_usd.hand_import.sheet import hand_sheet, joint_table
+
+        done = import_hand(self.file, self.out, self.describe)
+        print("\n".join([*done.notes, *(f"warning: {text}" for text in done.warnings)]))
+        print(joint_table(done.hand, done.sources))
+        hand_sheet(done.hand, done.sources, done.hand.path.with_suffix(".png"))
+        print(f"{done.hand.path}; look at {done.hand.path.with_suffix('.png').name} beside it")
+        return 0
 
 
 @dataclass(frozen=True)
@@ -62,6 +90,21 @@ class Objects:
     """Take the held-out families, which share no kind with the training families."""
     out: Path | None = None
     """Folder to write to; by default the named set in the asset cache (such as procedural-150-seed0)."""
+
+    def run(self) -> int:
+        """Author procedural objects."""
+        from vd.assets_usd.objects import procedural, sets
+
+        if self.procedural < 1 or self.seed < 0:
+            raise ValueError("--procedural must be at least 1 and --seed at least 0")
+        name = f"procedural-{'heldout-' if self.held_out else ''}{self.procedural}-seed{self.seed}"
+        folder = self.out or sets.built_in_folder(name)
+        models = procedural.procedural_set(
+            self.procedural, self.seed, held_out=self.held_out, progress=_bar("authoring")
+        )
+        size = sum(path.stat().st_size for path in sets.write_set(folder, models))
+        print(f"{len(models)} objects, {size / 1e6:.1f} MB in {folder}")
+        return 0
 
 
 @dataclass(frozen=True)
@@ -83,6 +126,33 @@ class Import:
     jobs: int = 0
     """Meshes at a time; 0: one per core."""
 
+    def run(self) -> int:
+        """Import meshes; returns 1 if any was refused."""
+        from vd.assets_usd.objects.importer import import_meshes
+        from vd.assets_usd.objects.plan import default_set
+
+        if not self.paths:
+            raise ValueError("name the mesh files, or folders of them, to import")
+        out = self.out or default_set(self.paths)
+        bar = _bar("importing")
+        start = time.monotonic()
+        try:
+            results = import_meshes(
+                self.paths,
+                out,
+                self.settings,
+                jobs=self.jobs,
+                progress=lambda result, done, total: bar(result.job.name, done, total),
+            )
+        except KeyboardInterrupt:
+            print(
+                f"\ninterrupted; what is finished is in {out}; the same command goes on from there",
+                file=sys.stderr,
+            )
+            return interrupt.INTERRUPTED
+        print(_summary(results, out, time.monotonic() - start))
+        return 1 if any(r.status == "refused" for r in results) else 0
+
 
 @dataclass(frozen=True)
 class Show:
@@ -92,6 +162,15 @@ class Show:
     """Folders, object files or set names (cube, procedural-150-seed0, ...)."""
     out: Path = Path("sheet.png")
     """PNG to write."""
+
+    def run(self) -> int:
+        """Draw a contact sheet."""
+        from vd.assets_usd.objects.sets import load_set
+        from vd.assets_usd.objects.sheet import contact_sheet
+
+        title = ", ".join(Path(name).name for name in self.sets)
+        print(contact_sheet(load_set(self.sets), self.out, title))
+        return 0
 
 
 Command = (
@@ -118,80 +197,6 @@ def _bar(label: str) -> Callable[[str, int, int], None]:
             bars[0].close()
 
     return advance
-
-
-def run_hand(command: Hand) -> int:
-    """Name or copy hands."""
-    from vd.assets_usd.hands import HANDS, hand_usd
-    from vd.files import write_text
-
-    paths = [hand_usd(name) for name in command.names or HANDS]
-    for path in paths:
-        if command.out is not None:
-            target, text = command.out / path.name, path.read_text()
-            if target.exists() and target.read_text(errors="replace") != text:
-                raise ValueError(f"{target} is there and another hand; write to another folder (--out)")
-            write_text(target, text)
-            path = target
-        print(path)
-    return 0
-
-
-def run_hand_import(command: HandImport) -> int:
-    """Import a hand."""
-    from vd.assets_usd.hand_import.importer import import_hand
-    from vd.assets_usd.hand_import.sheet import hand_sheet, joint_table
-
-    done = import_hand(command.file, command.out, command.describe)
-    print("\n".join([*done.notes, *(f"warning: {text}" for text in done.warnings)]))
-    print(joint_table(done.hand, done.sources))
-    hand_sheet(done.hand, done.sources, done.hand.path.with_suffix(".png"))
-    print(f"{done.hand.path}; look at {done.hand.path.with_suffix('.png').name} beside it")
-    return 0
-
-
-def run_objects(command: Objects) -> int:
-    """Author procedural objects."""
-    from vd.assets_usd.objects import procedural, sets
-
-    if command.procedural < 1 or command.seed < 0:
-        raise ValueError("--procedural must be at least 1 and --seed at least 0")
-    name = f"procedural-{'heldout-' if command.held_out else ''}{command.procedural}-seed{command.seed}"
-    folder = command.out or sets.built_in_folder(name)
-    models = procedural.procedural_set(
-        command.procedural, command.seed, held_out=command.held_out, progress=_bar("authoring")
-    )
-    size = sum(path.stat().st_size for path in sets.write_set(folder, models))
-    print(f"{len(models)} objects, {size / 1e6:.1f} MB in {folder}")
-    return 0
-
-
-def run_import(command: Import) -> int:
-    """Import meshes; returns 1 if any was refused."""
-    from vd.assets_usd.objects.importer import import_meshes
-    from vd.assets_usd.objects.plan import default_set
-
-    if not command.paths:
-        raise ValueError("name the mesh files, or folders of them, to import")
-    out = command.out or default_set(command.paths)
-    bar = _bar("importing")
-    start = time.monotonic()
-    try:
-        results = import_meshes(
-            command.paths,
-            out,
-            command.settings,
-            jobs=command.jobs,
-            progress=lambda result, done, total: bar(result.job.name, done, total),
-        )
-    except KeyboardInterrupt:
-        print(
-            f"\ninterrupted; what is finished is in {out}; the same command goes on from there",
-            file=sys.stderr,
-        )
-        return interrupt.INTERRUPTED
-    print(_summary(results, out, time.monotonic() - start))
-    return 1 if any(r.status == "refused" for r in results) else 0
 
 
 def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
@@ -226,16 +231,6 @@ def _span(values: list[float]) -> str:
     return low if low == high else f"{low}-{high}"
 
 
-def run_show(command: Show) -> int:
-    """Draw a contact sheet."""
-    from vd.assets_usd.objects.sets import load_set
-    from vd.assets_usd.objects.sheet import contact_sheet
-
-    title = ", ".join(Path(name).name for name in command.sets)
-    print(contact_sheet(load_set(command.sets), command.out, title))
-    return 0
-
-
 @interrupt.command("vd-assets")
 def main() -> int:
     """Run ``vd-assets``; returns the exit status."""
@@ -247,13 +242,7 @@ def main() -> int:
         check_file(command.out)
     elif command.out is not None:
         check_folder(command.out)
-    if isinstance(command, Hand):
-        return run_hand(command)
-    if isinstance(command, HandImport):
-        return run_hand_import(command)
-    if isinstance(command, Objects):
-        return run_objects(command)
-    return run_import(command) if isinstance(command, Import) else run_show(command)
+    return command.run()
 
 
 if __name__ == "__main__":

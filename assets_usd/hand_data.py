@@ -103,10 +103,6 @@ class CollisionShape:
         frame: Pose in the link frame [7]; of a hull that of the box around it.
         vertices: Corners of a hull in ``frame`` [V, 3] [m]; of other kinds [0, 3].
         friction: Coefficient of (dynamic) friction.
-        restitution: Coefficient of restitution.
-        stiffness: Newton's contact stiffness.
-        damping: Newton's contact damping.
-        gap: Distance at which contacts are looked for [m].
         fingertip: Whether its material is that of the fingertip variant.
     """
 
@@ -117,10 +113,6 @@ class CollisionShape:
     frame: np.ndarray
     vertices: np.ndarray
     friction: float
-    restitution: float
-    stiffness: float
-    damping: float
-    gap: float
     fingertip: bool
 
 
@@ -199,11 +191,9 @@ class HandModel:
         tip_link: Index of the link of each site [F].
         tip_frame: Pose of each site in its link [F, 7].
         mounted_camera: The depth camera, if it has one.
-        point_names: What each set of surface samples covers [P]: every link of the fingers, and what the file
-            samples of the base: its first motors (``f0_motor``), not the palm, of D'Claw hands, as in the
-            paper's released code; or all of it (``base``).
-        point_link: Link whose frame each set is in [P].
-        link_points: Surface samples [P, 500, 3] [m].
+        point_link: Link whose frame each set of surface samples is in [P].
+        link_points: Surface samples [P, 500, 3] [m]: of every link of the fingers, and of the base what the
+            file samples: its first motors, not the palm, of D'Claw hands, as in the paper's released code.
         shapes: Colliders.
     """
 
@@ -242,7 +232,6 @@ class HandModel:
     tip_link: np.ndarray
     tip_frame: np.ndarray
     mounted_camera: CameraModel | None
-    point_names: tuple[str, ...]
     point_link: np.ndarray
     link_points: np.ndarray
     shapes: tuple[CollisionShape, ...]

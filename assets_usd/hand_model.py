@@ -163,9 +163,8 @@ class _Reader(Described):
             tip_link=np.array([index[prim.GetParent().GetPath()] for prim in tip_prims]),
             tip_frame=np.array([self._relative(prim, prim.GetParent()) for prim in tip_prims]),
             mounted_camera=self._camera(camera, bodies[0]) if camera else None,
-            point_names=tuple(name for name, _, _ in points),
-            point_link=np.array([link for _, _, link in points]),
-            link_points=self._points([prim for _, prim, _ in points]),
+            point_link=np.array([link for _, link in points]),
+            link_points=self._points([prim for prim, _ in points]),
             shapes=tuple(shape for i, body in enumerate(bodies) for shape in self._shapes(body, i, tips)),
         )
 
@@ -220,16 +219,16 @@ class _Reader(Described):
                     "rename it if it is a finger's, weld it to its link if it is fixed, or remove it",
                 )
 
-    def _point_prims(self, links: tuple[str, ...]) -> list[tuple[str, Usd.Prim, int]]:
-        """Name, prim and link of the sets of surface samples, as far as links have them."""
-        root = self.root.GetPath()
-        found = [("base", self.stage.GetPrimAtPath(f"{root}/base/points"), 0)]
+    def _point_prims(self, links: tuple[str, ...]) -> list[tuple[Usd.Prim, int]]:
+        """Prim and link of the sets of surface samples, as far as links have them."""
+        places = [("base/points", 0)]
         for index, link in enumerate(links[1:], 1):
             if link.endswith("_l1"):
-                motor = link.replace("_l1", "_motor")
-                found.append((motor, self.stage.GetPrimAtPath(f"{root}/base/{motor}_points"), 0))
-            found.append((link, self.stage.GetPrimAtPath(f"{root}/{link}/points"), index))
-        return [(name, prim, link) for name, prim, link in found if prim]
+                places.append((f"base/{link.replace('_l1', '_motor')}_points", 0))
+            places.append((f"{link}/points", index))
+        root = self.root.GetPath()
+        found = [(self.stage.GetPrimAtPath(root.AppendPath(place)), link) for place, link in places]
+        return [(prim, link) for prim, link in found if prim]
 
     def _relative(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
         """Pose [7] of a prim in the frame of an ancestor; a scale is dropped, shear is refused."""
@@ -393,9 +392,5 @@ class _Reader(Described):
             frame=frame,
             vertices=vertices,
             friction=self.number(surface, "physics:dynamicFriction"),
-            restitution=self.number(surface, "physics:restitution"),
-            stiffness=self.number(surface, "newton:contactStiffness", positive=True),
-            damping=self.number(surface, "newton:contactDamping", positive=True),
-            gap=self.number(prim, "newton:contactGap"),
             fingertip=surface.GetName() == "fingertip_surface",
         )

@@ -86,7 +86,7 @@ def test_newton_sees_the_identified_drive_and_the_fingertip(hand, tmp_path):
         np.testing.assert_allclose(values, expected, rtol=1e-6)
         assert values[dof] == pytest.approx(wanted)
     plain = read_hand(hand.path)
-    assert got.shapes[-1].damping != plain.shapes[-1].damping, "the variant is still the one asked for"
+    assert got.shapes[-1].friction != plain.shapes[-1].friction, "the variant is still the one asked for"
 
 
 def test_the_layer_is_plain_usd_that_says_where_it_comes_from(hand, tmp_path):

@@ -55,12 +55,10 @@ def imported(tmp_path_factory: pytest.TempPathFactory):
     box.export(folder / "brick in mm.ply")
     trimesh.creation.box((0.1, 0.05, 0.05)).export(folder / "sub" / "clamp.glb")
     trimesh.creation.annulus(0.05, 0.058, 0.02, sections=16).export(folder / "ring.stl")
-    (folder / "empty.obj").write_text("")
     (folder / "cloud.obj").write_text("".join(f"v {i} {i * i} 1\n" for i in range(9)))
     (folder / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 1\nf 1 2 3\nf 1 2 4\n")
     (folder / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n")
     trimesh.creation.box((100.0, 0.15, 0.15)).export(folder / "needle.stl")
-    (folder / "junk.stl").write_bytes(b"this is no stereolithography file")
     notes = root / "notes.txt"
     notes.write_text("hello")
     with (folder / "objects.csv").open("w", newline="") as stream:
@@ -81,12 +79,10 @@ def imported(tmp_path_factory: pytest.TempPathFactory):
 
 
 REFUSALS = {
-    "empty": "empty file",
     "cloud": "not a mesh, or cut short: 9 points and no faces",
     "nan": "1 of 4 vertices are NaN or infinite",
     "flat": "degenerate: flat",
     "needle": "degenerate: flat.*give it thickness",
-    "junk": "neither mesh nor points|not a mesh",
     "notes": r"unsupported type \.txt; use \.obj, \.stl, \.ply, \.glb, \.usd",
 }
 
@@ -344,6 +340,11 @@ def stuck(*_: object) -> list[np.ndarray]:
         pass
 
 
+def crashing(*_: object) -> None:
+    """Stands for CoACD that ends its process."""
+    os._exit(11)
+
+
 def waiting(vertices: np.ndarray, *_: object) -> list[np.ndarray]:
     """Stands for CoACD on a machine with other things to do: 1.5 s for no work."""
     time.sleep(1.5)
@@ -358,13 +359,8 @@ def test_only_processor_time_makes_a_decomposition_fall_back(monkeypatch: pytest
     assert result.method == "one hull" and len(result.hulls) == 1
     assert "no result after 1 s of processor time" in result.fallback[0]
     assert hull_depth(result.hulls[0], mesh.vertices).max() < 1e-9
-    monkeypatch.setattr(d, "_coacd_parts", lambda *_: os._exit(11))
-    assert "exit code 11" in d.decompose(mesh.vertices, mesh.faces, limits).fallback[0]
     monkeypatch.setattr(d, "_coacd_parts", waiting)
     assert d.decompose(mesh.vertices, mesh.faces, limits).fallback == ()
-    monkeypatch.setattr(d, "HANG_S", 0.5)
-    with pytest.raises(m.MeshError, match=r"CoACD hangs.*import it again"):
-        d.decompose(mesh.vertices, mesh.faces, limits)
 
 
 def test_a_fall_back_is_said_and_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -372,9 +368,10 @@ def test_a_fall_back_is_said_and_done_again(tmp_path: Path, monkeypatch: pytest.
     (job,) = plan_jobs([tmp_path / "bracket.stl"], tmp_path, "MIT")
     settings = replace(FAST, licence="MIT")
     with monkeypatch.context() as patch:
-        patch.setattr(d, "_coacd_parts", lambda *_: os._exit(11))
+        patch.setattr(d, "_coacd_parts", crashing)
         fallen = import_mesh(job, settings).model
-    assert len(fallen.hulls) == 1 and "fall-back, tried again at the next import" in fallen.warnings[0]
+    assert len(fallen.hulls) == 1 and "or it crashed" in fallen.warnings[0]
+    assert "fall-back, tried again at the next import" in fallen.warnings[0]
     # The hull of the L without the L: a triangle of half 9 x 5 cm.
     assert fallen.volume_error == pytest.approx(0.5 * 0.09 * 0.05 * 0.03 / L_VOLUME, rel=0.05)
     assert read_object(Path(job.target)).warnings == fallen.warnings

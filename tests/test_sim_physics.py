@@ -226,17 +226,3 @@ def test_velocity_limits_hold(device):
     sim.velocity_limit.fill_(100.0)
     sim.step()
     assert np.abs(sim.joint_qd.numpy()[:, :12]).max() > 1.0
-
-
-def test_importing_keeps_every_collider_and_mount():
-    hand = load_hand("dclaw3")
-    builder = build_hand(hand, CFG, visuals=False)
-    colliding = [f for f in builder.shape_flags if f & newton.ShapeFlags.COLLIDE_SHAPES]
-    assert len(colliding) == len(hand.shapes)
-    model = builder.finalize(device="cpu")
-    state = model.state()
-    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
-    base = state.body_q.numpy()[0]
-    assert base[:3] == pytest.approx([0.0, 0.0, 0.25])
-    down = wp.quat_rotate(wp.quat(*base[3:]), wp.vec3(0.0, 0.0, 1.0))
-    assert down[2] == pytest.approx(-1.0)

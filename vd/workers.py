@@ -71,7 +71,7 @@ def run_tasks(
                         idle.append(_end(future, task, worker, finished, limit_s))
     finally:
         for worker in (*idle, *(worker for _, worker, _ in running.values())):
-            _kill(worker)
+            end_worker(worker)
 
 
 def _worker() -> ProcessPoolExecutor:
@@ -101,12 +101,13 @@ def _end(
             return worker
         except BrokenProcessPool:
             why = "its process died: out of memory, or killed"
-    _kill(worker)
+    end_worker(worker)
     finished(task, None, why)
     return _worker()
 
 
-def _kill(worker: ProcessPoolExecutor) -> None:
+def end_worker(worker: ProcessPoolExecutor) -> None:
+    """End the processes of a pool, whatever they do."""
     for process in list((worker._processes or {}).values()):
         process.kill()
     worker.shutdown(wait=False, cancel_futures=True)

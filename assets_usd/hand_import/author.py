@@ -1,19 +1,24 @@
 """A welded hand as USD (docs/reference/hand.md): numbers as text, meshes in a crate beside it."""
 
-import re
 from dataclasses import replace
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial.transform import Rotation
+from trimesh.util import append_faces
 
 from vd.assets_usd.hand_data import MotorModel, canonical_quat, compose, invert
 from vd.assets_usd.hand_import.description import Description
 from vd.assets_usd.hand_import.guess import Stance
 from vd.assets_usd.hand_import.source import Joint, Link, Shape
 from vd.assets_usd.hand_import.tree import Tree, shape_box
+from vd.assets_usd.objects.decompose import decompose
 from vd.assets_usd.objects.geometry import convex_hull, principal_axes, simplify_hull, surface_points
+from vd.assets_usd.objects.settings import ImportSettings
 
 HULL_VERTICES = 32
 """Most corners of a collider: contacts of more take longer and feel the same."""
@@ -23,12 +28,6 @@ GAP_M = 0.002
 SURFACES = {"surface": (2500.0, 100.0), "fingertip_surface": (2500.0, 100.0)}
 """Contact stiffness and damping of each material: MuJoCo's default, 20 ms and critically damped."""
 RESTITUTION = 0.5
-
-
-def prim_name(name: str) -> str:
-    """A name that USD takes."""
-    name = re.sub(r"\W", "_", name)
-    return name if name and not name[0].isdigit() else f"hand_{name}"
 
 
 class Author:
@@ -45,23 +44,13 @@ class Author:
         self.layer = Sdf.Layer.CreateAnonymous(".usda")
         self.meshes = Sdf.Layer.CreateAnonymous(".usdc")
         self.layer.subLayerPaths.append(self.meshes.identifier)
-        self.stage = Usd.Stage.Open(self.layer)
-
-    def write(self, folder: Path, source: str, apart: list[tuple[int, int]]) -> Path:
-        """Write ``<name>.usda`` and ``<name>_meshes.usdc``.
-
-        Args:
-            folder: Where to; it exists.
-            source: What it was made from, for people.
-            apart: Pairs of links whose contacts are off.
-        """
-        stage, name = self.stage, self.root[1:]
+        self.stage = stage = Usd.Stage.Open(self.layer)
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
         root = UsdGeom.Xform.Define(stage, self.root).GetPrim()
         stage.SetDefaultPrim(root)
-        root.SetDocumentation(f"{name}, imported from {source}")
+        root.SetDocumentation(f"{name}, imported from {self.tree.source}")
         UsdPhysics.ArticulationRootAPI.Apply(root)
         self._describe(root)
         self._materials()
@@ -77,9 +66,21 @@ class Author:
             site.CreatePurposeAttr(UsdGeom.Tokens.guide)
             _apply(site.GetPrim(), "NewtonSiteAPI")
             _place(site, self.stance.tips[finger])
-        for one, other in apart:
-            api = UsdPhysics.FilteredPairsAPI.Apply(stage.GetPrimAtPath(f"{self.root}/{self.names[one]}"))
-            api.CreateFilteredPairsRel().AddTarget(f"{self.root}/{self.names[other]}")
+
+    def write(self, folder: Path, apart: set[tuple[int, int]]) -> Path:
+        """Write ``<name>.usda`` and ``<name>_meshes.usdc``.
+
+        Args:
+            folder: Where to; it exists.
+            apart: Pairs of links whose contacts are off.
+        """
+        name = self.root[1:]
+        for one, pairs in groupby(sorted(apart), key=itemgetter(0)):
+            link = self.stage.GetPrimAtPath(f"{self.root}/{self.names[one]}")
+            others = UsdPhysics.FilteredPairsAPI.Apply(link).CreateFilteredPairsRel()
+            others.ClearTargets(removeSpec=False)
+            for _, other in pairs:
+                others.AddTarget(f"{self.root}/{self.names[other]}")
         path = folder / f"{name}.usda"
         self.meshes.Export(str(folder / f"{name}_meshes.usdc"))
         numbers = Sdf.Layer.CreateAnonymous(".usda")
@@ -192,9 +193,7 @@ class Author:
 
     def _points(self, path: str, meshes: list[tuple[np.ndarray, np.ndarray]]) -> None:
         """Samples of what is drawn of a link."""
-        starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
-        vertices = np.concatenate([vertices for vertices, _ in meshes])
-        faces = np.concatenate([faces + first for (_, faces), first in zip(meshes, starts, strict=False)])
+        vertices, faces = append_faces(*zip(*meshes, strict=True))
         points = UsdGeom.Points.Define(self.stage, path)
         points.CreatePurposeAttr(UsdGeom.Tokens.guide)
         points.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
@@ -257,8 +256,6 @@ class Author:
 
 def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and faces [T, 3] of any shape, in its link."""
-    import trimesh
-
     match shape.kind:
         case "mesh":
             vertices, faces = shape.vertices, shape.faces
@@ -283,9 +280,6 @@ def convex_parts(shape: Shape) -> list[Shape]:
     """A collider, or the parts of one that is to be split."""
     if shape.kind != "mesh" or not shape.split:
         return [shape]
-    from vd.assets_usd.objects.decompose import decompose
-    from vd.assets_usd.objects.settings import ImportSettings
-
     cut = decompose(shape.vertices, shape.faces, ImportSettings(), HULL_VERTICES)
     return [replace(shape, vertices=hull.vertices, faces=hull.faces) for hull in cut.hulls]
 

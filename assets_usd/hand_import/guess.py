@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import Workspace, compose
-from vd.assets_usd.hand_import.description import Description
+from vd.assets_usd.hand_import.description import Description, Place
 from vd.assets_usd.hand_import.source import Joint, Link
 from vd.assets_usd.hand_import.tree import Tree, shape_box
 
@@ -58,13 +58,14 @@ def take_stance(tree: Tree, said: Description) -> Stance:
     tips = _tips(tree)
     start = _start(tree, said)
     palm = _palm(tree, tips, said)
+    ends = _roots(tree), _tip_points(tree, tips, start)
     if said.mount is not None:
         quaternion = np.array(said.mount.quaternion) / np.linalg.norm(said.mount.quaternion)
         mount = np.array([*said.mount.position, *quaternion])
     else:
-        mount = _mount(tree, tips, start, palm)
+        mount = _mount(tree, ends, start, palm)
         tree.notes.append(f"guess: mounted palm up at {_text(mount)} (mount)")
-    return Stance(tips, start, palm, mount, _workspace(tree, tips, start, palm, mount, said))
+    return Stance(tips, start, palm, mount, _workspace(tree, ends, palm, mount, said.workspace))
 
 
 def _text(values: np.ndarray) -> str:
@@ -184,9 +185,13 @@ def _snapped(direction: np.ndarray) -> np.ndarray:
     return nearest if np.arccos(np.clip(direction @ nearest, -1.0, 1.0)) < SNAP_RAD else direction
 
 
-def _mount(tree: Tree, tips: list[np.ndarray], start: np.ndarray, palm: np.ndarray) -> np.ndarray:
+Ends = tuple[np.ndarray, np.ndarray]
+"""Roots of the fingers, and their tips at the start, in the base [F, 3] each."""
+
+
+def _mount(tree: Tree, ends: Ends, start: np.ndarray, palm: np.ndarray) -> np.ndarray:
     """Palm up, fingers towards +x, above the ground, with the middle of the hand above the origin."""
-    forward = (_tip_points(tree, tips, start) - _roots(tree)).mean(axis=0)
+    forward = (ends[1] - ends[0]).mean(axis=0)
     forward -= (forward @ palm) * palm
     if np.linalg.norm(forward) < 0.01:
         forward = np.eye(3)[np.argmin(np.abs(palm))]
@@ -201,27 +206,20 @@ def _mount(tree: Tree, tips: list[np.ndarray], start: np.ndarray, palm: np.ndarr
             placed = compose(pose, box)
             reach = np.abs(turn.as_matrix()[2] @ Rotation.from_quat(placed[3:]).as_matrix()) @ half
             lowest = min(lowest, float(turn.apply(placed[:3])[2] - reach))
-    middle = turn.apply(_middle(tree, tips, start))
+    middle = turn.apply(_middle(ends))
     return np.array([-middle[0], -middle[1], GROUND_M - lowest, *turn.as_quat()])
 
 
-def _middle(tree: Tree, tips: list[np.ndarray], start: np.ndarray) -> np.ndarray:
+def _middle(ends: Ends) -> np.ndarray:
     """The middle between the roots of the fingers and their tips [3]."""
-    return np.asarray((_roots(tree).mean(axis=0) + _tip_points(tree, tips, start).mean(axis=0)) / 2.0)
+    return np.asarray((ends[0].mean(axis=0) + ends[1].mean(axis=0)) / 2.0)
 
 
-def _workspace(
-    tree: Tree,
-    tips: list[np.ndarray],
-    start: np.ndarray,
-    palm: np.ndarray,
-    mount: np.ndarray,
-    said: Description,
-) -> Workspace:
+def _workspace(tree: Tree, ends: Ends, palm: np.ndarray, mount: np.ndarray, said: Place) -> Workspace:
     """Over the palm, in the middle of roots and tips, half an object away from what collides there."""
-    reach = float(np.linalg.norm(_tip_points(tree, tips, start) - _roots(tree), axis=1).mean())
-    size = said.workspace.size or (SIZES[0] * reach, SIZES[1] * reach)
-    middle = _middle(tree, tips, start)
+    reach = float(np.linalg.norm(ends[1] - ends[0], axis=1).mean())
+    size = said.size or (SIZES[0] * reach, SIZES[1] * reach)
+    middle = _middle(ends)
     boxes = [shape_box(shape) for shape in tree.links[0].shapes if shape.collides]
     tops = [
         float(palm @ pose[:3] + np.abs(palm @ Rotation.from_quat(pose[3:]).as_matrix()) @ half)
@@ -229,19 +227,9 @@ def _workspace(
     ]
     above = max(max(tops, default=0.0) + 0.5 * float(np.mean(size)) - palm @ middle, 0.0)
     goal = compose(mount, np.array([*(middle + above * palm), 0.0, 0.0, 0.0, 1.0]))[:3]
-    x, y, z = said.workspace.goal or (float(v) for v in goal)
-    place = Workspace(
-        drop_m=said.workspace.drop or (x, y, z + DROP_M),
-        goal_m=(x, y, z),
-        fall_m=said.workspace.fall or FALL * reach,
-        size_m=size,
-    )
-    for name, value in (
-        ("drop", place.drop_m),
-        ("goal", place.goal_m),
-        ("size", place.size_m),
-        ("fall", [place.fall_m]),
-    ):
-        if getattr(said.workspace, name) is None:
+    x, y, z = said.goal or (float(v) for v in goal)
+    drop, fall = said.drop or (x, y, z + DROP_M), said.fall or FALL * reach
+    for name, value in {"drop": drop, "goal": (x, y, z), "size": size, "fall": (fall,)}.items():
+        if getattr(said, name) is None:
             tree.notes.append(f"guess: {name} {_text(np.array(value))} m (workspace)")
-    return place
+    return Workspace(drop, (x, y, z), fall, size)

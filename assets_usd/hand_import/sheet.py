@@ -1,18 +1,18 @@
 """A picture of an imported hand: links and colliders, axes, tips, and the joints with their limits."""
 
-import colorsys
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel, compose
 from vd.assets_usd.hand_import.author import shape_mesh
 from vd.assets_usd.hand_import.source import Shape
 from vd.assets_usd.objects.geometry import convex_hull
-from vd.files import atomic_path
+from vd.assets_usd.objects.sheet import look_at, part_colour, save_figure
 
 VIEWS = {"from the front": (12.0, -60.0), "from above": (89.0, -90.0), "from the side": (0.0, 0.0)}
 """Name, elevation and azimuth [degrees] of the pictures, world frame."""
@@ -31,14 +31,12 @@ def _collider(shape: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def _draw(axes: Any, hand: HandModel, links: np.ndarray, joints: np.ndarray) -> None:
     """Colliders in one colour a link, axes of the joints, fingertips, drop point."""
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
     corners = []
     for shape in hand.shapes:
         vertices, faces = _collider(shape)
         pose = links[shape.link]
         corners.append((pose[:3] + Rotation.from_quat(pose[3:]).apply(vertices))[faces])
-        hue = colorsys.hsv_to_rgb((0.58 + shape.link * 0.381966) % 1.0, 0.5 if shape.link else 0.0, 0.85)
+        hue = part_colour(shape.link, 0.5 if shape.link else 0.0, 0.85)
         axes.add_collection3d(
             Poly3DCollection(corners[-1], facecolors=[hue], edgecolors=[hue], linewidths=0.2, alpha=0.45)
         )
@@ -52,11 +50,7 @@ def _draw(axes: Any, hand: HandModel, links: np.ndarray, joints: np.ndarray) -> 
     axes.scatter(*np.array(hand.workspace.drop_m)[:, None], color="#20a040", s=25, marker="x")
     points = np.concatenate([*(corner.reshape(-1, 3) for corner in corners), [hand.workspace.drop_m]])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    radius = np.abs(points - middle).max()
-    limits = np.stack([middle - radius, middle + radius], axis=1)
-    axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2], proj_type="ortho")
-    axes.set_box_aspect((1, 1, 1), zoom=1.5)
-    axes.set_axis_off()
+    look_at(axes, middle, np.abs(points - middle).max(), 1.5)
 
 
 def joint_table(hand: HandModel, sources: list[str]) -> str:
@@ -83,8 +77,6 @@ def hand_sheet(hand: HandModel, sources: list[str], path: Path) -> Path:
         sources: What its joints are called in the source [D].
         path: File to write; its suffix says which format.
     """
-    from matplotlib.figure import Figure
-
     links = compose(hand.mount, hand.forward_kinematics(hand.start))
     joints = compose(links[hand.joint_parent], hand.joint_parent_frame)
     figure = Figure((13.0, 4.6 + 0.14 * hand.num_joints), dpi=110)
@@ -102,7 +94,4 @@ def hand_sheet(hand: HandModel, sources: list[str], path: Path) -> Path:
     )
     figure.text(0.01, 0.97, title, fontsize=9, va="top")
     figure.text(0.03, text, joint_table(hand, sources), fontsize=6.5, va="top", family="monospace")
-    with atomic_path(Path(path)) as temporary, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of characters that its font lacks
-        figure.savefig(temporary)
-    return Path(path)
+    return save_figure(figure, path)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -189,8 +190,6 @@ def _bounded(value: float) -> float:
 
 
 def _read_mjcf(path: Path) -> Source:
-    import mujoco
-
     model: Any = mujoco.MjModel.from_xml_path(str(path))
     source = Source(path, model.names.split(b"\0")[0].decode() or path.stem, [], [])
     for i in range(1, model.nbody):
@@ -225,8 +224,6 @@ def _pose(position: np.ndarray, wxyz: np.ndarray) -> np.ndarray:
 
 def _mjcf_joints(model: Any, body: int, source: Source) -> None:
     """The joint of a body: none is a fixed one, more than one are none that a hand has."""
-    import mujoco
-
     first, count = model.body_jntadr[body], model.body_jntnum[body]
     parent, place = model.body_parentid[body] - 1, _pose(model.body_pos[body], model.body_quat[body])
     link = source.links[body - 1].name
@@ -262,8 +259,6 @@ def _mjcf_joints(model: Any, body: int, source: Source) -> None:
 
 
 def _mjcf_shape(model: Any, geom: int) -> Shape:
-    import mujoco
-
     kind = mujoco.mjtGeom(model.geom_type[geom]).name[7:].lower()
     shape = Shape(
         kind,
@@ -283,8 +278,6 @@ def _mjcf_shape(model: Any, geom: int) -> Shape:
 
 def _mjcf_equalities(model: Any, source: Source) -> None:
     """Couplings of two joints by a line are joints that follow; all others are problems."""
-    import mujoco
-
     joints = {joint.name: joint for joint in source.joints}
     for i in range(model.neq):
         kind, data = mujoco.mjtEq(model.eq_type[i]), model.eq_data[i]
@@ -302,8 +295,6 @@ def _mjcf_equalities(model: Any, source: Source) -> None:
 
 def _mjcf_actuators(model: Any, source: Source) -> None:
     """Gains and torque limits of the joints that actuators turn, by themselves or by a tendon of several."""
-    import mujoco
-
     joints = {joint.name: joint for joint in source.joints}
     by_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
     idle = sorted(set(range(model.ntendon)) - set(model.actuator_trnid[by_tendon, 0]))
@@ -324,8 +315,6 @@ def _mjcf_actuators(model: Any, source: Source) -> None:
 
 def _moved(model: Any, actuator: int, source: Source) -> list[str]:
     """Joints that an actuator moves; those of a tendon go on the list of what is coupled."""
-    import mujoco
-
     kind, target = model.actuator_trntype[actuator], model.actuator_trnid[actuator, 0]
     if kind == mujoco.mjtTrn.mjTRN_JOINT:
         return [model.joint(target).name]

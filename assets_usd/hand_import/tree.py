@@ -1,7 +1,6 @@
 """A source welded to what a hand is: a base and fingers, each a chain of revolute joints."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -13,6 +12,8 @@ from vd.assets_usd.hand_import.description import Description, Drive
 from vd.assets_usd.hand_import.source import IDENTITY, Joint, Link, Shape, Source
 from vd.assets_usd.hand_model import MAX_JOINTS
 
+KINDS = ("box", "sphere", "capsule", "cylinder", "mesh", "ellipsoid")
+"""What collides."""
 MOST_WRIST = 3
 """Most joints before the fingers that are held without being asked: more are an arm."""
 DENSITY_KG_M3 = 1000.0
@@ -23,6 +24,8 @@ DENSITY_KG_M3 = 1000.0
 class Tree:
     """A hand in its own order: ``base`` first, then the fingers from the palm; D joints, D + 1 links."""
 
+    source: str
+    """File that it was read from, for people."""
     links: list[Link]
     """Welded; of each the frame is that of the source's link that moves."""
     joints: list[Joint]
@@ -110,7 +113,7 @@ class _Grower:
                 links.append(self._welded(joint.child))
             tips.append(self._tip(chain[-1].child))
         self.fail()
-        tree = Tree(links, joints, counts, tips, self.notes)
+        tree = Tree(self.source.path.name, links, joints, counts, tips, self.notes)
         self._check_followers(tree)
         self._check_numbers(tree)
         self.fail()
@@ -119,24 +122,16 @@ class _Grower:
     def _check_names(self) -> None:
         joints = [joint.name for joint in self.source.joints if joint.kind != "fixed"]
         links = [link.name for link in self.source.links]
-        said = self.said
-        named: dict[str, Iterable[str]] = {
-            "hold": said.hold,
-            "mimic": said.mimic,
-            "limits": said.limits,
-            "drives": said.drives,
-            "start": said.start,
-            "motors": said.motors,
-        }
-        for entry, names in named.items():
-            for name in names:
-                if name not in joints:
-                    self.problems.append(f"{entry}: there is no joint {name}; there are {', '.join(joints)}")
-        linked: dict[str, Iterable[str]] = {"mass": said.mass, "tips": said.tips, "parts": said.parts}
-        for entry, names in linked.items():
-            for name in names:
-                if name not in links:
-                    self.problems.append(f"{entry}: there is no link {name}; there are {', '.join(links)}")
+        for kind, known, entries in (
+            ("joint", joints, "hold mimic limits drives start motors"),
+            ("link", links, "mass tips parts"),
+        ):
+            self.problems += [
+                f"{entry}: there is no {kind} {name}; there are {', '.join(known)}"
+                for entry in entries.split()
+                for name in getattr(self.said, entry)
+                if name not in known
+            ]
 
     def _take_said(self) -> None:
         """Put what the description says of joints and links into the source."""
@@ -258,20 +253,25 @@ class _Grower:
         group = self._group(first)
         parts = [(self.source.links[i], pose) for i, pose in group.items()]
         whole = Link(self.source.links[first].name)
-        whole.mass = sum(link.mass for link, _ in parts)
         for link, pose in parts:
             split = link.name in self.said.parts
             whole.shapes += [replace(s, frame=compose(pose, s.frame), split=split) for s in link.shapes]
             whole.sites |= {name: compose(pose, site) for name, site in link.sites.items()}
             whole.sites |= {link.name: pose} if link is not parts[0][0] else {}
-        if not whole.mass > 0.0:
+        if not sum(link.mass for link, _ in parts) > 0.0:
             return self._weighed(whole)
-        centres = [pose[:3] + Rotation.from_quat(pose[3:]).apply(link.com) for link, pose in parts]
-        whole.com = sum(link.mass * at for (link, _), at in zip(parts, centres, strict=True)) / whole.mass
-        for (link, pose), at in zip(parts, centres, strict=True):
-            turn, arm = Rotation.from_quat(pose[3:]).as_matrix(), at - whole.com
-            steiner = link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-            whole.inertia = whole.inertia + turn @ link.inertia @ turn.T + steiner
+        turns = [Rotation.from_quat(pose[3:]) for _, pose in parts]
+        combine(
+            whole,
+            [
+                (
+                    link.mass,
+                    pose[:3] + turn.apply(link.com),
+                    turn.as_matrix() @ link.inertia @ turn.as_matrix().T,
+                )
+                for (link, pose), turn in zip(parts, turns, strict=True)
+            ],
+        )
         return self._possible(whole)
 
     def _weighed(self, link: Link) -> Link:
@@ -282,15 +282,11 @@ class _Grower:
                 f"{link.name} has neither mass nor collider; give it one: mass: {{{link.name}: 0.02}}"
             )
             return link
-        masses = np.array([8.0 * np.prod(half) * DENSITY_KG_M3 for _, half in boxes])
-        link.mass = float(masses.sum())
-        link.com = np.array([pose[:3] for pose, _ in boxes]).T @ masses / link.mass
-        for mass, (pose, half) in zip(masses, boxes, strict=True):
-            turn, arm = Rotation.from_quat(pose[3:]).as_matrix(), pose[:3] - link.com
-            own = np.diag(mass / 3.0 * (half @ half - half**2))
-            link.inertia = (
-                link.inertia + turn @ own @ turn.T + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-            )
+        parts = []
+        for pose, half in boxes:
+            mass, turn = float(8.0 * np.prod(half) * DENSITY_KG_M3), Rotation.from_quat(pose[3:]).as_matrix()
+            parts.append((mass, pose[:3], turn @ np.diag(mass / 3.0 * (half @ half - half**2)) @ turn.T))
+        combine(link, parts)
         self.notes.append(
             f"guess: {link.name} has no mass in the file; {link.mass:.3f} kg by its colliders (mass)"
         )
@@ -375,15 +371,17 @@ class _Grower:
             )
         for link in tree.links:
             for shape in link.shapes:
-                if shape.collides and shape.kind not in (
-                    "box",
-                    "sphere",
-                    "capsule",
-                    "cylinder",
-                    "mesh",
-                    "ellipsoid",
-                ):
+                if shape.collides and shape.kind not in KINDS:
                     self.problems.append(f"a collider of {link.name} is a {shape.kind}; make it a mesh")
+
+
+def combine(link: Link, parts: list[tuple[float, np.ndarray, np.ndarray]]) -> None:
+    """Give a link the mass of parts: mass, centre [3], inertia about it in the link's axes [3, 3] each."""
+    link.mass = sum(mass for mass, _, _ in parts)
+    link.com = np.asarray(sum(mass * at for mass, at, _ in parts)) / link.mass
+    for mass, at, inertia in parts:
+        arm = at - link.com
+        link.inertia = link.inertia + inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
 
 
 def shape_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.stats import qmc
 
 from vd.assets_usd.objects.geometry import (
     GRID_TURN,
@@ -139,8 +140,6 @@ def _joined(first: Solid, second: Solid) -> Solid:
 
 def _points_around(vertices: np.ndarray) -> tuple[np.ndarray, float]:
     """Points [SAMPLES, 3] that fill a box around vertices along their principal axes, and its volume."""
-    from scipy.stats import qmc
-
     axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     along = vertices @ axes.T
     side = (1.0 + 2.0 * MARGIN) * np.ptp(along, axis=0)

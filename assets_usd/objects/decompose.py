@@ -1,12 +1,14 @@
 """Convex decomposition of a mesh: CoACD in a child process with a limit of processor time."""
 
-import multiprocessing
 import os
 import resource
 import signal
 import time
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -21,8 +23,9 @@ from vd.assets_usd.objects.geometry import (
     sides_along_axes,
     simplify_hull,
 )
-from vd.assets_usd.objects.settings import LEAST_THRESHOLD, ImportSettings, MeshError
+from vd.assets_usd.objects.settings import LEAST_THRESHOLD, ImportSettings
 from vd.interrupt import end_with_parent
+from vd.workers import end_worker
 
 HULL_VERTICES = 32
 """Most vertices of a part."""
@@ -49,10 +52,6 @@ NEARLY = 1.1
 
 RUNS = 2
 """Most runs of CoACD for one mesh."""
-
-HANG_S = 20.0
-"""Wall-clock time, per second of processor time allowed, after which CoACD is taken to hang: a busy machine
-gives it a twentieth of a core at least."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +90,8 @@ def _coacd_parts(
     return [np.asarray(v, dtype=np.float64) for v, _ in parts]
 
 
-def _answer(pipe: Any, parent: int, seconds: float, *arguments: Any) -> None:
-    """CoACD in this process, which its limit of processor time ends, or the end of its parent."""
+def _limited(parent: int, seconds: float) -> None:
+    """Let this process end with its limit of processor time, or with its parent."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once: CoACD does not listen
     end_with_parent(parent)
     limit = int(time.process_time()) + max(1, round(seconds))
@@ -100,39 +99,19 @@ def _answer(pipe: Any, parent: int, seconds: float, *arguments: Any) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     os.environ["OMP_WAIT_POLICY"] = "passive"  # threads that wait for each other take no processor time
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    try:
-        pipe.send(_coacd_parts(*arguments) or "CoACD returned no part")
-    except Exception as error:  # the reason travels to the parent
-        pipe.send(f"{type(error).__name__}: {error}")
 
 
 def _parts_or_reason(seconds: float, *arguments: Any) -> list[np.ndarray] | str:
-    """CoACD's parts, or why there are none, from a child process: it may hang or crash.
-
-    Raises:
-        MeshError: It hangs.
-    """
-    context = multiprocessing.get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
-    child = context.Process(target=_answer, args=(sender, os.getpid(), seconds, *arguments))
-    child.start()
-    sender.close()
+    """CoACD's parts, or why there are none, from a child process: it may take too long, or crash."""
+    child = ProcessPoolExecutor(1, get_context("fork"), _limited, (os.getpid(), seconds))
     try:
-        if receiver.poll(HANG_S * seconds):
-            return receiver.recv()
-        raise MeshError(
-            f"CoACD hangs: no result within {HANG_S * seconds:g} s, though allowed only {seconds:g} s of "
-            "processor time; import it again"
-        )
-    except EOFError:
-        child.join()
-        if child.exitcode == -signal.SIGXCPU:
-            return f"no result after {seconds:g} s of processor time (--time-limit)"
-        return f"CoACD ended with exit code {child.exitcode}"
+        return child.submit(_coacd_parts, *arguments).result() or "CoACD returned no part"
+    except BrokenProcessPool:
+        return f"no result after {seconds:g} s of processor time (--time-limit), or it crashed"
+    except Exception as error:  # whatever CoACD raises
+        return f"{type(error).__name__}: {error}"
     finally:
-        child.kill()
-        child.join()
-        receiver.close()
+        end_worker(child)
 
 
 def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ...]:
@@ -163,9 +142,6 @@ def decompose(
         faces: [T, 3].
         settings: Its limits.
         max_vertices: Most vertices of a part.
-
-    Raises:
-        MeshError: CoACD hangs.
     """
     parts = _parts_or_reason(settings.time_limit, vertices, faces, settings, max_vertices)
     hulls = () if isinstance(parts, str) else tidy_hulls(parts, max_vertices)
@@ -218,9 +194,6 @@ def best_decomposition(
         faces: [T, 3].
         settings: Limits; its threshold is that of the first decomposition.
         error_of: Error of parts.
-
-    Raises:
-        MeshError: CoACD hangs.
     """
     few = min(USUAL_HULLS, settings.max_hulls)
     first = decompose(vertices, faces, replace(settings, max_hulls=few))

@@ -8,9 +8,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import warp as wp
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
+
+from vd.kernels.sensor.winding import inside_kernel
 
 VOXELS = 96
 """Voxels along the longest side of a voxelised solid: about 1 % of volume error on thin shapes."""
@@ -33,11 +36,15 @@ SLIVER_THICKNESS = 2e-3
 """A part thinner than this share of the longest side (0.25 mm of 12 cm) is no solid to collide with."""
 
 
-class Hull(NamedTuple):
-    """A convex polyhedron: ``vertices`` [V, 3] and outward triangles ``faces`` [T, 3]."""
+class Surface(NamedTuple):
+    """Triangles: ``vertices`` [V, 3], and ``faces`` [T, 3], outward where they are closed."""
 
     vertices: np.ndarray
     faces: np.ndarray
+
+
+Hull = Surface
+"""A convex polyhedron."""
 
 
 class Solid(NamedTuple):
@@ -113,10 +120,6 @@ def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 def inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, level: float = 0.5) -> np.ndarray:
     """Whether the winding number of a mesh [V, 3], [T, 3] exceeds ``level`` at points [n, 3], bool [n]."""
-    import warp as wp
-
-    from vd.kernels.sensor.winding import inside_kernel
-
     low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
 
     def on_device(places: np.ndarray) -> wp.array:

@@ -14,7 +14,6 @@ import numpy as np
 from vd.assets_usd.objects.bodies import body_of, cavity_share, error_of_parts
 from vd.assets_usd.objects.decompose import (
     GOOD_ERROR,
-    HANG_S,
     HULL_VERTICES,
     RUNS,
     Decomposition,
@@ -36,6 +35,7 @@ from vd.assets_usd.objects.plan import Job, check_target, find_meshes, plan_jobs
 from vd.assets_usd.objects.reading import declared_unit, load_mesh, mesh_kind
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.settings import ImportSettings, MeshError
+from vd.assets_usd.objects.usd_mesh import usd_files
 from vd.files import make_folder
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
@@ -51,8 +51,9 @@ MAX_ERROR, MAX_OFFSET = 1.0, 0.03
 on average, than this share of the longest side: 4 mm of 13 cm, where fingertips have a radius of 10 mm. Of
 thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as parts differs by its volume."""
 
-OVERHEAD_S = 600.0
-"""Wall-clock time that a mesh gets beside its runs of CoACD before it is taken to hang."""
+HANG_S, OVERHEAD_S = 20.0, 600.0
+"""Wall-clock time after which a mesh is taken to hang: for each second of processor time that CoACD may take,
+of which a busy machine gives it a twentieth of a core at least, and beside its runs."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,6 @@ def content_hash(job: Job, settings: ImportSettings) -> str:
     """Hash of all that decides the object: bytes of the mesh, name, licence, settings and code version."""
     files = [Path(job.source)]
     if mesh_kind(files[0]) == "usd":
-        from vd.assets_usd.objects.usd_mesh import usd_files
-
         files = usd_files(files[0])
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files))
     parts = {

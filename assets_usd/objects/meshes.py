@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+import trimesh
 
 from vd.assets_usd.objects.settings import DENSITIES_KG_M3, ImportSettings, MeshError
 from vd.paper import PAPER
@@ -44,8 +45,6 @@ def mean_width(vertices: np.ndarray) -> float:
     Returns:
         The mean width in the points' unit.
     """
-    import trimesh
-
     return float(trimesh.convex.convex_hull(vertices).integral_mean_curvature / (2.0 * np.pi))
 
 

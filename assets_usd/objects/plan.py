@@ -11,6 +11,7 @@ from vd.assets_usd.objects.model import object_files, stored_facts
 from vd.assets_usd.objects.reading import MESH_SUFFIXES
 from vd.assets_usd.objects.sets import is_built_in, objects_dir
 from vd.assets_usd.objects.settings import MeshError
+from vd.assets_usd.objects.usd_mesh import usd_files
 
 GENERIC_WORDS = frozenset(
     re.findall(
@@ -119,8 +120,6 @@ def _meshes_below(folder: Path) -> list[Path]:
 
 def _parts_of_usd(path: Path) -> set[Path]:
     """The other files a USD is composed of; none if it cannot be opened, which its import says."""
-    from vd.assets_usd.objects.usd_mesh import usd_files
-
     try:
         return set(usd_files(path)) - {path.resolve()}
     except MeshError:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
+from trimesh.util import append_faces
 
 from vd.assets_usd.objects.geometry import (
     Hull,
@@ -90,7 +91,6 @@ def asymmetry(model: ObjectModel) -> float:
 def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
     """Triangles of all parts, without those wholly inside another part: vertices [V, 3], faces [T, 3]."""
     vertices, faces = [], []
-    count = 0
     for i, hull in enumerate(hulls):
         inside = np.zeros(len(hull.faces), dtype=bool)
         for j, other in enumerate(hulls):
@@ -98,9 +98,9 @@ def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
                 inside |= (hull_depth(other, hull.vertices) < 0.0)[hull.faces].all(axis=1)
         used, index = np.unique(hull.faces[~inside], return_inverse=True)
         vertices.append(hull.vertices[used])
-        faces.append(index.reshape(-1, 3) + count)
-        count += len(used)
-    return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+        faces.append(index.reshape(-1, 3))
+    joined, triangles = append_faces(vertices, faces)
+    return joined, triangles.astype(np.int32)
 
 
 def is_connected(hulls: Sequence[Hull]) -> bool:

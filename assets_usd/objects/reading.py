@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from vd.assets_usd.objects.settings import MeshError
+from vd.assets_usd.objects.usd_mesh import read_usd, usd_unit
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".usd", ".usda", ".usdc", ".usdz")
 
@@ -54,8 +56,6 @@ def declared_unit(path: Path) -> float | None:
     """
     kind = mesh_kind(path)
     if kind == "usd":
-        from vd.assets_usd.objects.usd_mesh import usd_unit
-
         return usd_unit(path)
     return 1.0 if kind == "glb" else None
 
@@ -79,13 +79,9 @@ def load_points(path: Path) -> Any:
     Raises:
         MeshError: Unsupported, unreadable or cut short, or with non-finite vertices.
     """
-    import trimesh
-
     path = Path(path)
     kind = mesh_kind(path)
     if kind == "usd":
-        from vd.assets_usd.objects.usd_mesh import read_usd
-
         vertices, faces = read_usd(path)
     elif kind == "obj":
         vertices, faces = read_obj(path)
@@ -98,8 +94,6 @@ def load_points(path: Path) -> Any:
 
 
 def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    import trimesh
-
     with path.open("rb") as stream:  # of a text of points fewer would be read without a word
         said = re.search(rb"element\s+face\s+(\d+)", stream.read(HEAD_BYTES)) if kind == "ply" else None
     try:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from vd.assets_usd.objects.geometry import (
     SLIVER_THICKNESS,
@@ -97,8 +98,6 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
     Raises:
         MeshError: Nothing but degenerate faces, several bodies, or too thin.
     """
-    import trimesh
-
     notes: list[str] = []
     warnings: list[str] = []
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -144,8 +143,6 @@ def _opened_seams(mesh: Any) -> Any:
 
     Surfaces that only touch along an edge are closed, yet no manifold; apart from each other they are.
     """
-    import trimesh
-
     count = np.bincount(mesh.edges_unique_inverse)
     if count.max() <= 2:
         return mesh
@@ -168,8 +165,6 @@ def _opened_seams(mesh: Any) -> Any:
 
 def _pieces(mesh: Any) -> tuple[np.ndarray, list[Any]]:
     """Piece of each face [T], and the connected pieces; a torn surface counts as one."""
-    import trimesh
-
     of_face = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
     if of_face.max() >= MOST_PIECES:
         return np.zeros_like(of_face), [mesh]
@@ -214,8 +209,6 @@ def _largest_body(mesh: Any, warnings: list[str]) -> Any:
     Raises:
         MeshError: They are too large to be debris.
     """
-    import trimesh
-
     of_face, pieces = _pieces(mesh)
     low, high = np.stack([piece.bounds for piece in pieces], axis=1)
     high = high + APART * mesh.extents.max()
@@ -259,8 +252,6 @@ def _containers(pieces: list[Any], volume: np.ndarray) -> tuple[np.ndarray, np.n
 
 def _filled_holes(mesh: Any, notes: list[str]) -> Any:
     """The mesh with its holes closed by fans, if they are small together."""
-    import trimesh
-
     count = np.bincount(mesh.edges_unique_inverse)
     rim = mesh.edges[count[mesh.edges_unique_inverse] == 1]  # directed as in their faces
     if not len(rim):
@@ -295,8 +286,6 @@ def _turned_outward(
     A closed piece in another is a cavity if it is wound the other way round, and else inside of the solid.
     What is in a cavity is solid again.
     """
-    import trimesh
-
     of_face, pieces = _pieces(mesh)
     volume = _volumes(pieces)
     largest, smallest = _containers(pieces, volume)

@@ -3,14 +3,13 @@
 Lengths in the unit of the points, in their frame.
 """
 
-from typing import NamedTuple
-
 import numpy as np
+import trimesh
 import warp as wp
 from scipy.spatial import cKDTree
 from warp.geometry import IsoSurfaceMarchingCubes
 
-from vd.assets_usd.objects.geometry import spread
+from vd.assets_usd.objects.geometry import Surface, spread
 from vd.kernels.sensor.winding import winding_kernel
 
 NEIGHBOURS = 24
@@ -27,13 +26,6 @@ CELLS = 64
 """Cells of the grid along the longest side."""
 MARGIN_CELLS = 12
 """Cells that the grid reaches beyond the samples: where nothing was scanned the surface bulges."""
-
-
-class Surface(NamedTuple):
-    """A closed mesh: ``vertices`` [V, 3] and outward triangles ``faces`` [T, 3]."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
 
 
 def smooth(points: np.ndarray) -> np.ndarray:
@@ -61,8 +53,6 @@ def surface_of_scan(points: np.ndarray, device: str = "cpu") -> Surface:
     Raises:
         ValueError: They enclose nothing.
     """
-    import trimesh
-
     scanned = np.asarray(points, dtype=np.float64)
     points = smooth(scanned)
     noise = float(np.sqrt(np.square(points - scanned).sum(axis=1).mean()))

@@ -1,10 +1,9 @@
 """Named object sets in the asset cache: built-in ones are authored on first use."""
 
 import re
-import shutil
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from vd.assets_usd.cache import assets_dir
 from vd.assets_usd.objects.model import (
@@ -112,19 +111,14 @@ def _author(folder: Path) -> None:
     """Write a built-in set into its folder."""
     make_folder(folder.parent)
     # Several ranks may ask at once: each writes aside, and the first to finish moves it into place.
-    with writing(folder):
-        aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
-        with writing(folder):
-            write_set(aside, _built_in_models(folder.name))
-        aside.chmod(0o755)
+    with writing(folder), TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as aside:
+        made = Path(aside) / folder.name
+        write_set(made, _built_in_models(folder.name))
         try:
-            aside.replace(folder)
+            made.replace(folder)
         except OSError:
             if not _holds_objects(folder):
                 raise
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
 
 
 def set_files(names_or_paths: Iterable[str | Path]) -> list[Path]:

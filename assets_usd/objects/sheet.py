@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.files import atomic_path
@@ -26,19 +28,34 @@ TILE_IN, CAPTION_IN = 1.7, 0.55
 
 def _draw(axes: Any, parts: Sequence[tuple[np.ndarray, np.ndarray]], colours: Sequence[Any]) -> None:
     """Draw meshes so that they fill the axes."""
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
     corners = np.concatenate([vertices[faces] for vertices, faces in parts])
     colour = np.repeat(np.array(colours), [len(faces) for _, faces in parts], axis=0)
     surface = Poly3DCollection(corners, facecolors=colour, edgecolors=colour, linewidths=0.3, shade=True)
     axes.add_collection3d(surface)
     middle = (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))) / 2
-    radius = np.linalg.norm(corners - middle, axis=2).max()
+    look_at(axes, middle, np.linalg.norm(corners - middle, axis=2).max(), ZOOM)
+    axes.view_init(**VIEW)
+
+
+def look_at(axes: Any, middle: np.ndarray, radius: float, zoom: float) -> None:
+    """Show what is within a radius about a point [3], without perspective."""
     limits = np.stack([middle - radius, middle + radius], axis=1)
     axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2], proj_type="ortho")
-    axes.set_box_aspect((1, 1, 1), zoom=ZOOM)
-    axes.view_init(**VIEW)
+    axes.set_box_aspect((1, 1, 1), zoom=zoom)
     axes.set_axis_off()
+
+
+def part_colour(number: int, saturation: float, value: float) -> tuple[float, float, float]:
+    """A colour for each part that differs from those of the parts before."""
+    return colorsys.hsv_to_rgb((0.58 + number * 0.381966) % 1.0, saturation, value)
+
+
+def save_figure(figure: Any, path: Path) -> Path:
+    """Write a figure, atomically; the suffix says which format."""
+    with atomic_path(Path(path)) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of characters that its font lacks
+        figure.savefig(temporary)
+    return Path(path)
 
 
 def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path:
@@ -52,8 +69,6 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
     Returns:
         The path.
     """
-    from matplotlib.figure import Figure
-
     errors = [model.volume_error for model in models]
     title = f"{title}, objects: {len(models)}\nvolume error {np.median(errors):.1%}, worst {max(errors):.1%}"
     columns = max(1, round(np.sqrt(len(models) / 2)))
@@ -63,7 +78,7 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
     for i, model in enumerate(models):
         left, top = (i % columns) * 2 * TILE_IN, (rows - i // columns) * (TILE_IN + CAPTION_IN)
         hulls = [(hull.vertices, hull.faces) for hull in model.hulls]
-        hues = [colorsys.hsv_to_rgb((0.58 + k * 0.381966) % 1.0, 0.52, 0.97) for k in range(len(hulls))]
+        hues = [part_colour(k, 0.52, 0.97) for k in range(len(hulls))]
         for k, (drawn, colours) in enumerate(
             [([(model.vertices, model.faces)], [MESH_COLOUR]), (hulls, hues)]
         ):
@@ -75,7 +90,4 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
         colour = WARNING_COLOUR if model.warnings else "black"
         figure.text(*at, "\n".join([model.name, *said]), fontsize=7, va="top", color=colour)
     figure.text(0.01, 1.0 - 0.1 / size[1], title, fontsize=11, va="top")
-    with atomic_path(Path(path)) as temporary, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of characters that its font lacks
-        figure.savefig(temporary)
-    return Path(path)
+    return save_figure(figure, path)

@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pxr import Tf, Usd, UsdGeom, UsdUtils
+from trimesh.util import append_faces
 
 from vd.assets_usd.objects.model import is_object
 from vd.assets_usd.objects.settings import MeshError
@@ -21,8 +23,6 @@ def opened(path: Path) -> Any:
     Raises:
         MeshError: No USD, one of our own objects, or a file it refers to is missing.
     """
-    from pxr import Tf, Usd, UsdUtils
-
     silence = UsdUtils.CoalescingDiagnosticDelegate()  # what matters is raised here
     try:
         stage = Usd.Stage.Open(str(path))
@@ -40,8 +40,6 @@ def opened(path: Path) -> Any:
 
 def usd_unit(path: Path) -> float | None:
     """``metersPerUnit`` of a USD file; None where it is not authored."""
-    from pxr import UsdGeom
-
     stage = opened(path)
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         return None
@@ -65,8 +63,6 @@ def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         MeshError: No USD, nothing to read in it, or geometry of a kind that is not read.
     """
-    from pxr import UsdGeom
-
     stage = opened(path)
     prims = _shown(stage)
     unread = [prim for prim in prims if str(prim.GetTypeName()) in _UNREAD]
@@ -81,9 +77,7 @@ def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
     ]
     if not parts:
         raise MeshError("no visible mesh below the default prim")
-    start = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    vertices = np.concatenate([vertices for vertices, _ in parts])
-    faces = np.concatenate([faces + first for (_, faces), first in zip(parts, start, strict=False)])
+    vertices, faces = append_faces(*zip(*parts, strict=True))
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         vertices = vertices @ Z_FROM_Y.T
     return vertices, faces
@@ -91,8 +85,6 @@ def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _shown(stage: Any) -> list[Any]:
     """Visible prims below the default prim, instances included, with a purpose that is shown."""
-    from pxr import Usd, UsdGeom
-
     root = stage.GetDefaultPrim() or stage.GetPseudoRoot()
     purposes: dict[Any, str] = {}
     for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
@@ -105,8 +97,6 @@ def _shown(stage: Any) -> list[Any]:
 
 def _triangles(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of a UsdGeomMesh: polygons become fans."""
-    from pxr import Usd, UsdGeom
-
     first = Usd.TimeCode.EarliestTime()
     attributes = mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetFaceVertexCountsAttr()
     points, corners, counts = (attribute.Get(first) for attribute in attributes)

@@ -17,8 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import canonical_quat
 from vd.assets_usd.objects.geometry import (
+    Surface,
     convex_hull,
     random_surface_points,
+    sides_along_axes,
     solid_of_mesh,
     surface_points,
 )
@@ -26,7 +28,7 @@ from vd.assets_usd.objects.meshes import GUESSED_UNITS, LONGEST_SIDE_M, UNITS_M,
 from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectError, ObjectModel, build_model
 from vd.assets_usd.objects.reading import load_points
 from vd.assets_usd.objects.repair import repair_mesh
-from vd.assets_usd.objects.scans import Surface, surface_of_scan
+from vd.assets_usd.objects.scans import surface_of_scan
 from vd.assets_usd.objects.sets import load_set
 from vd.evaluate.rollout import draw_goals
 
@@ -173,18 +175,12 @@ def _surface(path: Path, generator: np.random.Generator) -> Surface:
         raise MeshError(f"{len(points)} points; {LEAST_POINTS} at least make a shape")
     away = cKDTree(points).query(points, NEIGHBOURS)[0][:, -1]
     points = points[away < FAR * np.median(away)]
-    if _thickness(points) < THINNEST * np.ptp(points, axis=0).max():
+    if sides_along_axes(points).min() < THINNEST * np.ptp(points, axis=0).max():
         raise MeshError("flat: the scan shows one side only")
     try:
         return surface_of_scan(points)
     except ValueError as error:
         raise MeshError(str(error)) from error
-
-
-def _thickness(points: np.ndarray) -> float:
-    """Least extent of points along their principal axes."""
-    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    return float(np.ptp(points @ axes.T, axis=0).min())
 
 
 def _unit(path: Path, longest: float) -> float:

@@ -15,7 +15,6 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from vd.config import to_dict
-from vd.deploy.loop.goals import one_object
 from vd.deploy.loop.mocap import Mocap, MocapError, read_mocap
 from vd.evaluate.statistics import TOLERANCES_RAD, Interval, median_interval, rate_intervals, symmetric_error
 from vd.hand_log import HandLog, read_log
@@ -95,6 +94,8 @@ class Score:
 
 def score(cfg: ScoreCfg) -> int:
     """Print the table; 1 if no trial could be scored."""
+    from vd.deploy.loop.goals import one_object
+
     log = read_log(cfg.log)
     symmetry = one_object(log.run["object"]["set"]).symmetry
     mocap = in_world(read_mocap(cfg.mocap, cfg.body), up=cfg.up, world=cfg.world, marker=cfg.marker)

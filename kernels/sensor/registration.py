@@ -85,27 +85,37 @@ def standing_out(eye: Eye, place: wp.vec3, world: int, nearness: wp.array3d[floa
     return wp.clamp(1.0 / near - eye.margin - seen[2], 0.0, far)
 
 
-@wp.func
-def placed(
-    shapes: Shapes,
-    eye: Eye,
-    rendered: int,
-    every: int,
-    world: int,
-    turn: wp.quat,
-    seen: wp.array2d[wp.vec3],
-    count: wp.array[int],
-) -> wp.transform:
-    """The shape in a given rotation, what would be seen of it where points are.
+@wp.kernel
+def place_poses_kernel(
+    # Model:
+    shapes: Shapes,  # the shapes
+    eye: Eye,  # the camera
+    rendered: int,  # 1 where a camera saw the points, 0 where they are of all sides
+    every: int,  # look at every so many-th sample
+    # In:
+    world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
+    turn_in: wp.array2d[wp.quat],  # [M, C] rotations
+    misfit_in: wp.array2d[float],  # [M, C] NEVER where nothing is to be done
+    seen_in: wp.array2d[wp.vec3],  # [N, P] points seen of the object, base frame [m]
+    count_in: wp.array[int],  # [N] how many there are
+    # Out:
+    pose_out: wp.array2d[wp.transform],  # [M, C] object frame in the base frame
+):
+    """Place the shape in given rotations, what would be seen of it where points are. Launch: [M, C].
 
     The mean of the samples that lie nearer to the camera than their mean, of all without a camera, comes to
     the mean of the seen points.
     """
+    row, c = wp.tid()
+    world = world_in[row]
+    if world < 0 or misfit_in[row, c] >= NEVER:
+        return
+    turn = turn_in[row, c]
     shape = shapes.world_shape[world]
     middle = wp.vec3()
-    for i in range(count[world]):
-        middle += seen[world, i]
-    middle = middle / wp.max(float(count[world]), 1.0)
+    for i in range(count_in[world]):
+        middle += seen_in[world, i]
+    middle = middle / wp.max(float(count_in[world]), 1.0)
     whole = wp.vec3()
     for i in range(0, shapes.samples.shape[1], every):
         whole += shapes.samples[shape, i]
@@ -122,67 +132,7 @@ def placed(
                 total += sample
                 near += 1.0
         part = total / wp.max(near, 1.0)
-    return wp.transform(middle - wp.quat_rotate(turn, shapes.world_scale[world] * part), turn)
-
-
-@wp.kernel
-def start_poses_kernel(
-    # Model:
-    shapes: Shapes,  # the shapes
-    eye: Eye,  # the camera
-    rendered: int,  # 1 where a camera saw the points, 0 where they are of all sides
-    every: int,  # look at every so many-th sample
-    # In:
-    world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
-    first_in: wp.array[int],  # [M] which rotation is the first of each row, counted on and around
-    rotation_in: wp.array[wp.quat],  # [H] rotations
-    seen_in: wp.array2d[wp.vec3],  # [N, P] points seen of the object, base frame [m]
-    count_in: wp.array[int],  # [N] how many there are
-    # Out:
-    pose_out: wp.array2d[wp.transform],  # [M, C] object frame in the base frame
-):
-    """Place the shape in given rotations, as :func:`placed` does. Launch: [M, C]."""
-    row, c = wp.tid()
-    world = world_in[row]
-    if world < 0:
-        return
-    turn = rotation_in[(first_in[row] + c) % rotation_in.shape[0]]
-    pose_out[row, c] = placed(shapes, eye, rendered, every, world, turn, seen_in, count_in)
-
-
-@wp.kernel
-def replace_poses_kernel(
-    # Model:
-    shapes: Shapes,  # the shapes
-    eye: Eye,  # the camera
-    rendered: int,  # 1 where a camera saw the points, 0 where they are of all sides
-    every: int,  # look at every so many-th sample
-    # In:
-    world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
-    worse: float,  # a pose fits as it did if its misfit is no more than so many times that before
-    pose_in: wp.array2d[wp.transform],  # [N, C] poses before, object frame in the base frame
-    misfit_in: wp.array2d[float],  # [N, C] their misfits, averaged over time [m^2]
-    cost_in: wp.array2d[float],  # [M, C] misfits of what became of them now [m^2]
-    seen_in: wp.array2d[wp.vec3],  # [N, P] points seen of the object, base frame [m]
-    count_in: wp.array[int],  # [N] how many there are
-    # Out:
-    pose_out: wp.array2d[wp.transform],  # [M, C] poses
-    cost_out: wp.array2d[float],  # [M, C] NEVER where a pose fits as it did and none is written, else 0
-):
-    """Put poses where points are now, turned as they were: what falls is soon too far. Launch: [M, C].
-
-    Only those that do not fit any more as they did.
-    """
-    row, c = wp.tid()
-    world = world_in[row]
-    if world < 0:
-        return
-    cost_out[row, c] = 0.0
-    if cost_in[row, c] <= worse * misfit_in[world, c]:
-        cost_out[row, c] = NEVER
-        return
-    turn = wp.transform_get_rotation(pose_in[world, c])
-    pose_out[row, c] = placed(shapes, eye, rendered, every, world, turn, seen_in, count_in)
+    pose_out[row, c] = wp.transform(middle - wp.quat_rotate(turn, shapes.world_scale[world] * part), turn)
 
 
 @wp.func
@@ -289,26 +239,6 @@ def fit_poses_kernel(
             out += length * length
             samples += 1.0
     misfit[row, c] = off / wp.max(points, 1.0) + out / wp.max(samples, 1.0)
-
-
-@wp.kernel
-def take_better_kernel(
-    # In:
-    world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
-    known: int,  # attempts, K
-    # In/Out:
-    pose: wp.array2d[wp.transform],  # [M, >= 2 K] poses: attempt k + K is another one at what k is
-    cost: wp.array2d[float],  # their misfits [m^2], likewise; NEVER of the second ones afterwards
-):
-    """Of each two attempts at the same pose take the better one. Launch: [M, K]."""
-    row, k = wp.tid()
-    if world_in[row] < 0:
-        return
-    again = known + k
-    if cost[row, again] < cost[row, k]:
-        pose[row, k] = pose[row, again]
-        cost[row, k] = cost[row, again]
-    cost[row, again] = NEVER
 
 
 @wp.kernel

@@ -11,22 +11,15 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def draw_pose_error_kernel(
     # Model:
-    size: wp.vec2,
+    size: wp.vec2,  # length of the displacement [m] and angle of the rotation [rad]
     # In:
-    mask_in: wp.array[int],
+    mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
     # In/Out:
-    rng: wp.array[wp.uint32],
+    rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    error_out: wp.array[wp.transform],
+    error_out: wp.array[wp.transform],  # [N] displacement, rotation about the object's origin, world frame
 ):
-    """Draw the error of the masked worlds, of uniform direction and axis. Launch: [N].
-
-    Args:
-        size: Length of the displacement [m] and angle of the rotation [rad].
-        mask_in: 1 where a world is drawn anew, shape [N].
-        rng: Random stream of each world, shape [N].
-        error_out: Displacement, and rotation about the object's origin, world frame, shape [N].
-    """
+    """Draw the error of the masked worlds, of uniform direction and axis. Launch: [N]."""
     world = wp.tid()
     if mask_in[world] == 0:
         return
@@ -40,18 +33,12 @@ def draw_pose_error_kernel(
 @wp.kernel
 def mistake_pose_kernel(
     # In:
-    error_in: wp.array[wp.transform],
-    joint_q_in: wp.array2d[float],
+    error_in: wp.array[wp.transform],  # [N] displacement d and rotation r of each object, world frame
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position p [m] and quaternion q
     # Out:
-    joint_q_out: wp.array2d[float],
+    joint_q_out: wp.array2d[float],  # [N, D + 7] the same as it is believed
 ):
-    """Copy positions, the object's with its error: p + d, r * q. Launch: [N].
-
-    Args:
-        error_in: Displacement d and rotation r of each object, world frame, shape [N].
-        joint_q_in: Hand joints [rad], object position p [m] and quaternion q, shape [N, D + 7].
-        joint_q_out: The same as it is believed, shape [N, D + 7].
-    """
+    """Copy positions, the object's with its error: p + d, r * q. Launch: [N]."""
     world = wp.tid()
     joints = joint_q_in.shape[1] - 7
     for joint in range(joints):

@@ -43,18 +43,12 @@ def start_places(*, up: bool = False) -> list[tuple[float, float, float]]:
 
 @wp.struct
 class OpenHand:
-    """S shapes of the hand as it stands after a reset: boxes with rounded edges, which capsules are too.
+    """S shapes of the hand as it stands after a reset: boxes with rounded edges, which capsules are too."""
 
-    pose: Pose of each shape, shape [S].
-    half: Half extents without the rounding [m], shape [S].
-    radius: Radius of the rounding [m], shape [S].
-    reach: Distance from its centre within which a sample counts as inside, at most [m], shape [S].
-    """
-
-    pose: wp.array[wp.transform]
-    half: wp.array[wp.vec3]
-    radius: wp.array[float]
-    reach: wp.array[float]
+    pose: wp.array[wp.transform]  # [S] pose of each shape
+    half: wp.array[wp.vec3]  # [S] half extents without the rounding [m]
+    radius: wp.array[float]  # [S] radius of the rounding [m]
+    reach: wp.array[float]  # [S] distance from its centre within which a sample counts as inside, at most [m]
 
 
 @wp.func
@@ -68,34 +62,20 @@ def depth_in_box(point: wp.vec3, half: wp.vec3, radius: float) -> float:
 @wp.kernel
 def start_depth_kernel(
     # Model:
-    hand: OpenHand,
-    points: wp.array2d[wp.vec3],
-    world_object: wp.array[int],
-    world_scale: wp.array[float],
-    places: wp.array[wp.vec3],
-    table_top: float,
-    object_column: int,
+    hand: OpenHand,  # the hand after a reset
+    points: wp.array2d[wp.vec3],  # [K, P] surface points of each object, object frame [m]
+    world_object: wp.array[int],  # [N] object of each world
+    world_scale: wp.array[float],  # [N] factor on the object's size in each world
+    places: wp.array[wp.vec3],  # [C] displacements of the object [m]
+    table_top: float,  # height of the table's top [m]
+    object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
     # In:
-    reset_in: wp.array[int],
-    joint_q_in: wp.array2d[float],
+    reset_in: wp.array[int],  # [N] 1 where the world is reset; others are left as they are
+    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
     # In/Out:
-    depth: wp.array2d[float],
+    depth: wp.array2d[float],  # [N, C] depth beyond what is allowed [m], 0 before; raised to the deepest
 ):
-    """How deep the object would start in hand or table at each place. Launch: [N, C, CHUNKS].
-
-    Args:
-        hand: The hand after a reset.
-        points: Surface points of each object, object frame [m], shape [K, P].
-        world_object: Object of each world, shape [N].
-        world_scale: Factor on the object's size in each world, shape [N].
-        places: Displacements of the object [m], shape [C].
-        table_top: Height of the table's top [m].
-        object_column: Column of the object's position in ``joint_q_in``; its quaternion follows.
-        reset_in: 1 where the world is reset; others are left as they are, shape [N].
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        depth: Depth of the deepest sample beyond what is allowed [m], 0 where none is; raised from what it
-            is, shape [N, C].
-    """
+    """How deep the object would start in hand or table at each place. Launch: [N, C, CHUNKS]."""
     world, place, chunk = wp.tid()
     if reset_in[world] != 1:
         return
@@ -120,23 +100,15 @@ def start_depth_kernel(
 @wp.kernel
 def move_start_kernel(
     # Model:
-    places: wp.array[wp.vec3],
-    object_column: int,
+    places: wp.array[wp.vec3],  # [C] displacements of the object [m]
+    object_column: int,  # column of the object's position in ``joint_q``
     # In:
-    reset_in: wp.array[int],
+    reset_in: wp.array[int],  # [N] 1 where the world is reset; others are left as they are
     # In/Out:
-    depth: wp.array2d[float],
-    joint_q: wp.array2d[float],
+    depth: wp.array2d[float],  # [N, C] depth at each place [m], which becomes 0 for the next reset
+    joint_q: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
 ):
-    """Move the object to the place of least depth, of several the first. Launch: [N].
-
-    Args:
-        places: Displacements of the object [m], shape [C].
-        object_column: Column of the object's position in ``joint_q``.
-        reset_in: 1 where the world is reset; others are left as they are, shape [N].
-        depth: Depth at each place [m], which becomes 0 for the next reset, shape [N, C].
-        joint_q: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-    """
+    """Move the object to the place of least depth, of several the first. Launch: [N]."""
     world = wp.tid()
     if reset_in[world] != 1:
         return

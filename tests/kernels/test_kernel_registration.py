@@ -14,9 +14,7 @@ from vd.kernels.sensor.registration import (
     fit_poses_kernel,
     keep_poses_kernel,
     nearness_kernel,
-    replace_poses_kernel,
-    start_poses_kernel,
-    take_better_kernel,
+    place_poses_kernel,
 )
 from vd.kernels.sensor.shape_grids import off_mesh_kernel, shape_distance_kernel
 
@@ -198,62 +196,19 @@ def test_the_nearest_of_each_cell_is_kept(device, seed):
 
 @given(seed=seeds, rendered=st.booleans(), every=st.integers(1, 3))
 @EXAMPLES
-def test_a_start_puts_the_near_side_where_the_points_are(device, seed, rendered, every):
+def test_the_near_side_is_put_where_the_points_are(device, seed, rendered, every):
     scene = Scene(seed)
-    rotations = Rotation.random(6, rng=scene.rng)
-    first = scene.rng.integers(0, 6, len(scene.row_world))
-    inputs = [scene.model(), scene.camera(), int(rendered), every, scene.row_world, first]
-    inputs += [rotations.as_quat(), scene.seen, scene.count]
-    shape = (len(scene.row_world), 4)
-    (out,) = launch(start_poses_kernel, shape, inputs, device, shape)
-    for row, world in enumerate(scene.row_world):
-        for c in range(4):
-            turn = rotations[(first[row] + c) % 6]
-            place = scene.placed(world, turn, every, rendered=rendered)
-            np.testing.assert_allclose(out[row, c, :3], place, atol=1e-5)
-            np.testing.assert_allclose(out[row, c, 3:], turn.as_quat(), atol=1e-6)
-
-
-@given(seed=seeds, rendered=st.booleans(), every=st.integers(1, 3))
-@EXAMPLES
-def test_poses_that_fit_no_more_are_put_where_the_points_are_and_stay_turned(device, seed, rendered, every):
-    scene, worse, poses = Scene(seed), 1.5, 3
-    rows, before = len(scene.row_world), scene.random_poses(scene.worlds, poses)
-    misfit = scene.rng.uniform(0.1, 1.0, (scene.worlds, poses))
-    now = scene.rng.uniform(0.1, 1.0, (rows, poses))
-    inputs = [scene.model(), scene.camera(), int(rendered), every, scene.row_world, worse]
-    inputs += [before, misfit, now, scene.seen, scene.count]
-    out, cost = launch(replace_poses_kernel, (rows, poses), inputs, device, *[(rows, poses)] * 2)
-    for row, world in enumerate(scene.row_world):
-        for c in range(poses):
-            fits = now[row, c] <= worse * misfit[world, c]
-            assert cost[row, c] == (np.float32(NEVER) if fits else 0.0)
-            if fits:
-                assert np.isnan(out[row, c]).all()
-                continue
-            turn = Rotation.from_quat(before[world, c, 3:])
-            place = scene.placed(world, turn, every, rendered=rendered)
-            np.testing.assert_allclose(out[row, c, :3], place, atol=1e-5)
-            np.testing.assert_allclose(out[row, c, 3:], before[world, c, 3:], atol=1e-6)
-
-
-@given(seed=seeds)
-@EXAMPLES
-def test_of_two_attempts_the_better_one_is_taken(device, seed):
-    scene = Scene(seed)
-    rows, kept, candidates = len(scene.row_world), 3, 8
-    found, cost = scene.random_poses(rows, candidates), scene.rng.uniform(0.1, 1.0, (rows, candidates))
-    arrays = [device_array(found, wp.transform, device), device_array(cost, float, device)]
-    row_world = np.where(np.arange(rows) == 1, -1, scene.row_world)
-    launch(take_better_kernel, (rows, kept), [row_world, kept, *arrays], device)
-    expected, poses = cost.copy(), found.copy()
-    for row in np.flatnonzero(row_world >= 0):
-        for k in range(kept):
-            best = min((k, k + kept), key=lambda c, row=row: cost[row, c])
-            expected[row, k], poses[row, k] = cost[row, best], found[row, best]
-        expected[row, kept : 2 * kept] = NEVER
-    np.testing.assert_allclose(arrays[1].numpy(), expected, rtol=1e-6)
-    np.testing.assert_allclose(arrays[0].numpy(), poses, atol=1e-6)
+    shape = (len(scene.row_world), scene.poses)
+    misfit = np.where(scene.rng.random(shape) < 0.3, NEVER, 0.0)
+    inputs = [scene.model(), scene.camera(), int(rendered), every, scene.row_world]
+    inputs += [scene.pose[..., 3:], misfit, scene.seen, scene.count]
+    (out,) = launch(place_poses_kernel, shape, inputs, device, shape)
+    assert np.isnan(out[misfit > 0.0]).all()
+    for row, c in np.argwhere(misfit == 0.0):
+        turn = Rotation.from_quat(scene.pose[row, c, 3:])
+        place = scene.placed(scene.row_world[row], turn, every, rendered=rendered)
+        np.testing.assert_allclose(out[row, c, :3], place, atol=1e-5)
+        np.testing.assert_allclose(out[row, c, 3:], scene.pose[row, c, 3:], atol=1e-6)
 
 
 @given(

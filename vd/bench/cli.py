@@ -105,7 +105,7 @@ class PhysicsCommand(Measurement):
 
 @dataclass(frozen=True)
 class DepthCommand(Measurement):
-    """Depth images and clouds per second, beside Newton's camera at the same size in the same run."""
+    """Depth images and clouds per second."""
 
     envs: tuple[int, ...] = (256, 1024, 4096)
     """Numbers of environments to measure; 1 for the figure at deployment on a CPU."""

@@ -1,8 +1,7 @@
-"""``vd-bench depth``: depth images and clouds per second, beside Newton's camera on the same scene.
+"""``vd-bench depth``: depth images and clouds per second.
 
-Hands of 16 links in random poses around the reset, a different object in each block of environments near the
-table. Rates count images, each from new poses: Newton's include the refit of its hierarchies, which moving
-bodies need, ours the placing of meshes. That both show the same is a matter of tests.
+Hands in random poses around the reset, a different object in each block of environments near the table. Rates
+count images, each with the placing of meshes.
 """
 
 from typing import Any
@@ -10,10 +9,8 @@ from typing import Any
 import newton
 import numpy as np
 import warp as wp
-from newton.sensors import SensorCamera
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.bench.sim import seconds_per_call
@@ -31,9 +28,6 @@ OBJECT_SPREAD_M = 0.01
 LEAST_TIME_S = 1.0
 """Each rate is the mean over about this time, after a warm-up."""
 
-NEWTON_FROM_OPTICAL = Rotation.from_euler("x", 180, degrees=True)
-"""Newton's cameras look along -z with +y up; the optical frame along +z with +y down."""
-
 
 def captured(function: Any, device: str) -> Any:
     """``function`` as the launch of one graph."""
@@ -43,24 +37,16 @@ def captured(function: Any, device: str) -> Any:
 
 
 def bench_scene(
-    objects: list[ObjectModel], envs: int, hand: str, device: str, seed: int
+    objects: list[ObjectModel], envs: int, hand: str, device: str, seed: int, *, visuals: bool = False
 ) -> tuple[Scene, Any]:
-    """A scene with visual shapes, and a Newton state with random poses.
-
-    Args:
-        objects: Objects to spread over the environments; the first ones if there are fewer environments.
-        envs: Number of environments.
-        hand: Name of a hand.
-        device: Warp device.
-        seed: Of the poses.
-    """
+    """A scene, and a Newton state with random poses; of few environments fewer objects."""
     scene = build_scene(
         hand=load_hand(hand),
         objects=objects[:envs],
         num_envs=envs,
         cfg=SimCfg(),
         device=device,
-        visuals=True,
+        visuals=visuals,
     )
     state = scene.model.state()
     pose(scene, state, np.random.default_rng(seed))
@@ -78,46 +64,6 @@ def pose(scene: Scene, state: Any, generator: np.random.Generator) -> None:
     newton.eval_fk(scene.model, state.joint_q, state.joint_qd, state)
 
 
-class NewtonCamera:
-    """Newton's ray-traced camera with the hand's viewpoint in every world, forward depth only."""
-
-    def __init__(self, scene: Scene, camera_q: np.ndarray):
-        """Prepare rays and image.
-
-        Args:
-            scene: Environments, built with visual shapes.
-            camera_q: Optical frames in the world frame, shape [N, 7].
-        """
-        self.model, camera = scene.model, scene.hand.camera
-        device = self.model.device
-        self.sensor = SensorCamera(self.model, load_textures=False)
-        self.rays = newton_rays(camera, str(device))
-        turned = (Rotation.from_quat(camera_q[:, 3:]) * NEWTON_FROM_OPTICAL).as_quat()
-        poses = np.concatenate([camera_q[:, :3], turned], axis=1).astype(np.float32)
-        self.poses = wp.array(poses, dtype=wp.transformf, device=device)
-        self.depth = self.sensor.allocate_image_depth_forward(len(poses), camera.width, camera.height)
-
-    def refit(self, state: Any) -> None:
-        """Follow the bodies with the hierarchies."""
-        self.model.bvh_refit_shapes(state)
-
-    def render(self, state: Any) -> None:
-        """Draw, without a refit."""
-        self.sensor.update(state, self.poses, self.rays, forward_depth_image=self.depth)
-
-
-def newton_rays(camera: CameraModel, device: str) -> wp.array:
-    """Rays of a camera with a centred principal point, in Newton's form."""
-    return SensorCamera.compute_camera_rays_pinhole(
-        camera.width,
-        camera.height,
-        focal_length=camera.fx,
-        horizontal_aperture=float(camera.width),
-        vertical_aperture=camera.height * camera.fx / camera.fy,
-        device=device,
-    )
-
-
 def rate(envs: int, function: Any, device: str) -> float:
     """Images per second of a function that takes one in every world; waits for the device."""
     function()
@@ -130,8 +76,8 @@ def measure(objects: list[ObjectModel], envs: int, device: str, *, hand: str, se
     """Images per second of so many environments.
 
     Returns:
-        ``envs``; ``newton``: of Newton's ``SensorCamera``, forward depth only; ``images``: ours, depth alone;
-        ``clouds``: ours with a cloud of each image; ``points`` of a cloud, mean over environments.
+        ``envs``; ``images``: depth alone; ``clouds``: with a cloud of each image; ``points`` of a cloud, mean
+        over environments.
     """
     scene, state = bench_scene(objects, envs, hand, device, seed)
     body_q = state.body_q.reshape((envs, -1))
@@ -140,11 +86,4 @@ def measure(objects: list[ObjectModel], envs: int, device: str, *, hand: str, se
         ours = DepthCamera.of_scene(scene, body_q, cfg)
         ours.capture()
         row[name] = rate(envs, captured(ours.capture, device), device)
-    row["points"] = float(ours.count.numpy().mean())
-    theirs = NewtonCamera(scene, ours.camera_q.numpy())
-
-    def frame() -> None:
-        theirs.refit(state)
-        theirs.render(state)
-
-    return row | {"newton": rate(envs, frame, device)}
+    return row | {"points": float(ours.count.numpy().mean())}

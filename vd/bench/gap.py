@@ -17,12 +17,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from vd.assets_usd.hands import HANDS
+import warp as wp
+
+from vd.assets_usd.hands import HANDS, load_hand
 from vd.bench.gap_score import KINDS, Case, said, score
 from vd.bench.gap_sizes import showing
 from vd.bench.hidden_plant import OUTSIDE
 from vd.bench.hide import hide
 from vd.files import make_folder, write_json
+from vd.gap import workflow
+from vd.gap.torque_unit import in_known_unit
+from vd.kernels.servo import chains
 from vd.versions import source_commit
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
@@ -44,15 +49,7 @@ def battery(
     seeds: int = 5,
     first_seed: int = 0,
 ) -> list[Case]:
-    """The cases.
-
-    Args:
-        model: A hand, of which it takes one finger, or ``servo``.
-        kinds: Kinds of cases, of :data:`KINDS`.
-        effects: Effects to hide; empty: all that show on the model.
-        sizes: Sizes of single effects and of those outside the table.
-        seeds: Recordings of each effect and size.
-        first_seed: Seed of the first: recordings that the method has not been tuned on.
+    """The cases; arguments as in :class:`vd.bench.cli.GapCommand`.
 
     Raises:
         ValueError: An effect is unknown, or cannot show on the model.
@@ -84,21 +81,12 @@ def battery(
 
 
 def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
-    """Make the recording, analyse it, and compare; writes ``folder/CASE.json``.
-
-    Args:
-        case: The case.
-        folder: Folder of results.
-        device: Warp device of the analysis.
+    """Make the recording, analyse it on a Warp device, and compare; writes ``folder/CASE.json``.
 
     Returns:
         What :func:`score` returns, or the traceback under ``error``; with the commit and the processor time
         of this process ``cpu_s`` [s].
     """
-    from vd.assets_usd.hands import load_hand
-    from vd.gap import workflow
-    from vd.gap.torque_unit import in_known_unit
-
     quiet_warp()
     begin = time.process_time()
     try:
@@ -118,22 +106,11 @@ def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
 
 
 def run_battery(
-    cases: Sequence[Case],
-    folder: Path,
-    *,
-    jobs: int = 1,
-    device: str = "cpu",
+    cases: Sequence[Case], folder: Path, *, jobs: int = 1, device: str = "cpu"
 ) -> list[dict[str, Any]]:
-    """Run the cases that have no result yet, and print a line for each; what failed before comes last.
+    """Run the cases that have no result in the folder yet, with a line for each; returns the results of all.
 
-    Args:
-        cases: The battery.
-        folder: Folder of results.
-        jobs: Processes.
-        device: Warp device of the analyses.
-
-    Returns:
-        The results of all cases.
+    What failed before comes last.
     """
     make_folder(folder)
     done = {case: read_result(folder / f"{case.name}.json") for case in cases}
@@ -161,15 +138,10 @@ def run_battery(
 
 def _prepare(device: str, models: set[str]) -> None:
     """Fill the caches of kernels and hands before many processes want the same at once."""
-    import warp as wp
-
-    import vd.kernels.servo.chains
-    from vd.assets_usd.hands import load_hand
-
     for model in models & set(HANDS):
         load_hand(model)
     quiet_warp()
-    wp.load_module(vd.kernels.servo.chains, device=device)
+    wp.load_module(chains, device=device)
 
 
 def read_result(path: Path) -> dict[str, Any] | None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.signal import lfilter
 
 from vd.bench.hidden_finger import Finger, FingerBody, slip
 
@@ -163,8 +164,6 @@ class _Batch:
 
     def references(self) -> np.ndarray:
         """What the servos pull to, before the joint has a say: the command's path [K, PARTS, B, J] [rad]."""
-        from scipy.signal import lfilter
-
         dt = self.dt / PARTS
         edges = np.arange(self.steps * PARTS + 1) * dt
         delay, sigma = self.of("command_delay", "delay_s"), self.of("command_jitter", "sigma_s")

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from vd.assets_usd.hands import load_hand
 from vd.bench.hidden_finger import FingerBody
 from vd.bench.hidden_plant import OUTSIDE, Motion, Plant, Run, simulate
 from vd.files import write_json
@@ -314,8 +315,6 @@ def _spread(rng: np.random.Generator, width: float, shape: tuple[int, ...]) -> n
 
 
 def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
-    from vd.assets_usd.hands import load_hand
-
     if hiding.model not in FINGERS:
         raise ValueError(f"model {hiding.model!r}: choose {', '.join((*FINGERS, *BARE_MODELS))}")
     hand = load_hand(hiding.model)

@@ -9,17 +9,17 @@ import importlib
 import pkgutil
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 
+import vd.kernels
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage
 from vd.envs.reorient import ReorientEnv
-
-if TYPE_CHECKING:
-    from vd.policy import TrainedPolicy
+from vd.policy import TrainedPolicy
 
 WARM_UP_STEPS = 36
 """Control steps before timing: objects have landed and fingers reached them (3 s)."""
@@ -56,8 +56,6 @@ def own_share(env: ReorientEnv) -> float:
 
 def own_kernel_names() -> set[str]:
     """Names of all kernels of :mod:`vd.kernels`."""
-    import vd.kernels
-
     names = set()
     for info in pkgutil.walk_packages(vd.kernels.__path__, "vd.kernels."):
         module = importlib.import_module(info.name)
@@ -65,7 +63,7 @@ def own_kernel_names() -> set[str]:
     return names
 
 
-def measure(cfg: ReorientCfg, device: str, *, teacher: "TrainedPolicy", calls: int = 24) -> dict[str, float]:
+def measure(cfg: ReorientCfg, device: str, *, teacher: TrainedPolicy, calls: int = 24) -> dict[str, float]:
     """Measure one configuration; raises if any contact was lost.
 
     Args:
@@ -125,8 +123,6 @@ def measure(cfg: ReorientCfg, device: str, *, teacher: "TrainedPolicy", calls: i
 
 def free_memory(device: str) -> int:
     """Free memory of a CUDA device [bytes], after returning what allocators hold back."""
-    import torch
-
     gc.collect()  # an earlier row's simulation may still wait for it
     torch.cuda.empty_cache()
     wp.set_mempool_release_threshold(device, 0)

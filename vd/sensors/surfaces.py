@@ -1,21 +1,14 @@
 """The triangles that a camera can see in each world, gathered for the device."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from trimesh.util import append_faces
 
 from vd.assets_usd.hand_visuals import read_surfaces
+from vd.assets_usd.objects.geometry import Surface
 from vd.sim.scene import Scene
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Triangles fixed to a body: vertices [V, 3] [m] in its frame, faces [T, 3]."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
 
 
 class SurfaceSet:
@@ -36,7 +29,7 @@ class SurfaceSet:
         """Copy meshes to the device.
 
         Args:
-            meshes: The meshes.
+            meshes: The meshes, each in the frame of its body [m].
             shape_body: Body that carries each shape, an index within a world; -1 for the world, shape [S].
             shape_mesh: Mesh of each shape in each world, shape [N, S].
             shape_scale: Size factor of each shape in each world, shape [N, S].
@@ -49,13 +42,12 @@ class SurfaceSet:
         if empty := [i for i, mesh in enumerate(meshes) if not len(mesh.faces)]:
             raise ValueError(f"meshes {empty} have no triangles; leave them out")
         sizes = np.array([len(mesh.faces) for mesh in meshes])
-        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-        triangles = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)])
+        vertices, triangles = append_faces(*zip(*meshes, strict=True))
 
         def array(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(values, dtype=dtype, device=device)
 
-        self.points = array(np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32), wp.vec3)
+        self.points = array(vertices.astype(np.float32), wp.vec3)
         """Vertices of all meshes in their frames [m], shape [V]."""
         self.triangles = array(triangles.astype(np.int32), wp.vec3i)
         """Their triangles, mesh after mesh, shape [F]."""
@@ -77,22 +69,22 @@ class SurfaceSet:
 
 def scene_surfaces(scene: Scene) -> SurfaceSet:
     """What a camera sees of a scene but the table: the hand's links, and the object as its last shape."""
-    parts = read_surfaces(scene.hand)
+    drawn = read_surfaces(scene.hand)
     meshes: list[Surface] = []
     known: dict[bytes, int] = {}
 
-    def index(vertices: np.ndarray, faces: np.ndarray) -> int:
-        key = vertices.tobytes() + faces.tobytes()
+    def index(surface: Surface) -> int:
+        key = surface.vertices.tobytes() + surface.faces.tobytes()
         if key not in known:
             known[key] = len(meshes)
-            meshes.append(Surface(vertices, faces))
+            meshes.append(surface)
         return known[key]
 
-    links = [index(part.vertices, part.faces) for part in parts]
-    places = np.array([index(item.vertices, item.faces) for item in scene.objects])
+    links = [index(surface) for surface in drawn.values()]
+    places = np.array([index(Surface(item.vertices, item.faces)) for item in scene.objects])
     shape_mesh = np.column_stack([np.tile(links, (scene.num_envs, 1)), places[scene.world_object]])
     shape_scale = np.ones(shape_mesh.shape)
     shape_scale[:, -1] = scene.world_scale
-    bodies = [*(scene.link_body[part.link] for part in parts), scene.object_body]
+    bodies = [*(scene.link_body[link] for link in drawn), scene.object_body]
     device = str(scene.model.device)
     return SurfaceSet(meshes, np.array(bodies), shape_mesh, shape_scale, device=device)

@@ -19,13 +19,12 @@ from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.kernels.launch import launch
 from vd.kernels.sensor.registration import (
+    NEVER,
     Eye,
     fit_poses_kernel,
     keep_poses_kernel,
     nearness_kernel,
-    replace_poses_kernel,
-    start_poses_kernel,
-    take_better_kernel,
+    place_poses_kernel,
 )
 from vd.kernels.sensor.shape_grids import Shapes, off_mesh_kernel, shape_distance_kernel
 
@@ -157,7 +156,7 @@ class Registration:
             cells = (math.ceil(camera.height / CELL_PX), math.ceil(camera.width / CELL_PX))
         self._placing = [shapes, self._eye, int(camera is not None), EVERY_SAMPLE]
         self._nearness = wp.zeros((envs, *cells), dtype=float, device=device)
-        self._rotations = array(even_rotations(ROTATIONS), wp.quat)
+        self._rotations = torch.tensor(even_rotations(ROTATIONS), dtype=torch.float32, device=place)
         self.pose = torch.zeros((envs, KEPT, 7), device=place)
         self.pose[..., 6] = 1.0
         self.misfit = torch.zeros((envs, KEPT), device=place)
@@ -219,10 +218,9 @@ class Registration:
         self, envs: wp.array, steps: int, every: int, inputs: list[wp.array]
     ) -> tuple[wp.array, wp.array]:
         """Poses in all rotations [M, H], improved, and their misfits."""
-        first = wp.zeros(len(envs), dtype=int, device=self.device)
         poses = wp.empty((len(envs), ROTATIONS), dtype=wp.transform, device=self.device)
         cost = wp.zeros(poses.shape, dtype=float, device=self.device)
-        self._start(poses, envs, first, inputs)
+        self._place(poses, cost, envs, self._rotations.expand(len(envs), -1, -1), inputs)
         self._fit(poses, cost, envs, steps, every, inputs)
         return poses, cost
 
@@ -244,24 +242,26 @@ class Registration:
         self._cost.zero_()
         wp.copy(self._found[:, known], self._kept[0])
         self._fit(self._found[:, known], self._cost[:, known], envs, STEPS, 1, inputs)
-        # What falls is 4 cm farther at the next look, and steps look FAR_M far.
-        launch(
-            replace_poses_kernel,
-            (len(envs), KEPT),
-            [*self._placing, envs, WORSE, *self._kept, self._cost[:, known], *inputs],
-            [self._found[:, again], self._cost[:, again]],
-        )
-        self._fit(self._found[:, again], self._cost[:, again], envs, STEPS, 1, inputs)
-        first = wp.from_torch((self.looks * STRIDE) % ROTATIONS)
-        self._start(self._found[:, others], envs, first, inputs)
-        self._fit(self._found[:, others], self._cost[:, others], envs, STEPS, 1, inputs)
-        launch(take_better_kernel, (len(envs), KEPT), [envs, KEPT], [self._found, self._cost])
+        # What falls is 4 cm farther at the next look, and steps look FAR_M far: poses that do not fit as they
+        # did are put where points are now, turned as they were.
+        pose, cost = wp.to_torch(self._found), wp.to_torch(self._cost)
+        cost[:, again].masked_fill_(cost[:, known] <= WORSE * self.misfit, float(NEVER))
+        tried = (self.looks[:, None] * STRIDE + torch.arange(OTHERS, device=cost.device)) % ROTATIONS
+        for columns, turns in ((again, self.pose[..., 3:]), (others, self._rotations[tried])):
+            self._place(self._found[:, columns], self._cost[:, columns], envs, turns, inputs)
+            self._fit(self._found[:, columns], self._cost[:, columns], envs, STEPS, 1, inputs)
+        better = cost[:, again] < cost[:, known]  # of two attempts at one pose
+        pose[:, known] = torch.where(better[..., None], pose[:, again], pose[:, known])
+        cost[:, known] = torch.where(better, cost[:, again], cost[:, known])
+        cost[:, again] = float(NEVER)
         self._keep(KEPT, envs, self._found, self._cost)
 
-    def _start(self, pose: wp.array, envs: wp.array, first: wp.array, inputs: list[wp.array]) -> None:
-        """Write poses [M, C] in so many rotations, from the given ones on."""
-        given = [*self._placing, envs, first, self._rotations]
-        launch(start_poses_kernel, pose.shape, [*given, *inputs], [pose])
+    def _place(
+        self, pose: wp.array, cost: wp.array, envs: wp.array, turns: torch.Tensor, inputs: list[wp.array]
+    ) -> None:
+        """Write poses [M, C] in rotations [M, C, 4], but where the misfit is NEVER."""
+        given = [*self._placing, envs, wp.from_torch(turns.contiguous(), dtype=wp.quat), cost]
+        launch(place_poses_kernel, pose.shape, [*given, *inputs], [pose])
 
     def _fit(
         self, pose: wp.array, cost: wp.array, envs: wp.array, steps: int, every: int, inputs: list[wp.array]
