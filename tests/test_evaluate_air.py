@@ -10,7 +10,6 @@ from test_evaluate_page import read_page
 from test_evaluate_trace import STEP_RAD, HeldEnv, drawn, protocol
 
 from vd.evaluate.air import air_turns, judge_in_air, record_in_air
-from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.goals import AIR_S
 from vd.evaluate.page import terminal_text, write_page
 from vd.evaluate.result import Agent, Result
@@ -69,7 +68,7 @@ def flown(blind_rad=None, **settings):
 
 def row_of(trace, **agent):
     """The only row, of a policy that is stopped in its own way."""
-    who = Agent("p", "teacher", "state", lambda _: StoppingRule(), predicts=False, **agent)
+    who = Agent("p", "teacher", "state", lambda _: StoppingRule(), **agent)
     (row,) = judge_in_air(trace, protocol(EPISODES), list(OBJECTS), who, group="held-out")
     return row
 
@@ -116,10 +115,3 @@ def test_a_stop_away_from_the_goal_ends_the_row():
     far = rotation_angle(trace.start_quat, trace.goal_quat) > 1.0
     assert far.any() and trace.stopped.all() and not trace.reached[far].any()
     assert row_of(trace).overall.outcomes["orientation error"].value >= far.mean()
-
-
-def test_its_times_are_its_own():
-    for other in ({"in_air": True}, {"episode_s": 3.0}):
-        with pytest.raises(ValueError, match="leave --in-air and --episode-s out"):
-            EvalCfg(policies=("zero",), air_goals=True, **other).validate()
-    assert EvalCfg(air_goals=True).limit_s == 39.0

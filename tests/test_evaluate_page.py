@@ -44,6 +44,10 @@ def test_the_page_is_one_offline_file_with_rates_intervals_and_warnings(tmp_path
     assert "Objects with warnings" in text and "b&lt;i&gt;" in text and "open: a sheet" in text
     assert "over the episodes of each object" in text and "over whole objects" not in text
     assert "warning b<i>: open: a sheet" in terminal_text(found)
+    assert "Predicted distance" not in text
+    write_page(Result(tuple(compared())), tmp_path / "camera.html")
+    text, _ = read_page(tmp_path / "camera.html")
+    assert "Predicted distance" in text and "complete clouds" in text and "500 exact points" not in text
 
 
 def test_the_page_says_which_task_it_was(tmp_path, found):
@@ -61,12 +65,6 @@ def test_the_page_says_which_task_it_was(tmp_path, found):
     assert "randomisation mixed" in text_of(randomisation="mixed")
     away = text_of(policy="/home/me/a/policy.pt", objects="/data/mugs, cube", hand="/opt/my/hand.usda")
     assert not any(root in away for root in ("/home", "/data", "/opt"))
-
-
-def test_what_predictions_are_worth_is_told(tmp_path):
-    write_page(Result(tuple(compared())), tmp_path / "eval.html")
-    text, _ = read_page(tmp_path / "eval.html")
-    assert "Predicted distance" in text and "complete clouds" in text and "500 exact points" not in text
 
 
 def test_curves_end_at_one_minus_the_share_of_lost_objects(found):

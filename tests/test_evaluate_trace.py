@@ -110,7 +110,7 @@ def protocol(episodes):
 
 
 def judged(trace, objects, *, policy="p", kind="teacher", sees="state", rules=lambda _: StoppingRule()):
-    agent = Agent(policy, kind, sees, rules, predicts=trace.predicted is not None)
+    agent = Agent(policy, kind, sees, rules)
     return judge(trace, protocol(trace.steps.shape[1]), list(objects), agent, group="training")
 
 
@@ -205,7 +205,7 @@ def test_what_was_stopped_is_held_and_looked_at_again():
 def test_success_is_reported_at_the_stop_and_after_the_hold():
     objects = [FakeObject("a"), FakeObject("b")]
     env = HeldEnv(objects, num_envs=4, max_episode_steps=24, lost=[1])
-    who = Agent("s", "vision", "rendered clouds", lambda _: StoppingRule(0.3, 2.5), predicts=True)
+    who = Agent("s", "vision", "rendered clouds", lambda _: StoppingRule(0.3, 2.5))
     held = list(who.ways_to_stop(0.4).values())
     trace = record(env, Turner(env, until=6, offset=0.0), 2, **goal_ahead(0.85, 2, 2), held=held)
     rows = judge(trace, protocol(2), objects, who, group="g")

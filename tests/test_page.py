@@ -2,8 +2,6 @@
 
 from html.parser import HTMLParser
 
-import pytest
-from jinja2 import UndefinedError
 from matplotlib.figure import Figure
 
 from vd.page import environment
@@ -67,8 +65,3 @@ def test_pictures_and_videos_are_embedded(tmp_path):
     for image, kind in ((PNG, "png"), (tmp_path / "loop.gif", "gif"), (Figure(), "png")):
         _, references = rendered(tmp_path, image=image)
         assert [a.split(";")[0] for a in references.addresses] == [f"data:image/{kind}", "data:video/mp4"]
-
-
-def test_what_a_template_asks_for_has_to_be_given(tmp_path):
-    with pytest.raises(UndefinedError):
-        environment().from_string(PAGE).render()

@@ -150,10 +150,10 @@ def test_two_processes_share_gradients_and_draw_their_own(tmp_path):
 def test_with_its_network_set_to_zero_success_falls_to_chance(name, tmp_path):
     from vd.evaluate.cli import main as evaluate
     from vd.evaluate.result import Result
-    from vd.tracking.policy import load_tracking, tracking_export
+    from vd.tracking.policy import read_policy, tracking_export
     from vd.train.checkpoint import save_checkpoint
 
-    policy, rates = load_tracking(find_policy(name)), []
+    policy, rates = read_policy(find_policy(name)), []
     for blind in (False, True):
         if blind:
             torch.nn.utils.vector_to_parameters(

@@ -20,15 +20,15 @@ from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
 from vd.evaluate.agents import REPLACED, SHIPPED_POLICIES, find_policy, open_policy, sees_clouds, task_for
 from vd.evaluate.result import Result
-from vd.evaluate.senses import EnvironmentSenses
 from vd.evaluate.trace import Trace
-from vd.evaluate.tracking import TrackingActor
+from vd.evaluate.tracking import TrackingActor, sensed
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 from vd.policy import PolicySpec, TrainedPolicy, load_policy, perceptron
-from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.cfg import DepthSensorCfg
+from vd.sensors.depth_camera import DepthCamera
 from vd.tracking.observer import UNSEEN, Observer
-from vd.tracking.policy import TrackingPolicy, TrackingSpec, is_tracking, load_tracking, tracking_export
+from vd.tracking.policy import TrackingPolicy, TrackingSpec, read_policy, tracking_export
 from vd.tracking.tracker import Tracker
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main as vd_train
@@ -46,7 +46,7 @@ CLOSE_RAD = 0.15
 def vision_of(name: str) -> TrackingPolicy:
     """An installed tracking policy that finds its object by a network of random weights."""
     torch.manual_seed(0)
-    policy, sizes = load_tracking(find_policy(name)), AlignmentCfg(width=16, layers=1, heads=2, tokens=12)
+    policy, sizes = read_policy(find_policy(name)), AlignmentCfg(width=16, layers=1, heads=2, tokens=12)
     network = AlignmentNetwork(sizes).eval().requires_grad_(False)
     return replace(policy, spec=replace(policy.spec, alignment=sizes), alignment=network)
 
@@ -62,6 +62,10 @@ def observer_of(env: ReorientEnv) -> Observer:
         control_hz=env.cfg.sim.control_hz,
         device="cpu",
     )
+
+
+def camera_of(env: ReorientEnv) -> DepthCamera:
+    return DepthCamera.of_scene(env.scene, env.sim.body_q, frame_s=env.cfg.sim.control_dt)
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +89,8 @@ def env():
 
 def test_it_observes_what_its_teacher_does(env):
     """All but the object is the environment's own; the object is found near where it is."""
-    senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()), observer_of(env)
-    observed, angle = observer(replace(senses.read(), fresh=torch.ones(3, dtype=torch.bool)))
+    camera, observer = camera_of(env), observer_of(env)
+    observed, angle = observer(replace(sensed(env, camera), fresh=torch.ones(3, dtype=torch.bool)))
     true, columns = (
         wp.to_torch(env.world_observation),
         teacher_observation_slices(env.num_fingers, env.num_actions),
@@ -111,7 +115,7 @@ def test_it_observes_what_its_teacher_does(env):
 
 
 def test_the_shape_of_a_true_pose_is_as_the_environment_observes_it(env, monkeypatch):
-    senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()).read(), observer_of(env)
+    senses, observer = sensed(env, camera_of(env)), observer_of(env)
     observer(senses)
     pose = torch.tensor(env.object_pose()[:, :7])
     truly = replace(observer.found, position=pose[:, :3], orientation=pose[:, 3:])
@@ -124,14 +128,14 @@ def test_the_shape_of_a_true_pose_is_as_the_environment_observes_it(env, monkeyp
 
 def test_motion_is_that_between_two_looks():
     env = ReorientEnv(ReorientCfg(num_envs=1, objects=("cube",), seed=1, randomisation=EXACT), "cpu")
-    senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()), observer_of(env)
-    observer(senses.read())
+    camera, observer = camera_of(env), observer_of(env)
+    observer(sensed(env, camera))
     wp.to_torch(env.step_count).fill_(1)
     body_q, item = wp.to_torch(env.sim.body_q), env.scene.object_body
     turn = Rotation.from_rotvec([0.0, 0.0, 0.1])
     body_q[:, item, 3:] = torch.tensor((turn * Rotation.from_quat(body_q[:, item, 3:].numpy())).as_quat())
     body_q[:, item, :3] += torch.tensor([0.01, 0.0, 0.0])
-    observer(senses.read())
+    observer(sensed(env, camera))
     np.testing.assert_allclose(observer.found.velocity[0], [12.0 * 0.01, 0.0, 0.0], atol=0.05)
     np.testing.assert_allclose(observer.found.spin[0], [0.0, 0.0, 12.0 * 0.1], atol=0.5)
 
@@ -143,9 +147,8 @@ def teacher(request):
     observation = ObservationCfg(view=view)
     task = ReorientCfg(hand=hand, objects=("cube",), num_envs=1, observation=observation)
     columns = teacher_observation_slices(load_hand(hand).num_fingers, load_hand(hand).num_joints)
-    spec = PolicySpec(
-        columns["previous_action"].stop, columns["joint_position"].stop, (16, 8), "elu", "gaussian", True
-    )
+    sizes = columns["previous_action"].stop, columns["joint_position"].stop, (16, 8)
+    spec = PolicySpec(*sizes, "gaussian", normalise_observations=True)
     torch.manual_seed(0)
     weights = {f"mlp.{name}": value for name, value in perceptron(spec).state_dict().items()}
     weights["obs_normalizer._mean"] = torch.randn(1, spec.num_observations)
@@ -194,8 +197,8 @@ def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_ca
 @pytest.mark.parametrize("name", TRACKERS)
 def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
     path = SHIPPED_POLICIES[name]
-    policy = load_tracking(path)
-    assert sees_clouds(open_policy(name, "cpu")) and is_tracking(path)
+    policy = read_policy(path)
+    assert sees_clouds(open_policy(name, "cpu"))
     assert path.stat().st_size < (1.5e6 if policy.kind == "tracking" else 4.2e6), "no critic, no optimiser"
     assert policy.spec.calibrated_on and "/" not in policy.spec.teacher + policy.spec.calibrated_on
     if policy.kind == "tracking":  # the layers of others may be of a teacher that is not installed
@@ -204,24 +207,20 @@ def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
         assert torch.equal(policy.teacher.act(observation), teacher.act(observation))
 
 
-def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):
-    policy = load_tracking(SHIPPED_POLICIES["dclaw3-tracking"])
+def test_files_come_back_and_a_damaged_one_is_told(tmp_path):
+    policy = read_policy(SHIPPED_POLICIES["dclaw3-tracking"])
     moved = replace(policy, spec=replace(policy.spec, camera=(0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)))
     save_checkpoint(tmp_path / "tracking.pt", tracking_export(moved))
-    assert load_tracking(tmp_path / "tracking.pt").spec == moved.spec
+    assert read_policy(tmp_path / "tracking.pt").spec == moved.spec
     state = torch.load(tmp_path / "tracking.pt", weights_only=True)
     torch.save({**state, "tracking": {"gone": 1}}, tmp_path / "other.pt")
     with pytest.raises(ValueError, match=r"other\.pt: TrackingSpec has no field gone"):
-        load_tracking(tmp_path / "other.pt")
-
-
-def test_a_vision_policy_comes_back_with_its_network(tmp_path):
-    policy = vision_of("dclaw3-tracking")
-    save_checkpoint(tmp_path / "vision.pt", tracking_export(policy))
+        read_policy(tmp_path / "other.pt")
+    vision, clouds = vision_of("dclaw3-tracking"), torch.randn(2, 3, 40, 3)
+    save_checkpoint(tmp_path / "vision.pt", tracking_export(vision))
     found = open_policy(str(tmp_path / "vision.pt"), "cpu")
-    assert (found.kind, found.spec) == ("vision", policy.spec) and sees_clouds(found)
-    clouds = torch.randn(2, 3, 40, 3)
-    assert torch.equal(found.alignment(*clouds).rotation, policy.alignment(*clouds).rotation)
+    assert (found.kind, found.spec) == ("vision", vision.spec) and sees_clouds(found)
+    assert torch.equal(found.alignment(*clouds).rotation, vision.alignment(*clouds).rotation)
 
 
 @pytest.mark.parametrize("name", sorted(REPLACED))
@@ -232,34 +231,9 @@ def test_a_former_name_is_refused_with_the_one_to_take(name, capsys, tmp_path):
     assert REPLACED[name] in capsys.readouterr().err
 
 
-def test_what_has_no_checkpoints_does_not_speak_of_resuming(monkeypatch, capsys):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("vd.train.tracker.tracker_command", interrupted)
-    assert vd_train(["tracker", "dclaw3"]) == 130
-    assert "stopped at once\n" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("command", "word"),
-    [
-        ("calibrate", "vd-train tracker"),
-        ("follow", "vd-train tracker"),
-        ("noise", "'noise' is no more; no training needed it"),
-        ("profile", "'profile' is no more; no training needed it"),
-    ],
-)
-def test_a_former_command_is_refused_with_the_new_one(command, word, capsys):
-    assert vd_train([command, "student.pt"]) == 2
-    assert word in capsys.readouterr().err
-
-
 def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
-    policy = load_tracking(find_policy("dclaw3-tracking"))
-    plain, real = (
-        TrackingActor(env, policy, sensor_errors=errs)._senses.camera.cfg for errs in (False, True)
-    )
+    policy = read_policy(find_policy("dclaw3-tracking"))
+    plain, real = (TrackingActor(env, policy, sensor_errors=errs).camera.cfg for errs in (False, True))
     assert not plain.sensor.enabled and plain.latency_s == (0.0, 0.0) and plain.position_noise_m == 0.0
     assert real.sensor == DepthSensorCfg.realistic() and real.latency_s[1] > real.latency_s[0] > 0.0
     assert real.position_noise_m > 0.0 and real.rotation_noise_rad > 0.0
@@ -273,12 +247,10 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
     policy = vision_of("dclaw3-tracking") if kind == "vision" else open_policy("dclaw3-tracking", "cpu")
     task = task_for(
         policy,
-        hand=None,
         objects=("cube",),
         num_envs=1,
         seed=3,
         stop_tolerance_rad=0.4,
-        max_goal_angle_rad=None,
         episode_s=3.0,
         randomised=False,
         success_ends_episode=False,
@@ -291,7 +263,7 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
     for step in range(env.max_episode_steps):
         sensed = state_of(env)
         action = actor.act(wp.to_torch(env.observation))
-        image = actor._senses.camera.depth.numpy()[0].copy()
+        image = actor.camera.depth.numpy()[0].copy()
         decision = runner.decide(replace(sensed, depth=image))
         np.testing.assert_allclose(decision.action, action[0], atol=1e-3, err_msg=f"step {step}")
         assert decision.distance == pytest.approx(float(actor.predicted[0]), abs=1e-4)
@@ -335,19 +307,19 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
     flags = ["tracker", "dclaw3", "--objects", "cube", "--episodes", "1", "--device", "cpu"]
     flags += ["--out", str(path)]
     assert vd_train(flags) == 0
-    policy, cfg = load_tracking(path), asked[-1]
+    policy, cfg = read_policy(path), asked[-1]
     assert policy.spec.calibrated_on == "cube: 1 episodes, goals by points, tolerance 0.4 rad, seed 1000"
     assert policy.spec.teacher == "dclaw3" and policy.spec.precise is not None
     assert 0.0 < policy.spec.stopping.action_norm < 1.0
     assert cfg.sensor_errors and cfg.goals == "points"
     assert "Of 1 episodes" in capsys.readouterr().out
     assert vd_train([*flags, "--in-air"]) == 0
-    assert asked[-1].in_air and "in the air" in load_tracking(path).spec.calibrated_on
+    assert asked[-1].in_air and "in the air" in read_policy(path).spec.calibrated_on
     network, camera = vision_of("dclaw3-tracking").alignment, (0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)
     learned = AlignmentSpec(network=network.cfg, points=512, hand="dclaw4", camera=camera)
     state = {"student_state_dict": network.state_dict(), "spec": to_dict(learned), "iter": 1, "env_steps": 2}
     save_checkpoint(tmp_path / "alignment.pt", alignment_export(state))
     assert vd_train([*flags, "--alignment", str(tmp_path / "alignment.pt")]) == 0
-    assert load_tracking(path).kind == "vision" and load_tracking(path).spec.camera == camera
+    assert read_policy(path).kind == "vision" and read_policy(path).spec.camera == camera
     assert vd_train(["tracker", "dclaw3-tracking", *flags[2:]]) == 1
     assert "give a teacher" in capsys.readouterr().err

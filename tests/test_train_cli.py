@@ -10,7 +10,7 @@ import pytest
 from vd.assets_usd.hands import HANDS
 from vd.config import from_dict, to_dict
 from vd.device import resolve_device
-from vd.train.cli import main
+from vd.train.cli import GONE, main
 from vd.train.config import validate
 from vd.train.flags import OF_HELP_ALL, parse_teacher
 from vd.train.presets import PRESETS, TeacherCfg
@@ -37,20 +37,17 @@ def test_every_preset_parses_validates_and_survives_a_file(name, tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    ("gpus", "processes", "flags", "name"),
+    ("gpus", "flags", "name"),
     [
-        (0, 1, [], "cpu-demo"),
-        (0, 2, [], "cpu-demo"),
-        (1, 1, [], "gpu"),
-        (1, 1, ["--device", "cpu"], "cpu-demo"),
-        (2, 1, ["--device", "cuda:1"], "gpu"),
-        (2, 2, [], "gpu"),
+        (0, [], "cpu-demo"),
+        (1, [], "gpu"),
+        (1, ["--device", "cpu"], "cpu-demo"),
+        (2, ["--device", "cuda:1"], "gpu"),
     ],
 )
-def test_the_machine_decides_where_no_preset_is_named(monkeypatch, gpus, processes, flags, name):
+def test_the_machine_decides_where_no_preset_is_named(monkeypatch, gpus, flags, name):
     monkeypatch.setattr("torch.cuda.is_available", lambda: gpus > 0)
     monkeypatch.setattr("torch.cuda.device_count", lambda: gpus)
-    monkeypatch.setenv("WORLD_SIZE", str(processes))
     said: list[str] = []
     cfg = parse_teacher([*flags, "--seed", "5"], say=said.append)
     assert cfg.preset == name and cfg.env.seed == 5
@@ -106,7 +103,7 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
         [
             *("--preset", "gpu", "--hand", "dclaw3", "--objects", "cube", "cuboid", "--num_envs=128"),
             *("--seed", "7", "--ppo.epochs", "3", "--env.reward.energy=-1.5", "--out", "runs/x"),
-            *("--max-minutes", "2.5", "--hand-layer", "bench/identified.usda"),
+            *("--max-minutes", "2.5", "--hand-layer", "bench/identified.usda", "--randomise"),
             *("--env.randomisation.effects", "backlash.width_rad", "0", "0.03"),
             *("dead_zone.width_rad", "0", "0.1"),
         ]
@@ -122,6 +119,8 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
     assert cfg.env.reward.energy == -1.5 and cfg.ppo.epochs == 3
     assert cfg.run.out == Path("runs/x") and cfg.run.max_minutes == 2.5
     assert cfg.policy == PRESETS["gpu"]().policy
+    with pytest.raises(ValueError, match=r"--env\.randomisation\.force-s draws nothing; add --randomise"):
+        parse_teacher(["--preset", "gpu", "--env.randomisation.force-s", "0.1"])
 
 
 def test_a_smoke_test_leaves_nothing_and_can_be_done_again(tmp_path, monkeypatch, capsys):
@@ -170,26 +169,24 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path, capsys):
     assert not (tmp_path / "config.json").exists()
 
 
-def test_init_keeps_the_flags_and_names_a_missing_file(tmp_path, capsys):
-    start = ["--preset", "gpu", "--init", str(tmp_path / "no.pt"), "--env.observation.shape", "full"]
-    cfg = parse_teacher([*start, "--out", str(tmp_path / "run"), "--resume", "auto"])
-    assert cfg.init == str(tmp_path / "no.pt") and cfg.env.observation.shape == "full"
-    assert cfg.ppo == PRESETS["gpu"]().ppo and from_dict(TeacherCfg, to_dict(cfg)) == cfg
-    assert main(["teacher", *start, "--out", str(tmp_path / "run")]) == 1
-    assert "--init: no policy at" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
-def test_unknown_commands_devices_and_missing_files_are_explained(tmp_path, capsys):
+def test_unknown_commands_devices_and_missing_files_are_explained(tmp_path, monkeypatch, capsys):
     assert main(["pupil"]) == 2
     assert "no command 'pupil'" in capsys.readouterr().err
-    assert main(["curves", str(tmp_path)]) == 2
-    assert "tensorboard --logdir" in capsys.readouterr().err
+    for command, instead in GONE.items():
+        assert main([command, str(tmp_path)]) == 2
+        assert f"'{command}' is no more; {instead}" in capsys.readouterr().err
     assert main(["export", str(tmp_path / "x.pt")]) == 1
     for device in ("gpu", "cuda:97", "cuda:x"):
         with pytest.raises(ValueError, match="--device"):
             resolve_device(device)
     assert resolve_device("cpu") == "cpu"
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vd.train.tracker.tracker_command", interrupted)
+    assert main(["tracker", "dclaw3"]) == 130
+    assert "stopped at once\n" in capsys.readouterr().err, "there is no checkpoint to resume from"
 
 
 def test_export_commands(tmp_path, capsys):

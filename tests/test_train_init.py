@@ -205,6 +205,11 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert find_start(str(tmp_path / "policy.pt")) == tmp_path / "policy.pt"
     with pytest.raises(FileNotFoundError, match=r"--init: no policy at .*installed policy: dclaw3"):
         find_start(str(tmp_path / "none"))
+    start = ["--preset", "gpu", "--init", str(tmp_path / "no.pt"), "--env.observation.shape", "full"]
+    cfg = parse_teacher([*start, "--out", str(tmp_path / "run"), "--resume", "auto"])
+    assert cfg.env.observation.shape == "full" and cfg.ppo == PRESETS["gpu"]().ppo
+    assert main(["teacher", *start, "--out", str(tmp_path / "run")]) == 1
+    assert "--init: no policy at" in capsys.readouterr().err
     assert main(["teacher", "--init", "dclaw3-tracking", "--out", str(tmp_path / "run")]) == 1
     assert "holds no actor; give --init" in capsys.readouterr().err
     assert main(["teacher", "--init-stage", "1", "0", "--out", str(tmp_path / "run")]) == 1

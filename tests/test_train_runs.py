@@ -87,16 +87,6 @@ def test_keeps_the_last_and_the_best_since_two_episodes_are_over(tmp_path):
         other.load(str(found))
 
 
-def test_a_killed_writer_is_not_taken_for_a_checkpoint(tmp_path):
-    runner = make_runner(tmp_path, save_every=1)
-    runner.learn(1)
-    torn = tmp_path / "checkpoints" / ".model_0000002.x1.pt"
-    torn.write_bytes(b"torn")
-    assert find_checkpoint(tmp_path, "latest").name == "model_0000001.pt"
-    runner.learn(1)
-    assert not torn.exists()
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_and_the_run_goes_on(tmp_path, number):
     env = DummyEnv(num_envs=16)
@@ -257,15 +247,19 @@ def _outputs(runner, observation: torch.Tensor) -> list[torch.Tensor]:
         return [policy.output_mean.clone(), policy.output_std.clone(), runner.alg.critic(seen)]
 
 
-def test_a_new_run_can_begin_from_anothers_checkpoint(tmp_path):
-    first = make_runner(tmp_path / "first", save_every=1)
+def test_a_new_run_can_begin_from_anothers_checkpoint_at_its_own_rates(tmp_path):
+    adaptive = dataclasses.replace(SMALL_PPO, schedule="adaptive", desired_kl=1e-4)
+    first = make_runner(tmp_path / "first", ppo=adaptive, save_every=1)
     first._window = GoalWindow(1)
     first.learn(3)
     checkpoint = find_checkpoint(tmp_path / "first", "latest")
     assert load_checkpoint(checkpoint)["best"] is not None
-    second = make_runner(tmp_path / "second", env=DummyEnv(num_envs=16, seed=7), seed=7)
+    assert first.alg.learning_rate < adaptive.actor_learning_rate, "the rate has to have moved"
+    wanted = dataclasses.replace(SMALL_PPO, actor_learning_rate=7e-4, critic_learning_rate=8e-4)
+    second = make_runner(tmp_path / "second", env=DummyEnv(num_envs=16, seed=7), seed=7, ppo=wanted)
     second.begin_from(str(checkpoint))
-    assert second.new_inputs == 0 and second.begun
+    assert second.new_inputs == 0 and second.begun and second.alg.learning_rate == 7e-4
+    assert [group["lr"] for group in second.alg.optimizer.param_groups] == [7e-4, 8e-4]
     one, two = _weights(first), _weights(second)
     assert all(torch.equal(one[name], two[name]) for name in one)
     assert not second.env.env.step_count.numpy().any()
@@ -274,21 +268,8 @@ def test_a_new_run_can_begin_from_anothers_checkpoint(tmp_path):
     assert [row["iteration"] for row in _rows(tmp_path / "second")] == [4]
     with pytest.raises(ValueError, match="is a policy, which nothing can resume; --init"):
         second.load(str(tmp_path / "first" / "policy.pt"))
-
-
-def test_a_new_run_has_its_own_learning_rates_and_a_resumed_one_those_it_had(tmp_path):
-    adaptive = dataclasses.replace(SMALL_PPO, schedule="adaptive", desired_kl=1e-4)
-    first = make_runner(tmp_path / "first", ppo=adaptive, save_every=1)
-    first.learn(2)
-    checkpoint = str(find_checkpoint(tmp_path / "first", "latest"))
-    assert first.alg.learning_rate < adaptive.actor_learning_rate, "the rate has to have moved"
-    wanted = dataclasses.replace(SMALL_PPO, actor_learning_rate=7e-4, critic_learning_rate=8e-4)
-    second = make_runner(tmp_path / "second", ppo=wanted)
-    second.begin_from(checkpoint)
-    rates = [group["lr"] for group in second.alg.optimizer.param_groups]
-    assert rates == [7e-4, 8e-4] and second.alg.learning_rate == 7e-4
-    second.load(checkpoint)
-    assert second.alg.learning_rate == first.alg.learning_rate
+    second.load(str(checkpoint))
+    assert second.alg.learning_rate == first.alg.learning_rate, "a resumed run goes on with those it had"
 
 
 def test_a_run_goes_on_with_another_number_of_worlds_to_the_same_steps(tmp_path):

@@ -3,12 +3,12 @@
 Networks may have read less than the run observes: inputs that are new begin without effect.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vd.config import from_dict, to_dict
+from vd.config import from_dict, leaves, to_dict
 
 if TYPE_CHECKING:
     from torch import nn
@@ -36,9 +36,6 @@ _SENSES = ("hand", "fingertip", "hand_layer", "sim", "action", "observation")
 def find_start(name: str) -> Path:
     """The file that ``--init`` names: an installed policy, a file, or the best checkpoint of a run's folder.
 
-    Args:
-        name: What is named.
-
     Raises:
         FileNotFoundError: There is none.
         ValueError: It is a bundle.
@@ -61,10 +58,6 @@ def find_start(name: str) -> Path:
 
 def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     """Settings with which a run goes on as what it begins from was trained, where no preset is asked for.
-
-    Args:
-        name: What ``--init`` names.
-        base: Settings of the run, such as when to save.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -200,7 +193,7 @@ def check_fit(
             f"{spec.num_actions}; give --hand {hand}"
         )
     from_dict(ObservationCfg, state["task"].get("observation", {}), where=f"--init: {path}: task.observation")
-    for name in ("activation", "hidden", "distribution", "normalise_observations"):
+    for name in ("hidden", "distribution", "normalise_observations"):
         theirs, ours = getattr(found, name), getattr(spec, name)
         if theirs != ours:
             flag = f"--policy.{name.replace('_', '-')}"
@@ -221,17 +214,8 @@ def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
     from vd.envs.cfg import ReorientCfg
 
     default, before, now = (
-        dict(_leaves({k: t[k] for k in _SENSES if k in t}, "env"))
+        dict(leaves({k: t[k] for k in _SENSES if k in t}, "env"))
         for t in (to_dict(ReorientCfg()), trained, task)
     )
     before = {k: default[k] for k in now if k in default} | before
     return [f"{k} {before[k]}, here {now[k]}" for k in before if k in now and before[k] != now[k]]
-
-
-def _leaves(values: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
-    """Values by dotted path."""
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{where}.{key}")
-        else:
-            yield f"{where}.{key}", list(value) if isinstance(value, tuple) else value

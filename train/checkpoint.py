@@ -83,11 +83,9 @@ def _newest_sound(files: list[Path], network: str) -> Path:
 
 
 def prune_checkpoints(run_dir: Path, newest: int) -> None:
-    """Delete old periodic checkpoints, and what a killed run left half-written.
+    """Delete old periodic checkpoints up to iteration ``newest``, and what a killed run left half-written.
 
-    Args:
-        run_dir: Folder of the run.
-        newest: Iteration of the newest; what a run that went on from an older one finds after it, stays.
+    What a run that went on from an older checkpoint finds after that stays.
     """
     numbered = [(int(path.stem.removeprefix("model_")), path) for path in list_checkpoints(run_dir)]
     for _, path in [pair for pair in numbered if pair[0] <= newest][:-KEEP_LAST]:
@@ -108,13 +106,9 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 def load_checkpoint(
     path: Path, device: str = "cpu", *, network: str = "actor", flag: str = "--resume"
 ) -> dict[str, Any]:
-    """Read a checkpoint without executing anything in it.
+    """Read a checkpoint, with weights of an ``actor`` (teacher) or ``student``, executing nothing in it.
 
-    Args:
-        path: The file.
-        device: Torch device of its tensors.
-        network: What it has to hold the weights of: ``actor`` (teacher) or ``student``.
-        flag: What asked for it, for messages.
+    ``flag`` is what asked for it, for messages.
 
     Raises:
         ValueError: The file is damaged or not a checkpoint.

@@ -12,9 +12,6 @@ from typing import Any, ClassVar, Literal
 from vd.config import Dropped, Renamed, require
 from vd.paper import PAPER
 
-ACTIVATION = "elu"
-"""Activation of the hidden layers, as in the paper (MLP 512-256-256 ELU)."""
-
 
 @dataclass
 class PpoCfg:
@@ -108,11 +105,7 @@ class RunCfg:
     """Write TensorBoard files (tensorboard --logdir RUN-DIR)."""
 
     def deadline(self, started: float | None) -> float | None:
-        """``time.monotonic()`` at which a run that began at ``started`` has to end; None: no limit.
-
-        Args:
-            started: ``time.monotonic()``; now by default.
-        """
+        """``time.monotonic()`` at which a run that began at ``started``, or now, ends; None: no limit."""
         if self.max_minutes is None:
             return None
         return (time.monotonic() if started is None else started) + 60.0 * self.max_minutes

@@ -13,15 +13,18 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from vd import interrupt
 from vd.config import require
 from vd.evaluate.agents import check_names
-from vd.files import atomic_path, check_folder
+from vd.files import check_folder
 from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CAMERA_POLICY = "dclaw4-tracking"
 """Installed policy that finds the object by camera."""
@@ -224,7 +227,7 @@ class Demo:
 
     def training(self, part: Part) -> dict[str, Any]:
         """A small training, with its curve."""
-        run, film, curves = part.folder / "run", part.folder / "film.mp4", part.folder / "curves.png"
+        run, film = part.folder / "run", part.folder / "film.mp4"
         minutes = max(self.cfg.minutes - self.minutes - AROUND_TRAINING_MIN, LEAST_TRAINING_MIN)
         seed = ("--seed", str(self.cfg.seed))
         words = ("vd-train", "teacher", "--preset", "cpu-demo", *seed, "--max-minutes", f"{minutes:.2f}")
@@ -234,25 +237,20 @@ class Demo:
 
         rows = [row for row in read_progress(run / PROGRESS_FILE) if row["goals_per_episode"] is not None]
         goals = [row["goals_per_episode"] for row in rows]
-        draw_curve([row["env_steps"] for row in rows], goals, curves)
+        curves = goal_curve([row["env_steps"] for row in rows], goals)
         shown = {"film": film, "curves": curves, "low": min(goals), "last": goals[-1]}
         return shown | {"steps": rows[-1]["env_steps"]}
 
 
-def draw_curve(steps: Sequence[int], goals: Sequence[float], path: Path) -> None:
-    """Draw goals an episode against control steps, as a PNG."""
-    import matplotlib
+def goal_curve(steps: Sequence[int], goals: Sequence[float]) -> "Figure":
+    """Goals an episode against control steps."""
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axis = plt.subplots(figsize=(8, 3), constrained_layout=True)
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    axis = figure.add_subplot(xlabel="control steps", ylabel="goals an episode")
     axis.plot(steps, goals)
-    axis.set(xlabel="control steps", ylabel="goals an episode")
     axis.grid(alpha=0.3)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
-    plt.close(figure)
+    return figure
 
 
 def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:

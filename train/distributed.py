@@ -27,9 +27,6 @@ REPORT_AFTER_S = 90.0
 def join_processes(device: str) -> tuple[int, int]:
     """Meet the other processes that ``torchrun`` started, if it did; NCCL on GPUs, gloo on CPUs.
 
-    Args:
-        device: Torch device of this process.
-
     Returns:
         Number of this process, of which 0 logs and saves, and how many there are.
 
@@ -82,9 +79,6 @@ def ending_together(*agreed: type[BaseException]) -> Iterator[None]:
 
     The others wait in a collective that this process will never enter. Leaving the process group, as at
     a regular end, waits for them in turn: the error would be held back until the time limit, or for ever.
-
-    Args:
-        *agreed: Exceptions that all processes raise together; they pass.
     """
     try:
         yield

@@ -34,10 +34,7 @@ class BoundedStdGaussian(_Drawn, HeteroscedasticGaussianDistribution):
     and always a gradient. A bounded std matters here: unbounded it drifts upwards, and success asks for
     slow fingers, which exploration noise at a std of 0.1 already hides.
 
-    Args:
-        output_dim: Number of actions D.
-        init_std: Standard deviation of every action in every state at the start.
-        std_range: Open interval ``(low, high)`` of the standard deviation.
+    ``init_std`` is that of every action in every state at the start, ``std_range`` an open interval.
     """
 
     log_floor: torch.Tensor

@@ -86,10 +86,6 @@ def export_onnx(policy: "TrainedPolicy", path: Path) -> None:
 
     The graph takes ``observation`` [N, O] to the mean ``action`` [N, D], for any N.
 
-    Args:
-        policy: A policy on the CPU.
-        path: The file.
-
     Raises:
         RuntimeError: What the export needs is not installed, or actions differ by more than rounding.
     """

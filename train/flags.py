@@ -48,14 +48,10 @@ SHORT_FORMS = {name: f"env.{name}" for name in ("hand", "hand-layer", "objects",
 
 
 def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | None = None) -> TeacherCfg:
-    """The configuration that command-line flags ask for.
+    """The configuration that command-line flags ask for; ``say`` is told which preset the machine decided.
 
     The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins from, or the
     run's own configuration with ``--resume``), the second reads every flag with those values as defaults.
-
-    Args:
-        arguments: Flags.
-        say: Is told which preset the machine decided.
 
     Raises:
         FileNotFoundError: ``--resume`` names a run without a configuration.
@@ -89,11 +85,7 @@ def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | No
 
 
 def machine_preset(device: str | None) -> tuple[str, str]:
-    """The preset that learns on this machine, and why it is that.
-
-    Args:
-        device: What ``--device`` asks for; None and ``auto``: the GPU, if torch finds one.
-    """
+    """The preset that learns on this machine, or on what ``--device`` asks for, and why it is that."""
     if resolve_device(device or "auto") == "cpu":
         return "cpu-demo", (
             "there is no GPU. It learns an easier task, turns of one object about the vertical, in minutes; "
@@ -139,6 +131,10 @@ def _parsed(arguments: list[str], default: TeacherCfg) -> TeacherCfg:
         default = from_dict(kind, to_dict(default))
     cfg = tyro.cli(kind, args=arguments, default=default, prog="vd-train teacher", description=TEACHER_HELP)
     check_names((), cfg.env.objects, cfg.env.hand)
+    drawn, before = cfg.env.randomisation, default.env.randomisation
+    given = [name for name, value in vars(before).items() if getattr(drawn, name) != value]
+    if given and not drawn.enabled and given != ["enabled"]:
+        raise ValueError(f"--env.randomisation.{given[-1].replace('_', '-')} draws nothing; add --randomise")
     return cfg
 
 
@@ -159,11 +155,9 @@ def _without(kind: type, hidden: Collection[str], where: str = "") -> type:
 
 
 def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:
-    """Configuration of the run that ``--resume`` goes on with; None where ``auto`` finds no run.
+    """Configuration of the run that ``--resume`` goes on with, a teacher's or student's as ``start`` is.
 
-    Args:
-        arguments: The flags.
-        start: Configuration of a new run, teacher's or student's: what is read is of its kind.
+    None where ``auto`` finds no run.
 
     Raises:
         FileNotFoundError: There is no such run.

@@ -24,11 +24,8 @@ class Imitation:
     """Lets the actor of a learner imitate itself as it is now.
 
     rsl-rl's Distillation has a loop and a storage of its own and no critic; its loss is repeated here. Adam
-    begins fresh, and that of PPO sees none of these gradients.
-
-    Args:
-        learner: The learner, whose actor has the weights of the policy to imitate. The last that its critic
-            is told is what the actor observes, of the present state.
+    begins fresh, and that of PPO sees none of these gradients. The last that the learner's critic is told is
+    what the actor observes, of the present state.
 
     Attributes:
         teacher: The policy to imitate.
@@ -42,10 +39,7 @@ class Imitation:
         self._optimizer = torch.optim.Adam(learner.actor.parameters())
 
     def update(self, left: float) -> dict[str, float]:
-        """All epochs over the learner's latest rollout.
-
-        Args:
-            left: Share of the imitation that is left, of the rate too.
+        """All epochs over the learner's latest rollout, at ``left``, from 1 to 0, of the rate.
 
         Returns:
             ``imitation``: mean squared error of means and standard deviations of the actions.

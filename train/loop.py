@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
@@ -19,12 +19,16 @@ from vd.train.checkpoint import (
     prune_checkpoints,
     random_state,
     save_checkpoint,
+    saved_worlds,
     set_random_state,
 )
 from vd.train.config import RunCfg
 from vd.train.distributed import ending_together, join_processes, watch_iteration
 from vd.train.metrics import ProgressFile
 from vd.train.progress import ProgressLines
+
+if TYPE_CHECKING:
+    from vd.train.vec_env import ReorientVecEnv
 
 
 class Interrupted(Exception):  # noqa: N818  # not an error: the run was asked to stop and has saved
@@ -60,6 +64,7 @@ class TrainingLoop:
         run: Run settings.
         device: Torch device of networks and rollouts.
         deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
+        env: Environments that checkpoints hold, if any.
 
     Attributes:
         iteration: Iterations completed, over all resumed runs.
@@ -67,8 +72,15 @@ class TrainingLoop:
         new_episodes: Why the checkpoint that was loaded could not restore the environments; empty if it did.
     """
 
-    def __init__(self, run: RunCfg, *, device: str, deadline: float | None = None) -> None:
-        self.run, self.device = run, device
+    def __init__(
+        self,
+        run: RunCfg,
+        *,
+        device: str,
+        deadline: float | None = None,
+        env: "ReorientVecEnv | None" = None,
+    ) -> None:
+        self.run, self.device, self.env = run, device, env
         self.rank, self.world_size = join_processes(device)
         self.iteration, self.env_steps, self._elapsed_s = 0, 0, 0.0
         self.new_episodes = ""
@@ -223,7 +235,9 @@ class TrainingLoop:
 
     def _state(self) -> dict[str, Any]:
         """Everything a checkpoint holds."""
-        mine = {"random": random_state(self.device)} | self._own_state()
+        mine = {"random": random_state(self.device)}
+        if self.env is not None:
+            mine["env"] = self.env.env.state_dict()
         ranks: list[Any] = [mine]
         if self.is_distributed:
             ranks = [None] * self.world_size
@@ -235,16 +249,24 @@ class TrainingLoop:
         """Take over counters, environments and random state, all but the first only if they fit this run."""
         self.iteration, self.env_steps = state["iter"], state["env_steps"]
         self._elapsed_s = state["elapsed_s"]
-        ranks, count = state["ranks"], self.world_size
-        self.new_episodes = (
-            f"it is of {len(ranks)} processes, this run has {count}" if len(ranks) != count else ""
-        ) or self._misfit(ranks)
-        if self.new_episodes:
-            self._start_anew(ranks)
-            return
-        mine = ranks[self.rank]
-        self._load_own_state(mine)
-        set_random_state(mine["random"], self.device)
+        self.new_episodes = self._misfit(state["ranks"])
+        if not self.new_episodes:
+            mine = state["ranks"][self.rank]
+            if self.env is not None:
+                self.env.env.load_state_dict(mine["env"])
+            set_random_state(mine["random"], self.device)
+        elif self.env is not None:
+            self.env.start_anew(state["ranks"][0]["env"])
+
+    def _misfit(self, ranks: list[dict[str, Any]]) -> str:
+        """Why processes and environments of a checkpoint cannot be restored; empty if they can."""
+        if len(ranks) != self.world_size:
+            return f"it is of {len(ranks)} processes, this run has {self.world_size}"
+        if self.env is None or (saved := {saved_worlds(rank) for rank in ranks}) == {self.env.num_envs}:
+            return ""
+        if saved == {0}:
+            return "it holds no environments"
+        return f"it is of {max(saved)} environments a process, this run has {self.env.num_envs}"
 
     # What a subclass does.
 
@@ -264,22 +286,8 @@ class TrainingLoop:
         """What all processes have alike."""
         raise NotImplementedError
 
-    def _own_state(self) -> dict[str, Any]:
-        """What belongs to this process, such as its environments; nothing by default."""
-        return {}
-
-    def _load_own_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`_own_state` gave."""
-
-    def _misfit(self, ranks: list[dict[str, Any]]) -> str:
-        """Why the environments of a checkpoint cannot be restored; empty if they can."""
-        return ""
-
     def _close(self) -> None:
         """Release the environments."""
-
-    def _start_anew(self, ranks: list[dict[str, Any]]) -> None:
-        """Begin new episodes, since the environments of the checkpoint do not fit."""
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:
         """Write what is used of a checkpoint that was saved as ``path``."""

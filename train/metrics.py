@@ -50,11 +50,8 @@ class GoalWindow:
     """How goals ended over the last episode's worth of iterations.
 
     Success per goal is a ratio of rare events; a window as long as an episode holds about one ended goal
-    of every environment, and weighs early and late steps of an episode alike.
-
-    Args:
-        length: Iterations in the window.
-        success_ends: Whether a goal that is reached ends its episode (``success_ends_episode``).
+    of every environment, and weighs early and late steps of an episode alike. ``success_ends``: a goal that
+    is reached ends its episode.
     """
 
     def __init__(self, length: int, *, success_ends: bool = False) -> None:
@@ -97,13 +94,9 @@ class GoalWindow:
 
 
 class ProgressFile:
-    """One JSON object per iteration in ``progress.jsonl``, and the same numbers in TensorBoard.
+    """One JSON object per iteration in ``progress.jsonl``, and with ``tensorboard`` the same numbers there.
 
-    Args:
-        run_dir: Folder of the run.
-        tensorboard: Whether to write TensorBoard files too, in ``run_dir/tensorboard``.
-        done: Iterations to keep from an earlier run of this folder; later lines are dropped, since the
-            resumed run writes them anew.
+    Of an earlier run of this folder ``done`` iterations are kept; a resumed run writes later ones anew.
     """
 
     def __init__(self, run_dir: Path, *, tensorboard: bool = True, done: int = 0) -> None:
@@ -133,22 +126,15 @@ class ProgressFile:
                 line = json.dumps(row).encode() + b"\n"
                 while line:
                     line = line[self._file.write(line) :]
+            if self._board is not None:
+                with writing(self._path.with_name(BOARD_FOLDER)):
+                    for key, value in row.items():
+                        if value is not None:
+                            name = key if "/" in key else f"run/{key}"
+                            self._board.add_scalar(name, value, row["iteration"])
         except OSError:
             self._file.truncate(size)  # a line is whole or not there
             self._board = None  # closing it would only say so again
-            raise
-        if self._board is not None:
-            self._write_board(row)
-
-    def _write_board(self, row: dict[str, Any]) -> None:
-        try:
-            with writing(self._path.with_name(BOARD_FOLDER)):
-                for key, value in row.items():
-                    if value is not None:
-                        name = key if "/" in key else f"run/{key}"
-                        self._board.add_scalar(name, value, row["iteration"])
-        except OSError:
-            self._board = None
             raise
 
     def close(self) -> None:

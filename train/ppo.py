@@ -10,7 +10,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import nn
 
-from vd.train.config import ACTIVATION, PolicyCfg, PpoCfg, minibatches
+from vd.train.config import PolicyCfg, PpoCfg, minibatches
 from vd.train.distribution import BoundedStdGaussian, FreeStdGaussian
 from vd.train.graphed import Recorded
 from vd.train.vec_env import ReorientVecEnv
@@ -58,13 +58,6 @@ class TeacherPPO(PPO):
     terminal. The value belongs to the stored observation *before* the step, because the observation
     returned after it is already the new episode's. That stands in for ``V(s_{t+1})`` of the state that was
     cut off, one control step later: a small error in one step of an episode, and no bias towards zero.
-
-    Args:
-        actor: Policy.
-        critic: Value function.
-        storage: Rollout of T steps in N environments.
-        cfg: Settings.
-        **kwargs: rsl-rl's PPO arguments that are no settings: the device, and the processes.
 
     Attributes:
         actor_learns: Whether updates change the actor. A critic that knows nothing yet gives random
@@ -273,12 +266,7 @@ def make_learner(
 ) -> TeacherPPO:
     """A learner with new networks, on the environment's device.
 
-    Args:
-        env: Environment; the actor reads the first group of its observations, the critic all.
-        ppo: Algorithm settings.
-        policy: Network settings.
-        rank: Number of this process.
-        world_size: Processes of the run.
+    The actor reads the first group of observations, the critic all.
     """
     observations, device = env.get_observations(), env.device
     groups = list(observations.keys())
@@ -289,7 +277,7 @@ def make_learner(
         distribution |= {"class_name": BoundedStdGaussian}
     shape: dict[str, Any] = {
         "hidden_dims": policy.hidden,
-        "activation": ACTIVATION,
+        "activation": "elu",  # as of vd.policy.perceptron
         "obs_normalization": policy.normalise_observations,
     }
     return TeacherPPO(

@@ -21,11 +21,9 @@ FIGURES = {
 
 
 class ProgressLines:
-    """Prints the first, the latest and the last iteration; a context manager.
+    """Prints the first, the latest and the last iteration of ``total``; a context manager.
 
-    Args:
-        total: Iterations of the whole run.
-        enabled: Print anything (false on all ranks but the first).
+    All ranks but the first are not ``enabled``, and print nothing.
     """
 
     def __init__(self, total: int, *, enabled: bool = True) -> None:

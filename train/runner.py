@@ -16,10 +16,9 @@ from vd.train.checkpoint import (
     BEST_NAME,
     load_checkpoint,
     save_checkpoint,
-    saved_worlds,
     without_worlds,
 )
-from vd.train.config import ACTIVATION, PolicyCfg, PpoCfg, RunCfg, validate
+from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 from vd.train.imitate import IMITATED, Imitation
 from vd.train.loop import TrainingLoop, check_update
 from vd.train.metrics import GoalWindow, StepMeans
@@ -35,14 +34,7 @@ LOWER_RATES = "lower --ppo.actor-learning-rate, --ppo.critic-learning-rate or --
 class TeacherRunner(TrainingLoop):
     """Trains the teacher with rsl-rl's PPO.
 
-    Args:
-        env: Vectorised environment.
-        ppo: Algorithm settings.
-        policy: Network settings.
-        run: Run settings.
-        task: The environment's configuration as a dictionary, kept with every policy.
-        device: Torch device of networks and rollouts; the environment's.
-        deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
+    ``task`` is the configuration of the environment, kept with every policy; others as of TrainingLoop.
 
     Attributes:
         new_inputs: Observed values that the networks of the policy that it began from did not read.
@@ -51,6 +43,8 @@ class TeacherRunner(TrainingLoop):
         begun: Whether this run began from another one's networks, in this process.
         unlike: What observations and actions mean otherwise than to the policy that the run began from.
     """
+
+    env: ReorientVecEnv
 
     def __init__(
         self,
@@ -63,9 +57,8 @@ class TeacherRunner(TrainingLoop):
         device: str,
         deadline: float | None = None,
     ) -> None:
-        validate(ppo, policy, run)
-        super().__init__(run, device=device, deadline=deadline)
-        self.env, self.ppo, self.policy_cfg, self.task = env, ppo, policy, task
+        super().__init__(run, device=device, deadline=deadline, env=env)
+        self.ppo, self.policy_cfg, self.task = ppo, policy, task
         self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
         self._means, self._window = StepMeans(), self._new_window()
@@ -103,11 +96,7 @@ class TeacherRunner(TrainingLoop):
 
         Environments, random states, learning rates and the choice of the best checkpoint are this run's own,
         and so are a critic and an optimiser that the file lacks; then the critic learns alone first. Networks
-        that read less than this run observes are widened.
-
-        Args:
-            path: Checkpoint or exported policy.
-            stage: Difficulty and tightness to begin at, rather than those of the file.
+        that read less than this run observes are widened. With ``stage`` difficulty and tightness are these.
 
         Raises:
             ValueError: The file is damaged, of another hand or of another network.
@@ -230,7 +219,6 @@ class TeacherRunner(TrainingLoop):
             num_observations=self.num_observations,
             num_actions=self.env.num_actions,
             hidden=self.policy_cfg.hidden,
-            activation=ACTIVATION,
             distribution=self.policy_cfg.distribution,
             normalise_observations=self.policy_cfg.normalise_observations,
         )
@@ -248,9 +236,6 @@ class TeacherRunner(TrainingLoop):
         if self.imitation is not None and self.critic_warmup:
             state[IMITATED] = self.imitation.teacher.state_dict()
         return self.alg.save() | state
-
-    def _own_state(self) -> dict[str, Any]:
-        return {"env": self.env.env.state_dict()}
 
     def _take(self, state: dict[str, Any], path: str | Path) -> None:
         """Take over what was read from ``path``."""
@@ -270,20 +255,6 @@ class TeacherRunner(TrainingLoop):
         self._window.load_state_dict(state["window"])
         self._restore(state)
         self._stagger_due = bool(self.new_episodes)
-
-    def _misfit(self, ranks: list[dict[str, Any]]) -> str:
-        envs = {saved_worlds(rank) for rank in ranks}
-        if envs == {0}:
-            return "it holds no environments"
-        if envs != {self.env.num_envs}:
-            return f"it is of {max(envs)} environments a process, this run has {self.env.num_envs}"
-        return ""
-
-    def _start_anew(self, ranks: list[dict[str, Any]]) -> None:
-        self.env.start_anew(ranks[0]["env"])
-
-    def _load_own_state(self, state: dict[str, Any]) -> None:
-        self.env.env.load_state_dict(state["env"])
 
     def _close(self) -> None:
         self.env.env.close()

@@ -13,6 +13,7 @@ from vd.config import to_dict
 from vd.device import resolve_device
 from vd.files import check_folder
 from vd.train.begin import find_start
+from vd.train.config import validate
 from vd.train.flags import parse_teacher, write_config
 from vd.train.presets import SMOKE_RUN, TeacherCfg
 from vd.warp_quiet import quiet_warp
@@ -31,10 +32,7 @@ def build_teacher(
 ) -> "TeacherRunner":
     """Build environment and learner as ``cfg`` says, save the resolved configuration, and resume if asked.
 
-    Args:
-        cfg: Configuration.
-        started: ``time.monotonic()`` from which ``max_minutes`` counts; now by default.
-        say: Is told when the slow part begins.
+    ``max_minutes`` counts from ``started``; ``say`` is told when the slow part begins.
 
     Raises:
         FileExistsError: The run folder holds another run and ``resume`` is not set.
@@ -42,6 +40,7 @@ def build_teacher(
     """
     from vd.train.checkpoint import find_checkpoint, load_checkpoint
 
+    validate(cfg.ppo, cfg.policy, cfg.run)
     check_folder(cfg.run.out)
     rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
     checkpoint = find_checkpoint(cfg.run.out, cfg.resume)

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from vd.evaluate.cfg import EvalCfg
+from vd.evaluate.cfg import EpisodeFlags, EvalCfg
 from vd.evaluate.goals import Goals
 from vd.files import check_file
 from vd.paper import PAPER
@@ -19,19 +19,20 @@ if TYPE_CHECKING:
     from vd.tracking.policy import TrackingPolicy
 
 
-@dataclass
-class TrackerCfg:
+@dataclass(kw_only=True)
+class TrackerCfg(EpisodeFlags):
     """Write a tracking policy: a teacher that acts by a depth camera, on objects of known shape.
 
     With --alignment it is a vision policy: of the shape it knows no more than the points of the goal.
 
-    It finds the object among the camera's points. Nothing is learned; its stopping rules are chosen on
-    episodes with objects of validation, those of vd-eval with the same flags and --goals points.
+    It finds the object among the camera's points. Nothing is learned; its stopping rules, for
+    --stop-tolerance and for 0.1 rad, are chosen on episodes with objects of validation, those of vd-eval with
+    the same flags.
     """
 
     teacher: Annotated[str, tyro.conf.Positional]
     """The teacher: a policy.pt, a run's folder, or the name of an installed one."""
-    objects: tuple[str, ...]
+    objects: tuple[str, ...] = field()
     """Object sets to choose the stopping rules on, not those of the training."""
     alignment: Path | None = None
     """Network that finds objects by their goals' points, the alignment.pt of vd-train student."""
@@ -42,24 +43,8 @@ class TrackerCfg:
     quaternion xyzw; that of the network's training or the hand's own camera by default."""
     episodes: int = 256
     """Episodes; rounded up to as many of each object."""
-    tolerance_rad: float = PAPER.success.rotation_rad
-    """Largest true distance that counts as right [rad]; a rule for 0.1 rad is always chosen too."""
-    episode_s: float | None = None
-    """Length of an episode [s]; that of the paper's tests by default: 10, with --in-air 15."""
-    randomise: bool = False
-    """Domain randomisation and disturbances."""
-    in_air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Take the table away, as vd-eval --in-air does: the rule of a policy that is to hold its object."""
     goals: Goals = "points"
-    """What it knows shapes by: mesh, points (500 exact ones, as the paper's) or scan."""
-    sensor_errors: bool = EvalCfg.sensor_errors
-    """Its camera errs as a D415 does."""
-    num_envs: int | None = None
-    """Environments simulated at once; as of vd-eval by default."""
     seed: int = 1000
-    """Of starts, goals and sensor errors."""
-    device: str = "auto"
-    """cpu, cuda:0, ... or auto."""
 
 
 def tracker_command(arguments: Sequence[str], _started: float) -> int:
@@ -72,6 +57,7 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
             the tolerance.
     """
     cfg = tyro.cli(TrackerCfg, args=arguments, prog="vd-train tracker")
+    cfg.validate()
     check_file(cfg.out)
     from vd.evaluate.agents import check_names, open_teacher, policy_name
 
@@ -101,7 +87,7 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
         values.reshape(trace.steps.size, -1) for values in (trace.predicted, trace.action_norm, trace.error)
     )
     chosen = partial(calibrate, predicted, norm, true, trace.steps.ravel())
-    found = chosen(tolerance_rad=cfg.tolerance_rad)
+    found = chosen(tolerance_rad=cfg.stop_tolerance)
     try:
         precise = chosen(tolerance_rad=PAPER.success.precise_rad)
     except ValueError:  # of a policy that never came so near there is nothing to learn
@@ -109,7 +95,7 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     spec = replace(
         spec,
         stopping=found.rule,
-        tolerance_rad=cfg.tolerance_rad,
+        tolerance_rad=cfg.stop_tolerance,
         precise=None if precise is None else precise.rule,
         calibrated_on=_conditions(cfg, found.episodes),
     )
@@ -137,19 +123,8 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
     count = len(load_set(list(cfg.objects)))
     each = math.ceil(cfg.episodes / count)
     envs = cfg.num_envs or envs_for(count, each, device, camera=True)
-    evaluation = EvalCfg(
-        policies=(cfg.teacher,),
-        objects=cfg.objects,
-        episodes=each,
-        no_at_rest=True,
-        episode_s=cfg.episode_s,
-        randomise=cfg.randomise,
-        in_air=cfg.in_air,
-        goals=cfg.goals,
-        sensor_errors=cfg.sensor_errors,
-        seed=cfg.seed,
-        device=device,
-    )
+    told = {one.name: getattr(cfg, one.name) for one in fields(EpisodeFlags)} | {"episodes": each}
+    evaluation = EvalCfg(policies=(cfg.teacher,), no_at_rest=True, **told)
     env = ReorientEnv(task_of(evaluation, policy, cfg.objects, envs), device)
     env.objects = with_symmetries(env.objects, device)
     acting = actor_of(
@@ -166,4 +141,4 @@ def _conditions(cfg: TrackerCfg, episodes: int) -> str:
     parts += [] if cfg.goals == "mesh" else [f"goals by {cfg.goals}"]
     parts += ["in the air"] if cfg.in_air else []
     parts += [] if cfg.sensor_errors else ["without sensor errors"]
-    return ", ".join([*parts, f"tolerance {cfg.tolerance_rad:g} rad", f"seed {cfg.seed}"])
+    return ", ".join([*parts, f"tolerance {cfg.stop_tolerance:g} rad", f"seed {cfg.seed}"])

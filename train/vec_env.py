@@ -32,17 +32,6 @@ class ReorientVecEnv(VecEnv):
     the goal's return: it is not bootstrapped. Only a time-out without success or fall is
     (``extras["time_outs"]``). The observation returned is always that of the next action, after a reset
     or with the new goal.
-
-    Args:
-        env: The environment, already reset.
-
-    Attributes:
-        env: The same, for what rsl-rl knows nothing of.
-        num_envs: Environments N.
-        num_actions: Actions D.
-        max_episode_length: Control steps of an episode.
-        device: Torch device of every tensor.
-        cfg: The environment's configuration as a dictionary.
     """
 
     def __init__(self, env: Any) -> None:
@@ -149,10 +138,6 @@ class ReorientVecEnv(VecEnv):
         }
 
     def start_anew(self, state: dict[str, Any]) -> None:
-        """Begin new episodes in all environments.
-
-        Args:
-            state: What :meth:`state_dict` gave, of which the stage of the curriculum is taken.
-        """
+        """Begin new episodes in all environments, at the stage of the curriculum that their state has."""
         self.env.set_stage(saved_stage(state, self.env.cfg.curriculum))
         self.env.reset()

@@ -12,7 +12,7 @@ from vd.kernels.sensor.kinematics import Joints, forward_kinematics_kernel, link
 
 
 class HandCloud:
-    """Clouds of a hand in the frame of its base; samples come from its USD.
+    """Links and clouds of a hand, on the device; samples come from its USD.
 
     Args:
         hand: The hand.
@@ -24,53 +24,28 @@ class HandCloud:
     """
 
     def __init__(self, hand: HandModel, *, link_body: np.ndarray, device: str):
-        points = hand.link_points
-        body = np.repeat(np.asarray(link_body)[hand.point_link], points.shape[1])
+        link_body, points = np.asarray(link_body), hand.link_points
+        body, base = np.repeat(link_body[hand.point_link], points.shape[1]), int(link_body[0])
         self.count = len(body)
-        self._model = [
-            wp.array(points.reshape(-1, 3), dtype=wp.vec3, device=device),
-            wp.array(body, dtype=wp.int32, device=device),
-            int(link_body[0]),
-        ]
-
-    def __call__(self, body_q: wp.array) -> torch.Tensor:
-        """Points in the base frame [m] [R, H, 3] for poses in the world frame [R, B]."""
-        points = wp.empty((body_q.shape[0], self.count), dtype=wp.vec3, device=body_q.device)
-        launch(link_points_kernel, points.shape, [*self._model, body_q], [points])
-        return wp.to_torch(points)
-
-
-class HandKinematics:
-    """Poses of a hand's links from joint positions, on the device, in place of a simulator's."""
-
-    def __init__(self, hand: HandModel, *, link_body: np.ndarray, device: str):
-        """Put the joints on the device.
-
-        Args:
-            hand: The hand.
-            link_body: Column of each link in the poses, base first, shape [L].
-            device: Warp device.
-        """
-        self.device = device
 
         def array(values: Any, dtype: Any) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
+        self._samples = [array(points.reshape(-1, 3), wp.vec3), array(body, wp.int32), base]
         joints = Joints()
-        joints.parent = array(np.asarray(link_body)[hand.joint_parent], wp.int32)
-        joints.child = array(np.asarray(link_body)[hand.joint_child], wp.int32)
+        joints.parent = array(link_body[hand.joint_parent], wp.int32)
+        joints.child = array(link_body[hand.joint_child], wp.int32)
         joints.axis = array(hand.joint_axis, wp.vec3)
         joints.parent_frame = array(hand.joint_parent_frame, wp.transform)
         joints.child_frame = array(hand.joint_child_frame, wp.transform)
-        self._joints, self._base_body = joints, int(link_body[0])
-        self._base = wp.transform(*(float(value) for value in hand.mount))
+        self._joints = [joints, base, wp.transform(*(float(value) for value in hand.mount))]
 
-    def write(self, joint_q: wp.array, body_q: wp.array) -> None:
+    def pose(self, joint_q: wp.array, body_q: wp.array) -> None:
         """Write link poses in the world frame, shape [N, B], for positions [rad], shape [N, >= D]."""
-        wp.launch(
-            forward_kinematics_kernel,
-            dim=joint_q.shape[0],
-            inputs=[self._joints, self._base_body, self._base, joint_q],
-            outputs=[body_q],
-            device=self.device,
-        )
+        launch(forward_kinematics_kernel, joint_q.shape[0], [*self._joints, joint_q], [body_q])
+
+    def __call__(self, body_q: wp.array) -> torch.Tensor:
+        """Points in the base frame [m] [R, H, 3] for poses in the world frame [R, B]."""
+        points = wp.empty((body_q.shape[0], self.count), dtype=wp.vec3, device=body_q.device)
+        launch(link_points_kernel, points.shape, [*self._samples, body_q], [points])
+        return wp.to_torch(points)

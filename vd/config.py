@@ -4,7 +4,7 @@ import dataclasses
 import types
 import typing
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
@@ -157,6 +157,18 @@ def _convert_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
         except ValueError as error:
             errors.append(str(error))
     raise ValueError("; ".join(errors) or f"{where}: cannot be {value!r}")
+
+
+def leaves(values: Any, where: str = "") -> Iterator[tuple[str, Any]]:
+    """Plain values of nested dictionaries and lists by their path, such as ``hand.upper_rad[3]``."""
+    if isinstance(values, Mapping):
+        for key, item in values.items():
+            yield from leaves(item, f"{where}.{key}" if where else str(key))
+    elif isinstance(values, (list, tuple)):
+        for index, item in enumerate(values):
+            yield from leaves(item, f"{where}[{index}]")
+    else:
+        yield where, values
 
 
 def require(

@@ -16,13 +16,7 @@ from vd.kernels.task.observations import teacher_observation_slices
 
 
 class FrameMaps:
-    """From observations in the world frame to symmetry frames, and from actions in them to the joints.
-
-    Args:
-        hand: The hand.
-        seen: What its teacher observes, and in which frames.
-        device: Torch device.
-    """
+    """From observations in the world frame to symmetry frames, and from actions in them to the joints."""
 
     def __init__(self, hand: HandModel, seen: ObservationCfg, device: str | torch.device = "cpu") -> None:
         def array(values: object, dtype: torch.dtype) -> torch.Tensor:

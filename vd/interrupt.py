@@ -39,6 +39,7 @@ RENAMED = {
     "--goal-s": "--episode-s",
     "--air": "--in-air",
     "--num-worlds": "--num-envs",
+    "--tolerance-rad": "--stop-tolerance",
 }
 """Flags of earlier versions, and what they are called in all commands."""
 GONE = {
@@ -75,10 +76,7 @@ def note(number: int) -> None:
 def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
     """Have the entry point of a command start and end as all commands do.
 
-    ``VD_DEBUG=1`` in the environment adds to an error where in the code it arose.
-
-    Args:
-        name: What the command is called.
+    ``VD_DEBUG=1`` in the environment adds to an error where in the code it arose. ``name`` is the command's.
     """
 
     def format_warning(message: Warning | str, *_: Any, **__: Any) -> str:
@@ -176,8 +174,7 @@ def _come_again(lost: Any) -> None:
 def end_with_parent(parent: int) -> None:
     """Have SIGTERM end this process once its parent is gone: one that is killed cannot tell its children.
 
-    Args:
-        parent: The parent's process ID, as the parent tells it: it may be gone already.
+    The parent tells its process ID itself: it may be gone already.
     """
 
     def watch() -> None:

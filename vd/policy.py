@@ -6,7 +6,7 @@ Reading a policy needs torch only, no simulator and no rsl-rl, and executes noth
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import torch
 from torch import nn
@@ -14,13 +14,12 @@ from torch import nn
 from vd.config import from_dict
 
 POLICY_FORMAT = "visual-dexterity policy 1"
-_ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "gelu": nn.GELU}
 _STAGE = ("difficulty", "tightness", "tightening")
 """What says how far the curriculum has come, in the state of an environment."""
 _WEIGHTS = "_state_dict"
 """How the names of what holds weights end."""
-_POINTER = b"version https://git-lfs"
-"""How a file begins that git has put in the place of a large one."""
+REMEDY = "copy it again, or give another file of its run"
+"""What to do about a policy that cannot be read."""
 _NORMALISER_EPSILON = 1e-2
 """Added to the running std by the normaliser that trained the actor (rsl-rl's EmpiricalNormalization)."""
 
@@ -39,11 +38,11 @@ class Policy(Protocol):
 class PolicySpec:
     """What is needed to rebuild an actor around its weights: O observations, D actions."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"activation": "elu"}
     num_observations: int
     num_actions: int
     hidden: tuple[int, ...]
     """Widths of the hidden layers."""
-    activation: str
     distribution: str
     """``gaussian``, the network gives the mean, or ``state-dependent``: mean, then std."""
     normalise_observations: bool
@@ -77,13 +76,8 @@ class MeanAction(nn.Module):
 class TrainedPolicy:
     """The deterministic policy of a trained actor: the mean of its action distribution.
 
-    Args:
-        spec: Shape of the network.
-        weights: State of rsl-rl's actor (``mlp.*`` and, if it normalises, ``obs_normalizer.*``).
-        task: Configuration of the environment it was trained in, as a dictionary.
-        iteration: Iterations it was trained for.
-        env_steps: Control steps it was trained for.
-        device: Torch device.
+    ``weights`` are the state of rsl-rl's actor: ``mlp.*`` and, if it normalises, ``obs_normalizer.*``;
+    ``task`` is the configuration of the environment it was trained in, as a dictionary.
 
     Attributes:
         hand: Name of the hand it moves, as ``task`` says ("" if it does not).
@@ -124,13 +118,9 @@ class TrainedPolicy:
 
 
 class BuiltIn:
-    """An agent without a file: every action is zero, or uniform in [-1, 1].
+    """An agent without a file, ``zero`` or ``random``: every action is zero, or uniform in [-1, 1].
 
-    Args:
-        name: ``zero`` or ``random``.
-        num_actions: Actions D.
-        seed: Of random actions, the same for the same seed on the same device.
-        device: Torch device of the observations it will get.
+    Actions of a seed are the same on the same device, that of the observations.
     """
 
     def __init__(self, name: str, num_actions: int, *, seed: int = 0, device: str = "cpu") -> None:
@@ -155,8 +145,8 @@ def read_state(path: str | Path, device: str = "cpu", *, remedy: str) -> dict[st
     path = Path(path)
     try:
         state = torch.load(path, map_location=device, weights_only=True)
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"there is no file {path}; {remedy}") from error
     except Exception as error:
         raise ValueError(f"{path} {_damage(path, error)}; {remedy}") from error
     if not isinstance(state, dict):
@@ -169,15 +159,10 @@ def read_state(path: str | Path, device: str = "cpu", *, remedy: str) -> dict[st
 
 def _damage(path: Path, error: Exception) -> str:
     """What is wrong with a file that torch cannot read."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(len(_POINTER))
-    except OSError as reason:
-        return f"cannot be read ({reason.strerror})"
-    if not head:
+    if isinstance(error, OSError):
+        return f"cannot be read ({error.strerror})"
+    if path.stat().st_size == 0:
         return "is damaged: it is empty"
-    if head == _POINTER:
-        return "is a pointer of Git LFS, not the file itself ('git lfs pull' fetches that)"
     return f"is damaged, or is no file of torch ({(str(error) or type(error).__name__).splitlines()[0]})"
 
 
@@ -190,15 +175,6 @@ def _tensors_finite(value: Any) -> Iterator[bool]:
             yield from _tensors_finite(item)
 
 
-def holds(path: Path, part: str) -> bool:
-    """Whether a file of torch is a dictionary with such a key, as far as it can be read."""
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception:  # whoever reads it says what is wrong with it
-        return False
-    return isinstance(state, dict) and part in state
-
-
 def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
     """Rebuild the actor from a checkpoint of ``vd-train`` or from an exported ``policy.pt``.
 
@@ -206,12 +182,11 @@ def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
         FileNotFoundError: There is no such file.
         ValueError: The file is damaged, or not a policy.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no policy at {path}; give a policy.pt or a file of a run's checkpoints folder"
-        )
-    state = read_state(path, device, remedy="copy it again, or give another file of its run")
+    return teacher_in(read_state(path, device, remedy=REMEDY), path, device)
+
+
+def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedPolicy:
+    """The same from what was read of ``path``."""
     if "student_state_dict" in state and "spec" in state:
         raise ValueError(
             f"{path} is a student or its checkpoint, which does not act by itself; vd-train tracker TEACHER "
@@ -257,13 +232,11 @@ def policy_export(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def perceptron(spec: PolicySpec) -> nn.Sequential:
-    """The multilayer perceptron with the layer names rsl-rl gives it."""
-    if spec.activation not in _ACTIVATIONS:
-        raise ValueError(f"unknown activation '{spec.activation}'; known: {', '.join(_ACTIVATIONS)}")
+    """The multilayer perceptron with the layer names rsl-rl gives it, ELU between them as in the paper."""
     outputs = spec.num_actions * (2 if spec.distribution == "state-dependent" else 1)
     layers: list[nn.Module] = []
     width = spec.num_observations
     for hidden in spec.hidden:
-        layers += [nn.Linear(width, hidden), _ACTIVATIONS[spec.activation]()]
+        layers += [nn.Linear(width, hidden), nn.ELU()]
         width = hidden
     return nn.Sequential(*layers, nn.Linear(width, outputs))

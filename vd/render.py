@@ -83,12 +83,7 @@ class Camera:
         return wp.transform(wp.vec3(*self.eye), wp.quat(*Rotation.from_matrix(self.rotation).as_quat()))
 
     def aimed_at(self, point: Sequence[float], radius: float) -> "Camera":
-        """A camera that looks in the same direction at a ball around ``point``, which fills the picture.
-
-        Args:
-            point: Centre [m].
-            radius: Of the ball [m].
-        """
+        """A camera that looks in the same direction at a ball about ``point`` [m], filling the picture."""
         distance = radius / math.sin(math.atan(BALL_SHARE * math.tan(0.5 * self.fov)))
         eye = np.asarray(point, dtype=float) + distance * self.rotation[:, 2]
         return replace(self, eye=_vector(eye), target=_vector(point))
@@ -177,16 +172,10 @@ class PictureModel:
 
 
 class Renderer:
-    """Draws cells of hand and object with the goal beside each.
+    """Draws cells of hand and object, ``width`` by ``height`` pixels, with the goal beside each.
 
-    Args:
-        hand: The hand; None shows objects alone.
-        objects: The object of each cell, length C.
-        width: Width of a cell's picture [pixel].
-        height: Height of a cell's picture [pixel].
-        goal_size: Side of the square picture of the goal [pixel]; GOAL_SHARE of the height by default.
-        camera: Where from.
-        device: Warp device; the CPU is quick enough for video (see ``tests/test_render.py``).
+    Hand, objects and device are as of :class:`PictureModel`; the CPU is quick enough for video. The picture
+    of the goal is a square with sides of ``goal_size`` pixels, or GOAL_SHARE of the height.
     """
 
     def __init__(

@@ -3,10 +3,7 @@
 import ctypes
 import os
 import sys
-import tempfile
-
-_NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
-"""What Warp's library writes to standard error, past Python, on a machine without a GPU."""
+from contextlib import suppress
 
 
 def quiet_warp() -> None:
@@ -16,7 +13,8 @@ def quiet_warp() -> None:
     imported, so this comes before Newton.
 
     Without a driver there is no CUDA context that an early start could spoil. With one Warp starts when it
-    is first used, as ever.
+    is first used, as ever. Its library writes the warning past Python, so standard error itself is turned
+    away meanwhile.
     """
     import warp as wp
 
@@ -25,27 +23,20 @@ def quiet_warp() -> None:
     if _has_driver():
         return
     sys.stderr.flush()
-    kept = os.dup(2)
-    with tempfile.TemporaryFile() as said:
-        os.dup2(said.fileno(), 2)
-        try:
-            wp.init()
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            said.seek(0)
-            lines = [
-                line for line in said.read().splitlines(keepends=True) if not line.startswith(_NO_DRIVER)
-            ]
-            os.write(2, b"".join(lines))
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        wp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _has_driver() -> bool:
     """Whether the CUDA driver's library loads, by the names that Warp tries."""
     for name in ("libcuda.so", "libcuda.so.1"):
-        try:
+        with suppress(OSError):
             ctypes.CDLL(name)
-        except OSError:
-            continue
-        return True
+            return True
     return False

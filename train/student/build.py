@@ -28,12 +28,10 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
     trained, chosen = trained_task(policy), cfg.task
     task = task_for(
         policy,
-        hand=None,
         objects=chosen.objects or trained.objects,
         num_envs=chosen.num_envs,
         seed=chosen.seed,
         stop_tolerance_rad=PAPER.success.rotation_rad,
-        max_goal_angle_rad=None,
         episode_s=trained.episode_s,
         randomised=trained.randomisation.enabled,
         success_ends_episode=False,

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch.nn.functional import normalize
 
 from vd.assets_usd.hand_data import HandModel, compose, invert
-from vd.clouds import HandCloud, HandKinematics
+from vd.clouds import HandCloud
 from vd.train.student.shapes import drawn, random_matrices, uniform
 from vd.vision.rotations import matrices, rotations_about, two_columns
 
@@ -152,9 +152,9 @@ def posture_points(hand: HandModel, count: int, device: str) -> torch.Tensor:
     lower, upper = torch.tensor(np.stack([hand.lower, hand.upper]), dtype=torch.float32, device=place)
     joints = lower + (upper - lower) * torch.rand((count, len(lower)), device=place)
     poses = wp.empty((count, len(links)), dtype=wp.transform, device=device)
-    kinematics = HandKinematics(hand, link_body=links, device=device)
-    kinematics.write(wp.from_torch(joints), poses)
-    return HandCloud(hand, link_body=links, device=device)(poses)
+    cloud = HandCloud(hand, link_body=links, device=device)
+    cloud.pose(wp.from_torch(joints), poses)
+    return cloud(poses)
 
 
 def nearest(cell: torch.Tensor, depth: torch.Tensor, cells: int) -> torch.Tensor:

@@ -28,7 +28,6 @@ from vd.files import make_folder, write_json
 from vd.gap import workflow
 from vd.gap.torque_unit import in_known_unit
 from vd.kernels.servo import chains
-from vd.versions import source_commit
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
 
@@ -100,7 +99,7 @@ def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
         result = score(case, in_known_unit(report, hidden.recording).to_dict(), hidden.truth)
     except Exception:  # one case that fails is a figure of the battery, not its end
         result = {"case": asdict(case), "error": traceback.format_exc(limit=6)}
-    result |= {"commit": source_commit(), "cpu_s": time.process_time() - begin}
+    result["cpu_s"] = time.process_time() - begin
     write_json(folder / f"{case.name}.json", result)
     return result
 

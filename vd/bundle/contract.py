@@ -5,13 +5,12 @@ it again from the hand at hand and compares field by field. SI units, radians; q
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from vd.assets_usd.hand_data import HandModel
-from vd.config import from_dict, to_dict
+from vd.config import from_dict, leaves, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
@@ -180,37 +179,25 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
         for part, values in contract.interface.items()
         if part != "cloud"  # none, in bundles of earlier versions
     }
-    for name, have, want in _differences(found, wanted):
-        part = name.split(".")[0]
-        raise ContractError(
-            f"{where} does not fit the hand {hand.name} ({hand.path}): {name} is {_short(have)} here, but "
-            f"{_short(want)} in the bundle; {_REMEDY[part]}"
-        )
+    have, want = dict(leaves(found)), dict(leaves(wanted))
+    for name in dict.fromkeys((*want, *have)):
+        here, there = have.get(name), want.get(name)
+        if not _same(here, there):
+            raise ContractError(
+                f"{where} does not fit the hand {hand.name} ({hand.path}): {name} is {_short(here)} here, "
+                f"but {_short(there)} in the bundle; {_REMEDY[name.split('.')[0]]}"
+            )
 
 
-def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Fields in which two trees of plain values differ: name, found, wanted."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in dict.fromkeys((*wanted, *found)):
-            below = f"{name}.{key}" if name else str(key)
-            yield from _differences(found.get(key), wanted.get(key), below)
-    elif isinstance(found, list) and isinstance(wanted, list):
-        if len(found) != len(wanted):
-            yield f"{name} (their number)", len(found), len(wanted)
-            return
-        for index, (one, other) in enumerate(zip(found, wanted, strict=True)):
-            yield from _differences(one, other, f"{name}[{index}]")
-    elif isinstance(found, float) and isinstance(wanted, float):
-        if not math.isclose(found, wanted, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE):
-            yield name, found, wanted
-    elif found != wanted:
-        yield name, found, wanted
+def _same(found: Any, wanted: Any) -> bool:
+    """Whether two plain values are equal, numbers but for rounding."""
+    if isinstance(found, float) and isinstance(wanted, float):
+        return math.isclose(found, wanted, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE)
+    return bool(found == wanted)
 
 
 def _short(value: Any) -> str:
     """A value for a message."""
     if value is None:
         return "missing"
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    return f"{len(value)} fields" if isinstance(value, dict) else repr(value)
+    return f"{value:.6g}" if isinstance(value, float) else repr(value)

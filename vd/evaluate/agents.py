@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from vd.bundle import is_bundle
 from vd.config import from_dict
 from vd.envs.cfg import CurriculumCfg, ObservationCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TableCfg
-from vd.paper import PAPER
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -36,11 +35,6 @@ DEFAULT_POLICY = "dclaw4"
 DEFAULT_HAND = "dclaw4"
 NO_LAYER = "none"
 """What --hand-layer is to be for the hand as it is, whatever the training."""
-LAYER_HELP = (
-    "Layer over the hand with a servo model, identified.usda of vd-gap; by default the policy's, "
-    f"{NO_LAYER} for the hand as it is."
-)
-"""What --hand-layer means on the command lines of vd-eval and vd-play."""
 # What a run's folder holds, best first.
 _RUN_FILES = ("policy.pt", "checkpoints/best.pt")
 
@@ -106,17 +100,14 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | TrackingPolicy | Non
     """
     if name in BUILT_IN:
         return None
-    from vd.policy import load_policy
-    from vd.tracking.policy import is_tracking, load_tracking
-
     path = find_policy(name)
     if is_bundle(path):
         from vd.bundle.store import read_bundle
 
         return read_bundle(path, device)
-    if is_tracking(path):
-        return load_tracking(path, device)
-    return load_policy(path, device)
+    from vd.tracking.policy import read_policy
+
+    return read_policy(path, device)
 
 
 def sees_clouds(policy: Any | None) -> bool:
@@ -167,24 +158,6 @@ def _on_hand(task: ReorientCfg, hand: str | None, hand_layer: str | None) -> Reo
     """A task with the hand and layer that were asked for; None: as trained."""
     layer = task.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer
     return replace(task, hand=hand or task.hand, hand_layer=layer)
-
-
-def start_at_rest(yes: bool, no: bool) -> bool | None:
-    """What the flags ``--at-rest`` and ``--no-at-rest`` ask for; None: as trained.
-
-    Raises:
-        ValueError: Both are given.
-    """
-    if yes and no:
-        raise ValueError("--at-rest and --no-at-rest exclude each other; give one of them, or none")
-    return yes if yes or no else None
-
-
-def episode_limit_s(episode_s: float | None, *, in_air: bool) -> float:
-    """Length of an episode [s]: as asked for, or that of the paper's test on the table or in the air."""
-    if episode_s is not None:
-        return episode_s
-    return PAPER.scene.air_episode_s if in_air else PAPER.scene.episode_s
 
 
 def task_for(

@@ -11,15 +11,24 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.evaluate.goals import AIR_HOLD_S, ALONE_S, GOAL_S, IN_A_ROW
 from vd.evaluate.result import Agent, InAir, Protocol, Row, row_of
 from vd.evaluate.rollout import draw_goals, unit_quats
-from vd.evaluate.statistics import choose_unit, rate_intervals, rotation_angle, symmetric_error
-from vd.evaluate.trace import Episode, Way, air_table_steps, copy_motion, drawn_rounds, motion_of, out_of_hand
+from vd.evaluate.statistics import choose_unit, rate_intervals, rotation_angle, share_among, symmetric_error
+from vd.evaluate.trace import (
+    Way,
+    act_in,
+    advance,
+    air_table_steps,
+    copy_motion,
+    drawn_rounds,
+    episodes_of,
+    motion_of,
+    out_of_hand,
+)
 
 
 @dataclass(frozen=True)
@@ -76,17 +85,10 @@ def record_in_air(
     goals: np.ndarray | None = None,
     on_step: Callable[[], object] = lambda: None,
 ) -> AirTrace:
-    """Run a policy and write down what becomes of its objects.
+    """Run a policy and write down what becomes of its objects; others as of :func:`vd.evaluate.trace.record`.
 
-    Args:
-        env: As of :func:`vd.evaluate.trace.record`, with episodes of AIR_S.
-        policy: What acts.
-        turns: What :func:`air_turns` gave, of the objects of the environment.
-        way: When it is stopped, and gets the next goal.
-        tolerance: Largest true distance at which a stop reaches its goal [rad]; after others nothing follows.
-        starts: Initial orientations [K, M, 4]; None: the environment draws them.
-        goals: Goals while the table is there [K, M, 4], with ``starts``.
-        on_step: Called after every control step.
+    It gets the first goal, and the next after each stop by ``way`` within ``tolerance`` [rad] of the true
+    one, by ``turns`` of :func:`air_turns`; ``goals`` are those while the table is there.
     """
     shape = turns.shape[:2]
     trace = AirTrace(
@@ -117,20 +119,15 @@ def judge_in_air(
     exact = rotation_angle(trace.end_quat, trace.goal_quat)
     pairs = zip(trace.end_quat, trace.goal_quat, objects, strict=True)
     error = np.stack([symmetric_error(end, goal, item.symmetry) for end, goal, item in pairs])
-    before = rotation_angle(trace.start_quat, trace.goal_quat)
-    episodes = tuple(
-        Episode(
-            object_index=k,
-            start_quat=tuple(trace.start_quat[k, m].tolist()),
-            goal_quat=tuple(trace.goal_quat[k, m].tolist()),
-            start_error_rad=float(before[k, m]),
-            error_rad=float(error[k, m]),
-            exact_error_rad=float(exact[k, m]),
-            steps=int(trace.steps[k, m]),
-            stopped=bool(trace.stopped[k, m]),
-            fell=bool(trace.lost[k, m] and not trace.stopped[k, m]),
-        )
-        for k, m in np.ndindex(*trace.steps.shape)
+    episodes = episodes_of(
+        start_quat=trace.start_quat,
+        goal_quat=trace.goal_quat,
+        start_error_rad=rotation_angle(trace.start_quat, trace.goal_quat),
+        error_rad=error,
+        exact_error_rad=exact,
+        steps=trace.steps,
+        stopped=trace.stopped,
+        fell=trace.lost & ~trace.stopped,
     )
     near = trace.stopped & (error <= protocol.stop_tolerance_rad)
     held, symmetric, in_a_row = rate_intervals(np.stack([trace.held, near, trace.reached == IN_A_ROW]), unit)
@@ -143,25 +140,16 @@ def judge_in_air(
         condition=condition,
         stopped_by=stopped_by,
         rule=rule,
-        ours="",
-        held=None,
         symmetric=symmetric,
-        precise=None,
-        prediction=None,
         in_air=InAir(
             held=held,
-            first=_share(first, trace.held),
+            first=share_among(first, trace.held),
             in_a_row=in_a_row,
-            lost=_share(trace.lost, trace.held),
-            let_go=_share(trace.let_go, first),
+            lost=share_among(trace.lost, trace.held),
+            let_go=share_among(trace.let_go, first),
         ),
     )
     return [row]
-
-
-def _share(of: np.ndarray, among: np.ndarray) -> float | None:
-    """Mean of ``of`` where ``among`` holds; None where it does nowhere."""
-    return float(of[among].mean()) if among.any() else None
 
 
 class _Flight:
@@ -222,12 +210,9 @@ class _Flight:
         env, (rule, by) = self._env, self._way
         smoothed = wp.to_torch(env.smoothed)
         norm = smoothed.norm(dim=-1).cpu().numpy()
-        if by == "predicted":
-            policy.active = torch.zeros(env.num_envs, dtype=torch.bool, device=smoothed.device)
-            policy.active[torch.from_numpy(self._envs).to(smoothed.device)] = True
         quat = unit_quats(env.object_pose()[:, 3:7])
         true = rotation_angle(quat, unit_quats(env.goal_quat.numpy()))
-        action = policy.act(wp.to_torch(env.observation))
+        action = act_in(env, policy, self._envs)
         seen = policy.predicted.cpu().numpy() if by == "predicted" else true
         stops = rule.stops(seen, norm) & (self._age > 0)
         trace = self._trace
@@ -238,7 +223,7 @@ class _Flight:
         reached = self._envs[stops[self._envs]]
         trace.reached[self._of(reached)] += 1
         copy_motion(self._kept, motion_of(env), reached[trace.reached[self._of(reached)] == 1])
-        env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
+        advance(env, action)
         return reached
 
     def _hold(self) -> None:

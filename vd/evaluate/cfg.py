@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from vd.config import require
 from vd.envs.cfg import RandomisationCfg
-from vd.evaluate.agents import LAYER_HELP, SHIPPED_POLICIES, episode_limit_s, start_at_rest
+from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.evaluate.conditions import CONDITIONS, Condition
 from vd.evaluate.goals import AIR_S, Goals
 from vd.paper import PAPER
@@ -32,6 +33,13 @@ OF_THE_SUITE = (
     "sensor_errors",
 )
 """Settings that a suite decides."""
+EXCLUSIVE = (
+    ("condition", "randomise", "table_friction"),
+    ("at_rest", "no_at_rest"),
+    ("air_goals", "in_air"),
+    ("air_goals", "episode_s"),
+)
+"""Settings that say different things of the same."""
 POLICY_HELP = (
     "A policy.pt, a checkpoint, the folder of a bundle or of a run, the name of an installed "
     f"policy ({', '.join(SHIPPED_POLICIES)}), or zero or random, which have no file."
@@ -39,8 +47,60 @@ POLICY_HELP = (
 """What names a policy on a command line."""
 
 
-@dataclass
-class EvalCfg:
+@dataclass(kw_only=True)
+class TaskFlags:
+    """The task in which policies act, for vd-eval, vd-play and vd-train tracker."""
+
+    objects: tuple[str, ...] = ("cube",)
+    """Object sets by name, folders or files (vd-assets makes them)."""
+    seed: int = 0
+    """Seed of starts, goals and everything else random."""
+    in_air: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
+    randomise: bool = False
+    """Randomise dynamics and add noise and disturbances as in training."""
+    device: str = "auto"
+    """auto, cpu or cuda:N."""
+
+
+@dataclass(kw_only=True)
+class HandFlags:
+    """The hand, for vd-eval and vd-play."""
+
+    hand: str | None = None
+    """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
+    hand_layer: str | None = None
+    """Layer over the hand with a servo model, identified.usda of vd-gap; by default the policy's, none for
+    the hand as it is."""
+
+
+@dataclass(kw_only=True)
+class EpisodeFlags(TaskFlags):
+    """Episodes that are judged, for vd-eval and vd-train tracker."""
+
+    episodes: int = 20
+    """Starts and goals of every object."""
+    stop_tolerance: float = PAPER.success.rotation_rad
+    """An episode stops below this error [rad]; 0.1 for the paper's precise variant."""
+    episode_s: float | None = None
+    """Time limit of an episode [s]; 10 by default, 15 with --in-air, 39 with --air-goals of vd-eval."""
+    goals: Goals = "mesh"
+    """What camera policies know shapes and goals by: the exact mesh; 500 exact points, as the paper's; or a
+    scan, points with 4 mm of noise and a fifth missing. A surface is laid through points."""
+    sensor_errors: bool = True
+    """Cameras of policies err as a D415 does: noise, gaps, late images, not quite where it is believed
+    (docs/concepts/perception.md). Without: as in their training."""
+    num_envs: int | None = None
+    """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a GPU (1024
+    with camera policies)."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the flag and the remedy."""
+        require(self, "--", "positive", "episodes stop_tolerance episode_s num_envs")
+
+
+@dataclass(kw_only=True)
+class EvalCfg(HandFlags, EpisodeFlags):
     """Evaluate policies: every object from the same starts to the same goals, whatever the policy.
 
     Objects fall into the hand from orientations uniform on SO(3), or, with --at-rest, lie on the table.
@@ -66,13 +126,6 @@ class EvalCfg:
     objects: tuple[str, ...] = ()
     """Object sets by name, folders or files (vd-assets makes them); cube by default. NAME=SET puts one into a
     group, which gets figures of its own: training=FOLDER held-out=FOLDER symmetric=symmetric."""
-    episodes: int = 20
-    """Starts and goals of every object."""
-    hand: str | None = None
-    """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
-    hand_layer: Annotated[str | None, tyro.conf.arg(help=LAYER_HELP)] = None
-    seed: int = 0
-    """Seed of starts, goals and everything else random."""
     max_goal_angle: float = math.pi
     """Goals are within this angle [rad] of the start; pi is all of SO(3)."""
     at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -80,25 +133,11 @@ class EvalCfg:
     environment draws such starts and their goals; they depend on --num-envs too."""
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
-    stop_tolerance: float = PAPER.success.rotation_rad
-    """An episode stops below this error [rad]; 0.1 for the paper's precise variant."""
-    episode_s: float | None = None
-    """Time limit of an episode [s]; 10 by default, 15 with --in-air, 39 with --air-goals."""
-    in_air: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
     air_goals: tyro.conf.FlagCreatePairsOff[bool] = False
     """The same, and a second later goal after goal, three with 12 s for each; what reaches the first is also
     held for 30 s. Success is of the first."""
     table_friction: float | None = None
     """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
-    goals: Goals = "mesh"
-    """What camera policies know shapes and goals by: the exact mesh; 500 exact points, as the paper's; or a
-    scan, points with 4 mm of noise and a fifth missing. A surface is laid through points."""
-    sensor_errors: bool = True
-    """Cameras of policies err as a D415 does: noise, gaps, late images, not quite where it is believed
-    (docs/concepts/perception.md). Without: as in their training."""
-    randomise: bool = False
-    """Randomise dynamics and add noise and disturbances as in training."""
     condition: Condition | None = None
     """Evaluate in a named condition, whatever the training: nominal; s3, Table S3; hard, the same with forces
     that last a control step; mixed, Table S3 with friction, backlash, late commands and a late object;
@@ -106,11 +145,6 @@ class EvalCfg:
     change one thing, which the page of --suite robust names."""
     engine: Engine = "newton"
     """What steps the physics: as in training, or MuJoCo's own engine in C, in steps of 1 ms, on the CPU."""
-    num_envs: int | None = None
-    """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a GPU (1024
-    with camera policies)."""
-    device: str = "auto"
-    """auto, cpu or cuda:N."""
     out: Path = Path("runs/eval")
     """Folder for eval.json and eval.html."""
     json: bool = False
@@ -140,6 +174,11 @@ class EvalCfg:
         return AIR_S if self.air_goals else episode_limit_s(self.episode_s, in_air=self.in_air)
 
     @property
+    def rest(self) -> bool | None:
+        """Whether objects start at rest; None: as trained."""
+        return self.at_rest if self.at_rest or self.no_at_rest else None
+
+    @property
     def randomisation(self) -> RandomisationCfg | None:
         """What is drawn; None: as trained."""
         if self.condition is not None:
@@ -148,55 +187,34 @@ class EvalCfg:
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
-        if self.episodes < 1:
-            raise ValueError(f"--episodes is {self.episodes}; at least 1 is needed")
-        if not 0.0 < self.max_goal_angle <= math.pi + 1e-6:
-            raise ValueError(
-                f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
-            )
-        if not 0.0 < self.stop_tolerance <= math.pi:
-            raise ValueError(
-                f"--stop-tolerance is {self.stop_tolerance}; it must be above 0 and at most pi rad"
-            )
-        if self.table_friction is not None and self.randomise:
-            raise ValueError("--table-friction and --randomise exclude each other; give one of them")
-        if self.condition is not None and (self.randomise or self.table_friction is not None):
-            raise ValueError("--condition excludes --randomise and --table-friction; give one of them")
-        if self.table_friction is not None and self.table_friction < 0.0:
-            raise ValueError(f"--table-friction is {self.table_friction}; it must not be negative")
+        super().validate()
+        require(self, "--", "positive", "jobs max_goal_angle")
+        require(self, "--", "zero or positive", "table_friction")
+        if self.max_goal_angle > math.pi + 1e-6:
+            raise ValueError(f"--max-goal-angle is {self.max_goal_angle}; it must be at most pi rad")
         if self.engine == "mujoco" and self.device.startswith("cuda"):
             raise ValueError(f"--engine mujoco steps on the CPU, not on {self.device}; leave --device out")
-        self._validate_time()
-        self._validate_suite()
-        start_at_rest(self.at_rest, self.no_at_rest)
-        if self.num_envs is not None and self.num_envs < 1:
-            raise ValueError(
-                f"--num-envs is {self.num_envs}; at least one environment for each object is needed"
-            )
+        given = [name for name, value in vars(EvalCfg()).items() if getattr(self, name) != value]
+        for names in EXCLUSIVE:
+            if len(both := [flag(name) for name in names if name in given]) > 1:
+                raise ValueError(f"{' and '.join(both)} exclude each other; give one of them")
+        if self.suite is None and (self.quick or self.jobs > 1):
+            raise ValueError("--quick and --jobs are of a suite; add --suite paper, or leave them out")
+        decided = [flag(name) for name in OF_THE_SUITE if self.suite and name in given]
+        if decided:
+            raise ValueError(f"{' and '.join(decided)} is decided by --suite {self.suite}; leave it out")
 
-    def _validate_time(self) -> None:
-        if self.air_goals and (self.in_air or self.episode_s is not None):
-            raise ValueError(
-                "--air-goals has the table go, and a time limit, of its own; leave --in-air and "
-                "--episode-s out"
-            )
-        if self.limit_s <= 0.0:
-            raise ValueError(f"--episode-s is {self.episode_s}; it must be positive")
 
-    def _validate_suite(self) -> None:
-        if self.jobs < 1:
-            raise ValueError(f"--jobs is {self.jobs}; at least 1 is needed")
-        if self.suite is None:
-            if self.quick:
-                raise ValueError("--quick is of a suite; add --suite paper, or lower --episodes")
-            if self.jobs > 1:
-                raise ValueError("--jobs is of a suite; add --suite paper, or leave it out")
-            return
-        default = EvalCfg()
-        for name in OF_THE_SUITE:
-            if getattr(self, name) != getattr(default, name):
-                flag = name.replace("_", "-")
-                raise ValueError(f"--{flag} is decided by --suite {self.suite}; leave it out")
+def flag(name: str) -> str:
+    """What the field ``name`` is called on a command line."""
+    return f"--{name.replace('_', '-')}"
+
+
+def episode_limit_s(episode_s: float | None, *, in_air: bool) -> float:
+    """Length of an episode [s]: as asked for, or that of the paper's test on the table or in the air."""
+    if episode_s is not None:
+        return episode_s
+    return PAPER.scene.air_episode_s if in_air else PAPER.scene.episode_s
 
 
 def parse_groups(objects: Sequence[str]) -> dict[str, tuple[str, ...]]:

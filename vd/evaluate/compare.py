@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vd.evaluate.agents import check_fits, open_policy, sees_clouds, start_at_rest, task_for
+from vd.evaluate.agents import check_fits, open_policy, sees_clouds, task_for
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
 from vd.evaluate.conditions import in_condition
 from vd.sim.cfg import in_mujoco
@@ -16,10 +16,8 @@ from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
-    from vd.evaluate.air import AirTrace
     from vd.evaluate.goals import Goals
     from vd.evaluate.result import Agent, Protocol, Result
-    from vd.evaluate.trace import Trace
 
 ENVS_CPU, ENVS_GPU, ENVS_CAMERA_GPU = 64, 8192, 1024
 """Environments simulated at once by default: enough to keep the device busy, few enough to fit anywhere;
@@ -73,7 +71,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
         actor, agent = actor_of(
             name, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
         )
-        trace: Any = (run_in_air if cfg.air_goals else run_episodes)(cfg, env, actor, agent)
+        trace = run_episodes(cfg, env, actor, agent)
         for group, sets in groups.items():
             chosen = [files.index(file) for file in set_files(sets)]
             objects = [env.objects[number] for number in chosen]
@@ -102,7 +100,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         episode_s=cfg.limit_s,
         randomised=True,
         success_ends_episode=True,
-        at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
+        at_rest=cfg.rest,
         hand_layer=cfg.hand_layer,
         condition=cfg.randomisation,
     )
@@ -159,9 +157,9 @@ def actor_of(
 
     if policy is None:
         actor = BuiltIn(name, env.num_actions, seed=seed, device=env.device)
-        return actor, Agent(name, name, "nothing", StoppingRule, predicts=False)
+        return actor, Agent(name, name, "nothing", StoppingRule)
     if not sees_clouds(policy):
-        return policy, Agent(name, "teacher", "state", StoppingRule, predicts=False)
+        return policy, Agent(name, "teacher", "state", StoppingRule)
     from vd.workers import one_thread_without_gpu
 
     one_thread_without_gpu(env.device)
@@ -169,38 +167,26 @@ def actor_of(
     from vd.evaluate.tracking import TrackingActor
 
     eyes = TrackingActor(env, policy, **settings)
-    return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for, predicts=True)
+    return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for)
 
 
-def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "Trace":
-    """All episodes of one policy, with a progress bar."""
+def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> Any:
+    """All episodes of one policy, with a progress bar: a Trace, or with ``--air-goals`` an AirTrace."""
+    from vd.evaluate.air import air_turns, record_in_air
     from vd.evaluate.trace import air_table_steps, record
 
+    drawn, tolerance = _drawn(cfg, env), cfg.stop_tolerance
     with _progress(cfg, env, agent) as on_step:
-        trace = record(
-            env,
-            actor,
-            cfg.episodes,
-            **_drawn(cfg, env),
-            table_steps=air_table_steps(env.cfg.sim.control_hz) if cfg.in_air else None,
-            held=[way for way in agent.ways_to_stop(cfg.stop_tolerance).values() if way[1] != "success"],
-            on_step=on_step,
-        )
-    env.check()
-    return trace
-
-
-def run_in_air(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "AirTrace":
-    """The same with ``--air-goals``."""
-    from vd.evaluate.air import air_turns, record_in_air
-
-    names = [item.name for item in env.objects]
-    turns = air_turns(names, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle)
-    way, tolerance = agent.own_way(cfg.stop_tolerance)[1], cfg.stop_tolerance
-    with _progress(cfg, env, agent) as on_step:
-        trace = record_in_air(
-            env, actor, turns, way, tolerance=tolerance, **_drawn(cfg, env), on_step=on_step
-        )
+        trace: Any
+        if cfg.air_goals:
+            names, way = [item.name for item in env.objects], agent.own_way(tolerance)[1]
+            turns = air_turns(names, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle)
+            trace = record_in_air(env, actor, turns, way, tolerance=tolerance, **drawn, on_step=on_step)
+        else:
+            held = [way for way in agent.ways_to_stop(tolerance).values() if way[1] != "success"]
+            table_steps = air_table_steps(env.cfg.sim.control_hz) if cfg.in_air else None
+            settings: dict[str, Any] = {"table_steps": table_steps, "held": held, "on_step": on_step}
+            trace = record(env, actor, cfg.episodes, **drawn, **settings)
     env.check()
     return trace
 

@@ -22,8 +22,9 @@ from vd.evaluate.statistics import (
     order_interval,
     paired_difference,
     rate_intervals,
+    share_among,
 )
-from vd.evaluate.trace import Episode, StopsBy, Trace, Way
+from vd.evaluate.trace import Episode, StopsBy, Trace, Way, at_steps
 from vd.files import write_json
 from vd.paper import PAPER
 from vd.sim.cfg import Engine
@@ -137,7 +138,7 @@ class InAir:
     """Share of the objects with which the first goal was reached that holding still lost."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """One policy on one group of objects in one condition, under one way to stop."""
 
@@ -154,20 +155,20 @@ class Row:
     stopped_by: StoppedBy
     rule: StoppingRule
     """Bounds of the distance and of the action's norm."""
-    ours: str
+    ours: str = ""
     """What of it is ours, not the paper's; empty for the conditions of the paper."""
     protocol: Protocol
     object_names: tuple[str, ...]
     overall: Summary
     per_object: tuple[Summary, ...]
-    held: Interval | None
+    held: Interval | None = None
     """Share of episodes stopped so, and still there after the hand has held for HOLD_S; None: not tried."""
     symmetric: Interval
     """Share of episodes stopped within the tolerance of what looks like the goal; where the true distance
     decides, it is that distance."""
-    precise: Interval | None
+    precise: Interval | None = None
     """Share of episodes that stop within 0.1 rad of the very goal, by the rule for that; None: not tried."""
-    prediction: Prediction | None
+    prediction: Prediction | None = None
     """What its predictions are worth; None: they do not stop it."""
     warnings: dict[str, str]
     """By name of an object: what its import says may be wrong with it."""
@@ -268,8 +269,6 @@ class Agent:
     """Both as of :class:`Row`."""
     rules: Callable[[float], StoppingRule]
     """Its own rule for a tolerance [rad]."""
-    predicts: bool
-    """Whether it predicts its distance to the goal."""
 
     def ways_to_stop(self, tolerance_rad: float) -> dict[tuple[StoppedBy, str], Way]:
         """The ways to stop it within a tolerance [rad], the headline first, by name and what is ours of it.
@@ -280,7 +279,7 @@ class Agent:
         """
         own, norm = self.rules(tolerance_rad), PAPER.success.action_norm
         true = StoppingRule(tolerance_rad, norm)
-        if not self.predicts:
+        if not self.sees.endswith("clouds"):  # nor predicts
             return {("true distance", ""): (true, "exact"), (SUCCESS, ""): (true, "success")}
         ways: dict[tuple[StoppedBy, str], Way] = {
             ("prediction", ""): (replace(own, action_norm=norm), "predicted"),
@@ -397,21 +396,16 @@ def _stopped_within(
 ) -> np.ndarray:
     """Which episodes a rule stops within a bound of an error, one of the trace's, bool [K, M]."""
     steps, stopped = trace.ends(rule, by)
-    at_stop = np.take_along_axis(error, steps[..., None], axis=-1)[..., 0]
-    return np.asarray(stopped & (at_stop <= bound_rad))
+    return np.asarray(stopped & (at_steps(error, steps) <= bound_rad))
 
 
 def _prediction(trace: Trace) -> Prediction:
     assert trace.predicted is not None
     there = np.isfinite(trace.predicted)
     true, predicted = trace.error[there], trace.predicted[there]
-
-    def share(of: np.ndarray, among: np.ndarray) -> float | None:
-        return float(of[among].mean()) if among.any() else None
-
     return Prediction(
         states=len(true),
         mean_error_rad=float(np.abs(predicted - true).mean()),
-        seen={str(bound): share(predicted <= bound, true <= bound) for bound in BOUNDS_RAD},
-        right={str(bound): share(true <= bound, predicted <= bound) for bound in BOUNDS_RAD},
+        seen={str(bound): share_among(predicted <= bound, true <= bound) for bound in BOUNDS_RAD},
+        right={str(bound): share_among(true <= bound, predicted <= bound) for bound in BOUNDS_RAD},
     )

@@ -53,10 +53,10 @@ def known_objects(
     """
     if goals == "mesh":
         return objects
-    rng = np.random.default_rng(seed)
-    clouds = [
-        item.surface_points if goals == "points" else scan(item.surface_points, rng) for item in objects
-    ]
-    if not surfaces:
-        return [replace(item, surface_points=points) for item, points in zip(objects, clouds, strict=True)]
-    return [known_by_points(item, points, device) for item, points in zip(objects, clouds, strict=True)]
+    known, rng = [], np.random.default_rng(seed)
+    for item in objects:
+        points = item.surface_points if goals == "points" else scan(item.surface_points, rng)
+        known.append(
+            known_by_points(item, points, device) if surfaces else replace(item, surface_points=points)
+        )
+    return known

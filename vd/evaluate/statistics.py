@@ -74,6 +74,11 @@ def choose_unit(num_objects: int) -> Unit:
     return "object" if num_objects >= MIN_CLUSTERS else "episode"
 
 
+def share_among(of: np.ndarray, among: np.ndarray) -> float | None:
+    """Mean of ``of`` where ``among`` holds; None where it does nowhere."""
+    return float(of[among].mean()) if among.any() else None
+
+
 def paired_difference(outcomes: np.ndarray, others: np.ndarray, unit: Unit) -> Interval:
     """How much larger the rate of some outcomes is than that of others on the same episodes, bool [K, M]."""
     pairs = outcomes.astype(float) - others

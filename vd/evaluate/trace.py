@@ -119,20 +119,31 @@ class Trace:
     def episodes(self, rule: StoppingRule, by: StopsBy) -> tuple[Episode, ...]:
         """The episodes as a rule ends them, object by object; arguments as of :meth:`ends`."""
         steps, stopped = self.ends(rule, by)
-        return tuple(
-            Episode(
-                object_index=k,
-                start_quat=tuple(self.start_quat[k, m].tolist()),
-                goal_quat=tuple(self.goal_quat[k, m].tolist()),
-                start_error_rad=float(self.error[k, m, 0]),
-                error_rad=float(self.error[k, m, steps[k, m]]),
-                exact_error_rad=float(self.exact[k, m, steps[k, m]]),
-                steps=int(steps[k, m]),
-                stopped=bool(stopped[k, m]),
-                fell=bool(self.fell[k, m] and not stopped[k, m]),
-            )
-            for k, m in np.ndindex(*steps.shape)
+        return episodes_of(
+            start_quat=self.start_quat,
+            goal_quat=self.goal_quat,
+            start_error_rad=self.error[..., 0],
+            error_rad=at_steps(self.error, steps),
+            exact_error_rad=at_steps(self.exact, steps),
+            steps=steps,
+            stopped=stopped,
+            fell=self.fell & ~stopped,
         )
+
+
+def at_steps(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Of values after t steps [K, M, T + 1] those after ``steps`` [K, M]."""
+    return np.take_along_axis(values, steps[..., None], axis=-1)[..., 0]
+
+
+def episodes_of(**columns: np.ndarray) -> tuple[Episode, ...]:
+    """Episodes, object by object, from columns [K, M, ..] of all their fields but the first."""
+    places = np.ndindex(*columns["steps"].shape)
+    rows = ((k, {name: values[k, m].tolist() for name, values in columns.items()}) for k, m in places)
+    return tuple(
+        Episode(k, **row | {name: tuple(row[name]) for name in ("start_quat", "goal_quat")})
+        for k, row in rows
+    )
 
 
 def record(
@@ -219,6 +230,20 @@ def copy_motion(out: dict[str, torch.Tensor], motion: dict[str, torch.Tensor], e
         out[name][rows] = values[rows]
 
 
+def act_in(env: Any, policy: Any, envs: np.ndarray) -> torch.Tensor:
+    """Actions [N, D]; a policy with ``predicted`` is told that it need not act but in some environments."""
+    if hasattr(policy, "predicted"):
+        policy.active = torch.zeros_like(policy.predicted, dtype=torch.bool)
+        policy.active[torch.from_numpy(envs).to(policy.active.device)] = True
+    action: torch.Tensor = policy.act(wp.to_torch(env.observation))
+    return action
+
+
+def advance(env: Any, action: torch.Tensor) -> None:
+    """One control step of all environments with actions [N, D]."""
+    env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
+
+
 def out_of_hand(env: Any) -> np.ndarray:
     """Whether each object is where it counts as lost, bool [N]; what is not a number is lost too."""
     away = env.object_pose()[:, :3] - np.array(env.hand.workspace.goal_m)
@@ -247,14 +272,11 @@ class _Round:
                 env.sim.place_table(present=False)
             place = self._place(envs)
             trace.action_norm[(*place, step)] = smoothed.norm(dim=-1).cpu().numpy()[envs]
-            if trace.predicted is not None:
-                policy.active = torch.zeros(env.num_envs, dtype=torch.bool, device=smoothed.device)
-                policy.active[torch.from_numpy(envs).to(smoothed.device)] = True
-            action = policy.act(wp.to_torch(env.observation))
+            action = act_in(env, policy, envs)
             if trace.predicted is not None:
                 trace.predicted[(*place, step)] = policy.predicted.cpu().numpy()[envs]
             self._keep_stops(envs, step)
-            env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
+            advance(env, action)
             self._write_errors(envs, step + 1, unit_quats(env.object_pose_end.numpy()[envs, 3:7]))
             trace.still[(*place, step + 1)] = env.still.numpy()[envs] != 0
             done = env.done.numpy()[envs] != 0

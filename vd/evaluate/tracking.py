@@ -7,9 +7,27 @@ import warp as wp
 
 from vd.evaluate.goals import Goals
 from vd.evaluate.scanned import known_objects
-from vd.evaluate.senses import EnvironmentSenses
+from vd.senses import Senses
+from vd.sensors.depth_camera import DepthCamera
 from vd.tracking.policy import TrackingPolicy
 from vd.tracking.tracker import Tracker
+
+
+def sensed(env: Any, camera: DepthCamera) -> Senses:
+    """What the hands of an environment sense now; later steps change all of it but the points."""
+    fresh, joints = wp.to_torch(env.step_count) == 0, env.num_joints
+    camera.reset(wp.from_torch(fresh.int()))  # a late image must not show what was before a reset
+    camera.capture()
+    # Without a pixel in the crop the cloud is one false point at the origin: it counts for nothing.
+    unseen = (wp.to_torch(camera.count) == 0)[:, None, None]
+    return Senses(
+        joint_q=wp.to_torch(env.measured_q)[:, :joints],
+        joint_qd=wp.to_torch(env.measured_qd)[:, :joints],
+        action=wp.to_torch(env.smoothed),
+        goal_quat=wp.to_torch(env.goal_quat),
+        points=wp.to_torch(camera.points).masked_fill(unseen, torch.nan),
+        fresh=fresh,
+    )
 
 
 class TrackingActor:
@@ -17,6 +35,7 @@ class TrackingActor:
 
     Attributes:
         num_actions: D.
+        camera: A depth camera in every environment.
         tracker: What decides.
         predicted: Distance to the goal that it expected before the latest action [rad], shape [N].
         active: Where it acts, bool [N]; elsewhere its actions are 0.
@@ -33,9 +52,10 @@ class TrackingActor:
     ):
         """Open its eyes in every environment, with ``sensor_errors`` those of a real camera."""
         scene, camera, depth = env.scene, env.hand.camera.at(policy.spec.camera), policy.spec.depth
-        self.num_actions = policy.num_actions
+        self.num_actions, self._env, frame_s = policy.num_actions, env, env.cfg.sim.control_dt
+        env.acts_in_frame = False  # who sees by a camera acts in the world, whatever its teacher does
         depth = depth.with_errors() if sensor_errors else depth
-        self._senses = EnvironmentSenses(env, camera, depth, seed=seed)
+        self.camera = DepthCamera.of_scene(scene, env.sim.body_q, depth, camera, frame_s=frame_s, seed=seed)
         self.tracker = Tracker(
             policy,
             env.hand,
@@ -53,6 +73,6 @@ class TrackingActor:
 
     def act(self, _observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] for what is sensed now; the teacher's observation is not looked at."""
-        decision = self.tracker.step(self._senses.read())
+        decision = self.tracker.step(sensed(self._env, self.camera))
         self.predicted.copy_(decision.angle)
         return decision.action.masked_fill(~self.active[:, None], 0.0)

@@ -14,8 +14,8 @@ import tyro
 from vd import interrupt
 from vd.config import require
 from vd.device import resolve_device
-from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, check_names, episode_limit_s
-from vd.evaluate.cfg import POLICY_HELP
+from vd.evaluate.agents import DEFAULT_POLICY, check_names
+from vd.evaluate.cfg import LOG_EVERY_S, POLICY_HELP, HandFlags, TaskFlags, episode_limit_s
 from vd.files import check_file
 from vd.hand_log import is_log
 from vd.paper import PAPER
@@ -31,8 +31,8 @@ VIDEO_SECONDS = 10.0
 FAST_WORLDS_CPU = 16
 
 
-@dataclass
-class PlayCfg:
+@dataclass(kw_only=True)
+class PlayCfg(HandFlags, TaskFlags):
     """Watch a policy: in the browser, or as a video made without a display or GPU.
 
     Starts and goals are as trained; without a policy objects drop, and goals are all of SO(3).
@@ -42,11 +42,6 @@ class PlayCfg:
     """
 
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = DEFAULT_POLICY
-    hand: str | None = None
-    """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
-    hand_layer: Annotated[str | None, tyro.conf.arg(help=LAYER_HELP)] = None
-    objects: tuple[str, ...] = ("cube",)
-    """Object sets by name, folders or files; the viewer offers each object."""
     video: Path | None = None
     """Write this file, .mp4, and exit."""
     seconds: float = VIDEO_SECONDS
@@ -57,14 +52,6 @@ class PlayCfg:
     """Port of the viewer."""
     host: str = "127.0.0.1"
     """Address of the viewer; 0.0.0.0 lets other machines look."""
-    seed: int = 0
-    """Seed of starts and goals."""
-    in_air: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
-    randomise: bool = False
-    """Randomise dynamics and add noise and disturbances as in training."""
-    device: str = "auto"
-    """auto, cpu or cuda:N."""
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
@@ -115,8 +102,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     env, policy = _open(cfg, num_envs=cfg.cells)
     from tqdm import tqdm
 
-    from vd.evaluate.cfg import LOG_EVERY_S
-    from vd.play.video import GRID_CELL, SINGLE_CELL, record, write_frames
+    from vd.play.video import GRID_CELL, SINGLE_CELL, drawn, watched, write_frames
     from vd.render import Renderer
 
     envs = spread(env.world_object, cfg.cells)
@@ -125,7 +111,9 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     renderer = Renderer(env.hand, items, width=width, height=height, device=env.device)
     rate = env.cfg.sim.control_hz
     steps = max(1, round(cfg.seconds * rate))
-    frames: Iterable[Any] = record(env, policy, renderer, envs, steps)
+    # On a GPU what others launch would become part of the step's graph.
+    shots = watched(env, policy, envs, steps)
+    frames: Iterable[Any] = drawn(renderer, shots, meanwhile=env.device == "cpu")
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
     frames = tqdm(frames, total=steps + 1, unit="frame", desc="vd-play", mininterval=refresh)
     count = write_frames(path, frames, rate)

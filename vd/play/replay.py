@@ -9,20 +9,14 @@ from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.hand_log import HandLog, LogError
-from vd.play.video import SINGLE_CELL, Composer, Snapshot, write_frames
+from vd.play.video import SINGLE_CELL, Snapshot, drawn, write_frames
 from vd.render import OUT_OF_SIGHT, Renderer
 
 
 class Replay:
     """The steps of a log as snapshots, and stepping through them as through a :class:`.session.Session`.
 
-    Args:
-        log: The log; it starts over at its end.
-
-    Attributes:
-        hand: The hand that moved.
-        objects: The object.
-        snapshots: One for each control step.
+    It starts over at the end.
 
     Raises:
         LogError: Hand or object are not here.
@@ -95,23 +89,13 @@ class Replay:
                 drops=lost,
             )
 
-    def frames(self, renderer: Renderer) -> Iterator[np.ndarray]:
-        """Draw one frame for each control step, RGB bytes [height, width, 3]."""
-        composer = Composer(1)
-        for shot in self.snapshots:
-            yield composer.frame(renderer.render(shot.joint_q[None], shot.goal_quat[None]), [shot])
-
 
 def film(log: HandLog, path: Path) -> int:
-    """Write the film of a log; returns the number of frames.
-
-    Args:
-        log: The log.
-        path: .mp4.
+    """Write the film of a log to an .mp4; returns the number of frames.
 
     Raises:
         LogError: Hand or object are not here.
     """
     shown, (width, height) = Replay(log), SINGLE_CELL
     renderer = Renderer(shown.hand, shown.objects, width=width, height=height)
-    return write_frames(path, shown.frames(renderer), shown.control_hz)
+    return write_frames(path, drawn(renderer, ([shot] for shot in shown.snapshots)), shown.control_hz)

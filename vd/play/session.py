@@ -9,16 +9,7 @@ from vd.play.video import Snapshot, Watcher, act
 
 
 class Session:
-    """One environment is watched at a time; all of them run.
-
-    Args:
-        env: An environment with at least one environment for each object.
-        policy: What acts.
-        seed: Of the goals drawn on demand.
-
-    Attributes:
-        snapshot: What is shown now.
-    """
+    """One environment is watched at a time, ``snapshot`` shows it; all run, one for each object at least."""
 
     def __init__(self, env: Any, policy: Any, *, seed: int = 0):
         self.env, self._policy = env, policy

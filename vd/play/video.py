@@ -1,8 +1,8 @@
-"""Frames and video files: the picture, the goal beside it, and a strip of numbers and the error's curve."""
+"""Frames and video files: the picture, the goal beside it, and a strip of numbers."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
@@ -14,20 +14,19 @@ import warp as wp
 from PIL import Image, ImageDraw, ImageFont
 
 from vd.evaluate.statistics import rotation_angle
+from vd.evaluate.trace import advance
 from vd.files import atomic_path
 from vd.paper import PAPER
 from vd.render import Picture, Renderer
 
 # Size of a cell's picture [pixel]: alone, and in a grid.
 SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)
-STRIP_HEIGHT = 80
+STRIP_HEIGHT = 60
 MARGIN = 10
-# Error curve: as long as an episode of the paper.
-CURVE_STEPS = round(PAPER.scene.episode_s * PAPER.scene.control_hz)
 # A reached goal or a drop colours the frame's edge for this many control steps, half a second.
 FLASH_STEPS = 6
-INK, SOFT, LINE, STRIP = (28, 35, 48), (110, 119, 134), (205, 211, 220), (250, 251, 252)
-GREEN, RED, BLUE = (0, 140, 100), (205, 70, 20), (0, 114, 178)
+INK, SOFT, STRIP = (28, 35, 48), (110, 119, 134), (250, 251, 252)
+GREEN, RED = (0, 140, 100), (205, 70, 20)
 GOAL_EDGE = (89, 173, 107)
 # H.264 quality of libx264 (0 lossless, 51 worst): no visible blocks at this size, about 0.5 MB for 10 s.
 VIDEO_CRF = 22
@@ -60,12 +59,7 @@ class Snapshot:
 
 
 class Watcher:
-    """Reads chosen environments of an environment after every step, and counts goals and drops.
-
-    Args:
-        env: The environment.
-        envs: Indices of the environments to watch, length C.
-    """
+    """Reads chosen environments of an environment after every step, and counts goals and drops."""
 
     def __init__(self, env: Any, envs: Sequence[int]):
         self.env, self.envs = env, list(envs)
@@ -74,14 +68,7 @@ class Watcher:
         self.drops = np.zeros(len(self.envs), dtype=int)
 
     def read(self, *, stepped: bool = True) -> list[Snapshot]:
-        """The present state of the watched environments.
-
-        Args:
-            stepped: Whether a step was made since the last call; False after a reset.
-
-        Returns:
-            C snapshots.
-        """
+        """The present state of the watched environments; not ``stepped`` after a reset."""
         env, envs = self.env, self.envs
         success = (env.success.numpy()[envs] != 0) & stepped
         fell = (env.fell.numpy()[envs] != 0) & stepped
@@ -110,25 +97,27 @@ class Watcher:
         ]
 
 
-def record(
-    env: Any, policy: Any, renderer: Renderer, envs: Sequence[int], steps: int
+def watched(env: Any, policy: Any, envs: Sequence[int], steps: int) -> Iterator[list[Snapshot]]:
+    """Reset, run a policy, and give the start and every control step of the environments ``envs``."""
+    watcher = Watcher(env, envs)
+    env.reset()
+    yield watcher.read(stepped=False)
+    for _ in range(steps):
+        act(env, policy)
+        yield watcher.read()
+
+
+def drawn(
+    renderer: Renderer, steps: Iterable[list[Snapshot]], *, meanwhile: bool = True
 ) -> Iterator[np.ndarray]:
-    """Reset, run a policy, and draw the start and every control step.
+    """Draw each of ``steps``, on a thread of its own while the next one is made, unless not ``meanwhile``.
 
-    On a CPU a frame is drawn while the next step is simulated. So the kernels of both are compiled at the
-    same time.
-
-    Args:
-        env: The environment.
-        policy: With ``act(observation)``, torch in and out.
-        renderer: With one cell for each of ``envs``.
-        envs: Which environments are drawn, length C.
-        steps: Control steps.
+    So the kernels of both are compiled at the same time. The renderer has a cell for each snapshot of a step.
 
     Yields:
         Frames, RGB bytes [height, width, 3].
     """
-    watcher, composer = Watcher(env, envs), Composer(len(envs))
+    composer = Composer(renderer.pictured.cells)
 
     def draw(snapshots: list[Snapshot]) -> np.ndarray:
         pictures = renderer.render(
@@ -138,46 +127,28 @@ def record(
         )
         return composer.frame(pictures, snapshots)
 
-    env.reset()
-    snapshots = watcher.read(stepped=False)
     with ThreadPoolExecutor(max_workers=1) as pool:
-        for _ in range(steps):
-            frame = pool.submit(draw, snapshots)
-            if str(env.device) != "cpu":  # what others launch would become part of the step's graph
-                frame.result()
-            act(env, policy)
-            snapshots = watcher.read()
-            yield frame.result()
-    yield draw(snapshots)
+        frames: deque[Future[np.ndarray]] = deque()
+        for snapshots in steps:
+            frames.append(pool.submit(draw, snapshots))
+            if len(frames) > meanwhile:
+                yield frames.popleft().result()
+        yield from (frame.result() for frame in frames)
 
 
 def act(env: Any, policy: Any) -> None:
     """Make one control step with the policy's mean action."""
-    action = policy.act(wp.to_torch(env.observation))
-    env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
+    advance(env, policy.act(wp.to_torch(env.observation)))
 
 
 class Composer:
-    """Puts pictures and numbers together, cell by cell, into frames.
-
-    Args:
-        cells: C.
-    """
+    """Puts pictures and numbers together, cell by cell, into frames."""
 
     def __init__(self, cells: int):
-        self._errors: list[deque[float]] = [deque(maxlen=CURVE_STEPS) for _ in range(cells)]
         self._flash = [(0, INK)] * cells
 
     def frame(self, pictures: Sequence[Picture], snapshots: Sequence[Snapshot]) -> np.ndarray:
-        """One frame of all cells, in a grid that is as square as it gets.
-
-        Args:
-            pictures: C pictures.
-            snapshots: What they show.
-
-        Returns:
-            RGB bytes [height, width, 3], both even as video codecs want them.
-        """
+        """One frame of all cells, in a grid as square as it gets: RGB bytes [height, width, 3], both even."""
         cells = [self._cell(i, *pair) for i, pair in enumerate(zip(pictures, snapshots, strict=True))]
         return _grid(cells, int(np.ceil(np.sqrt(len(cells)))))
 
@@ -188,12 +159,7 @@ class Composer:
         draw = ImageDraw.Draw(canvas)
         self._goal(canvas, draw, picture.goal)
         self._edge(index, draw, shot, width, height)
-        self._errors[index].append(shot.error_rad)
-        top = height + MARGIN
-        half = width // 2
-        _numbers(draw, MARGIN, top, shot)
-        box = half, top, width - half - MARGIN, STRIP_HEIGHT - 2 * MARGIN
-        _curve(draw, box, self._errors[index])
+        _numbers(draw, height + MARGIN, width // 2, shot)
         return np.asarray(canvas)
 
     def _goal(self, canvas: Image.Image, draw: ImageDraw.ImageDraw, goal: np.ndarray) -> None:
@@ -214,27 +180,14 @@ class Composer:
             self._flash[index] = (left - 1, color)
 
 
-def _numbers(draw: ImageDraw.ImageDraw, x: int, y: int, shot: Snapshot) -> None:
+def _numbers(draw: ImageDraw.ImageDraw, y: int, half: int, shot: Snapshot) -> None:
     name = shot.name if len(shot.name) <= 22 else shot.name[:21] + "…"
     within = shot.error_rad <= PAPER.success.rotation_rad
-    draw.text((x, y - 2), name, fill=INK, font=_font(14))
-    draw.text((x, y + 17), f"error {shot.error_rad:.2f} rad", fill=GREEN if within else INK, font=_font(18))
+    draw.text((MARGIN, y - 2), name, fill=INK, font=_font(14))
+    error = f"error {shot.error_rad:.2f} rad"
+    draw.text((MARGIN, y + 17), error, fill=GREEN if within else INK, font=_font(18))
     counts = f"{shot.time_s:.1f} s   goals {shot.goals}   drops {shot.drops}"
-    draw.text((x, y + 43), counts, fill=SOFT, font=_font(12))
-
-
-def _curve(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], errors: Sequence[float]) -> None:
-    """Error against time over the last episode length, from 0 to pi, with the success tolerance."""
-    x, y, width, height = box
-    draw.rectangle((x, y, x + width, y + height), fill=(255, 255, 255), outline=LINE)
-    tolerance = y + height * (1 - PAPER.success.rotation_rad / np.pi)
-    draw.line((x, tolerance, x + width, tolerance), fill=GOAL_EDGE)
-    points = [
-        (x + width * i / (CURVE_STEPS - 1), y + height * (1 - error / np.pi))
-        for i, error in enumerate(errors)
-    ]
-    if len(points) > 1:
-        draw.line(points, fill=BLUE, width=2)
+    draw.text((half, y + 22), counts, fill=SOFT, font=_font(12))
 
 
 @lru_cache(maxsize=8)
@@ -252,15 +205,9 @@ def _grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
 
 
 def write_frames(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
-    """Write frames to a video, H.264, which plays everywhere, atomically, as they come.
+    """Write frames, RGB bytes [height, width, 3], one at least, to a video as they come, atomically.
 
-    Args:
-        path: ``.mp4``.
-        frames: RGB bytes [height, width, 3], all of one size, one at least.
-        fps: Frames per second.
-
-    Returns:
-        The number of frames taken.
+    H.264 plays everywhere. Returns the number of frames.
     """
     import imageio_ffmpeg
 

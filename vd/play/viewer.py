@@ -31,11 +31,7 @@ CAMERA_DISTANCE = 1.25
 class PlayViewer:
     """Shows a session in the browser and lets it be steered from there.
 
-    Args:
-        session: What runs.
-        host: Address to serve on; ``127.0.0.1`` keeps it on this machine.
-        port: Port to serve on; the next free one is taken if it is in use.
-        verbose: Print the address.
+    It serves on ``host``, of which ``127.0.0.1`` keeps it on this machine, and the next free port.
     """
 
     def __init__(

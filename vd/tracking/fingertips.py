@@ -12,12 +12,7 @@ from vd.quaternions import product, rotated
 
 
 class Fingertips:
-    """Poses and velocities of a hand's fingertips, as a teacher observes them.
-
-    Args:
-        hand: The hand.
-        device: Torch device.
-        dtype: Of the geometry.
+    """Poses and velocities of a hand's fingertips, as a teacher observes them, in this precision.
 
     Raises:
         ValueError: Its fingers differ, or its joints are no chains from the base to each fingertip.
@@ -43,12 +38,8 @@ class Fingertips:
     def __call__(self, position: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
         """Position [m], quaternion, velocity [m/s] and angular velocity [rad/s] of each fingertip in turn.
 
-        Args:
-            position: Joint positions [rad], shape [N, D].
-            velocity: Joint velocities [rad/s], shape [N, D].
-
-        Returns:
-            Columns as of :func:`vd.kernels.task.observations.teacher_observation_slices`, shape [N, 13 G].
+        Joint positions [rad] and velocities [rad/s] are [N, D]; columns [N, 13 G] as of
+        :func:`vd.kernels.task.observations.teacher_observation_slices`.
         """
         shape = (len(position), *self._axis.shape[:2], 1)
         half, rate = 0.5 * position.reshape(shape), velocity.reshape(shape)

@@ -17,7 +17,7 @@ import warp as wp
 
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.clouds import HandCloud, HandKinematics
+from vd.clouds import HandCloud
 from vd.envs.shapes import ShapeObserver
 from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
 from vd.paper import PAPER
@@ -88,7 +88,6 @@ class Observer:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         envs: dict[str, Any] = {"world_object": world_object, "world_scale": world_scale, "device": device}
-        self._kinematics = HandKinematics(hand, link_body=links, device=device)
         self._hand_cloud = HandCloud(hand, link_body=links, device=device)
         self._ages = (0.0,) if alignment is None else AGES_S
         self.finder: Registration | GoalFinder
@@ -126,15 +125,12 @@ class Observer:
     def __call__(self, senses: Senses) -> tuple[torch.Tensor, torch.Tensor]:
         """Look once.
 
-        Args:
-            senses: What is sensed.
-
         Returns:
             The teacher's observation in the world frame [N, O], and how far the object is expected to be from
             its goal [rad] [N]. Of the orientations in which a known shape looks like the wanted one
             (:mod:`.symmetry`) the nearest is the goal: which of them it is, nobody can see.
         """
-        self._kinematics.write(wp.from_torch(senses.joint_q.contiguous()), self._links)
+        self._hand_cloud.pose(wp.from_torch(senses.joint_q.contiguous()), self._links)
         found = self.found = self._find(senses)
         goal = nearest_goal(found.orientation, senses.goal_quat, self._symmetry)
         angle = rotation_distance(found.orientation, goal)
@@ -163,7 +159,7 @@ class Observer:
         if age > 0.0:
             links = self._past_links
             joints = senses.joint_q - age * senses.joint_qd
-            self._kinematics.write(wp.from_torch(joints.contiguous()), links)
+            self._hand_cloud.pose(wp.from_torch(joints.contiguous()), links)
         return self._hand_cloud(links)
 
     def _find(self, senses: Senses) -> Found:

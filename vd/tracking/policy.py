@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from vd.config import Dropped, from_dict, to_dict
-from vd.policy import TrainedPolicy, holds, policy_of, read_state
+from vd.policy import REMEDY, TrainedPolicy, policy_of, read_state, teacher_in
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
 from vd.vision.alignment import AlignmentNetwork
@@ -68,13 +68,8 @@ class TrackingPolicy:
         return self.teacher.task
 
 
-def is_tracking(path: Path) -> bool:
-    """Whether a file is a tracking policy, as far as it can be read."""
-    return holds(path, "tracking")
-
-
 def tracking_export(policy: TrackingPolicy) -> dict[str, Any]:
-    """What :func:`load_tracking` reads."""
+    """What :func:`read_policy` reads."""
     teacher = policy.teacher
     network = policy.alignment
     own = {} if network is None else {name: v.cpu() for name, v in network.state_dict().items()}
@@ -92,18 +87,16 @@ def tracking_export(policy: TrackingPolicy) -> dict[str, Any]:
     }
 
 
-def load_tracking(path: str | Path, device: str = "cpu") -> TrackingPolicy:
-    """Read a tracking policy.
-
-    Args:
-        path: The file that ``vd-train tracker`` wrote.
-        device: Torch device.
+def read_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy | TrackingPolicy:
+    """The policy in a file: by camera, of vd-train tracker, or a teacher (:func:`vd.policy.load_policy`).
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is damaged, or of another version.
+        ValueError: It is damaged, no policy, or of another version.
     """
-    state = read_state(path, device, remedy="copy it again, or write it anew with vd-train tracker")
+    state = read_state(path, device, remedy=REMEDY)
+    if "tracking" not in state:
+        return teacher_in(state, path, device)
     try:
         spec, network = from_dict(TrackingSpec, state["tracking"]), None
         if spec.alignment is not None:

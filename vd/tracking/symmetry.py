@@ -46,12 +46,7 @@ _found: dict[bytes, np.ndarray] = {}
 
 
 def symmetries(objects: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
-    """Symmetries of shapes, the identity first: quaternions [S, 4] for each.
-
-    Args:
-        objects: The shapes.
-        device: Warp device.
-    """
+    """Symmetries of shapes, the identity first: quaternions [S, 4] for each."""
     keys = [_key(item) for item in objects]
     unknown = {}
     for key, item in zip(keys, objects, strict=True):
@@ -73,13 +68,7 @@ def with_symmetries(objects: Sequence[ObjectModel], device: str) -> list[ObjectM
 def symmetries_of_worlds(
     objects: Sequence[ObjectModel], world_object: np.ndarray, device: str
 ) -> torch.Tensor:
-    """Symmetries of the object of each environment [N, S, 4], the identity where there are fewer.
-
-    Args:
-        objects: The shapes.
-        world_object: Object of each environment, shape [N].
-        device: Warp device.
-    """
+    """Symmetries of the object of each environment [N, S, 4], the identity where there are fewer."""
     found = symmetries(objects, device)
     turns = np.zeros((len(found), max(map(len, found)), 4), dtype=np.float32)
     turns[..., 3] = 1.0
@@ -88,22 +77,9 @@ def symmetries_of_worlds(
     return torch.tensor(turns[np.asarray(world_object)], device=wp.device_to_torch(device))
 
 
-def equivalent_goals(goal: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
-    """Orientations that look like the wanted one.
-
-    Args:
-        goal: Wanted orientations [N, 4].
-        turns: Symmetries of each environment's shape [N, S, 4].
-
-    Returns:
-        Orientations [N, S, 4], the wanted one first.
-    """
-    return product(goal[:, None].expand_as(turns), turns)
-
-
 def nearest_goal(orientation: torch.Tensor, goal: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
     """Of the orientations that look like the wanted one the nearest [N, 4]; arguments [N, 4], [N, S, 4]."""
-    goals = equivalent_goals(goal, turns)
+    goals = product(goal[:, None].expand_as(turns), turns)
     angle = rotation_distance(orientation[:, None].expand_as(goals), goals)
     best = angle.argmin(dim=1)
     return goals[torch.arange(len(goals), device=goals.device), best]

@@ -30,20 +30,11 @@ class Decision:
 class Tracker:
     """Finds the objects of N hands, and lets the teacher act on them.
 
-    Args:
-        policy: The policy.
-        hand: The hand.
-        objects: The objects, as their shapes are known.
-        camera: What sees them, posed in the base frame.
-        world_object: Object of each hand [N]; the first by default, of one hand.
-        world_scale: Size factor of each hand's object [N]; 1 by default.
-        device: Warp device.
+    ``camera`` is posed in the base frame. By default there is one hand, with the first object in its size;
+    else ``world_object`` and ``world_scale`` [N] tell the objects of the hands, and size factors.
 
     Attributes:
         observer: Finds and follows the objects.
-
-    Raises:
-        ValueError: The hand has other joints.
     """
 
     def __init__(
@@ -59,11 +50,6 @@ class Tracker:
     ):
         teacher = policy.teacher
         task = from_dict(ReorientCfg, policy.task, where="task of the policy")
-        if hand.num_joints != policy.num_actions:
-            raise ValueError(
-                f"the policy moves {policy.num_actions} joints, the hand {hand.name} has {hand.num_joints}; "
-                "use the hand it was trained for"
-            )
         objects_of = np.zeros(1, dtype=int) if world_object is None else world_object
         self.observer = Observer(
             hand,
