@@ -144,6 +144,12 @@ class MotorModel:
     """Its angle where the joint is at zero [rad], from the middle of its turn."""
     gear: float = 1.0
     """Its turns for one of the joint."""
+    p_gain: int = 200
+    """Position gain with which it is as stiff as the joint's drive, in its units; by default the paper's."""
+    d_gain: int = 10
+    """Its damping likewise."""
+    current: float = 0.0
+    """Largest current [A] in current-based position control; 0 for plain position control."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,10 @@ EARLIER: dict[str, Any] = {
     "vd:workspace:size": (0.095, 0.165),
 }
 EARLIER_START = (0.0, 0.8, -1.1)
+EARLIER_MOTOR = "XH430-V210"
 """What every hand had in earlier versions, whose files say nothing of it: that of D'Claws."""
+GAINS: dict[str, type] = {"p_gain": int, "d_gain": int, "current": float}
+"""What a file need not say of a motor."""
 ROUNDING_RAD = 1e-5
 """How far a start may be beyond a limit: limits are degrees in single precision."""
 
@@ -130,17 +133,21 @@ class Described:
 
     def motors(self, joints: list[Usd.Prim]) -> tuple[MotorModel | None, ...]:
         """The motor of each joint that says which it has; no two have one ID."""
+        if self.earlier:
+            return tuple(MotorModel(EARLIER_MOTOR, 10 * (n // 3 + 1) + n % 3) for n in range(len(joints)))
         motors: list[MotorModel | None] = []
         for joint in joints:
             if not joint.GetAuthoredPropertiesInNamespace("vd:motor"):
                 motors.append(None)
                 continue
+            said = {n: k for n, k in GAINS.items() if joint.GetAttribute(f"vd:motor:{n}").HasAuthoredValue()}
             motor = MotorModel(
                 model=str(self.value(joint, "vd:motor:model")),
                 id=int(self.value(joint, "vd:motor:id")),
                 sign=self.number(joint, "vd:motor:sign"),
                 offset_rad=self.number(joint, "vd:motor:offset"),
                 gear=self.number(joint, "vd:motor:gear", positive=True),
+                **{name: kind(self.number(joint, f"vd:motor:{name}")) for name, kind in said.items()},
             )
             if abs(motor.sign) != 1.0:
                 raise self.fail(joint, f"'vd:motor:sign' is {motor.sign:g}", "it is 1, or -1")

@@ -12,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import newton_usd_schemas  # noqa: F401 - before the first stage, or mimic joints are no schema of it
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial import ConvexHull

@@ -36,7 +36,7 @@ USAGE = """usage: vd-deploy [POLICY] [flags]   the same as vd-deploy run
 commands:
 {}
 
-What talks to motors takes --hand dclaw3|dclaw4 and either --port DEVICE or --twin, a simulated hand on a
+What talks to motors takes --hand HAND and either --port DEVICE or --twin, a simulated hand on a
 pseudo-terminal. Nothing moves before the preflight has passed and you have said yes (--yes says so at once).
 vd-deploy COMMAND --help lists the flags of a command, vd-deploy --hand dclaw3 --help those of a run."""
 

@@ -12,11 +12,10 @@ from simulated_clock import SimulatedClock
 
 from vd.assets_usd.hand_model import HandModel
 from vd.deploy.hardware.bus import BAUD_RATE, MotorBus
-from vd.deploy.hardware.connect import MOTOR
-from vd.deploy.hardware.control_table import MODELS, to_angle
+from vd.deploy.hardware.control_table import to_angle
 from vd.deploy.hardware.joints import Joints
 from vd.deploy.twin.line import MotorLine
-from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.motor import make_motors
 from vd.deploy.twin.plant import Plant
 
 BYTE_S = 10.0 / BAUD_RATE
@@ -87,12 +86,10 @@ def simulated_bus(
     """A line of a hand's motors, and a configured bus to it."""
     clock = SimulatedClock()
     port = SimulatedPort(clock)
-    port.line = line = MotorLine(
-        [Motor(MODELS[MOTOR], id) for id in joints.ids], plant, clock=clock, put=port.put
-    )
+    port.line = line = MotorLine(make_motors(joints), plant, clock=clock, put=port.put)
     stop = clock.every(TICK_S, line.go_on)
-    with MotorBus(port, joints.ids, MOTOR, clock=clock) as bus:
-        bus.configure(joints.settings(hand, MOTOR))
+    with MotorBus(port, joints.ids, joints.models, clock=clock) as bus:
+        bus.configure(joints.settings())
         yield line, bus
     stop()
 

@@ -20,7 +20,7 @@ from vd.deploy.camera.calibrate import CalibrateCfg, calibrate, seat
 from vd.deploy.camera.camera import Frame
 from vd.deploy.camera.hand_eye import HandEyeError, Views, marker_corners, refine, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, picture_of
-from vd.deploy.hardware.joints import uncalibrated
+from vd.deploy.hardware.joints import read_joints
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed (extra: hardware)")
 
@@ -201,7 +201,7 @@ class Bench:
     def __init__(self, hand, lens, poses, camera, joint_rad=0.0):
         self.hand, self.intrinsics, self.poses, self.at = hand, lens, list(poses), -1
         self.camera, self.said = compose(camera, AWAY), camera
-        self.generator, self.joints = np.random.default_rng(0), uncalibrated(hand)
+        self.generator, self.joints = np.random.default_rng(0), read_joints(hand)
         self.bus = self
         wrong = joint_rad * self.generator.standard_normal((len(poses) // 2, hand.num_joints))
         self.read_poses = self.poses + np.repeat(wrong, 2, axis=0)

@@ -21,7 +21,7 @@ from vd.deploy import cli
 from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.hardware import check, home, record
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
-from vd.deploy.hardware.joints import uncalibrated
+from vd.deploy.hardware.joints import read_joints
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import StoppedError
 from vd.deploy.twin.faults import BEFORE, MOVING, try_fault, try_preflight
@@ -44,13 +44,13 @@ def hand():
 @pytest.fixture
 def line(hand, monkeypatch):
     """What commands connect to: motors on a simulated line, where nothing is late on a busy machine."""
-    joints = uncalibrated(hand)
+    joints = read_joints(hand)
     with simulated_bus(hand, joints) as (motors, bus):
         motors.plant.position[:] = hand.start + 0.1
 
         @contextlib.contextmanager
         def connect(options, **twin_options):
-            yield Connection(hand, joints, bus)
+            yield Connection(joints, bus)
 
         for module in (check, home, record):
             monkeypatch.setattr(module, "connect", connect)
@@ -73,7 +73,7 @@ def test_check_misses_the_camera(line, capsys):
 @pytest.mark.parametrize("name", BEFORE)
 def test_the_preflight_finds(name, hand, monkeypatch):
     monkeypatch.setattr(check, "CYCLES", 1)
-    outcome = try_preflight(name, hand, uncalibrated(hand))
+    outcome = try_preflight(name, read_joints(hand))
     assert outcome.right, outcome.happened
 
 
@@ -222,28 +222,29 @@ def test_a_recording_says_that_it_missed_its_rate(line, plan, tmp_path, capsys):
 
 
 def test_motions_go_finger_by_finger_and_a_plan_of_another_hand_is_refused(hand, tmp_path):
-    motions = record.motions_of(hand, (), ("gain_ladder", "slow_triangle"))
+    joints = read_joints(hand)
+    motions = record.motions_of(joints, (), ("gain_ladder", "slow_triangle"))
     fingers = [motion.excitation.joints[0][:2] for motion in motions]
     assert fingers == sorted(fingers) and len({motion.file for motion in motions}) == len(motions)
     assert {motion.excitation.conditions["p_gain"] for motion in motions} == {200.0, 100.0, 50.0}
     with pytest.raises(ValueError, match="fingers 0 to 2"):
-        record.motions_of(hand, (3,), ("chirp",))
+        record.motions_of(joints, (3,), ("chirp",))
     (tmp_path / "of_another.csv").write_text("t,command.f9_j1\n0.0,0.0\n")
     for file, fault in (("of_another.csv", "f9_j1"), ("gone.csv", "gone.csv")):
         plan = {"trajectories": [{"file": file}], "joints": ["f9_j1"]}
         (tmp_path / "next_experiment.json").write_text(json.dumps(plan))
         with pytest.raises(record.RecordError, match=f"no plan for dclaw3: .*{fault}"):
-            record.read_plan(tmp_path, hand)
+            record.read_plan(tmp_path, joints)
     with pytest.raises(record.RecordError, match="no plan for dclaw3"):
-        record.read_plan(tmp_path / "nowhere.json", hand)
+        record.read_plan(tmp_path / "nowhere.json", joints)
 
 
 @pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])
 def test_the_largest_motions_touch_nothing(name):
     hand = load_hand(name)
-    joints = uncalibrated(hand)
+    joints = read_joints(hand)
     plant = NewtonHand(hand, joints, SimCfg(physics_hz=240.0))
-    for motion in record.motions_of(hand, (0,), ("steps_and_sines",)):
+    for motion in record.motions_of(joints, (0,), ("steps_and_sines",)):
         if motion.excitation.name != "step_large":
             continue
         commands = [*[motion.excitation.command[0]] * 200, *motion.excitation.command]
@@ -255,21 +256,22 @@ def test_the_largest_motions_touch_nothing(name):
 
 def test_a_payload_needs_somebody_to_hang_it(line, hand, tmp_path):
     cfg = record.RecordCfg(port=PORT, out=tmp_path, fingers=(0,), excitations=("second_payload",), yes=True)
-    motions = [motion for motion in record.motions_of(hand, (0,), cfg.excitations) if motion.payload[0]]
+    every = record.motions_of(read_joints(hand), (0,), cfg.excitations)
+    motions = [motion for motion in every if motion.payload[0]]
     with record.connect(cfg) as connection, pytest.raises(record.RecordError, match=r"hang 0\.05 kg"):
         record._session(cfg, connection, ("f0_j1",), motions, motions[0].payload, print)
 
 
 def test_a_fault_of_the_table_ends_safely(hand):
     fault = next(fault for fault in MOVING if fault.name == "Ctrl-C")
-    outcome = try_fault(fault, hand, uncalibrated(hand))
+    outcome = try_fault(fault, read_joints(hand))
     assert not outcome.energised and not outcome.pushing and outcome.detected_s is not None
 
 
 def test_options_and_commands_that_cannot_be_are_refused(capsys):
     for options, error in (
         (HandOptions(), "--port"),
-        (HandOptions(port=PORT, motor="XL430"), "--motor XL430: no such"),
+        (HandOptions(port=PORT, motor="XL430"), "no motor is called XL430"),
     ):
         with pytest.raises(ValueError, match=error), connect(options):
             pass
@@ -282,7 +284,7 @@ def test_options_and_commands_that_cannot_be_are_refused(capsys):
 
 
 @pytest.mark.parametrize(
-    ("twin", "status", "said"), [("--seed no", 2, "seed"), ("--ids 300", 1, "an ID lies")]
+    ("twin", "status", "said"), [("--seed no", 2, "seed"), ("--hand nobody", 1, "no hand is called")]
 )
 def test_a_twin_that_cannot_be_says_why(twin, status, said):
     command = [sys.executable, "-m", "vd.deploy.cli", "check", "--twin", f"--twin-args={twin}"]

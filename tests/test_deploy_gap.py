@@ -17,8 +17,7 @@ from vd.deploy.clock import Pacer
 from vd.deploy.hardware import record
 from vd.deploy.hardware.connect import Connection
 from vd.deploy.hardware.control_table import TICK_MODULUS
-from vd.deploy.hardware.joints import uncalibrated
-from vd.deploy.hardware.motion import move
+from vd.deploy.hardware.joints import read_joints
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop
@@ -70,15 +69,15 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     layer = tmp_path / "late.usda"
     layer.write_text(LAYER)
     hand = load_hand("dclaw4")
-    joints = uncalibrated(hand)
-    motions = record.motions_of(hand, (0,), ("steps_and_sines",))
+    joints = read_joints(hand)
+    motions = record.motions_of(joints, (0,), ("steps_and_sines",))
     chosen = [m for m in motions if m.excitation.joints == ("f0_j1",) and m.excitation.name in KINDS]
 
     @contextlib.contextmanager
     def connect(_, **twin_options):
         plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=960.0))
         with simulated_bus(hand, joints, plant) as (_, bus):
-            yield Connection(hand, joints, bus)
+            yield Connection(joints, bus)
 
     monkeypatch.setattr(record, "connect", connect)
     monkeypatch.setattr(record, "motions_of", lambda *_: chosen)
@@ -108,13 +107,13 @@ class Waving(PolicyRunner):
 def rollout(folder, plant_hand, episode_s):
     """The log of a run without an object."""
     hand = load_hand("dclaw3")
-    joints = uncalibrated(hand)
+    joints = read_joints(hand)
     plant = NewtonHand(plant_hand, joints, SimCfg(physics_hz=960.0))
     with simulated_bus(hand, joints, plant) as (_, bus):
         run = {"goals": [[0.0, 0.0, 0.0, 1.0]]}
-        with SafeHand(bus, joints, hand) as safe:
+        with SafeHand(bus, joints) as safe:
             safe.arm()
-            move(safe, np.tile([0.0, 0.3, -0.5], 3), 0.5)
+            safe.move(np.tile([0.0, 0.3, -0.5], 3), 0.5)
             log = LogWriter(folder, hand, run, servo={}, clock=bus.clock)
             pacer, actions = Pacer(12.0, bus.clock), ActionFilter(hand, ReorientCfg())
             loop = ControlLoop(safe, Waving(bus.clock), actions, pacer, log, episode_s=episode_s, hold_s=0.0)

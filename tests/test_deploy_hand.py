@@ -8,7 +8,7 @@ import pytest
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.hardware.control_table import MODELS
-from vd.deploy.hardware.joints import CalibrationError, Joints, read_joints, uncalibrated
+from vd.deploy.hardware.joints import CalibrationError, Joints, read_joints
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.deploy.twin.plant import Drive
 from vd.kernels.servo.actuators import COULOMB_TORQUE
@@ -26,8 +26,9 @@ def hand():
 def turned(hand) -> Joints:
     """Motors mounted every which way."""
     rng = np.random.default_rng(0)
-    plain = uncalibrated(hand)
-    return Joints(plain.names, plain.ids, rng.choice([-1.0, 1.0], 9), rng.uniform(-0.5, 0.5, 9))
+    signs, angles = rng.choice([-1.0, 1.0], 9), rng.uniform(-0.5, 0.5, 9)
+    turned = zip(hand.motors, signs, angles, strict=True)
+    return Joints(hand, tuple(replace(motor, sign=s, offset_rad=o) for motor, s, o in turned))
 
 
 def save(joints: Joints, path, hand: str) -> dict:
@@ -63,39 +64,36 @@ def test_the_hand_goes_where_its_motors_drive_and_falls_without_them(hand, turne
 
 
 def test_limits_are_the_hands_in_the_motors_frame(hand, turned):
-    settings = turned.settings(hand, MODEL)
+    turned = Joints(hand, tuple(replace(motor, model=MODEL) for motor in turned.motors))
+    settings = turned.settings()
     for axis, id in enumerate(turned.ids):
         ends = turned.to_motor(np.stack([hand.lower, hand.upper]))[:, axis]
         assert settings[id].lower_rad == min(ends) and settings[id].upper_rad == max(ends)
         torque = settings[id].current_limit_a * MODELS[MODEL].torque_nm_per_a
         assert torque == pytest.approx(hand.effort[axis], rel=1e-6)
-    far = Joints(turned.names, turned.ids, turned.sign, turned.offset + 3.0)
+    far = Joints(hand, tuple(replace(motor, offset_rad=motor.offset_rad + 3.0) for motor in turned.motors))
     with pytest.raises(CalibrationError, match=r"f0_j1, motor 10: its range"):
-        far.settings(hand, MODEL)
+        far.settings()
 
 
 def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_path):
     path = tmp_path / "motors.json"
     save(turned, path, hand.name)
-    again = read_joints(path, hand)
+    again = read_joints(hand, path)
     assert again.ids == turned.ids
     np.testing.assert_array_equal(again.offset, turned.offset)
     with pytest.raises(CalibrationError, match="f3_j1"):
-        read_joints(path, load_hand("dclaw4"))
+        read_joints(load_hand("dclaw4"), path)
     with pytest.raises(CalibrationError, match=r"^--calibration \S+none\.json: No such file.*leave it out"):
-        read_joints(tmp_path / "none.json", hand)
+        read_joints(hand, tmp_path / "none.json")
 
 
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
         ({"sign": 2}, r"motors\.sign of f0_j2 is 2; it is 1, or -1"),
-        ({"sign": -1.9}, r"motors\.sign of f0_j2 is -1\.9"),
-        ({"sign": True}, r"motors\[1\]\.sign: expected float, got True"),
         ({"id": 10}, r"motors\.id are \[10, 10, 12.*give each motor its own"),
-        ({"id": 11.7}, r"motors\[1\]\.id: expected int, got 11\.7"),
         ({"id": "11"}, r"motors\[1\]\.id: expected int, got '11'"),
-        ({"offset_rad": "0.1"}, r"motors\[1\]\.offset_rad: expected float, got '0\.1'"),
         ({"offset_rad": float("nan")}, r"motors\.offset_rad of f0_j2 is nan"),
         ({"offset": 0.1}, r"motors\[1\] has no field offset; it has id, joint, offset_rad, sign"),
         ({"sign": None}, r"motors\[1\] has no sign; name it"),
@@ -110,13 +108,13 @@ def test_what_is_no_calibration_is_refused_with_file_and_field(hand, turned, tmp
     record["motors"][1] = {name: value for name, value in record["motors"][1].items() if value is not None}
     path.write_text(json.dumps(record))
     with pytest.raises(CalibrationError, match=rf"motors\.json.*{reason}"):
-        read_joints(path, hand)
+        read_joints(hand, path)
 
 
 @pytest.mark.parametrize("effect", [None, COULOMB_TORQUE])
 def test_goals_and_readings_do_not_wait_for_steps(hand, effect):
     """Asked in between, a hand in steps of 2 ms is where one in steps of a quarter millisecond is."""
-    joints = uncalibrated(hand)
+    joints = read_joints(hand)
     if effect is not None:
         servo = hand.servo.copy()
         servo[:, effect] = 0.1
@@ -140,7 +138,7 @@ def test_goals_and_readings_do_not_wait_for_steps(hand, effect):
 
 def test_the_recorded_steps_are_the_solvers(hand):
     """Fingers that press on each other: contacts come and go, and the solver's iterations differ."""
-    joints = uncalibrated(hand)
+    joints = read_joints(hand)
     recorded, stepped = NewtonHand(hand, joints), NewtonHand(hand, joints)
     goal = np.tile([0.3, hand.lower[1], hand.lower[2]], 3)
     contacts = []

@@ -1,12 +1,17 @@
 """A policy on a hand sees by the real camera's lens, from where calibration found it to be."""
 
 import numpy as np
+import pytest
+import warp as wp
+from sensed_world import state_of
 
 from vd.assets_usd.camera_layer import read_camera, write_camera_layer
 from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop.policy_runner import load_runner, seen_points
+from vd.envs.reorient import ReorientEnv
+from vd.evaluate.agents import open_policy, task_for
 
 SHIFT_M = 0.01
 
@@ -26,6 +31,20 @@ def test_installed_trackers_stop_by_rules_from_episodes_and_say_where_there_is_n
         assert [runner.calibrated for runner in runners.values()] == [True, False, True]
         bounds = [runner.rule.distance_rad for runner in runners.values()]
         assert bounds[0] > bounds[1] > bounds[2] > 0.0
+
+
+@pytest.mark.parametrize("name", ["dclaw3", "dclaw4-cube"])
+def test_a_teacher_acts_on_what_a_twin_tells_as_in_its_environment(name):
+    policy = open_policy(name, "cpu")
+    task = task_for(policy, stop_tolerance_rad=0.4, randomised=False, num_envs=1, objects=("cube",))
+    env = ReorientEnv(task, "cpu")
+    runner = load_runner(name, task.hand, env.hand, env.objects[0], object="cube")
+    for _ in range(4):
+        action = wp.from_torch(policy.act(wp.to_torch(env.observation)))
+        wanted = action if env.symmetry_frames is None else env.symmetry_frames.world_action(action)
+        found = runner.decide(state_of(env))
+        np.testing.assert_allclose(found.action, wanted.numpy()[0], atol=2e-3)
+        env.step(action)
 
 
 def test_lens_and_place_are_those_of_the_real_camera(tmp_path):

@@ -108,9 +108,9 @@ class Truth:
     position: tuple[float, float, float] = (0.0, 0.0, 0.03)
     quat: tuple[float, ...] = tuple(GOAL)
 
-    def object_pose(self) -> np.ndarray:
+    def object_state(self) -> np.ndarray:
         """Where it lies."""
-        return np.array([*self.position, *self.quat])
+        return np.array([*self.position, *self.quat, *np.zeros(6)])
 
 
 def test_the_grid_stays_where_it_was_whatever_is_late():
@@ -294,7 +294,7 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(tmp_path, cap
 @pytest.mark.parametrize(
     ("flags", "error"),
     [
-        ("--hand dclaw3 --twin dclaw3", "no robot senses; vd-train tracker"),
+        ("--hand dclaw3 --port /dev/none dclaw3", "no robot senses; vd-train tracker"),
         ("--hand dclaw4 --twin dclaw3-tracking", "moves 9 joints, the hand dclaw4 has 12"),
         ("--hand dclaw3 --port /dev/none", "name the policy"),
         ("--hand dclaw3 --twin zero --goal 1,2,3", "give a quaternion"),

@@ -1,6 +1,7 @@
 """What the preflight reads of the motors: a wrong register is named, and set or refused; remedies do mend."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from simulated_hand import simulated_bus
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.hardware import check
-from vd.deploy.hardware.connect import MOTOR, Connection
+from vd.deploy.hardware.connect import Connection
 from vd.deploy.hardware.control_table import MODELS, table
-from vd.deploy.hardware.joints import uncalibrated
+from vd.deploy.hardware.joints import read_joints
 from vd.deploy.hardware.registers import REGISTERS
 
+MOTOR = "XH430-V210"
 FACTORY = {name: item.initial for name, item in table(MODELS[MOTOR]).items()}
 
 
@@ -23,7 +25,7 @@ class Rig:
     """A hand's motors on a simulated line, with nothing between a test and them."""
 
     def __init__(self, hand, joints, line, bus):
-        self.connection, self.line, self.bus = Connection(hand, joints, bus), line, bus
+        self.connection, self.line, self.bus = Connection(joints, bus), line, bus
         self.motor = line.motors[0]
 
     def findings(self):
@@ -38,8 +40,11 @@ class Rig:
 
 @pytest.fixture
 def rig(monkeypatch):
+    """Motor 12 is under a largest current, as no D'Claw's is."""
     hand = load_hand("dclaw3")
-    joints = uncalibrated(hand)
+    motors = tuple(replace(motor, current=0.3 * (motor.id == 12)) for motor in hand.motors)
+    hand = replace(hand, motors=motors)
+    joints = read_joints(hand)
     monkeypatch.setattr(check, "CYCLES", 1)
     with simulated_bus(hand, joints) as (line, bus):
         line.plant.position[:] = hand.start + 0.1
@@ -48,8 +53,7 @@ def rig(monkeypatch):
 
 
 def test_every_register_of_the_table_is_compared(rig):
-    hand, joints = rig.connection.hand, rig.connection.joints
-    rig.bus.configure(joints.settings(hand, MOTOR))
+    rig.bus.configure(rig.connection.joints.settings())
     tables = {id: rig.bus.read_table(id) for id in rig.bus.ids}
     assert [one.what for one in check.register_findings(rig.connection, tables)] == ["registers"]
     for register in REGISTERS:
@@ -68,7 +72,7 @@ def test_another_operating_mode_is_set_before_the_gains_that_it_resets(rig):
     order = []
     rig.motor._accept = lambda name, value: (order.append(name), accept(name, value))
     rig.motor.put("operating_mode", 4)
-    rig.bus.configure(rig.connection.joints.settings(rig.connection.hand, MOTOR))
+    rig.bus.configure(rig.connection.joints.settings())
     assert order.index("operating_mode") < order.index("position_p_gain")
     assert (rig.motor.get("operating_mode"), rig.motor.get("position_p_gain")) == (3, 200)
 

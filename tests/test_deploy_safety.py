@@ -13,8 +13,7 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 from simulated_hand import energised, push, simulated_bus
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy.hardware.joints import Joints, uncalibrated
-from vd.deploy.hardware.motion import move
+from vd.deploy.hardware.joints import Joints
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import WATCH_S, SafeHand, StoppedError
 from vd.deploy.timely import undisturbed
@@ -37,9 +36,10 @@ def hand():
 @pytest.fixture
 def joints(hand) -> Joints:
     """Some motors turn the other way and are mounted elsewhere."""
-    plain = uncalibrated(hand)
     rng = np.random.default_rng(1)
-    return Joints(plain.names, plain.ids, rng.choice([-1.0, 1.0], 9), rng.uniform(-0.3, 0.3, 9))
+    signs, angles = rng.choice([-1.0, 1.0], 9), rng.uniform(-0.3, 0.3, 9)
+    turned = zip(hand.motors, signs, angles, strict=True)
+    return Joints(hand, tuple(replace(motor, sign=s, offset_rad=o) for motor, s, o in turned))
 
 
 @pytest.fixture
@@ -63,12 +63,12 @@ def bus(both):
 def test_it_moves_in_the_joints_frame_and_ends_with_torque_off(bus, line, hand, joints):
     said = []
     goal = START + 0.2
-    with SafeHand(bus, joints, hand, QUICK, said.append) as safe:
+    with SafeHand(bus, joints, QUICK, said.append) as safe:
         assert energised(line) == []
         start = safe.arm()
         np.testing.assert_allclose(start.position, START, atol=0.001)
         assert len(energised(line)) == 9 and push(line).max() < 0.002
-        worst = move(safe, goal, 1.0)
+        worst = safe.move(goal, 1.0)
         assert worst.max() < 0.15  # the lag of 0.1 s at 1 rad/s, and a step of the goal
         np.testing.assert_allclose(safe.read().position, goal, atol=0.005)
     assert energised(line) == [] and said == ["torque off"]
@@ -76,7 +76,7 @@ def test_it_moves_in_the_joints_frame_and_ends_with_torque_off(bus, line, hand, 
 
 
 def test_goals_keep_the_limits(bus, hand, joints):
-    with SafeHand(bus, joints, hand, replace(QUICK, step_rad=0.3, margin_rad=0.1)) as safe:
+    with SafeHand(bus, joints, replace(QUICK, step_rad=0.3, margin_rad=0.1)) as safe:
         here = safe.arm().position
         far = np.where(np.arange(9) % 2, 9.0, -9.0)
         sent = safe.command(far)
@@ -131,7 +131,7 @@ def run_until_stopped(safe: SafeHand, target: np.ndarray, seconds: float = 5.0) 
 )
 def test_faults_stop_the_hand_in_time_and_are_named(bus, line, hand, joints, fault, reason, found_s):
     target = START + 0.3
-    with SafeHand(bus, joints, hand, QUICK) as safe:
+    with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
         assert run_until_stopped(safe, target, 0.3) == "nothing stopped it"
         injected = bus.clock.now()
@@ -149,7 +149,7 @@ def test_faults_stop_the_hand_in_time_and_are_named(bus, line, hand, joints, fau
 
 def test_on_a_lost_bus_what_presses_on_an_obstacle_is_let_go(bus, line, hand, joints):
     """No state tells of the obstacle; the motors themselves know where they are."""
-    with SafeHand(bus, joints, hand, QUICK) as safe:
+    with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
         safe.read()
         safe.command(START + 0.3)
@@ -161,7 +161,7 @@ def test_on_a_lost_bus_what_presses_on_an_obstacle_is_let_go(bus, line, hand, jo
 
 
 def test_a_blocked_joint_is_let_go(bus, line, hand, joints):
-    with SafeHand(bus, joints, hand, replace(QUICK, step_rad=4.0, current_s=0.3)) as safe:
+    with SafeHand(bus, joints, replace(QUICK, step_rad=4.0, current_s=0.3)) as safe:
         here = safe.arm().position
         line.plant.blocked[2] = True
         target = here + np.eye(9)[2] * 1.5
@@ -174,26 +174,26 @@ def test_a_blocked_joint_is_let_go(bus, line, hand, joints):
 
 
 def test_deadlines_and_images_stop_the_hand(bus, hand, joints):
-    with SafeHand(bus, joints, hand, QUICK) as safe:
+    with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
         for missed in (True, True, False, True, True):
             safe.beat(missed=missed)
         with pytest.raises(StoppedError, match="3 deadlines missed"):
             safe.beat(missed=True)
-    with SafeHand(bus, joints, hand, QUICK) as safe:
+    with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
         shown = bus.clock.now()
         safe.image_at(shown)
         assert "image is" in run_until_stopped(safe, START)
         assert 0.0 < safe.report.detected_s - shown - QUICK.stale_s < 2 * WATCH_S
-    with SafeHand(bus, joints, hand, QUICK) as safe:
+    with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
         with pytest.raises(StoppedError, match=r"3\.00 s from the future"):
             safe.image_at(bus.clock.now() + 3.0)
 
 
 def test_a_loop_that_stands_is_stopped_by_the_watchdog(bus, hand, joints):
-    with SafeHand(bus, joints, hand, QUICK) as safe:
+    with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
         safe.read()
         safe.command(START + 0.3)
@@ -207,7 +207,7 @@ def test_a_loop_that_stands_is_stopped_by_the_watchdog(bus, hand, joints):
 
 
 def test_motors_stop_by_themselves_if_the_driver_dies(bus, line, hand, joints):
-    safe = SafeHand(bus, joints, hand, SafetyCfg())  # no block: nothing of ours stops it
+    safe = SafeHand(bus, joints, SafetyCfg())  # no block: nothing of ours stops it
     safe.arm()
     safe.command(START + 0.3)
     bus.clock.sleep(0.29)
@@ -215,7 +215,7 @@ def test_motors_stop_by_themselves_if_the_driver_dies(bus, line, hand, joints):
     bus.clock.sleep(0.03)
     assert {motor.get("bus_watchdog") for motor in line.motors} == {-1}
     assert push(line).max() < 0.002
-    with SafeHand(bus, joints, hand, QUICK) as again:  # and can be used again
+    with SafeHand(bus, joints, QUICK) as again:  # and can be used again
         again.arm()
         here = again.read().position
         again.command(here + 0.2)
@@ -226,7 +226,7 @@ def test_motors_stop_by_themselves_if_the_driver_dies(bus, line, hand, joints):
 def test_an_exception_stops_the_hand(bus, line, hand, joints):
     said = []
     with pytest.raises(ZeroDivisionError):
-        with SafeHand(bus, joints, hand, QUICK, said.append) as safe:
+        with SafeHand(bus, joints, QUICK, said.append) as safe:
             safe.arm()
             safe.command(START + 0.3)
             _ = 1 / 0
@@ -235,7 +235,7 @@ def test_an_exception_stops_the_hand(bus, line, hand, joints):
 
 
 def test_the_hand_can_be_left_holding(bus, line, hand, joints):
-    with SafeHand(bus, joints, hand, SafetyCfg(then="hold")) as safe:
+    with SafeHand(bus, joints, SafetyCfg(then="hold")) as safe:
         safe.arm()
         safe.command(START + 0.3)
     assert len(energised(line)) == 9
@@ -261,4 +261,4 @@ def test_settings_that_switch_a_limit_off_are_refused(bus, hand, joints):
     with pytest.raises(ValueError, match=r"safety\.step_rad is 0"):
         SafetyCfg(step_rad=0.0)
     with pytest.raises(ValueError, match=r"safety\.margin_rad is 2"):
-        SafeHand(bus, joints, hand, SafetyCfg(margin_rad=2.0))
+        SafeHand(bus, joints, SafetyCfg(margin_rad=2.0))

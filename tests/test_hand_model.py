@@ -313,7 +313,7 @@ def test_a_file_of_an_earlier_version_is_mounted_as_it_was(tmp_path: Path, four_
     hand = read_hand(edited(four_fingers.path, tmp_path, older))
     for name in ("mount", "palm", "start"):
         np.testing.assert_array_equal(getattr(hand, name), getattr(four_fingers, name))
-    assert hand.workspace == four_fingers.workspace and hand.motors == (None,) * 12
+    assert hand.workspace == four_fingers.workspace and hand.motors == four_fingers.motors
 
 
 def test_a_camera_is_optional_until_it_is_needed(tmp_path: Path, four_fingers: HandModel) -> None:

@@ -47,7 +47,7 @@ GONE = {
     "--env.observation.history": "a memory of past steps cost 2 points (docs/results.md#robustness)",
     "--ppo.optimizer": "Adam is the only one",
     "--agent": "name zero or random in place of a policy",
-    "--allegro": "the comparison is in docs/results.md",
+    "--allegro": "vd-assets hand import makes an Allegro of its URDF",
     "--env.randomisation.restitution": "contacts are damped springs (docs/limitations.md)",
     "--keep-every": "weight averaging gained too little (docs/lessons.md)",
     "--shard": "give each machine other --kinds",

@@ -250,6 +250,9 @@ class Author:
             ("sign", kinds.Double, motor.sign),
             ("offset", kinds.Double, motor.offset_rad),
             ("gear", kinds.Double, motor.gear),
+            ("p_gain", kinds.Int, motor.p_gain),
+            ("d_gain", kinds.Int, motor.d_gain),
+            ("current", kinds.Double, motor.current),
         ):
             prim.CreateAttribute(f"vd:motor:{name}", kind, custom=True).Set(value)
 

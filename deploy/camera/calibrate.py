@@ -24,7 +24,7 @@ from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_mar
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.hardware.answers import BusError
 from vd.deploy.hardware.check import confirm
-from vd.deploy.hardware.connect import HandOptions, connect, read_hand_and_joints
+from vd.deploy.hardware.connect import HandOptions, connect, motors_of
 from vd.files import check_file
 from vd.paper import PAPER
 
@@ -65,7 +65,7 @@ class CalibrateCfg(HandOptions):
 def calibrate(cfg: CalibrateCfg) -> int:
     """Take views, solve, write the layer; 1 if the result is too uncertain."""
     require(cfg, "--", "positive", "side_m count")
-    hand, _ = read_hand_and_joints(cfg)
+    hand = motors_of(cfg).hand
     fingers = cfg.fingers or tuple(range(hand.num_fingers))
     if not all(0 <= f < hand.num_fingers for f in fingers) or len(set(fingers)) != len(fingers):
         raise ValueError(f"--fingers {fingers}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")

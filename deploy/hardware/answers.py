@@ -111,8 +111,9 @@ def read_answer(frame: bytes) -> Answer | None:
 class StateCheck:
     """Makes states of the answers of some motors, and refuses those that cannot follow the last one."""
 
-    def __init__(self, ids: Sequence[int], model: Model):
-        self._ids, self._model, self._items = tuple(ids), model, table(model)
+    def __init__(self, ids: Sequence[int], models: Sequence[Model]):
+        self._ids, self._items = tuple(ids), table(models[0])
+        self._current_unit_a = np.array([model.current_unit_a for model in models])
         self.fastest = np.full(len(self._ids), np.inf)
         """Limits of the motors' speeds, as far as they are known [rad/s] [D]."""
         self._last: HandState | None = None
@@ -146,7 +147,7 @@ class StateCheck:
             time_s=time_s,
             position=np.array([to_angle(int(count)) for count in counts]),
             velocity=column("present_velocity") * RAD_S_PER_COUNT,
-            current=column("present_current") * self._model.current_unit_a,
+            current=column("present_current") * self._current_unit_a,
             pwm=column("present_pwm") / FULL_PWM,
             voltage=0.1 * column("present_input_voltage"),
             temperature=column("present_temperature").astype(float),

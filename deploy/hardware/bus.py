@@ -29,11 +29,12 @@ from vd.deploy.hardware.answers import (
     read_answer,
 )
 from vd.deploy.hardware.control_table import (
-    MODELS,
     SIZE,
     WATCHDOG_UNIT_S,
+    Model,
     describe_hardware_error,
     model_name,
+    motor_model,
     table,
     to_counts,
 )
@@ -58,7 +59,7 @@ LATE_S = 0.02
 
 
 class MotorBus:
-    """Motors of one model on one serial port.
+    """Motors on one serial port.
 
     Every exchange raises :class:`BusError` where a packet could not be sent, a motor refused, or no sound
     answer came, also not when asked again.
@@ -66,7 +67,7 @@ class MotorBus:
     Args:
         port: Device, such as /dev/ttyUSB0, or an open port of the SDK's kind.
         ids: Motors in the order of the arrays.
-        model: Name of their model.
+        models: Model of each, or the name of that of all.
         baud_rate: To open the device with.
         retries: How often to ask again where no sound answer came; what suits the port by default.
         clock: Time.
@@ -79,19 +80,22 @@ class MotorBus:
         self,
         port: Any,
         ids: Sequence[int],
-        model: str,
+        models: str | Sequence[Model],
         *,
         baud_rate: int = BAUD_RATE,
         retries: int | None = None,
         clock: Clock = MONOTONIC,
     ):
         """Open the port."""
-        self.ids, self.model, self.clock = tuple(ids), MODELS[model], clock
-        self._items = table(self.model)
+        self.ids, self.clock = tuple(ids), clock
+        self.models = (motor_model(models),) * len(self.ids) if isinstance(models, str) else tuple(models)
+        """Model of each motor."""
+        self._model = dict(zip(self.ids, self.models, strict=True))
+        self._items = {id: table(model) for id, model in self._model.items()}
         self._sdk = sdk()
         self._lock = threading.RLock()
         self._packets = self._sdk.PacketHandler(2.0)
-        self._states = StateCheck(self.ids, self.model)
+        self._states = StateCheck(self.ids, self.models)
         self._goals, self._length = b"", STATE_BYTES
         self._settings: dict[int, MotorSettings] = {}
         self.rejected = 0
@@ -182,13 +186,13 @@ class MotorBus:
             except (SilentError, LateError, GarbledError) as error:
                 wrong[id] = str(error)
             else:
-                if number != self.model.number:
-                    wrong[id] = f"motor {id} is {model_name(number)}, not {self.model.name}"
+                if number != self._model[id].number:
+                    wrong[id] = f"motor {id} is {model_name(number)}, not {self._model[id].name}"
         return wrong
 
     def read(self, id: int, name: str) -> int:
         """Value of one item of the control table."""
-        item = self._items[name]
+        item = self._items[id][name]
         where = numbers(item.address, item.size)
         return item.from_bytes(self._ask(id, f"read {name}", Instruction.READ, where, item.size))
 
@@ -201,12 +205,12 @@ class MotorBus:
         data = self._ask(id, "read the control table", Instruction.READ, numbers(0, SIZE), SIZE)
         return {
             name: item.from_bytes(data[item.address : item.address + item.size])
-            for name, item in self._items.items()
+            for name, item in self._items[id].items()
         }
 
     def write(self, id: int, name: str, value: int) -> None:
         """Write one item of the control table."""
-        item = self._items[name]
+        item = self._items[id][name]
         data = numbers(item.address) + item.to_bytes(value)
         self._ask(id, f"write {value} to {name}", Instruction.WRITE, data)
 
@@ -233,7 +237,7 @@ class MotorBus:
 
     def _to_set(self, id: int, settings: MotorSettings) -> dict[str, tuple[int, int]]:
         """Registers that are ours to set and differ: value, and the wanted one."""
-        rows = different(self.read_table(id), self.model, settings)
+        rows = different(self.read_table(id), self._model[id], settings)
         return {one.name: values for one, values in rows.items() if not one.remedy}
 
     def torque(self, on: bool, ids: Iterable[int] | None = None) -> dict[int, str]:
@@ -301,7 +305,7 @@ class MotorBus:
 
     def _write_all(self, name: str, values: Sequence[int], *, later: bool = False) -> None:
         """Write one item of every motor in one packet, now or with the question for their state."""
-        item = self._items[name]
+        item = self._items[self.ids[0]][name]
         rows = [bytes([id]) + item.to_bytes(value) for id, value in zip(self.ids, values, strict=True)]
         parameters = numbers(item.address, item.size) + b"".join(rows)
         packet = encode(Packet(BROADCAST, Instruction.SYNC_WRITE, parameters))
@@ -351,7 +355,7 @@ class MotorBus:
         return self._again(self._read_torque, self.retries)
 
     def _read_torque(self) -> np.ndarray:
-        item = self._items["torque_enable"]
+        item = self._items[self.ids[0]]["torque_enable"]
         with self._line():
             _, answers = self._ask_all(item.address, item.size)
         return np.array([bool(item.from_bytes(answer.data)) for answer in answers])

@@ -18,7 +18,6 @@ from vd.deploy.finding import Finding, finding, listed, show
 from vd.deploy.hardware.answers import BusError, GarbledError, LateError
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
 from vd.deploy.hardware.joints import CalibrationError
-from vd.deploy.hardware.motion import move
 from vd.deploy.hardware.registers import RESTART, Register, different, kept
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import SafeHand
@@ -132,13 +131,14 @@ def register_findings(connection: Connection, tables: Tables) -> Iterator[Findin
     """Compare control tables with what is wanted of them: a finding for each register that differs."""
     bus = connection.bus
     try:
-        settings = connection.joints.settings(connection.hand, bus.model.name)
+        settings = connection.joints.settings()
     except CalibrationError as error:
         yield Finding("registers", False, str(error))
         return
+    models = dict(zip(bus.ids, bus.models, strict=True))
     rows: dict[Register, list[tuple[int, int, int]]] = {}
     for id, found in tables.items():
-        for one, values in different(found, bus.model, settings[id]).items():
+        for one, values in different(found, models[id], settings[id]).items():
             rows.setdefault(one, []).append((id, *values))
     for one, motors in rows.items():
         alike: dict[tuple[int, int], list[str]] = {}
@@ -151,7 +151,7 @@ def register_findings(connection: Connection, tables: Tables) -> Iterator[Findin
                 for (value, wanted), ids in alike.items()
             ]
         )
-        where = " (kept without power)" if kept(bus.model, one) else ""
+        where = " (kept without power)" if kept(one) else ""
         found_is = f"{one.why}: {changes}" if one.remedy else f"{changes}{where}; else {one.why}"
         yield Finding(one.name, not one.remedy, found_is)
     if not rows:
@@ -175,7 +175,7 @@ def write_settings(connection: Connection) -> Finding:
     """Write the registers that differ, with the torque off, and read them back."""
     bus, what = connection.bus, "settings"
     try:
-        bus.configure(connection.joints.settings(connection.hand, bus.model.name))
+        bus.configure(connection.joints.settings())
     except BusError as error:
         return Finding(what, False, str(error))
     return Finding(what, True, "registers written and read back, torque off")
@@ -191,11 +191,10 @@ def _state(connection: Connection) -> Iterator[Finding]:
         if t > COOL_C
     ]
     yield finding("temperature", hot, f"up to {state.temperature.max():.0f} deg C")
-    supply = bus.model.supply_v
     weak = [
-        f"motor {id}: {v:.1f} V, not {supply:g}: check the supply and its wires"
-        for id, v in zip(bus.ids, state.voltage, strict=True)
-        if abs(v - supply) > VOLTAGE_SHARE * supply
+        f"motor {id}: {v:.1f} V, not {model.supply_v:g}: check the supply and its wires"
+        for id, model, v in zip(bus.ids, bus.models, state.voltage, strict=True)
+        if abs(v - model.supply_v) > VOLTAGE_SHARE * model.supply_v
     ]
     yield finding("voltage", weak, f"{state.voltage.min():.1f} to {state.voltage.max():.1f} V")
     q = joints.to_joint(state.position)
@@ -248,7 +247,7 @@ def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
         for end in (low, high, home[axis]):
             goal = home.copy()
             goal[axis] = end
-            worst = max(worst, abs(move(safe, goal, RANGE_SPEED_RAD_S)[axis]))
+            worst = max(worst, abs(safe.move(goal, RANGE_SPEED_RAD_S)[axis]))
         ok = worst < FOLLOW_RAD
         why = "" if ok else ": blocked, a wrong sign, or a wrong joint's ID?"
         found = f"{low:.2f} to {high:.2f} rad, at most {worst:.2f} from its goal{why}"
@@ -327,7 +326,7 @@ def check(cfg: CheckCfg) -> int:
             confirm("Every joint will move slowly through its range.", yes=cfg.yes)
             findings += show([write_settings(connection)], quiet=cfg.json)
             _stop_at_wrong(findings)
-            safe = SafeHand(connection.bus, connection.joints, connection.hand, SafetyCfg())
+            safe = SafeHand(connection.bus, connection.joints, SafetyCfg())
             findings += show(sweep(connection, stack.enter_context(safe)), quiet=cfg.json)
     right = all(one.ok for one in findings)
     if cfg.json:

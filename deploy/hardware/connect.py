@@ -17,16 +17,13 @@ if TYPE_CHECKING:
     from vd.deploy.hardware.joints import Joints
     from vd.deploy.twin.child import TwinChild
 
-MOTOR = "XH430-V210"
-"""The motors whose stall torque is the hand's effort limit."""
-
 
 @dataclass(frozen=True)
 class HandOptions:
     """Which hand, and where its motors are."""
 
     hand: str = "dclaw3"
-    """dclaw3, dclaw4 or a hand's USD."""
+    """dclaw3, dclaw4, an imported hand or a hand's USD."""
     hand_layer: Path | None = None
     """Identified servo model over the hand (identified.usda); a twin moves as it says."""
     port: str | None = None
@@ -36,9 +33,9 @@ class HandOptions:
     twin_args: str = ""
     """More options of the twin: --twin-args="--lose 0.01"; see python -m vd.deploy.twin.twin --help."""
     calibration: Path | None = None
-    """Calibration file of the joints' motors; IDs 10, 11, 12, 20, ... with zero in the middle by default."""
-    motor: str = MOTOR
-    """Model of the motors."""
+    """Calibration file of the joints' motors; by default IDs, directions and zeros are the USD's."""
+    motor: str | None = None
+    """Model of all motors, in place of what the hand's USD says."""
     baud_rate: int = BAUD_RATE
     """Of the port."""
 
@@ -47,32 +44,30 @@ class HandOptions:
 class Connection:
     """A hand and the bus to its motors."""
 
-    hand: "HandModel"
-    """The hand, with its layer."""
     joints: "Joints"
-    """Which motor turns which joint."""
+    """Which motor turns which joint of the hand."""
     bus: "MotorBus"
     """Its motors, in the joints' order."""
     twin: "TwinChild | None" = None
     """The twin, if it is one."""
 
+    @property
+    def hand(self) -> "HandModel":
+        """The hand, with its layer."""
+        return self.joints.hand
 
-def read_hand_and_joints(options: HandOptions) -> tuple["HandModel", "Joints"]:
-    """The hand of the options and its motors.
+
+def motors_of(options: HandOptions) -> "Joints":
+    """The motors of the options' hand.
 
     Raises:
         ValueError: Port and twin, motor, hand, layer or calibration cannot be used.
     """
     from vd.assets_usd.hands import load_hand
-    from vd.deploy.hardware.control_table import MODELS
-    from vd.deploy.hardware.joints import read_joints, uncalibrated
+    from vd.deploy.hardware.joints import read_joints
 
-    if options.motor not in MODELS:
-        raise ValueError(f"--motor {options.motor}: no such motor; choose of {', '.join(MODELS)}")
     hand = load_hand(options.hand, layer=options.hand_layer)
-    if options.calibration is None:
-        return hand, uncalibrated(hand)
-    return hand, read_joints(options.calibration, hand)
+    return read_joints(hand, options.calibration, options.motor)
 
 
 @contextlib.contextmanager
@@ -92,7 +87,7 @@ def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
     from vd.deploy.twin.child import TwinChild
     from vd.deploy.twin.twin import TwinCommand
 
-    hand, joints = read_hand_and_joints(options)
+    joints = motors_of(options)
     if options.twin == (options.port is not None):
         raise ValueError("give --port, such as /dev/ttyUSB0, or --twin for a simulated hand")
     with contextlib.ExitStack() as stack:
@@ -116,5 +111,5 @@ def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
             twin = TwinChild(command)
             stack.callback(twin.close)
             port = twin.path
-        bus = MotorBus(port, joints.ids, options.motor, baud_rate=options.baud_rate)
-        yield Connection(hand, joints, stack.enter_context(bus), twin)
+        bus = MotorBus(port, joints.ids, joints.models, baud_rate=options.baud_rate)
+        yield Connection(joints, stack.enter_context(bus), twin)

@@ -1,6 +1,7 @@
-"""Control tables of the XM430 and XH430 motors (ROBOTIS e-manual), as typed data, and their units.
+"""Control tables of DYNAMIXEL X motors (ROBOTIS e-manual, one page a model), as typed data, and their units.
 
-Angles in radians with zero in the middle of the range, velocities in rad/s, currents in A.
+The models share addresses and differ in units and limits. Angles in radians with zero in the middle of the
+range, velocities in rad/s, currents in A.
 """
 
 import math
@@ -21,6 +22,8 @@ SIZE = 148
 EEPROM_END = 64
 """Items below are kept without power, and cannot be written while torque is on."""
 POSITION_MODE = 3
+CURRENT_POSITION_MODE = 5
+"""Position control under a largest current, over 256 turns either way: position limits do not act."""
 FULL_PWM = 885.0
 """Counts of the whole supply voltage."""
 WATCHDOG_UNIT_S = 0.02
@@ -71,7 +74,15 @@ class Model:
     """Least and largest voltage limit [0.1 V]."""
     supply_v: float
     torque_nm_per_a: float
-    """Stall torque over stall current."""
+    """Stall torque over stall current, at the supply's voltage. XL330 and XC330 measure the supply's current,
+    so their torque is a guess."""
+    temperature_limit: int = 80
+    """Initial limit [deg C]."""
+    velocity_most: int = 1023
+    """Largest limit, counts of 0.229 rev/min."""
+    senses_current: bool = True
+    """Whether it measures and limits its current. Others tell a load, in 0.1 % of the largest, by which
+    the current is guessed, and have no current-based mode."""
 
     def current_of(self, torque_nm: np.ndarray) -> np.ndarray:
         """Currents for torques [A], no larger than the motor's largest."""
@@ -81,13 +92,36 @@ class Model:
 MODELS = {
     model.name: model
     for model in (
+        Model("XL330-M077", 1190, 1e-3, 1750, 1620, (35, 70), 5.0, 0.215 / 1.47, 70, 2047),
+        Model("XL330-M288", 1200, 1e-3, 1750, 445, (35, 70), 5.0, 0.52 / 1.47, 70, 2047),
+        Model("XC330-T181", 1210, 1e-3, 910, 510, (55, 140), 12.0, 0.80 / 0.88, 70, 2047),
+        Model("XC330-T288", 1220, 1e-3, 910, 320, (55, 140), 12.0, 1.00 / 0.88, 70, 2047),
+        Model("XC330-M181", 1230, 1e-3, 2352, 545, (35, 70), 5.0, 0.60 / 1.80, 70, 2047),
+        Model("XC330-M288", 1240, 1e-3, 2352, 350, (35, 70), 5.0, 0.93 / 1.80, 70, 2047),
+        Model("XL430-W250", 1060, 1.4e-3, 1000, 265, (60, 140), 12.0, 1.5 / 1.4, 72, senses_current=False),
+        Model("XC430-W150", 1070, 1.4e-3, 1000, 460, (60, 160), 12.0, 1.6 / 1.4, senses_current=False),
+        Model("XC430-W240", 1080, 1.4e-3, 1000, 306, (60, 160), 12.0, 1.9 / 1.4, senses_current=False),
         Model("XM430-W210", 1030, 2.69e-3, 1193, 330, (95, 160), 12.0, 3.0 / 2.3),
         Model("XM430-W350", 1020, 2.69e-3, 1193, 200, (95, 160), 12.0, 4.1 / 2.3),
+        Model("XM540-W150", 1130, 2.69e-3, 2047, 230, (95, 160), 12.0, 7.3 / 4.4),
+        Model("XM540-W270", 1120, 2.69e-3, 2047, 128, (95, 160), 12.0, 10.6 / 4.4),
         Model("XH430-W350", 1000, 2.69e-3, 648, 280, (95, 160), 12.0, 3.4 / 1.3),
         Model("XH430-V210", 1050, 1.34e-3, 689, 380, (110, 300), 24.0, 2.6 / 0.7),
     )
 }
 """The motors, by name."""
+
+
+def motor_model(name: str) -> Model:
+    """A motor by the name of its model, with or without what its plug is called (``XC330-M288-T``).
+
+    Raises:
+        ValueError: There is none of this name.
+    """
+    short = "-".join(name.upper().split("-")[:2])
+    if short not in MODELS:
+        raise ValueError(f"no motor is called {name}; choose of {', '.join(MODELS)}")
+    return MODELS[short]
 
 
 def model_name(number: int) -> str:
@@ -129,12 +163,12 @@ def table(model: Model) -> dict[str, Item]:
         "protocol_type": Item(13, 1, True, 2, 1, 2),
         "homing_offset": Item(20, 4, True, 0, -1_044_479, 1_044_479),
         "moving_threshold": Item(24, 4, True, 10, 0, 1023),
-        "temperature_limit": Item(31, 1, True, 80, 0, 100),
+        "temperature_limit": Item(31, 1, True, model.temperature_limit, 0, 100),
         "max_voltage_limit": Item(32, 2, True, high_v, low_v, high_v),
         "min_voltage_limit": Item(34, 2, True, low_v, low_v, high_v),
         "pwm_limit": Item(36, 2, True, int(FULL_PWM), 0, int(FULL_PWM)),
         "current_limit": Item(38, 2, True, model.current_limit, 0, model.current_limit),
-        "velocity_limit": Item(44, 4, True, model.velocity_limit, 0, 1023),
+        "velocity_limit": Item(44, 4, True, model.velocity_limit, 0, model.velocity_most),
         "max_position_limit": Item(48, 4, True, 4095, 0, 4095),
         "min_position_limit": Item(52, 4, True, 0, 0, 4095),
         "startup_configuration": Item(60, 1, True, 0, 0, 3),
@@ -171,7 +205,8 @@ def table(model: Model) -> dict[str, Item]:
         "present_temperature": Item(146, 1, False, 30, 0),
         "backup_ready": Item(147, 1, False, 0, 0),
     }
-    return items
+    lacking = () if model.senses_current else ("current_limit", "goal_current")
+    return {name: item for name, item in items.items() if name not in lacking}
 
 
 def to_counts(angle_rad: float) -> int:

@@ -9,7 +9,6 @@ import tyro
 from vd.config import require
 from vd.deploy.hardware.check import ready
 from vd.deploy.hardware.connect import HandOptions, connect
-from vd.deploy.hardware.motion import move
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
 
@@ -37,9 +36,9 @@ def home(cfg: HomeCfg) -> int:
     with connect(cfg) as connection:
         pose = connection.hand.start
         ready(connection, f"The hand will move to its start at {cfg.speed:g} rad/s.", yes=cfg.yes)
-        with SafeHand(connection.bus, connection.joints, connection.hand, cfg.safety) as safe:
+        with SafeHand(connection.bus, connection.joints, cfg.safety) as safe:
             safe.arm()
-            move(safe, pose, cfg.speed)
+            safe.move(pose, cfg.speed)
             left = np.abs(safe.read().position - pose)
     axis = int(np.argmax(left))
     print(f"farthest from its place: {connection.joints.names[axis]}, {left[axis]:.3f} rad")

@@ -1,6 +1,6 @@
-"""Which motor turns which joint, which way round, and from where: the hand's USD and a calibration file.
+"""Which motor turns which joint, which way round, and from where: a hand's USD, and a calibration over it.
 
-A motor's angle is ``sign * q + offset`` of its joint's angle q [rad].
+A motor's angle is ``sign * gear * q + offset`` of its joint's angle q [rad].
 """
 
 import json
@@ -9,16 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from vd.assets_usd.hand_data import HandModel
+from vd.assets_usd.hand_data import HandModel, MotorModel
 from vd.config import from_dict
 from vd.deploy.hardware.answers import HandState
-from vd.deploy.hardware.control_table import MODELS, RAD_S_PER_COUNT, to_angle
+from vd.deploy.hardware.control_table import RAD_S_PER_COUNT, Model, motor_model, to_angle
 from vd.deploy.hardware.packets import MAX_ID
 from vd.deploy.hardware.registers import MotorSettings
 
 FORMAT = "vd-motors/1"
-LARGEST_VELOCITY_LIMIT = 1023
-"""Counts that the velocity limit of a motor can hold."""
 
 
 @dataclass(frozen=True)
@@ -41,97 +39,152 @@ class _File:
 
 
 class CalibrationError(ValueError):
-    """A calibration that cannot be used; names file, joint and remedy."""
+    """Motors that cannot be used; names file or hand, joint and remedy."""
 
 
-@dataclass(frozen=True)
 class Joints:
-    """The motors of a hand's joints, in the joints' order."""
+    """The motors of a hand's joints, in the joints' order.
 
-    names: tuple[str, ...]
-    """Names of the joints [D]."""
-    ids: tuple[int, ...]
-    """Motor of each joint [D]."""
-    sign: np.ndarray
-    """1 or -1: which way the motor turns [D]."""
-    offset: np.ndarray
-    """Angle of the motor where the joint is at zero [rad], shape [D]."""
+    Raises:
+        CalibrationError: A motor is of no known model, or cannot be driven as it is to be.
+    """
+
+    def __init__(self, hand: HandModel, motors: tuple[MotorModel, ...]):
+        self.hand, self.names, self.motors = hand, hand.joint_names, motors
+        self.ids = tuple(motor.id for motor in motors)
+        """Motor of each joint [D]."""
+        self.sign = np.array([motor.sign for motor in motors])
+        """1 or -1: which way the motor turns [D]."""
+        self.gear = np.array([motor.gear for motor in motors])
+        """Turns of the motor for one of the joint [D]."""
+        self.offset = np.array([motor.offset_rad for motor in motors])
+        """Angle of the motor where the joint is at zero [rad], shape [D]."""
+        self.capped = np.array([motor.current > 0.0 for motor in motors])
+        """Whether its mode keeps the motor below its largest current [D]."""
+        try:
+            self.models: tuple[Model, ...] = tuple(motor_model(motor.model) for motor in motors)
+        except ValueError as error:
+            raise CalibrationError(f"{hand.name}: {error}") from error
+        for name, model, capped in zip(self.names, self.models, self.capped, strict=True):
+            if capped and not model.senses_current:
+                raise CalibrationError(
+                    f"{hand.name}: {name} has a largest current, which {model.name} does not measure; "
+                    "take vd:motor:current away"
+                )
 
     def to_motor(self, joint: np.ndarray) -> np.ndarray:
         """Angles of the motors [rad] from those of the joints, shape [..., D]."""
-        return self.sign * joint + self.offset
+        return self.sign * self.gear * joint + self.offset
 
     def to_joint(self, motor: np.ndarray) -> np.ndarray:
         """Angles of the joints [rad] from those of the motors, shape [..., D]."""
-        return self.sign * (motor - self.offset)
+        return self.sign * (motor - self.offset) / self.gear
 
     def state(self, motors: HandState) -> HandState:
-        """A state of the motors, in the joints' frame."""
+        """A state of the motors, in the joints' frame; currents stay the motors' own."""
         return replace(
             motors,
             position=self.to_joint(motors.position),
-            velocity=self.sign * motors.velocity,
+            velocity=self.sign * motors.velocity / self.gear,
             current=self.sign * motors.current,
             pwm=self.sign * motors.pwm,
         )
 
-    def settings(self, hand: HandModel, model: str) -> dict[int, MotorSettings]:
-        """Limits of every motor: the hand's, as far as the motor has them.
+    def currents(self) -> np.ndarray:
+        """Largest current of each motor [A] [D]: what it is said to have, or needs for its joint's torque."""
+        torque = self.hand.effort / self.gear
+        needed = [float(model.current_of(t)) for model, t in zip(self.models, torque, strict=True)]
+        return np.where(self.capped, [motor.current for motor in self.motors], needed)
+
+    @property
+    def p_gain(self) -> int:
+        """Position gain of a recording: the largest of the motors."""
+        return max(motor.p_gain for motor in self.motors)
+
+    def servo(self) -> dict[str, str | int]:
+        """What a log says of the motors."""
+        models = ", ".join(dict.fromkeys(model.name for model in self.models))
+        return {"model": models, "p_gain": self.p_gain, "d_gain": max(motor.d_gain for motor in self.motors)}
+
+    def settings(self) -> dict[int, MotorSettings]:
+        """Limits and gains of every motor, by ID: the hand's, as far as the motor has them.
 
         Raises:
             CalibrationError: A joint's range leaves the motor's one turn.
         """
-        motor = MODELS[model]
-        ends = np.sort(np.stack([self.to_motor(hand.lower), self.to_motor(hand.upper)]), axis=0)
-        first, last, current = to_angle(0), to_angle(4095), motor.current_of(hand.effort)
+        ends = np.sort(np.stack([self.to_motor(self.hand.lower), self.to_motor(self.hand.upper)]), axis=0)
+        first, last, currents = to_angle(0), to_angle(4095), self.currents()
         result = {}
-        for axis, id in enumerate(self.ids):
+        for axis, (motor, model) in enumerate(zip(self.motors, self.models, strict=True)):
             low, high = float(ends[0, axis]), float(ends[1, axis])
             if low < first or high > last:
                 raise CalibrationError(
-                    f"{self.names[axis]}, motor {id}: its range is {low:.2f} to {high:.2f} rad of the motor, "
-                    f"which turns from {first:.2f} to {last:.2f}; mount it nearer its middle, or mend offset"
+                    f"{self.names[axis]}, motor {motor.id}: its range is {low:.2f} to {high:.2f} rad of the "
+                    f"motor, which turns from {first:.2f} to {last:.2f}; mount it nearer its middle, or mend "
+                    "its offset"
                 )
-            result[id] = MotorSettings(
-                current_limit_a=float(current[axis]),
-                velocity_limit_rad_s=min(
-                    float(hand.velocity_limit[axis]), LARGEST_VELOCITY_LIMIT * RAD_S_PER_COUNT
-                ),
+            fastest = float(self.hand.velocity_limit[axis]) * motor.gear
+            result[motor.id] = MotorSettings(
+                current_limit_a=float(currents[axis]),
+                velocity_limit_rad_s=min(fastest, model.velocity_most * RAD_S_PER_COUNT),
                 lower_rad=low,
                 upper_rad=high,
+                p_gain=motor.p_gain,
+                d_gain=motor.d_gain,
+                current_based=motor.current > 0.0,
             )
         return result
 
 
-def uncalibrated(hand: HandModel) -> Joints:
-    """Motors as they are numbered on ROBEL's D'Claw (10, 11, 12, 20, ...), zero in their middle."""
-    count = len(hand.joint_names)
-    ids = tuple(10 * (axis // 3 + 1) + axis % 3 for axis in range(count))
-    return Joints(tuple(hand.joint_names), ids, np.ones(count), np.zeros(count))
+def read_joints(hand: HandModel, calibration: Path | None = None, model: str | None = None) -> Joints:
+    """The motors of a hand.
 
-
-def read_joints(path: Path, hand: HandModel) -> Joints:
-    """Read a calibration file.
+    Args:
+        hand: The hand, whose USD says which motors it has.
+        calibration: File with their IDs, directions and zeros, which count before the USD's.
+        model: Model of all of them, which counts before the USD's.
 
     Raises:
-        CalibrationError: It cannot be read, is no calibration, or not one of this hand.
+        CalibrationError: A joint has no motor, or the calibration is none, or not one of this hand.
+        ValueError: There is no such model.
     """
+    if model is not None:
+        motor_model(model)
+    entries: dict[str, _Motor] = {}
+    if calibration is not None:
+        entries = _read_calibration(Path(calibration), hand)
+    motors = []
+    for name, leader, said in zip(hand.joint_names, hand.mimic, hand.motors, strict=True):
+        entry = entries.get(name)
+        if leader >= 0:
+            raise CalibrationError(f"{hand.name}: {name} follows another joint; each needs a motor here")
+        if said is None and (entry is None or model is None):
+            raise CalibrationError(
+                f"{hand.path} does not say which motor turns {name}: describe motors when it is imported "
+                "(vd:motor), or give --motor and --calibration"
+            )
+        motor = said or MotorModel(str(model), 0)
+        if entry is not None:
+            motor = replace(motor, id=entry.id, sign=entry.sign, offset_rad=entry.offset_rad)
+        motors.append(motor if model is None else replace(motor, model=model))
+    return Joints(hand, tuple(motors))
+
+
+def _read_calibration(path: Path, hand: HandModel) -> dict[str, _Motor]:
+    """The entries of a calibration file, by joint."""
     try:
-        motors = _by_joint(from_dict(_File, json.loads(Path(path).read_text()), where="the file"), hand)
+        return _by_joint(from_dict(_File, json.loads(path.read_text()), where="the file"), hand)
     except OSError as error:
         raise CalibrationError(
             f"--calibration {path}: {error.strerror}; give a file with an entry for each joint of "
-            f"{hand.name}, or leave it out where IDs, zeros and directions are the default"
+            f"{hand.name}, or leave it out where IDs, zeros and directions are those of the hand's USD"
         ) from error
     except (TypeError, ValueError) as error:  # of JSON, text and fields too
         raise CalibrationError(f"{path} is not a calibration of {hand.name}: {error}") from error
-    ids = [motor.id for motor in motors]
-    sign = np.array([motor.sign for motor in motors])
-    return Joints(tuple(hand.joint_names), tuple(ids), sign, np.array([motor.offset_rad for motor in motors]))
 
 
-def _by_joint(file: _File, hand: HandModel) -> list[_Motor]:
-    """The entries of a file in the order of a hand's joints.
+def _by_joint(file: _File, hand: HandModel) -> dict[str, _Motor]:
+    """The entries of a file by joint.
 
     Raises:
         ValueError: Its format is another, or its entries are not one for each joint.
@@ -151,4 +204,4 @@ def _by_joint(file: _File, hand: HandModel) -> list[_Motor]:
             raise ValueError(f"motors.sign of {motor.joint} is {motor.sign:g}; it is 1, or -1")
         if not np.isfinite(motor.offset_rad):
             raise ValueError(f"motors.offset_rad of {motor.joint} is {motor.offset_rad}; give an angle [rad]")
-    return [file.motors[named.index(name)] for name in hand.joint_names]
+    return {motor.joint: motor for motor in file.motors}

@@ -18,10 +18,8 @@ from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import ready
-from vd.deploy.hardware.connect import Connection, HandOptions, connect, read_hand_and_joints
+from vd.deploy.hardware.connect import Connection, HandOptions, connect, motors_of
 from vd.deploy.hardware.control_table import RAD_PER_COUNT, TICK_MODULUS
-from vd.deploy.hardware.motion import move
-from vd.deploy.hardware.registers import D_GAIN, P_GAIN
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
 from vd.deploy.timely import undisturbed
@@ -30,6 +28,7 @@ from vd.hand_log import read_columns
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
+    from vd.deploy.hardware.joints import Joints
     from vd.gap.excitations import Excitation
     from vd.gap.recording import Recording, Trajectory
 
@@ -39,7 +38,6 @@ ROUNDING_S = 1e-6
 """Of times on the grid of samples."""
 SPEED_RAD_S = 1.0
 """Of the way to where a motion starts."""
-JOINTS_PER_FINGER = 3
 ASIDE = 0.8
 """Where the other fingers swing to meanwhile, outward, as a share of half their range: on the three-finger
 hand a straight finger that bends through its range would press on its neighbour."""
@@ -98,7 +96,7 @@ class Motion:
     def payload(self) -> tuple[float, str]:
         """Mass that has to hang at a fingertip [kg], and at whose; of nobody without one."""
         mass = float(self.excitation.conditions.get("payload_kg", 0.0))
-        return mass, self.excitation.joints[0].partition("_")[0] if mass > 0.0 else ""
+        return mass, _finger(self.excitation.joints[0]) if mass > 0.0 else ""
 
 
 class Sample(NamedTuple):
@@ -110,7 +108,7 @@ class Sample(NamedTuple):
     enabled: np.ndarray
 
 
-def motions_of(hand: "HandModel", fingers: Sequence[int], sets: Sequence[str]) -> list[Motion]:
+def motions_of(motors: "Joints", fingers: Sequence[int], sets: Sequence[str]) -> list[Motion]:
     """The motions of excitation sets, finger by finger.
 
     Raises:
@@ -118,32 +116,38 @@ def motions_of(hand: "HandModel", fingers: Sequence[int], sets: Sequence[str]) -
     """
     from vd.gap.excitations import JointRange, excitation_set
 
-    reach = JointRange(hand.joint_names, hand.lower, hand.upper, p_gain=float(P_GAIN))
+    hand = motors.hand
+    reach = JointRange(hand.joint_names, hand.lower, hand.upper, p_gain=float(motors.p_gain))
     every = excitation_set(reach, sets)
     joints = joints_of(hand, fingers)
     ordered = sorted(
         (motion for motion in every if motion.joints[0] in joints),
-        key=lambda motion: hand.joint_names.index(motion.joints[0]) // JOINTS_PER_FINGER,
+        key=lambda motion: _finger(motion.joints[0]),
     )
     return [
-        _motion(f"{index:03d}_{motion.joints[0]}_{motion.name}.csv", motion, hand)
+        _motion(f"{index:03d}_{motion.joints[0]}_{motion.name}.csv", motion, motors)
         for index, motion in enumerate(ordered)
     ]
 
 
-def _motion(file: str, excitation: "Excitation", hand: "HandModel") -> Motion:
+def _finger(joint: str) -> str:
+    """The finger of a joint, as its name says."""
+    return joint.partition("_")[0]
+
+
+def _motion(file: str, excitation: "Excitation", motors: "Joints") -> Motion:
     """An excitation with the fingers aside that it does not move, and the usual gain if it names none."""
-    command = excitation.command.copy()
-    moved = {name.partition("_")[0] for name in excitation.joints}
-    for swing in range(0, len(hand.joint_names), JOINTS_PER_FINGER):
-        if hand.joint_names[swing].partition("_")[0] not in moved:
+    hand, command = motors.hand, excitation.command.copy()
+    moved = {_finger(name) for name in excitation.joints}
+    for swing in (finger.start for finger in hand.fingers):
+        if _finger(hand.joint_names[swing]) not in moved:
             low, high = hand.lower[swing], hand.upper[swing]
             command[:, swing] = 0.5 * (low + high) + ASIDE * 0.5 * (high - low)
-    conditions = {"p_gain": float(P_GAIN), **excitation.conditions}
+    conditions = {"p_gain": float(motors.p_gain), **excitation.conditions}
     return Motion(file, replace(excitation, command=command, conditions=conditions))
 
 
-def read_plan(path: Path, hand: "HandModel") -> list[Motion]:
+def read_plan(path: Path, motors: "Joints") -> list[Motion]:
     """The motions of a plan that ``vd-gap plan`` wrote; joints that it does not name are straight.
 
     ``path`` is next_experiment.json, or the folder with it.
@@ -154,18 +158,20 @@ def read_plan(path: Path, hand: "HandModel") -> list[Motion]:
     file = path / "next_experiment.json" if path.is_dir() else path
     try:
         plan: dict[str, Any] = json.loads(file.read_text())
-        return [_planned(file.parent, entry, plan["joints"], hand) for entry in plan["trajectories"]]
+        return [_planned(file.parent, entry, plan["joints"], motors) for entry in plan["trajectories"]]
     except RecordError:
         raise
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise RecordError(f"{file} is no plan for {hand.name}: {error}; vd-gap plan writes one") from error
+        raise RecordError(
+            f"{file} is no plan for {motors.hand.name}: {error}; vd-gap plan writes one"
+        ) from error
 
 
-def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], hand: "HandModel") -> Motion:
+def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], motors: "Joints") -> Motion:
     """The motion of a plan's entry, whose file is in ``folder``."""
     from vd.gap.excitations import Excitation
 
-    columns = read_columns(folder / entry["file"])
+    hand, columns = motors.hand, read_columns(folder / entry["file"])
     command = np.tile(0.5 * (hand.lower + hand.upper), (len(columns["t"]), 1))
     enabled = np.ones(command.shape, dtype=bool)
     for name in joints:
@@ -176,7 +182,7 @@ def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], hand
         enabled[:, column] = columns.get(f"enabled.{name}", np.ones(len(command))) > 0.0
     joints = tuple(entry["joints"])
     excitation = Excitation(entry["excitation"], joints, columns["t"], command, entry["conditions"], enabled)
-    return _motion("plan_" + Path(entry["file"]).name, excitation, hand)
+    return _motion("plan_" + Path(entry["file"]).name, excitation, motors)
 
 
 def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
@@ -189,7 +195,7 @@ def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
     if wrong:
         raise ValueError(f"--fingers {wrong[0]}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")
     chosen = sorted(set(fingers)) or range(hand.num_fingers)
-    return tuple(name for f in chosen for name in hand.joint_names[3 * f : 3 * f + JOINTS_PER_FINGER])
+    return tuple(name for f in chosen for name in hand.joint_names[hand.fingers[f]])
 
 
 def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
@@ -223,9 +229,9 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
         BusError: A gain could not be written.
     """
     excitation, bus = motion.excitation, safe.bus
-    move(safe, excitation.command[0], SPEED_RAD_S)
-    motors = [bus.ids[column] for column in columns]
-    _set_gain(bus, motors, int(float(excitation.conditions["p_gain"])))
+    safe.move(excitation.command[0], SPEED_RAD_S)
+    gain = int(float(excitation.conditions["p_gain"]))
+    _set_gains(bus, {bus.ids[column]: gain for column in columns})
     samples = list[Sample]()
     pacer = Pacer(rate_hz, bus.clock)
     pacer.wait()
@@ -245,12 +251,12 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
         pacer.wait()
     if not on.all():
         safe.switch(np.ones_like(on))
-    _set_gain(bus, motors, P_GAIN)
+    _set_gains(bus, {bus.ids[column]: safe.joints.motors[column].p_gain for column in columns})
     return _trajectory(motion, columns, samples)
 
 
-def _set_gain(bus: MotorBus, motors: Sequence[int], gain: int) -> None:
-    for id in motors:
+def _set_gains(bus: MotorBus, gains: Mapping[int, int]) -> None:
+    for id, gain in gains.items():
         if bus.read(id, "position_p_gain") != gain:
             bus.write(id, "position_p_gain", gain)
 
@@ -289,11 +295,12 @@ def record(cfg: RecordCfg) -> int:
 
     require(cfg, "--", "positive", "rate_hz")
     check_folder(cfg.out)
-    hand, _ = read_hand_and_joints(cfg)
-    joints = joints_of(hand, cfg.fingers)
-    motions = (
-        motions_of(hand, cfg.fingers, cfg.excitations) if cfg.plan is None else read_plan(cfg.plan, hand)
-    )
+    motors = motors_of(cfg)
+    joints = joints_of(motors.hand, cfg.fingers)
+    if cfg.plan is None:
+        motions = motions_of(motors, cfg.fingers, cfg.excitations)
+    else:
+        motions = read_plan(cfg.plan, motors)
     with (
         connect(cfg, physics_hz=TWIN_HZ, realtime=cfg.realtime) as connection,
         undisturbed(cfg.realtime),
@@ -339,7 +346,7 @@ def _session(
         question = f"Hang {payload_kg:g} kg at the fingertip of {finger}. {question}"
     ready(connection, question, yes=cfg.yes)
     columns = [connection.joints.names.index(name) for name in joints]
-    with SafeHand(connection.bus, connection.joints, connection.hand, cfg.safety) as safe:
+    with SafeHand(connection.bus, connection.joints, cfg.safety) as safe:
         safe.arm()
         for number, motion in enumerate(motions, 1):
             trajectory = play(safe, motion, columns, cfg.rate_hz)
@@ -347,9 +354,10 @@ def _session(
             what = f"{number}/{len(motions)} {Path(motion.file).stem}"
             said = f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz"
             if rate < RATE_SHARE * cfg.rate_hz:
+                look = "" if cfg.twin else "look at the adapter's latency timer and the baud rate, "
                 said += (
-                    f", not {cfg.rate_hz:g}: a sample takes {1e3 / rate:.1f} ms; look at the adapter's "
-                    f"latency timer, the baud rate, end other programs, or ask for --rate-hz {rate:.0f}"
+                    f", not {cfg.rate_hz:g}: a sample takes {1e3 / rate:.1f} ms; {look}"
+                    f"end other programs, or ask for --rate-hz {rate:.0f}"
                 )
             print(said, file=sys.stderr, flush=True)
             keep(trajectory)
@@ -370,5 +378,4 @@ def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "
         return found
     if hand.name not in HANDS:
         raise RecordError(f"a recording names its hand, and {hand.name} is none of {', '.join(HANDS)}")
-    servo = {"model": connection.bus.model.name, "p_gain": P_GAIN, "d_gain": D_GAIN}
-    return Recording(cfg.out, hand.name, joints, servo, RAD_PER_COUNT, ())
+    return Recording(cfg.out, hand.name, joints, connection.joints.servo(), RAD_PER_COUNT, ())

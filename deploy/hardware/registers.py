@@ -2,16 +2,23 @@
 
 One table for the preflight, which compares, and for :meth:`vd.deploy.hardware.bus.MotorBus.configure`, which
 writes. What is wanted is the hand's own value, and else the factory's. The other registers tell, or act in
-other operating modes alone: velocity gains, goal current, goal velocity.
+other operating modes alone: velocity gains, goal velocity.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from vd.deploy.hardware.control_table import EEPROM_END, RAD_S_PER_COUNT, Model, table, to_counts
+from vd.deploy.hardware.control_table import (
+    CURRENT_POSITION_MODE,
+    EEPROM_END,
+    MODELS,
+    POSITION_MODE,
+    RAD_S_PER_COUNT,
+    Model,
+    table,
+    to_counts,
+)
 
-P_GAIN, D_GAIN = 200, 10
-"""Position gains of the paper's motors, in their units."""
 RESTART = "switch its power off and on"
 """Clears a motor's error, and has it count angles within one turn."""
 WIZARD = "set it to {wanted} with ROBOTIS' DYNAMIXEL Wizard 2.0"
@@ -62,10 +69,15 @@ REGISTERS = (
     Register("feedforward_1st_gain", "it is pushed beyond its goals"),
     Register("feedforward_2nd_gain", "it is pushed beyond its goals"),
     Register("goal_pwm", "its torque and speed are cut"),
+    Register("goal_current", "its grip is not the hand's"),
     Register("profile_acceleration", "it comes slowly to its goals"),
     Register("profile_velocity", "it comes slowly to its goals"),
 )
 """The table."""
+ROUNDING = 1e-6
+"""Of a count: 0.35 A are 350 counts of 1 mA, not 349."""
+OWN = ("current_limit", "goal_current")
+"""Registers that not every motor and mode has: they are compared where the settings name them."""
 
 
 @dataclass(frozen=True)
@@ -80,18 +92,24 @@ class MotorSettings:
     """Least angle [rad]."""
     upper_rad: float
     """Largest angle [rad]."""
-    p_gain: int = P_GAIN
-    d_gain: int = D_GAIN
+    p_gain: int = 200
+    d_gain: int = 10
+    current_based: bool = False
+    """Whether ``current_limit_a`` bounds what a joint may pull (current-based position control)."""
 
     def values(self, model: Model) -> dict[str, int]:
         """Values of the control table that are the joint's own, by item."""
+        current = int(self.current_limit_a / model.current_unit_a + ROUNDING)
         return {
+            "operating_mode": CURRENT_POSITION_MODE if self.current_based else POSITION_MODE,
             "return_delay_time": 0,
-            "current_limit": int(self.current_limit_a / model.current_unit_a),
+            **({"current_limit": current} if model.senses_current else {}),
+            **({"goal_current": current} if self.current_based else {}),
             "velocity_limit": int(self.velocity_limit_rad_s / RAD_S_PER_COUNT),
             "min_position_limit": to_counts(self.lower_rad),
             "max_position_limit": to_counts(self.upper_rad),
             "position_p_gain": self.p_gain,
+            "position_i_gain": 0,
             "position_d_gain": self.d_gain,
         }
 
@@ -107,7 +125,8 @@ def different(
         settings: What its joint wants; the factory's values otherwise.
     """
     items, own = table(model), settings.values(model)
-    wanted = {one: own.get(one.name, items[one.name].initial) for one in REGISTERS}
+    compared = [one for one in REGISTERS if one.name in own or one.name not in OWN]
+    wanted = {one: own.get(one.name, items[one.name].initial) for one in compared}
     return {
         one: (found[one.name], value)
         for one, value in wanted.items()
@@ -115,6 +134,6 @@ def different(
     }
 
 
-def kept(model: Model, register: Register) -> bool:
+def kept(register: Register) -> bool:
     """Whether a register is kept without power (EEPROM)."""
-    return table(model)[register.name].address < EEPROM_END
+    return table(next(iter(MODELS.values())))[register.name].address < EEPROM_END

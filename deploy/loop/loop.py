@@ -157,19 +157,19 @@ class ControlLoop:
             frame = self._camera.read(CAMERA_SHARE * self._pacer.period_s)
             self._safe.image_at(frame.time_s)
             depth, image_s = frame.image, frame.time_s
-        pose = None if self._twin is None else self._twin.object_pose()
+        truth = None if self._twin is None else self._twin.object_state()
         state = self._safe.read()
         smoothed = self._actions.smoothed
-        return Sensed(state.position, state.velocity, smoothed, goal, depth, pose), state, image_s
+        return Sensed(state.position, state.velocity, smoothed, goal, depth, truth), state, image_s
 
     def _ended(self, distance: float, sensed: Sensed, *, first: bool) -> str:
         """``stopped``, ``lost``, or nothing."""
         rule = self._runner.rule
         if rule.stops(np.array(distance), np.array(np.linalg.norm(sensed.smoothed))) and not first:
             return "stopped"
-        if sensed.object_pose is not None:
-            away = np.linalg.norm(sensed.object_pose[:3] - np.array(self._safe.hand.workspace.goal_m))
-            if away > PAPER.success.fall_m:
+        if sensed.truth is not None:
+            away = np.linalg.norm(sensed.truth[:3] - np.array(self._safe.hand.workspace.goal_m))
+            if away > self._safe.hand.workspace.fall_m:
                 return "lost"
         return ""
 
@@ -186,8 +186,8 @@ class ControlLoop:
     ) -> None:
         """Log the step, keep its times, and now and then say how it goes."""
         truth: list[float] = []
-        if sensed.object_pose is not None:
-            pose = sensed.object_pose.astype(float)
+        if sensed.truth is not None:
+            pose = sensed.truth[:7].astype(float)
             error = symmetric_error(pose[None, 3:], sensed.goal_quat[None], self._symmetry)
             truth = [*pose.tolist(), float(error[0])]
         joints = {

@@ -11,8 +11,10 @@ import warp as wp
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import check_fits, open_policy, trained_task
+from vd.evaluate.agents import check_fits, open_policy, task_for, trained_task
+from vd.evaluate.statistics import symmetric_error
 from vd.paper import PAPER
+from vd.policy import TrainedPolicy
 from vd.senses import Senses
 from vd.sensors.depth_cloud import CameraCloud
 from vd.stopping import StoppingRule
@@ -37,8 +39,9 @@ class Sensed:
     """Wanted orientation of the object, xyzw [4]."""
     depth: np.ndarray | None = None
     """Depth image [m], 0 for none [H, W]."""
-    object_pose: np.ndarray | None = None
-    """True pose of the object [7], which a twin tells and no policy is told."""
+    truth: np.ndarray | None = None
+    """True position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] of the object [13], which a twin
+    tells, and of the policies a teacher is told."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,63 @@ class PolicyRunner:
     def decide(self, sensed: Sensed) -> Decision:
         """What to do now."""
         return Decision(np.zeros_like(sensed.smoothed), float("nan"))
+
+
+class TeacherRunner(PolicyRunner):
+    """A teacher before a twin, which tells the object's true state: an environment makes its observation.
+
+    Args:
+        policy: The teacher.
+        hand_name: Name of the hand or its USD.
+        object: Name of the object's set, or its file.
+        tolerance_rad: How near to the goal it is to stop [rad].
+    """
+
+    kind = "teacher"
+
+    def __init__(self, policy: TrainedPolicy, hand_name: str, object: str, tolerance_rad: float):
+        from vd.envs.reorient import ReorientEnv
+
+        task = task_for(
+            policy,
+            stop_tolerance_rad=tolerance_rad,
+            randomised=False,
+            hand=hand_name,
+            at_rest=False,
+            num_envs=1,
+            objects=(object,),
+        )
+        super().__init__(task, StoppingRule(tolerance_rad))
+        self._env, self._policy, self._begins = ReorientEnv(task, "cpu"), policy, True
+        drop = self._env.hand.workspace.drop_m
+        self._before = np.array([*drop, 0.0, 0.0, 0.0, 1.0, *np.zeros(6)])
+
+    def new_goal(self) -> None:
+        """The symmetry frame is chosen anew."""
+        self._begins = True
+
+    def decide(self, sensed: Sensed) -> Decision:
+        """What it does in this state."""
+        env, sim = self._env, self._env.sim
+        truth = self._before if sensed.truth is None else sensed.truth
+        for array, joints, rest in (
+            (sim.joint_q, sensed.joint_q, truth[:7]),
+            (sim.joint_qd, sensed.joint_qd, truth[7:]),
+            (env.measured_q, sensed.joint_q, truth[:7]),
+            (env.measured_qd, sensed.joint_qd, truth[7:]),
+            (env.smoothed, sensed.smoothed, ()),
+        ):
+            array.assign(np.array([[*joints, *rest]], dtype=np.float32)[:, : array.shape[1]])
+        sim.forward_kinematics()
+        if self._begins:
+            env.give_goals(np.zeros(1, int), sensed.goal_quat[None])
+            self._begins = False
+        env.observe()
+        action: Any = wp.from_torch(self._policy.act(wp.to_torch(env.observation)).contiguous())
+        if env.symmetry_frames is not None:
+            action = env.symmetry_frames.world_action(action)
+        error = symmetric_error(truth[None, 3:7], sensed.goal_quat[None], env.objects[0].symmetry)
+        return Decision(action.numpy()[0].copy(), float(error[0]))
 
 
 class TrackingRunner(PolicyRunner):
@@ -142,6 +202,7 @@ def load_runner(
     *,
     tolerance_rad: float = PAPER.success.rotation_rad,
     seed: int = 0,
+    object: str | None = None,
 ) -> PolicyRunner:
     """Load a policy for the loop.
 
@@ -152,9 +213,10 @@ def load_runner(
         item: The object.
         tolerance_rad: How near to the goal it is to stop [rad].
         seed: Of the choice of camera points.
+        object: What a twin holds, whose true state a teacher is told; None: a real hand.
 
     Raises:
-        ValueError: It is for another hand, or does not see by a camera.
+        ValueError: It is for another hand, or a teacher for a real one.
     """
     policy: Any = None if name == ZERO else open_policy(name, "cpu")
     if policy is None:
@@ -164,6 +226,8 @@ def load_runner(
     check_fits(name, policy, hand_name)
     if isinstance(policy, TrackingPolicy):
         return TrackingRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
+    if object is not None:
+        return TeacherRunner(policy, hand_name, object, tolerance_rad)
     raise ValueError(
         f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train tracker "
         "makes a tracking policy of it"

@@ -1,6 +1,6 @@
 """Drive a hand with a policy: pursue goals one after the other, in one process at 12 Hz, and log every step.
 
-The policy sees joints and a depth camera: a tracking or vision policy.
+The policy sees joints and a depth camera: a tracking or vision policy. A twin tells a teacher the truth.
 """
 
 import contextlib
@@ -20,11 +20,9 @@ from vd.deploy.camera.camera import Camera
 from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.finding import Finding
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
-from vd.deploy.hardware.motion import MOVE_S, move
-from vd.deploy.hardware.registers import D_GAIN, P_GAIN
 from vd.deploy.loop.run_page import goal_results, summary_line, write_page
 from vd.deploy.safety.limits import SafetyCfg
-from vd.deploy.safety.safety import SafeHand, StoppedError
+from vd.deploy.safety.safety import MOVE_S, SafeHand, StoppedError
 from vd.deploy.timely import undisturbed
 from vd.evaluate.agents import check_names
 from vd.files import check_folder
@@ -56,8 +54,8 @@ class RunCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """Bundle, file or name of a policy that sees by camera; with --twin the installed tracking policy of the
-    hand by default. "zero" is the zero-action baseline."""
+    """Bundle, file or name of a policy that sees by camera, with --twin a teacher too, and by default the
+    installed tracking policy of the hand. "zero" is the zero-action baseline."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj, .glb)."""
     goal: tuple[str, ...] = ()
@@ -120,17 +118,18 @@ def run(cfg: RunCfg) -> int:
     check_folder(cfg.log or LOGS)
     import torch
 
-    from vd.deploy.hardware.connect import read_hand_and_joints
+    from vd.deploy.hardware.connect import motors_of
     from vd.deploy.loop.goals import make_goals, one_object
     from vd.deploy.loop.policy_runner import load_runner
 
     quiet_warp()
     torch.set_num_threads(1)  # of several, some would wait for one that has no core
     goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
-    hand, _ = read_hand_and_joints(cfg)
+    hand = motors_of(cfg).hand
     item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
     tolerance = cfg.tolerance_rad
-    runner = load_runner(name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed)
+    told = cfg.object if cfg.twin else None
+    runner = load_runner(name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told)
     if not runner.calibrated:
         print(
             f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that distance; "
@@ -140,8 +139,8 @@ def run(cfg: RunCfg) -> int:
     folder = cfg.log or LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
     fault: StoppedError | None = None
     status = 0
-    camera = runner.camera or hand.camera
-    place = (*map(float, camera.position), *map(float, camera.quaternion))
+    camera = runner.camera or hand.mounted_camera
+    place = None if camera is None else (*map(float, camera.position), *map(float, camera.quaternion))
     with connect(
         cfg, object=cfg.object, camera=place, realistic=cfg.realistic, realtime=cfg.realtime
     ) as connection:
@@ -201,16 +200,16 @@ def _pursue(
             folder,
             hand,
             _description(cfg, name, runner, item, goals),
-            servo={"model": cfg.motor, "p_gain": P_GAIN, "d_gain": D_GAIN},
+            servo=connection.joints.servo(),
             truth=twin is not None,
         )
         pacer = Pacer(hz, latest=LATEST)
         reason, outcomes = "aborted", list[str]()
         loop: ControlLoop | None = None
         try:
-            with SafeHand(connection.bus, connection.joints, hand, cfg.safety) as safe:
+            with SafeHand(connection.bus, connection.joints, cfg.safety) as safe:
                 safe.arm()
-                move(safe, pose, HOME_RAD_S)
+                safe.move(pose, HOME_RAD_S)
                 place(safe, pose, twin, yes=cfg.yes)
                 loop = ControlLoop(
                     safe,

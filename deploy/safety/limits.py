@@ -9,13 +9,14 @@ from typing import Literal
 
 import numpy as np
 
-from vd.assets_usd.hand_data import HandModel
 from vd.config import require
 from vd.deploy.hardware.answers import HandState
-from vd.deploy.hardware.control_table import Model
+from vd.deploy.hardware.joints import Joints
 from vd.paper import PAPER
 
 PERIOD_S = 1.0 / PAPER.scene.control_hz
+SHUTDOWN_C = 10.0
+"""How far below the temperature at which a motor shuts down the hand is stopped."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,11 @@ class SafetyCfg:
     else moves it."""
     current_share: float = 0.8
     """Current over the one for the joints' largest torque at which the hand is stopped, if it lasts; motors
-    shut down by themselves near 1."""
+    shut down by themselves near 1. Motors whose mode limits their current may go on at that limit."""
     current_s: float = 0.5
     """How long [s] a current may be above that."""
     temperature_c: float = 70.0
-    """Temperature [deg C] of a motor at which the hand is stopped; motors shut down at 80."""
+    """Temperature [deg C] at which the hand is stopped, or 10 below that at which a motor shuts down."""
     lost_s: float = 3.0 * PERIOD_S
     """Time [s] without a sound state after which the bus is lost; shorter gaps repeat the last state."""
     misses: int = 3
@@ -64,12 +65,14 @@ class Limits:
         ValueError: The margin leaves a joint no range.
     """
 
-    def __init__(self, hand: HandModel, motor: Model, names: Sequence[str], cfg: SafetyCfg):
-        self._names, self._cfg = tuple(names), cfg
+    def __init__(self, joints: Joints, names: Sequence[str], cfg: SafetyCfg):
+        hand, self._names, self._cfg = joints.hand, tuple(names), cfg
         self.lower, self.upper = hand.lower + cfg.margin_rad, hand.upper - cfg.margin_rad
         if (self.lower >= self.upper).any():
             raise ValueError(f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider")
-        self._current = cfg.current_share * motor.current_of(hand.effort)
+        self._current = np.where(joints.capped, np.inf, cfg.current_share * joints.currents())
+        most = [model.temperature_limit - SHUTDOWN_C for model in joints.models]
+        self._temperature = np.minimum(cfg.temperature_c, most)
         self._velocity = cfg.velocity_share * hand.velocity_limit
         self._strained_since = np.full(len(self._names), np.inf)
 
@@ -81,7 +84,7 @@ class Limits:
     def passed(self, state: HandState) -> str:
         """Which limit the newest state of the joints is beyond, in words; empty for none."""
         fast = np.abs(state.velocity) > self._velocity
-        hot = state.temperature > self._cfg.temperature_c
+        hot = state.temperature > self._temperature
         strained = np.abs(state.current) > self._current
         self._strained_since = np.where(strained, np.minimum(self._strained_since, state.time_s), np.inf)
         long = state.time_s - self._strained_since > self._cfg.current_s
@@ -89,7 +92,7 @@ class Limits:
             if fast[axis]:
                 return f"{name}: {state.velocity[axis]:.1f} rad/s, over {self._velocity[axis]:.1f}"
             if hot[axis]:
-                return f"{name}: {state.temperature[axis]:.0f} deg C, over {self._cfg.temperature_c:g}"
+                return f"{name}: {state.temperature[axis]:.0f} deg C, over {self._temperature[axis]:g}"
             if long[axis]:
                 return f"{name}: {state.current[axis]:.2f} A for {self._cfg.current_s:g} s; is it blocked?"
         return ""

@@ -1,6 +1,6 @@
 """Limits and a watchdog between whatever decides on goals and the motors; they hold whatever it decides.
 
-    with SafeHand(bus, joints, hand, cfg) as safe:     # preflight has passed, the person has confirmed
+    with SafeHand(bus, joints, cfg) as safe:           # preflight has passed, the person has confirmed
         safe.arm()                                     # torque on where the hand is; watchdogs run from here
         while not done:
             state = safe.read()                        # joints' frame [rad]; checked
@@ -17,6 +17,7 @@ Angles and speeds are the joints', rad and rad/s; times of the monotonic clock.
 """
 
 import contextlib
+import math
 import signal
 import sys
 import threading
@@ -27,18 +28,22 @@ from typing import Any
 
 import numpy as np
 
-from vd.assets_usd.hand_data import HandModel
 from vd.deploy.finding import listed
 from vd.deploy.hardware.answers import BusError, HandState, LateError, SilentError
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.joints import Joints
 from vd.deploy.safety.limits import PERIOD_S, Limits, SafetyCfg
 
+MOVE_S = 0.04
+"""Time between the goals of a slow movement."""
+SETTLE_STEPS = 10
+"""Steps at its end."""
 WATCH_S = 0.01
 """How often the watchdog looks."""
 TORQUE_S = PERIOD_S / 3.0
 """Age of what is known of the motors' torque from which it is asked for again, in a packet of its own, since
 its register lies far from the state's: with each reading of a control loop, each third of a recording."""
+DEFAULTS = SafetyCfg()
 TORQUE_GONE = "another program on the line switched it off, or it restarted"
 AHEAD_S = 0.02
 """An image cannot be newer than the moment it came [s]; what the SDK makes of its clock is off by some ms."""
@@ -90,14 +95,13 @@ class SafeHand:
         self,
         bus: MotorBus,
         joints: Joints,
-        hand: HandModel,
-        cfg: SafetyCfg | None = None,
+        cfg: SafetyCfg = DEFAULTS,
         say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
     ):
         """Nothing is sent before :meth:`arm`."""
-        self.bus, self.joints, self.hand, self.cfg, self._say = bus, joints, hand, cfg or SafetyCfg(), say
+        self.bus, self.joints, self.hand, self.cfg, self._say = bus, joints, joints.hand, cfg, say
         self._names = [f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)]
-        self.limits = Limits(hand, bus.model, self._names, self.cfg)
+        self.limits = Limits(joints, self._names, self.cfg)
         self.repeated = 0
         """Readings without a sound answer, for which the last state stood in."""
         self.report: StopReport | None = None
@@ -184,6 +188,29 @@ class SafeHand:
             except BusError as error:
                 raise self._stop(unheard(error), lost=True) from error
         return goal
+
+    def move(self, goal: np.ndarray, speed: float) -> np.ndarray:
+        """Move slowly in a straight line of joint angles, and wait for the hand to follow.
+
+        Args:
+            goal: Angles of the joints [rad], shape [D].
+            speed: Of the joint that has farthest to go [rad/s].
+
+        Returns:
+            The largest distance of each joint from where it should have been [rad], shape [D].
+        """
+        start = self.read().position
+        steps = max(1, math.ceil(float(np.abs(goal - start).max()) / (speed * MOVE_S)))
+        worst = np.zeros(len(start))
+        clock = self.bus.clock
+        begin = clock.now()
+        for step in range(1, steps + SETTLE_STEPS + 1):
+            target = start + (goal - start) * min(1.0, step / steps)
+            self.command(target)
+            clock.sleep(begin + step * MOVE_S - clock.now())
+            worst = np.maximum(worst, np.abs(self.read().position - target))
+            self.beat()
+        return worst
 
     def switch(self, on: np.ndarray) -> None:
         """Switch the torque of joints on or off; one that is switched on stays where it is.

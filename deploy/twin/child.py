@@ -56,13 +56,13 @@ class TwinChild:
             self._process.kill()
             self._process.join()
 
-    def object_pose(self) -> np.ndarray:
-        """The object's true position [m] and quaternion xyzw [7].
+    def object_state(self) -> np.ndarray:
+        """The object's true position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] [13].
 
         Raises:
             TwinError: No answer.
         """
-        return np.asarray(self.ask("pose"))
+        return np.asarray(self.ask("object"))
 
     def place_object(self) -> None:
         """Put the object where an episode starts; it falls from there.

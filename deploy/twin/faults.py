@@ -17,17 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
-from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import preflight, write_settings
-from vd.deploy.hardware.connect import MOTOR, Connection
-from vd.deploy.hardware.control_table import MODELS, HardwareError
-from vd.deploy.hardware.joints import Joints, uncalibrated
+from vd.deploy.hardware.connect import Connection
+from vd.deploy.hardware.control_table import HardwareError
+from vd.deploy.hardware.joints import Joints, read_joints
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import FINISHED, SafeHand, StoppedError
 from vd.deploy.twin.line import Faults
-from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.motor import Motor, make_motors
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.deploy.twin.plant import Drive, FirstOrderPlant, Plant
 from vd.deploy.twin.twin import Twin
@@ -265,14 +264,14 @@ class Outcome:
 
 
 @contextlib.contextmanager
-def scene_of(hand: HandModel, joints: Joints, *, blockable: bool = False) -> Iterator[Scene]:
+def scene_of(joints: Joints, *, blockable: bool = False) -> Iterator[Scene]:
     """A twin that serves, and a configured bus to it."""
-    plant: Plant = FirstOrderPlant(len(joints.ids)) if blockable else NewtonHand(hand, joints)
-    motors = [Motor(MODELS[MOTOR], id) for id in joints.ids]
+    plant: Plant = FirstOrderPlant(len(joints.ids)) if blockable else NewtonHand(joints.hand, joints)
+    motors = make_motors(joints)
     witness = Witness(plant, motors)
-    with Twin(motors, witness, Faults(seed=1)) as twin, MotorBus(twin.path, joints.ids, MOTOR) as bus:
+    with Twin(motors, witness, Faults(seed=1)) as twin, MotorBus(twin.path, joints.ids, joints.models) as bus:
         bus.retries = SETUP_RETRIES
-        bus.configure(joints.settings(hand, MOTOR))
+        bus.configure(joints.settings())
         bus.retries = 1
         yield Scene(twin, bus, witness)
 
@@ -301,12 +300,12 @@ def _outcome(
     )
 
 
-def try_fault(fault: Fault, hand: HandModel, joints: Joints) -> Outcome:
+def try_fault(fault: Fault, joints: Joints) -> Outcome:
     """Move the hand's twin, inject a fault, and see how it ends."""
-    with scene_of(hand, joints, blockable=fault.blockable) as scene:
+    with scene_of(joints, blockable=fault.blockable) as scene:
         scene.camera = fault.camera
         with contextlib.suppress(StoppedError, ArithmeticError):
-            with SafeHand(scene.bus, joints, hand, fault.cfg, lambda text: None) as safe:
+            with SafeHand(scene.bus, joints, fault.cfg, lambda text: None) as safe:
                 safe.arm()
                 _move(scene, safe, fault)
         time.sleep(REST_S)
@@ -357,13 +356,13 @@ def _move(scene: Scene, safe: SafeHand, fault: Fault) -> None:
         time.sleep(max(0.0, due - time.monotonic()))
 
 
-def try_preflight(name: str, hand: HandModel, joints: Joints) -> Outcome:
+def try_preflight(name: str, joints: Joints) -> Outcome:
     """Spoil something before the start; nothing may move."""
-    with scene_of(hand, joints, blockable=True) as scene:
+    with scene_of(joints, blockable=True) as scene:
         scene.bus.release()
         BEFORE[name](scene)
         time.sleep(0.1)
-        connection = Connection(hand, joints, scene.bus)
+        connection = Connection(joints, scene.bus)
         wrong = [finding for finding in preflight(connection) if not finding.ok]
         if not wrong and not (written := write_settings(connection)).ok:
             wrong = [written]
@@ -372,12 +371,12 @@ def try_preflight(name: str, hand: HandModel, joints: Joints) -> Outcome:
         return _outcome(scene, name, happened, joints, right=right)
 
 
-def try_process(name: str, hand: HandModel, joints: Joints) -> Outcome:
+def try_process(name: str, joints: Joints) -> Outcome:
     """Send a signal to `vd-deploy home` while it moves the twin."""
-    with scene_of(hand, joints) as scene:
+    with scene_of(joints) as scene:
         scene.bus.close()  # one program at a time has the port
         command = [sys.executable, "-m", "vd.deploy.cli", "home", "--port", scene.twin.path, "--yes"]
-        command += ["--hand", hand.name, "--speed", "0.2"]
+        command += ["--hand", joints.hand.name, "--speed", "0.2"]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         end = time.monotonic() + START_S
         while (
@@ -411,12 +410,11 @@ class FaultsCommand:
     def run(self) -> int:
         """Try all; 1 if one did not end as it has to."""
         quiet_warp()
-        hand = load_hand(self.hand)
-        joints = uncalibrated(hand)
+        joints = read_joints(load_hand(self.hand))
         trials: dict[str, Callable[[], Outcome]] = {
-            **{fault.name: partial(try_fault, fault, hand, joints) for fault in MOVING},
-            **{name: partial(try_preflight, name, hand, joints) for name in BEFORE},
-            **{name: partial(try_process, name, hand, joints) for name in PROCESS},
+            **{fault.name: partial(try_fault, fault, joints) for fault in MOVING},
+            **{name: partial(try_preflight, name, joints) for name in BEFORE},
+            **{name: partial(try_process, name, joints) for name in PROCESS},
         }
         outcomes = []
         for name, trial in trials.items():
@@ -424,7 +422,9 @@ class FaultsCommand:
                 outcomes.append(trial())
                 print(outcomes[-1], flush=True)
         if self.json is not None:
-            write_json(self.json, [asdict(outcome) for outcome in outcomes])
+            never = (float("inf"), float("-inf"))  # no number of JSON
+            rows = [asdict(outcome).items() for outcome in outcomes]
+            write_json(self.json, [{k: None if v in never else v for k, v in row} for row in rows])
         return 0 if all(outcome.right for outcome in outcomes) else 1
 
 

@@ -4,6 +4,7 @@ import math
 
 from vd.deploy.hardware.control_table import (
     COUNTS_PER_TURN,
+    CURRENT_POSITION_MODE,
     EEPROM_END,
     POSITION_MODE,
     RAD_S_PER_COUNT,
@@ -16,6 +17,7 @@ from vd.deploy.hardware.control_table import (
     to_angle,
     to_counts,
 )
+from vd.deploy.hardware.joints import Joints
 from vd.deploy.hardware.packets import ALERT, Failure
 from vd.deploy.twin.plant import Drive
 
@@ -64,6 +66,7 @@ class Motor:
         for name, item in self.items.items():
             if item.address >= EEPROM_END and item.writable:
                 self.put(name, item.initial)
+        self._let_pull()
         self.put("hardware_error_status", 0)
         self._clock = self.id * PHASE_S % TICK_S
         self._strained = self._silence = 0.0
@@ -91,6 +94,11 @@ class Motor:
     def shut_down(self) -> bool:
         """Whether an error has taken the torque away; only a reboot gives it back."""
         return bool(self.get("hardware_error_status") & self.get("shutdown"))
+
+    def _let_pull(self) -> None:
+        """Goal current at its limit, as when switched on, or in another operating mode."""
+        if self.model.senses_current:
+            self.put("goal_current", self.get("current_limit"))
 
     def _count_one_turn(self) -> None:
         """Count angles anew within one turn, as when switched on: turned by hand it has counted on."""
@@ -135,7 +143,7 @@ class Motor:
             return Failure.ACCESS
         if name in GOALS and self.get("bus_watchdog") == -1:
             return Failure.ACCESS
-        if name == "goal_position":
+        if name == "goal_position" and self.get("operating_mode") == POSITION_MODE:
             low, high = self.get("min_position_limit"), self.get("max_position_limit")
             return Failure.NONE if low <= value <= high else Failure.LIMIT
         limits = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
@@ -145,11 +153,13 @@ class Motor:
 
     def _accept(self, name: str, value: int) -> None:
         if name == "torque_enable" and value and not self.get("torque_enable"):
-            self._count_one_turn()
+            if self.get("operating_mode") == POSITION_MODE:
+                self._count_one_turn()
             self.put("goal_position", self.get("present_position"))  # a motor does not jump when switched on
         if name == "operating_mode" and value != self.get(name):
             for item in MODE_ITEMS:
                 self.put(item, self.items[item].initial)
+            self._let_pull()
             if value == POSITION_MODE:
                 self._count_one_turn()
         self.put(name, value)
@@ -160,7 +170,9 @@ class Motor:
 
     def drive(self) -> Drive:
         """What the motor does with its axis; profiles, I gain and feed-forward are not simulated."""
-        limit = min(self.get("current_limit"), self.model.current_limit) * self.model.current_unit_a
+        counts = self.get("current_limit") if self.model.senses_current else self.model.current_limit
+        if self.get("operating_mode") == CURRENT_POSITION_MODE:
+            counts = min(counts, self.get("goal_current"))
         goal: float | None = None
         if self.get("torque_enable"):
             turns = 2.0 * math.pi * self._turns
@@ -169,7 +181,7 @@ class Motor:
             goal_rad=goal,
             p_gain=float(self.get("position_p_gain")),
             velocity_limit=self.get("velocity_limit") * RAD_S_PER_COUNT,
-            torque_limit=limit * self.model.torque_nm_per_a,
+            torque_limit=counts * self.model.current_unit_a * self.model.torque_nm_per_a,
         )
 
     def sense(self, seconds: float, position: float, velocity: float, torque: float) -> None:
@@ -208,3 +220,8 @@ class Motor:
         if limit > 0 and self._silence > limit * WATCHDOG_UNIT_S:
             self.put("bus_watchdog", -1)
             self.put("goal_position", self.get("present_position"))
+
+
+def make_motors(joints: Joints) -> list[Motor]:
+    """A hand's motors, as they come from the factory but for their IDs."""
+    return [Motor(model, id) for model, id in zip(joints.models, joints.ids, strict=True)]

@@ -15,7 +15,7 @@ import warp as wp
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.deploy.hardware.joints import Joints
-from vd.deploy.twin.plant import P_GAIN_UNIT, Drive
+from vd.deploy.twin.plant import Drive
 from vd.kernels.task.actions import limit_joint_velocity_kernel
 from vd.sim.actuators import JointServo, has_effects
 from vd.sim.cfg import SimCfg
@@ -34,8 +34,9 @@ ROOM = 4
 class NewtonHand:
     """A simulated hand; its axes are the motors', in the joints' order.
 
-    A motor at the paper's position gain has the hand's identified stiffness and damping; its stiffness grows
-    with the gain. With its torque off a joint has neither. Effects of the hand's layer act as in training.
+    A motor at the position gain of the hand's USD has the hand's stiffness and damping; its stiffness grows
+    with the gain. In current-based mode its current limits the torque. With its torque off a joint has
+    neither. Effects of the hand's layer act as in training.
     """
 
     def __init__(
@@ -49,7 +50,8 @@ class NewtonHand:
         """What is where in the world; None without an object to handle."""
         if item is None:
             world = build_hand(hand, cfg, visuals=False)
-            add_table(world, cfg, visible=False)
+            if not hand.palm_up:
+                add_table(world, cfg, visible=False)
             builder = new_builder()
             builder.add_world(world)
             self._model = builder.finalize(device="cpu")
@@ -66,7 +68,9 @@ class NewtonHand:
         self._pair_s, self._rest = 2.0 * cfg.physics_dt, 0.0
         self._pulled = np.zeros(self._axes)
         self._stiffness, self._damping = np.zeros(self._axes), np.zeros(self._axes)
-        self._gains: tuple[tuple[float, float], ...] = ()
+        self._p_gain = np.array([motor.p_gain for motor in joints.motors])
+        self._effort = hand.effort
+        self._gains: tuple[tuple[float, float, float], ...] = ()
         self._write(self._state.joint_q, self._target)
         if item is not None:
             self.place_object((0.0, 0.0, 0.0, 1.0))
@@ -155,7 +159,7 @@ class NewtonHand:
         self._set_gains(drives)
         goals = np.array([np.nan if drive.goal_rad is None else drive.goal_rad for drive in drives])
         self._target = np.where(np.isnan(goals), self._target, self.joints.to_joint(goals))
-        fastest = [drive.velocity_limit for drive in drives]
+        fastest = np.array([drive.velocity_limit for drive in drives]) / self.joints.gear
         self._limits.assign(np.minimum(fastest, self.hand.velocity_limit))
         seconds = min(seconds, LONGEST_S)
         while self._rest + seconds >= self._pair_s:
@@ -188,23 +192,27 @@ class NewtonHand:
         q, qd = self.joint_q[: self._axes].astype(float), self.joint_qd[: self._axes].astype(float)
         reference = self._held if self._servo is None else self._servo.reference.numpy()[0]
         torque = self._stiffness * (reference - q) - self._damping * qd
-        torque = np.clip(torque, -self.hand.effort, self.hand.effort)
+        torque = np.clip(torque, -self._effort, self._effort)
         if self._servo is not None:  # late, or with an offset
             q = self._servo.measured_q.numpy()[0].astype(float)
             qd = self._servo.measured_qd.numpy()[0].astype(float)
         if self.scene is None:
             q = q + self._rest * qd
-        sign = self.joints.sign
-        return self.joints.to_motor(q), sign * qd, sign * torque
+        sign, gear = self.joints.sign, self.joints.gear
+        return self.joints.to_motor(q), sign * gear * qd, sign * torque / gear
 
     def _set_gains(self, drives: Sequence[Drive]) -> None:
         """Tell the solver of gains that changed, and of torque switched on or off."""
-        gains = tuple((drive.p_gain, float(drive.goal_rad is not None)) for drive in drives)
+        gains = tuple((one.p_gain, float(one.goal_rad is not None), one.torque_limit) for one in drives)
         if gains == self._gains:
             return
         self._gains = gains
-        p_gain, on = np.array(gains).T
-        scale = on * p_gain / P_GAIN_UNIT
+        p_gain, on, torque = np.array(gains).T
+        scale = on * p_gain / self._p_gain
+        if self.joints.capped.any():
+            most = np.minimum(self.hand.effort, torque * self.joints.gear)
+            self._effort = np.where(self.joints.capped, most, self.hand.effort)
+            self._write(self._model.joint_effort_limit, self._effort)
         self._stiffness, self._damping = self.hand.kp * scale, self.hand.kd * on
         if self._servo is not None:
             self._servo.power.assign(scale[None].astype(np.float32))

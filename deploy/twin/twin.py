@@ -22,14 +22,13 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import tyro
 
 from vd import interrupt
-from vd.deploy.hardware.control_table import MODELS
-from vd.deploy.hardware.packets import MAX_ID
 from vd.deploy.timely import undisturbed
 from vd.deploy.twin.line import Faults, MotorLine
-from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.motor import Motor, make_motors
 from vd.deploy.twin.plant import Plant
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
@@ -142,24 +141,22 @@ class Twin(MotorLine):
 class TwinCommand:
     """Serve a bus of simulated motors on a pseudo-terminal until interrupted."""
 
-    ids: tuple[int, ...] = (10, 11, 12, 20, 21, 22, 30, 31, 32)
-    """IDs of the motors, on axes without mass; without --hand."""
-    hand: str | None = None
-    """Hand that the motors move, simulated in Newton: dclaw3, dclaw4 or a hand's USD."""
+    hand: str = "dclaw3"
+    """Hand that its motors move, simulated in Newton: dclaw3, dclaw4, an imported hand or a hand's USD."""
     hand_layer: Path | None = None
     """Identified servo model over it (identified.usda), whose effects act."""
     physics_hz: float = PAPER.scene.physics_hz
     """Rate of its simulation."""
     calibration: Path | None = None
-    """Calibration file of that hand's motors; IDs 10, 11, 12, 20, ... by default."""
+    """Calibration file of that hand's motors."""
     object: str | None = None
-    """Object on the table, with --hand: name of a built-in set, or a file."""
+    """Object on the table or in the hand: name of a built-in set, or a file."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the depth camera in the hand's base frame, position [m] and quaternion xyzw; the hand's own."""
     realistic: bool = False
     """Give the depth images the errors of a real camera."""
-    model: str = "XH430-V210"
-    """Their model."""
+    model: str | None = None
+    """Model of all motors, in place of what the hand's USD says."""
     faults: Annotated[Faults, tyro.conf.arg(name="")] = field(default_factory=Faults)
     realtime: bool = False
     """Run before all ordinary programs, where that is permitted."""
@@ -168,22 +165,17 @@ class TwinCommand:
         """Serve until interrupted, or until a pipe's other end is gone.
 
         Args:
-            pipe: Takes the path of the port, which is printed without one. Answers ``pose`` with the object's
-                position [m] and quaternion xyzw [7], ``depth`` with an image [m] [H, W] and its time [s], and
-                ``place``, by which the object is where an episode starts.
+            pipe: Takes the path of the port, which is printed without one. Answers ``object`` with its
+                position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] [13], ``depth`` with an image
+                [m] [H, W] and its time [s], and ``place``, by which the object is where an episode starts.
 
         Raises:
             ValueError: Options that cannot be.
         """
-        if self.model not in MODELS:
-            raise ValueError(f"--model {self.model}: no such motor; choose of {', '.join(MODELS)}")
-        wrong = [id for id in self.ids if not 0 <= id <= MAX_ID]
-        if wrong:
-            raise ValueError(f"--ids {wrong[0]}: an ID lies within 0 and {MAX_ID}")
-        ids, plant = (self.ids, None) if self.hand is None else self._hand(self.hand)
-        motors = [Motor(MODELS[self.model], id) for id in ids]
+        plant = self._plant()
+        motors = make_motors(plant.joints)
         tell: Callable[[str], None] = partial(print, flush=True) if pipe is None else pipe.send
-        answer = self._beside(plant) if pipe is not None and plant is not None else None
+        answer = None if pipe is None else self._beside(plant)
         with (
             contextlib.closing(Twin(motors, plant, self.faults, pipe, answer)) as twin,
             undisturbed(self.realtime, level=1),
@@ -191,19 +183,19 @@ class TwinCommand:
             tell(twin.path)  # once it can answer at once: the collector takes a while
             twin.serve()
 
-    def _hand(self, name: str) -> "tuple[tuple[int, ...], NewtonHand]":
-        """The motors and the simulated hand."""
+    def _plant(self) -> "NewtonHand":
+        """The simulated hand and its motors."""
         from vd.assets_usd.hands import load_hand
-        from vd.deploy.hardware.joints import read_joints, uncalibrated
+        from vd.deploy.hardware.joints import read_joints
         from vd.deploy.loop.goals import one_object
         from vd.deploy.twin.newton_hand import NewtonHand
         from vd.sim.cfg import SimCfg
 
         quiet_warp()
-        hand = load_hand(name, layer=self.hand_layer)
-        joints = uncalibrated(hand) if self.calibration is None else read_joints(self.calibration, hand)
+        hand = load_hand(self.hand, layer=self.hand_layer)
+        joints = read_joints(hand, self.calibration, self.model)
         item = None if self.object is None else one_object(self.object)
-        return joints.ids, NewtonHand(hand, joints, SimCfg(physics_hz=self.physics_hz), item=item)
+        return NewtonHand(hand, joints, SimCfg(physics_hz=self.physics_hz), item=item)
 
     def _beside(self, hand: "NewtonHand") -> Callable[[str], Any] | None:
         """What answers requests, of a hand with an object: eyes and a helping hand, which no real one has."""
@@ -212,16 +204,18 @@ class TwinCommand:
         from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
         from vd.sensors.depth_camera import DepthCamera
 
-        sensor = DepthSensorCfg.realistic() if self.realistic else DepthSensorCfg()
-        cfg, place = DepthCameraCfg(points=0, sensor=sensor), hand.hand.camera.at(self.camera)
-        camera = DepthCamera.of_scene(hand.scene, hand.body_q, cfg, place, seed=self.faults.seed)
-        camera.capture()  # loads kernels
+        camera: DepthCamera | None = None
+        if hand.hand.mounted_camera is not None:
+            sensor = DepthSensorCfg.realistic() if self.realistic else DepthSensorCfg()
+            cfg, place = DepthCameraCfg(points=0, sensor=sensor), hand.hand.camera.at(self.camera)
+            camera = DepthCamera.of_scene(hand.scene, hand.body_q, cfg, place, seed=self.faults.seed)
+            camera.capture()  # loads kernels
 
         def answer(request: str) -> Any:
             match request:
-                case "pose":
-                    return hand.joint_q[-7:]
-                case "depth":
+                case "object":
+                    return np.concatenate([hand.joint_q[-7:], hand.joint_qd[-6:]])
+                case "depth" if camera is not None:
                     camera.capture()
                     return camera.depth.numpy()[0].copy(), time.monotonic()
                 case "place":

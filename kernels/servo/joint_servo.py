@@ -6,9 +6,9 @@ Order in a control step: :func:`send_command_kernel` once; before every physics 
 :mod:`vd.kernels.servo.actuators`; here its result goes where MuJoCo Warp reads it, per world and physics
 step.
 
-N worlds, D hand joints of fingers of three; joint ``j`` of world ``w`` has row ``w D + j`` of the
-parameters and states. Arrays ``[N, *]`` hold at least D columns, the hand joints first. A world's
-clock is ``STATE_TIME``, zero at its reset.
+N worlds, D hand joints, which couple in threes, as fingers of three do; joint ``j`` of world ``w`` has row
+``w D + j`` of the parameters and states. Arrays ``[N, *]`` hold at least D columns, the hand joints first. A
+world's clock is ``STATE_TIME``, zero at its reset.
 """
 
 import warp as wp
@@ -176,7 +176,8 @@ def drive_joint_kernel(
     first = joint - joint % JOINTS_PER_FINGER
     coupled = wp.float32(0.0)
     for k in range(JOINTS_PER_FINGER):
-        coupled += parameters[row, COUPLING_0 + k] * joint_q_in[world, first + k]
+        if first + k < reference_in.shape[1]:
+            coupled += parameters[row, COUPLING_0 + k] * joint_q_in[world, first + k]
     speed = joint_qd_in[world, joint]
     drive = drive_joint(
         reference_in[world, joint] + coupled,

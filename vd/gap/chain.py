@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import HandModel
 from vd.gap.recording import Recording
 from vd.kernels.servo import actuators as servo
+from vd.kernels.servo.chain_bodies import MAX_JOINTS
 from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
 
 GRAVITY_M_S2 = 9.81
 """Acceleration of gravity, the simulator's."""
-JOINTS_PER_FINGER = 3
 FREE = 1.0e6
 """A position [rad] that no joint and a torque [N m] that no drive reaches: the bound of one that has none."""
 
@@ -58,7 +58,7 @@ class Chain:
         columns: Their columns in the recording [n].
         baseline_free: Names of the parameters that the baseline fits.
         start_row: Nominal parameter rows, every effect off [n, PARAMETER_COLUMNS].
-        slot: Place of each joint in its finger (0 to 2), its column of the coupling [n].
+        slot: Place of each joint in its finger, of a longer one in the chain: its column of the coupling [n].
         bodies: Whether the links have mass; if not, each joint is its own inertia.
         axis: Unit joint axes in the base frame, all joints at zero, as all that follows [n, 3].
         offset: From the joint before (the base) to the joint [n, 3] [m].
@@ -112,7 +112,8 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
     Joints of a finger that are not recorded are taken to stand at zero.
 
     Raises:
-        ValueError: The recording is of a hand and none is given, or it has joints that the hand has not.
+        ValueError: The recording is of a hand and none is given, it has joints that the hand has not, or too
+            many of one finger.
     """
     gains = [t.conditions["p_gain"] for t in recording.trajectories if "p_gain" in t.conditions]
     p_gain = max((float(gain) for gain in gains), default=None)
@@ -126,11 +127,17 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
             f"{recording.path}: joints {', '.join(unknown)} are not joints of {hand.name} "
             f"({', '.join(hand.joint_names)}); name the hand that was recorded"
         )
-    fingers: dict[int, list[str]] = {}
-    for index, name in enumerate(hand.joint_names):
-        if name in recording.joints:
-            fingers.setdefault(index // JOINTS_PER_FINGER, []).append(name)
-    return [_finger(recording, hand, finger, tuple(names), p_gain) for finger, names in fingers.items()]
+    found = []
+    for finger in hand.fingers:
+        names = tuple(name for name in hand.joint_names[finger] if name in recording.joints)
+        if len(names) > MAX_JOINTS:
+            raise ValueError(
+                f"{recording.path}: {', '.join(names)} are {len(names)} joints of one finger; a chain "
+                f"may have {MAX_JOINTS}; leave those out that stood at zero"
+            )
+        if names:
+            found.append(_finger(recording, hand, finger, names, p_gain))
+    return found
 
 
 def load_of(conditions: dict[str, float | str]) -> Load | None:
@@ -179,11 +186,12 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
 
 
 def _finger(
-    recording: Recording, hand: HandModel, finger: int, names: tuple[str, ...], p_gain: float | None
+    recording: Recording, hand: HandModel, finger: slice, names: tuple[str, ...], p_gain: float | None
 ) -> Chain:
     """A finger's bodies with all joints at zero; what an unrecorded joint carries is fixed to its parent."""
-    slots = [i for i in range(JOINTS_PER_FINGER) if hand.joint_names[finger * JOINTS_PER_FINGER + i] in names]
-    joints = finger * JOINTS_PER_FINGER + np.array(slots)
+    length = finger.stop - finger.start
+    slots = [i for i, name in enumerate(hand.joint_names[finger]) if name in names]
+    joints = finger.start + np.array(slots)
     poses = hand.forward_kinematics(np.zeros(hand.num_joints))
     origins, axes = [], []
     for joint in joints:
@@ -194,8 +202,8 @@ def _finger(
     n = len(joints)
     mass, com, inertia = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
     for i, slot in enumerate(slots):
-        last = slots[i + 1] if i + 1 < n else JOINTS_PER_FINGER
-        carried = hand.joint_child[finger * JOINTS_PER_FINGER + np.arange(slot, last)]
+        last = slots[i + 1] if i + 1 < n else length
+        carried = hand.joint_child[finger.start + np.arange(slot, last)]
         masses = hand.link_mass[carried]
         turns = [Rotation.from_quat(pose[3:]) for pose in poses[carried]]
         centres = np.array(
@@ -222,7 +230,7 @@ def _finger(
         columns=np.array([recording.joints.index(name) for name in names]),
         baseline_free=("kp", "kd", "velocity_limit"),
         start_row=rows,
-        slot=np.array(slots),
+        slot=np.array(slots) if length <= MAX_JOINTS else np.arange(n),
         bodies=True,
         axis=np.array(axes),
         offset=np.diff(np.array(origins), axis=0, prepend=np.zeros((1, 3))),

@@ -73,8 +73,13 @@ class HandReplay:
             keep_positions: Keep the predicted positions, not just their squared errors.
 
         Raises:
-            ValueError: The recording has joints that the hand has not.
+            ValueError: The recording has joints that the hand has not, or fingers are not of three joints.
         """
+        if any(finger.stop - finger.start != JOINTS_PER_FINGER for finger in hand.fingers):
+            raise ValueError(
+                f"{hand.name}: whole hands are replayed with fingers of {JOINTS_PER_FINGER} joints alone; "
+                "vd-gap run takes one finger"
+            )
         unknown = [name for name in recording.joints if name not in hand.joint_names]
         if unknown:
             raise ValueError(
