@@ -40,9 +40,12 @@ def hand_usd(name: str) -> Path:
     imported = imported_folder(name) / f"{name}.usda"
     if name.isidentifier() and imported.is_file():
         return imported
+    from vd.assets_usd.hand_import.description import BUILT_IN
+
+    how = f" URDF --describe {name}" if name in BUILT_IN else ""
     raise ValueError(
         f"no hand is called {name!r}: choose one of {', '.join(HANDS)}, give a hand's USD file, or import "
-        "one (vd-assets hand import)"
+        f"one (vd-assets hand import{how})"
     )
 
 

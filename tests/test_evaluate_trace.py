@@ -1,7 +1,6 @@
 """Episodes, rules that stop them, and what is counted; with a test double of the environment."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -52,7 +51,7 @@ class HeldEnv(FakeEnv):
 
     def __init__(self, *args, lost=(), **settings):
         super().__init__(*args, tolerance=NEVER_RAD, **settings)
-        self.cfg.success = SimpleNamespace(fall_m=0.24)
+        self.cfg.success = SuccessCfg(fall_m=0.24)
         self.lost, self.tables, self.held_tables = lost, [], []
         self.sim.place_table = lambda present: self.tables.append((int(self.step_count.numpy()[0]), present))
         self.sim.place_tables = lambda count, last: self.held_tables.append(

@@ -19,8 +19,11 @@ from vd.assets_usd.hand_data import HandError, HandModel
 from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hand_model import open_stage
 from vd.assets_usd.hands import load_hand
-from vd.envs.cfg import ObservationCfg, ReorientCfg
+from vd.envs.cfg import ObservationCfg, ReorientCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
+from vd.evaluate.agents import trained_task
+from vd.policy import load_policy
+from vd.train.cli import main as train
 
 REAL = ("leap", "allegro")
 
@@ -380,7 +383,7 @@ def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
     cfg = ReorientCfg(hand=str(hand.path), objects=("cube",), num_envs=4)
     env = ReorientEnv(cfg, "cpu")
     assert len(np.unique(env.scene.world_scale)) > 1, "worlds differ, and so need masks"
-    assert (env.num_actions, env.num_observations) == (6, 3 * 6 + 13 * 2 + 21)
+    assert (env.num_actions, env.num_observations) == (5, 3 * 6 + 13 * 2 + 21), "the sixth joint has no motor"
     model, geoms = env.sim.solver.mj_model, {}
     for geom in range(model.ngeom):
         name = model.body(model.geom_bodyid[geom]).name.removeprefix("_toy_")
@@ -396,11 +399,33 @@ def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
     for one, other in itertools.combinations(links, 2):
         assert meet(one, other) == (one[:2] != other[:2]), (one, other)
     assert not meet("base", "f0_l1") and meet("base", "f1_l4") and meet("object", "f1_l4")
-    rng = np.random.default_rng(0)
+    assert "table" not in geoms and not env.has_table().any(), "the palm looks up"
+    rng, lost = np.random.default_rng(0), np.zeros(4)
     for _ in range(12):
-        env.step(wp.array(rng.uniform(-1.0, 1.0, (4, 6)), dtype=float))
+        env.step(wp.array(rng.uniform(-1.0, 1.0, (4, 5)), dtype=float))
+        away = np.linalg.norm(env.object_pose_end.numpy()[:, :3] - hand.workspace.goal_m, axis=1)
+        np.testing.assert_array_equal(env.fell.numpy(), away >= hand.workspace.fall_m)
+        lost += env.fell.numpy()
+    assert lost.any(), "nothing is below"
     q = env.sim.joint_q.numpy()
     assert np.isfinite(env.observation.numpy()).all()
     np.testing.assert_allclose(q[:, 5], 0.8 * q[:, 4] + 0.05, atol=0.01)
-    with pytest.raises(HandError, match=r"the fingers of toy have \[2, 4\] joints.*observation.view"):
+    with pytest.raises(ValueError, match=r"joints of toy follow others.*observation.view"):
         ReorientEnv(replace(cfg, observation=ObservationCfg(view="goal")), "cpu")
+    with pytest.raises(ValueError, match=r"toy looks up, so there is no table.*table.away_share"):
+        ReorientEnv(replace(cfg, table=TableCfg(away_share=0.5)), "cpu")
+
+
+def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
+    (tmp_path / "said.yaml").write_text("workspace: {size: [0.04, 0.05]}")
+    hand = import_hand(write_urdf(tmp_path), tmp_path / "out", tmp_path / "said.yaml").hand
+    small = ["--num-envs", "8", "--ppo.minibatch-size", "32", "--max-steps", "128", "--device", "cpu"]
+    flags = ["--preset", "leap-objects", "--objects", "cube", "--hand", str(hand.path), *small]
+    assert train(["teacher", *flags, "--out", str(tmp_path / "run")]) == 0
+    policy = load_policy(tmp_path / "run" / "policy.pt")
+    assert policy.num_actions == 5
+    env = ReorientEnv(trained_task(policy), "cpu")
+    assert env.objects[0].longest_side == pytest.approx(0.05)
+    np.testing.assert_allclose(np.ptp(env.objects[0].hulls[0].vertices, axis=0), 0.05, rtol=1e-6)
+    env.step(wp.from_torch(policy.act(wp.to_torch(env.observation))))
+    assert np.isfinite(env.observation.numpy()).all()

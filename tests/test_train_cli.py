@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from vd.assets_usd.hands import HANDS
 from vd.config import from_dict, to_dict
 from vd.device import resolve_device
 from vd.train.cli import GONE, main
@@ -17,10 +18,19 @@ from vd.train.teacher import BUILDING, build_teacher
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
-def test_every_preset_parses_validates_and_survives_a_file(name):
+def test_every_preset_parses_validates_and_survives_a_file(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path))
     preset = PRESETS[name]()
     assert preset.preset == name
-    assert parse_teacher(["--preset", name]) == preset
+    if preset.env.hand in HANDS:
+        assert parse_teacher(["--preset", name]) == preset
+    else:
+        with pytest.raises(
+            ValueError, match=f"no hand is called '{preset.env.hand}'.*--describe {preset.env.hand}"
+        ):
+            parse_teacher(["--preset", name])
+        flags = ["--preset", name, "--hand", "dclaw3"]
+        assert parse_teacher(flags).env == dataclasses.replace(preset.env, hand="dclaw3")
     validate(preset.ppo, preset.policy, preset.run)
     preset.env.validate()
     assert from_dict(TeacherCfg, json.loads(json.dumps(to_dict(preset)))) == preset

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -20,6 +21,7 @@ from vd.envs.cfg import (
     TighteningCfg,
 )
 from vd.paper import PAPER
+from vd.sim.cfg import SimCfg
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 
 TRAINING_SET = ("procedural-150-seed0",)
@@ -31,7 +33,9 @@ class TeacherCfg:
     """Train the teacher: PPO on the simulator's state."""
 
     RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None, "second_view": Dropped(False)}
-    preset: Annotated[str, tyro.conf.arg(metavar="{paper,gpu,cpu-demo}")] = "paper"
+    preset: Annotated[
+        str, tyro.conf.arg(metavar="{paper,gpu,cpu-demo,leap-cube,leap-objects,allegro-cube}")
+    ] = "paper"
     """Settings to start from; every other flag overrides one of them. By default what learns on this
     machine."""
     resume: str | None = None
@@ -156,6 +160,32 @@ def gpu() -> TeacherCfg:
     )
 
 
+def in_palm(preset: str, hand: str, objects: tuple[str, ...] = ("cube",)) -> TeacherCfg:
+    """An imported hand, palm up: objects rest in it, goal after goal in any orientation.
+
+    Args:
+        preset: Its name.
+        hand: Name by which ``vd-assets hand import`` keeps the hand.
+        objects: Object sets, made to fit the hand.
+    """
+    base = gpu()
+    env = replace(
+        base.env,
+        hand=hand,
+        objects=objects,
+        fit_objects=True,
+        num_envs=8192,  # hands of many colliders fill a GPU sooner
+        episode_s=10.0,  # what falls ends it; what is held meets many goals
+        failures_per_million=20.0,
+        sim=SimCfg(njmax=320, nconmax=48, nccdmax=12),
+        observation=ObservationCfg(shape="full", canonical=True),  # such hands have no symmetry
+        # Lost is also every goal to come, so a fall costs half of what it does over a table.
+        reward=replace(TOWARDS_GOAL, fall=-150.0),
+        success=replace(base.env.success, rotation_rad=0.2, joint_speed_rad_s=0.8, fall_m=None),
+    )
+    return replace(base, preset=preset, run=replace(base.run, out=Path("runs") / preset), env=env)
+
+
 def cpu_demo() -> TeacherCfg:
     """Minutes on two cores, on an easier task: from rest, goals about the vertical, no stillness test."""
     return TeacherCfg(
@@ -199,6 +229,9 @@ PRESETS: dict[str, Callable[[], TeacherCfg]] = {
     "paper": paper,
     "cpu-demo": cpu_demo,
     "gpu": gpu,
+    "leap-cube": partial(in_palm, "leap-cube", "leap"),
+    "leap-objects": partial(in_palm, "leap-objects", "leap", TRAINING_SET),
+    "allegro-cube": partial(in_palm, "allegro-cube", "allegro"),
 }
 """Presets by name."""
 

@@ -13,7 +13,7 @@ the root prim under ``visualDexterity``. Files are binary crates (``.usd``): 150
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +109,18 @@ class ObjectModel:
     def longest_side(self) -> float:
         """Longest side of the axis-aligned bounding box of the visual mesh, m."""
         return float(np.ptp(self.vertices, axis=0).max())
+
+    def fitted(self, sides: tuple[float, float]) -> "ObjectModel":
+        """The object, scaled as little as gives its longest side one of these lengths [m]; its mass stays."""
+        factor = float(np.clip(self.longest_side, *sides)) / self.longest_side
+        return replace(
+            self,
+            vertices=self.vertices * np.float32(factor),
+            hulls=tuple(hull._replace(vertices=hull.vertices * np.float32(factor)) for hull in self.hulls),
+            inertia=self.inertia * factor**2,
+            surface_points=self.surface_points * np.float32(factor),
+            scale=self.scale * factor,
+        )
 
 
 def build_model(

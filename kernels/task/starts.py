@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 PLACE_STEP_M = 0.015
 """Distance of places from each other [m]: smaller ones need more of them to come out of a finger."""
 RINGS, RING_PLACES, LEVELS = 2, 6, 4
-"""Places of a level: below the start, and rings of six around; levels go down, away from the palm."""
+"""Places of a level: the start, and rings of six around; levels go away from the palm."""
 APART_M = 0.004
 """Distance from the hand at which a sample counts as outside [m]: half of that between samples. Of 13 meshes
 none of 325 starts is then more than 1 mm inside, at 3 mm one in a hundred is."""
@@ -25,16 +25,19 @@ CHUNKS = 8
 """Threads that share the samples of an object at one place."""
 
 
-def start_places() -> list[tuple[float, float, float]]:
-    """Displacements from the start as drawn [m], itself first, the nearer ones before the farther."""
+def start_places(*, up: bool = False) -> list[tuple[float, float, float]]:
+    """Displacements from the start as drawn [m], itself first, the nearer ones before the farther.
+
+    Levels go away from the palm: down, or up from a hand in which objects rest.
+    """
     places = []
     for level in range(LEVELS):
-        down = -PLACE_STEP_M * level
-        places.append((0.0, 0.0, down))
+        height = (PLACE_STEP_M if up else -PLACE_STEP_M) * level
+        places.append((0.0, 0.0, height))
         for ring in range(1, RINGS + 1):
             angles = [2.0 * pi * (i + 0.5 * ring) / RING_PLACES for i in range(RING_PLACES)]
             radius = PLACE_STEP_M * ring
-            places += [(radius * cos(angle), radius * sin(angle), down) for angle in angles]
+            places += [(radius * cos(angle), radius * sin(angle), height) for angle in angles]
     return sorted(places, key=lambda place: round(sum(x * x for x in place), 9))
 
 

@@ -74,7 +74,7 @@ def world_action_kernel(
     sign: wp.array2d[float],  # [V, D] -1 where that joint turns the other way, else 1
     # In:
     frame_in: wp.array[int],  # [N] symmetry frame of each environment
-    action_in: wp.array2d[float],  # [N, D] action in the frame
+    action_in: wp.array2d[float],  # [N, *] action in the frame
     # Out:
     action_out: wp.array2d[float],  # [N, D] action in the world; not ``action_in``
 ):

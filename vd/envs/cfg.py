@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass, field
 from math import pi
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from vd.config import Dropped, Renamed, require
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
+
+if TYPE_CHECKING:
+    from vd.assets_usd.hand_data import Workspace
 
 MAX_LATENCY_S = 0.5
 """Largest latency of what is seen that can be drawn [s] (ours): environments keep all of it in memory."""
@@ -71,8 +74,12 @@ class SuccessCfg:
     """Largest angular speed of the object [rad/s]; 0 does not ask."""
     action_norm: float = PAPER.success.action_norm
     """Largest norm of the smoothed action; 0 does not ask."""
-    fall_m: float = PAPER.success.fall_m
-    """Distance from the goal position at which the object counts as lost [m]."""
+    fall_m: float | None = None
+    """Distance from the goal position at which the object counts as lost [m]; None: the hand's."""
+
+    def fall_of(self, workspace: "Workspace") -> float:
+        """Distance at which objects are lost by a hand with this workspace [m]."""
+        return workspace.fall_m if self.fall_m is None else self.fall_m
 
 
 @dataclass(frozen=True)
@@ -344,6 +351,8 @@ class ReorientCfg:
     """Layer over the hand with an identified servo model: identified.usda of vd-gap."""
     objects: tuple[str, ...] = ("cube",)
     """Object sets: names or folders of object USDs."""
+    fit_objects: bool = False
+    """Scale objects as little as makes them fit the hand (the sizes in its USD): sets are made for D'Claw."""
     num_envs: int = 4096
     """Environments simulated side by side."""
     seed: int = 0

@@ -25,7 +25,7 @@ class HandedOver:
         self._state = state
         handed = chosen(state.cfg, state.cfg.table.handed_share)
         self._model = [reset_q, wp.array(handed, dtype=wp.int32, device=state.device), table_steps]
-        self._grasps = state.zeros(state.num_envs, GRASPS, 2 * state.num_actions + 7)
+        self._grasps = state.zeros(state.num_envs, GRASPS, 2 * state.num_joints + 7)
         self._count = state.zeros(state.num_envs, dtype=wp.int32)
 
     def hand_over(self, success: wp.array, fell: wp.array, reset: wp.array, step_count: wp.array) -> None:

@@ -44,7 +44,7 @@ class SeenState:
         if not self.is_late:
             return
         self.arrays = [wp.zeros_like(array) for array in present]
-        d, f = state.num_actions, state.num_fingers
+        d, f = state.num_joints, state.num_fingers
         slots = math.ceil(longest / state.cfg.sim.physics_dt) + 1
         columns = ring_columns(d, sim.joint_q.shape[1], sim.joint_qd.shape[1], f)
         self._ring = wp.zeros((n * slots, columns), dtype=float, device=device)

@@ -34,7 +34,7 @@ class Observer:
         """Allocate for what ``drawn`` has drawn; ``shapes`` also where they are not observed."""
         self._state, self._drawn = state, drawn
         cfg, n, device = state.cfg.observation, state.num_envs, state.device
-        self.parts = observation_parts(cfg, state.num_fingers, state.num_actions)
+        self.parts = observation_parts(cfg, state.num_fingers, state.num_joints)
         self.num_observations = actor_size(self.parts)
         self.seen = SeenState(state)
         self._pose_error = PoseError(state)
@@ -50,7 +50,7 @@ class Observer:
         if shapes:
             items = state.surface_points, state.world_object, state.world_scale
             self.shapes = ShapeObserver(*items, state.fingers.tip_body, state.fingers.tip_offset)
-        slices = teacher_observation_slices(state.num_fingers, state.num_actions)
+        slices = teacher_observation_slices(state.num_fingers, state.num_joints)
         self._body_com = wp.clone(state.sim.model.body_com[: state.scene.bodies_per_world])
         hand, materials = state.hand, PAPER.materials
         self._gains = [wp.array(gain, dtype=float, device=device) for gain in (hand.kp, hand.kd)]
@@ -120,7 +120,7 @@ class Observer:
             assert self.shapes is not None
             _, _, joint_q, _, body_q, _ = seen
             first = self.parts["shape"].start
-            self.shapes.observe(joint_q, state.num_actions, body_q, state.goal_quat, out, first)
+            self.shapes.observe(joint_q, state.num_joints, body_q, state.goal_quat, out, first)
 
     def _tell(self) -> None:
         """Write what was drawn."""

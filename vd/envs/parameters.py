@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from vd.assets_usd.hand_data import Workspace
+from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, blend
 from vd.kernels.task.actions import ActionParams
@@ -30,9 +30,9 @@ class TaskParameters:
     Arrays because a CUDA graph bakes scalar arguments in; a curriculum writes into them instead.
     """
 
-    def __init__(self, cfg: ReorientCfg, workspace: Workspace, device: Any):
+    def __init__(self, cfg: ReorientCfg, hand: HandModel, device: Any):
         """Put the configuration at full difficulty on ``device``."""
-        self.cfg, self._workspace = cfg, workspace
+        self.cfg, self._hand = cfg, hand
         random = cfg.randomisation
         on = 1.0 if random.enabled else 0.0
 
@@ -60,7 +60,7 @@ class TaskParameters:
             for noise in (on, 0.0)
         )
         self.start = array(
-            StartParams, position=wp.vec3(*workspace.drop_m), noise=PAPER.scene.object_start_noise_m
+            StartParams, position=wp.vec3(*hand.workspace.drop_m), noise=PAPER.scene.object_start_noise_m
         )
         self.force = array(
             ForceParams,
@@ -117,7 +117,7 @@ class TaskParameters:
             fall=reward.fall,
             table_contact=reward.table_contact,
             table_contact_force=PAPER.reward.table_contact_force_n,
-            fingertip_height=PAPER.reward.fingertip_height,
+            fingertip_height=0.0 if self._hand.palm_up else PAPER.reward.fingertip_height,
             height_limit=PAPER.reward.fingertip_height_m,
             progress=reward.progress,
             lift=reward.lift,
@@ -132,8 +132,8 @@ class TaskParameters:
             object_spin=threshold(success.object_spin_rad_s, loose.object_spin_rad_s),
             action_norm=threshold(success.action_norm, loose.action_norm),
             table_contact_force=PAPER.reward.table_contact_force_n,
-            fall_distance=success.fall_m,
-            fall_center=np.array(self._workspace.goal_m, dtype=np.float32),
+            fall_distance=success.fall_of(self._hand.workspace),
+            fall_center=np.array(self._hand.workspace.goal_m, dtype=np.float32),
         )
         self._write(
             "goal",

@@ -40,7 +40,7 @@ class Randomiser:
         self._state = state
         cfg = state.cfg
         self.enabled = cfg.randomisation.enabled
-        n, d = state.num_envs, state.num_actions
+        n, d = state.num_envs, state.num_joints
         device = state.device
 
         zeros = state.zeros
@@ -52,7 +52,7 @@ class Randomiser:
         """Object mass [kg], shape [N]."""
         self.action_offset = zeros(n, d)
         # Not of the shape's values, which no sensor measures.
-        self.observation_offset = zeros(n, teacher_observation_size(state.num_fingers, state.num_actions))
+        self.observation_offset = zeros(n, teacher_observation_size(state.num_fingers, state.num_joints))
         self.force = zeros(n, dtype=wp.vec3)
         """Disturbance force on the object [N], world frame, shape [N]."""
         self._no_force = zeros(n, dtype=wp.vec3)

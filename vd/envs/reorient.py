@@ -13,6 +13,7 @@ import warp as wp
 
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
+from vd.envs.followers import Spread
 from vd.envs.handed import HandedOver, success_ends
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
@@ -33,8 +34,9 @@ in an unlucky start fails in the first step, again whenever the run is started a
 
 
 class ReorientEnv:
-    """N environments, each with a hand (F fingers, D joints), a table and an object to reorient.
+    """N environments, each with a hand (F fingers, D joints, A of them actuated) and an object to reorient.
 
+    Objects are over a table, but rest in a hand whose palm looks up, and then there is none.
     All arrays are Warp arrays on ``device``; ``wp.to_torch`` views them without copying.
     """
 
@@ -61,7 +63,8 @@ class ReorientEnv:
 
         self.num_envs = cfg.num_envs
         self.num_fingers = self.hand.num_fingers
-        self.num_actions = self.hand.num_joints
+        self.num_joints = self.hand.num_joints
+        self.num_actions = len(self.hand.actuated)
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
         self.reward_term_names = REWARD_TERMS
@@ -108,12 +111,12 @@ class ReorientEnv:
 
     def _allocate(self) -> None:
         """Arrays of what a step decides, and of its counts."""
-        n, d = self.num_envs, self.num_actions
+        n = self.num_envs
 
         zeros = self.state.zeros
 
-        self.action = zeros(n, d)
-        """Action of the present step in [-1, 1], shape [N, D]."""
+        self.action = zeros(n, self.num_actions)
+        """Action of the present step in [-1, 1], shape [N, A]."""
         self.reward = zeros(n)
         """Reward of the present step, shape [N]."""
         self.reward_terms = zeros(n, len(REWARD_TERMS))
@@ -149,6 +152,7 @@ class ReorientEnv:
         reset_q = self.hand.start
         self._reset_q: wp.array = wp.array(reset_q, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, reset_q)
+        self._spread = Spread(self.state)
 
     def _find_rest_poses(self) -> wp.array:
         """Drop every object a few times and keep where it came to lie, shape [N, K]."""
@@ -160,7 +164,8 @@ class ReorientEnv:
                 self.sim.step()
             self.check()
             dropped.append(self.object_pose())
-        poses = rest_poses(np.stack(dropped, axis=1), self.hand.workspace, self.cfg.success.fall_m)
+        fall_m = self.cfg.success.fall_of(self.hand.workspace)
+        poses = rest_poses(np.stack(dropped, axis=1), self.hand.workspace, fall_m)
         return wp.array(poses, dtype=wp.transform, device=self.device)
 
     # Stepping
@@ -206,7 +211,7 @@ class ReorientEnv:
         """Simulate one control step; environments that end are reset, and the observation is fresh.
 
         Args:
-            action: Actions in [-1, 1], shape [N, D]: a Warp array or anything ``wp.copy`` takes.
+            action: Actions in [-1, 1], shape [N, A]: a Warp array or anything ``wp.copy`` takes.
         """
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
@@ -247,7 +252,7 @@ class ReorientEnv:
 
     def _apply_action(self) -> None:
         p, sim = self.parameters, self.sim
-        action = self.action
+        action = self._spread.all_joints(self.action)
         if self.symmetry_frames is not None and self.acts_in_frame:
             action = self.symmetry_frames.world_action(action)
         self._launch(
@@ -277,10 +282,10 @@ class ReorientEnv:
             sim.put_back(self.step_count, self.max_episode_steps - 1)
         self.fingers.measure(self.randomiser.kp, self.randomiser.kd)
         if self._lifts and self.observer.shapes is not None:
-            self.observer.shapes.measure_clearance(sim.joint_q, self.num_actions, self.clearance)
+            self.observer.shapes.measure_clearance(sim.joint_q, self.num_joints, self.clearance)
         self._judge()
         self._end_episodes()
-        self._launch(record_step_kernel, [sim.joint_q, self.num_actions], [self.object_pose_end])
+        self._launch(record_step_kernel, [sim.joint_q, self.num_joints], [self.object_pose_end])
         self.randomiser.redraw(self._reset)
         command = None
         if self._handed is not None:
@@ -398,11 +403,13 @@ class ReorientEnv:
     def has_table(self) -> np.ndarray:
         """Whether each table was there in the last step, by the task, bool, shape [N] (host copy)."""
         last = self._table_steps
+        if self.hand.palm_up:
+            return np.zeros(self.num_envs, bool)
         return np.ones(self.num_envs, bool) if last is None else self.step_count.numpy() <= last.numpy()
 
     def object_pose(self) -> np.ndarray:
         """Present object poses, position [m] and quaternion xyzw, shape [N, 7] (host copy)."""
-        return self.sim.joint_q.numpy()[:, self.num_actions : self.num_actions + 7].copy()
+        return self.sim.joint_q.numpy()[:, self.num_joints : self.num_joints + 7].copy()
 
     def check(self) -> None:
         """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or too many steps failed."""

@@ -36,7 +36,7 @@ class FreeStarts:
         self._hand.radius = wp.array(radius, dtype=float, device=device)
         reach = np.linalg.norm(half, axis=1) + radius + APART_M
         self._hand.reach = wp.array(reach, dtype=float, device=device)
-        self._places = wp.array(start_places(), dtype=wp.vec3, device=device)
+        self._places = wp.array(start_places(up=state.hand.palm_up), dtype=wp.vec3, device=device)
         self._depth = state.zeros(state.num_envs, len(self._places))
 
     def move(self, reset: wp.array) -> None:
@@ -50,15 +50,15 @@ class FreeStarts:
                 state.world_object,
                 state.world_scale,
                 places,
-                PAPER.scene.table_top_m,
-                state.num_actions,
+                -np.inf if state.hand.palm_up else PAPER.scene.table_top_m,
+                state.num_joints,
                 reset,
                 state.sim.joint_q,
             ],
             [self._depth],
             dim=(*self._depth.shape, CHUNKS),
         )
-        state.launch(move_start_kernel, [places, state.num_actions, reset], [self._depth, state.sim.joint_q])
+        state.launch(move_start_kernel, [places, state.num_joints, reset], [self._depth, state.sim.joint_q])
 
 
 def rounded_box(shape: CollisionShape) -> tuple[tuple[float, ...], float]:

@@ -37,7 +37,7 @@ class ChosenFrames:
         self._offset = wp.array(tables.offset, dtype=float, device=device)
         self._sign = wp.array(tables.sign, dtype=float, device=device)
         self._sector = wp.array(tables.sector[:chosen_from], dtype=wp.vec3, device=device)
-        self._action = wp.zeros((envs, state.num_actions), dtype=float, device=device)
+        self._action = wp.zeros((envs, state.num_joints), dtype=float, device=device)
         self.chosen = wp.zeros(envs, dtype=wp.int32, device=device)
         self.observation = wp.zeros_like(out)
 
@@ -46,7 +46,7 @@ class ChosenFrames:
         state = self._state
         state.launch(
             choose_frame_kernel,
-            [self._sector, state.num_actions, reset, new_goal, state.sim.joint_q, state.goal_quat],
+            [self._sector, state.num_joints, reset, new_goal, state.sim.joint_q, state.goal_quat],
             [self.chosen],
         )
 

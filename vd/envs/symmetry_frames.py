@@ -63,8 +63,10 @@ def symmetry_frames(hand: HandModel, observation: ObservationCfg, view: View) ->
 
     Raises:
         ValueError: The fingers are not spaced evenly about the vertical, or the hand is not its own mirror
-            image.
+            image, or has joints that follow others.
     """
+    if len(hand.actuated) < hand.num_joints:
+        raise ValueError(f"joints of {hand.name} follow others; set observation.view to world")
     fingers, each = hand.num_fingers, hand.joints_per_finger
     tips = _tips(hand, np.zeros(each))
     turns = [_turn(step, fingers) for step in range(fingers)]

@@ -78,7 +78,7 @@ class TaskState:
         return self.hand.num_fingers
 
     @property
-    def num_actions(self) -> int:
+    def num_joints(self) -> int:
         """D."""
         return self.hand.num_joints
 
@@ -90,6 +90,12 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
         ValueError: For a configuration that cannot work, naming field and remedy.
     """
     hand, objects = load_hand(cfg.hand, cfg.fingertip, cfg.hand_layer), load_set(list(cfg.objects))
+    if hand.palm_up and (cfg.table.away_share > 0.0 or cfg.table.lift_share > 0.0):
+        raise ValueError(
+            f"{hand.name} looks up, so there is no table: leave table.away_share and table.lift_share at 0"
+        )
+    if cfg.fit_objects:
+        objects = [item.fitted(hand.workspace.size_m) for item in objects]
     scene = build_scene(
         hand=hand,
         objects=objects,
@@ -118,7 +124,7 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
         scene=scene,
         sim=sim,
         fingers=Fingers(hand, scene, sim),
-        parameters=TaskParameters(cfg, hand.workspace, device),
+        parameters=TaskParameters(cfg, hand, device),
         servo_ranges=ranges,
         measured_q=sim.joint_q if sim.servo is None else sim.servo.measured_q,
         measured_qd=sim.joint_qd if sim.servo is None else sim.servo.measured_qd,

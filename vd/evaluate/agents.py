@@ -147,9 +147,9 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
         from vd.bundle.store import read_contract
 
         return check_hand(read_contract(path), model, path)
-    if policy.num_actions != model.num_joints:
+    if policy.num_actions != len(model.actuated):
         raise ValueError(
-            f"{name} moves {policy.num_actions} joints, the hand {model.name} has {model.num_joints}; "
+            f"{name} moves {policy.num_actions} joints, the hand {model.name} has {len(model.actuated)}; "
             f"use the hand it was trained for: --hand {trained_task(policy).hand}"
         )
 

@@ -115,6 +115,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
 
 def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: str) -> "Protocol":
     """How the episodes of one policy with the objects of a group are run."""
+    from vd.assets_usd.hands import load_hand
     from vd.evaluate.result import Protocol
 
     return Protocol(
@@ -130,6 +131,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
         randomisation=cfg.condition or ("on" if cfg.randomise else "off"),
         at_rest=task.start.at_rest,
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
+        palm_up=load_hand(task.hand).palm_up,
         in_air=cfg.in_air,
         air_goals=cfg.air_goals,
         table_friction=cfg.table_friction,

@@ -297,8 +297,9 @@ def asked(protocols: Sequence[Protocol]) -> str:
         goals = f"uniform within {angle:g} rad of the start"
     rest = "at rest on the table, as the environment draws them"
     table = "" if protocol.table_friction is None else f" of friction {protocol.table_friction:g}"
+    place = "palm up" if protocol.palm_up else "on the table"
     parts = (
-        f"{hands} {'in the air' if protocol.in_air or protocol.air_goals else 'on the table'}{table}",
+        f"{hands} {'in the air' if protocol.in_air or protocol.air_goals else place}{table}",
         *(["goal after goal"] if protocol.air_goals else []),
         f"{protocol.episodes} episodes of {protocol.episode_s:g} s for each object, seed {protocol.seed}",
         f"starts {rest if protocol.at_rest else 'dropped into the hand, uniform on SO(3)'}",

@@ -71,6 +71,8 @@ class Protocol:
     they fall, with starts uniform on SO(3), the same for any environment."""
     goals_about_vertical: bool = False
     """Goals only turn the object about the vertical."""
+    palm_up: bool = False
+    """Objects rest in the hand; there is no table."""
     in_air: bool = False
     """The table is taken away once the hand had time to grasp."""
     air_goals: bool = False

@@ -247,7 +247,7 @@ def advance(env: Any, action: torch.Tensor) -> None:
 def out_of_hand(env: Any) -> np.ndarray:
     """Whether each object is where it counts as lost, bool [N]; what is not a number is lost too."""
     away = env.object_pose()[:, :3] - np.array(env.hand.workspace.goal_m)
-    return np.asarray(~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_m))
+    return np.asarray(~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_of(env.hand.workspace)))
 
 
 class _Round:

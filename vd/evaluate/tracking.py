@@ -15,7 +15,7 @@ from vd.tracking.tracker import Tracker
 
 def sensed(env: Any, camera: DepthCamera) -> Senses:
     """What the hands of an environment sense now; later steps change all of it but the points."""
-    fresh, joints = wp.to_torch(env.step_count) == 0, env.num_actions
+    fresh, joints = wp.to_torch(env.step_count) == 0, env.num_joints
     camera.reset(wp.from_torch(fresh.int()))  # a late image must not show what was before a reset
     camera.capture()
     # Without a pixel in the crop the cloud is one false point at the origin: it counts for nothing.

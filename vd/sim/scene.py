@@ -308,7 +308,8 @@ def build_scene(
                 continue
             world = new_builder()
             world.add_builder(hand_builder)
-            add_table(world, cfg, visible=visuals)
+            if not hand.palm_up:  # what rests in a hand needs no table, and what falls from it is lost
+                add_table(world, cfg, visible=visuals)
             add_object(world, item, cfg, at=hand.workspace.drop_m, scale=float(scale), visuals=visuals)
             scene.replicate(world, int(copies))
             worlds.append((world, int(copies)))
