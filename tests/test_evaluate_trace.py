@@ -374,6 +374,6 @@ def test_without_a_table_objects_fall_and_it_comes_back():
     assert falls.fell.all() and (falls.steps > 24).all() and (falls.steps <= 28).all()
     env.sim.place_table(present=False)
     gone = env.sim.solver.mjw_data.geom_xpos.numpy().copy()
-    env.randomiser.push()
+    env.randomiser.write_model()
     np.testing.assert_array_equal(env.sim.solver.mjw_data.geom_xpos.numpy(), gone)
     env.check()

@@ -27,7 +27,7 @@ from vd.kernels.task.shapes import shape_observation_size
 from vd.policy import PolicySpec, TrainedPolicy, load_policy, perceptron
 from vd.sensors.cfg import DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
-from vd.tracking.observer import UNSEEN, Observer
+from vd.tracking.camera_observer import UNSEEN, CameraObserver
 from vd.tracking.policy import TrackingPolicy, TrackingSpec, read_policy, tracking_export
 from vd.tracking.tracker import Tracker
 from vd.train.checkpoint import save_checkpoint
@@ -51,8 +51,8 @@ def vision_of(name: str) -> TrackingPolicy:
     return replace(policy, spec=replace(policy.spec, alignment=sizes), alignment=network)
 
 
-def observer_of(env: ReorientEnv) -> Observer:
-    return Observer(
+def observer_of(env: ReorientEnv) -> CameraObserver:
+    return CameraObserver(
         env.hand,
         env.objects,
         env.num_observations,
@@ -161,7 +161,7 @@ def tracker_of(teacher: TrainedPolicy, monkeypatch, world: torch.Tensor, angle: 
     hand, envs = load_hand(teacher.hand), len(world)
     policy = TrackingPolicy(teacher, TrackingSpec())
     tracker = Tracker(policy, hand, load_set("cube"), hand.camera, world_object=np.zeros(envs, dtype=int))
-    monkeypatch.setattr(Observer, "__call__", lambda self, senses: (world, angle))
+    monkeypatch.setattr(CameraObserver, "__call__", lambda self, senses: (world, angle))
     return tracker
 
 

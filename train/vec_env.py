@@ -8,7 +8,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from vd.config import to_dict
-from vd.envs.state import saved_stage
+from vd.envs.saved_state import saved_stage
 from vd.paper import PAPER
 
 OBSERVATION_GROUP = "policy"

@@ -76,7 +76,7 @@ def calibrate(cfg: CalibrateCfg) -> int:
     thought = np.concatenate([hand.camera.position, hand.camera.quaternion])
     found = solve(views, thought, {finger: seat(hand, finger, thought) for finger in fingers})
     error_m = found.point_error(hand.goal_in_base)
-    write_layer(cfg.out, hand, found, error_m)
+    write_camera_layer(cfg.out, hand, found, error_m)
     print("\n".join(report(hand, found, views, error_m)))
     print(f"written to {cfg.out}; vd-deploy --camera-layer {cfg.out}")
     if error_m <= LARGEST_ERROR_M:
@@ -150,7 +150,7 @@ def seat(hand: HandModel, finger: int, camera: np.ndarray) -> np.ndarray:
     return compose(invert(tip), np.concatenate([tip[:3] + SEAT_M * normal, turn.as_quat()]))
 
 
-def write_layer(path: Path, hand: HandModel, found: HandEye, error_m: float) -> None:
+def write_camera_layer(path: Path, hand: HandModel, found: HandEye, error_m: float) -> None:
     """Write the layer, with what is known of its errors (SI units, radians)."""
     from vd.assets_usd.camera_layer import write_camera_layer
 

@@ -140,9 +140,9 @@ def run(cfg: RunCfg) -> int:
     fault: StoppedError | None = None
     status = 0
     camera = runner.camera or hand.mounted_camera
-    place = None if camera is None else (*map(float, camera.position), *map(float, camera.quaternion))
+    camera_pose = None if camera is None else (*map(float, camera.position), *map(float, camera.quaternion))
     with connect(
-        cfg, object=cfg.object, camera=place, realistic=cfg.realistic, realtime=cfg.realtime
+        cfg, object=cfg.object, camera=camera_pose, realistic=cfg.realistic, realtime=cfg.realtime
     ) as connection:
         try:
             status = _pursue(cfg, name, runner, connection, item, goals, folder)

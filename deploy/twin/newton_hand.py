@@ -17,9 +17,9 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.deploy.hardware.joints import Joints
 from vd.deploy.twin.plant import Drive
 from vd.kernels.task.actions import limit_joint_velocity_kernel
-from vd.sim.actuators import JointServo, has_effects
 from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
+from vd.sim.joint_servo import JointServo, has_effects
 from vd.sim.scene import Scene, add_table, build_hand, build_scene, new_builder
 
 SHORTEST_COMMAND_S = 0.0025

@@ -107,7 +107,7 @@ def place_table_kernel(
 
 
 @wp.kernel
-def record_step_kernel(
+def keep_object_pose_kernel(
     # In:
     joint_q: wp.array2d[float],
     object_column: int,

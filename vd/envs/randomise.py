@@ -193,7 +193,7 @@ class Randomiser:
         if not self.enabled or steps % self._push_interval:
             return
         if self._state.device == "cpu":
-            self.push()
+            self.write_model()
             return
         if self._push_graph is None:
             with wp.ScopedCapture(device=self._state.device) as capture:
@@ -202,7 +202,7 @@ class Randomiser:
         wp.capture_launch(self._push_graph)
         self._push_inertia()
 
-    def push(self) -> None:
+    def write_model(self) -> None:
         """Write gains, frictions and inertias of rotors into the model and tell the solver."""
         self._push_gains_and_frictions()
         self._push_inertia()

@@ -17,12 +17,12 @@ from vd.envs.followers import Spread
 from vd.envs.handed import HandedOver, success_ends
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
+from vd.envs.saved_state import load_arrays, save_state, saved_stage
 from vd.envs.setup import SETTLE_S, rest_poses, table_steps
 from vd.envs.starts import FreeStarts
-from vd.envs.state import load_arrays, save_state, saved_stage
 from vd.envs.task_state import build_task
 from vd.kernels.task.actions import apply_action_kernel
-from vd.kernels.task.environments import record_step_kernel
+from vd.kernels.task.environments import keep_object_pose_kernel
 from vd.kernels.task.guard import void_step_kernel
 from vd.kernels.task.resets import episode_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
@@ -189,7 +189,7 @@ class ReorientEnv:
         self._new_goal.zero_()
         self.randomiser.draw(self._reset)
         self._reset_envs(use_start=object_quat is not None, use_goal=goal_quat is not None)
-        self.randomiser.push()
+        self.randomiser.write_model()
         self.observe()
 
     def give_goals(self, envs: np.ndarray, goal_quat: np.ndarray) -> None:
@@ -285,7 +285,7 @@ class ReorientEnv:
             self.observer.shapes.measure_clearance(sim.joint_q, self.num_joints, self.clearance)
         self._judge()
         self._end_episodes()
-        self._launch(record_step_kernel, [sim.joint_q, self.num_joints], [self.object_pose_end])
+        self._launch(keep_object_pose_kernel, [sim.joint_q, self.num_joints], [self.object_pose_end])
         self.randomiser.redraw(self._reset)
         command = None
         if self._handed is not None:
@@ -445,15 +445,15 @@ class ReorientEnv:
         self.parameters.set_stage(stage)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue exactly, see :func:`vd.envs.state.save_state`."""
+        """Everything needed to continue exactly, see :func:`vd.envs.saved_state.save_state`."""
         return save_state(self.state, self._arrays(), self.stage, self.steps)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, see :func:`vd.envs.state.load_arrays`."""
+        """Continue from :meth:`state_dict`, see :func:`vd.envs.saved_state.load_arrays`."""
         load_arrays(self.state, self._arrays(), state)
         self.steps = int(state["steps"])
         self.set_stage(saved_stage(state, self.cfg.curriculum))
-        self.randomiser.push()
+        self.randomiser.write_model()
         self.sim.forward_kinematics()
 
     def _arrays(self) -> dict[str, wp.array]:

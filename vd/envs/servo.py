@@ -6,7 +6,7 @@ from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import RandomisationCfg
 from vd.envs.effects import PARAMETERS
 from vd.kernels.servo import actuators
-from vd.sim.actuators import has_effects
+from vd.sim.joint_servo import has_effects
 
 
 def gain_scales(hand: HandModel, cfg: RandomisationCfg) -> tuple[np.ndarray, np.ndarray]:

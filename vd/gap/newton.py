@@ -28,9 +28,9 @@ from vd.kernels.servo.joint_replay import (
     rest_play_kernel,
     sample_position_kernel,
 )
-from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
+from vd.sim.joint_servo import JointServo
 from vd.sim.scene import build_hand, new_builder
 
 JOINTS_PER_FINGER = 3

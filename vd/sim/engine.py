@@ -33,7 +33,7 @@ ROWS_A_PART = 8
 STATE = ("qpos", "qvel", "qacc_warmstart")
 INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied")
 DRIVES = ("actuator_gainprm", "actuator_biasprm", "dof_frictionloss", "dof_solref", "dof_solimp")
-"""What :class:`vd.sim.actuators.JointServo` writes into the model in every physics step."""
+"""What :class:`vd.sim.joint_servo.JointServo` writes into the model in every physics step."""
 
 
 class WarpSolver(SolverMuJoCo):

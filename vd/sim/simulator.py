@@ -13,9 +13,9 @@ from vd.kernels.task.contacts import pair_force_kernel
 from vd.kernels.task.environments import place_table_kernel
 from vd.kernels.task.guard import collect_overflow_kernel, guard_kernel, put_back_kernel
 from vd.paper import PAPER
-from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
+from vd.sim.joint_servo import JointServo
 from vd.sim.pair_order import sort_pairs
 from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
 

@@ -13,7 +13,7 @@ from vd.config import from_dict
 from vd.envs.cfg import ReorientCfg
 from vd.frame_maps import FrameMaps
 from vd.senses import Senses
-from vd.tracking.observer import Observer
+from vd.tracking.camera_observer import CameraObserver
 from vd.tracking.policy import TrackingPolicy
 
 
@@ -51,7 +51,7 @@ class Tracker:
         teacher = policy.teacher
         task = from_dict(ReorientCfg, policy.task, where="task of the policy")
         objects_of = np.zeros(1, dtype=int) if world_object is None else world_object
-        self.observer = Observer(
+        self.observer = CameraObserver(
             hand,
             objects,
             teacher.num_observations,

@@ -53,7 +53,7 @@ class Found:
     """Angular velocity [rad/s] [N, 3]; zero where it is not known."""
 
 
-class Observer:
+class CameraObserver:
     """Follows the object of each hand, and makes of it and of the joints a teacher's observation.
 
     Args:
