@@ -5,15 +5,12 @@ Plain NumPy and SciPy on small meshes. Lengths in metres, masses in kilograms; a
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import warp as wp
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
-
-from vd.kernels.sensor.winding import inside_kernel
 
 VOXELS = 96
 """Voxels along the longest side of a voxelised solid: about 1 % of volume error on thin shapes."""
@@ -120,9 +117,13 @@ def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 def inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, level: float = 0.5) -> np.ndarray:
     """Whether the winding number of a mesh [V, 3], [T, 3] exceeds ``level`` at points [n, 3], bool [n]."""
+    import warp as wp
+
+    from vd.kernels.sensor.winding import inside_kernel
+
     low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
 
-    def on_device(places: np.ndarray) -> wp.array:
+    def on_device(places: np.ndarray) -> Any:
         return wp.array(((places - low) / size).astype(np.float32), dtype=wp.vec3, device="cpu")
 
     corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")

@@ -17,9 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import newton_usd_schemas  # noqa: F401 - before the first stage, or mimic joints are no schema of it
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.geometry import Hull, Solid, principal_axes
@@ -164,6 +162,8 @@ def build_model(
 
 
 def _add_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    from pxr import UsdGeom, Vt
+
     mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, dtype=np.float32)))
     mesh.CreateFaceVertexIndicesAttr(
@@ -186,6 +186,9 @@ def write_object(path: Path, model: ObjectModel) -> Path:
     Returns:
         The path.
     """
+    import newton_usd_schemas  # noqa: F401 - before the first stage, or mimic joints are no schema of it
+    from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+
     path = Path(path)
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -245,6 +248,8 @@ def _key(name: str) -> str:
 
 def _layer(path: Path) -> Any:
     """The layer of a USD file as it is now; None if it is none."""
+    from pxr import Sdf, Tf
+
     try:
         # Anonymous: a layer cached by path would hide that the file was written anew.
         return Sdf.Layer.OpenAsAnonymous(str(path))
@@ -277,6 +282,9 @@ def read_object(path: Path) -> ObjectModel:
     Raises:
         ObjectError: The file is missing, no USD, of another version, or a part is missing.
     """
+    import newton_usd_schemas  # noqa: F401 - before the first stage, or mimic joints are no schema of it
+    from pxr import Usd, UsdGeom, UsdPhysics
+
     path = Path(path)
     if not path.is_file():
         raise ObjectError(f"{path}: no such object file")
