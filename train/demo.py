@@ -41,7 +41,7 @@ HIDDEN = "backlash:width_rad=0.06"
 """Effect that is hidden in a single servo: a quarter of a finger's time."""
 MISSES = "12"
 """Deadlines missed in a row at which the twin stops: a second, since the machine may do other things too."""
-LEAST_TRAINING_MIN, AROUND_TRAINING_MIN = 1.0, 2.4
+LEAST_TRAINING_MIN, AROUND_TRAINING_MIN = 1.0, 1.5
 """Time that training gets at least [min], and that its start with cold caches, curve and film take."""
 REFRESH_S = 15
 """Seconds after which a browser reads an unfinished page again."""
