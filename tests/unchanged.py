@@ -106,11 +106,13 @@ def tracking(work: Path, objects: Path) -> dict[str, Any]:
 
 def tasks() -> dict[str, Any]:
     """Every task that ships, of presets, policies and conditions, and options that none of them has."""
+    from vd.assets_usd.hands import HANDS
     from vd.evaluate.agents import open_teacher, trained_task
     from vd.evaluate.conditions import CONDITIONS
     from vd.train.presets import PRESETS
 
-    found = {f"preset {name}": preset().env for name, preset in PRESETS.items()}
+    presets = {f"preset {name}": preset().env for name, preset in PRESETS.items()}
+    found = {name: env for name, env in presets.items() if env.hand in HANDS}  # others have to be imported
     found |= {f"policy {n}": trained_task(open_teacher(n, "cpu")) for n in {w[0] for w in TEACHERS.values()}}
     table, four = found["policy dclaw3"], found["policy dclaw4"]
     found |= {f"condition {name}": replace(table, randomisation=drawn) for name, drawn in CONDITIONS.items()}
