@@ -7,7 +7,7 @@ from vd.envs.task_state import TaskState
 from vd.kernels.task.symmetry import world_action_kernel
 
 
-class Spread:
+class ActuatedActions:
     """Gives each joint its action; joints that follow another have none, which is 0."""
 
     def __init__(self, state: TaskState):

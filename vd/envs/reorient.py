@@ -13,7 +13,7 @@ import warp as wp
 
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
-from vd.envs.followers import Spread
+from vd.envs.followers import ActuatedActions
 from vd.envs.handed import HandedOver, success_ends
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
@@ -152,7 +152,7 @@ class ReorientEnv:
         reset_q = self.hand.start
         self._reset_q: wp.array = wp.array(reset_q, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, reset_q)
-        self._spread = Spread(self.state)
+        self._actuated = ActuatedActions(self.state)
 
     def _find_rest_poses(self) -> wp.array:
         """Drop every object a few times and keep where it came to lie, shape [N, K]."""
@@ -252,7 +252,7 @@ class ReorientEnv:
 
     def _apply_action(self) -> None:
         p, sim = self.parameters, self.sim
-        action = self._spread.all_joints(self.action)
+        action = self._actuated.all_joints(self.action)
         if self.symmetry_frames is not None and self.acts_in_frame:
             action = self.symmetry_frames.world_action(action)
         self._launch(
