@@ -14,7 +14,6 @@ import warp as wp
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.followers import ActuatedActions
-from vd.envs.handed import HandedOver, success_ends
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.saved_state import load_arrays, save_state, saved_stage
@@ -91,10 +90,6 @@ class ReorientEnv:
         self._table_steps: wp.array | None = None
         if cfg.table.away_share > 0.0:
             self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device)
-        self._handed: HandedOver | None = None
-        if cfg.table.handed_share > 0.0:
-            self._handed = HandedOver(state, self._reset_q, self._table_steps)
-        self._ends = success_ends(state)
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
@@ -150,7 +145,7 @@ class ReorientEnv:
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         reset_q = self.hand.start
-        self._reset_q: wp.array = wp.array(reset_q, dtype=float, device=self.device)
+        self._reset_q = wp.array(reset_q, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, reset_q)
         self._actuated = ActuatedActions(self.state)
 
@@ -287,11 +282,7 @@ class ReorientEnv:
         self._end_episodes()
         self._launch(keep_object_pose_kernel, [sim.joint_q, self.num_joints], [self.object_pose_end])
         self.randomiser.redraw(self._reset)
-        command = None
-        if self._handed is not None:
-            self._handed.hand_over(self.success, self.fell, self._reset, self.step_count)
-            command = sim.target
-        self._reset_envs(command=command)
+        self._reset_envs()
         self.observe()
 
     def _judge(self) -> None:
@@ -342,7 +333,7 @@ class ReorientEnv:
                 self.success,
                 self.fell,
                 self.max_episode_steps,
-                self._ends,
+                int(self.cfg.success_ends_episode),
                 self.step_count,
                 self.goal_steps,
                 self.goal_counts,
@@ -350,13 +341,8 @@ class ReorientEnv:
             [self.timed_out, self.done, self._reset, self._new_goal],
         )
 
-    def _reset_envs(
-        self, *, use_start: bool = False, use_goal: bool = False, command: wp.array | None = None
-    ) -> None:
-        """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too.
-
-        ``command`` is what servos have been told so far [rad], shape [N, *]; the positions by default.
-        """
+    def _reset_envs(self, *, use_start: bool = False, use_goal: bool = False) -> None:
+        """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too."""
         sim, p = self.sim, self.parameters
         self._launch(
             reset_kernel,
@@ -391,7 +377,7 @@ class ReorientEnv:
         sim.solver.reset(sim.state, world_mask=self._env_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
         if sim.servo is not None:
-            sim.servo.reset(self._reset, command=command)
+            sim.servo.reset(self._reset)
         self.observer.begin(self._reset)
 
     def observe(self) -> None:
@@ -470,7 +456,6 @@ class ReorientEnv:
             "rng": self.state.rng,
             **self.observer.stateful(),
             **self.randomiser.stateful(),
-            **({} if self._handed is None else self._handed.stateful()),
         }
 
     def close(self) -> None:
