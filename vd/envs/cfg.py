@@ -56,6 +56,8 @@ class RewardCfg:
     """Ours: times the height of the object's lowest point above the table (there or not), 1 from 2 cm on."""
     scale: float = 1.0
     """Ours: factor on the sum; changes no optimum, keeps value targets near 1."""
+    terms: dict[str, float] = field(default_factory=dict)
+    """Your own terms: functions (module:function) with their coefficients (docs/tutorials/terms.md)."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,16 @@ class ObservationCfg:
     dynamics: Literal["none", "critic"] = "none"
     """Ours, privileged: whether the critic is told what was drawn (gains, delay, friction and backlash of
     joints, frictions, mass, latency), and the present state and shape, without noise."""
+    terms: dict[str, int] = field(default_factory=dict)
+    """Your own values: functions (module:function), and how many values each gives. Symmetry frames show
+    them as they are, without latency and noise."""
+    critic_terms: dict[str, int] = field(default_factory=dict)
+    """The same, for the critic alone."""
+
+    @property
+    def own(self) -> dict[str, int]:
+        """All own values, those of the actor first."""
+        return self.terms | self.critic_terms
 
     def num_frames(self, fingers: int) -> int:
         """Symmetry frames of a hand of so many fingers; 0: it sees the world as it is."""

@@ -191,8 +191,8 @@ def task_for(
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     if sees_clouds(policy):  # who does not look at its teacher's observation
         base = replace(base, observation=ObservationCfg())
-    if base.observation.dynamics == "critic":  # whom nobody asks here
-        base = replace(base, observation=replace(base.observation, dynamics="none"))
+    seen = replace(base.observation, dynamics="none", critic_terms={})  # nobody asks the critic here
+    base = replace(base, observation=seen, reward=replace(base.reward, terms={}))  # and nobody is paid
     return replace(
         _on_hand(base, hand, hand_layer),
         success=replace(SuccessCfg(), rotation_rad=stop_tolerance_rad),
