@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from vd.evaluate.agents import trained_task
+from vd.envs.cfg import ReorientCfg
 from vd.policy import load_policy
 from vd.sim.cfg import SimCfg, coarser
 from vd.train.checkpoint import checkpoint_path
@@ -47,7 +47,7 @@ def test_a_run_goes_on_bit_for_bit_and_another_sees_more_from_there(tmp_path):
     """It learns in coarser physics; what it learned is judged in the default."""
     whole = _train(tmp_path / "whole", 4)
     assert whole.env.env.cfg.sim == coarser(SimCfg()) != SimCfg()
-    assert trained_task(load_policy(tmp_path / "whole" / "policy.pt")).sim == SimCfg()
+    assert ReorientCfg.of(load_policy(tmp_path / "whole" / "policy.pt")).sim == SimCfg()
     resumed = _train(tmp_path / "part", 2, resume=str(checkpoint_path(tmp_path / "whole", 2)))
     for one, two in ((whole.alg.actor, resumed.alg.actor), (whole.alg.critic, resumed.alg.critic)):
         weights, again = one.state_dict(), two.state_dict()

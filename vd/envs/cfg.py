@@ -1,10 +1,10 @@
 """Configuration of the reorientation task; every default is the paper's."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import pi
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from vd.config import Dropped, Renamed, require
+from vd.config import Dropped, Renamed, from_dict, require
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
@@ -345,7 +345,10 @@ class RandomisationCfg:
 
 @dataclass(frozen=True)
 class ReorientCfg:
-    """The in-hand reorientation task: hand, objects, environments and all terms."""
+    """The in-hand reorientation task: hand, objects, environments and all terms.
+
+    Fields are those of ``--env`` in ``vd-train teacher --help-all``; :meth:`of` takes a policy's.
+    """
 
     RETIRED: ClassVar[dict[str, Any]] = {
         "num_worlds": Renamed("num_envs"),
@@ -390,6 +393,15 @@ class ReorientCfg:
     table: TableCfg = field(default_factory=TableCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
+
+    @classmethod
+    def of(cls, policy: Any, **changes: Any) -> "ReorientCfg":
+        """The task in which a policy was trained, with some fields changed.
+
+        Raises:
+            ValueError: It is of another version.
+        """
+        return replace(from_dict(cls, policy.task, where="task of the policy"), **changes)
 
     @property
     def max_episode_steps(self) -> int:

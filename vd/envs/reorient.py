@@ -5,7 +5,6 @@ physics is Warp kernels; a step copies nothing to the host, and it is one captur
 What a step does stands in :meth:`ReorientEnv.launch_step`, in its order.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import newton
@@ -29,6 +28,7 @@ from vd.kernels.task.guard import void_step_kernel
 from vd.kernels.task.resets import episode_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.task.success import success_kernel
+from vd.sim.graphs import Graphs
 
 FAILURES_AT_FIRST = 10.0
 """Steps of environments that may fail beside those that ``failures_per_million`` allows (ours): one object
@@ -40,6 +40,24 @@ class ReorientEnv:
 
     Objects are over a table, but rest in a hand whose palm looks up, and then there is none.
     All arrays are Warp arrays on ``device``; ``wp.to_torch`` views them without copying.
+
+    Programs and own terms use :meth:`reset`, :meth:`step`, its halves :meth:`advance` and :meth:`renew`,
+    :meth:`give_goals`, :meth:`object_pose`, :meth:`check`, :meth:`close`, and:
+
+    Attributes:
+        observation, privileged: What the actor reads, and the critic alone besides, shapes [N, O], [N, P].
+        action, smoothed: Actions of the step [N, A], and their moving average over all joints [N, D].
+        reward, reward_terms: Reward, and its terms (``reward_term_names``) unscaled, shapes [N], [N, T].
+        success, fell: 1 where the goal was reached, the object was lost, in this step, int32, shape [N].
+        timed_out: 1 where the episode ended by its length alone, int32, shape [N].
+        ended: Not 0 where the episode ended, and the environment was reset, int32, shape [N].
+        rotation_error: Angle to the goal at the end of the step, before resets [rad], shape [N].
+        step_count: Control steps since the reset, int32, shape [N].
+        goal_quat: Wanted orientation of the object, xyzw, shape [N].
+        measured_q, measured_qd: Joints as encoders report them [rad, rad/s], in the first D columns.
+        sim.joint_q, sim.joint_qd: Joints [rad, rad/s], then pose and velocity of the object (position [m] and
+            quaternion; linear [m/s] and angular [rad/s]), shapes [N, D + 7], [N, D + 6].
+        fingers.tip_pos: Fingertips in the world frame [m], shape [N, F].
     """
 
     def __init__(self, cfg: ReorientCfg, device: str | None = None):
@@ -107,7 +125,7 @@ class ReorientEnv:
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
         self.parameters.set_stage(self.stage)
-        self._graphs: dict[str, Any] = {}
+        self._graphs = Graphs(self.device, captured=self.sim.solver.captured)
         self.steps = 0
         """Control steps of all environments since the begin of the run, with those of a checkpoint."""
         self._own_steps = 0
@@ -122,25 +140,17 @@ class ReorientEnv:
         zeros = self.state.zeros
 
         self.action = zeros(n, self.num_actions)
-        """Action of the present step in [-1, 1], shape [N, A]."""
         self.reward = zeros(n)
-        """Reward of the present step, shape [N]."""
         self.reward_terms = zeros(n, len(self.reward_term_names))
-        """Terms of the reward, unscaled, shape [N, T]."""
         self.rotation_error = zeros(n)
-        """Angle to the goal at the end of the step, before resets [rad], shape [N]."""
         self.still = zeros(n, dtype=wp.int32)
         """1 where all of success holds but the rotation's threshold, shape [N]."""
         self.success = zeros(n, dtype=wp.int32)
-        """1 where the goal was reached in this step, shape [N]."""
         self.fell = zeros(n, dtype=wp.int32)
-        """1 where the object was lost in this step, shape [N]."""
         self.timed_out = zeros(n, dtype=wp.int32)
-        """1 where the episode ended by its length alone, shape [N]."""
         self.done = zeros(n, dtype=wp.int32)
         """1 where the return ends: success, fall or time-out, shape [N]."""
         self.step_count = zeros(n, dtype=wp.int32)
-        """Control steps since the environment's reset, shape [N]."""
         self.goal_steps = zeros(n, dtype=wp.int32)
         """Control steps since the environment's goal was given, shape [N]."""
         self.object_pose_end = zeros(n, dtype=wp.transform)
@@ -152,7 +162,6 @@ class ReorientEnv:
         self.previous_error = zeros(n)
         """Rotation error at the end of the last step, for the progress in it [rad], shape [N]."""
         self.ended = zeros(n, dtype=wp.int32)
-        """Not 0 where the episode ended, and the environment was reset; shape [N]."""
         self._new_goal = zeros(n, dtype=wp.int32)
         self._env_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
@@ -231,7 +240,7 @@ class ReorientEnv:
         """
         if self._terms is None:
             self._take(action)
-            self._replay(self.launch_step)
+            self._graphs.replay(self.launch_step)
             self.randomiser.after_step(self.steps)
         else:
             self.advance(action)
@@ -243,7 +252,7 @@ class ReorientEnv:
         Arguments are those of :meth:`step`.
         """
         self._take(action)
-        self._replay(self._launch_judged)
+        self._graphs.replay(self._launch_judged)
         if self._terms is not None:
             self._terms.pay(self)
 
@@ -255,7 +264,7 @@ class ReorientEnv:
         """
         if reset is not None:
             wp.copy(self.ended, reset)
-        self._replay(self._launch_renewal)
+        self._graphs.replay(self._launch_renewal)
         self._new_goal.zero_()
         if self._terms is not None:
             self._terms.observe(self)
@@ -267,19 +276,6 @@ class ReorientEnv:
             wp.copy(self.action, action)
         self.steps += 1
         self._own_steps += 1
-
-    def _replay(self, launch: Callable[[], None]) -> None:
-        """Launch kernels, the first time as they are, which loads them, then as a graph."""
-        name = launch.__name__
-        if name not in self._graphs or not self.sim.solver.captured:
-            launch()
-            self._graphs[name] = None
-            return
-        if self._graphs[name] is None:
-            with wp.ScopedCapture(device=self.device) as capture:
-                launch()
-            self._graphs[name] = capture.graph
-        wp.capture_launch(self._graphs[name])
 
     def motion(self) -> dict[str, wp.array]:
         """What the motion goes on from, the last targets included: arrays with a row for each; not copies."""
@@ -294,7 +290,7 @@ class ReorientEnv:
 
     def hold(self) -> None:
         """One control step in which no policy acts and the hand keeps its last targets; nothing is reset."""
-        self._replay(self.sim.step)
+        self._graphs.replay(self.sim.step)
 
     def _apply_action(self) -> None:
         p, sim = self.parameters, self.sim
