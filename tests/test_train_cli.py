@@ -14,7 +14,6 @@ from vd.train.cli import GONE, main
 from vd.train.config import validate
 from vd.train.flags import OF_HELP_ALL, parse_teacher
 from vd.train.presets import PRESETS, TeacherCfg
-from vd.train.teacher import BUILDING, build_teacher
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
@@ -55,23 +54,6 @@ def test_the_machine_decides_where_no_preset_is_named(monkeypatch, gpus, flags, 
     assert len(said) == 1 and f"preset {name}, since none is named" in said[0]
     assert parse_teacher(["--preset", "paper"], say=said.append).ppo == PRESETS["paper"]().ppo
     assert parse_teacher(["--smoke"], say=said.append).smoke and len(said) == 1
-
-
-def test_a_preset_for_a_gpu_says_on_a_cpu_what_that_costs(tmp_path):
-    said: list[str] = []
-
-    def say(text: str) -> None:
-        said.append(text)
-        if text == BUILDING:
-            raise InterruptedError
-
-    for name in ("gpu", "cpu-demo"):
-        with pytest.raises(InterruptedError):
-            build_teacher(
-                parse_teacher(["--preset", name, "--device", "cpu", "--out", str(tmp_path)]), say=say
-            )
-    assert [text.split()[0] for text in said] == ["16384", "building", "building"]
-    assert "--num-envs" in said[0]
 
 
 def test_a_preset_for_a_hand_of_its_own_serves_the_other():
