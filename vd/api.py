@@ -1,6 +1,7 @@
 """What the package offers to programs, where no other module has it under its stable name (:mod:`vd`)."""
 
 import json
+import multiprocessing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -147,8 +148,11 @@ def analyse_gap(recording: str | Path, out: str | Path, **settings: Any) -> "Rep
         The report: ``verdict``, ``effects`` and how much closer the identified model is, ``closing``.
 
     Raises:
+        RuntimeError: A script calls it without ``if __name__ == "__main__":``; worker processes import it.
         ValueError: The recording or a setting cannot be used.
     """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker that imports the script
+        raise RuntimeError('analyse_gap() starts processes: call it under if __name__ == "__main__":')
     from vd.gap.result import Report
     from vd.gap.steps import Analysis, Settings
 
