@@ -1,5 +1,6 @@
 """What programs build on: the stable names, the examples, and own terms of reward and observation."""
 
+import re
 import runpy
 import subprocess
 import sys
@@ -29,6 +30,8 @@ def test_the_package_loads_no_name_before_it_is_used():
     code = "import sys, vd; print({'torch', 'warp', 'numpy', 'tyro'} & set(sys.modules), dir(vd))"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.startswith("set()") and all(f"'{name}'" in said for name in vd.__all__)
+    stub = Path(vd.__file__).with_suffix(".pyi").read_text()  # for editors and type checkers
+    assert set(re.findall(r'"(\w+)",', stub)) == set(vd.__all__)
     assert len(vd.__all__) == 10 and all(getattr(vd, name).__doc__ for name in vd.__all__)
 
 
