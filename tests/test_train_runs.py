@@ -157,7 +157,7 @@ def test_nan_in_the_networks_stops_with_what_to_change(tmp_path):
 def test_values_that_are_not_finite_become_null_and_a_torn_line_is_skipped(tmp_path):
     from vd.train.metrics import ProgressFile
 
-    log = ProgressFile(tmp_path, tensorboard=False)
+    log = ProgressFile(tmp_path, logger="none")
     log.write({"iteration": 1, "value": float("nan")})
     log.close()
     path = tmp_path / "progress.jsonl"
@@ -171,7 +171,7 @@ def test_values_that_are_not_finite_become_null_and_a_torn_line_is_skipped(tmp_p
 def test_tensorboard_files_hold_the_curve(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    make_runner(tmp_path, tensorboard=True).learn(2)
+    make_runner(tmp_path, logger="tensorboard").learn(2)
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     assert [e.step for e in events.Scalars("task/rotation_error")] == [1, 2]

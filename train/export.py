@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
+from vd.command_line import parse
 from vd.files import atomic_path, check_file, check_folder
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ class BundleCfg:
 
 def export_command(arguments: list[str], _started: float) -> int:
     """``vd-train export``; the exit status."""
-    cfg = tyro.cli(ExportCfg, args=arguments, prog="vd-train export")
+    cfg: ExportCfg = parse(ExportCfg, arguments, prog="vd-train export")
     check_file(cfg.output)
     if cfg.resumable and cfg.output.suffix == ONNX:
         raise ValueError(f"--resumable writes a checkpoint, which {cfg.output} is not; leave one of them out")
@@ -124,7 +125,7 @@ def export_onnx(policy: "TrainedPolicy", path: Path) -> None:
 
 def bundle_command(arguments: list[str], _started: float) -> int:
     """``vd-train bundle``; the exit status."""
-    cfg = tyro.cli(BundleCfg, args=arguments, prog="vd-train bundle")
+    cfg: BundleCfg = parse(BundleCfg, arguments, prog="vd-train bundle")
     check_folder(cfg.output.parent)
 
     from vd.bundle.store import write_bundle
