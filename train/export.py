@@ -5,6 +5,7 @@ import timeit
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -117,11 +118,19 @@ def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path) -> None:
     drawn = torch.randn(CHECKED, teacher.num_observations, generator=torch.Generator().manual_seed(0))
     _export(teacher.network, {"observation": drawn}, ["action"], path)
     if not isinstance(policy, TrainedPolicy) and policy.alignment is not None:
-        torch.export.register_dataclass(Residual)
+        _have_exported(Residual)
         clouds = CLOUD_M * torch.randn(2, CHECKED, POINTS, 3, generator=torch.Generator().manual_seed(0))
         named = {"goal_points": clouds[0], "seen_points": clouds[1, :, : POINTS - 1]}  # of another number
         outputs = [one.name for one in fields(Residual)]
         _export(policy.alignment, named, outputs, path.with_stem(f"{path.stem}-alignment"))
+
+
+@cache
+def _have_exported(kind: type) -> None:
+    """Have exports take apart what a network returns; torch wants to be told once."""
+    import torch
+
+    torch.export.register_dataclass(kind)
 
 
 def _export(network: "Module", inputs: dict[str, "Tensor"], outputs: list[str], path: Path) -> None:
