@@ -23,6 +23,7 @@ from vd import interrupt
 from vd.command_line import parse
 from vd.config import from_dict, to_dict
 from vd.evaluate.agents import (
+    BUILT_IN,
     POLICY_FOLDER,
     POLICY_LIST,
     SHIPPED_POLICIES,
@@ -90,7 +91,7 @@ def check_name(name: str) -> None:
     Raises:
         ValueError: It cannot.
     """
-    if not _NAME.fullmatch(name):
+    if not _NAME.fullmatch(name) or name in BUILT_IN:
         raise ValueError(f"{name!r} is no name of a policy: letters, digits, and . _ - between them")
 
 
