@@ -138,19 +138,18 @@ def _export(network: "Module", inputs: dict[str, "Tensor"], outputs: list[str], 
     import torch
 
     network = network.eval().requires_grad_(False)
-    # Of number one a size would be taken for fixed.
-    dims = {"environments": torch.export.Dim("environments")}
+    number = torch.export.Dim("environments")
     shapes = tuple(
-        {0: dims["environments"]} | {i: torch.export.Dim(f"{name}_{i}") for i in range(1, value.ndim - 1)}
+        {0: number} | {i: torch.export.Dim(f"{name}_{i}") for i in range(1, value.ndim - 1)}
         for name, value in inputs.items()
     )
     # It warns of libraries that this network does not need, and of its own future.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), atomic_path(path) as temporary:
-        warnings.simplefilter("ignore", FutureWarning)
+        warnings.simplefilter("ignore")
         torch.onnx.export(
             network,
-            tuple(value[:2] for value in inputs.values()),
+            tuple(value[:2] for value in inputs.values()),  # of one it would take the number for fixed
             temporary,
             input_names=list(inputs),
             output_names=outputs,
