@@ -22,6 +22,11 @@ def test_sim_rows_add_up(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out) == row
 
 
+def test_a_policy_that_cannot_be_measured_is_told_at_once():
+    with pytest.raises(ValueError, match="sees point clouds"):
+        SimCommand(policy="dclaw3-tracking", device="cpu").run()
+
+
 def test_our_kernels_take_a_share_of_a_step(device):
     if device == "cpu":
         pytest.skip("Warp times single kernels on a GPU only")
