@@ -5,8 +5,8 @@ from pathlib import Path
 import vd
 
 result = vd.evaluate_policies(
-    *("dclaw3", "zero"),
-    hand="dclaw3",
+    *("dclaw4", "zero"),
+    hand="dclaw4",
     objects=("cube",),
     episodes=4,
     episode_s=3.0,

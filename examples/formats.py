@@ -26,5 +26,5 @@ recording = vd.read("mine")  # checked: a mistake is named by file, row and colu
 print(recording.joints, recording.trajectories[0].position.shape)
 vd.write(recording, "again")
 
-vd.write(vd.load_policy("dclaw3", device="cpu"), "bundle")
+vd.write(vd.load_policy("dclaw4", device="cpu"), "bundle")
 print(vd.read("bundle").hand)

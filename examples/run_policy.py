@@ -4,9 +4,9 @@ import warp as wp
 
 import vd
 
-policy = vd.load_policy("dclaw3", device="cpu")
+policy = vd.load_policy("dclaw4", device="cpu")
 env = vd.ReorientEnv(vd.ReorientCfg.of(policy, objects=("cube",), num_envs=4), "cpu")
-actor = vd.load_policy("dclaw3", env)  # zero, random and policies by camera act so too
+actor = vd.load_policy("dclaw4", env)  # zero, random and policies by camera act so too
 
 reached = 0
 for _ in range(36):  # three seconds

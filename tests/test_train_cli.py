@@ -123,6 +123,8 @@ def test_resume_starts_from_the_runs_own_configuration(tmp_path):
     )
     saved = dataclasses.replace(saved, preset="multi-gpu")  # as earlier versions wrote it
     (tmp_path / "config.json").write_text(json.dumps(to_dict(saved)))
+    asked = dataclasses.replace(saved, preset="gpu")
+    assert parse_teacher(["--config", str(tmp_path / "config.json")]) == asked, "another run like it"
     cfg = parse_teacher(["--out", str(tmp_path), "--resume", "--max-steps", "123"])
     assert cfg.resume == "latest" and cfg.run.save_every == 17 and cfg.run.max_steps == 123
     assert cfg.env == saved.env and cfg.run.out == tmp_path
@@ -197,7 +199,7 @@ def test_files_from_before_a_field_went_are_read_if_it_was_off():
     before["env"]["caught"] = {"after_s": 2.0, "beyond_rad": 0.4, "go_on_share": 0.0}
     before["env"]["aim"] = {"enabled": False, "past_rad": 0.3, "within_rad": 0.3}
     before["env"]["focus"] = {"success": {}, "share": 0.7}
-    before["run"]["keep_last"] = 3
+    before["run"] |= {"keep_last": 3, "tensorboard": before["run"].pop("logger") != "none"}
     before["run"]["run_dir"] = before["run"].pop("out")
     before["env"]["num_worlds"] = before["env"].pop("num_envs")
     assert from_dict(TeacherCfg, before) == PRESETS["gpu"]()
