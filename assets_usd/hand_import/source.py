@@ -108,8 +108,6 @@ def read_source(path: Path) -> Source:
     if not path.is_file():
         raise HandError(f"{path}: no such file; give a URDF, or an MJCF")
     text = path.read_text(errors="replace")
-    if "xacro:" in text or "${" in text:
-        raise HandError(f"{path}: a xacro; expand it first, xacro {path.name} > hand.urdf, and give that")
     if "<robot" in text:
         read = _read_urdf
     elif "<mujoco" in text:
@@ -122,13 +120,16 @@ def read_source(path: Path) -> Source:
         try:
             source = read(path)
         except Exception as error:  # whatever a parser raises: the file is at fault
-            raise HandError(f"{path}: cannot be parsed: {error}") from error
+            xacro = "<xacro:" in text or "${" in str(error)
+            remedy = f"; expand it first: xacro {path.name} > hand.urdf" if xacro else ""
+            raise HandError(f"{path}: cannot be parsed: {error}{remedy}") from error
     for one in said:
         heard = " ".join(str(one.message).split())
         if any(word in heard for word in HARMLESS) or issubclass(one.category, DeprecationWarning):
             source.notes.append(f"the parser says: {heard}")
         elif "package" in heard:
-            source.problems.append(f"{heard}; or write it relative to {path.name}")
+            heard = heard.partition(" For robust")[0]
+            source.problems.append(f"{heard} Name a folder above {path.name} so, or write relative paths")
         else:
             file = "; put the file there" if "exist" in heard or "found" in heard else ""
             source.problems.append(f"the parser says: {heard}{file}")
@@ -373,13 +374,15 @@ def _mjcf_actuators(model: Any, source: Source) -> None:
 def _moved(model: Any, actuator: int, source: Source) -> list[str]:
     """Joints that an actuator moves; those of a tendon go on the list of what is coupled."""
     kind, target = model.actuator_trntype[actuator], model.actuator_trnid[actuator, 0]
+    name = model.actuator(actuator).name or f"actuator {actuator}"
+    if model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_MUSCLE:
+        source.problems.append(f"{name} is a muscle, which only pulls; make it a motor")
     if kind == mujoco.mjtTrn.mjTRN_JOINT:
         return [_joint_name(model, target)]
     wraps = range(0)
     if kind == mujoco.mjtTrn.mjTRN_TENDON:
         wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
     if not wraps or any(model.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
-        name = model.actuator(actuator).name or f"actuator {actuator}"
         source.problems.append(
             f"{name} pulls at no joint but over sites; give its joints motors of their own"
         )

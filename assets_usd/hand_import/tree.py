@@ -85,6 +85,7 @@ class _Grower:
             self.out.setdefault(joint.parent, []).append(number)
         self.held: dict[str, float] = dict(said.hold)
         self.raised: list[str] = []
+        self.hollow: dict[str, float] = {}
 
     def fail(self) -> None:
         """Raise what was found, if anything."""
@@ -127,6 +128,11 @@ class _Grower:
         if self.raised:
             self.notes.append(
                 f"no body has the moments of inertia of {', '.join(self.raised)}; the smaller are raised"
+            )
+        if self.hollow:
+            self.notes.append(
+                f"guess: meshes of {', '.join(self.hollow)} collide as their hulls, up to "
+                f"{max(self.hollow.values()):.1f} times their volume (parts)"
             )
         tree = Tree(self.source.path.name, links, joints, counts, tips, self.notes)
         self._check_followers(tree)
@@ -425,9 +431,7 @@ class _Grower:
         elif shape.collides and shape.kind == "mesh" and not split:
             volume = abs(float(trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume))
             if hull > HOLLOW * volume > 0.0:
-                self.notes.append(
-                    f"guess: {what} collides as its hull, {hull / volume:.1f} times its volume (parts)"
-                )
+                self.hollow[link.name] = max(hull / volume, self.hollow.get(link.name, 0.0))
 
 
 def combine(link: Link, parts: list[tuple[float, np.ndarray, np.ndarray]]) -> None:
