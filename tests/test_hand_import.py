@@ -1,6 +1,7 @@
 """Hands from URDF and MJCF: what the USD says against what MuJoCo reads in the same file, and refusals."""
 
 import itertools
+import json
 import re
 import sys
 from dataclasses import replace
@@ -457,6 +458,8 @@ def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
     small = ["--num-envs", "8", "--ppo.minibatch-size", "32", "--max-steps", "128", "--device", "cpu"]
     flags = ["--preset", "leap-objects", "--objects", "cube", "--hand", str(hand.path), *small]
     assert train(["teacher", *flags, "--out", str(tmp_path / "run")]) == 0
+    rows = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
+    assert len(rows) > 1 and all(row["loss/kl"] > 0.0 and row["loss/value"] > 0.0 for row in rows)
     policy = load_policy(tmp_path / "run" / "policy.pt")
     assert policy.num_actions == 5
     env = ReorientEnv(trained_task(policy), "cpu")
