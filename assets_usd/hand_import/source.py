@@ -123,9 +123,8 @@ def read_source(path: Path) -> Source:
             xacro = "<xacro:" in text or "${" in str(error)
             remedy = f"; expand it first: xacro {path.name} > hand.urdf" if xacro else ""
             raise HandError(f"{path}: cannot be parsed: {error}{remedy}") from error
-    for one in said:
-        heard = " ".join(str(one.message).split())
-        if any(word in heard for word in HARMLESS) or issubclass(one.category, DeprecationWarning):
+    for heard, kind in dict.fromkeys((" ".join(str(one.message).split()), one.category) for one in said):
+        if any(word in heard for word in HARMLESS) or issubclass(kind, DeprecationWarning):
             source.notes.append(f"the parser says: {heard}")
         elif "package" in heard:
             heard = heard.partition(" For robust")[0]

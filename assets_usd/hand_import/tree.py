@@ -420,18 +420,20 @@ class _Grower:
                 self.problems.append(f"a collider of {link.name} is a {shape.kind}; make it a mesh")
             return
         half = shape_box(shape)[1]
-        hull = hull_volume(shape.vertices) if shape.kind == "mesh" else float(np.prod(half))
         if not LEAST_M < 2.0 * half.max() < MOST_M:
             self.problems.append(
                 f"{what} is {2.0 * half.max():.3g} m long; give it its size in metres, a mesh by its scale, "
                 "such as 0.001"
             )
-        elif shape.collides and not hull > 0.0:
-            self.problems.append(f"{what} is flat and collides; give it a thickness, or make it a box")
-        elif shape.collides and shape.kind == "mesh" and not split:
+        elif shape.collides and shape.kind == "mesh":
+            hull = hull_volume(shape.vertices)
             volume = abs(float(trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume))
-            if hull > HOLLOW * volume > 0.0:
+            if not hull > 0.0:
+                self.problems.append(f"{what} is flat and collides; give it a thickness, or make it a box")
+            elif hull > HOLLOW * volume > 0.0 and not split:
                 self.hollow[link.name] = max(hull / volume, self.hollow.get(link.name, 0.0))
+        elif shape.collides and not half.min() > 0.0:
+            self.problems.append(f"{what} is flat and collides; give it a thickness")
 
 
 def combine(link: Link, parts: list[tuple[float, np.ndarray, np.ndarray]]) -> None:

@@ -69,7 +69,7 @@ class HandFlags:
     """The hand, for vd-eval and vd-play."""
 
     hand: str | None = None
-    """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
+    """dclaw3, dclaw4, an imported hand or a hand's USD; by default the policy's, or dclaw4."""
     hand_layer: str | None = None
     """Layer over the hand with a servo model, identified.usda of vd-gap; by default the policy's, none for
     the hand as it is."""
