@@ -122,29 +122,25 @@ def test_a_stop_away_from_the_goal_ends_the_row():
     assert row_of(trace, air_goals=True).overall.outcomes["orientation error"].value >= far.mean()
 
 
-def test_successes_in_a_row_end_with_a_fall_or_a_goal_that_takes_too_long(tmp_path):
+def test_successes_in_a_row_end_with_a_fall_or_a_goal_that_takes_too_long(tmp_path, monkeypatch):
     series = replace(CONSECUTIVE, most=6, goal_s=1.5)
     env = SeriesEnv(series.length_s, fall_at={0: 1, 5: 20})
     turns = draw_turns(["a", "b"], EPISODES, series.most, seed=2, max_goal_angle=1.5)
     turns[0, 2, 3] = Rotation.from_rotvec([0.0, 0.0, 3.0]).as_quat()  # 26 steps away, of which it has 18
-    start, goal = (drawn(OBJECTS, EPISODES)[name] for name in ("starts", "goals"))
-    goal[:] = (
-        (Rotation.from_rotvec([0.0, 1.05, 0.0]) * Rotation.from_quat(start.reshape(-1, 4)))
-        .as_quat()
-        .reshape(goal.shape)
-    )
+    start = drawn(OBJECTS, EPISODES)["starts"]
+    ahead = Rotation.from_rotvec([0.0, 1.05, 0.0]) * Rotation.from_quat(start.reshape(-1, 4))
+    given = {"starts": start, "goals": ahead.as_quat().reshape(start.shape)}
     _, way = way_of(AGENT, series, 0.4)
     assert way[0].action_norm > env.num_actions, "no action is too much"
-    trace = record_series(env, Seeker(env), turns, way, series, tolerance=0.4, starts=start, goals=goal)
+    trace = record_series(env, Seeker(env), turns, way, series, tolerance=0.4, **given)
     assert not env.tables, "the table is left alone"
     np.testing.assert_allclose(rotation_angle(trace.start_quat, trace.goal_quat), 1.05, atol=1e-5)
     np.testing.assert_array_equal(trace.steps[:, 2:], 7)
     reached = trace.reached.tolist()
     assert reached[0][0] == 0 and reached[0][2] == 3 and 1 <= reached[1][1] < 6 and trace.lost.sum() == 2
     assert [count for row in reached for count in row if count == 6] == [6] * 5
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vd.evaluate.in_a_row.CONSECUTIVE", series)
-        row = row_of(trace, consecutive=True, episode_s=1.5)
+    monkeypatch.setattr("vd.evaluate.in_a_row.CONSECUTIVE", series)
+    row = row_of(trace, consecutive=True, episode_s=1.5)
     both, a, b = row.consecutive
     total = trace.reached.sum()
     assert (both.mean, both.median, both.full, both.lost) == pytest.approx((total / 8, 6.0, 5 / 8, 2 / 8))

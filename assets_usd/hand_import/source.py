@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandError, compose
@@ -167,6 +168,8 @@ def _read_urdf(path: Path) -> Source:
             mesh = builder.shape_source[i]
             shape.vertices = np.array(mesh.vertices, dtype=float) * scale
             shape.faces = np.array(mesh.indices, dtype=np.int32).reshape(-1, 3)
+            if trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume < 0.0:
+                shape.faces = shape.faces[:, ::-1]  # a scale that mirrors, as of left hands
             shape.size = ()
         links[body].shapes.append(shape)
     names = [joint.removeprefix(f"{label}/") for joint in builder.joint_label]
