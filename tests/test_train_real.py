@@ -99,4 +99,5 @@ def test_the_command_trains_saves_on_sigterm_and_resumes(tmp_path):
     steps = (done + 1) * 4 * config["ppo"]["rollout_steps"]
     assert main(["teacher", "--out", str(tmp_path), "--resume", "--max-steps", str(steps)]) == 0
     assert [row["iteration"] for row in read_progress(progress)] == list(range(1, done + 2))
-    assert load_policy(tmp_path / "policy.pt").hand == "dclaw3"
+    policy = load_policy(tmp_path / "policy.pt")
+    assert policy.hand == policy.trained_hand["name"] == "dclaw3"
