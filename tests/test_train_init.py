@@ -96,28 +96,6 @@ def test_only_the_critic_learns_while_it_warms_up(tmp_path, monkeypatch, schedul
     ]
 
 
-def test_a_run_that_stops_while_the_critic_warms_up_goes_on_with_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(begin, "CRITIC_WARMUP", 4)
-    path = _export(tmp_path / "first", critic=False)
-    whole = _begun(tmp_path / "whole", path)
-    whole.learn(6)
-    part = _begun(tmp_path / "part", path)
-    part.learn(2)
-    checkpoint = find_checkpoint(tmp_path / "part", "latest")
-    assert "critic_state_dict" not in load_checkpoint(tmp_path / "part" / "policy.pt"), (
-        "it is worth nothing yet"
-    )
-    resumed = make_runner(tmp_path / "part", seed=99, policy=NORMALISING, ppo=LEARNED)
-    resumed.load(str(checkpoint))
-    assert resumed.critic_warmup == 2
-    resumed.learn(4)
-    assert _same(_state(whole.alg.actor), _state(resumed.alg.actor)) == list(_state(whole.alg.actor))
-    again = make_runner(tmp_path / "again", policy=NORMALISING, ppo=LEARNED)
-    again.begin_from(str(checkpoint))
-    assert again.critic_warmup == 2, "another run that begins from it has what is left to do"
-    assert "critic_state_dict" in policy_export(load_checkpoint(find_checkpoint(tmp_path / "part", "latest")))
-
-
 @pytest.mark.parametrize(
     ("tightened", "asked", "wanted"),
     [(True, None, (1.0, 1.0)), (False, None, (1.0, 0.0)), (True, (0.5, 0.0), (0.5, 0.0))],

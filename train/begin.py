@@ -41,11 +41,11 @@ def find_start(name: str) -> Path:
         ValueError: It is a bundle.
     """
     from vd.bundle import is_bundle
-    from vd.evaluate.agents import SHIPPED_POLICIES, find_policy
+    from vd.evaluate.agents import find_policy, installed_policies
     from vd.train.checkpoint import BEST_NAME, CHECKPOINT_FOLDER
 
     best = Path(name) / CHECKPOINT_FOLDER / BEST_NAME
-    if name not in SHIPPED_POLICIES and best.is_file():
+    if name not in installed_policies() and best.is_file():
         return best
     try:
         path = find_policy(name)

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from vd import interrupt
+from vd.command_line import parse
 from vd.device import resolve_device
 from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
@@ -190,7 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given and given[0] in GONE:
         print(f"vd-bench: {given[0]!r} is no more: {GONE[given[0]]}", file=sys.stderr)
         return interrupt.USAGE_ERROR
-    command = tyro.cli(Command, args=arguments, prog="vd-bench", description=__doc__)
+    command = parse(Command, arguments, prog="vd-bench", description=__doc__)
     if isinstance(command, GapCommand):
         check_folder(command.out)
     elif isinstance(command, Measurement) and command.json is not None:

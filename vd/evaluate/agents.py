@@ -1,10 +1,12 @@
 """Agents by name or file, and the task they act in: shared by vd-eval and vd-play."""
 
+import json
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vd.assets_usd.cache import assets_dir
 from vd.bundle import is_bundle
 from vd.config import from_dict
 from vd.envs.cfg import CurriculumCfg, ObservationCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TableCfg
@@ -16,7 +18,11 @@ if TYPE_CHECKING:
 BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
 
-SHIPPED_POLICIES = {path.stem: path for path in sorted((Path(__file__).parents[1] / "policies").glob("*.pt"))}
+POLICY_FOLDER = Path(__file__).parents[1] / "policies"
+"""Policies of the package, and POLICY_LIST. A wheel has two of them, a checkout all."""
+POLICY_LIST = "policies.json"
+"""Tells of the policies of a folder (:mod:`vd.policy_store`), in a wheel also of those that it lacks."""
+SHIPPED_POLICIES = {path.stem: path for path in sorted(POLICY_FOLDER.glob("*.pt"))}
 """Trained policies that are installed with the package, by name: ``<hand>`` or ``<hand>-<task>``."""
 
 REPLACED = {
@@ -39,6 +45,16 @@ NO_LAYER = "none"
 _RUN_FILES = ("policy.pt", "checkpoints/best.pt")
 
 
+def pulled_folder() -> Path:
+    """Where ``vd-policies pull`` puts policies."""
+    return assets_dir() / "policies"
+
+
+def installed_policies() -> dict[str, Path]:
+    """Policies by name: those of the package, and those that were pulled."""
+    return {path.stem: path for path in sorted(pulled_folder().glob("[!.]*.pt"))} | SHIPPED_POLICIES
+
+
 def find_policy(name: str | Path) -> Path:
     """The policy file that ``name`` means: one that is installed, a file, or the best one of a run's folder.
 
@@ -46,20 +62,27 @@ def find_policy(name: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: There is none.
-        ValueError: A policy of that name was installed once.
+        ValueError: A policy of that name was installed once, or has to be pulled.
     """
     if str(name) in REPLACED:
         raise ValueError(f"the policy {name} is not installed any more; take {REPLACED[str(name)]}")
-    if str(name) in SHIPPED_POLICIES:
-        return SHIPPED_POLICIES[str(name)]
+    installed = installed_policies()
+    if str(name) in installed:
+        return installed[str(name)]
     path = Path(name)
     if path.is_file() or is_bundle(path):
         return path
+    known = json.loads((POLICY_FOLDER / POLICY_LIST).read_text())["policies"]
+    if not path.exists() and str(name) in known:
+        raise ValueError(
+            f"the policy {name} is not on this machine: vd-policies pull {name} --at PLACE, such as the "
+            "folder vd/policies of a checkout"
+        )
     if not path.is_dir():
         raise FileNotFoundError(
             f"no policy at {path}; give a policy.pt, a bundle's folder, a file of a run's "
             f"checkpoints folder, a run's folder, or the name of an installed policy: "
-            f"{', '.join(SHIPPED_POLICIES)}"
+            f"{', '.join(installed)}"
         )
     for candidate in _RUN_FILES:
         if (path / candidate).is_file():
@@ -83,7 +106,7 @@ def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None 
 def policy_name(name: str | Path) -> str:
     """``name`` as it is told to others: the name of an installed policy if it is the file of one."""
     path = Path(name).resolve()
-    return next((known for known, file in SHIPPED_POLICIES.items() if file.resolve() == path), str(name))
+    return next((known for known, file in installed_policies().items() if file.resolve() == path), str(name))
 
 
 def trained_task(policy: Any) -> ReorientCfg:

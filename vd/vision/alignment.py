@@ -67,7 +67,7 @@ class Patches(nn.Module):
     def forward(self, cloud: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
         """Tokens [B, T, E] of clouds about their means [m] [B, P, 3], in no order, and their neighbours."""
         centres = cloud[:, : self.cfg.tokens]
-        rows = torch.arange(len(cloud), device=cloud.device)[:, None, None]
+        rows = torch.arange(cloud.shape[0], device=cloud.device)[:, None, None]
         read = self.points((cloud[rows, near] - centres[:, :, None]) / PATCH_M)
         place = centres / CLOUD_M
         waves = [wave(place * scale) for scale in WAVES for wave in (torch.sin, torch.cos)]
@@ -127,7 +127,7 @@ class AlignmentNetwork(nn.Module):
 
     def compare(self, goal: torch.Tensor, seen: torch.Tensor) -> Residual:
         """What is predicted from the tokens of goals and of what is seen, [B, T, E] each."""
-        tokens = torch.cat([self.summary.expand(len(goal), -1, -1), goal, seen], dim=1)
+        tokens = torch.cat([self.summary.expand(goal.shape[0], -1, -1), goal, seen], dim=1)
         *before, last = self.layers
         for layer in before:
             tokens = layer(tokens)
