@@ -23,7 +23,6 @@ from vd.assets_usd.hand_model import open_stage
 from vd.assets_usd.hands import load_hand
 from vd.envs.cfg import ObservationCfg, ReorientCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import trained_task
 from vd.policy import load_policy
 from vd.train.cli import main as train
 
@@ -465,7 +464,7 @@ def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
     assert len(rows) > 1 and all(row["loss/kl"] > 0.0 and row["loss/value"] > 0.0 for row in rows)
     policy = load_policy(tmp_path / "run" / "policy.pt")
     assert policy.num_actions == 5
-    env = ReorientEnv(trained_task(policy), "cpu")
+    env = ReorientEnv(ReorientCfg.of(policy), "cpu")
     assert env.objects[0].longest_side == pytest.approx(0.05)
     np.testing.assert_allclose(np.ptp(env.objects[0].hulls[0].vertices, axis=0), 0.05, rtol=1e-6)
     env.step(wp.from_torch(policy.act(wp.to_torch(env.observation))))

@@ -128,5 +128,5 @@ def test_what_messages_and_pages_tell_to_install_exists():
         for path in (ROOT / folder).rglob("*.*"):
             if path.suffix in (".py", ".md"):
                 told |= set(re.findall(r"pip install [^\n`]*?'([^'\n]*\[[^'\n]*)'", path.read_text()))
-    assert told == {f".[{extra}]" for extra in ("hardware", "export", "docs")}
-    assert {"hardware", "export", "docs"} <= PROJECT["project"]["optional-dependencies"].keys()
+    assert told == {f".[{extra}]" for extra in ("hardware", "export", "gym", "docs")}
+    assert {"hardware", "export", "gym", "docs"} <= PROJECT["project"]["optional-dependencies"].keys()

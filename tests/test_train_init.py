@@ -8,8 +8,8 @@ import torch
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
 from vd.config import to_dict
-from vd.envs.cfg import CurriculumCfg, TighteningCfg
-from vd.evaluate.agents import SHIPPED_POLICIES, trained_task
+from vd.envs.cfg import CurriculumCfg, ReorientCfg, TighteningCfg
+from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.policy import MeanAction, load_policy, policy_export
 from vd.train import begin
 from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start
@@ -200,7 +200,7 @@ def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
     cfg = parse_teacher(["--init", name, "--objects", "cube", "--num-envs", "8"])
     state = load_checkpoint(SHIPPED_POLICIES[name])
     assert cfg.env.objects == ("cube",) and cfg.env.num_envs == 8
-    trained = trained_task(load_policy(SHIPPED_POLICIES[name]))
+    trained = ReorientCfg.of(load_policy(SHIPPED_POLICIES[name]))
     assert replace(cfg.env, objects=trained.objects, num_envs=trained.num_envs) == trained
     for field in ("hidden", "distribution", "normalise_observations"):
         wanted = state["policy"][field]

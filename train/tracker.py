@@ -76,6 +76,8 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     teacher = open_teacher(cfg.teacher, device)
     if teacher is None:
         raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
+    if own := teacher.task["observation"].get("terms"):
+        raise ValueError(f"{cfg.teacher} observes {', '.join(own)}, which no camera shows; give another")
     spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
     policy = TrackingPolicy(teacher, spec)
     if cfg.alignment is not None:

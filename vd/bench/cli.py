@@ -60,7 +60,7 @@ class SimCommand(Measurement):
 
     def run(self) -> int:
         """Measure and print."""
-        from vd.evaluate.agents import open_teacher, trained_task
+        from vd.evaluate.agents import open_teacher
 
         device = resolve_device(self.device)
         teacher = open_teacher(self.policy, device)
@@ -68,8 +68,9 @@ class SimCommand(Measurement):
             raise ValueError(f"--policy {self.policy} has no network; give a teacher")
         quiet_warp()
         from vd.bench.sim import measure
+        from vd.envs.cfg import ReorientCfg
 
-        task = dataclasses.replace(trained_task(teacher), objects=self.objects)
+        task = ReorientCfg.of(teacher, objects=self.objects)
         tasks = (dataclasses.replace(task, num_envs=envs) for envs in self.envs)
         rows = (measure(cfg, device, teacher=teacher) for cfg in tasks)
         report(rows, device, self.json)

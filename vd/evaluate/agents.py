@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from vd.assets_usd.cache import assets_dir
 from vd.bundle import is_bundle
-from vd.config import from_dict
 from vd.envs.cfg import CurriculumCfg, ObservationCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TableCfg
 
 if TYPE_CHECKING:
@@ -109,11 +108,6 @@ def policy_name(name: str | Path) -> str:
     return next((known for known, file in installed_policies().items() if file.resolve() == path), str(name))
 
 
-def trained_task(policy: Any) -> ReorientCfg:
-    """The configuration a policy was trained in."""
-    return from_dict(ReorientCfg, policy.task, where="task of the policy")
-
-
 def open_policy(name: str, device: str) -> "TrainedPolicy | TrackingPolicy | None":
     """Load what :func:`find_policy` finds; None for a built-in agent, which has to know its task first.
 
@@ -164,7 +158,7 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
         return
     from vd.assets_usd.hands import load_hand
 
-    task = _on_hand(trained_task(policy), hand, hand_layer)
+    task = _on_hand(ReorientCfg.of(policy), hand, hand_layer)
     model, path = load_hand(task.hand, task.fingertip, task.hand_layer), find_policy(name)
     if is_bundle(path):
         from vd.bundle.contract import check_hand
@@ -174,7 +168,7 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
     if policy.num_actions != len(model.actuated):
         raise ValueError(
             f"{name} moves {policy.num_actions} joints, the hand {model.name} has {len(model.actuated)}; "
-            f"use the hand it was trained for: --hand {trained_task(policy).hand}"
+            f"use the hand it was trained for: --hand {ReorientCfg.of(policy).hand}"
         )
     if policy.kind == "teacher" and policy.trained_hand:
         from vd.bundle.contract import check_trained_hand
@@ -216,11 +210,11 @@ def task_for(
         condition: What is drawn, in place of ``randomised`` (:mod:`vd.evaluate.conditions`).
         settings: Other fields of the task.
     """
-    base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
+    base = ReorientCfg.of(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     if sees_clouds(policy):  # who does not look at its teacher's observation
         base = replace(base, observation=ObservationCfg())
-    if base.observation.dynamics == "critic":  # whom nobody asks here
-        base = replace(base, observation=replace(base.observation, dynamics="none"))
+    seen = replace(base.observation, dynamics="none", critic_terms={})  # nobody asks the critic here
+    base = replace(base, observation=seen, reward=replace(base.reward, terms={}))  # and nobody is paid
     return replace(
         _on_hand(base, hand, hand_layer),
         success=replace(SuccessCfg(), rotation_rad=stop_tolerance_rad),
