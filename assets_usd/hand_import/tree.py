@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import HandError, compose, invert
 from vd.assets_usd.hand_import.description import Description, Drive
 from vd.assets_usd.hand_import.source import IDENTITY, Joint, Link, Shape, Source
-from vd.assets_usd.hand_model import MAX_JOINTS
+from vd.kernels.servo.actuators import MAX_JOINTS
 
 KINDS = ("box", "sphere", "capsule", "cylinder", "mesh", "ellipsoid")
 """What collides."""
