@@ -227,8 +227,10 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
     """
     excitation, bus = motion.excitation, safe.bus
     safe.move(excitation.command[0], SPEED_RAD_S)
-    gain = int(float(excitation.conditions["p_gain"]))
-    _set_gains(bus, {bus.ids[column]: gain for column in columns})
+    # Of motors whose gains differ, each has the same share of its own.
+    share = float(excitation.conditions["p_gain"]) / safe.joints.p_gain
+    own = {bus.ids[column]: safe.joints.motors[column].p_gain for column in columns}
+    _set_gains(bus, {id: round(share * gain) for id, gain in own.items()})
     samples = list[Sample]()
     pacer = Pacer(rate_hz, bus.clock)
     pacer.wait()
@@ -248,7 +250,7 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
         pacer.wait()
     if not on.all():
         safe.switch(np.ones_like(on))
-    _set_gains(bus, {bus.ids[column]: safe.joints.motors[column].p_gain for column in columns})
+    _set_gains(bus, own)
     return _trajectory(motion, columns, samples)
 
 
@@ -362,9 +364,10 @@ def _session(
 
 def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":
     """The recording in the folder, or an empty one."""
-    from vd.gap.recording import USD_SUFFIXES, Recording, read_recording
+    from vd.assets_usd.hands import called
+    from vd.gap.recording import Recording, read_recording
 
-    model = str(Path(cfg.hand).resolve()) if cfg.hand.endswith(USD_SUFFIXES) else cfg.hand
+    model = called(connection.hand)
     if (cfg.out / "recording.json").exists():
         found = read_recording(cfg.out)
         if found.joints != joints or found.model != model:

@@ -86,7 +86,7 @@ def chain_dynamics(q: Any, speed: Any, links: Any):
             pushed += wp.cross(alpha, arm)
             moment = inertia * alpha + moment
         force = weight * (pushed + wp.cross(omega, wp.cross(omega, arm)))
-        moved = wp.mat33(0.0)
+        moved = type(links.axis)(0.0)
         for j in range(len(q)):
             if j <= i:
                 lever = wp.cross(axes[j], arm)

@@ -210,7 +210,7 @@ def write_drives(
     """
     source = {joint: joint for joint in found.joints}
     if every_finger:
-        source |= counterparts(hand.joint_names, found.joints)
+        source |= counterparts(hand, found.joints)
     columns = {"kp": found.kp, "kd": found.kd, "velocity_limit": found.velocity_limit}
     baseline = {
         joint: {name: float(values[found.joints.index(known)]) for name, values in columns.items()}
