@@ -111,7 +111,8 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
     Joints of a finger that are not recorded are taken to stand at zero.
 
     Raises:
-        ValueError: The recording is of a hand and none is given, or it has joints that the hand has not.
+        ValueError: The recording is of a hand and none is given, it has joints that the hand has not, or
+            joints follow others.
     """
     gains = [t.conditions["p_gain"] for t in recording.trajectories if "p_gain" in t.conditions]
     p_gain = max((float(gain) for gain in gains), default=None)
@@ -125,6 +126,8 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
             f"{recording.path}: joints {', '.join(unknown)} are not joints of {hand.name} "
             f"({', '.join(hand.joint_names)}); name the hand that was recorded"
         )
+    if (hand.mimic >= 0).any():
+        raise ValueError(f"{hand.name}: some joints follow others, which the gap workflow does not model")
     found = []
     for finger in hand.fingers:
         names = tuple(name for name in hand.joint_names[finger] if name in recording.joints)
