@@ -83,7 +83,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
 
     @contextlib.contextmanager
     def connect(_, **twin_options):
-        plant = NewtonHand(load_hand(str(hand.path), layer=layer), joints, SimCfg(physics_hz=960.0))
+        plant = NewtonHand(load_hand(str(hand.path), layer=layer), joints, SimCfg(physics_hz=3840.0))
         with simulated_bus(hand, joints, plant) as (_, bus):
             yield Connection(joints, bus)
 

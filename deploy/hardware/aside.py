@@ -8,6 +8,8 @@ from vd.assets_usd.hand_model import HandModel
 
 ASIDE = 0.8
 """How far a finger swings one of its joints aside, and how far motions go, as a share of half the range."""
+CLEARANCE_M = 0.01
+"""Gap below which fingers count as touching [m]: gravity bends joints by 0.1 rad."""
 STEPS = 13
 """Angles of a joint at which a finger that moves through its range is looked at."""
 
@@ -49,19 +51,20 @@ class _Touching:
         builder = new_builder()
         builder.add_world(world)
         self._model = make_solver(builder.finalize(device="cpu"), SimCfg()).mj_model
+        self._model.geom_margin[:] = CLEARANCE_M
         self._data = mujoco.MjData(self._model)
         link_finger = np.full(hand.num_joints + 1, -1)
         link_finger[hand.joint_child] = hand.joint_finger
         self._finger = np.concatenate([[-1], link_finger])[self._model.geom_bodyid]
 
     def __call__(self, q: np.ndarray, fingers: set[int]) -> bool:
-        """Whether links of these fingers, at joint angles [D] [rad], touch each other or the base."""
+        """Whether links of these fingers, at joint angles [D] [rad], are near each other or in the base."""
         import mujoco
 
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_collision(self._model, self._data)
-        contact = self._data.contact
-        pairs = self._finger[contact.geom[contact.dist < 0.0]]
-        return bool(np.isin(pairs, [-1, *fingers]).all(axis=1).any())
+        pairs, gaps = self._finger[self._data.contact.geom], self._data.contact.dist
+        near = gaps < np.where((pairs < 0).any(axis=1), 0.0, CLEARANCE_M)
+        return bool((near & np.isin(pairs, [-1, *fingers]).all(axis=1)).any())
