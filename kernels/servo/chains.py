@@ -212,9 +212,7 @@ def rollout_kernel(size: int) -> wp.Kernel:
         sample_count: wp.array[int],  # [R] rows of each trajectory
         first_output: wp.array[int],  # [R] row of ``predicted`` where each rollout begins
         stream: wp.array[int],  # [R] number of each trajectory's random stream
-        start: wp.array2d[
-            float
-        ],  # [R, n] measured positions at the start, where the joints are at rest [rad]
+        start: wp.array2d[float],  # [R, n] positions measured at the start, where the joints rest [rad]
         wanted: wp.array[int],  # [R] joint whose positions are kept, in column 0; -1 for all, each in its own
         slot: wp.array[int],  # [n] place of each joint in the finger, which is its column of the coupling
         lower: wp.array[float],  # [n] lower stops [rad]
@@ -226,9 +224,7 @@ def rollout_kernel(size: int) -> wp.Kernel:
         dt: float,  # time step [s]
         # Out:
         state: wp.array3d[float],  # [R, n, STATE_COLUMNS] working memory
-        predicted: wp.array2d[
-            float
-        ],  # [S', n] positions as the servo would have reported them or [S', 1] [rad]
+        predicted: wp.array2d[float],  # [S', n] positions as the servo reports them, or [S', 1] [rad]
     ):
         """Simulate trajectories with parameter sets. Launch: [R]."""
         run = wp.tid()
