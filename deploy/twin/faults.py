@@ -316,7 +316,8 @@ def try_fault(fault: Fault, joints: Joints) -> Outcome:
         time.sleep(REST_S)
         report = safe.report
         assert report is not None
-        if not fault.stops:
+        # At its largest current a motor whose mode keeps it may go on.
+        if not fault.stops or (fault.blockable and joints.capped.any()):
             right = report.reason == FINISHED
             happened = f"went on; {safe.repeated} readings repeated" if right else report.reason
             return _outcome(scene, fault.name, happened, joints, right=right)
