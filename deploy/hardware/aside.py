@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 
-from vd.assets_usd.hand_model import HandModel
+from vd.assets_usd.hand_data import HandModel
 
 ASIDE = 0.8
 """How far a finger swings one of its joints aside, and how far motions go, as a share of half the range."""
