@@ -17,7 +17,7 @@ from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.finding import Finding, finding, listed, show
 from vd.deploy.hardware.answers import BusError, GarbledError, LateError
 from vd.deploy.hardware.aside import aside
-from vd.deploy.hardware.connect import Connection, HandOptions, connect
+from vd.deploy.hardware.connect import Connection, HandOptions, connect, motors_of
 from vd.deploy.hardware.joints import CalibrationError
 from vd.deploy.hardware.registers import RESTART, Register, different, kept
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
@@ -326,7 +326,8 @@ def camera_preflight(cfg: CheckCfg, connection: Connection) -> Iterator[Finding]
 def check(cfg: CheckCfg) -> int:
     """Look, and print a table; 1 if something is wrong."""
     with contextlib.ExitStack() as stack:
-        connection = stack.enter_context(connect(cfg, object=None if cfg.no_camera else "cube"))
+        sees = not cfg.no_camera and motors_of(cfg).hand.mounted_camera is not None
+        connection = stack.enter_context(connect(cfg, object="cube" if sees else None))
         findings = show(preflight(connection), quiet=cfg.json)
         if not cfg.no_camera:
             findings += show(camera_preflight(cfg, connection), quiet=cfg.json)
