@@ -12,6 +12,7 @@ import tyro
 
 from vd import interrupt
 from vd.assets_usd.objects.settings import ImportSettings
+from vd.command_line import parse
 from vd.files import check_file, check_folder
 
 if TYPE_CHECKING:
@@ -237,7 +238,7 @@ def main() -> int:
     words = sys.argv[1:]
     if words[:2] == ["hand", "import"]:
         words[:2] = ["hand-import"]
-    command = tyro.cli(Command, args=words, prog="vd-assets", description=__doc__)
+    command = parse(Command, words, prog="vd-assets", description=__doc__)
     if isinstance(command, Show):
         check_file(command.out)
     elif command.out is not None:

@@ -77,11 +77,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     elif not arguments[0].startswith("-") and (wrong := _no_policy(arguments[0])):
         print(f"vd-deploy: {wrong}", file=sys.stderr)
         return FAILED
-    import tyro
+    from vd.command_line import parse
 
     module = importlib.import_module(f"vd.deploy.{COMMANDS[name][0]}")
     options_of = getattr(module, f"{name.capitalize()}Cfg")
-    options = tyro.cli(options_of, args=arguments, prog=f"vd-deploy {name}", description=module.__doc__)
+    options = parse(options_of, arguments, prog=f"vd-deploy {name}", description=module.__doc__)
     return int(getattr(module, name)(options))
 
 

@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
 
 
@@ -21,6 +22,9 @@ class Clock(Protocol):
 
     def every(self, seconds: float, do: Callable[[], None]) -> Callable[[], None]:
         """Do something again and again, whatever the program does, until what is returned was called."""
+
+    def beside(self, do: Callable[[], object]) -> Callable[[], bool]:
+        """Begin what takes long; what is returned tells whether it has ended, and raises what that raised."""
 
 
 class MonotonicClock:
@@ -50,6 +54,20 @@ class MonotonicClock:
 
         thread.start()
         return stop
+
+    def beside(self, do: Callable[[], object]) -> Callable[[], bool]:
+        """Do something in a thread."""
+        pool = ThreadPoolExecutor(1, "beside")
+        future = pool.submit(do)
+        pool.shutdown(wait=False)
+
+        def ended() -> bool:
+            if not future.done():
+                return False
+            future.result()
+            return True
+
+        return ended
 
 
 MONOTONIC = MonotonicClock()

@@ -1,10 +1,12 @@
 """What the site has beyond the files of ``docs``: documents of the root, and tables made from the code.
 
-A hook of mkdocs (``mkdocs.yml``). The package has to be installed; nothing heavy is imported.
+A hook of mkdocs (``mkdocs.yml``). The package has to be installed.
 """
 
 import contextlib
+import dataclasses
 import importlib
+import inspect
 import io
 import os
 import re
@@ -95,6 +97,35 @@ def _subcommands(text: str) -> Iterator[str]:
         yield from re.findall(r"^  ([a-z][a-z-]+)", block, re.MULTILINE)
 
 
+def names() -> str:
+    """The stable names of the package: what each takes, and its docstring."""
+    import vd
+
+    parts = []
+    for name in vd.__all__:
+        thing = getattr(vd, name)
+        parts += [f"## {name}", _documented(name, thing)]
+        # Of a class the methods that its docstring names.
+        methods = re.findall(r":meth:`(\w+)`", thing.__doc__) if inspect.isclass(thing) else ()
+        parts += [_documented(f"{name}.{method}", getattr(thing, method)) for method in methods]
+    return "\n\n".join(parts)
+
+
+def _documented(name: str, thing: Any) -> str:
+    """A class or function with its docstring, and its signature, unless that is long."""
+    own = inspect.isclass(thing) and not dataclasses.is_dataclass(thing)
+    texts = [inspect.getdoc(one) or "" for one in ([thing, thing.__init__] if own else [thing])]
+    text = re.sub(r":\w+:`([^`]+)`", r"\1", "\n\n".join(texts)).replace("``", "")
+    signature = str(inspect.signature(thing)).replace("'", "")
+    shown = f"{name}{signature if len(signature) < 2 * COLUMNS else '(...)'}"
+    return f"```text\n{shown}\n\n{textwrap.indent(text, '    ')}\n```"
+
+
+def own_terms() -> str:
+    """The example of own terms."""
+    return f"```python\n{(ROOT / 'examples/own_terms.py').read_text()}```"
+
+
 def constants() -> str:
     """The paper's constants with their sources."""
     from vd.paper import provenance
@@ -130,5 +161,12 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
 
-GENERATED = {"commands": commands, "constants": constants, "effects": effects, "registers": registers}
+GENERATED = {
+    "names": names,
+    "own_terms": own_terms,
+    "commands": commands,
+    "constants": constants,
+    "effects": effects,
+    "registers": registers,
+}
 """What takes the place of a comment ``<!-- generated: name -->``."""

@@ -203,7 +203,7 @@ def make_runner(scenes=None, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_
         scenes,
         AlignmentNetwork(cfg.network),
         cfg,
-        RunCfg(out=out, device="cpu", save_every=1, tensorboard=False, max_steps=steps),
+        RunCfg(out=out, device="cpu", save_every=1, logger="none", max_steps=steps),
         spec=AlignmentSpec(network=cfg.network, points=cfg.points, hand="dclaw3"),
         task={},
         looks=looks,

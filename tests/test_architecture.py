@@ -47,6 +47,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.assets_usd": (
         *LEAVES,
         "vd.config",
+        "vd.command_line",
         "vd.workers",
         "vd.warp_quiet",
         "vd.kernels",

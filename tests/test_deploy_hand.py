@@ -95,7 +95,10 @@ def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_pa
         ({"id": 10}, r"motors\.id are \[10, 10, 12.*give each motor its own"),
         ({"id": "11"}, r"motors\[1\]\.id: expected int, got '11'"),
         ({"offset_rad": float("nan")}, r"motors\.offset_rad of f0_j2 is nan"),
-        ({"offset": 0.1}, r"motors\[1\] has no field offset; it has id, joint, offset_rad, sign"),
+        (
+            {"offset": 0.1},
+            r"motors\[1\] has no field offset; is it offset_rad\? it has id, joint, offset_rad, sign",
+        ),
         ({"sign": None}, r"motors\[1\] has no sign; name it"),
         ({"joint": "f0_j1"}, "motors has 2 entries of f0_j1"),
         ({"joint": "thumb"}, "motors has no entries of f0_j2"),

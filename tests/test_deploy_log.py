@@ -3,6 +3,7 @@
 import json
 import os
 import threading
+from dataclasses import replace
 
 import imageio.v3 as iio
 import numpy as np
@@ -80,8 +81,12 @@ def test_a_log_is_shown(folder, tmp_path, capsys):
     assert "cannot be shown" in capsys.readouterr().err
 
 
-def test_the_viewer_steps_through_a_log(folder):
+def test_the_viewer_steps_through_a_log(folder, monkeypatch):
     session = Replay(read_log(folder))
+    assert session.snapshot.table
+    up = replace(session.hand, palm=-session.hand.palm)
+    monkeypatch.setattr("vd.play.replay.load_hand", lambda _: up)
+    assert not Replay(read_log(folder)).snapshot.table, "a palm that looks up has none"
     session.step()
     first = session.snapshot.time_s
     session.step()

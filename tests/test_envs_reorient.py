@@ -183,18 +183,6 @@ def test_evaluation_stops_at_success():
     assert not np.allclose(ended[:, :3], start), "the pose at the end is kept"
 
 
-def test_time_out_resets_and_says_so():
-    env = make(episode_s=0.5)
-    assert env.max_episode_steps == 6
-    run(env, 5)
-    assert not env.timed_out.numpy().any()
-    run(env, 1)
-    assert env.timed_out.numpy().all() and env.done.numpy().all()
-    assert (env.step_count.numpy() == 0).all()
-    columns = teacher_observation_slices(3, 9)["joint_velocity"]
-    assert np.abs(env.observation.numpy()[:, columns]).max() == 0.0, "the observation is of the new episode"
-
-
 @pytest.mark.parametrize(
     ("seeing", "object_signs"),
     [

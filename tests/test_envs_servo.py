@@ -121,18 +121,6 @@ def test_worlds_draw_from_the_identified_intervals(layer):
     assert still == pytest.approx(np.broadcast_to(env.hand.servo, still.shape), rel=1e-6)
 
 
-def test_effects_are_drawn_without_a_layer():
-    effects = {"command_delay.delay_s": (0.0, 0.04), "encoder_bias.bias_rad": (-0.02, 0.02)}
-    drawn = rows(make(num_envs=16, randomisation=dataclasses.replace(SERVOS, effects=effects)))
-    for column, (low, high) in (
-        (actuators.COMMAND_DELAY, (0.0, 0.04)),
-        (actuators.ENCODER_BIAS, (-0.02, 0.02)),
-    ):
-        values = drawn[:, :, column]
-        assert low <= values.min() < 0.7 * low + 0.3 * high < 0.3 * low + 0.7 * high < values.max() <= high
-    assert make(randomisation=dataclasses.replace(STILL, effects=effects)).sim.servo is None
-
-
 def test_servos_are_drawn_anew_and_started_anew_with_their_world_alone(layer):
     path = layer(backlash={"width_rad": (0.03, 0.02, 0.05)}, command_delay={"delay_s": 0.1})
     env = make(path, episode_s=0.5, randomisation=SERVOS)

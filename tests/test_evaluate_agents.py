@@ -8,6 +8,7 @@ import torch
 
 from vd.assets_usd.hands import hand_usd
 from vd.evaluate.agents import (
+    POLICY_FOLDER,
     SHIPPED_POLICIES,
     find_policy,
     open_policy,
@@ -18,6 +19,7 @@ from vd.evaluate.cli import main
 from vd.evaluate.conditions import CONDITIONS
 from vd.evaluate.result import SUCCESS, Result
 from vd.policy import load_policy
+from vd.policy_store import describe, read_store
 
 
 def task_of(policy, **changes):
@@ -25,8 +27,9 @@ def task_of(policy, **changes):
 
 
 @pytest.mark.parametrize("name", SHIPPED_POLICIES)
-def test_installed_policies_load_and_act(name):
-    policy = open_policy(name, "cpu")
+def test_installed_policies_load_act_and_are_listed(name):
+    policy, listed = open_policy(name, "cpu"), read_store(POLICY_FOLDER).policies
+    assert listed[name] == describe(name, SHIPPED_POLICIES[name]) and listed.keys() == SHIPPED_POLICIES.keys()
     assert name.split("-")[0] == policy.task["hand"], "the name begins with the hand"
     layers = policy if policy.kind == "teacher" else policy.teacher
     action = layers.act(torch.zeros(3, layers.num_observations))

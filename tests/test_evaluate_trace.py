@@ -228,12 +228,6 @@ def test_what_predicts_nothing_is_judged_by_the_success_criteria_of_training_too
     assert [row.headline for row in rows] == [True, False]
 
 
-def test_the_table_goes_and_comes_back():
-    env = HeldEnv(num_envs=1, max_episode_steps=6)
-    record(env, Turner(env), 2, **goal_ahead(1.0, 1, 2), table_steps=2)
-    assert env.tables == [(0, True), (2, False), (0, True), (2, False), (0, True)]
-
-
 @pytest.mark.parametrize("envs", [5, 40])
 def test_every_start_and_goal_is_run_once_whatever_the_number_of_environments(envs):
     objects = [FakeObject("a"), FakeObject("b", CUBE), FakeObject("c")]

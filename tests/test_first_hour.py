@@ -79,7 +79,7 @@ def documented_lines():
         for block in re.findall(r"^ *```(?:bash|sh|console)?\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE):
             for line in block.replace("\\\n", " ").splitlines():
                 if re.match(r"\s*vd-\w+(\s|$)", line):
-                    yield page.name, shlex.join(shlex.split(line, comments=True))
+                    yield page.name, shlex.join(shlex.split(line.partition(" > ")[0], comments=True))
         running = re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE)
         for code in re.findall(r"`(vd-[^`]* --[^`]+)`", running):
             yield page.name, " ".join(code.split())

@@ -1,6 +1,7 @@
 """Hands from URDF and MJCF: what the USD says against what MuJoCo reads in the same file, and refusals."""
 
 import itertools
+import json
 import re
 import sys
 from dataclasses import replace
@@ -17,11 +18,11 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd import cli
 from vd.assets_usd.hand_data import HandError, HandModel
 from vd.assets_usd.hand_import.importer import import_hand
+from vd.assets_usd.hand_import.source import read_source
 from vd.assets_usd.hand_model import open_stage
 from vd.assets_usd.hands import load_hand
 from vd.envs.cfg import ObservationCfg, ReorientCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import trained_task
 from vd.policy import load_policy
 from vd.train.cli import main as train
 
@@ -199,9 +200,10 @@ def test_newton_reads_the_same(toy):
     q = np.random.default_rng(1).uniform(hand.lower, hand.upper)
     local = hand.forward_kinematics(q)
     turn = Rotation.from_quat(hand.mount[3:])
-    np.testing.assert_allclose(
-        world.link_poses(q)[:, :3], turn.apply(local[:, :3]) + hand.mount[:3], atol=1e-6
-    )
+    poses = world.link_poses(q)
+    np.testing.assert_allclose(poses[:, :3], turn.apply(local[:, :3]) + hand.mount[:3], atol=1e-6)
+    off = (turn * Rotation.from_quat(local[:, 3:])).inv() * Rotation.from_quat(poses[:, 3:])
+    assert off.magnitude().max() < 1e-5
     np.testing.assert_allclose(builder.body_mass, hand.link_mass, rtol=1e-6)
     colliding = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES]
     assert sorted(builder.shape_body[i] for i in colliding) == [shape.link for shape in hand.shapes]
@@ -283,8 +285,18 @@ ARM = [
         (replaced("knob.stl", "gone.stl"), ("gone.stl", "put the file there")),
         (replaced('xyz="0 0 0.05"', 'xyz="0 0 50"'), ("m long", "convert the file to metres")),
         ([PARTS[0]], ("no joint moves",)),
+        (replaced(' scale="0.001 0.001 0.001"', ""), ("a mesh of a_2 is 40 m long", "scale")),
+        (replaced('radius="0.012"', 'radius="0"'), ("a sphere of b_2 is 0 m long",)),
+        (replaced('upper="1.4"', 'upper="90"'), ("a1 has the limits -0.2 and 90 rad", "in radians")),
+        (replaced('mass value="0.03"', 'mass value="-0.03"'), ("a_1 weighs -0.03 kg", "mass: {a_1")),
+        (replaced('xyz="0 0.6 0.8"', 'xyz="0 0 0"'), ("b3 has no axis",)),
+        (replaced('joint name="b2"', 'joint name="b1"'), ("b1 is the name of more than one joint",)),
+        (replaced('joint="b3"', 'joint="zz"'), ("unknown joint 'zz'",)),
+        (replaced("knob.stl", "package://toys/knob.stl"), ("package://toys", "folder above toy.urdf")),
+        (replaced('rpy="0 0 0.3"', 'rpy="0 0 ${turn}"'), ("xacro toy.urdf > hand.urdf",)),
+        ([re.sub("<collision>.*</collision>", "", p) for p in PARTS], ("nothing collides of a_2",)),
     ],
-    ids=["prismatic", "endless", "branch", "arm", "effort", "mimic", "mesh", "units", "none"],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
 )
 def test_what_cannot_be_imported_is_refused_by_name(tmp_path, parts, words):
     path = write_urdf(tmp_path, parts)
@@ -293,6 +305,12 @@ def test_what_cannot_be_imported_is_refused_by_name(tmp_path, parts, words):
     for word in (str(path), *words):
         assert word in str(caught.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_mirrored_mesh_is_not_inside_out(tmp_path):
+    path = write_urdf(tmp_path, replaced('scale="0.001', 'scale="-0.001'))
+    (mesh,) = (shape for link in read_source(path).links for shape in link.shapes if shape.kind == "mesh")
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume == pytest.approx(0.02 * 0.016 * 0.04, rel=1e-4)
 
 
 def test_a_tendon_over_two_joints_is_refused_until_it_is_described(tmp_path):
@@ -317,9 +335,27 @@ def test_a_tendon_over_two_joints_is_refused_until_it_is_described(tmp_path):
     assert hand.mimic[1] == 0 and hand.actuated.tolist() == [0, 2, 3, 4]
 
 
-def test_impossible_inertia_is_raised_and_said(tmp_path):
-    done = import_hand(write_urdf(tmp_path, replaced('izz="1e-5"', 'izz="9e-5"')), tmp_path / "out")
-    assert any("no body has the moments" in note and "a_1" in note for note in done.notes)
+def test_what_is_seldom_meant_or_left_out_is_said(tmp_path):
+    parts = replaced('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><dynamics friction="0.1"/>')
+    for old, new in (('izz="1e-5"', 'izz="9e-5"'), ('"0.8"', '"2"'), ('"a1"', '"hand/a1"')):
+        parts = [part.replace(old, new) for part in parts]
+    parts[3] = parts[3].replace("e-5", "")
+    done = import_hand(write_urdf(tmp_path, [*parts, link("lost", 0.03)]), tmp_path / "out")
+    said = "\n".join([*done.notes, *done.warnings])
+    for words in (
+        "no body has the moments",
+        "dry friction is left out: of hand/a1, a2, b2, b4",
+        "lost is joined to nothing",
+        "b4 follows b3 to -0.35 and 2.85 rad, beyond its limits -0.20 and 1.40",
+        "a_1 turns like a body of",
+    ):
+        assert words in said, words
+    assert done.sources == ["hand/a1", "a2", "b1", "b2", "b3", "b4"]
+    assert not any("replaces" in text for text in done.warnings)
+    other = write_urdf(tmp_path).rename(tmp_path / "left.urdf")
+    assert any(
+        "toy was imported from toy.urdf" in text for text in import_hand(other, tmp_path / "out").warnings
+    )
 
 
 @pytest.mark.parametrize(
@@ -329,6 +365,8 @@ def test_impossible_inertia_is_raised_and_said(tmp_path):
         ("palms: [0, 0, 1]", "no field palms"),
         ("hold: {zz: 0}", "there is no joint zz; there are a1"),
         ("tips: {zz: [0, 0, 0]}", "there is no link zz"),
+        ("start: {b2: 5}", "start: 5 rad is beyond the limits of b2, -0.2 to 1.4"),
+        ("hold: {b1: 5}", "hold: 5 rad is beyond the limits of b1"),
         ("[1, 2", "said.yaml"),
     ],
 )
@@ -422,9 +460,11 @@ def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
     small = ["--num-envs", "8", "--ppo.minibatch-size", "32", "--max-steps", "128", "--device", "cpu"]
     flags = ["--preset", "leap-objects", "--objects", "cube", "--hand", str(hand.path), *small]
     assert train(["teacher", *flags, "--out", str(tmp_path / "run")]) == 0
+    rows = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
+    assert len(rows) > 1 and all(row["loss/kl"] > 0.0 and row["loss/value"] > 0.0 for row in rows)
     policy = load_policy(tmp_path / "run" / "policy.pt")
     assert policy.num_actions == 5
-    env = ReorientEnv(trained_task(policy), "cpu")
+    env = ReorientEnv(ReorientCfg.of(policy), "cpu")
     assert env.objects[0].longest_side == pytest.approx(0.05)
     np.testing.assert_allclose(np.ptp(env.objects[0].hulls[0].vertices, axis=0), 0.05, rtol=1e-6)
     env.step(wp.from_torch(policy.act(wp.to_torch(env.observation))))

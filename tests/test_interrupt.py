@@ -35,20 +35,6 @@ def test_every_command_ends_with_128_and_the_signals_number(script, number, monk
 
 
 @pytest.mark.parametrize("number", STATUS)
-def test_a_command_that_only_knows_that_it_was_interrupted_ends_so_too(number):
-    @interrupt.command("vd-some")
-    def exits() -> None:
-        try:
-            os.kill(os.getpid(), number)
-        except KeyboardInterrupt:  # what is finished is kept
-            sys.exit(interrupt.INTERRUPTED)
-
-    with pytest.raises(SystemExit) as end:
-        exits()
-    assert end.value.code == STATUS[number]
-
-
-@pytest.mark.parametrize("number", STATUS)
 def test_a_signal_that_arrives_in_a_finaliser_is_not_lost(number):
     class Finalised:
         def __del__(self) -> None:

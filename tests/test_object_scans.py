@@ -79,6 +79,8 @@ def test_a_scan_is_noisy_and_misses_one_side():
     scanned = scan(whole, rng)
     assert scanned.shape == whole.shape
     assert scan(whole.astype(np.float32), rng).dtype == np.float32, "of the kind that the search for it takes"
+    first = np.abs(scanned[:100].mean(axis=0) - scanned.mean(axis=0))
+    assert first.max() < 0.3 * RADIUS_M, "in no order: a network takes the first points for the whole"
     off = np.linalg.norm(scanned, axis=1) - RADIUS_M  # across the surface only one axis of the noise shows
     assert off.std() == pytest.approx(NOISE_M, rel=0.1)
     side = -scanned.mean(axis=0) / np.linalg.norm(scanned.mean(axis=0))

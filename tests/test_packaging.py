@@ -13,7 +13,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from vd.evaluate.agents import SHIPPED_POLICIES
+from vd.evaluate.agents import DEFAULT_POLICY, POLICY_LIST, SHIPPED_POLICIES
+from vd.train.demo import CAMERA_POLICY
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -85,12 +86,12 @@ def test_wheel_holds_modules_policies_and_what_else_is_read(wheel):
     assert {f"vd/templates/{path.name}" for path in (ROOT / "vd/templates").iterdir()} <= sizes.keys()
     assert {f"vd/assets_usd/usd/{path.name}" for path in (ROOT / "assets_usd/usd").iterdir()} <= sizes.keys()
     assert "vd/py.typed" in sizes and any(name.endswith("licenses/LICENSE") for name in sizes)
-    assert {name for name in sizes if name.endswith(".pt")} == {
-        f"vd/policies/{path.name}" for path in SHIPPED_POLICIES.values()
-    }
-    for name in SHIPPED_POLICIES:  # exports, not checkpoints: those hold optimiser and worlds
+    shipped = {DEFAULT_POLICY, CAMERA_POLICY}  # others are pulled
+    assert {name for name in sizes if name.endswith(".pt")} == {f"vd/policies/{name}.pt" for name in shipped}
+    assert f"vd/policies/{POLICY_LIST}" in sizes
+    for name, path in SHIPPED_POLICIES.items():  # exports, not checkpoints: those hold optimiser and worlds
         most = MAX_POLICY_BYTES + (ALIGNMENT_BYTES if name.endswith("-vision") else 0)
-        assert sizes[f"vd/policies/{name}.pt"] < most
+        assert path.stat().st_size < most
 
 
 def test_wheel_runs_from_a_fresh_folder(wheel, tmp_path):
@@ -127,5 +128,5 @@ def test_what_messages_and_pages_tell_to_install_exists():
         for path in (ROOT / folder).rglob("*.*"):
             if path.suffix in (".py", ".md"):
                 told |= set(re.findall(r"pip install [^\n`]*?'([^'\n]*\[[^'\n]*)'", path.read_text()))
-    assert told == {f".[{extra}]" for extra in ("hardware", "export", "docs")}
-    assert {"hardware", "export", "docs"} <= PROJECT["project"]["optional-dependencies"].keys()
+    assert told == {f".[{extra}]" for extra in ("hardware", "export", "gym", "docs")}
+    assert {"hardware", "export", "gym", "docs"} <= PROJECT["project"]["optional-dependencies"].keys()

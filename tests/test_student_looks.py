@@ -94,7 +94,7 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     sizes = {"batch": 8, "steps": 2, "shapes": 8, "hands": 4, "points": 64, "views": 1, "fresh-shapes": 1}
     small = [word for name, value in sizes.items() for word in (f"--align.{name}", str(value))]
     network = ["--align.network.width", "16", "--align.network.tokens", "12", "--align.network.layers", "1"]
-    common = ["--preset", "cpu-demo", "--num-envs", "2", "--no-tensorboard", "--teacher", "dclaw3"]
+    common = ["--preset", "cpu-demo", "--num-envs", "2", "--logger", "none", "--teacher", "dclaw3"]
     common += ["--objects", "cube", *small]
     folders = [tmp_path / f"stage{number}" for number in (0, 1)]
     assert main(["student", *common, *network, "--out", str(folders[0]), "--max-steps", "32"]) == 0

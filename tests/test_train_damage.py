@@ -126,16 +126,16 @@ def test_checkpoints_of_a_run_that_went_on_from_an_older_one_are_kept(tmp_path, 
 
 
 @pytest.mark.parametrize(
-    ("limit", "tensorboard", "named"),
+    ("limit", "logger", "named"),
     [
-        (45_000, False, r"progress\.jsonl"),
-        (45_000, True, "tensorboard"),
-        (30_000, False, r"model_0000010\.pt"),
+        (45_000, "none", r"progress\.jsonl"),
+        (45_000, "tensorboard", "tensorboard"),
+        (30_000, "none", r"model_0000010\.pt"),
     ],
 )
-def test_a_full_disk_ends_a_run_in_words_and_it_can_go_on(tmp_path, capfd, limit, tensorboard, named):
+def test_a_full_disk_ends_a_run_in_words_and_it_can_go_on(tmp_path, capfd, limit, logger, named):
     make_runner(tmp_path).learn(1)
-    runner = make_runner(tmp_path, save_every=10, tensorboard=tensorboard)
+    runner = make_runner(tmp_path, save_every=10, logger=logger)
     runner.load(str(find_checkpoint(tmp_path, "latest")))
     with small_files(limit), pytest.raises(OutputError, match=rf"cannot write .*{named}: File too large"):
         runner.learn(100)

@@ -8,8 +8,8 @@ import torch
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
 from vd.config import to_dict
-from vd.envs.cfg import CurriculumCfg, TighteningCfg
-from vd.evaluate.agents import SHIPPED_POLICIES, trained_task
+from vd.envs.cfg import CurriculumCfg, ReorientCfg, TighteningCfg
+from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.policy import MeanAction, load_policy, policy_export
 from vd.train import begin
 from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start
@@ -94,28 +94,6 @@ def test_only_the_critic_learns_while_it_warms_up(tmp_path, monkeypatch, schedul
         0,
         0,
     ]
-
-
-def test_a_run_that_stops_while_the_critic_warms_up_goes_on_with_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(begin, "CRITIC_WARMUP", 4)
-    path = _export(tmp_path / "first", critic=False)
-    whole = _begun(tmp_path / "whole", path)
-    whole.learn(6)
-    part = _begun(tmp_path / "part", path)
-    part.learn(2)
-    checkpoint = find_checkpoint(tmp_path / "part", "latest")
-    assert "critic_state_dict" not in load_checkpoint(tmp_path / "part" / "policy.pt"), (
-        "it is worth nothing yet"
-    )
-    resumed = make_runner(tmp_path / "part", seed=99, policy=NORMALISING, ppo=LEARNED)
-    resumed.load(str(checkpoint))
-    assert resumed.critic_warmup == 2
-    resumed.learn(4)
-    assert _same(_state(whole.alg.actor), _state(resumed.alg.actor)) == list(_state(whole.alg.actor))
-    again = make_runner(tmp_path / "again", policy=NORMALISING, ppo=LEARNED)
-    again.begin_from(str(checkpoint))
-    assert again.critic_warmup == 2, "another run that begins from it has what is left to do"
-    assert "critic_state_dict" in policy_export(load_checkpoint(find_checkpoint(tmp_path / "part", "latest")))
 
 
 @pytest.mark.parametrize(
@@ -222,7 +200,7 @@ def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
     cfg = parse_teacher(["--init", name, "--objects", "cube", "--num-envs", "8"])
     state = load_checkpoint(SHIPPED_POLICIES[name])
     assert cfg.env.objects == ("cube",) and cfg.env.num_envs == 8
-    trained = trained_task(load_policy(SHIPPED_POLICIES[name]))
+    trained = ReorientCfg.of(load_policy(SHIPPED_POLICIES[name]))
     assert replace(cfg.env, objects=trained.objects, num_envs=trained.num_envs) == trained
     for field in ("hidden", "distribution", "normalise_observations"):
         wanted = state["policy"][field]

@@ -1,10 +1,10 @@
-"""The teacher's network as ONNX."""
+"""The networks of policies as ONNX."""
 
 import numpy as np
 import pytest
 import torch
 
-from vd.evaluate.agents import SHIPPED_POLICIES
+from vd.evaluate.agents import SHIPPED_POLICIES, open_policy
 from vd.policy import load_policy
 from vd.train.cli import main
 
@@ -14,7 +14,7 @@ onnxruntime = pytest.importorskip("onnxruntime", reason="pip install 'visual-dex
 @pytest.mark.parametrize("name", ["dclaw3", "dclaw4-cube"], ids=["state-dependent", "gaussian"])
 def test_onnxruntime_gives_the_same_actions_for_any_number_of_worlds(tmp_path, name, capsys):
     assert main(["export", str(SHIPPED_POLICIES[name]), str(tmp_path / "policy.onnx")]) == 0
-    assert "the same actions within" in capsys.readouterr().out
+    assert "gives the same within" in capsys.readouterr().out
     policy = load_policy(SHIPPED_POLICIES[name])
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
     for envs in (1, 7):
@@ -24,6 +24,20 @@ def test_onnxruntime_gives_the_same_actions_for_any_number_of_worlds(tmp_path, n
         (found,) = session.run(["action"], {"observation": observation.numpy()})
         assert found.shape == (envs, policy.num_actions)
         np.testing.assert_allclose(found, policy.act(observation).numpy(), atol=1e-4)
+
+
+def test_a_vision_policy_has_two_networks_and_looks_at_any_number_of_points(tmp_path):
+    assert main(["export", "dclaw4-vision", str(tmp_path / "policy.onnx")]) == 0
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy-alignment.onnx"))
+    policy = open_policy("dclaw4-vision", "cpu")
+    for pairs, goals, seen in ((1, 500, 512), (5, 300, 200)):
+        clouds = [0.03 * torch.randn(pairs, points, 3) for points in (goals, seen)]
+        told = dict(zip(("goal_points", "seen_points"), (cloud.numpy() for cloud in clouds), strict=True))
+        for name, wanted in vars(policy.alignment(*clouds)).items():
+            (found,) = session.run([name], told)
+            np.testing.assert_allclose(found, wanted.detach().numpy(), atol=1e-4)
+    actions = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
+    assert actions.get_inputs()[0].shape[1] == policy.teacher.num_observations
 
 
 def test_a_file_with_other_actions_is_not_written(tmp_path, monkeypatch):

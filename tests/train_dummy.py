@@ -187,7 +187,7 @@ def make_runner(
     """A runner on the dummy, deterministic from ``seed``."""
     torch.manual_seed(seed)
     env = env or DummyEnv(num_envs=16, seed=seed, device=device)
-    settings = RunCfg(out=run_dir, device=device, **{"save_every": 3, "tensorboard": False, **run})
+    settings = RunCfg(out=run_dir, device=device, **{"save_every": 3, "logger": "none", **run})
     task = {"hand": "dummy", "tolerance": PAPER.success.rotation_rad}
     return TeacherRunner(
         ReorientVecEnv(env), ppo, policy, settings, task=task, device=device, deadline=deadline

@@ -107,13 +107,15 @@ def tracking(work: Path, objects: Path) -> dict[str, Any]:
 def tasks() -> dict[str, Any]:
     """Every task that ships, of presets, policies and conditions, and options that none of them has."""
     from vd.assets_usd.hands import HANDS
-    from vd.evaluate.agents import open_teacher, trained_task
+    from vd.envs.cfg import ReorientCfg
+    from vd.evaluate.agents import open_teacher
     from vd.evaluate.conditions import CONDITIONS
     from vd.train.presets import PRESETS
 
     presets = {f"preset {name}": preset().env for name, preset in PRESETS.items()}
     found = {name: env for name, env in presets.items() if env.hand in HANDS}  # others have to be imported
-    found |= {f"policy {n}": trained_task(open_teacher(n, "cpu")) for n in {w[0] for w in TEACHERS.values()}}
+    teachers = {words[0] for words in TEACHERS.values()}
+    found |= {f"policy {name}": ReorientCfg.of(open_teacher(name, "cpu")) for name in teachers}
     table, four = found["policy dclaw3"], found["policy dclaw4"]
     found |= {f"condition {name}": replace(table, randomisation=drawn) for name, drawn in CONDITIONS.items()}
     for view, base in (("world", table), ("mirrored", table)):

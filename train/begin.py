@@ -41,11 +41,11 @@ def find_start(name: str) -> Path:
         ValueError: It is a bundle.
     """
     from vd.bundle import is_bundle
-    from vd.evaluate.agents import SHIPPED_POLICIES, find_policy
+    from vd.evaluate.agents import find_policy, installed_policies
     from vd.train.checkpoint import BEST_NAME, CHECKPOINT_FOLDER
 
     best = Path(name) / CHECKPOINT_FOLDER / BEST_NAME
-    if name not in SHIPPED_POLICIES and best.is_file():
+    if name not in installed_policies() and best.is_file():
         return best
     try:
         path = find_policy(name)
@@ -112,6 +112,11 @@ def widen(state: dict[str, Any], actor: "nn.Module", critic: "nn.Module") -> tup
     from vd.policy import policy_export
 
     widened, most = {}, 0
+    before, now = (w["mlp.0.weight"].shape[1] for w in (state["actor_state_dict"], actor.state_dict()))
+    told = state.get("critic_state_dict", {}).get("mlp.0.weight")
+    if told is not None and told.shape[1] > before < now:
+        # What a critic is told besides comes after what is new, where its weights do not look for it.
+        state = {key: value for key, value in state.items() if key != "critic_state_dict"}
     for key, network in (("actor_state_dict", actor), ("critic_state_dict", critic)):
         if key not in state:
             continue

@@ -15,7 +15,7 @@ commands:
   tracker    let it act by a camera, learn nothing vd-train tracker dclaw3 --objects SET
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
-             or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
+             or any policy's networks as ONNX     vd-train export POLICY policy.onnx
   bundle     write a policy as it is deployed     vd-train bundle tracking.pt bundles/first
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset gpu

@@ -3,6 +3,7 @@
 Defaults are the paper's (Table S1), or its released code's where the paper says nothing.
 """
 
+import importlib.util
 import math
 import time
 from dataclasses import dataclass
@@ -87,6 +88,7 @@ class RunCfg:
         "keep_last": 3,
         "keep_every": Dropped(None),
         "stagger": True,
+        "tensorboard": Renamed("logger", {True: "tensorboard", False: "none"}),
     }
     out: Path = Path("runs/teacher")
     """Folder for configuration, checkpoints and TensorBoard files."""
@@ -101,8 +103,9 @@ class RunCfg:
     keep the task's own, and are judged in it."""
     save_every: int = 100
     """Iterations between checkpoints."""
-    tensorboard: bool = True
-    """Write TensorBoard files (tensorboard --logdir RUN-DIR)."""
+    logger: Literal["tensorboard", "wandb", "none"] = "tensorboard"
+    """Where curves go beside progress.jsonl: files for tensorboard --logdir RUN, or these and Weights &
+    Biases (pip install wandb; WANDB_MODE=offline needs no account)."""
 
     def deadline(self, started: float | None) -> float | None:
         """``time.monotonic()`` at which a run that began at ``started``, or now, ends; None: no limit."""
@@ -113,6 +116,8 @@ class RunCfg:
     def validate(self) -> None:
         """Raise ValueError naming the flag, its value and what it has to be."""
         require(self, "--", "positive", "max_steps max_minutes save_every")
+        if self.logger == "wandb" and importlib.util.find_spec("wandb") is None:
+            raise ValueError("--logger wandb needs wandb, which is not installed: pip install wandb")
 
 
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from vd import interrupt
+from vd.command_line import parse
 from vd.config import require
 from vd.evaluate.agents import check_names
 from vd.files import check_folder
@@ -282,7 +283,7 @@ def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:
 @interrupt.command("demo")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; returns the exit status: 1 if a part failed."""
-    cfg = tyro.cli(DemoCfg, args=arguments, prog="python -m vd.train.demo")
+    cfg: DemoCfg = parse(DemoCfg, arguments, prog="python -m vd.train.demo")
     require(cfg, "--", "positive", "minutes")
     check_names([CAMERA_POLICY], [])
     check_folder(cfg.out)

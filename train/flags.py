@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 import tyro
 
+from vd.command_line import ConfigFile, parse, take_config
 from vd.config import from_dict, to_dict
 from vd.device import resolve_device
 from vd.evaluate.agents import check_names
@@ -32,6 +33,7 @@ Ctrl-C saves. --help-all lists the flags of physics, reward, success and of the 
 
 _RARE = {
     "env": "sim action reward success visuals table_friction",
+    "env.observation": "terms critic_terms",
     "env.curriculum.tightening": "joint_speed_rad_s object_speed_m_s object_spin_rad_s action_norm",
     "env.randomisation": "stiffness_scale damping_scale link_mass_scale friction table_friction "
     "object_scale object_scale_count object_mass_kg action_noise_std action_offset_std "
@@ -45,43 +47,66 @@ SHORT_FORMS = {name: f"env.{name}" for name in ("hand", "hand-layer", "objects",
     "randomise": "env.randomisation.enabled"
 }
 """Flags that are short for others: fields of the environment that are common enough."""
+STARTS = {
+    **{name: f"--{name}" for name in ("preset", "init", "resume", "smoke", "stage")},
+    **{f"run.{name}": f"--{name}" for name in ("out", "device")},
+    "env.hand": "--env.hand",
+}
+"""What decides from where a configuration starts, by its place in a file."""
 
 
 def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | None = None) -> TeacherCfg:
     """The configuration that command-line flags ask for; ``say`` is told which preset the machine decided.
 
     The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins from, or the
-    run's own configuration with ``--resume``), the second reads every flag with those values as defaults.
+    run's own configuration with ``--resume``), as flags and ``--config`` say; the second reads every flag
+    with those values, and over them those of the file, as defaults.
 
     Raises:
         FileNotFoundError: ``--resume`` names a run without a configuration.
         ValueError: There is no such preset, the run's configuration is not one of this version, or ``--init``
             is no teacher.
     """
-    arguments = normalise(arguments, SHORT_FORMS)
+    arguments, file = starting(normalise(arguments, SHORT_FORMS), GONE)
     preset, init, resume = (value_of(arguments, flag) for flag in ("--preset", "--init", "--resume"))
     out = value_of(arguments, "--out")
     saved = resume is not None and out is not None and (Path(out) / CONFIG_NAME).is_file()
     if preset is not None and preset not in PRESETS:
         instead = GONE.get(preset, f"one of {', '.join(PRESETS)}")
         raise ValueError(f"--preset {preset} is none; {instead}")
+    reason = ""
     if "--smoke" in arguments:
         start = smoke()
     elif preset is None and init is not None:
         start = settings_of(init, PRESETS["gpu"]())
     elif preset is None and not saved:
         # Wrong flags and names, and --help, do not wait for torch.
-        _parsed(arguments, PRESETS["gpu"]())
+        _parsed(arguments, PRESETS["gpu"](), file)
         preset, reason = machine_preset(value_of(arguments, "--device"))
         start = PRESETS[preset]()
-        if say is not None:
-            say(f"preset {preset}, since none is named: {reason}")
     else:
         start = PRESETS[preset or "gpu"]()
     if init is None:
         start = for_hand(start, value_of(arguments, "--env.hand"))
     base = (saved_config(arguments, start) or start) if resume is not None else start
-    return _parsed(arguments, base)
+    cfg = _parsed(arguments, base, file)
+    if say is not None and reason:
+        say(f"preset {preset}, since none is named: {reason}")
+    return cfg
+
+
+def starting(arguments: list[str], gone: Collection[str] = ()) -> tuple[list[str], ConfigFile | None]:
+    """A command line with what a ``--config`` says of where to start from before it, and that file.
+
+    A file of a preset that is ``gone`` was written by an earlier version, and has all settings.
+    """
+    arguments, file = take_config(arguments)
+    if file is None:
+        return arguments, None
+    words = file.words(STARTS)
+    if value_of(words, "--preset") in gone:
+        words[:2] = ["--preset", "gpu"]
+    return words + arguments, file
 
 
 def machine_preset(device: str | None) -> tuple[str, str]:
@@ -121,15 +146,18 @@ def value_of(arguments: list[str], flag: str) -> str | None:
     return arguments[places[-1] + 1] if places else None
 
 
-def _parsed(arguments: list[str], default: TeacherCfg) -> TeacherCfg:
-    """Every flag, with the values of ``default`` for those that are not given; wrong names are refused."""
+def _parsed(arguments: list[str], default: TeacherCfg, file: ConfigFile | None) -> TeacherCfg:
+    """Every flag, with the values of ``file`` and ``default`` for the others; wrong names are refused."""
     kind: Any = TeacherCfg
+    default = default if file is None else file.over(default)
     if "--help-all" in arguments:
         arguments = ["--help"]
     elif {"-h", "--help"} & set(arguments):
         kind = _without(TeacherCfg, OF_HELP_ALL)
         default = from_dict(kind, to_dict(default))
-    cfg = tyro.cli(kind, args=arguments, default=default, prog="vd-train teacher", description=TEACHER_HELP)
+    cfg: TeacherCfg = parse(
+        kind, arguments, default=default, prog="vd-train teacher", description=TEACHER_HELP
+    )
     check_names((), cfg.env.objects, cfg.env.hand)
     drawn, before = cfg.env.randomisation, default.env.randomisation
     given = [name for name, value in vars(before).items() if getattr(drawn, name) != value]

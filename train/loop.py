@@ -124,7 +124,7 @@ class TrainingLoop:
         with contextlib.ExitStack() as stack:
             log: ProgressFile | None = None
             if self.is_main:
-                log = ProgressFile(self.run.out, tensorboard=self.run.tensorboard, done=first)
+                log = ProgressFile(self.run.out, self.run.logger, done=first)
                 stack.callback(log.close)
             stack.enter_context(self._signals(lines))
             stack.enter_context(lines)

@@ -10,9 +10,11 @@ from typing import Any
 import torch
 
 from vd.files import make_folder, write_text, writing
+from vd.train.flags import CONFIG_NAME
 
 PROGRESS_FILE = "progress.jsonl"
 BOARD_FOLDER = "tensorboard"
+WANDB_PROJECT = "visual-dexterity"
 
 
 class StepMeans:
@@ -94,24 +96,19 @@ class GoalWindow:
 
 
 class ProgressFile:
-    """One JSON object per iteration in ``progress.jsonl``, and with ``tensorboard`` the same numbers there.
+    """One JSON object per iteration in ``progress.jsonl``, and the same numbers for ``logger`` (``RunCfg``).
 
     Of an earlier run of this folder ``done`` iterations are kept; a resumed run writes later ones anew.
     """
 
-    def __init__(self, run_dir: Path, *, tensorboard: bool = True, done: int = 0) -> None:
+    def __init__(self, run_dir: Path, logger: str = "tensorboard", *, done: int = 0) -> None:
         make_folder(run_dir)
         path = self._path = run_dir / PROGRESS_FILE
         kept = [row for row in read_progress(path) if row["iteration"] <= done] if path.is_file() else []
         write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
         with writing(path):
             self._file = path.open("ab", buffering=0)
-        self._board: Any = None
-        if tensorboard:
-            from torch.utils.tensorboard import SummaryWriter  # heavy, and optional
-
-            threading.excepthook = _report_thread
-            self._board = SummaryWriter(str(run_dir / BOARD_FOLDER), purge_step=done + 1, flush_secs=10)
+        self._board = None if logger == "none" else _board(run_dir, logger, done)
 
     def write(self, row: dict[str, Any]) -> None:
         """Add an iteration. Values that are not finite become ``null``.
@@ -142,6 +139,24 @@ class ProgressFile:
         self._file.close()
         if self._board is not None:
             self._board.close()
+            getattr(self._board, "stop", lambda: None)()  # of Weights & Biases
+
+
+def _board(run_dir: Path, logger: str, done: int) -> Any:
+    """What draws curves; it has ``add_scalar``."""
+    threading.excepthook = _report_thread
+    folder = str(run_dir / BOARD_FOLDER)
+    if logger == "tensorboard":
+        from torch.utils.tensorboard import SummaryWriter  # heavy, and optional
+
+        return SummaryWriter(folder, purge_step=done + 1, flush_secs=10)
+    import wandb
+    from rsl_rl.utils.wandb_log_writer import WandbLogWriter
+
+    board = WandbLogWriter(folder, WANDB_PROJECT)
+    wandb.run.name = run_dir.name
+    wandb.config.update(json.loads((run_dir / CONFIG_NAME).read_text()))
+    return board
 
 
 def _report_thread(args: threading.ExceptHookArgs) -> None:

@@ -264,7 +264,7 @@ def smoke() -> TeacherCfg:
             max_steps=2048,
             max_minutes=1.0,
             save_every=1,
-            tensorboard=False,
+            logger="none",
         ),
         ppo=replace(cfg.ppo, minibatch_size=128, epochs=2),
         env=replace(cfg.env, num_envs=16, start=replace(cfg.env.start, poses=1)),  # finding them takes long

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vd.command_line import parse
 from vd.evaluate.cfg import EpisodeFlags, EvalCfg
 from vd.evaluate.goals import Goals
 from vd.files import check_file
@@ -56,7 +57,7 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
         ValueError: The teacher is none, or observes what no camera shows, or no rule stops any episode within
             the tolerance.
     """
-    cfg = tyro.cli(TrackerCfg, args=arguments, prog="vd-train tracker")
+    cfg: TrackerCfg = parse(TrackerCfg, arguments, prog="vd-train tracker")
     cfg.validate()
     check_file(cfg.out)
     from vd.evaluate.agents import check_names, open_teacher, policy_name
@@ -75,6 +76,8 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     teacher = open_teacher(cfg.teacher, device)
     if teacher is None:
         raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
+    if own := teacher.task["observation"].get("terms"):
+        raise ValueError(f"{cfg.teacher} observes {', '.join(own)}, which no camera shows; give another")
     spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
     policy = TrackingPolicy(teacher, spec)
     if cfg.alignment is not None:

@@ -14,7 +14,7 @@ from vd.paper import PAPER
 OBSERVATION_GROUP = "policy"
 """What actor and critic both read; all there is in the paper."""
 PRIVILEGED_GROUP = "privileged"
-"""What the critic alone reads besides (``ObservationCfg.dynamics``)."""
+"""What the critic alone reads besides (``ObservationCfg.dynamics``, ``critic_terms``)."""
 
 
 class ReorientVecEnv(VecEnv):
@@ -76,7 +76,7 @@ class ReorientVecEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         """The observation for the next action, ``{"policy": [N, O]}``, a copy on the device.
 
-        With ``ObservationCfg.dynamics`` also ``"privileged"``, [N, P].
+        Where the critic is told more also ``"privileged"``, [N, P].
         """
         copies = {group: values.clone() for group, values in self._observed.items()}
         return TensorDict(copies, batch_size=[self.num_envs])

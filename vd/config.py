@@ -1,6 +1,7 @@
 """Typed configurations to and from plain dictionaries (JSON, checkpoints), checked field by field."""
 
 import dataclasses
+import difflib
 import types
 import typing
 import warnings
@@ -21,9 +22,10 @@ class Dropped:
 
 @dataclasses.dataclass(frozen=True)
 class Renamed:
-    """In ``RETIRED``: a field that has another name now."""
+    """In ``RETIRED``: a field that has another name now, and what became of its values where they changed."""
 
     name: str
+    values: Mapping[Any, Any] = dataclasses.field(default_factory=dict)
 
 
 def to_dict(value: Any) -> Any:
@@ -47,8 +49,10 @@ def to_dict(value: Any) -> Any:
     raise TypeError(f"a configuration cannot hold a {type(value).__name__}: {value!r}")
 
 
-def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
+def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "", over: T | None = None) -> T:
     """Build the dataclass ``cls`` from what :func:`to_dict` wrote. Fields that are absent keep their default.
+
+    With ``over`` they are as in that one, in groups too.
 
     A class that lost a field says so in ``RETIRED``: by name the value that means what is now always so, of a
     group that went the values of those fields that say so. Others are refused, but for :class:`Dropped`.
@@ -64,21 +68,45 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
     names = {field.name for field in fields}
     unknown = sorted(set(values) - names)
     if unknown:
+        meant = _meant(unknown[0], names, hints)
         raise ValueError(
-            f"{where or cls.__name__} has no field {', '.join(unknown)}; it has {', '.join(sorted(names))}"
+            f"{where or cls.__name__} has no field {', '.join(unknown)}; {meant}it has "
+            f"{', '.join(sorted(names))}"
         )
-    needed = [field for field in fields if field.default is field.default_factory is dataclasses.MISSING]
-    left_out = {field.name for field in needed} - set(values)
-    if left_out:
+    left_out = needed(cls) - values.keys()
+    if left_out and over is None:
         raise ValueError(f"{where or cls.__name__} has no {', '.join(sorted(left_out))}; name it")
     prefix = f"{where}." if where else ""
-    return cls(**{name: _convert(hints[name], item, prefix + name) for name, item in values.items()})
+    found = {
+        name: _convert(hints[name], item, prefix + name, getattr(over, name, None))
+        for name, item in values.items()
+    }
+    return cls(**found) if over is None else dataclasses.replace(over, **found)  # type: ignore[type-var]
+
+
+def needed(cls: type) -> set[str]:
+    """Names of the fields of a dataclass that have no default."""
+    missing = dataclasses.MISSING
+    return {one.name for one in dataclasses.fields(cls) if one.default is one.default_factory is missing}
+
+
+def _meant(name: str, names: set[str], hints: Mapping[str, Any]) -> str:
+    """Asks for the field that ``name`` is likely meant to be, one of a group or one that is spelled alike."""
+    groups = {one: hints[one] for one in sorted(names) if dataclasses.is_dataclass(hints[one])}
+    inside = [
+        f"{one}.{name}" for one, kind in groups.items() if name in {f.name for f in dataclasses.fields(kind)}
+    ]
+    found = inside + difflib.get_close_matches(name, sorted(names), 1)
+    return f"is it {found[0]}? " if found else ""
 
 
 def without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], where: str) -> dict[str, Any]:
     """``values`` without fields that are no more, and with today's names; ``retired`` is as ``RETIRED``."""
-    new = {old: to.name for old, to in retired.items() if isinstance(to, Renamed)}
-    values = {new.get(name, name): value for name, value in values.items()}
+    new = {old: to for old, to in retired.items() if isinstance(to, Renamed) and old in values}
+    values = {name: value for name, value in values.items() if name not in new} | {
+        to.name: to.values.get(values[old], values[old]) if to.values else values[old]
+        for old, to in new.items()
+    }
     for name in retired.keys() & values.keys():
         value, wanted = values[name], retired[name]
         if isinstance(wanted, Mapping) and wanted and isinstance(value, Mapping):
@@ -94,19 +122,23 @@ def without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], where
     return {name: value for name, value in values.items() if name not in retired}
 
 
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    """``value`` as the type ``hint`` asks for: nested dataclasses, tuples, paths and unions of them."""
+def _convert(hint: Any, value: Any, where: str, over: Any = None) -> Any:
+    """``value`` as the type ``hint`` asks for: nested dataclasses, tuples, paths and unions of them.
+
+    Of a dataclass ``over`` has what is left out.
+    """
     if hint is Any:
         return value
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:
-        return _convert(args[0], value, where)
+        return _convert(args[0], value, where, over)
     if origin in (typing.Union, types.UnionType):
-        return _convert_union(args, value, where)
-    if origin in (tuple, list) and isinstance(value, (list, tuple)):
+        return _convert_union(args, value, where, over)
+    if origin in (tuple, list):
         return _convert_sequence(origin, args, value, where)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return from_dict(hint, _mapping(value, f"fields of {hint.__name__}", where), where=where)
+        named = _mapping(value, f"fields of {hint.__name__}", where)
+        return from_dict(hint, named, where=where, over=over if isinstance(over, hint) else None)
     if origin is dict:
         named = _mapping(value, "values by name", where)
         return {key: _convert(args[1], item, f"{where}.{key}") for key, item in named.items()}
@@ -124,8 +156,10 @@ def _mapping(value: Any, wanted: str, where: str) -> Mapping[str, Any]:
     return value
 
 
-def _convert_sequence(kind: Any, args: tuple[Any, ...], value: list | tuple, where: str) -> Any:
+def _convert_sequence(kind: Any, args: tuple[Any, ...], value: Any, where: str) -> Any:
     """``value`` as a list or tuple of what ``args`` say."""
+    if not isinstance(value, (list, tuple)):
+        raise ValueError(f"{where}: expected a list, [{value!r}]")
     inner = [args[0]] * len(value) if kind is list or args[-1:] == (Ellipsis,) else list(args)
     if len(inner) != len(value):
         raise ValueError(f"{where}: expected {len(inner)} values, got {len(value)}")
@@ -144,7 +178,7 @@ def _convert_plain(kind: type, value: Any, where: str) -> Any:
     return value
 
 
-def _convert_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
+def _convert_union(options: tuple[Any, ...], value: Any, where: str, over: Any) -> Any:
     """``value`` as the first of ``options`` that takes it."""
     if value is None and type(None) in options:
         return None
@@ -153,7 +187,7 @@ def _convert_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
         if option is type(None):
             continue
         try:
-            return _convert(option, value, where)
+            return _convert(option, value, where, over)
         except ValueError as error:
             errors.append(str(error))
     raise ValueError("; ".join(errors) or f"{where}: cannot be {value!r}")

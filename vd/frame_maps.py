@@ -22,7 +22,7 @@ class FrameMaps:
         def array(values: object, dtype: torch.dtype) -> torch.Tensor:
             return torch.as_tensor(values).to(device=device, dtype=dtype)
 
-        actors = replace(seen, dynamics="none")  # what a critic is told besides, only a simulator knows
+        actors = replace(seen, dynamics="none", critic_terms={})  # what else is told, only simulators know
         tables = symmetry_frames(hand, actors, seen.view)
         self._source, self._joints = (array(v, torch.long) for v in (tables.source, tables.joints))
         self._factor, self._offset, self._sign, self._sector = (

@@ -40,6 +40,8 @@ RENAMED = {
     "--air": "--in-air",
     "--num-worlds": "--num-envs",
     "--tolerance-rad": "--stop-tolerance",
+    "--tensorboard": "--logger tensorboard",
+    "--no-tensorboard": "--logger none",
 }
 """Flags of earlier versions, and what they are called in all commands."""
 GONE = {

@@ -1,5 +1,6 @@
 """From a URDF or MJCF to the USD of a hand."""
 
+import math
 import shutil
 import tempfile
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from vd.assets_usd.hand_import.description import read_description
 from vd.assets_usd.hand_import.guess import Stance, take_stance
 from vd.assets_usd.hand_import.source import Source, read_source
 from vd.assets_usd.hand_import.tree import Tree, grow
-from vd.assets_usd.hand_model import read_hand
+from vd.assets_usd.hand_model import open_stage, read_hand
 from vd.assets_usd.hands import HANDS, imported_folder
 from vd.assets_usd.objects.plan import prim_name
 from vd.files import make_folder
@@ -24,6 +25,8 @@ DEEP_M = 0.0005
 """Colliders that are less than this in each other touch."""
 REACH_M = (0.03, 0.5)
 """Least and largest distance from the root of a finger to its tip: what is beyond is in another unit."""
+BEYOND_RAD = 0.02
+"""By which a joint may be led beyond its limits before it is said."""
 MOST_EFFORT_NM, MOST_MASS_KG = 5.0, 5.0
 """A joint that is stronger and a hand that is heavier are not believed without a warning."""
 
@@ -72,11 +75,23 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
             "the start; their contact is off, unless another start keeps them apart"
             for (one, other), depth in sorted(deep.items())
         ]
+        warnings += _replaced(folder / target.name, source)
         make_folder(folder)
         for file in Path(scratch).iterdir():
             shutil.copy(file, folder / file.name)
     sources = [joint.name for joint in tree.joints]
     return Imported(read_hand(folder / target.name), tree.notes, warnings, sources)
+
+
+def _replaced(path: Path, source: Source) -> list[str]:
+    """What is said where a hand of another file has the name."""
+    if not path.is_file():
+        return []
+    stage = open_stage(path)  # which its prims need as long as they are read
+    before = stage.GetDefaultPrim().GetDocumentation().rpartition("imported from ")[2]
+    if before == source.path.name:
+        return []
+    return [f"{path.stem} was imported from {before}; this replaces it, unless it gets another name (name)"]
 
 
 def _check_units(source: Source, tree: Tree, stance: Stance) -> None:
@@ -104,6 +119,20 @@ def _suspicious(tree: Tree) -> list[str]:
     mass = sum(link.mass for link in tree.links)
     if mass > MOST_MASS_KG:
         said.append(f"the hand weighs {mass:.2f} kg; is that in kilograms?")
+    for link in tree.links[1:]:
+        radius = math.sqrt(np.linalg.eigvalsh(link.inertia)[-1] / link.mass)
+        if radius > REACH_M[1]:
+            said.append(f"{link.name} turns like a body of {radius:.2g} m; is its inertia in kg m2?")
+    by_name = {joint.name: joint for joint in tree.joints}
+    for joint in tree.joints:
+        if joint.mimic is not None:
+            leader, factor, offset = joint.mimic
+            ends = sorted(factor * end + offset for end in (by_name[leader].lower, by_name[leader].upper))
+            if ends[0] < joint.lower - BEYOND_RAD or ends[1] > joint.upper + BEYOND_RAD:
+                said.append(
+                    f"{joint.name} follows {leader} to {ends[0]:.2f} and {ends[1]:.2f} rad, beyond its "
+                    f"limits {joint.lower:.2f} and {joint.upper:.2f}, which hold both back (limits)"
+                )
     return said + [
         f"zero is outside the limits of {joint.name}, {joint.lower:.2f} to {joint.upper:.2f} rad"
         for joint in tree.joints

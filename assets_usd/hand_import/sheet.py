@@ -50,7 +50,7 @@ def _draw(axes: Any, hand: HandModel, links: np.ndarray, joints: np.ndarray) -> 
     axes.scatter(*np.array(hand.workspace.drop_m)[:, None], color="#20a040", s=25, marker="x")
     points = np.concatenate([*(corner.reshape(-1, 3) for corner in corners), [hand.workspace.drop_m]])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    look_at(axes, middle, np.abs(points - middle).max(), 1.5)
+    look_at(axes, middle, np.abs(points - middle).max(), 1.35)
 
 
 def joint_table(hand: HandModel, sources: list[str]) -> str:

@@ -5,12 +5,15 @@ SI units, radians; poses are position and quaternion xyzw, [7]. What a file does
 
 import math
 import warnings
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandError, compose
@@ -19,6 +22,8 @@ from vd.warp_quiet import quiet_warp
 IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 UNLIMITED = 1e4
 """Angles and efforts from which a parser means that there is no limit."""
+HARMLESS = ("texture", "opacity")
+"""Words of what a parser says of looks alone; all else that it says has left something out."""
 
 
 @dataclass
@@ -103,10 +108,10 @@ def read_source(path: Path) -> Source:
     path = Path(path)
     if not path.is_file():
         raise HandError(f"{path}: no such file; give a URDF, or an MJCF")
-    head = path.read_text(errors="replace")
-    if "<robot" in head:
+    text = path.read_text(errors="replace")
+    if "<robot" in text:
         read = _read_urdf
-    elif "<mujoco" in head:
+    elif "<mujoco" in text:
         read = _read_mjcf
     else:
         raise HandError(f"{path}: neither a URDF nor an MJCF; expand a xacro first, export others to URDF")
@@ -116,11 +121,18 @@ def read_source(path: Path) -> Source:
         try:
             source = read(path)
         except Exception as error:  # whatever a parser raises: the file is at fault
-            raise HandError(f"{path}: cannot be parsed: {error}") from error
-    heard = dict.fromkeys(" ".join(str(one.message).split()) for one in said)
-    missing = [text for text in heard if "not found" in text or "ailed to" in text or "not exist" in text]
-    source.problems += [f"{text}; put the file there" for text in missing]
-    source.notes += [f"the parser says: {text}" for text in heard if text not in missing]
+            xacro = "<xacro:" in text or "${" in str(error)
+            remedy = f"; expand it first: xacro {path.name} > hand.urdf" if xacro else ""
+            raise HandError(f"{path}: cannot be parsed: {error}{remedy}") from error
+    for heard, kind in dict.fromkeys((" ".join(str(one.message).split()), one.category) for one in said):
+        if any(word in heard for word in HARMLESS) or issubclass(kind, DeprecationWarning):
+            source.notes.append(f"the parser says: {heard}")
+        elif "package" in heard:
+            heard = heard.partition(" For robust")[0]
+            source.problems.append(f"{heard} Name a folder above {path.name} so, or write relative paths")
+        else:
+            file = "; put the file there" if "exist" in heard or "found" in heard else ""
+            source.problems.append(f"the parser says: {heard}{file}")
     return source
 
 
@@ -131,7 +143,8 @@ def _read_urdf(path: Path) -> Source:
     builder.default_shape_cfg.density = 0.0  # masses are those of the file
     builder.add_urdf(str(path))
     kinds = {newton.GeoType.MESH: "mesh", newton.GeoType.CONVEX_MESH: "mesh"}
-    short = [label.rsplit("/", 1)[-1] for label in builder.body_label]
+    label = builder.articulation_label[0] if builder.articulation_label else ""
+    short = [body.removeprefix(f"{label}/") for body in builder.body_label]
     links = [
         Link(
             name,
@@ -155,10 +168,15 @@ def _read_urdf(path: Path) -> Source:
             mesh = builder.shape_source[i]
             shape.vertices = np.array(mesh.vertices, dtype=float) * scale
             shape.faces = np.array(mesh.indices, dtype=np.int32).reshape(-1, 3)
+            if trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume < 0.0:
+                shape.faces = shape.faces[:, ::-1]  # a scale that mirrors, as of left hands
             shape.size = ()
         links[body].shapes.append(shape)
-    names = [label.rsplit("/", 1)[-1] for label in builder.joint_label]
-    joints = []
+    names = [joint.removeprefix(f"{label}/") for joint in builder.joint_label]
+    joints: list[Joint] = []
+    source = Source(path, label or path.stem, links, joints)
+    _check_urdf_names(source)
+    friction = {}
     for i, name in enumerate(names):
         if builder.joint_parent[i] < 0:
             continue  # what fixes it to the world
@@ -170,6 +188,9 @@ def _read_urdf(path: Path) -> Source:
         if kind != newton.JointType.REVOLUTE:
             continue
         axis = np.array(builder.joint_axis[dof], dtype=float)
+        if not np.linalg.norm(axis) > 0.0:
+            source.problems.append(f"{name} has no axis but 0 0 0; give it one")
+            continue
         joint.axis = axis / np.linalg.norm(axis)
         joint.lower, joint.upper = (
             _bounded(values[dof]) for values in (builder.joint_limit_lower, builder.joint_limit_upper)
@@ -177,11 +198,31 @@ def _read_urdf(path: Path) -> Source:
         joint.effort = _bounded(builder.joint_effort_limit[dof]) or math.nan
         joint.velocity = _bounded(builder.joint_velocity_limit[dof]) or math.nan
         joint.kd = builder.joint_damping[dof] or math.nan
+        friction[name] = builder.joint_friction[dof]
         if (leader := builder.joint_mimic_joint[i]) >= 0:
             offset, factor = builder.joint_mimic_coeffs[i]
             joint.mimic = names[leader], float(factor), float(offset)
-    label = builder.articulation_label[0] if builder.articulation_label else path.stem
-    return Source(path, label, links, joints)
+    _leave_out(source, "dry friction", friction)
+    return source
+
+
+def _check_urdf_names(source: Source) -> None:
+    """Names that stand for two, and links that no joint joins."""
+    root = ElementTree.parse(source.path).getroot()
+    for kind in ("link", "joint"):
+        counts = Counter(str(element.get("name")) for element in root.findall(kind))
+        twice = [name for name, count in counts.items() if count > 1]
+        source.problems += [f"{name} is the name of more than one {kind}; rename them" for name in twice]
+        if kind == "link":
+            alone = counts.keys() - {link.name for link in source.links}
+            source.notes += [f"{name} is joined to nothing and is left out" for name in sorted(alone)]
+
+
+def _leave_out(source: Source, what: str, values: dict[str, float]) -> None:
+    """Say what of joints or links a hand has no place for."""
+    names = [name for name, value in values.items() if value]
+    if names:
+        source.notes.append(f"{what} is left out: of {', '.join(names)}")
 
 
 def _bounded(value: float) -> float:
@@ -215,6 +256,14 @@ def _read_mjcf(path: Path) -> Source:
             source.apart.append((first, second))
     _mjcf_equalities(model, source)
     _mjcf_actuators(model, source)
+    joints = {_joint_name(model, i): i for i in range(model.njnt)}
+    for what, values, number in (
+        ("dry friction", model.dof_frictionloss, model.jnt_dofadr),
+        ("the spring", model.jnt_stiffness, np.arange(model.njnt)),
+    ):
+        _leave_out(source, what, {name: float(values[number[i]]) for name, i in joints.items()})
+    lifted = {model.body(i).name: float(model.body_gravcomp[i]) for i in range(1, model.nbody)}
+    _leave_out(source, "compensation of gravity", lifted)
     return source
 
 
@@ -222,12 +271,18 @@ def _pose(position: np.ndarray, wxyz: np.ndarray) -> np.ndarray:
     return np.concatenate([position, wxyz[[1, 2, 3, 0]]])
 
 
+def _joint_name(model: Any, joint: int) -> str:
+    """Its name, or one that says whose it is."""
+    body = model.body(model.jnt_bodyid[joint])
+    return str(model.joint(joint).name or f"the joint of {body.name or f'body {body.id}'}")
+
+
 def _mjcf_joints(model: Any, body: int, source: Source) -> None:
     """The joint of a body: none is a fixed one, more than one are none that a hand has."""
     first, count = model.body_jntadr[body], model.body_jntnum[body]
     parent, place = model.body_parentid[body] - 1, _pose(model.body_pos[body], model.body_quat[body])
     link = source.links[body - 1].name
-    names = [model.joint(i).name or f"the joint of {link}" for i in range(first, first + count)]
+    names = [_joint_name(model, i) for i in range(first, first + count)]
     if parent < 0:
         if count:
             source.notes.append(
@@ -280,6 +335,8 @@ def _mjcf_equalities(model: Any, source: Source) -> None:
     """Couplings of two joints by a line are joints that follow; all others are problems."""
     joints = {joint.name: joint for joint in source.joints}
     for i in range(model.neq):
+        if not model.eq_active0[i]:
+            continue
         kind, data = mujoco.mjtEq(model.eq_type[i]), model.eq_data[i]
         name = model.eq(i).name or f"equality {i}"
         if kind != mujoco.mjtEq.mjEQ_JOINT or model.eq_obj2id[i] < 0 or np.any(data[2:5]):
@@ -288,7 +345,7 @@ def _mjcf_equalities(model: Any, source: Source) -> None:
                 f"{name} ({text}) couples more than a line; remove it and use hold or mimic"
             )
             continue
-        one, other = (model.joint(model_id[i]).name for model_id in (model.eq_obj1id, model.eq_obj2id))
+        one, other = (_joint_name(model, number[i]) for number in (model.eq_obj1id, model.eq_obj2id))
         if one in joints:
             joints[one].mimic = other, float(data[1]), float(data[0])
 
@@ -303,31 +360,36 @@ def _mjcf_actuators(model: Any, source: Source) -> None:
         source.notes.append(f"tendons without a motor are left out: {names}")
     for i in range(model.nu):
         gear, affine = abs(float(model.actuator_gear[i, 0])) or 1.0, int(mujoco.mjtBias.mjBIAS_AFFINE)
-        strongest = float(np.abs(model.actuator_forcerange[i]).max())
+        strongest = math.nan
+        if model.actuator_forcelimited[i]:
+            strongest = float(np.abs(model.actuator_forcerange[i]).max())
+        elif model.actuator_ctrllimited[i] and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE:
+            strongest = float(np.abs(model.actuator_gainprm[i, 0] * model.actuator_ctrlrange[i]).max())
         for joint in (joints[name] for name in _moved(model, i, source) if name in joints):
             if model.actuator_biastype[i] == affine:
-                joint.kp = float(model.actuator_gainprm[i, 0]) * gear**2
-                damping = -float(model.actuator_biasprm[i, 2]) * gear**2
-                joint.kd = damping + (0.0 if math.isnan(joint.kd) else joint.kd) or math.nan
-            if model.actuator_forcelimited[i]:
-                joint.effort = strongest * gear
+                stiffness, damping = (-float(b) * gear**2 for b in model.actuator_biasprm[i, 1:3])
+                joint.kp = float(np.nansum([joint.kp, stiffness])) or math.nan
+                joint.kd = float(np.nansum([joint.kd, damping])) or math.nan
+            joint.effort = float(np.fmin(strongest * gear, joint.effort))
 
 
 def _moved(model: Any, actuator: int, source: Source) -> list[str]:
     """Joints that an actuator moves; those of a tendon go on the list of what is coupled."""
     kind, target = model.actuator_trntype[actuator], model.actuator_trnid[actuator, 0]
+    name = model.actuator(actuator).name or f"actuator {actuator}"
+    if model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_MUSCLE:
+        source.problems.append(f"{name} is a muscle, which only pulls; make it a motor")
     if kind == mujoco.mjtTrn.mjTRN_JOINT:
-        return [model.joint(target).name]
+        return [_joint_name(model, target)]
     wraps = range(0)
     if kind == mujoco.mjtTrn.mjTRN_TENDON:
         wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
     if not wraps or any(model.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
-        name = model.actuator(actuator).name or f"actuator {actuator}"
         source.problems.append(
             f"{name} pulls at no joint but over sites; give its joints motors of their own"
         )
         return []
-    moved = [model.joint(model.wrap_objid[w]).name for w in wraps]
+    moved = [_joint_name(model, model.wrap_objid[w]) for w in wraps]
     if len(moved) > 1:
         source.coupled.append((model.tendon(target).name, moved))
     return moved

@@ -5,17 +5,27 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandError, compose, invert
 from vd.assets_usd.hand_import.description import Description, Drive
 from vd.assets_usd.hand_import.source import IDENTITY, Joint, Link, Shape, Source
+from vd.assets_usd.objects.geometry import hull_volume
 from vd.kernels.servo.actuators import MAX_JOINTS
 
 KINDS = ("box", "sphere", "capsule", "cylinder", "mesh", "ellipsoid")
 """What collides."""
 MOST_WRIST = 3
 """Most joints before the fingers that are held without being asked: more are an arm."""
+MOST_RAD = 2.0 * math.pi + 0.01
+"""Limits beyond a turn are in degrees, or none."""
+SLACK_RAD = 1e-3
+"""By which a described angle may be rounded beyond a limit."""
+LEAST_M, MOST_M = 0.0005, 1.0
+"""Lengths of shapes between which they are those of a hand in metres."""
+HOLLOW = 1.5
+"""Volume of a hull over that of its mesh from which it closes a hollow that may matter."""
 DENSITY_KG_M3 = 1000.0
 """Of the colliders of a link whose mass is not said: plastic."""
 
@@ -74,6 +84,8 @@ class _Grower:
         for number, joint in enumerate(source.joints):
             self.out.setdefault(joint.parent, []).append(number)
         self.held: dict[str, float] = dict(said.hold)
+        self.raised: list[str] = []
+        self.hollow: dict[str, float] = {}
 
     def fail(self) -> None:
         """Raise what was found, if anything."""
@@ -113,6 +125,15 @@ class _Grower:
                 links.append(self._welded(joint.child))
             tips.append(self._tip(chain[-1].child))
         self.fail()
+        if self.raised:
+            self.notes.append(
+                f"no body has the moments of inertia of {', '.join(self.raised)}; the smaller are raised"
+            )
+        if self.hollow:
+            self.notes.append(
+                f"guess: meshes of {', '.join(self.hollow)} collide as their hulls, up to "
+                f"{max(self.hollow.values()):.1f} times their volume (parts)"
+            )
         tree = Tree(self.source.path.name, links, joints, counts, tips, self.notes)
         self._check_followers(tree)
         self._check_numbers(tree)
@@ -150,7 +171,18 @@ class _Grower:
             if link.name in said.mass:
                 scale = said.mass[link.name] / link.mass if link.mass > 0.0 else 0.0
                 link.mass, link.inertia = said.mass[link.name], link.inertia * scale
-        self.notes += [f"{name} is held at {angle:g} rad, as described" for name, angle in said.hold.items()]
+        by_name = {joint.name: joint for joint in self.source.joints}
+        for name, angle in said.hold.items():
+            self.notes.append(f"{name} is held at {angle:g} rad, as described")
+            self._check_angle("hold", by_name[name], angle)
+
+    def _check_angle(self, entry: str, joint: Joint, angle: float) -> None:
+        """Refuse an angle that is described and beyond the limits."""
+        if angle < joint.lower - SLACK_RAD or angle > joint.upper + SLACK_RAD:
+            self.problems.append(
+                f"{entry}: {angle:g} rad is beyond the limits of {joint.name}, {joint.lower:g} to "
+                f"{joint.upper:g} rad"
+            )
 
     def _check_tendons(self) -> None:
         """Joints that a tendon moves together, unless the description says what they do."""
@@ -255,9 +287,16 @@ class _Grower:
         whole = Link(self.source.links[first].name)
         for link, pose in parts:
             split = link.name in self.said.parts
+            for shape in link.shapes:
+                self._check_shape(link, shape, split=split)
             whole.shapes += [replace(s, frame=compose(pose, s.frame), split=split) for s in link.shapes]
             whole.sites |= {name: compose(pose, site) for name, site in link.sites.items()}
             whole.sites |= {link.name: pose} if link is not parts[0][0] else {}
+        for link, _ in parts:
+            if not 0.0 <= link.mass < math.inf:
+                self.problems.append(
+                    f"{link.name} weighs {link.mass:g} kg in the file; say mass: {{{link.name}: 0.02}}"
+                )
         if not sum(link.mass for link, _ in parts) > 0.0:
             return self._weighed(whole)
         turns = [Rotation.from_quat(pose[3:]) for _, pose in parts]
@@ -300,11 +339,7 @@ class _Grower:
         mended[0] = max(mended[0], (mended[2] - mended[1]) * 1.001)
         mended[:2] = np.maximum(mended[:2], mended[0])
         if np.any(mended > moments * 1.01):
-            text = ", ".join(f"{value:.3g}" for value in moments)
-            self.notes.append(
-                f"no body has the moments {text} kg m2 of {link.name}; raised to "
-                f"{', '.join(f'{value:.3g}' for value in mended)}"
-            )
+            self.raised.append(link.name)
         if np.any(mended != moments):
             link.inertia = axes @ np.diag(mended) @ axes.T
         return link
@@ -358,21 +393,47 @@ class _Grower:
     def _check_numbers(self, tree: Tree) -> None:
         """Limits and torque limits, which are never guessed."""
         for joint in tree.joints:
-            if not joint.lower < joint.upper:
+            if not (joint.lower < joint.upper and max(-joint.lower, joint.upper) < MOST_RAD):
                 self.problems.append(
-                    f"{joint.name} has the limits {joint.lower:g} and {joint.upper:g} rad; give it some: "
-                    f"limits: {{{joint.name}: [-1.6, 1.6]}}"
+                    f"{joint.name} has the limits {joint.lower:g} and {joint.upper:g} rad; give it some in "
+                    f"radians: limits: {{{joint.name}: [-1.6, 1.6]}}"
                 )
+            elif joint.name in self.said.start:
+                self._check_angle("start", joint, self.said.start[joint.name])
         weak = [joint.name for joint in tree.joints if not joint.effort > 0.0 and joint.mimic is None]
         if weak:
             self.problems.append(
                 f"{', '.join(weak)}: no torque limit in the file; say drive: {{effort: 1.0}} (N m) or "
                 f"drives: {{{weak[0]}: {{effort: 1.0}}}}; or mimic or hold, where there is no motor"
             )
-        for link in tree.links:
-            for shape in link.shapes:
-                if shape.collides and shape.kind not in KINDS:
-                    self.problems.append(f"a collider of {link.name} is a {shape.kind}; make it a mesh")
+        for end in np.cumsum(tree.counts):
+            if not any(shape.collides for shape in tree.links[end].shapes):
+                self.problems.append(
+                    f"nothing collides of {tree.links[end].name}, which has a fingertip; add a collision"
+                )
+
+    def _check_shape(self, link: Link, shape: Shape, *, split: bool) -> None:
+        """Kind, extent and unit of a collider or a drawing, and hollows of a mesh that collides whole."""
+        what = f"a {shape.kind} of {link.name}"
+        if shape.kind not in KINDS:
+            if shape.collides:
+                self.problems.append(f"a collider of {link.name} is a {shape.kind}; make it a mesh")
+            return
+        half = shape_box(shape)[1]
+        if not LEAST_M < 2.0 * half.max() < MOST_M:
+            self.problems.append(
+                f"{what} is {2.0 * half.max():.3g} m long; give it its size in metres, a mesh by its scale, "
+                "such as 0.001"
+            )
+        elif shape.collides and shape.kind == "mesh":
+            hull = hull_volume(shape.vertices)
+            volume = abs(float(trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume))
+            if not hull > 0.0:
+                self.problems.append(f"{what} is flat and collides; give it a thickness, or make it a box")
+            elif hull > HOLLOW * volume > 0.0 and not split:
+                self.hollow[link.name] = max(hull / volume, self.hollow.get(link.name, 0.0))
+        elif shape.collides and not half.min() > 0.0:
+            self.problems.append(f"{what} is flat and collides; give it a thickness")
 
 
 def combine(link: Link, parts: list[tuple[float, np.ndarray, np.ndarray]]) -> None:

@@ -83,6 +83,7 @@ def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
         TwinError: The twin did not start.
         BusError: The port cannot be opened.
     """
+    from vd.command_line import parse
     from vd.deploy.hardware.bus import MotorBus
     from vd.deploy.twin.child import TwinChild
     from vd.deploy.twin.twin import TwinCommand
@@ -100,9 +101,7 @@ def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
                 model=options.motor,
                 **twin_options,
             )
-            command = tyro.cli(
-                TwinCommand, args=options.twin_args.split(), default=default, prog="--twin-args"
-            )
+            command = parse(TwinCommand, options.twin_args.split(), default=default, prog="--twin-args")
             print(
                 "starting the twin (the first start compiles its kernels for minutes) ...",
                 file=sys.stderr,

@@ -48,7 +48,7 @@ class ControlLoop:
     """Pursues goals, one after the other: acts until the policy says it has arrived, holds, and goes on.
 
     Args:
-        safe: The hand, armed.
+        safe: The hand, armed, at its start.
         episode_s: Time for each goal [s].
         hold_s: How long the hand holds still after each stop [s], before it goes on.
         camera: Depth camera; None: the policy needs none.
@@ -73,7 +73,7 @@ class ControlLoop:
         self._safe, self._runner, self._actions, self._pacer, self._log = safe, runner, actions, pacer, log
         self._episode_s, self._hold_s = episode_s, hold_s
         self._camera, self._twin, self._symmetry = camera, twin, symmetry
-        self._target = safe.read().position
+        self._target = safe.hand.start
         self.times: list[StepTimes] = []
         """Of every step so far."""
 
@@ -86,10 +86,11 @@ class ControlLoop:
         """
         outcomes = []
         self._runner.begin()
-        if len(goals):  # see the object before the first deadline: to find it takes longer than to follow it
-            self._safe.beat(missed=False)
-            self._runner.decide(self._sense(goals[0])[0])
-            self._safe.beat(missed=False)
+        if len(goals):  # to find the object takes longer than to follow it, and than a step may
+            sensed, *_ = self._sense(goals[0])
+            found = self._pacer.clock.beside(lambda: self._runner.decide(sensed))
+            while not found():
+                self.step(0, goals[0], acting=False)
         for number, goal in enumerate(goals):
             outcome, distance = self._pursue(number, goal)
             outcomes.append(outcome)

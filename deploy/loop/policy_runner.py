@@ -11,7 +11,7 @@ import warp as wp
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import check_fits, open_policy, task_for, trained_task
+from vd.evaluate.agents import check_fits, open_policy, task_for
 from vd.evaluate.statistics import symmetric_error
 from vd.paper import PAPER
 from vd.policy import TrainedPolicy
@@ -167,7 +167,7 @@ class TrackingRunner(PolicyRunner):
         tolerance_rad: float = PAPER.success.rotation_rad,
         seed: int = 0,
     ):
-        super().__init__(trained_task(policy), policy.spec.rule_for(tolerance_rad))
+        super().__init__(ReorientCfg.of(policy), policy.spec.rule_for(tolerance_rad))
         self.kind = policy.kind
         self.calibrated, depth = policy.spec.calibrated_for(tolerance_rad), policy.spec.depth
         self._cloud = partial(
@@ -242,11 +242,7 @@ def seen_points(cloud: CameraCloud, depth: np.ndarray | None) -> torch.Tensor:
     """
     if depth is None:
         raise ValueError("the policy sees by a depth camera, but there is no image")
-    points, count = cloud.make(depth)
-    seen = wp.to_torch(points)
-    if not count.numpy()[0]:  # the false point of an empty cloud counts for nothing
-        seen.fill_(torch.nan)
-    return seen
+    return cloud.seen(depth)
 
 
 def senses_of(sensed: Sensed, points: torch.Tensor, *, fresh: bool = False) -> Senses:

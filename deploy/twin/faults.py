@@ -436,9 +436,9 @@ class FaultsCommand:
 
 def main() -> int:
     """Entry point of ``python -m vd.deploy.twin.faults``."""
-    import tyro
+    from vd.command_line import parse
 
-    return tyro.cli(FaultsCommand, prog="python -m vd.deploy.twin.faults", description=__doc__).run()
+    return parse(FaultsCommand, prog="python -m vd.deploy.twin.faults", description=__doc__).run()
 
 
 if __name__ == "__main__":

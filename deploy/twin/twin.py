@@ -26,6 +26,7 @@ import numpy as np
 import tyro
 
 from vd import interrupt
+from vd.command_line import parse
 from vd.deploy.timely import undisturbed
 from vd.deploy.twin.line import Faults, MotorLine
 from vd.deploy.twin.motor import Motor, make_motors
@@ -228,7 +229,7 @@ class TwinCommand:
 @interrupt.command("vd.deploy.twin.twin")
 def main() -> int:
     """Entry point of ``python -m vd.deploy.twin.twin``; returns the exit status."""
-    tyro.cli(TwinCommand, prog="python -m vd.deploy.twin.twin", description=__doc__).serve()
+    parse(TwinCommand, prog="python -m vd.deploy.twin.twin", description=__doc__).serve()
     return 0
 
 

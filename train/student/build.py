@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
     """The environments of the student: those of the teacher's training."""
-    from vd.evaluate.agents import task_for, trained_task
+    from vd.evaluate.agents import task_for
 
-    trained, chosen = trained_task(policy), cfg.task
+    trained, chosen = ReorientCfg.of(policy), cfg.task
     task = task_for(
         policy,
         objects=chosen.objects or trained.objects,

@@ -5,10 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
-import tyro
-
 from vd import interrupt
-from vd.train.flags import normalise, saved_config, value_of
+from vd.command_line import parse
+from vd.train.flags import normalise, saved_config, starting, value_of
 from vd.train.student.build import build_student
 from vd.train.student.config import ALIGNMENT_NAME, PRESETS, Stage, StudentTrainCfg
 from vd.train.teacher import say_of_main
@@ -31,13 +30,14 @@ def parse_student(flags: Sequence[str]) -> StudentTrainCfg:
     """The configuration that command-line flags ask for.
 
     The first pass finds where to start from (``--preset`` and ``--stage``, the run's own configuration with
-    ``--resume``, the network of ``--init``), the second reads every flag with those values as defaults.
+    ``--resume``, the network of ``--init``), as flags and ``--config`` say; the second reads every flag with
+    those values, and over them those of the file, as defaults.
 
     Raises:
         FileNotFoundError: ``--resume`` or ``--init`` name what is not there.
         ValueError: What they name is not of this version.
     """
-    arguments = normalise(flags, SHORT_FORMS)
+    arguments, file = starting(normalise(flags, SHORT_FORMS))
     preset, stage = value_of(arguments, "--preset") or "gpu", value_of(arguments, "--stage") or "0"
     # The second pass refuses unknown names.
     number = cast(Stage, int(stage)) if stage in ("0", "1") else 0
@@ -46,7 +46,11 @@ def parse_student(flags: Sequence[str]) -> StudentTrainCfg:
         base = saved_config(arguments, base) or _with_init(arguments, base)
     elif "--help" not in arguments and "-h" not in arguments:
         base = _with_init(arguments, base)
-    return tyro.cli(StudentTrainCfg, args=arguments, default=base, prog="vd-train student", description=HELP)
+    base = base if file is None else file.over(base)
+    cfg: StudentTrainCfg = parse(
+        StudentTrainCfg, arguments, default=base, prog="vd-train student", description=HELP
+    )
+    return cfg
 
 
 def student_command(arguments: list[str], started: float) -> int:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from vd import interrupt
+from vd.command_line import parse
 from vd.device import resolve_device
 from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
@@ -59,7 +60,7 @@ class SimCommand(Measurement):
 
     def run(self) -> int:
         """Measure and print."""
-        from vd.evaluate.agents import open_teacher, trained_task
+        from vd.evaluate.agents import open_teacher
 
         device = resolve_device(self.device)
         teacher = open_teacher(self.policy, device)
@@ -67,8 +68,9 @@ class SimCommand(Measurement):
             raise ValueError(f"--policy {self.policy} has no network; give a teacher")
         quiet_warp()
         from vd.bench.sim import measure
+        from vd.envs.cfg import ReorientCfg
 
-        task = dataclasses.replace(trained_task(teacher), objects=self.objects)
+        task = ReorientCfg.of(teacher, objects=self.objects)
         tasks = (dataclasses.replace(task, num_envs=envs) for envs in self.envs)
         rows = (measure(cfg, device, teacher=teacher) for cfg in tasks)
         report(rows, device, self.json)
@@ -190,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given and given[0] in GONE:
         print(f"vd-bench: {given[0]!r} is no more: {GONE[given[0]]}", file=sys.stderr)
         return interrupt.USAGE_ERROR
-    command = tyro.cli(Command, args=arguments, prog="vd-bench", description=__doc__)
+    command = parse(Command, arguments, prog="vd-bench", description=__doc__)
     if isinstance(command, GapCommand):
         check_folder(command.out)
     elif isinstance(command, Measurement) and command.json is not None:

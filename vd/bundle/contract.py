@@ -133,6 +133,9 @@ def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
     if seen.shape != "none":
         end = slices["previous_action"].stop
         parts["shape"] = (end, end + shape_observation_size(hand.num_fingers))
+    if seen.terms:
+        end = max(last for _, last in parts.values())
+        parts["terms"] = (end, end + sum(seen.terms.values()))
     return {
         "parts": parts,  # first column and the one after the last
         "velocity_scale": PAPER.observation.velocity_scale,  # of joints, and of the object's turning

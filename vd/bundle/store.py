@@ -48,7 +48,7 @@ def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
         FileExistsError: The folder holds something else.
         OutputError: It cannot be written.
     """
-    task = from_dict(ReorientCfg, policy.task, where="task of the policy")
+    task = ReorientCfg.of(policy)
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
     rules: StoppingRules | None = None
     if isinstance(policy, TrackingPolicy):

@@ -1,10 +1,10 @@
 """Configuration of the reorientation task; every default is the paper's."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import pi
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from vd.config import Dropped, Renamed, require
+from vd.config import Dropped, Renamed, from_dict, require
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
@@ -56,6 +56,8 @@ class RewardCfg:
     """Ours: times the height of the object's lowest point above the table (there or not), 1 from 2 cm on."""
     scale: float = 1.0
     """Ours: factor on the sum; changes no optimum, keeps value targets near 1."""
+    terms: dict[str, float] = field(default_factory=dict)
+    """Your own terms: functions (module:function) with their coefficients (docs/tutorials/terms.md)."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,16 @@ class ObservationCfg:
     dynamics: Literal["none", "critic"] = "none"
     """Ours, privileged: whether the critic is told what was drawn (gains, delay, friction and backlash of
     joints, frictions, mass, latency), and the present state and shape, without noise."""
+    terms: dict[str, int] = field(default_factory=dict)
+    """Your own values: functions (module:function), and how many values each gives. Symmetry frames show
+    them as they are, without latency and noise."""
+    critic_terms: dict[str, int] = field(default_factory=dict)
+    """The same, for the critic alone."""
+
+    @property
+    def own(self) -> dict[str, int]:
+        """All own values, those of the actor first."""
+        return self.terms | self.critic_terms
 
     def num_frames(self, fingers: int) -> int:
         """Symmetry frames of a hand of so many fingers; 0: it sees the world as it is."""
@@ -333,7 +345,10 @@ class RandomisationCfg:
 
 @dataclass(frozen=True)
 class ReorientCfg:
-    """The in-hand reorientation task: hand, objects, environments and all terms."""
+    """The in-hand reorientation task: hand, objects, environments and all terms.
+
+    Fields are those of ``--env`` in ``vd-train teacher --help-all``; :meth:`of` takes a policy's.
+    """
 
     RETIRED: ClassVar[dict[str, Any]] = {
         "num_worlds": Renamed("num_envs"),
@@ -378,6 +393,15 @@ class ReorientCfg:
     table: TableCfg = field(default_factory=TableCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
+
+    @classmethod
+    def of(cls, policy: Any, **changes: Any) -> "ReorientCfg":
+        """The task in which a policy was trained, with some fields changed.
+
+        Raises:
+            ValueError: It is of another version.
+        """
+        return replace(from_dict(cls, policy.task, where="task of the policy"), **changes)
 
     @property
     def max_episode_steps(self) -> int:

@@ -10,8 +10,8 @@ from vd.kernels.task.shapes import shape_observation_size
 def observation_parts(cfg: ObservationCfg, fingers: int, joints: int) -> dict[str, slice]:
     """Columns of the parts of an observation, in order, those included that only the critic reads.
 
-    state, shape, dynamics, present (state and shape without latency and noise); parts that are off are
-    missing.
+    state, shape, terms (own values), critic_terms, dynamics, present (state and shape without latency and
+    noise); parts that are off are missing.
     """
     told = cfg.dynamics != "none"
     state = teacher_observation_size(fingers, joints)
@@ -19,12 +19,18 @@ def observation_parts(cfg: ObservationCfg, fingers: int, joints: int) -> dict[st
     sizes = {
         "state": state,
         "shape": shape,
+        "terms": sum(cfg.terms.values()),
+        "critic_terms": sum(cfg.critic_terms.values()),
         "dynamics": dynamics_size(joints) if told else 0,
         "present": state + shape if told else 0,
     }
     return consecutive({name: size for name, size in sizes.items() if size})
 
 
+CRITIC_ALONE = ("critic_terms", "dynamics", "present")
+"""Parts that the actor does not read, the last of all."""
+
+
 def actor_size(parts: dict[str, slice]) -> int:
     """Values that the actor reads, the first of all."""
-    return max(columns.stop for name, columns in parts.items() if name not in ("dynamics", "present"))
+    return max(columns.stop for name, columns in parts.items() if name not in CRITIC_ALONE)

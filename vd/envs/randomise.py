@@ -1,7 +1,5 @@
 """Domain randomisation (Table S3): draws on the device, written into the simulator's model."""
 
-from typing import Any
-
 import newton
 import numpy as np
 import warp as wp
@@ -23,6 +21,7 @@ from vd.kernels.task.randomisation import (
     draw_servo_kernel,
 )
 from vd.paper import PAPER
+from vd.sim.graphs import Graphs
 from vd.sim.scene import SHAPE_HAND, SHAPE_OBJECT, SHAPE_TABLE
 
 # Drawn gains and frictions reach the solver once a second: an environment in this many has new ones then.
@@ -62,7 +61,7 @@ class Randomiser:
         self._age, self._due = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
         self._interval = round(cfg.randomisation.redraw_s * cfg.sim.control_hz)
         self._push_interval = round(PUSH_INTERVAL_S * cfg.sim.control_hz)
-        self._push_graph: Any = None
+        self._graphs = Graphs(device)
 
         model, scene = state.sim.model, state.scene
         self._nominal_kp = wp.array(state.hand.kp, dtype=float, device=device)
@@ -195,11 +194,7 @@ class Randomiser:
         if self._state.device == "cpu":
             self.write_model()
             return
-        if self._push_graph is None:
-            with wp.ScopedCapture(device=self._state.device) as capture:
-                self._push_gains_and_frictions()
-            self._push_graph = capture.graph
-        wp.capture_launch(self._push_graph)
+        self._graphs.replay(self._push_gains_and_frictions)
         self._push_inertia()
 
     def write_model(self) -> None:

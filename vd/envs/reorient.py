@@ -21,12 +21,14 @@ from vd.envs.saved_state import load_arrays, save_state, saved_stage
 from vd.envs.setup import SETTLE_S, rest_poses, table_steps
 from vd.envs.starts import FreeStarts
 from vd.envs.task_state import build_task
+from vd.kernels.rng import init_rng_kernel
 from vd.kernels.task.actions import apply_action_kernel
 from vd.kernels.task.environments import keep_object_pose_kernel
 from vd.kernels.task.guard import void_step_kernel
 from vd.kernels.task.resets import episode_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.task.success import success_kernel
+from vd.sim.graphs import Graphs
 
 FAILURES_AT_FIRST = 10.0
 """Steps of environments that may fail beside those that ``failures_per_million`` allows (ours): one object
@@ -38,6 +40,24 @@ class ReorientEnv:
 
     Objects are over a table, but rest in a hand whose palm looks up, and then there is none.
     All arrays are Warp arrays on ``device``; ``wp.to_torch`` views them without copying.
+
+    Programs and own terms use :meth:`reset`, :meth:`step`, its halves :meth:`advance` and :meth:`renew`,
+    :meth:`give_goals`, :meth:`object_pose`, :meth:`check`, :meth:`close`, and:
+
+    Attributes:
+        observation, privileged: What the actor reads, and the critic alone besides, shapes [N, O], [N, P].
+        action, smoothed: Actions of the step [N, A], and their moving average over all joints [N, D].
+        reward, reward_terms: Reward, and its terms (``reward_term_names``) unscaled, shapes [N], [N, T].
+        success, fell: 1 where the goal was reached, the object was lost, in this step, int32, shape [N].
+        timed_out: 1 where the episode ended by its length alone, int32, shape [N].
+        ended: Not 0 where the episode ended, and the environment was reset, int32, shape [N].
+        rotation_error: Angle to the goal at the end of the step, before resets [rad], shape [N].
+        step_count: Control steps since the reset, int32, shape [N].
+        goal_quat: Wanted orientation of the object, xyzw, shape [N].
+        measured_q, measured_qd: Joints as encoders report them [rad, rad/s], in the first D columns.
+        sim.joint_q, sim.joint_qd: Joints [rad, rad/s], then pose and velocity of the object (position [m] and
+            quaternion; linear [m/s] and angular [rad/s]), shapes [N, D + 7], [N, D + 6].
+        fingers.tip_pos: Fingertips in the world frame [m], shape [N, F].
     """
 
     def __init__(self, cfg: ReorientCfg, device: str | None = None):
@@ -52,6 +72,11 @@ class ReorientEnv:
         """
         cfg.validate()
         self.cfg = cfg
+        self._terms: Any = None
+        if cfg.reward.terms or cfg.observation.own:
+            from vd.envs.terms import OwnTerms  # needs torch, which the task alone does not
+
+            self._terms = OwnTerms(cfg)
         self.device = str(wp.get_device(device))
         self.state = state = build_task(cfg, self.device)
         """What this and its parts share."""
@@ -67,7 +92,7 @@ class ReorientEnv:
         self.num_actions = len(self.hand.actuated)
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
-        self.reward_term_names = REWARD_TERMS
+        self.reward_term_names = (*REWARD_TERMS, *cfg.reward.terms)
 
         self._allocate()
         self._lifts = cfg.reward.lift != 0.0
@@ -94,14 +119,13 @@ class ReorientEnv:
         self._handed: HandedOver | None = None
         if cfg.table.handed_share > 0.0:
             self._handed = HandedOver(state, self._reset_q, self._table_steps)
-        self._ends = success_ends(state)
+        self.ends = success_ends(state)
+        """1 where a success ends the episode, shape [N]."""
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
         self.parameters.set_stage(self.stage)
-        self._graph: Any = None
-        self._hold_graph: Any = None
-        self._kernels_loaded = False
+        self._graphs = Graphs(self.device, captured=self.sim.solver.captured)
         self.steps = 0
         """Control steps of all environments since the begin of the run, with those of a checkpoint."""
         self._own_steps = 0
@@ -116,25 +140,17 @@ class ReorientEnv:
         zeros = self.state.zeros
 
         self.action = zeros(n, self.num_actions)
-        """Action of the present step in [-1, 1], shape [N, A]."""
         self.reward = zeros(n)
-        """Reward of the present step, shape [N]."""
-        self.reward_terms = zeros(n, len(REWARD_TERMS))
-        """Terms of the reward, unscaled, shape [N, T]."""
+        self.reward_terms = zeros(n, len(self.reward_term_names))
         self.rotation_error = zeros(n)
-        """Angle to the goal at the end of the step, before resets [rad], shape [N]."""
         self.still = zeros(n, dtype=wp.int32)
         """1 where all of success holds but the rotation's threshold, shape [N]."""
         self.success = zeros(n, dtype=wp.int32)
-        """1 where the goal was reached in this step, shape [N]."""
         self.fell = zeros(n, dtype=wp.int32)
-        """1 where the object was lost in this step, shape [N]."""
         self.timed_out = zeros(n, dtype=wp.int32)
-        """1 where the episode ended by its length alone, shape [N]."""
         self.done = zeros(n, dtype=wp.int32)
         """1 where the return ends: success, fall or time-out, shape [N]."""
         self.step_count = zeros(n, dtype=wp.int32)
-        """Control steps since the environment's reset, shape [N]."""
         self.goal_steps = zeros(n, dtype=wp.int32)
         """Control steps since the environment's goal was given, shape [N]."""
         self.object_pose_end = zeros(n, dtype=wp.transform)
@@ -145,7 +161,8 @@ class ReorientEnv:
         """Height of the object's lowest point above the table [m], shape [N]; 0 unless it is rewarded."""
         self.previous_error = zeros(n)
         """Rotation error at the end of the last step, for the progress in it [rad], shape [N]."""
-        self._reset, self._new_goal = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
+        self.ended = zeros(n, dtype=wp.int32)
+        self._new_goal = zeros(n, dtype=wp.int32)
         self._env_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
@@ -170,13 +187,21 @@ class ReorientEnv:
 
     # Stepping
 
-    def reset(self, object_quat: np.ndarray | None = None, goal_quat: np.ndarray | None = None) -> None:
+    def reset(
+        self,
+        object_quat: np.ndarray | None = None,
+        goal_quat: np.ndarray | None = None,
+        seed: int | None = None,
+    ) -> None:
         """Reset all environments.
 
         Args:
             object_quat: Start orientations of the objects, xyzw, shape [N, 4]; random by default.
             goal_quat: Goal orientations, xyzw, either sign, shape [N, 4]; drawn as configured by default.
+            seed: Begin the random streams anew from this; None: they go on.
         """
+        if seed is not None:
+            self._launch(init_rng_kernel, [seed], [self.state.rng])
         for given, buffer in ((object_quat, self._given_start), (goal_quat, self._given_goal)):
             if given is not None:
                 given = np.asarray(given, dtype=np.float32)
@@ -185,9 +210,9 @@ class ReorientEnv:
                         f"reset() takes orientations of shape ({self.num_envs}, 4), not {given.shape}"
                     )
                 buffer.assign(given)
-        self._reset.fill_(1)
+        self.ended.fill_(1)
         self._new_goal.zero_()
-        self.randomiser.draw(self._reset)
+        self.randomiser.draw(self.ended)
         self._reset_envs(use_start=object_quat is not None, use_goal=goal_quat is not None)
         self.randomiser.write_model()
         self.observe()
@@ -201,7 +226,7 @@ class ReorientEnv:
         """
         mask, goals = np.zeros(self.num_envs, np.int32), self.goal_quat.numpy()
         mask[envs], goals[envs] = 1, goal_quat
-        self._reset.zero_()
+        self.ended.zero_()
         self._new_goal.assign(mask)
         self._given_goal.assign(goals)
         self._reset_envs(use_goal=True)
@@ -213,20 +238,44 @@ class ReorientEnv:
         Args:
             action: Actions in [-1, 1], shape [N, A]: a Warp array or anything ``wp.copy`` takes.
         """
+        if self._terms is None:
+            self._take(action)
+            self._graphs.replay(self.launch_step)
+            self.randomiser.after_step(self.steps)
+        else:
+            self.advance(action)
+            self.renew()
+
+    def advance(self, action: Any) -> None:
+        """The first half of :meth:`step`: simulate and judge; ``ended`` says where an episode is over.
+
+        Arguments are those of :meth:`step`.
+        """
+        self._take(action)
+        self._graphs.replay(self._launch_judged)
+        if self._terms is not None:
+            self._terms.pay(self)
+
+    def renew(self, reset: wp.array | None = None) -> None:
+        """The other half of :meth:`step`: new goals where one was reached, resets, and the observation.
+
+        Args:
+            reset: 1 where to reset, int32, shape [N]; by default ``ended``, which becomes this.
+        """
+        if reset is not None:
+            wp.copy(self.ended, reset)
+        self._graphs.replay(self._launch_renewal)
+        self._new_goal.zero_()
+        if self._terms is not None:
+            self._terms.observe(self)
+        self.randomiser.after_step(self.steps)
+
+    def _take(self, action: Any) -> None:
+        """Put the actions of a step where the graph reads them."""
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
-        if not (self._kernels_loaded and self.sim.solver.captured):
-            self.launch_step()  # before the capture, also in a run that resumes at a later step
-            self._kernels_loaded = True
-        else:
-            if self._graph is None:
-                with wp.ScopedCapture(device=self.device) as capture:
-                    self.launch_step()
-                self._graph = capture.graph
-            wp.capture_launch(self._graph)
         self.steps += 1
         self._own_steps += 1
-        self.randomiser.after_step(self.steps)
 
     def motion(self) -> dict[str, wp.array]:
         """What the motion goes on from, the last targets included: arrays with a row for each; not copies."""
@@ -241,14 +290,7 @@ class ReorientEnv:
 
     def hold(self) -> None:
         """One control step in which no policy acts and the hand keeps its last targets; nothing is reset."""
-        if not self.sim.solver.captured:
-            self.sim.step()
-            return
-        if self._hold_graph is None:
-            with wp.ScopedCapture(device=self.device) as capture:
-                self.sim.step()
-            self._hold_graph = capture.graph
-        wp.capture_launch(self._hold_graph)
+        self._graphs.replay(self.sim.step)
 
     def _apply_action(self) -> None:
         p, sim = self.parameters, self.sim
@@ -272,6 +314,11 @@ class ReorientEnv:
 
     def launch_step(self) -> None:
         """Launch every kernel of a control step; :meth:`step` replays them as one graph."""
+        self._launch_judged()
+        self._launch_renewal()
+
+    def _launch_judged(self) -> None:
+        """Move, and judge the state that is reached."""
         sim = self.sim
         self._apply_action()
         self.randomiser.disturb()
@@ -286,13 +333,16 @@ class ReorientEnv:
         self._judge()
         self._end_episodes()
         self._launch(keep_object_pose_kernel, [sim.joint_q, self.num_joints], [self.object_pose_end])
-        self.randomiser.redraw(self._reset)
+
+    def _launch_renewal(self) -> None:
+        """Give new goals, reset what has ended, and observe."""
+        self.randomiser.redraw(self.ended)
         command = None
         if self._handed is not None:
-            self._handed.hand_over(self.success, self.fell, self._reset, self.step_count)
-            command = sim.target
+            self._handed.hand_over(self.success, self.fell, self.ended, self.step_count)
+            command = self.sim.target
         self._reset_envs(command=command)
-        self.observe()
+        self.observer.observe()
 
     def _judge(self) -> None:
         """Success and reward of the step, before resets."""
@@ -342,18 +392,18 @@ class ReorientEnv:
                 self.success,
                 self.fell,
                 self.max_episode_steps,
-                self._ends,
+                self.ends,
                 self.step_count,
                 self.goal_steps,
                 self.goal_counts,
             ],
-            [self.timed_out, self.done, self._reset, self._new_goal],
+            [self.timed_out, self.done, self.ended, self._new_goal],
         )
 
     def _reset_envs(
         self, *, use_start: bool = False, use_goal: bool = False, command: wp.array | None = None
     ) -> None:
-        """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too.
+        """Reset the environments of ``ended``, give a goal to those of ``_new_goal`` too.
 
         ``command`` is what servos have been told so far [rad], shape [N, *]; the positions by default.
         """
@@ -365,7 +415,7 @@ class ReorientEnv:
                 p.start,
                 p.goal,
                 self._rest_poses,
-                self._reset,
+                self.ended,
                 self._new_goal,
                 self._given_start,
                 int(use_start),
@@ -384,19 +434,21 @@ class ReorientEnv:
                 self._env_mask,
             ],
         )
-        self._free_starts.move(self._reset)
+        self._free_starts.move(self.ended)
         if self.symmetry_frames is not None:
-            self.symmetry_frames.choose(self._reset, self._new_goal)
+            self.symmetry_frames.choose(self.ended, self._new_goal)
         # The solver warm-starts from the last accelerations, which mean nothing after a reset.
         sim.solver.reset(sim.state, world_mask=self._env_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
         if sim.servo is not None:
-            sim.servo.reset(self._reset, command=command)
-        self.observer.begin(self._reset)
+            sim.servo.reset(self.ended, command=command)
+        self.observer.begin(self.ended)
 
     def observe(self) -> None:
         """Refresh the observation from the present state; :meth:`step` and :meth:`reset` have done so."""
         self.observer.observe()
+        if self._terms is not None:
+            self._terms.observe(self)
 
     # Reading
 
@@ -413,6 +465,8 @@ class ReorientEnv:
 
     def check(self) -> None:
         """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or too many steps failed."""
+        if self._terms is not None:
+            self._terms.check()
         rate = self.cfg.failures_per_million
         expected = rate * 1e-6 * self._own_steps * self.num_envs
         self.sim.check(FAILURES_AT_FIRST + expected if rate > 0.0 else 0.0)
@@ -475,4 +529,4 @@ class ReorientEnv:
 
     def close(self) -> None:
         """Release the captured graphs."""
-        self._graph = self._hold_graph = None
+        self._graphs.clear()

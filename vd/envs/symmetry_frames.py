@@ -213,6 +213,8 @@ def _observation_map(
         for name, columns in shape_observation_slices(count).items():
             slices[name] = slice(first + columns.start, first + columns.stop)
     blocks["dynamics"] = block_diag(np.kron(np.eye(JOINT_CHANNELS), np.abs(joints)), np.eye(SCALARS))
+    for name in ("terms", "critic_terms"):  # own values, of which nobody here knows how they turn
+        blocks[name] = np.eye(sum(getattr(observation, name).values()))
     slices |= {name: columns for name, columns in parts.items() if name in blocks}
     size = max(columns.stop for columns in parts.values())
     matrix = np.zeros((size, size))

@@ -1,12 +1,13 @@
 """Agents by name or file, and the task they act in: shared by vd-eval and vd-play."""
 
+import json
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vd.assets_usd.cache import assets_dir
 from vd.bundle import is_bundle
-from vd.config import from_dict
 from vd.envs.cfg import CurriculumCfg, ObservationCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TableCfg
 
 if TYPE_CHECKING:
@@ -16,7 +17,11 @@ if TYPE_CHECKING:
 BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
 
-SHIPPED_POLICIES = {path.stem: path for path in sorted((Path(__file__).parents[1] / "policies").glob("*.pt"))}
+POLICY_FOLDER = Path(__file__).parents[1] / "policies"
+"""Policies of the package, and POLICY_LIST. A wheel has two of them, a checkout all."""
+POLICY_LIST = "policies.json"
+"""Tells of the policies of a folder (:mod:`vd.policy_store`), in a wheel also of those that it lacks."""
+SHIPPED_POLICIES = {path.stem: path for path in sorted(POLICY_FOLDER.glob("*.pt"))}
 """Trained policies that are installed with the package, by name: ``<hand>`` or ``<hand>-<task>``."""
 
 REPLACED = {
@@ -39,6 +44,16 @@ NO_LAYER = "none"
 _RUN_FILES = ("policy.pt", "checkpoints/best.pt")
 
 
+def pulled_folder() -> Path:
+    """Where ``vd-policies pull`` puts policies."""
+    return assets_dir() / "policies"
+
+
+def installed_policies() -> dict[str, Path]:
+    """Policies by name: those of the package, and those that were pulled."""
+    return {path.stem: path for path in sorted(pulled_folder().glob("[!.]*.pt"))} | SHIPPED_POLICIES
+
+
 def find_policy(name: str | Path) -> Path:
     """The policy file that ``name`` means: one that is installed, a file, or the best one of a run's folder.
 
@@ -46,20 +61,27 @@ def find_policy(name: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: There is none.
-        ValueError: A policy of that name was installed once.
+        ValueError: A policy of that name was installed once, or has to be pulled.
     """
     if str(name) in REPLACED:
         raise ValueError(f"the policy {name} is not installed any more; take {REPLACED[str(name)]}")
-    if str(name) in SHIPPED_POLICIES:
-        return SHIPPED_POLICIES[str(name)]
+    installed = installed_policies()
+    if str(name) in installed:
+        return installed[str(name)]
     path = Path(name)
     if path.is_file() or is_bundle(path):
         return path
+    known = json.loads((POLICY_FOLDER / POLICY_LIST).read_text())["policies"]
+    if not path.exists() and str(name) in known:
+        raise ValueError(
+            f"the policy {name} is not on this machine: vd-policies pull {name} --at PLACE, such as the "
+            "folder vd/policies of a checkout"
+        )
     if not path.is_dir():
         raise FileNotFoundError(
             f"no policy at {path}; give a policy.pt, a bundle's folder, a file of a run's "
             f"checkpoints folder, a run's folder, or the name of an installed policy: "
-            f"{', '.join(SHIPPED_POLICIES)}"
+            f"{', '.join(installed)}"
         )
     for candidate in _RUN_FILES:
         if (path / candidate).is_file():
@@ -83,12 +105,7 @@ def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None 
 def policy_name(name: str | Path) -> str:
     """``name`` as it is told to others: the name of an installed policy if it is the file of one."""
     path = Path(name).resolve()
-    return next((known for known, file in SHIPPED_POLICIES.items() if file.resolve() == path), str(name))
-
-
-def trained_task(policy: Any) -> ReorientCfg:
-    """The configuration a policy was trained in."""
-    return from_dict(ReorientCfg, policy.task, where="task of the policy")
+    return next((known for known, file in installed_policies().items() if file.resolve() == path), str(name))
 
 
 def open_policy(name: str, device: str) -> "TrainedPolicy | TrackingPolicy | None":
@@ -134,20 +151,20 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
 
     Raises:
         vd.bundle.contract.ContractError: A bundle; names field, found, expected and remedy.
-        ValueError: The hand has another name or number of joints, or cannot be read.
+        ValueError: The hand has another number of joints, or cannot be read.
     """
     if policy is None:
         return
     from vd.assets_usd.hands import load_hand, root_name
 
-    task = _on_hand(trained_task(policy), hand, hand_layer)
+    task = _on_hand(ReorientCfg.of(policy), hand, hand_layer)
     model, path = load_hand(task.hand, task.fingertip, task.hand_layer), find_policy(name)
     if is_bundle(path):
         from vd.bundle.contract import check_hand
         from vd.bundle.store import read_contract
 
         return check_hand(read_contract(path), model, path)
-    own = trained_task(policy).hand
+    own = ReorientCfg.of(policy).hand
     if policy.num_actions != len(model.actuated) or (task.hand != own and root_name(own) != model.name):
         raise ValueError(
             f"{name} moves {policy.num_actions} joints of {own}, the hand {model.name} has "
@@ -189,11 +206,11 @@ def task_for(
         condition: What is drawn, in place of ``randomised`` (:mod:`vd.evaluate.conditions`).
         settings: Other fields of the task.
     """
-    base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
+    base = ReorientCfg.of(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     if sees_clouds(policy):  # who does not look at its teacher's observation
         base = replace(base, observation=ObservationCfg())
-    if base.observation.dynamics == "critic":  # whom nobody asks here
-        base = replace(base, observation=replace(base.observation, dynamics="none"))
+    seen = replace(base.observation, dynamics="none", critic_terms={})  # nobody asks the critic here
+    base = replace(base, observation=seen, reward=replace(base.reward, terms={}))  # and nobody is paid
     return replace(
         _on_hand(base, hand, hand_layer),
         success=replace(SuccessCfg(), rotation_rad=stop_tolerance_rad),

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,7 +12,7 @@ from vd.config import require
 from vd.envs.cfg import RandomisationCfg
 from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.evaluate.conditions import CONDITIONS, Condition
-from vd.evaluate.goals import AIR_S, Goals
+from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, Goals, GoalSeries
 from vd.paper import PAPER
 from vd.sim.cfg import Engine
 
@@ -27,6 +27,7 @@ OF_THE_SUITE = (
     "episode_s",
     "in_air",
     "air_goals",
+    "consecutive",
     "table_friction",
     "condition",
     "goals",
@@ -36,7 +37,7 @@ OF_THE_SUITE = (
 EXCLUSIVE = (
     ("condition", "randomise", "table_friction"),
     ("at_rest", "no_at_rest"),
-    ("air_goals", "in_air"),
+    ("air_goals", "in_air", "consecutive"),
     ("air_goals", "episode_s"),
 )
 """Settings that say different things of the same."""
@@ -68,7 +69,7 @@ class HandFlags:
     """The hand, for vd-eval and vd-play."""
 
     hand: str | None = None
-    """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
+    """dclaw3, dclaw4, an imported hand or a hand's USD; by default the policy's, or dclaw4."""
     hand_layer: str | None = None
     """Layer over the hand with a servo model, identified.usda of vd-gap; by default the policy's, none for
     the hand as it is."""
@@ -83,7 +84,8 @@ class EpisodeFlags(TaskFlags):
     stop_tolerance: float = PAPER.success.rotation_rad
     """An episode stops below this error [rad]; 0.1 for the paper's precise variant."""
     episode_s: float | None = None
-    """Time limit of an episode [s]; 10 by default, 15 with --in-air, 39 with --air-goals of vd-eval."""
+    """Time limit of an episode [s]; 10 by default, 15 with --in-air, 39 with --air-goals of vd-eval, of
+    whose --consecutive it is the time for each goal."""
     goals: Goals = "mesh"
     """What camera policies know shapes and goals by: the exact mesh; 500 exact points, as the paper's; or a
     scan, points with 4 mm of noise and a fifth missing. A surface is laid through points."""
@@ -136,6 +138,9 @@ class EvalCfg(HandFlags, EpisodeFlags):
     air_goals: tyro.conf.FlagCreatePairsOff[bool] = False
     """The same, and a second later goal after goal, three with 12 s for each; what reaches the first is also
     held for 30 s. Success is of the first."""
+    consecutive: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Successes in a row: goal after goal, 50 at most, until the object is lost or one is not reached within
+    --episode-s. The distance decides; neither action nor stillness is asked for."""
     table_friction: float | None = None
     """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
     condition: Condition | None = None
@@ -169,9 +174,19 @@ class EvalCfg(HandFlags, EpisodeFlags):
         return self.objects or ("cube",)
 
     @property
+    def series(self) -> GoalSeries | None:
+        """Goals in a row, if they are asked for."""
+        if self.air_goals:
+            return AIR_GOALS
+        limit_s = episode_limit_s(self.episode_s, in_air=False)
+        return replace(CONSECUTIVE, goal_s=limit_s) if self.consecutive else None
+
+    @property
     def limit_s(self) -> float:
         """Time limit of an episode [s]."""
-        return AIR_S if self.air_goals else episode_limit_s(self.episode_s, in_air=self.in_air)
+        if self.series is not None:
+            return self.series.length_s
+        return episode_limit_s(self.episode_s, in_air=self.in_air)
 
     @property
     def rest(self) -> bool | None:

@@ -5,9 +5,8 @@ import sys
 from collections.abc import Sequence
 from itertools import chain
 
-import tyro
-
 from vd import interrupt
+from vd.command_line import parse
 from vd.evaluate.agents import check_names
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.files import check_file, check_folder
@@ -16,7 +15,7 @@ from vd.files import check_file, check_folder
 @interrupt.command("vd-eval")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-eval``; returns the exit status."""
-    cfg = tyro.cli(EvalCfg, args=arguments, prog="vd-eval")
+    cfg: EvalCfg = parse(EvalCfg, arguments, prog="vd-eval")
     try:
         cfg.validate()
         check_names(cfg.agent_names, chain(*parse_groups(cfg.object_sets).values()), cfg.hand)

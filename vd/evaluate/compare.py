@@ -45,7 +45,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
 
     from vd.assets_usd.objects.sets import set_files
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.air import judge_in_air
+    from vd.evaluate.in_a_row import judge_series
     from vd.evaluate.result import Result, judge
     from vd.tracking.symmetry import with_symmetries
     from vd.versions import installed_versions
@@ -76,7 +76,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
             chosen = [files.index(file) for file in set_files(sets)]
             objects = [env.objects[number] for number in chosen]
             protocol = _protocol(cfg, wanted, sets, agent.sees)
-            judged = judge_in_air if cfg.air_goals else judge
+            judged = judge if cfg.series is None else judge_series
             rows += judged(trace.of(chosen), protocol, objects, agent, group=group, condition=condition)
     env.close()
     software = {"device": wp.get_device(device).name} | installed_versions(_PACKAGES)
@@ -126,7 +126,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
         seed=cfg.seed,
         max_goal_angle_rad=cfg.max_goal_angle,
         stop_tolerance_rad=cfg.stop_tolerance,
-        episode_s=task.episode_s,
+        episode_s=cfg.series.goal_s if cfg.series and cfg.consecutive else task.episode_s,
         control_hz=task.sim.control_hz,
         randomisation=cfg.condition or ("on" if cfg.randomise else "off"),
         at_rest=task.start.at_rest,
@@ -134,6 +134,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
         palm_up=load_hand(task.hand).palm_up,
         in_air=cfg.in_air,
         air_goals=cfg.air_goals,
+        consecutive=cfg.consecutive,
         table_friction=cfg.table_friction,
         goals=cfg.goals,
         sensor_errors=cfg.sensor_errors and sees == "rendered clouds",
@@ -171,21 +172,23 @@ def actor_of(
 
 
 def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> Any:
-    """All episodes of one policy, with a progress bar: a Trace, or with ``--air-goals`` an AirTrace."""
-    from vd.evaluate.air import air_turns, record_in_air
+    """All episodes of one policy, with a progress bar: a Trace, or of goals in a row a SeriesTrace."""
+    from vd.evaluate.in_a_row import draw_turns, record_series, way_of
     from vd.evaluate.trace import air_table_steps, record
 
     drawn, tolerance = _drawn(cfg, env), cfg.stop_tolerance
     with _progress(cfg, env, agent) as on_step:
         trace: Any
-        if cfg.air_goals:
-            names, way = [item.name for item in env.objects], agent.own_way(tolerance)[1]
-            turns = air_turns(names, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle)
-            trace = record_in_air(env, actor, turns, way, tolerance=tolerance, **drawn, on_step=on_step)
+        if series := cfg.series:
+            names, (_, way) = [item.name for item in env.objects], way_of(agent, series, tolerance)
+            draw: dict[str, Any] = {"seed": cfg.seed, "max_goal_angle": cfg.max_goal_angle}
+            turns = draw_turns(names, cfg.episodes, series.most, **draw)
+            settings: dict[str, Any] = {"tolerance": tolerance, "on_step": on_step}
+            trace = record_series(env, actor, turns, way, series, **drawn, **settings)
         else:
             held = [way for way in agent.ways_to_stop(tolerance).values() if way[1] != "success"]
             table_steps = air_table_steps(env.cfg.sim.control_hz) if cfg.in_air else None
-            settings: dict[str, Any] = {"table_steps": table_steps, "held": held, "on_step": on_step}
+            settings = {"table_steps": table_steps, "held": held, "on_step": on_step}
             trace = record(env, actor, cfg.episodes, **drawn, **settings)
     env.check()
     return trace

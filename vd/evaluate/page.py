@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vd.evaluate.goals import AIR_HOLD_S
+from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE
 from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row
 from vd.evaluate.statistics import Interval
 from vd.evaluate.trace import HOLD_S
@@ -28,6 +28,15 @@ _NAMES = ("policy", "objects", "stopped by")
 _HEADER = (*_NAMES, "success", f"and held {HOLD_S:g} s", "within 0.1 rad", "lost")
 _BESIDE_HEADER = (*_NAMES, "up to symmetry", "median error [rad]", "time [s]")
 _AIR_HEADER = ("policy", "objects", "held", "first goal", "three in a row", "lost", "let go")
+_CONSECUTIVE_HEADER = (
+    "policy",
+    "objects",
+    "in a row, mean",
+    "median",
+    "of all goals",
+    "lost",
+    f"{CONSECUTIVE.most} in a row",
+)
 _OBJECT_HEADER = ("object", *OUTCOMES, "up to symmetry", "median error [rad]")
 _BOUND_HEADER = ("policy", "objects", "bound [rad]", "near and seen so", "said and right", "mean error [rad]")
 GREY = "#8a8f98"
@@ -107,7 +116,8 @@ def write_page(
         beside=beside,
         hold_s=f"{HOLD_S:g}",
         air=_air_table(headlines, short),
-        air_hold_s=f"{AIR_HOLD_S:g}",
+        air_hold_s=f"{AIR_GOALS.hold_s:g}",
+        consecutive=_consecutive_table(result.rows, short),
         differences=_differences(result, short),
         figures=figures,
         missing=[(condition, shown_name(policy), why) for condition, policy, why in result.missing],
@@ -134,6 +144,8 @@ def terminal_text(result: Result) -> str:
         cut = [[*row[: WORDS + 1], *(cell.split(" (")[0] for cell in row[WORDS + 1 :])] for row in rows]
         parts.append(aligned([header, *cut], words=WORDS))
     header, rows = _air_table(result.rows, short)
+    parts += [aligned([header, *rows], words=2)] if rows else []
+    header, rows = _consecutive_table(result.rows, short)
     parts += [aligned([header, *rows], words=2)] if rows else []
     if len(result.policies) == 1 and not suite:
         for row in result.rows:
@@ -245,6 +257,21 @@ def _air_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     ]
 
 
+def _consecutive_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
+    """Successes in a row: of all objects, and of each where there are more."""
+    return _CONSECUTIVE_HEADER, [
+        (
+            short[row.policy],
+            _where(row) if one.name == "all" else one.name,
+            f"{one.mean:.1f}",
+            f"{one.median:g}",
+            *map(share, (one.goals, one.lost, one.full)),
+        )
+        for row in rows
+        for one in row.consecutive[: None if len(row.object_names) > 1 else 1]
+    ]
+
+
 def _bound_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     """What predictions are worth at each bound."""
     return _BOUND_HEADER, [
@@ -297,11 +324,12 @@ def asked(protocols: Sequence[Protocol]) -> str:
         goals = f"uniform within {angle:g} rad of the start"
     rest = "at rest on the table, as the environment draws them"
     table = "" if protocol.table_friction is None else f" of friction {protocol.table_friction:g}"
+    limit = f"{protocol.episode_s:g} s" + (" a goal" if protocol.consecutive else "")
     place = "palm up" if protocol.palm_up else "on the table"
     parts = (
         f"{hands} {'in the air' if protocol.in_air or protocol.air_goals else place}{table}",
-        *(["goal after goal"] if protocol.air_goals else []),
-        f"{protocol.episodes} episodes of {protocol.episode_s:g} s for each object, seed {protocol.seed}",
+        *(["goal after goal"] if protocol.air_goals or protocol.consecutive else []),
+        f"{protocol.episodes} episodes of {limit} for each object, seed {protocol.seed}",
         f"starts {rest if protocol.at_rest else 'dropped into the hand, uniform on SO(3)'}",
         f"goals {goals}",
         f"stop within {protocol.stop_tolerance_rad:g} rad",

@@ -77,6 +77,8 @@ class Protocol:
     """The table is taken away once the hand had time to grasp."""
     air_goals: bool = False
     """The same, and only then come the goals that count, in a row."""
+    consecutive: bool = False
+    """Goal after goal until one fails; ``episode_s`` is the time for each."""
     table_friction: float | None = None
     """Coefficient of the table if it is not the nominal one."""
     goals: Goals = "mesh"
@@ -124,7 +126,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class InAir:
-    """Goal after goal in the air (:mod:`vd.evaluate.air`)."""
+    """Goal after goal in the air (:mod:`vd.evaluate.in_a_row`)."""
 
     held: Interval
     """Share of episodes in which the object was still held when the first goal was drawn."""
@@ -136,6 +138,23 @@ class InAir:
     """Share of those that were held in which the object was lost on the way."""
     let_go: float | None
     """Share of the objects with which the first goal was reached that holding still lost."""
+
+
+@dataclass(frozen=True)
+class Consecutive:
+    """Goals reached one after the other (:mod:`vd.evaluate.in_a_row`), of all objects or of one."""
+
+    name: str
+    """Object, or ``all``."""
+    mean: float
+    """Successes in a row, of all episodes."""
+    median: float
+    goals: float
+    """Share of all goals that were reached."""
+    lost: float
+    """Share of episodes that ended because the object was lost."""
+    full: float
+    """Share of episodes in which all goals were reached."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +194,9 @@ class Row:
     episodes: tuple[Episode, ...]
     """K x M, object by object; of goals in a row those of the first."""
     in_air: InAir | None = None
-    """What became of goals in a row, if there were any."""
+    """What became of goals in a row in the air, if there were any."""
+    consecutive: tuple[Consecutive, ...] = ()
+    """Of consecutive goals, if there were any: of all objects, then of each."""
 
     @property
     def successes(self) -> np.ndarray:

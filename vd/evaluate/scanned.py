@@ -25,11 +25,13 @@ MISSING = PAPER.cloud.dropout_ratio[1]
 
 def scan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Samples [m] of a shape [K, 3], body frame, as a scan has them: noisy, one side replaced by others."""
-    side = rng.normal(size=3)
-    seen = np.argsort(points @ side)[: round(len(points) * (1.0 - MISSING))]
+    along = np.argsort(points @ rng.normal(size=3))
+    seen = along[: round(len(points) * (1.0 - MISSING))]
     again = rng.choice(seen, len(points) - len(seen))
     noise = rng.normal(scale=NOISE_M, size=points.shape).astype(points.dtype)
-    return points[np.concatenate([seen, again])] + noise
+    scanned = np.empty_like(points)
+    scanned[along] = points[np.concatenate([seen, again])] + noise  # as without order as the points were
+    return scanned
 
 
 def known_by_points(item: ObjectModel, points: np.ndarray, device: str) -> ObjectModel:

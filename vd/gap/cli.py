@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from vd import interrupt
+from vd.command_line import parse
 from vd.device import resolve_device
 from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
@@ -298,11 +299,8 @@ Command = (
 @interrupt.command("vd-gap")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
-    command: Run | Find | Explain | Close | Report | Plan | Identify | Hide = tyro.cli(
-        Command,
-        args=arguments,
-        prog="vd-gap",
-        description=__doc__,
+    command: Run | Find | Explain | Close | Report | Plan | Identify | Hide = parse(
+        Command, arguments, prog="vd-gap", description=__doc__
     )
     from vd.gap.recording import RecordingError
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from vd import interrupt
+from vd.command_line import parse
 from vd.config import require
 from vd.device import resolve_device
 from vd.evaluate.agents import DEFAULT_POLICY, check_names
@@ -63,7 +64,7 @@ class PlayCfg(HandFlags, TaskFlags):
 @interrupt.command("vd-play")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-play``; returns the exit status."""
-    cfg = tyro.cli(PlayCfg, args=arguments, prog="vd-play")
+    cfg: PlayCfg = parse(PlayCfg, arguments, prog="vd-play")
     cfg.validate()
     if cfg.video is not None:
         check_file(cfg.video)

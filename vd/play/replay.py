@@ -87,6 +87,7 @@ class Replay:
                 fell=fell,
                 goals=reached,
                 drops=lost,
+                table=not self.hand.palm_up,
             )
 
 

@@ -9,7 +9,6 @@ import warp as wp
 
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.config import from_dict
 from vd.envs.cfg import ReorientCfg
 from vd.frame_maps import FrameMaps
 from vd.senses import Senses
@@ -49,7 +48,7 @@ class Tracker:
         device: str = "cpu",
     ):
         teacher = policy.teacher
-        task = from_dict(ReorientCfg, policy.task, where="task of the policy")
+        task = ReorientCfg.of(policy)
         objects_of = np.zeros(1, dtype=int) if world_object is None else world_object
         self.observer = CameraObserver(
             hand,

@@ -1,4 +1,6 @@
-"""Goal after goal in the air: what is counted; with a test double of the environment."""
+"""Goal after goal: what is counted; with a test double of the environment."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from test_evaluate_page import read_page
 from test_evaluate_trace import STEP_RAD, HeldEnv, drawn, protocol
 
-from vd.evaluate.air import air_turns, judge_in_air, record_in_air
-from vd.evaluate.goals import AIR_S
+from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE
+from vd.evaluate.in_a_row import draw_turns, judge_series, record_series, way_of
 from vd.evaluate.page import terminal_text, write_page
 from vd.evaluate.result import Agent, Result
 from vd.evaluate.statistics import rotation_angle
@@ -20,13 +22,13 @@ OBJECTS = (FakeObject("a"), FakeObject("b"))
 EPISODES = 4
 
 
-class AirEnv(HeldEnv):
+class SeriesEnv(HeldEnv):
     """Remembers which goals were given when."""
 
-    def __init__(self, **settings):
+    def __init__(self, length_s=AIR_GOALS.length_s, **settings):
         self.given = []
         super().__init__(
-            OBJECTS, num_envs=len(OBJECTS) * EPISODES, max_episode_steps=round(12 * AIR_S), **settings
+            OBJECTS, num_envs=len(OBJECTS) * EPISODES, max_episode_steps=round(12 * length_s), **settings
         )
 
     def give_goals(self, envs, goal_quat):
@@ -58,18 +60,21 @@ class Seeker:
 
 def flown(blind_rad=None, **settings):
     """What became of the episodes, the environment, and where the goals were."""
-    env = AirEnv(**settings)
-    turns = air_turns([item.name for item in OBJECTS], EPISODES, seed=2, max_goal_angle=np.pi)
+    env = SeriesEnv(**settings)
+    turns = draw_turns([item.name for item in OBJECTS], EPISODES, 3, seed=2, max_goal_angle=np.pi)
     policy, by = Seeker(env, blind_rad), "exact" if blind_rad is None else "predicted"
     way = StoppingRule(), by
-    trace = record_in_air(env, policy, turns, way, tolerance=0.4, **drawn(OBJECTS, EPISODES))
+    trace = record_series(env, policy, turns, way, AIR_GOALS, tolerance=0.4, **drawn(OBJECTS, EPISODES))
     return trace, env, turns
 
 
-def row_of(trace, **agent):
-    """The only row, of a policy that is stopped in its own way."""
-    who = Agent("p", "teacher", "state", lambda _: StoppingRule(), **agent)
-    (row,) = judge_in_air(trace, protocol(EPISODES), list(OBJECTS), who, group="held-out")
+AGENT = Agent("p", "teacher", "state", lambda _: StoppingRule())
+
+
+def row_of(trace, **asked):
+    """The only row."""
+    how = replace(protocol(EPISODES), **asked)
+    (row,) = judge_series(trace, how, list(OBJECTS), AGENT, group="held-out")
     return row
 
 
@@ -85,7 +90,7 @@ def test_goals_follow_one_another_once_the_table_is_gone():
     error = rotation_angle(trace.end_quat, trace.goal_quat)
     assert trace.stopped.all() and (error < 0.4).all()
     np.testing.assert_array_equal(trace.let_go, [[0, 1, 0, 0], [0, 0, 0, 0]])
-    row = row_of(trace)
+    row = row_of(trace, air_goals=True)
     assert row.successes.all() and row.in_air.in_a_row.value == 1.0 and row.in_air.let_go == 1 / 8
 
 
@@ -93,7 +98,7 @@ def test_what_is_lost_before_or_after_the_first_goal_was_drawn_is_told_apart(tmp
     trace, _, _ = flown(fall_at={0: 20, 5: 37})
     np.testing.assert_array_equal(trace.lost, [[True, False, False, False], [False, True, False, False]])
     np.testing.assert_array_equal(trace.held, [[False, True, True, True], [True] * 4])
-    row = row_of(trace)
+    row = row_of(trace, air_goals=True)
     assert row.overall.outcomes["success"].value == row.in_air.in_a_row.value == 6 / 8
     assert row.overall.outcomes["object falls"].value == 2 / 8
     assert (row.in_air.first, row.in_air.lost) == pytest.approx((6 / 7, 1 / 7))
@@ -114,4 +119,33 @@ def test_a_stop_away_from_the_goal_ends_the_row():
     assert trace.held.all() and len(env.given) == 1 and not trace.lost.any()
     far = rotation_angle(trace.start_quat, trace.goal_quat) > 1.0
     assert far.any() and trace.stopped.all() and not trace.reached[far].any()
-    assert row_of(trace).overall.outcomes["orientation error"].value >= far.mean()
+    assert row_of(trace, air_goals=True).overall.outcomes["orientation error"].value >= far.mean()
+
+
+def test_successes_in_a_row_end_with_a_fall_or_a_goal_that_takes_too_long(tmp_path, monkeypatch):
+    series = replace(CONSECUTIVE, most=6, goal_s=1.5)
+    env = SeriesEnv(series.length_s, fall_at={0: 1, 5: 20})
+    turns = draw_turns(["a", "b"], EPISODES, series.most, seed=2, max_goal_angle=1.5)
+    turns[0, 2, 3] = Rotation.from_rotvec([0.0, 0.0, 3.0]).as_quat()  # 26 steps away, of which it has 18
+    start = drawn(OBJECTS, EPISODES)["starts"]
+    ahead = Rotation.from_rotvec([0.0, 1.05, 0.0]) * Rotation.from_quat(start.reshape(-1, 4))
+    given = {"starts": start, "goals": ahead.as_quat().reshape(start.shape)}
+    _, way = way_of(AGENT, series, 0.4)
+    assert way[0].action_norm > env.num_actions, "no action is too much"
+    trace = record_series(env, Seeker(env), turns, way, series, tolerance=0.4, **given)
+    assert not env.tables, "the table is left alone"
+    np.testing.assert_allclose(rotation_angle(trace.start_quat, trace.goal_quat), 1.05, atol=1e-5)
+    np.testing.assert_array_equal(trace.steps[:, 2:], 7)
+    reached = trace.reached.tolist()
+    assert reached[0][0] == 0 and reached[0][2] == 3 and 1 <= reached[1][1] < 6 and trace.lost.sum() == 2
+    assert [count for row in reached for count in row if count == 6] == [6] * 5
+    monkeypatch.setattr("vd.evaluate.in_a_row.CONSECUTIVE", series)
+    row = row_of(trace, consecutive=True, episode_s=1.5)
+    both, a, b = row.consecutive
+    total = trace.reached.sum()
+    assert (both.mean, both.median, both.full, both.lost) == pytest.approx((total / 8, 6.0, 5 / 8, 2 / 8))
+    assert both.goals == pytest.approx(total / (total + 3)) and (a.name, b.name) == ("a", "b")
+    assert a.mean == pytest.approx(15 / 4) and a.median == 4.5 and row.successes.sum() == 7
+    write_page(Result((row,)), tmp_path / "eval.html")
+    for text in (read_page(tmp_path / "eval.html")[0], terminal_text(Result((row,)))):
+        assert "of all goals" in text and "3.8" in text and "4.5" in text and "1.5 s a goal" in text

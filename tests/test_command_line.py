@@ -1,0 +1,117 @@
+"""Settings in files, in and out, of every command."""
+
+import importlib
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+from unittest.mock import MagicMock
+
+import pytest
+import yaml
+
+from vd.train.config import RunCfg
+from vd.train.flags import parse_teacher
+from vd.train.presets import PRESETS
+from vd.train.student.cli import parse_student
+
+ROOT = Path(__file__).resolve().parents[1]
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+LINES = {
+    "vd-eval": "zero --objects cube cuboid --in-air --table-friction 3e-1",
+    "vd-play": "zero --video a.mp4",
+    "vd-train teacher": "--preset gpu --hand dclaw3 --ppo.actor-learning-rate 3e-5 --randomise",
+    "vd-train student": "--preset cpu-demo --validate cube --camera 0 0 0 0 0 0 1",
+    "vd-train tracker": "dclaw3 --objects cube",
+    "vd-train bundle": "a.pt b",
+    "vd-gap run": "rec --effects backlash --model a.usda",
+    "vd-gap hide": "servo --out rec --effect backlash:width_rad=0.06 --effect dead_zone",
+    "vd-bench sim": "--envs 16 32",
+    "vd-assets import": "meshes --mcts-iterations 5",
+    "vd-deploy": "dclaw3-tracking --twin --safety.misses 12 --goal 0,0,0,1 --no-realtime",
+    "vd-policies pull": "dclaw3 --at folder",
+}
+REFUSED = {
+    ("vd-train teacher", "ppo: {epoch: 3}"): "bad.yaml: ppo has no field epoch; is it epochs?",
+    ("vd-train teacher", "out: runs/x"): "bad.yaml: TeacherCfg has no field out; is it run.out?",
+    ("vd-train teacher", "preset: huge"): "--preset huge is none; one of paper",
+    ("vd-eval zero", "objects: cube"): "bad.yaml: objects: expected a list, ['cube']",
+    ("vd-eval zero", "episodes: 0"): "--episodes is 0; it has to be positive",
+    ("vd-deploy", "safety: {misses: 0}"): "bad.yaml: safety.misses is 0; it has to be positive",
+    ("vd-gap run", "a: ["): "bad.yaml cannot be read",
+    ("vd-play", "seed"): "bad.yaml has no fields",
+    ("vd-play --config a.yaml", "seed: 1"): "names a.yaml and",
+    ("vd-play", None): "there is no file",
+}
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Runs a command line; its exit status, what it prints, and what it says."""
+
+    def started(line):
+        script, *words = shlex.split(line)
+        monkeypatch.setattr(sys, "argv", [script, *words])
+        try:
+            status = importlib.import_module(SCRIPTS[script].partition(":")[0]).main()
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return started
+
+
+@pytest.mark.parametrize("command", LINES)
+def test_what_a_command_prints_of_its_settings_it_reads(command, tmp_path, run):
+    status, printed, _ = run(f"{command} {LINES[command]} --print-config")
+    assert status == 0 and isinstance(yaml.safe_load(printed), dict)
+    (tmp_path / "run.yaml").write_text(printed)
+    assert run(f"{command} --config {tmp_path / 'run.yaml'} --print-config")[:2] == (0, printed)
+
+
+@pytest.mark.parametrize(("line", "text"), REFUSED)
+def test_a_file_that_cannot_be_used_is_refused_by_name(line, text, tmp_path, run):
+    if text is not None:
+        (tmp_path / "bad.yaml").write_text(text)
+    status, _, said = run(f"{line} --config {tmp_path / 'bad.yaml'}")
+    assert status == 1 and REFUSED[line, text] in said
+
+
+def test_only_one_place_reads_command_lines():
+    sources = [
+        path for part in ("vd", "train", "deploy", "assets_usd") for path in (ROOT / part).rglob("*.py")
+    ]
+    assert [path.name for path in sources if "tyro.cli(" in path.read_text()] == ["command_line.py"]
+
+
+def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
+    path = tmp_path / "run.yaml"
+    path.write_text("objects: [cuboid]\nin_air: true\nquick: true\ntable_friction: 3e-1\npolicies: [random]")
+    values = yaml.safe_load(run(f"vd-eval zero --config={path} --in-air --no-quick --print-config")[1])
+    assert values["policies"] == ["zero"] and values["objects"] == ["cuboid"]
+    assert values["in_air"] and not values["quick"] and values["table_friction"] == 0.3
+
+    path.write_text("preset: cpu-demo\nppo: {epochs: 3}\nrun: {out: a}\nenv: {hand: dclaw4}")
+    cfg, preset = parse_teacher(["--config", str(path), "--ppo.gamma", "0.5"]), PRESETS["cpu-demo"]()
+    assert (cfg.ppo.epochs, cfg.ppo.gamma, cfg.run.out) == (3, 0.5, Path("a"))
+    assert cfg.ppo.minibatch_size == preset.ppo.minibatch_size and cfg.env.observation.view == "goal"
+    assert parse_teacher(["--config", str(path), "--preset", "gpu"]).policy == PRESETS["gpu"]().policy
+    path.write_text("stage: 1\npreset: cpu-demo")
+    assert parse_student(["--config", str(path)]).run.out.name == "cpu-stage1"
+
+
+def test_a_logger_that_is_not_installed_is_refused_and_one_that_is_gets_the_curve(tmp_path, monkeypatch):
+    from train_dummy import make_runner
+
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ValueError, match=r"--logger wandb needs wandb, .* pip install wandb"):
+        RunCfg(logger="wandb").validate()
+    wandb = MagicMock()
+    monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", wandb)
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    (tmp_path / "config.json").write_text('{"ppo": {}}')
+    make_runner(tmp_path, logger="wandb").learn(2)
+    logged = {(call.kwargs["step"], *call.args[0]) for call in wandb.log.call_args_list}
+    assert {(1, "reward/total"), (2, "run/steps_per_s")} <= logged and wandb.run.name == tmp_path.name
+    wandb.config.update.assert_called_with({"ppo": {}})
+    wandb.finish.assert_called_once()

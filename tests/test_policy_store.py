@@ -1,0 +1,119 @@
+"""Policies fetched from folders, servers and repositories, and given to others."""
+
+import functools
+import re
+import shutil
+import sys
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from threading import Thread
+from unittest.mock import MagicMock
+
+import pytest
+
+from vd import policy_store
+from vd.evaluate import agents
+from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, pulled_folder
+from vd.policy_store import main
+
+CUBE, OTHER = (SHIPPED_POLICIES[name].read_bytes() for name in ("dclaw4-cube", "dclaw4"))
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder with one policy, ``mine``; none is pulled yet."""
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "cache"))
+    assert main(["push", "dclaw4-cube", "--at", str(tmp_path / "place"), "--name", "mine"]) == 0
+    return tmp_path / "place"
+
+
+@pytest.fixture
+def served(place):
+    """The folder behind a server: its URL, what was asked of it, and how it behaves."""
+    asked, how = [], {"parts": True, "most": None}
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append((self.path, dict(self.headers)))
+            data = (place / Path(self.path).name).read_bytes()
+            part = re.match(r"bytes=(\d+)-", self.headers.get("Range", "")) if how["parts"] else None
+            data = data[int(part[1]) :] if part else data
+            self.send_response(206 if part else 200)
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            self.wfile.write(data[: how["most"]] if self.path.endswith(".pt") else data)
+
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}", asked, how
+    server.shutdown()
+
+
+def refused(capsys, *words):
+    """What a command line that cannot be says."""
+    assert main(words) == 1
+    return capsys.readouterr().err
+
+
+def test_a_pulled_policy_has_a_name_and_nothing_takes_its_place_unasked(place, capsys):
+    pull, push = ["pull", "mine", "--at", str(place)], ["push", "dclaw4", "--at", str(place), "--name"]
+    assert main(pull) == main(pull) == main(["list", "--at", str(place)]) == 0
+    assert find_policy("mine") == pulled_folder() / "mine.pt"
+    assert re.search(r"^mine +teacher +dclaw4 +1\.0 MB  installed$", capsys.readouterr().out, re.MULTILINE)
+
+    assert "another policy" in refused(capsys, *push, "mine")
+    assert main([*push, "mine", "--replace"]) == main([*push, "mine"]) == 0
+    assert "is there already" in capsys.readouterr().out
+    assert "--replace" in refused(capsys, *pull) and find_policy("mine").read_bytes() == CUBE
+    assert main([*pull, "--replace"]) == 0 and find_policy("mine").read_bytes() == OTHER
+    assert main([*push, "dclaw4-cube"]) == 0
+    assert "which stays" in refused(capsys, "pull", "dclaw4-cube", "--at", str(place))
+
+
+@pytest.mark.parametrize("parts", [True, False], ids=["of parts", "of whole files"])
+def test_a_download_that_broke_off_goes_on(served, parts, capsys):
+    url, asked, how = served
+    how.update(parts=parts, most=300_000)
+    said = refused(capsys, "pull", "mine", "--at", url)
+    assert "ended after 300000 of 1034568 bytes; the same command goes on" in said
+    assert not (pulled_folder() / "mine.pt").exists()
+    how["most"] = None
+    assert main(["pull", "mine", "--at", url]) == 0
+    assert asked[-1][1]["Range"] == "bytes=300000-" and find_policy("mine").read_bytes() == CUBE
+    assert {path.name for path in pulled_folder().iterdir()} == {"mine.pt", "policies.json"}
+
+
+def test_what_is_not_as_listed_or_has_no_name_is_refused(place, capsys, monkeypatch):
+    said, at = functools.partial(refused, capsys), ("--at", str(place))
+    shutil.copy(SHIPPED_POLICIES["dclaw4"], place / "mine.pt")
+    assert "SHA-256 differs" in said("pull", "mine", *at) and not list(pulled_folder().iterdir())
+    assert "has no policy yours; it has mine" in said("pull", "yours", *at)
+    assert "--name says how" in said("push", str(place / "mine.pt"), *at)
+    assert "a URL can only be read" in said("push", "dclaw4", "--at", "http://127.0.0.1:1")
+    listed = place / "policies.json"
+    listed.write_text(listed.read_text().replace('"mine"', '"../mine"'))
+    assert "'../mine' is no name of a policy" in said("pull", "../mine", *at)
+    listed.unlink()
+    assert "policies.json cannot be read" in said("list", *at)
+    monkeypatch.setattr(agents, "SHIPPED_POLICIES", {})  # as in a wheel
+    with pytest.raises(ValueError, match=r"dclaw3 is not on this machine: vd-policies pull dclaw3 --at"):
+        find_policy("dclaw3")
+
+
+def test_a_repository_of_hugging_face_is_read_and_gets_policy_and_list_at_once(served, monkeypatch, capsys):
+    url, asked, _ = served
+    monkeypatch.setattr(policy_store, "HUB_URL", url)
+    monkeypatch.setenv("HF_TOKEN", "secret")
+    assert main(["pull", "mine", "--at", "hf://me/hands"]) == 0
+    path, headers = asked[-1]
+    assert path == "/me/hands/resolve/main/mine.pt" and headers["Authorization"] == "Bearer secret"
+    push = ["push", "dclaw4", "--at", "hf://me/hands"]
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    assert "pip install huggingface_hub" in refused(capsys, *push)
+    hub = MagicMock(CommitOperationAdd=lambda *file: file)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    assert main(push) == 0
+    commit = hub.HfApi().create_commit.call_args.kwargs
+    (file, path), (listed, text) = commit["operations"]
+    assert (commit["repo_id"], file, listed) == ("me/hands", "dclaw4.pt", "policies.json")
+    assert Path(path) == SHIPPED_POLICIES["dclaw4"] and b'"mine"' in text and b'"dclaw4"' in text

@@ -1,0 +1,220 @@
+"""What the package offers to programs, where no other module has it under its stable name (:mod:`vd`)."""
+
+import json
+import multiprocessing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from vd.assets_usd.hand_data import CameraModel, HandModel
+    from vd.assets_usd.objects.model import ObjectModel
+    from vd.envs.reorient import ReorientEnv
+    from vd.evaluate.result import Result
+    from vd.gap.result import Report
+
+
+def load_policy(name: str | Path, env: "ReorientEnv | None" = None, device: str = "auto") -> Any:
+    """A policy from a file, to look at, or to act in an environment.
+
+    Args:
+        name: An installed policy such as ``dclaw4``, a ``policy.pt``, a bundle's or a run's folder; with an
+            environment also ``zero`` and ``random``.
+        env: Where it acts. A policy that sees by a camera opens its eyes in there, and acts there alone.
+        device: Of the policy, without an environment: auto, cpu or cuda:N.
+
+    Returns:
+        A policy: ``act(observation)`` gives actions [N, A] for observations [N, O], torch tensors. Without an
+        environment it has ``task``, for :meth:`ReorientCfg.of`, and a policy by camera does not act.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is no policy.
+    """
+    from vd.device import resolve_device
+    from vd.evaluate.agents import open_policy
+    from vd.evaluate.compare import actor_of
+
+    policy = open_policy(str(name), resolve_device(device) if env is None else env.device)
+    if env is not None:
+        return actor_of(str(name), policy, env)[0]
+    if policy is None:
+        raise ValueError(f"{name} acts in any environment, and has to know which; give env")
+    return policy
+
+
+def evaluate_policies(*policies: str, **settings: Any) -> "Result":
+    """Run policies through the same episodes, as ``vd-eval`` does, and write ``eval.json`` into ``out``.
+
+    Args:
+        policies: As of :func:`load_policy`, with ``zero`` and ``random``.
+        settings: Long flags of ``vd-eval`` with underscores: ``objects``, ``episodes``, ``out``.
+
+    Returns:
+        The result: ``rows``, one of each policy, group of objects and way to stop.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+        ValueError: A setting or a set of objects cannot be used.
+    """
+    from vd.evaluate.agents import check_names
+    from vd.evaluate.cfg import EvalCfg, parse_groups
+    from vd.evaluate.compare import compare
+
+    cfg = EvalCfg(policies=policies, **settings)
+    cfg.validate()
+    check_names(
+        cfg.agent_names, [s for sets in parse_groups(cfg.object_sets).values() for s in sets], cfg.hand
+    )
+    return compare(cfg)
+
+
+class ObjectTracker:
+    """Finds an object of known shape in depth images beside the hand; :meth:`look` takes the next."""
+
+    def __init__(
+        self,
+        hand: "HandModel",
+        item: "ObjectModel",
+        camera: "CameraModel | None" = None,
+        *,
+        device: str = "cpu",
+    ):
+        """Measure the shape.
+
+        Args:
+            hand: The hand (:func:`load_hand`), whose own points are left out.
+            item: The object (:func:`load_objects`).
+            camera: Lens, and pose in the base frame; the hand's own by default (``hand.camera``).
+            device: Warp device.
+        """
+        from vd.kernels.task.observations import teacher_observation_size
+        from vd.paper import PAPER
+        from vd.sensors.depth_cloud import CameraCloud
+        from vd.tracking.camera_observer import CameraObserver
+
+        camera = camera or hand.camera
+        self._cloud = CameraCloud(camera, np.asarray(hand.mount), device=device)
+        self._observer = CameraObserver(
+            hand,
+            [item],
+            teacher_observation_size(hand.num_fingers, hand.num_joints),
+            world_object=np.zeros(1, int),
+            world_scale=np.ones(1),
+            camera=camera,
+            control_hz=PAPER.scene.control_hz,
+            device=device,
+        )
+
+    def look(self, depth: np.ndarray, joint_q: np.ndarray, *, fresh: bool = False) -> np.ndarray:
+        """Find the object in the next image.
+
+        Args:
+            depth: Depth along the optical axis [m], 0 for none, shape [H, W].
+            joint_q: Joint positions [rad], shape [D].
+            fresh: Forget where it was.
+
+        Returns:
+            Position [m] and quaternion xyzw in the world frame, shape [7]; of a symmetric object one of the
+            orientations in which it looks like this. As before where nothing is seen of it.
+
+        Raises:
+            ValueError: The image has another size than the camera.
+        """
+        import torch
+
+        from vd.senses import Senses
+
+        points = self._cloud.seen(depth)
+        joints = torch.as_tensor(joint_q, dtype=torch.float32, device=points.device)[None]
+        still, anywhere = torch.zeros_like(joints), points.new_tensor([[0.0, 0.0, 0.0, 1.0]])
+        begins = torch.tensor([fresh], device=points.device)
+        self._observer(Senses(joints, still, still, anywhere, points, begins))
+        found = self._observer.found
+        assert found is not None
+        return torch.cat([found.position[0], found.orientation[0]]).cpu().numpy()
+
+
+def analyse_gap(recording: str | Path, out: str | Path, **settings: Any) -> "Report":
+    """Find, explain and close the gap of a recording, as ``vd-gap run`` does; finished steps are kept.
+
+    Args:
+        recording: Folder of the recording.
+        out: Folder for ``report.json``, ``report.html`` and the identified model, ``identified.usda``.
+        settings: ``hand``, ``hand_layer``, ``effects``, ``seed``, ``device``, as the flags of ``vd-gap run``.
+
+    Returns:
+        The report: ``verdict``, ``effects`` and how much closer the identified model is, ``closing``.
+
+    Raises:
+        RuntimeError: A script calls it without ``if __name__ == "__main__":``; worker processes import it.
+        ValueError: The recording or a setting cannot be used.
+    """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker that imports the script
+        raise RuntimeError('analyse_gap() starts processes: call it under if __name__ == "__main__":')
+    from vd.gap.result import Report
+    from vd.gap.steps import Analysis, Settings
+
+    Analysis(Settings(Path(recording), **settings), Path(out)).run("report")
+    return Report.read(Path(out) / "report.json")
+
+
+def read(path: str | Path) -> Any:
+    """Read a file or folder of any of the formats, as its own content says which.
+
+    Args:
+        path: Folder of a recording, a bundle, or the log of a run; ``report.json`` of ``vd-gap``;
+            ``eval.json`` of ``vd-eval``.
+
+    Returns:
+        A recording, a policy, a log, a report or a result.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is none of these, damaged, or of another version.
+    """
+    from vd.bundle import is_bundle
+    from vd.evaluate.result import Result
+    from vd.gap.recording import read_recording
+    from vd.gap.result import Report
+    from vd.hand_log import is_log, read_log
+
+    path = Path(path)
+    if is_bundle(path):
+        from vd.bundle.store import read_bundle
+
+        return read_bundle(path)
+    if is_log(path):
+        return read_log(path)
+    if path.is_dir():
+        return read_recording(path)
+    values = json.loads(path.read_text())
+    of_gap = isinstance(values, dict) and str(values.get("format")).startswith("vd-gap")
+    return Report.read(path) if of_gap else Result.read(path)
+
+
+def write(value: Any, path: str | Path) -> None:
+    """Write what :func:`read` reads: a recording or a policy into a folder, a report or result into a file.
+
+    Raises:
+        FileExistsError: The folder for a bundle holds something else.
+        OutputError: It cannot be written.
+        TypeError: There is no format for such a value.
+    """
+    from vd.evaluate.result import Result
+    from vd.gap.recording import Recording, write_recording
+    from vd.gap.result import Report
+
+    if isinstance(value, Recording):
+        write_recording(value, path)
+    elif isinstance(value, Report | Result):
+        value.write(Path(path))
+    elif hasattr(value, "task"):
+        from vd.bundle.store import write_bundle
+
+        write_bundle(value, Path(path))
+    else:
+        raise TypeError(
+            f"there is no format for a {type(value).__name__}; give a recording, policy or result"
+        )

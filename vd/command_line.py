@@ -1,0 +1,161 @@
+"""What all commands do with their words: flags over a file of settings, ``--config``, over defaults."""
+
+import dataclasses
+import inspect
+import re
+import sys
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import tyro
+
+from vd.config import from_dict, needed, to_dict
+
+T = TypeVar("T")
+
+CONFIG, PRINT = "--config", "--print-config"
+HELP = """Settings may be in a file too: --config FILE reads YAML or JSON as --print-config prints it. Flags
+override it, and what it leaves out keeps its default."""
+_FLOAT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$")
+"""Numbers that PyYAML takes for text: 3e-4."""
+
+
+@dataclass(frozen=True)
+class ConfigFile:
+    """Settings of a file, by group and field as ``config.json`` of a run has them."""
+
+    path: Path
+    values: Mapping[str, Any]
+
+    def over(self, default: T) -> T:
+        """``default`` with what the file says.
+
+        Raises:
+            ValueError: A field is unknown, or has a wrong value; names file, field and remedy.
+        """
+        try:
+            return from_dict(type(default), self.values, over=default)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{CONFIG} {self.path}: {error}") from error
+
+    def words(self, flags: Mapping[str, str]) -> list[str]:
+        """What the file says of a few flags, by dotted path, as if it had been typed."""
+        found = []
+        for path, flag in flags.items():
+            value: Any = self.values
+            for name in path.split("."):
+                value = value.get(name) if isinstance(value, Mapping) else None
+            if value is not None and value is not False:
+                found += [flag] if value is True else [flag, str(value)]
+        return found
+
+
+def parse(
+    kind: Any,
+    words: Sequence[str] | None = None,
+    *,
+    prog: str,
+    default: Any = None,
+    description: str | None = None,
+) -> Any:
+    """Read a command line; ``--print-config`` prints what it asks for as YAML and ends the program.
+
+    Args:
+        kind: Dataclass of the settings, or a union of those of subcommands.
+        words: The command line without the command's name; that of the program by default.
+        prog: The command's name.
+        default: What is set where neither flags nor a file say otherwise.
+        description: What the help text begins with; the docstring of ``kind`` by default.
+
+    Raises:
+        FileNotFoundError: There is no such ``--config``.
+        ValueError: It is no file of these settings.
+    """
+    arguments, file = take_config(sys.argv[1:] if words is None else words)
+    commands = _subcommands(kind)
+    if commands and arguments and arguments[0] in commands:
+        kind, prog, description = commands[arguments[0]], f"{prog} {arguments.pop(0)}", None
+    if file is not None and isinstance(kind, type):
+        default = file.over(default or kind(**dict.fromkeys(needed(kind), tyro.MISSING)))
+        arguments = [word for word in arguments if word not in _set_already(default, arguments)]
+    shown = PRINT in arguments
+    cfg = tyro.cli(
+        kind,
+        args=[word for word in arguments if word != PRINT],
+        prog=prog,
+        description=f"{description or inspect.getdoc(kind)}\n\n{HELP}",
+        **({} if default is None else {"default": default}),
+    )
+    if shown:
+        import yaml
+
+        print(yaml.safe_dump(to_dict(cfg), sort_keys=False), end="")
+        raise SystemExit(0)
+    return cfg
+
+
+def take_config(words: Sequence[str]) -> tuple[list[str], ConfigFile | None]:
+    """A command line without ``--config FILE``, and that file.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It cannot be read, or there are two.
+    """
+    left: list[str] = []
+    paths: list[str] = []
+    rest = iter(words)
+    for word in rest:
+        flag, equals, value = word.partition("=")
+        if flag != CONFIG:
+            left.append(word)
+        elif path := value if equals else next(rest, ""):
+            paths.append(path)
+        else:
+            raise ValueError(f"{CONFIG} needs a file; {PRINT} shows what it may hold")
+    if len(paths) > 1:
+        raise ValueError(f"{CONFIG} names {' and '.join(paths)}; give one file")
+    return left, _read(Path(paths[0])) if paths else None
+
+
+def _read(path: Path) -> ConfigFile:
+    """A file of settings."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """Takes 3e-4 for a number."""
+
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789"))
+    try:
+        values = yaml.load(path.read_text(), Loader=Loader)  # a safe one
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"{CONFIG}: there is no file {path}; {PRINT} prints settings to begin from"
+        ) from error
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{CONFIG} {path} cannot be read: {error}") from error
+    if not isinstance(values, dict):
+        raise ValueError(f"{CONFIG} {path} has no fields; {PRINT} shows what it may hold")
+    return ConfigFile(path, values)
+
+
+def _subcommands(kind: Any) -> dict[str, Any]:
+    """Settings of subcommands by name; none of a single command."""
+    if dataclasses.is_dataclass(kind):
+        return {}
+    return {
+        marker.name: typing.get_args(option)[0]
+        for option in typing.get_args(kind)
+        for marker in typing.get_args(option)[1:]
+        if getattr(marker, "name", None)
+    }
+
+
+def _set_already(default: Any, words: Sequence[str]) -> set[str]:
+    """Switches that are on already: tyro knows some of these by their opposite alone."""
+    names = [
+        f.name.replace("_", "-") for f in dataclasses.fields(default) if getattr(default, f.name) is True
+    ]
+    return {f"--{name}" for name in names if f"--no-{name}" not in words}

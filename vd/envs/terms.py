@@ -1,0 +1,96 @@
+"""A user's own terms of reward and observation: functions of the environment, named by the configuration.
+
+A function takes the :class:`vd.envs.reorient.ReorientEnv` and gives a torch tensor on its device: [N] for the
+reward, [N] or [N, K] for the observation. It reads the environment and writes nothing to it.
+"""
+
+import importlib
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+
+from vd.envs.cfg import ReorientCfg
+from vd.kernels.task.rewards import REWARD_TERMS
+
+
+class OwnTerms:
+    """The own terms of a task.
+
+    Raises:
+        ValueError: A name means no function, or is there twice; a number of values is not positive.
+    """
+
+    def __init__(self, cfg: ReorientCfg):
+        self._coefficients, self._scale = cfg.reward.terms, cfg.reward.scale
+        seen, told = cfg.observation.terms, cfg.observation.critic_terms
+        if twice := sorted(seen.keys() & told.keys()):
+            raise ValueError(f"observation.critic_terms has {twice[0]}, which the critic is shown already")
+        self._sizes, self._seen = cfg.observation.own, sum(seen.values())
+        if wrong := [name for name, size in self._sizes.items() if size < 1]:
+            raise ValueError(f"observation.terms: {wrong[0]} has to give 1 value or more")
+        self._functions = {name: _function(name) for name in self._coefficients.keys() | self._sizes.keys()}
+        self._not_finite: dict[str, torch.Tensor] = {}
+
+    @torch.no_grad()
+    def pay(self, env: Any) -> None:
+        """Add to the reward of a step what own terms give for the state before resets."""
+        reward, terms = wp.to_torch(env.reward), wp.to_torch(env.reward_terms)
+        failed = wp.to_torch(env.sim.failed) > 0
+        for column, (name, coefficient) in enumerate(self._coefficients.items(), len(REWARD_TERMS)):
+            paid = (coefficient * self._value(env, name, 1)[:, 0]).masked_fill(failed, 0.0)
+            terms[:, column] = paid
+            reward += self._scale * paid
+
+    @torch.no_grad()
+    def observe(self, env: Any) -> None:
+        """Write own values of the present state into the observation, as they are in every frame."""
+        observer = env.observer
+        column = observer.num_observations - self._seen
+        for name, size in self._sizes.items():
+            value = self._value(env, name, size)
+            for array in (observer.world_values, observer.all_values):
+                wp.to_torch(array)[:, column : column + size] = value
+            column += size
+
+    def check(self) -> None:
+        """Refuse values that were not finite; waits for the device.
+
+        Raises:
+            ValueError: It names the term.
+        """
+        for name, seen in self._not_finite.items():
+            if bool(seen):
+                raise ValueError(f"the own term {name} gave a value that is not finite; mend the function")
+
+    def _value(self, env: Any, name: str, size: int) -> torch.Tensor:
+        """What a function gives [N, K]."""
+        value = self._functions[name](env)
+        shape = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
+        if shape not in {(env.num_envs, size), (env.num_envs,) if size == 1 else None}:
+            raise ValueError(
+                f"the own term {name} gave {shape}; return a torch tensor of shape ({env.num_envs}, {size})"
+            )
+        bad = ~torch.isfinite(value).all()
+        self._not_finite[name] = self._not_finite.get(name, bad) | bad
+        return value.reshape(env.num_envs, size).float()
+
+
+def _function(name: str) -> Callable[[Any], torch.Tensor]:
+    """The function ``module:function``; modules of the working folder are found as well."""
+    module, _, function = name.partition(":")
+    here = str(Path.cwd())
+    sys.path.append(here)
+    try:
+        found: Any = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"the own term {name!r} is not found ({error}); name it module:function, and run where that "
+            "module can be imported"
+        ) from error
+    finally:
+        sys.path.remove(here)
+    return found

@@ -1,0 +1,334 @@
+"""``vd-policies``: policies in folders, at URLs and in Hugging Face repositories, with their SHA-256.
+
+Such a place holds ``NAME.pt`` for each policy, and ``policies.json``, which tells of them all.
+"""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.client import HTTPException
+from pathlib import Path
+from typing import IO, Annotated, Any
+from urllib.request import Request, urlopen
+
+import tyro
+
+from vd import interrupt
+from vd.command_line import parse
+from vd.config import from_dict, to_dict
+from vd.evaluate.agents import (
+    BUILT_IN,
+    POLICY_FOLDER,
+    POLICY_LIST,
+    SHIPPED_POLICIES,
+    find_policy,
+    installed_policies,
+    open_policy,
+    policy_name,
+    pulled_folder,
+)
+from vd.files import OutputError, atomic_path, make_folder, write_json, writing
+
+STORE_FORMAT = "visual-dexterity policies 1"
+HUB, HUB_URL = "hf://", "https://huggingface.co"
+BLOCK = 1 << 20
+"""Bytes read at a time."""
+TIMEOUT_S = 60.0
+"""Longest silence of a server."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+PLACE = "a folder, a URL, or hf://OWNER/NAME of Hugging Face"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What is told of a policy."""
+
+    sha256: str
+    bytes: int
+    kind: str
+    """teacher, tracking or vision."""
+    hand: str
+
+
+@dataclass(frozen=True)
+class Store:
+    """The whole of ``policies.json``."""
+
+    policies: dict[str, Entry] = field(default_factory=dict)
+    format: str = STORE_FORMAT
+
+
+def read_store(place: str | Path) -> Store:
+    """What there is at a place.
+
+    Raises:
+        FileNotFoundError: There is no list.
+        OSError: The place does not answer.
+        ValueError: Its list is none.
+    """
+    with _reading(str(place), POLICY_LIST) as stream:
+        text = stream.read()
+    try:
+        store = from_dict(Store, json.loads(text))
+        if store.format != STORE_FORMAT:
+            raise ValueError(f"format is {store.format!r}, this version reads {STORE_FORMAT!r}")
+        for name in store.policies:
+            check_name(name)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{place}/{POLICY_LIST}: {error}") from error
+    return store
+
+
+def check_name(name: str) -> None:
+    """Refuse what cannot be a policy's name, such as a path.
+
+    Raises:
+        ValueError: It cannot.
+    """
+    if not _NAME.fullmatch(name) or name in BUILT_IN:
+        raise ValueError(f"{name!r} is no name of a policy: letters, digits, and . _ - between them")
+
+
+def pull(name: str, place: str, *, replace: bool = False) -> Path:
+    """Fetch a policy; what an earlier call began goes on.
+
+    Raises:
+        FileExistsError: There is another policy of this name, and ``replace`` is not set.
+        OSError: The place does not answer, or the file cannot be written.
+        ValueError: There is no such policy, or it is not the one that the list tells of.
+    """
+    found = read_store(place).policies
+    if name not in found:
+        raise ValueError(f"{place} has no policy {name}; it has {', '.join(found) or 'none'}")
+    entry, target = found[name], pulled_folder() / f"{name}.pt"
+    here = SHIPPED_POLICIES.get(name, target)
+    if here.exists() and _digest(here) == entry.sha256:
+        return here
+    if here.exists() and (name in SHIPPED_POLICIES or not replace):
+        remedy = "which stays" if name in SHIPPED_POLICIES else "--replace takes the one there"
+        raise FileExistsError(f"{here} is another policy than {name} at {place}; {remedy}")
+    part = make_folder(target.parent) / f".{name}.{entry.sha256[:12]}.part"
+    _download(place, f"{name}.pt", part, entry.bytes)
+    if _digest(part) != entry.sha256:
+        part.unlink()
+        raise ValueError(
+            f"{place}/{name}.pt is not the file that {POLICY_LIST} there tells of (SHA-256 differs)"
+        )
+    with writing(target):
+        part.replace(target)
+    _tell(target.parent, name, entry)
+    return target
+
+
+def push(path: Path, name: str, place: str, entry: Entry, *, replace: bool = False) -> bool:
+    """Put a policy into a folder or repository; false if it is there already.
+
+    Raises:
+        FileExistsError: There is another policy of this name, and ``replace`` is not set.
+        OSError: The place does not answer, or cannot be written to.
+        ValueError: Nothing can be pushed there.
+    """
+    check_name(name)
+    if "://" in place and not place.startswith(HUB):
+        raise ValueError(f"--at {place}: a URL can only be read; push to the folder it serves, or to hf://")
+    try:
+        there = read_store(place)
+    except FileNotFoundError:
+        there = Store()
+    before = there.policies.get(name, entry)
+    if before.sha256 != entry.sha256 and not replace:
+        raise FileExistsError(f"{name} at {place} is another policy; give another --name, or --replace")
+    if name in there.policies and before == entry:
+        return False
+    if place.startswith(HUB):
+        _commit(place.removeprefix(HUB), path, name, Store(there.policies | {name: entry}))
+        return True
+    target = Path(place) / path.with_name(f"{name}.pt").name
+    if not (target.exists() and _digest(target) == entry.sha256):
+        with atomic_path(target) as temporary:
+            shutil.copyfile(path, temporary)
+    _tell(Path(place), name, entry)
+    return True
+
+
+def describe(name: str, path: Path) -> Entry:
+    """What is to be told of a policy that can be read.
+
+    Raises:
+        ValueError: It is no policy, or a bundle.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path} is a bundle; push the policy it was made of")
+    policy: Any = open_policy(name, "cpu")
+    return Entry(_digest(path), path.stat().st_size, policy.kind, policy.hand)
+
+
+def _tell(folder: Path, name: str, entry: Entry) -> None:
+    """Note a policy in the list of a folder."""
+    try:
+        store = read_store(folder)
+    except FileNotFoundError:
+        store = Store()
+    write_json(folder / POLICY_LIST, to_dict(Store(dict(sorted((store.policies | {name: entry}).items())))))
+
+
+def _commit(repository: str, path: Path, name: str, store: Store) -> None:
+    """Put a policy and the new list into a repository at once."""
+    try:
+        from huggingface_hub import CommitOperationAdd, HfApi
+    except ImportError as error:
+        raise ValueError(
+            "pushing to Hugging Face needs huggingface_hub: pip install huggingface_hub, then hf auth login"
+        ) from error
+    text = json.dumps(to_dict(store), indent=1) + "\n"
+    HfApi().create_commit(
+        repo_id=repository,
+        operations=[
+            CommitOperationAdd(f"{name}.pt", str(path)),
+            CommitOperationAdd(POLICY_LIST, text.encode()),
+        ],
+        commit_message=f"Add {name}",
+    )
+
+
+def _download(place: str, file: str, part: Path, size: int) -> None:
+    """Have ``part`` hold all of a file; what it holds already is not asked for."""
+    have = part.stat().st_size if part.exists() else 0
+    if have < size:
+        with writing(part):
+            grown = part.open("ab")
+        with grown, _reading(place, file, have) as stream:
+            while block := stream.read(BLOCK):
+                with writing(part):
+                    grown.write(block)
+        have = part.stat().st_size
+    if have < size:
+        raise OSError(f"{place}/{file} ended after {have} of {size} bytes; the same command goes on")
+
+
+@contextmanager
+def _reading(place: str, file: str, skip: int = 0) -> Iterator[IO[bytes]]:
+    """A file of a place, without its first bytes."""
+    try:
+        with _open(place, file, skip) as stream:
+            yield stream
+    except OutputError:
+        raise
+    except (OSError, HTTPException) as error:
+        missing = isinstance(error, FileNotFoundError) or getattr(error, "code", None) == 404
+        kind = FileNotFoundError if missing else ConnectionError
+        raise kind(f"{place}/{file} cannot be read ({error}); --at names {PLACE}") from error
+
+
+def _open(place: str, file: str, skip: int) -> IO[bytes]:
+    if "://" not in place:
+        stream: Any = (Path(place) / file).open("rb")
+        stream.seek(skip)
+        return stream
+    url = f"{HUB_URL}/{place.removeprefix(HUB)}/resolve/main" if place.startswith(HUB) else place.rstrip("/")
+    request = Request(f"{url}/{file}", headers={"Range": f"bytes={skip}-"} if skip else {})
+    token = os.environ.get("HF_TOKEN")
+    if place.startswith(HUB) and token:  # of private repositories; not for who they redirect to
+        request.add_unredirected_header("Authorization", f"Bearer {token}")
+    stream = urlopen(request, timeout=TIMEOUT_S)
+    if skip and stream.status != 206:  # it gives all or nothing
+        stream.read(skip)
+    return stream
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@dataclass(frozen=True)
+class List:
+    """Show the policies that commands know by name, and with --at those of a place."""
+
+    at: str | None = None
+    """A folder, a URL, or hf://OWNER/NAME of Hugging Face."""
+
+    def run(self) -> int:
+        """Print a line for each."""
+        there = {} if self.at is None else read_store(self.at).policies
+        for folder in (POLICY_FOLDER, pulled_folder()):
+            known = read_store(folder).policies if (folder / POLICY_LIST).exists() else {}
+            for name, entry in known.items():
+                if (folder / f"{name}.pt").exists():
+                    same = there.pop(name, entry).sha256 == entry.sha256
+                    _show(name, entry, "installed" if same else f"installed; another one at {self.at}")
+        for name, entry in there.items():
+            _show(name, entry, f"vd-policies pull {name} --at {self.at}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Fetch policies; commands then know them by name. An interrupted download goes on."""
+
+    names: tyro.conf.Positional[tuple[str, ...]]
+    """Policies, as vd-policies list --at names them."""
+    at: str
+    """A folder, a URL, or hf://OWNER/NAME of Hugging Face (of a private one with HF_TOKEN)."""
+    replace: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Let one that was pulled before go."""
+
+    def run(self) -> int:
+        """Fetch each and print where it is."""
+        if not self.names:
+            raise ValueError(f"name what to pull: {', '.join(read_store(self.at).policies)}")
+        for name in self.names:
+            print(f"{name}: {pull(name, self.at, replace=self.replace)}", flush=True)
+        return 0
+
+
+@dataclass(frozen=True)
+class Push:
+    """Give a policy to others: its file, and its SHA-256 in policies.json beside it."""
+
+    policy: Annotated[str, tyro.conf.Positional]
+    """A policy.pt or tracking.pt, a run's folder, or the name of an installed policy."""
+    at: str
+    """Folder, made if it is not there, or hf://OWNER/NAME, a repository of Hugging Face that is there."""
+    name: str | None = None
+    """Name under which others find it; that of an installed policy by default."""
+    replace: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Take the place of another policy of this name."""
+
+    def run(self) -> int:
+        """Check that it is a policy, then write."""
+        path = find_policy(self.policy)
+        name = self.name or policy_name(path)
+        if self.name is None and name not in installed_policies():
+            raise ValueError(f"--name says how others call {path}; give one")
+        done = push(path, name, self.at, describe(self.policy, path), replace=self.replace)
+        print(f"{self.at}: {name} {'is written' if done else 'is there already'}")
+        return 0
+
+
+Command = (
+    Annotated[List, tyro.conf.subcommand("list")]
+    | Annotated[Pull, tyro.conf.subcommand("pull")]
+    | Annotated[Push, tyro.conf.subcommand("push")]
+)
+
+
+def _show(name: str, entry: Entry, where: str) -> None:
+    print(f"{name:<24} {entry.kind:<9} {entry.hand:<10} {entry.bytes / 1e6:5.1f} MB  {where}")
+
+
+@interrupt.command("vd-policies")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``vd-policies``; returns the exit status."""
+    command: List | Pull | Push = parse(Command, arguments, prog="vd-policies", description=__doc__)
+    return command.run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
