@@ -6,7 +6,7 @@ import pytest
 
 from vd.bench import gap
 from vd.bench.cli import GapCommand
-from vd.bench.gap_score import Case, figures, markdown, score
+from vd.bench.gap_score import BATTERIES, Case, figures, markdown, score
 
 TRUTH = {
     "noise_floor_rad": 5e-4,
@@ -58,6 +58,19 @@ def test_the_effect_that_stands_for_another_is_right_if_the_report_says_so():
 def test_an_effect_that_does_not_show_is_refused():
     with pytest.raises(ValueError, match="no payload_inertia"):
         gap.battery("servo", effects=("payload_inertia",))
+
+
+def test_batteries_share_neither_seeds_nor_plants():
+    hidings = {
+        which: [one.hiding() for one in gap.battery("servo", effects=("backlash",), which=which)]
+        for which in BATTERIES
+    }
+    seeds, plants = (
+        [{getattr(h, name) for h in made} for made in hidings.values()] for name in ("seed", "physics")
+    )
+    assert len(set.union(*seeds)) == sum(map(len, seeds))
+    assert len(set.union(*plants)) == sum(len(each.plants) for each in BATTERIES.values())
+    assert case("backlash").name != case("backlash", battery="closed").name
 
 
 def test_names_are_scored_against_the_truth():

@@ -1,12 +1,15 @@
 """The hidden plant obeys closed forms and another engine; recordings of it hide what they hide."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from vd.bench.gap_sizes import effect_at
 from vd.bench.hidden_finger import FingerBody
+from vd.bench.hidden_physics import Physics
 from vd.bench.hidden_plant import Plant, Run, simulate
-from vd.bench.hide import COUPLING, Hiding, simulate_hidden
+from vd.bench.hide import COUPLING, NOISE_RAD, Hiding, _Session, simulate_hidden
 from vd.gap.chain import chains
 from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators as kernel
@@ -88,6 +91,30 @@ def test_effects_outside_the_table_act():
     _, early = answer(servo(**warm), ramp)
     _, late = answer(servo(**warm), ramp, session_s=100.0)
     assert np.abs(late - early).max() > 0.05
+
+
+def test_dry_friction_builds_up_over_a_travel_and_stays_within_its_bounds():
+    """Below it a joint bends and comes back, as on the spring that friction over the travel is."""
+    friction, travel = 0.2, 2.0e-3
+    stiff = replace(servo(coulomb_friction={"tau_c_nm": friction}), physics=Physics(presliding_rad=travel))
+    time, path = answer(stiff, lambda time: np.where((time > 0.1) & (time < 1.0), 0.05, 0.0))
+    held = KP * 0.05 / (KP + friction / travel)
+    assert path[time < 1.0][-1, 0] == pytest.approx(held, rel=0.02) and abs(path[-1, 0]) < 1e-5
+    _, path = answer(stiff, step, duration=4.0)
+    assert KP * (STEP - path[-1, 0]) <= friction * 1.001
+
+
+def test_gears_ripple_and_noise_has_a_colour_but_no_other_size():
+    geared = replace(servo(), physics=Physics(ripple_nm=0.2, ripple_per_turn=20.0))
+    _, path = answer(geared, step)
+    assert KP * (STEP - path[-1, 0]) == pytest.approx(-0.2 * np.sin(20 * path[-1, 0]), abs=1e-3)
+    white, coloured = (
+        _Session(Hiding("servo", physics=Physics(noise_s=noise_s)))._noise((9999, 1), np.arange(9999) * 0.01)
+        for noise_s in (0.0, 0.02)
+    )
+    for noise, memory in ((white, 0.0), (coloured, np.exp(-0.5))):
+        assert noise.std() == pytest.approx(NOISE_RAD, rel=0.1)
+        assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(memory, abs=0.05)
 
 
 FINGER = FingerBody(

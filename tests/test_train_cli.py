@@ -199,6 +199,7 @@ def test_files_from_before_a_field_went_are_read_if_it_was_off():
     before["env"]["caught"] = {"after_s": 2.0, "beyond_rad": 0.4, "go_on_share": 0.0}
     before["env"]["aim"] = {"enabled": False, "past_rad": 0.3, "within_rad": 0.3}
     before["env"]["focus"] = {"success": {}, "share": 0.7}
+    before["env"]["table"]["handed_share"] = 0.25  # of installed policies, which nobody needs to be told
     before["run"] |= {"keep_last": 3, "tensorboard": before["run"].pop("logger") != "none"}
     before["run"]["run_dir"] = before["run"].pop("out")
     before["env"]["num_worlds"] = before["env"].pop("num_envs")

@@ -15,9 +15,11 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(frozen=True)
 class Dropped:
-    """In ``RETIRED``: a field that changed nothing of what a file is. Values other than this leave a note."""
+    """In ``RETIRED``: a field that changed nothing of what a file is. Other values leave a note."""
 
     value: Any
+    installed: Any = None
+    """What an installed policy has there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +114,7 @@ def without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], where
         if isinstance(wanted, Mapping) and wanted and isinstance(value, Mapping):
             without_retired(value, wanted, f"{where}.{name}")
         elif isinstance(wanted, Dropped):
-            if value != wanted.value:
+            if value not in (wanted.value, wanted.installed):
                 warnings.warn(f"{where}.{name} is {value!r}; this version ignores it", stacklevel=2)
         elif to_dict(value) != wanted:
             raise ValueError(

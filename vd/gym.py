@@ -55,8 +55,6 @@ class ReorientVectorEnv(VectorEnv):
         """
         self._mode = AutoresetMode(autoreset_mode)
         task = replace(cfg or ReorientCfg(), num_envs=num_envs, **settings)
-        if self._mode != AutoresetMode.SAME_STEP and task.table.handed_share > 0.0:
-            raise ValueError("table.handed_share needs autoreset_mode SameStep; set it to 0 with others")
         self.metadata = {"autoreset_mode": self._mode, "torch": True}
         self.env = env = ReorientEnv(task, device)
         self.num_envs = num_envs
@@ -67,7 +65,7 @@ class ReorientVectorEnv(VectorEnv):
         self._action = wp.to_torch(env.action)
         self._observation, self._reward = wp.to_torch(env.observation), wp.to_torch(env.reward)
         self._error = wp.to_torch(env.rotation_error)
-        self._flags = [wp.to_torch(array) for array in (env.ended, env.success, env.fell, env.ends)]
+        self._flags = [wp.to_torch(array) for array in (env.ended, env.success, env.fell)]
         self._over = torch.zeros_like(self._reward, dtype=torch.bool)
 
     def reset(
@@ -91,8 +89,10 @@ class ReorientVectorEnv(VectorEnv):
         """One control step with actions [N, A] in [-1, 1]; those beyond are clipped."""
         self._action.copy_(torch.as_tensor(actions))
         self.env.advance(self.env.action)
-        ended, success, fell, ends = (flag > 0 for flag in self._flags)
-        reward, terminated = self._reward.clone(), fell | (success & ends)
+        ended, success, fell = (flag > 0 for flag in self._flags)
+        reward, terminated = self._reward.clone(), fell.clone()
+        if self.env.cfg.success_ends_episode:
+            terminated |= success
         truncated = ended & ~terminated
         info: dict[str, Any] = {"success": success, "rotation_error": self._error.clone()}
         if self._mode == AutoresetMode.SAME_STEP:

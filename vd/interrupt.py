@@ -46,6 +46,7 @@ RENAMED = {
 """Flags of earlier versions, and what they are called in all commands."""
 GONE = {
     "--from-scratch": "stage 1 begins from what --init names",
+    "--env.table.handed-share": "beginning in grasps cost 3 points (docs/lessons.md)",
     "--env.observation.history": "a memory of past steps cost 2 points (docs/results.md#robustness)",
     "--ppo.optimizer": "Adam is the only one",
     "--agent": "name zero or random in place of a policy",

@@ -1,8 +1,7 @@
 """End of episodes, resets of the state and new goals.
 
-Order in a control step: after the reward, :func:`episode_kernel` decides what ends, :func:`hand_over_kernel`
-which of the new episodes begin in a grasp, then :func:`reset_kernel` acts on the masks. Masks are int32, 0 or
-1, or HANDED; worlds outside them keep every bit.
+Order in a control step: after the reward, :func:`episode_kernel` decides what ends, then :func:`reset_kernel`
+acts on the masks. Masks are int32, 0 or 1; worlds outside them keep every bit.
 """
 
 import warp as wp
@@ -19,9 +18,6 @@ from vd.kernels.transforms import (
 )
 
 wp.set_module_options({"enable_backward": False})
-
-HANDED = 2
-"""What a mask of resets holds where the state to begin in is written already."""
 
 
 @wp.struct
@@ -46,7 +42,7 @@ def episode_kernel(
     success_in: wp.array[int],  # [N] 1 where the goal is reached
     fell_in: wp.array[int],  # [N] 1 where the object is lost
     max_steps: int,  # length of an episode [control steps]
-    ends_in: wp.array[int],  # [N] 1 where a success ends the episode; 0: it goes on with a new goal
+    ends: int,  # 1: a success ends the episode; 0: it goes on with a new goal
     # In/Out:
     step_count: wp.array[int],  # [N] control steps since the reset
     goal_steps: wp.array[int],  # [N] control steps since the goal was given
@@ -70,7 +66,7 @@ def episode_kernel(
     goal_steps[world] = goal_steps[world] + 1
 
     at_end = steps >= max_steps
-    reset = fell or at_end or (success and ends_in[world] != 0)
+    reset = fell or at_end or (success and ends != 0)
     timed_out_out[world] = wp.where(at_end and not success and not fell, 1, 0)
     done_out[world] = wp.where(success or fell or at_end, 1, 0)
     if success or fell or at_end:
@@ -84,63 +80,6 @@ def episode_kernel(
 
 
 @wp.kernel
-def hand_over_kernel(
-    # Model:
-    reset_q: wp.array[float],  # [D] hand joints after a reset [rad]
-    handed: wp.array[int],  # [N] 1 where episodes begin in a grasp
-    table_steps: wp.array[int],  # [N] control steps for which the table stays
-    # In:
-    success_in: wp.array[int],  # [N] 1 where the goal is reached
-    fell_in: wp.array[int],  # [N] 1 where the object is lost
-    failed_in: wp.array[int],  # [N] 1 where the physics failed
-    # In/Out:
-    reset: wp.array[int],  # [N] 1 where the world is reset; becomes HANDED where it begins in a grasp
-    step_count: wp.array[int],  # [N] control steps since the reset
-    grasps: wp.array3d[float],  # [N, K, 2 D + 7] grasps: joints, object position and quaternion, targets
-    count: wp.array[int],  # [N] grasps that are remembered
-    joint_q: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
-    target: wp.array2d[float],  # [N, *] joint targets [rad]
-    rng: wp.array[wp.uint32],  # [N] random stream of each world
-):
-    """Remember the grasps in which goals are reached in the air, and begin episodes in them. Launch: [N].
-
-    A success once the table is gone adds the present state; of K the new one replaces one at random. A fall
-    takes one away: what nobody can hold, with what was drawn for the world, is soon forgotten, and an episode
-    without a grasp begins on the table. One that begins in a grasp, any of them, begins at the step at
-    which its table goes.
-    """
-    world = wp.tid()
-    state = rng[world]
-    joints = reset_q.shape[0]
-    known = count[world]
-    if handed[world] != 0 and success_in[world] != 0 and step_count[world] > table_steps[world]:
-        slot = known
-        if known == grasps.shape[1]:
-            slot = wp.randi(state, 0, known)
-        else:
-            known += 1
-        for i in range(joints + 7):
-            grasps[world, slot, i] = joint_q[world, i]
-        for joint in range(joints):
-            grasps[world, slot, joints + 7 + joint] = target[world, joint]
-    if (fell_in[world] != 0 or failed_in[world] != 0) and known > 0:
-        known -= 1
-    count[world] = known
-    if reset[world] != 0:
-        for joint in range(joints):
-            target[world, joint] = reset_q[joint]
-        if known > 0:
-            reset[world] = wp.static(HANDED)
-            step_count[world] = table_steps[world]
-            slot = wp.randi(state, 0, known)
-            for i in range(joints + 7):
-                joint_q[world, i] = grasps[world, slot, i]
-            for joint in range(joints):
-                target[world, joint] = grasps[world, slot, joints + 7 + joint]
-    rng[world] = next_stream(state, world)
-
-
-@wp.kernel
 def reset_kernel(
     # Model:
     reset_q: wp.array[float],  # [D] hand joints after a reset [rad]
@@ -148,7 +87,7 @@ def reset_kernel(
     goal_params: wp.array[GoalParams],  # [1] draw of the goal
     rest_poses: wp.array2d[wp.transform],  # [N, K] poses at rest of each world's object; K = 0: none
     # In:
-    reset_in: wp.array[int],  # [N] 1 where the world is reset, HANDED where it begins as ``joint_q`` says
+    reset_in: wp.array[int],  # [N] 1 where the world is reset
     new_goal_in: wp.array[int],  # [N] 1 where only the goal is drawn anew
     start_quat_in: wp.array[wp.quat],  # [N] start orientation; [0] if ``use_start_quat`` is 0
     use_start_quat: int,  # whether ``start_quat_in`` takes the place of the random orientation
@@ -169,8 +108,7 @@ def reset_kernel(
     """Reset the worlds of one mask; draw a goal for those of either mask. Launch: [N].
 
     A reset puts the hand to ``reset_q``, the object to position + U(-noise, noise) on each axis with a
-    uniform random orientation, all velocities and counters to zero. What is handed over keeps positions and
-    step. Where poses at rest are given, the
+    uniform random orientation, all velocities and counters to zero. Where poses at rest are given, the
     object starts in one of them instead, turned by a random angle about the vertical through its origin.
     A goal is uniform among the orientations within max_angle of the object's (or turns it about the
     vertical only); the smoothed action starts at zero with each goal. A goal that is drawn is less than half
@@ -187,9 +125,6 @@ def reset_kernel(
     joints = reset_q.shape[0]
 
     if reset:
-        for i in range(joints + 6):
-            joint_qd_out[world, i] = 0.0
-    if reset_in[world] == 1:
         start = start_params[0]
         for joint in range(joints):
             joint_q[world, joint] = reset_q[joint]
@@ -207,6 +142,8 @@ def reset_kernel(
             start_quat = start_quat_in[world]
         for i in range(4):
             joint_q[world, joints + 3 + i] = start_quat[i]
+        for i in range(joints + 6):
+            joint_qd_out[world, i] = 0.0
         step_count_out[world] = 0
 
     goal_steps_out[world] = 0

@@ -77,7 +77,7 @@ def start_depth_kernel(
 ):
     """How deep the object would start in hand or table at each place. Launch: [N, C, CHUNKS]."""
     world, place, chunk = wp.tid()
-    if reset_in[world] != 1:
+    if reset_in[world] == 0:
         return
     position = read_vec3(world, object_column, joint_q_in) + places[place]
     orientation = read_quat(world, object_column + 3, joint_q_in)
@@ -110,7 +110,7 @@ def move_start_kernel(
 ):
     """Move the object to the place of least depth, of several the first. Launch: [N]."""
     world = wp.tid()
-    if reset_in[world] != 1:
+    if reset_in[world] == 0:
         return
     best = wp.int32(0)
     for place in range(1, places.shape[0]):

@@ -151,6 +151,9 @@ class GapCommand:
     damping or mass."""
     first_seed: int = 0
     """Seed of the first recording: others than those that the method was tuned on."""
+    battery: Literal["tuned", "development", "closed"] = "tuned"
+    """Plants and seeds: as the rules were tuned on, others to develop on, or those that judge a finished
+    method once."""
     jobs: int = 1
     """Cases at a time, one process and one thread each."""
     device: str = "cpu"
@@ -169,6 +172,7 @@ class GapCommand:
             sizes=self.sizes,
             seeds=self.seeds,
             first_seed=self.first_seed,
+            which=self.battery,
         )
         device = resolve_device(self.device)
         results = run_battery(cases, self.out, jobs=max(self.jobs, 1), device=device)

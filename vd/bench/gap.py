@@ -47,8 +47,9 @@ def battery(
     sizes: Sequence[int] = (0, 1, 2, 3),
     seeds: int = 5,
     first_seed: int = 0,
+    which: str = "tuned",
 ) -> list[Case]:
-    """The cases; arguments as in :class:`vd.bench.cli.GapCommand`.
+    """The cases; arguments as in :class:`vd.bench.cli.GapCommand`, ``which`` its battery.
 
     Raises:
         ValueError: An effect is unknown, or cannot show on the model.
@@ -62,16 +63,16 @@ def battery(
 
     def sized(kind: str, among: Sequence[str]) -> list[Case]:
         each = itertools.product(numbers, sizes, among)
-        return [Case(kind, model, (name,), size, seed) for seed, size, name in each]
+        return [Case(kind, model, (name,), size, seed, battery=which) for seed, size, name in each]
 
     cases = {
         "single": sized("single", names),
         "none": [
-            Case("none", model, (), 0, first_seed + i, changes[i % len(changes)])
+            Case("none", model, (), 0, first_seed + i, changes[i % len(changes)], which)
             for i in range(NOTHING_A_SEED * seeds)
         ],
         "pair": [
-            Case("pair", model, pair, PAIR_SIZE, first_seed + number)
+            Case("pair", model, pair, PAIR_SIZE, first_seed + number, battery=which)
             for number, pair in enumerate(itertools.combinations(names, 2))
         ],
         "outside": sized("outside", tuple(OUTSIDE)),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vd.bench.gap_sizes import sized_effect
+from vd.bench.hidden_physics import TUNED, Physics
 from vd.bench.hidden_plant import CABLE, COGGING, WARMING
 from vd.bench.hide import Hiding
 from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
@@ -37,6 +38,44 @@ MASS_EFFECTS = ("gravity_load", "payload_inertia")
 
 
 @dataclass(frozen=True)
+class Battery:
+    """Recordings of machines that are alike.
+
+    Attributes:
+        first_seed: Added to every seed.
+        plants: What obeys the laws in its own way; a seed takes the next.
+    """
+
+    first_seed: int
+    plants: tuple[Physics, ...]
+
+
+BATTERIES: Mapping[str, Battery] = {
+    "tuned": Battery(0, (TUNED,)),
+    "development": Battery(
+        20000,
+        (
+            Physics(5.0e-4, presliding_rad=1.0e-3, noise_s=0.006, ripple_nm=5.0e-4, ripple_per_turn=31.0),
+            Physics(2.5e-4, presliding_rad=2.5e-3, noise_s=0.003, ripple_nm=1.0e-3, ripple_per_turn=11.0),
+            Physics(3.3e-4, presliding_rad=5.0e-4, noise_s=0.012, ripple_nm=3.0e-4, ripple_per_turn=53.0),
+        ),
+    ),
+    "closed": Battery(
+        40000,
+        (
+            Physics(2.8e-4, presliding_rad=1.7e-3, noise_s=0.008, ripple_nm=4.0e-4, ripple_per_turn=19.0),
+            Physics(4.5e-4, presliding_rad=7.0e-4, noise_s=0.004, ripple_nm=8.0e-4, ripple_per_turn=41.0),
+            Physics(3.7e-4, presliding_rad=3.0e-3, noise_s=0.002, ripple_nm=6.0e-4, ripple_per_turn=73.0),
+            Physics(2.3e-4, presliding_rad=4.0e-4, noise_s=0.015, ripple_nm=1.0e-3, ripple_per_turn=8.0),
+        ),
+    ),
+}
+"""The one that the rules of the search were tuned on; one whose plants solve, stick, read and turn otherwise,
+to develop on; and one that stays closed until a method is finished, and is then run once. A gear's ripple is
+below the noise floor on its own; a tooth bends by less than two encoder counts."""
+
+
+@dataclass(frozen=True)
 class Case:
     """One recording of the battery.
 
@@ -48,6 +87,7 @@ class Case:
         seed: Of base parameters and noise.
         change: With nothing hidden: ``exact`` (the model's own base), ``base`` (other stiffness, damping,
             speed limit) or ``mass`` (other masses as well).
+        battery: One of :data:`BATTERIES`.
     """
 
     kind: str
@@ -56,22 +96,25 @@ class Case:
     size: int
     seed: int
     change: str = "base"
+    battery: str = "tuned"
 
     @property
     def name(self) -> str:
         """Name of its result file."""
         what = "+".join(self.effects) or self.change
-        return f"{self.kind}-{self.model}-{what}-size{self.size}-seed{self.seed}"
+        own = "" if self.battery == "tuned" else f"-{self.battery}"
+        return f"{self.kind}-{self.model}-{what}-size{self.size}-seed{self.seed}{own}"
 
     def hiding(self) -> Hiding:
         """The recording to make."""
-        index = KINDS.index(self.kind)
+        index, battery = KINDS.index(self.kind), BATTERIES[self.battery]
         return Hiding(
             model=self.model,
             effects={name: sized_effect(name, self.size, self.model) for name in self.effects},
-            seed=1000 * index + self.seed,
+            seed=battery.first_seed + 1000 * index + self.seed,
             base_spread=0.0 if self.change == "exact" else Hiding.base_spread,
             mass_spread=MASS_SPREAD if self.change == "mass" else 0.0,
+            physics=battery.plants[self.seed % len(battery.plants)],
         )
 
 

@@ -16,9 +16,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from vd.bench.hidden_finger import Finger, FingerBody, slip
+from vd.bench.hidden_physics import TUNED, Physics
 
-STEP_S = 4.0e-4
-"""Time step [s]: five times finer than the fitted model's, second order where the motion is smooth."""
 FULL_DUTY_RAD = 1.2
 """Error at full P gain that asks for all of the supply [rad], as of a soft X-series servo."""
 PARTS = 8
@@ -54,6 +53,7 @@ class Plant:
         effects: Name to parameter to values [J].
         full_gain: P gain, as recordings name it, at which ``kp`` holds.
         effort: Largest torque of the drives [N m]; None: no limit.
+        physics: How it obeys its laws.
     """
 
     joints: tuple[str, ...]
@@ -66,6 +66,7 @@ class Plant:
     effects: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
     full_gain: float = 1.0
     effort: np.ndarray | None = None
+    physics: Physics = TUNED
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,16 +107,17 @@ class Motion:
     duty: np.ndarray
 
 
-def simulate(runs: Sequence[Run], *, dt: float = STEP_S) -> list[Motion]:
+def simulate(runs: Sequence[Run], *, dt: float | None = None) -> list[Motion]:
     """Simulate runs together.
 
     Args:
         runs: Trajectories; all plants have the same number of joints, and all have a finger or none.
-        dt: Time step [s].
+        dt: Time step [s]; that of the first plant by default.
 
     Raises:
         ValueError: An effect is too stiff for the time step.
     """
+    dt = runs[0].plant.physics.step_s if dt is None else dt
     batch = _Batch(runs, dt)
     path, asked = batch.integrate(batch.references())
     grid = np.arange(path.shape[0]) * dt
@@ -277,6 +279,7 @@ class _Batch:
             v = new
             v = np.minimum(np.maximum(v, -self.limit), self.limit)
             q = middle + half * v
+            loads.bend(v)
             path[k + 1] = q
         return path, asked
 
@@ -293,6 +296,10 @@ class _Batch:
     ) -> np.ndarray:
         """Speeds after a step [B, J] from ``v``, friction as of a torque carried and a sliding speed."""
         minus, plus = loads.friction(carried, sliding, time)
+        if loads.bends:
+            elastic = loads.presliding > 0.0
+            push = push - np.where(elastic, loads.bent(v, minus, plus), 0.0)
+            minus, plus = np.where(elastic, 0.0, minus), np.where(elastic, 0.0, plus)
         if self.body is not None:
             zero = np.zeros_like(v)
             return self.body.velocity(middle, v, push, resisting + zero, minus, plus, self.inertia, self.dt)
@@ -428,7 +435,25 @@ class _Loads:
         self.springs, self.cogs, self.pulls = self.spring.any(), self.ripple.any(), self.cable.any()
         self.stribecks = self.static.any() or self.sliding.any()
         self.warms, self.loads = self.cold.any() or self.warm.any(), self.load.any()
-        self.turn = self.rate = np.zeros_like(self.weight)
+        self.turn = self.rate = self.strain = np.zeros_like(self.weight)
+        self.presliding, self.gear, self.teeth = (
+            np.array([[getattr(p.physics, name)] for p in batch.plants]) + self.strain
+            for name in ("presliding_rad", "ripple_nm", "ripple_per_turn")
+        )
+        self.bends, self.geared = self.presliding.any(), self.gear.any()
+
+    def bend(self, v: np.ndarray) -> None:
+        """Bend what carries dry friction by a step at speeds [B, J]."""
+        if self.bends:
+            self.strain = self._bent(v)
+
+    def bent(self, v: np.ndarray, minus: np.ndarray, plus: np.ndarray) -> np.ndarray:
+        """Friction torque [B, J] [N m] as far as a step at speeds ``v`` has it build up to its bounds."""
+        strain = self._bent(v)
+        return np.where(strain > 0.0, plus, minus) * strain
+
+    def _bent(self, v: np.ndarray) -> np.ndarray:
+        return np.clip(self.strain + v * self.dt / np.maximum(self.presliding, 1e-12), -1.0, 1.0)
 
     def start(self, q: np.ndarray) -> None:
         """Put the second masses at rest on the joints."""
@@ -442,6 +467,8 @@ class _Loads:
             torque = torque - self.weight * np.sin(q + self.phase)
         if self.cogs:
             torque = torque + self.ripple * np.sin(self.turns * q)
+        if self.geared:
+            torque = torque + self.gear * np.sin(self.teeth * q)
         if self.pulls:
             torque = torque - self.cable * np.maximum(q - self.slack, 0.0)
         if self.springs:

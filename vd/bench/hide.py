@@ -6,14 +6,16 @@ counts and jittered stamps. What is hidden is written beside the folder, never i
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.signal import lfilter
 
 from vd.assets_usd.hands import load_hand
 from vd.bench.hidden_finger import FingerBody
+from vd.bench.hidden_physics import TUNED, Physics
 from vd.bench.hidden_plant import OUTSIDE, Motion, Plant, Run, simulate
 from vd.files import write_json
 from vd.gap.excitations import Excitation, JointRange, excitation_set
@@ -75,6 +77,7 @@ class Hiding:
         base_spread: Spread of stiffness, damping and speed limit about the hand's; 0: exactly the hand's.
         mass_spread: Spread of the finger's masses and inertias about the hand's.
         pwm: Record the duty cycle as well.
+        physics: Of the plant, and of its sensor.
     """
 
     model: str
@@ -86,6 +89,7 @@ class Hiding:
     base_spread: float = BASE_SPREAD
     mass_spread: float = 0.0
     pwm: bool = False
+    physics: Physics = TUNED
 
 
 @dataclass(frozen=True)
@@ -164,12 +168,14 @@ def simulate_hidden(hidings: Sequence[Hiding]) -> list[Hidden]:
     """
     sessions = [_Session(hiding) for hiding in hidings]
     runs = [run for session in sessions for run in session.runs]
-    # Long trajectories with long ones: a batch runs as long as its longest.
+    # Long trajectories with long ones: a batch runs as long as its longest, with one time step.
     order = sorted(range(len(runs)), key=lambda i: runs[i].time[-1])
     moved: dict[int, Motion] = {}
-    for start in range(0, len(order), CHUNK):
-        part = order[start : start + CHUNK]
-        moved.update(zip(part, simulate([runs[i] for i in part]), strict=True))
+    for step in {run.plant.physics.step_s for run in runs}:
+        same = [i for i in order if runs[i].plant.physics.step_s == step]
+        for start in range(0, len(same), CHUNK):
+            part = same[start : start + CHUNK]
+            moved.update(zip(part, simulate([runs[i] for i in part]), strict=True))
     motions = (moved[i] for i in range(len(runs)))
     return [session.finish([next(motions) for _ in session.runs]) for session in sessions]
 
@@ -201,12 +207,21 @@ class _Session:
             time[i] = max(time[i], time[i - 1] + SHORTEST_PERIOD_S)
         return np.round(time, 6)
 
+    def _noise(self, shape: tuple[int, ...], time: np.ndarray) -> np.ndarray:
+        """Noise of a reading [T, J] [rad]; of the same size whatever its correlation."""
+        white = self.rng.normal(0.0, NOISE_RAD, shape)
+        if self.plant.physics.noise_s <= 0.0:
+            return white
+        keep = math.exp(-float(np.median(np.diff(time))) / self.plant.physics.noise_s)
+        new = math.sqrt(1.0 - keep * keep)
+        return lfilter([new], [1.0, -keep], white, axis=0, zi=(1.0 - new) * white[:1])[0]
+
     def finish(self, moved: Sequence[Motion]) -> Hidden:
         """Add noise and rounding; the recording and the truth."""
         hiding = self.hiding
         trajectories = []
         for i, (motion, run, own) in enumerate(zip(self.motions, self.runs, moved, strict=True)):
-            noisy = own.position + self.rng.normal(0.0, NOISE_RAD, own.position.shape)
+            noisy = own.position + self._noise(own.position.shape, run.time)
             trajectories.append(
                 Trajectory(
                     file=f"{i:03d}_{motion.joints[0]}_{motion.name}.csv",
@@ -274,7 +289,7 @@ def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
             raise ValueError(f"{name}: {hiding.model} has one joint, which nothing can drive; take a hand")
         on = np.array([joint in having for joint in plant.joints], dtype=float)
         effects[name] = {key: on * given.get(key, value) for key, value in typical.items()}
-    return reach, Plant(**{**vars(plant), "effects": effects})
+    return reach, replace(plant, effects=effects, physics=hiding.physics)
 
 
 def _signed(name: str) -> set[str]:

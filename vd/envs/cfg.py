@@ -151,6 +151,7 @@ class StartCfg:
 class TableCfg:
     """Ours: environments whose table is taken away, as in in-air tests, or does not help; none by default."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"handed_share": Dropped(0.0, 0.25)}
     away_share: float = 0.0
     """Share of the environments whose episodes lose the table; the same environments throughout."""
     away_s: tuple[float, float] = (PAPER.scene.air_table_s, PAPER.scene.air_table_s)
@@ -158,19 +159,10 @@ class TableCfg:
     lift_share: float = 0.0
     """Share of the environments in which success asks that the object does not touch the table: those that
     lose it first, then others."""
-    handed_share: float = 0.0
-    """Share of the environments, of those that lose the table, in which goals follow one another, whatever
-    success_ends_episode says, and whose episodes begin in the air: in a grasp of their own in which a goal
-    was reached, with no table. As long as they have none they begin on the table."""
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        require(self, "table.", "in [0, 1]", "away_share lift_share handed_share")
-        if self.handed_share > self.away_share:
-            raise ValueError(
-                f"table.handed_share is {self.handed_share:g}, more than lose the table; "
-                f"raise table.away_share ({self.away_share:g})"
-            )
+        require(self, "table.", "in [0, 1]", "away_share lift_share")
         if not 0.0 < self.away_s[0] <= self.away_s[1]:
             raise ValueError(
                 f"table.away_s is {self.away_s[0]:g} {self.away_s[1]:g}; it has to rise, and be positive"

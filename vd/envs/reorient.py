@@ -14,7 +14,6 @@ import warp as wp
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.followers import ActuatedActions
-from vd.envs.handed import HandedOver, success_ends
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.saved_state import load_arrays, save_state, saved_stage
@@ -116,11 +115,6 @@ class ReorientEnv:
         self._table_steps: wp.array | None = None
         if cfg.table.away_share > 0.0:
             self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device)
-        self._handed: HandedOver | None = None
-        if cfg.table.handed_share > 0.0:
-            self._handed = HandedOver(state, self._reset_q, self._table_steps)
-        self.ends = success_ends(state)
-        """1 where a success ends the episode, shape [N]."""
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
@@ -167,7 +161,7 @@ class ReorientEnv:
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         reset_q = self.hand.start
-        self._reset_q: wp.array = wp.array(reset_q, dtype=float, device=self.device)
+        self._reset_q = wp.array(reset_q, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, reset_q)
         self._actuated = ActuatedActions(self.state)
 
@@ -337,11 +331,7 @@ class ReorientEnv:
     def _launch_renewal(self) -> None:
         """Give new goals, reset what has ended, and observe."""
         self.randomiser.redraw(self.ended)
-        command = None
-        if self._handed is not None:
-            self._handed.hand_over(self.success, self.fell, self.ended, self.step_count)
-            command = self.sim.target
-        self._reset_envs(command=command)
+        self._reset_envs()
         self.observer.observe()
 
     def _judge(self) -> None:
@@ -392,7 +382,7 @@ class ReorientEnv:
                 self.success,
                 self.fell,
                 self.max_episode_steps,
-                self.ends,
+                int(self.cfg.success_ends_episode),
                 self.step_count,
                 self.goal_steps,
                 self.goal_counts,
@@ -400,13 +390,8 @@ class ReorientEnv:
             [self.timed_out, self.done, self.ended, self._new_goal],
         )
 
-    def _reset_envs(
-        self, *, use_start: bool = False, use_goal: bool = False, command: wp.array | None = None
-    ) -> None:
-        """Reset the environments of ``ended``, give a goal to those of ``_new_goal`` too.
-
-        ``command`` is what servos have been told so far [rad], shape [N, *]; the positions by default.
-        """
+    def _reset_envs(self, *, use_start: bool = False, use_goal: bool = False) -> None:
+        """Reset the environments of ``ended``, give a goal to those of ``_new_goal`` too."""
         sim, p = self.sim, self.parameters
         self._launch(
             reset_kernel,
@@ -441,7 +426,7 @@ class ReorientEnv:
         sim.solver.reset(sim.state, world_mask=self._env_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
         if sim.servo is not None:
-            sim.servo.reset(self.ended, command=command)
+            sim.servo.reset(self.ended)
         self.observer.begin(self.ended)
 
     def observe(self) -> None:
@@ -524,7 +509,6 @@ class ReorientEnv:
             "rng": self.state.rng,
             **self.observer.stateful(),
             **self.randomiser.stateful(),
-            **({} if self._handed is None else self._handed.stateful()),
         }
 
     def close(self) -> None:

@@ -57,9 +57,11 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         ValueError: If it belongs to another number of environments, other objects, another hand or servo
         model.
     """
-    # Checkpoints from before goals had an age: no goal is older than its episode. Later ones counted them.
+    # Checkpoints from before goals had an age: no goal is older than its episode.
     arrays = {"goal_steps": state["arrays"]["step_count"]} | state["arrays"]
-    arrays.pop("goals_reached", None)
+    # Earlier ones counted goals, or remembered grasps.
+    for gone in ("goals_reached", "grasps", "grasp_count"):
+        arrays.pop(gone, None)
     # And from before fingers had couplings for more than three joints: there are none.
     rows = arrays.get("servo_parameters")
     if rows is not None and rows.shape[1] == EARLIER_COLUMNS:
@@ -67,8 +69,8 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         arrays["servo_parameters"] = np.insert(rows, none, 0.0, axis=1)
     if arrays.keys() != here.keys():
         raise ValueError(
-            "the saved environment has other servos, frames, memory, latency or grasps; resume with "
-            "hand_layer, observation, table, randomisation.effects and observation_latency_s, "
+            "the saved environment has other servos, frames, memory or latency; resume with "
+            "hand_layer, observation, randomisation.effects and observation_latency_s, "
             "encoder_latency_s of the checkpoint, or from one without environments "
             "(vd-train export --resumable)"
         )

@@ -273,7 +273,6 @@ def behind(search: Search, weighting: SampleWeighting) -> Search:
         search,
         run=run,
         candidates=[name for name in search.candidates if name != JITTER],
-        restarts=0,
         like=((), {}),
         changing=((), {}),
         jittered=((), {}),

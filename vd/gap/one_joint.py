@@ -16,7 +16,7 @@ from vd.gap.jitter_search import FIXED, jitter_as_another
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import EXPLAINED, JITTER
 from vd.gap.recording import Recording
-from vd.gap.search import LOOKS, RESTARTS
+from vd.gap.search import LOOKS
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import vetoes
@@ -129,7 +129,6 @@ class Explainer:
             scales=joint.scales,
             weights=resamples(len(spec.trajectories), rng),
             refits=REFITS,
-            restarts=0 if hidden else RESTARTS,
             looks=0 if hidden else LOOKS,
             vetoes={**stood_for(same), **told},
             report=lambda line: self.progress(f"explain: {joint.name}: {line}"),

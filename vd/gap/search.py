@@ -21,14 +21,12 @@ WIDE = 15.0
 promise is no guide to where an effect that rings or brakes can be found."""
 LOOKS = 2
 """Rounds in which they are: each costs as much as several others."""
-RESTARTS = 2
-"""Searches from another first effect, where the first search leaves a gap."""
 UNEARNED = float(np.hypot(1.0, MIN_GAIN_FLOORS))
 """Error, in noise floors, from which down to the floor no further effect can close what it has to."""
 COARSE = 0.9
 """Share of an error that a finer time step leaves, at which the search is made with that."""
 NEAR = 4.0
-"""A final error between ``NO_GAP`` and this, in noise floors, is worth a search from another first effect."""
+"""Error, in noise floors, up to which a model stands for a cause that the table has not."""
 
 
 @dataclass(kw_only=True)
@@ -36,7 +34,6 @@ class Search(Frictions, ABC):
     """A search for one joint, which can be made again with samples weighted, or from another's effects.
 
     Attributes:
-        restarts: Searches from another first effect, where the first search leaves a gap.
         looks: Rounds in which every start may be tried (:meth:`look_wider`).
         wide: Whether more is tried than the best starts and one effect after the other.
         like: What another joint of the finger certainly lacks: effects, and values by key.
@@ -44,7 +41,6 @@ class Search(Frictions, ABC):
         jittered: The same of one that has random delays, these among the effects: what is sure beside them.
     """
 
-    restarts: int = RESTARTS
     looks: int = LOOKS
     wide: bool = True
     like: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
@@ -70,9 +66,7 @@ class Search(Frictions, ABC):
             ]
             return self.run(every)
 
-        return replace(
-            self, run=run, fine=True, restarts=RESTARTS, looks=LOOKS, without={}, apart={}, added={}
-        )
+        return replace(self, run=run, fine=True, looks=LOOKS, without={}, apart={}, added={})
 
     def finished(self, present: JointFit) -> bool:
         """Whether a model leaves nothing to explain: noise, of no more than its size."""

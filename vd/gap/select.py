@@ -16,7 +16,7 @@ from vd.gap.frictions import EXACTLY
 from vd.gap.jitter_search import at_once, in_place, jitter_as_another, try_jitter, unlimited
 from vd.gap.joint_fit import ONE_SIDED, JointFit
 from vd.gap.judge import EXPLAINED, JITTER, NESTED, SHARP
-from vd.gap.search import NEAR, UNEARNED, WIDE, Search
+from vd.gap.search import UNEARNED, WIDE, Search
 from vd.gap.telemetry import BEHIND_SENSOR
 
 MIN_TRAJECTORIES = 3
@@ -59,8 +59,6 @@ class Selection(Search):
         trials += rows
         if weighting := clock_sensitivity(self, present):
             return explain_weighted(self, baseline, weighting)
-        present, rivals, rows = self.begun_elsewhere(baseline, present, rivals, rows)
-        trials += rows
         if self.too_coarse(present):
             return self.explain_finer(baseline, present, trials)
         if present.effects:
@@ -90,40 +88,6 @@ class Selection(Search):
         if weighting := clock_sensitivity(self, baseline):  # with an identified limit in it
             return explain_weighted(self, baseline, weighting)
         return None
-
-    def begun_elsewhere(
-        self, baseline: JointFit, present: JointFit, rivals: Rivals, rows: list[Trial]
-    ) -> tuple[JointFit, Rivals, list[Trial]]:
-        """The best of what was found and of searches from other first effects.
-
-        Args:
-            baseline: The plain model.
-            present: What the first search has found.
-            rivals: Fits with others in the place of each of its effects.
-            rows: The evidence of that search.
-
-        Returns:
-            The model, its rivals, and the further evidence.
-        """
-        alone = [t for t in rows if t.round == 1 and len(t.fit.effects) == 1]
-        first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
-        tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
-        trials: list[Trial] = []
-        for name in sorted(first, key=lambda n: first[n].rmse):
-            if present.effects and (self.finished(present) or self.ended(present)):
-                break
-            # Far from the floor another path would change little, unless its beginning was as good.
-            far = present.effects and present.held_out_rmse >= NEAR * self.floor
-            skipped = name not in tied if far else name in present.effects
-            if skipped or self.restarts == 0 or first[name].at_bound:
-                continue
-            self.restarts -= 1
-            other, fits, rows = self.search(baseline, first[name])
-            if self.best([present, other]) is other:
-                self.report(f"from {name}: {1e3 * other.held_out_rmse:.2f} mrad held out is better")
-                present, rivals = other, fits
-                trials += [replace(row, round=row.round + MAX_ROUNDS) for row in rows]
-        return present, rivals, trials
 
     def explain_finer(self, baseline: JointFit, present: JointFit, trials: list[Trial]) -> Explanation:
         """The explanation by a search with a finer time step, or by the model that leaves noise with it."""
@@ -216,7 +180,6 @@ class Selection(Search):
             random = at_once(self, baseline)
             if random and self.likelier(found[0], random[0]) and unlimited(self, found[0], random[0]):
                 self.report(f"{JITTER} leaves noise: nothing else is tried from every start")
-                self.restarts = 0
                 return found
             self.report("not explained: every candidate is tried from every start")
         return self.search(baseline, baseline)
