@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 
 from vd.assets_usd.hands import load_hand
 from vd.bundle import is_bundle
-from vd.bundle.contract import ContractError, check_hand
+from vd.bundle.contract import ContractError, check_hand, check_trained_hand, trained_hand
 from vd.bundle.store import read_bundle, read_contract, write_bundle
 from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy
 from vd.evaluate.cli import main as evaluate
@@ -102,6 +102,17 @@ def test_a_vision_policy_comes_back_and_answers_with_its_network(tmp_path):
     edit(tmp_path / "vision", lambda _: None)
     with pytest.raises(ContractError, match="outputs differ by"):
         read_bundle(tmp_path / "vision")
+
+
+def test_a_policys_hand_is_refused_once_it_is_another_one_of_the_same_name(hand):
+    wanted = trained_hand(hand)
+    assert load_policy(SHIPPED_POLICIES["leap-cube"]).trained_hand["effort_nm"][0] == pytest.approx(0.28)
+    for other in (hand, load_hand("dclaw4")):  # of another name, a person chose it
+        check_trained_hand(wanted, other, "policy.pt")
+    with pytest.raises(ContractError, match=r"hand\.effort_nm\[0\] is .* here, but .* in its training; use"):
+        check_trained_hand(wanted, replace(hand, effort=2.0 * hand.effort), "policy.pt")
+    with pytest.raises(ContractError, match=r"hand\.tips_in_base\[0\]\[0\]"):
+        check_trained_hand(wanted, replace(hand, tip_frame=hand.tip_frame + 1e-3), "policy.pt")
 
 
 def test_another_hand_is_refused_by_field(teacher_bundle, hand, capsys):

@@ -34,7 +34,8 @@ LOWER_RATES = "lower --ppo.actor-learning-rate, --ppo.critic-learning-rate or --
 class TeacherRunner(TrainingLoop):
     """Trains the teacher with rsl-rl's PPO.
 
-    ``task`` is the configuration of the environment, kept with every policy; others as of TrainingLoop.
+    ``task`` is the configuration of the environment, kept with every policy, as is ``trained_hand``
+    (:func:`vd.bundle.contract.trained_hand`); others as of TrainingLoop.
 
     Attributes:
         new_inputs: Observed values that the networks of the policy that it began from did not read.
@@ -54,11 +55,12 @@ class TeacherRunner(TrainingLoop):
         run: RunCfg,
         *,
         task: dict[str, Any],
+        trained_hand: dict[str, Any] | None = None,
         device: str,
         deadline: float | None = None,
     ) -> None:
         super().__init__(run, device=device, deadline=deadline, env=env)
-        self.ppo, self.policy_cfg, self.task = ppo, policy, task
+        self.ppo, self.policy_cfg, self.task, self.trained_hand = ppo, policy, task, trained_hand
         self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
         self._means, self._window = StepMeans(), self._new_window()
@@ -232,6 +234,7 @@ class TeacherRunner(TrainingLoop):
             "policy": to_dict(self._spec()),
             "learner": {"ppo": to_dict(self.ppo), "policy": to_dict(self.policy_cfg)},
             "task": self.task,
+            "trained_hand": self.trained_hand,
         }
         if self.imitation is not None and self.critic_warmup:
             state[IMITATED] = self.imitation.teacher.state_dict()

@@ -59,6 +59,8 @@ def build_teacher(
 
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
+    from vd.assets_usd.hands import load_hand
+    from vd.bundle.contract import trained_hand
     from vd.envs.reorient import ReorientEnv
     from vd.sim.cfg import coarser
     from vd.train.runner import TeacherRunner
@@ -76,6 +78,7 @@ def build_teacher(
         cfg.policy,
         cfg.run,
         task=to_dict(cfg.env),
+        trained_hand=trained_hand(load_hand(cfg.env.hand, cfg.env.fingertip)),
         device=device,
         deadline=cfg.run.deadline(started),
     )

@@ -81,6 +81,8 @@ class TrainedPolicy:
 
     Attributes:
         hand: Name of the hand it moves, as ``task`` says ("" if it does not).
+        trained_hand: What that was in training (:func:`vd.bundle.contract.trained_hand`); empty in files of
+            earlier versions.
         network: From observations [N, O] to mean actions [N, D]; what an exporter needs.
     """
 
@@ -94,8 +96,10 @@ class TrainedPolicy:
         task: dict[str, Any],
         iteration: int = 0,
         env_steps: int = 0,
+        trained_hand: dict[str, Any] | None = None,
         device: str = "cpu",
     ) -> None:
+        self.trained_hand = trained_hand or {}
         self.spec, self.task, self.iteration, self.env_steps = spec, task, iteration, env_steps
         self.hand = str(task.get("hand", ""))
         self.num_observations, self.num_actions = spec.num_observations, spec.num_actions
@@ -208,6 +212,7 @@ def policy_of(state: dict[str, Any], device: str) -> TrainedPolicy:
         task=state["task"],
         iteration=int(state["iter"]),
         env_steps=int(state["env_steps"]),
+        trained_hand=state.get("trained_hand"),
         device=device,
     )
 
@@ -228,7 +233,7 @@ def policy_export(state: dict[str, Any]) -> dict[str, Any]:
     if "ranks" in state:
         environment = state["ranks"][0]["env"]
         exported["stage"] = {key: environment[key] for key in _STAGE if key in environment}
-    return exported | {key: state[key] for key in ("stage", "learner") if key in state}
+    return exported | {key: state[key] for key in ("stage", "learner", "trained_hand") if key in state}
 
 
 def perceptron(spec: PolicySpec) -> nn.Sequential:

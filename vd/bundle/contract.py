@@ -103,13 +103,7 @@ def derive_interface(
     depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth") if source.depth else None
     parts = {
         "conventions": CONVENTIONS,
-        "hand": {
-            "name": hand.name,  # of the root prim of its USD
-            "joint_names": hand.joint_names,  # in the order of joint positions and actions
-            "lower_rad": _floats(hand.lower),
-            "upper_rad": _floats(hand.upper),
-            "base_in_world": _floats(hand.mount),
-        },
+        "hand": _hand(hand),
         # smoothed = ema_alpha clip(action) + (1 - ema_alpha) smoothed, zero at the start;
         # target = clamp(q + smoothed scale_rad_s / control_hz, lower, upper), q as measured.
         "action": {
@@ -122,6 +116,32 @@ def derive_interface(
         "camera": None if depth is None else _camera(hand, depth, camera),
     }
     found: dict[str, Any] = to_dict(parts)
+    return found
+
+
+def _hand(hand: HandModel) -> dict[str, Any]:
+    """The hand as a bundle's interface has it."""
+    return {
+        "name": hand.name,  # of the root prim of its USD
+        "joint_names": hand.joint_names,  # in the order of joint positions and actions
+        "lower_rad": _floats(hand.lower),
+        "upper_rad": _floats(hand.upper),
+        "base_in_world": _floats(hand.mount),
+    }
+
+
+def trained_hand(hand: HandModel) -> dict[str, Any]:
+    """What a policy's file says of the hand of its training, as JSON has it.
+
+    Args:
+        hand: The hand without a layer, whose servo model was identified later.
+    """
+    own = {
+        "effort_nm": _floats(hand.effort),
+        "drop_m": _floats(hand.workspace.drop_m),
+        "tips_in_base": [_floats(tip[:3]) for tip in hand.tip_poses(hand.start)],
+    }
+    found: dict[str, Any] = to_dict(_hand(hand) | own)
     return found
 
 
@@ -162,7 +182,7 @@ def _floats(values: Any) -> list[float]:
 
 _REMEDY = {
     "conventions": "export the policy again with this version",
-    "hand": "use the hand it was trained for, or train a policy for this one",
+    "hand": "use the hand it was trained for (if imported, import it again), or train a policy for this one",
     "action": "export the policy again; its contract was changed after the export",
     "observation": "export the policy again with this version",
     "camera": "use the camera it was made for, or write it for this one (vd-train, --camera)",
@@ -182,13 +202,35 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
         for part, values in contract.interface.items()
         if part != "cloud"  # none, in bundles of earlier versions
     }
+    _check_same(found, wanted, hand, where, "in the bundle")
+
+
+def check_trained_hand(wanted: dict[str, Any], hand: HandModel, where: str | Path) -> None:
+    """Refuse a hand that is called like the one of a policy's training, and is another one.
+
+    Args:
+        wanted: What the policy's file says (:func:`trained_hand`).
+        hand: The hand without a layer.
+        where: The policy.
+
+    Raises:
+        ContractError: The first field that differs, what the hand has, what the policy wants, what to do.
+    """
+    if wanted and wanted["name"] == hand.name:
+        _check_same({"hand": trained_hand(hand)}, {"hand": wanted}, hand, where, "in its training")
+
+
+def _check_same(
+    found: dict[str, Any], wanted: dict[str, Any], hand: HandModel, where: str | Path, said: str
+) -> None:
+    """Refuse the first field of ``wanted``, which is ``said``, that is another one in ``found``."""
     have, want = dict(leaves(found)), dict(leaves(wanted))
     for name in dict.fromkeys((*want, *have)):
         here, there = have.get(name), want.get(name)
         if not _same(here, there):
             raise ContractError(
                 f"{where} does not fit the hand {hand.name} ({hand.path}): {name} is {_short(here)} here, "
-                f"but {_short(there)} in the bundle; {_REMEDY[name.split('.')[0]]}"
+                f"but {_short(there)} {said}; {_REMEDY[name.split('.')[0]]}"
             )
 
 

@@ -17,7 +17,7 @@ from vd.envs.followers import ActuatedActions
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.saved_state import load_arrays, save_state, saved_stage
-from vd.envs.setup import SETTLE_S, rest_poses, table_steps
+from vd.envs.setup import rest_poses, table_steps
 from vd.envs.starts import FreeStarts
 from vd.envs.task_state import build_task
 from vd.kernels.rng import init_rng_kernel
@@ -124,15 +124,12 @@ class ReorientEnv:
         """Control steps of all environments since the begin of the run, with those of a checkpoint."""
         self._own_steps = 0
         if cfg.start.at_rest:
-            self._rest_poses = self._find_rest_poses()
+            self._rest_poses = wp.array(rest_poses(self), dtype=wp.transform, device=self.device)
         self.reset()
 
     def _allocate(self) -> None:
         """Arrays of what a step decides, and of its counts."""
-        n = self.num_envs
-
-        zeros = self.state.zeros
-
+        n, zeros = self.num_envs, self.state.zeros
         self.action = zeros(n, self.num_actions)
         self.reward = zeros(n)
         self.reward_terms = zeros(n, len(self.reward_term_names))
@@ -160,24 +157,9 @@ class ReorientEnv:
         self._env_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
-        reset_q = self.hand.start
-        self._reset_q = wp.array(reset_q, dtype=float, device=self.device)
-        self._free_starts = FreeStarts(self.state, reset_q)
+        self._reset_q = wp.array(self.hand.start, dtype=float, device=self.device)
+        self._free_starts = FreeStarts(self.state, self.hand.start)
         self._actuated = ActuatedActions(self.state)
-
-    def _find_rest_poses(self) -> wp.array:
-        """Drop every object a few times and keep where it came to lie, shape [N, K]."""
-        dropped = []
-        for _ in range(self.cfg.start.poses):
-            self.reset()
-            for _ in range(round(SETTLE_S * self.cfg.sim.control_hz)):
-                wp.copy(self.sim.target, self.sim.joint_q)
-                self.sim.step()
-            self.check()
-            dropped.append(self.object_pose())
-        fall_m = self.cfg.success.fall_of(self.hand.workspace)
-        poses = rest_poses(np.stack(dropped, axis=1), self.hand.workspace, fall_m)
-        return wp.array(poses, dtype=wp.transform, device=self.device)
 
     # Stepping
 

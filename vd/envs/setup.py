@@ -1,9 +1,14 @@
 """What is chosen once, when environments are built: sizes of objects, tables that leave, starts at rest."""
 
-import numpy as np
+from typing import TYPE_CHECKING
 
-from vd.assets_usd.hand_data import Workspace
+import numpy as np
+import warp as wp
+
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
+
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
 
 ALWAYS = 2**31 - 1
 """Last step of a table that stays."""
@@ -40,20 +45,24 @@ def chosen(cfg: ReorientCfg, share: float) -> np.ndarray:
     return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
 
 
-def rest_poses(dropped: np.ndarray, workspace: Workspace, fall_m: float) -> np.ndarray:
-    """Where the objects came to lie, of those drops that stayed in the claw, float, shape [N, K, 7].
+def rest_poses(env: "ReorientEnv") -> np.ndarray:
+    """Drop every object a few times; where they came to lie, float, shape [N, K, 7].
 
-    A drop that left it is replaced by one of the same environment that did not, or, if all did, by the start.
-
-    Args:
-        dropped: Poses after K drops, position [m] and quaternion xyzw, shape [N, K, 7].
-        workspace: Of the hand.
-        fall_m: Distance from the goal position at which an object counts as lost [m].
+    A drop that left the claw is replaced by one of the same environment that did not, or, if all did, by the
+    start. Each is a position [m] and a quaternion xyzw.
     """
-    count = dropped.shape[1]
-    inside = np.linalg.norm(dropped[:, :, :3] - workspace.goal_m, axis=2) < fall_m
+    workspace, dropped = env.hand.workspace, []
+    for _ in range(env.cfg.start.poses):
+        env.reset()
+        for _ in range(round(SETTLE_S * env.cfg.sim.control_hz)):
+            wp.copy(env.sim.target, env.sim.joint_q)
+            env.sim.step()
+        env.check()
+        dropped.append(env.object_pose())
+    found = np.stack(dropped, axis=1)
+    inside = np.linalg.norm(found[:, :, :3] - workspace.goal_m, axis=2) < env.cfg.success.fall_of(workspace)
     # Choose, for every slot, the slot itself or the first good one of the world.
-    slot = np.where(inside, np.arange(count), np.argmax(inside, axis=1)[:, None])
-    poses = np.take_along_axis(dropped, slot[:, :, None], axis=1)
+    slot = np.where(inside, np.arange(len(dropped)), np.argmax(inside, axis=1)[:, None])
+    poses = np.take_along_axis(found, slot[:, :, None], axis=1)
     poses[~inside.any(axis=1)] = [*workspace.drop_m, 0.0, 0.0, 0.0, 1.0]
     return poses

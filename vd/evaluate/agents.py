@@ -150,7 +150,8 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
     """Refuse a policy that moves another hand, before anything slow; agents without a file move any.
 
     Raises:
-        vd.bundle.contract.ContractError: A bundle; names field, found, expected and remedy.
+        vd.bundle.contract.ContractError: A bundle of another hand, or a policy whose hand has changed since;
+            names field, found, expected and remedy.
         ValueError: The hand has another number of joints, or cannot be read.
     """
     if policy is None:
@@ -170,6 +171,10 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
             f"{name} moves {policy.num_actions} joints of {own}, the hand {model.name} has "
             f"{len(model.actuated)}; use the hand it was trained for: --hand {own}"
         )
+    if policy.kind == "teacher" and policy.trained_hand:
+        from vd.bundle.contract import check_trained_hand
+
+        check_trained_hand(policy.trained_hand, load_hand(task.hand, task.fingertip), name)
 
 
 def _on_hand(task: ReorientCfg, hand: str | None, hand_layer: str | None) -> ReorientCfg:

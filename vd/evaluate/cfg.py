@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from vd.assets_usd.hands import HANDS
 from vd.config import require
 from vd.envs.cfg import RandomisationCfg
 from vd.evaluate.agents import SHIPPED_POLICIES
@@ -119,7 +120,7 @@ class EvalCfg(HandFlags, EpisodeFlags):
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = ()
     suite: Literal["paper", "robust"] | None = None
-    """Run the paper's evaluations, or those of every --condition, on the installed policies if none is named.
+    """Run the paper's evaluations, or those of every --condition, on the D'Claw policies if none is named.
     --objects training=FOLDER held-out=FOLDER names objects; without, our procedural sets stand for them."""
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
     """Of the suite only a part, with few objects and episodes: minutes on two CPU cores."""
@@ -166,7 +167,8 @@ class EvalCfg(HandFlags, EpisodeFlags):
             raise ValueError(
                 f"name a policy: a file, zero, random, or an installed one ({', '.join(SHIPPED_POLICIES)})"
             )
-        return tuple(dict.fromkeys(self.policies or SHIPPED_POLICIES))
+        shipped = (name for name in SHIPPED_POLICIES if name.partition("-")[0] in HANDS)
+        return tuple(dict.fromkeys(self.policies or shipped))
 
     @property
     def object_sets(self) -> tuple[str, ...]:
