@@ -152,7 +152,7 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
     Raises:
         vd.bundle.contract.ContractError: A bundle of another hand, or a policy whose hand has changed since;
             names field, found, expected and remedy.
-        ValueError: The hand has another number of joints, or cannot be read.
+        ValueError: The hand has another name or number of joints, or cannot be read.
     """
     if policy is None:
         return
