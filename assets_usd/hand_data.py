@@ -253,6 +253,11 @@ class HandModel:
         return len(self.joint_names)
 
     @property
+    def joint_finger(self) -> np.ndarray:
+        """Finger of each joint, int [D]."""
+        return np.repeat(np.arange(self.num_fingers), [finger.stop - finger.start for finger in self.fingers])
+
+    @property
     def joints_per_finger(self) -> int:
         """Joints of every finger.
 

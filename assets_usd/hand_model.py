@@ -27,6 +27,7 @@ from vd.assets_usd.hand_data import (
 )
 from vd.assets_usd.hand_description import EARLIER_START, Described, xyzw
 from vd.assets_usd.hand_layer import add_layer, read_servo
+from vd.kernels.servo.actuators import MAX_JOINTS
 
 __all__ = ["CameraModel", "CollisionShape", "HandError", "HandModel", "open_stage", "read_hand"]
 
@@ -34,8 +35,6 @@ OPTICAL_FROM_USD = Rotation.from_euler("x", 180, degrees=True)
 """A USD camera looks along -z with +y up; the optical frame along +z with +y down."""
 
 LINK_NAME = re.compile(r"f(\d+)_l(\d+)")
-MAX_JOINTS = 6
-"""Most joints of a finger: of the hands that there are, none has more than five."""
 ORTHONORMAL_TOLERANCE = 1e-5
 """Allowed scale or shear in the transform of a link, above the rounding of single precision."""
 

@@ -49,6 +49,19 @@ def hand_usd(name: str) -> Path:
     )
 
 
+def called(hand: "HandModel") -> str:
+    """What :func:`load_hand` finds a hand by: its name, or its file if no hand of that name is this one."""
+    try:
+        return hand.name if hand_usd(hand.name).samefile(hand.path) else str(hand.path.resolve())
+    except ValueError:
+        return str(hand.path.resolve())
+
+
+def root_name(hand: str) -> str:
+    """What a hand is called in its USD, given by name or file; a file that is not here, as that is called."""
+    return load_hand(hand).name if Path(hand).is_file() else Path(hand).stem
+
+
 def load_hand(name: str, fingertip: str = "rigid", layer: str | Path | None = None) -> "HandModel":
     """Read a hand by name or by the path of its USD.
 

@@ -16,6 +16,7 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
 from simulated_hand import simulated_bus
 
+from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hands import load_hand
 from vd.deploy import cli
 from vd.deploy.camera.realsense import RealSenseCfg
@@ -239,9 +240,15 @@ def test_motions_go_finger_by_finger_and_a_plan_of_another_hand_is_refused(hand,
         record.read_plan(tmp_path / "nowhere.json", joints)
 
 
-@pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])
-def test_the_largest_motions_touch_nothing(name):
-    hand = load_hand(name)
+@pytest.mark.parametrize("name", ["dclaw3", "dclaw4", "leap"])
+def test_the_largest_motions_touch_nothing(name, request, tmp_path):
+    if name == "leap":
+        path = request.getfixturevalue("shared_dir") / "hands" / "leap_hand" / "leap_hand_right.urdf"
+        if not path.is_file():
+            pytest.skip(f"there is no {path}")
+        hand = import_hand(path, tmp_path, "leap").hand
+    else:
+        hand = load_hand(name)
     joints = read_joints(hand)
     plant = NewtonHand(hand, joints, SimCfg(physics_hz=240.0))
     for motion in record.motions_of(joints, (0,), ("steps_and_sines",)):
@@ -249,8 +256,10 @@ def test_the_largest_motions_touch_nothing(name):
             continue
         commands = [*[motion.excitation.command[0]] * 200, *motion.excitation.command]
         for index, command in enumerate(commands):
-            plant.advance(0.01, [Drive(float(angle), 200.0, 8.0, 2.6) for angle in command])
-            touching = int(plant._solver.mjw_data.nacon.numpy()[0])
+            goals = zip(joints.to_motor(command), joints.motors, strict=True)
+            plant.advance(0.01, [Drive(float(angle), motor.p_gain, 8.0, 2.6) for angle, motor in goals])
+            found = plant._solver.mjw_data
+            touching = np.count_nonzero(found.contact.dist.numpy()[: found.nacon.numpy()[0]] < 0.0)
             assert index < 200 or touching == 0, f"{motion.file}: {touching} contacts"
 
 

@@ -1,6 +1,7 @@
 """What vd-gap makes of a recording of the twin and of the log of a run, exactly: on a simulated clock."""
 
 import contextlib
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,9 @@ from hypothesis import strategies as st
 pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
 from simulated_hand import simulated_bus
+from test_hand_import import MIMIC, PARTS, write_urdf
 
+from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hands import load_hand
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware import record
@@ -28,18 +31,19 @@ from vd.envs.cfg import ReorientCfg
 from vd.gap.chain import chains
 from vd.gap.recording import read_recording
 from vd.gap.rollout import Rollouts
-from vd.gap.workflow import explain
+from vd.gap.steps import Analysis, Settings
+from vd.kernels.servo.actuators import COMMAND_DELAY
 from vd.sim.cfg import SimCfg
 from vd.stopping import StoppingRule
 
 DELAY_S = 0.04
 LAYER = """#usda 1.0
 (
-    defaultPrim = "dclaw4"
+    defaultPrim = "toy"
 )
-over "dclaw4"
+over "toy"
 {
-    over "f0_j1"
+    over "f1_j4"
     {
         custom double vd:command_delay:delay_s = 0.04
     }
@@ -65,29 +69,38 @@ def test_late_packets_do_not_move_the_times_of_states(seed, rate, begin):
 
 @pytest.mark.slow
 def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
-    """Four motions of one joint, and three candidates: enough for one effect."""
-    layer = tmp_path / "late.usda"
+    """Four motions of the last joint of four, and three candidates: enough for one effect."""
+    layer, said = tmp_path / "late.usda", tmp_path / "said.yaml"
     layer.write_text(LAYER)
-    hand = load_hand("dclaw4")
+    ids = dict(zip(("a1", "a2", "b1", "b2", "b3", "b4"), (5, 1, 2, 4, 3, 9), strict=True))
+    motors = {name: {"model": "XL330-M288", "id": id, "sign": (-1) ** id} for name, id in ids.items()}
+    said.write_text(json.dumps({"motors": motors}))
+    parts = [part.replace(MIMIC, "") for part in PARTS]
+    hand = import_hand(write_urdf(tmp_path, parts), tmp_path / "out", str(said)).hand
     joints = read_joints(hand)
-    motions = record.motions_of(joints, (0,), ("steps_and_sines",))
-    chosen = [m for m in motions if m.excitation.joints == ("f0_j1",) and m.excitation.name in KINDS]
+    motions = record.motions_of(joints, (1,), ("steps_and_sines",))
+    chosen = [m for m in motions if m.excitation.joints == ("f1_j4",) and m.excitation.name in KINDS]
 
     @contextlib.contextmanager
     def connect(_, **twin_options):
-        plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=960.0))
+        plant = NewtonHand(load_hand(str(hand.path), layer=layer), joints, SimCfg(physics_hz=3840.0))
         with simulated_bus(hand, joints, plant) as (_, bus):
             yield Connection(joints, bus)
 
     monkeypatch.setattr(record, "connect", connect)
     monkeypatch.setattr(record, "motions_of", lambda *_: chosen)
-    cfg = record.RecordCfg(hand="dclaw4", port="simulated", out=tmp_path / "rec", fingers=(0,))
+    cfg = record.RecordCfg(hand=str(hand.path), port="simulated", out=tmp_path / "rec", fingers=(1,))
     assert record.record(replace(cfg, yes=True, realtime=False)) == 0
     candidates = ("command_delay", "coulomb_friction", "backlash")
-    report = explain(tmp_path / "rec", hand, tmp_path / "gap", effects=candidates, workers=1)
-    (found,) = report.effects
-    assert found.name == "command_delay" and found.joints == ("f0_j1",)
+    analysis = Analysis(Settings(tmp_path / "rec", effects=candidates), tmp_path / "gap")
+    analysis.run("close")
+    (found,) = analysis.explained().effects
+    assert found.name == "command_delay" and found.joints == ("f1_j4",)
     assert found.parameters["delay_s"].value == pytest.approx(DELAY_S, abs=0.001)
+    closed = json.loads((tmp_path / "gap" / "close.json").read_text())
+    assert closed["identified_rmse_rad"] < 0.1 * closed["baseline_rmse_rad"]
+    again = load_hand(str(hand.path), layer=tmp_path / "gap" / "identified.usda")
+    assert again.servo[5, COMMAND_DELAY] == pytest.approx(DELAY_S, abs=0.001)
 
 
 class Waving(PolicyRunner):

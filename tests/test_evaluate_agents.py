@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from vd.assets_usd.hands import hand_usd
 from vd.evaluate.agents import (
     POLICY_FOLDER,
     SHIPPED_POLICIES,
@@ -73,7 +74,11 @@ def test_another_hand_is_refused_before_anything_is_built(policy, tmp_path, caps
     for command, flags in ((main, ["--out", str(tmp_path)]), (play, ["--video", str(tmp_path / "m.mp4")])):
         assert command([policy, "--hand", "dclaw3", "--device", "cpu", *flags]) == 1
         error = capsys.readouterr().err
-        assert f"{policy} moves 12 joints, the hand dclaw3 has 9" in error and "--hand dclaw4" in error
+        assert f"{policy} moves 12 joints of dclaw4, the hand dclaw3 has 9; use" in error
+    other = tmp_path / "other.usda"
+    other.write_text(hand_usd("dclaw4").read_text().replace("dclaw4", "other"))
+    assert main([policy, "--hand", str(other), "--device", "cpu", "--out", str(tmp_path)]) == 1
+    assert "the hand other has 12" in capsys.readouterr().err
 
 
 def test_start_goals_and_layer_are_as_trained_unless_asked_otherwise():

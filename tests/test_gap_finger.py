@@ -39,15 +39,6 @@ def blank() -> Recording:
     return Recording(Path("made up"), "dclaw3", JOINTS, {}, 1e-5, tuple(parts))
 
 
-def test_of_a_longer_finger_three_joints_are_taken() -> None:
-    hand = replace(load_hand("dclaw4"), fingers=(slice(0, 4), slice(4, 8), slice(8, 12)))
-    with pytest.raises(ValueError, match=r"f1_j1 are 4 joints of one finger"):
-        chains(replace(blank(), joints=hand.joint_names[:4]), hand)
-    (chain,) = chains(replace(blank(), joints=hand.joint_names[1:4]), hand)
-    assert chain.slot.tolist() == [0, 1, 2]
-    np.testing.assert_allclose(chain.mass, hand.link_mass[2:5])
-
-
 def recorded(
     factors: tuple[float, float, float], lacks: dict[int, float] | None = None, dt: float = DT
 ) -> tuple[Recording, Chain]:

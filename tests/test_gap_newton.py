@@ -8,10 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from test_hand_import import MIMIC, PARTS, link, write_urdf
+from test_hand_import import joint as a_joint
 
+from vd.assets_usd.hand_data import HandModel
+from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hands import load_hand
 from vd.gap import cli
 from vd.gap.chain import chains
+from vd.gap.close import counterparts
 from vd.gap.excitations import JointRange, steps_and_sines
 from vd.gap.identify import identify, write_drives
 from vd.gap.newton import HandReplay, simulate_hand
@@ -37,9 +42,9 @@ EFFECTS: dict[str, dict[str, float]] = {
 
 
 @cache
-def motions(kind: str, joints: tuple[str, ...], seconds: float) -> Recording:
+def motions(kind: str, joints: tuple[str, ...], seconds: float, hand: HandModel = HAND) -> Recording:
     """The start of one of the paper's excitations on some joints, with the commands as positions."""
-    reach = JointRange(HAND.joint_names, HAND.lower, HAND.upper)
+    reach = JointRange(hand.joint_names, hand.lower, hand.upper)
     trajectories = []
     for motion in steps_and_sines(reach):
         if motion.name == kind and motion.joints[0] in joints:
@@ -58,7 +63,7 @@ def motions(kind: str, joints: tuple[str, ...], seconds: float) -> Recording:
                     motion.enabled[keep],
                 )
             )
-    return Recording(Path("unsaved"), HAND.name, HAND.joint_names, {}, 1e-4, tuple(trajectories))
+    return Recording(Path("unsaved"), hand.name, hand.joint_names, {}, 1e-4, tuple(trajectories))
 
 
 def rows(**columns: float) -> np.ndarray:
@@ -88,6 +93,27 @@ def test_newton_agrees_with_the_rollouts_under_every_kind_of_effect():
     expected = ((newton - measured) ** 2).reshape(len(EFFECTS), count, length, 3).sum(axis=2)
     squared = replay.squared_error.numpy()[:, :3].reshape(len(EFFECTS), count, 3)
     assert np.allclose(squared, expected, rtol=1e-3, atol=1e-6)
+
+
+def test_newton_agrees_on_fingers_that_differ(tmp_path):
+    """Fingers of two and of six joints, which couple within themselves."""
+    longer = [link("b_5", 0.03), a_joint("b5", "b_4", "b_5", 'xyz="0 0 0.03"', "1 0 0")]
+    longer += [link("b_6", 0.03), a_joint("b6", "b_5", "b_6", 'xyz="0 0 0.03"')]
+    parts = [part.replace(MIMIC, "") for part in PARTS]
+    hand = import_hand(write_urdf(tmp_path, [*parts, *longer]), tmp_path / "out").hand
+    recording = motions("sine_0.50hz", ("f0_j2", "f1_j1", "f1_j5"), 0.9, hand)
+    each = np.stack([hand.servo, hand.servo, hand.servo])
+    each[1, :, [servo.COULOMB_TORQUE, servo.COMMAND_DELAY]] = [[0.05], [0.013]]
+    each[2, 2, servo.COUPLING_0 + 5], each[2, 7, servo.COUPLING_0 + 4] = 0.3, 0.4
+    newton = simulate_hand(recording, hand, each)
+    short, long = chains(recording, hand)
+    assert (len(short.joints), len(long.joints)) == (2, 6)
+    for chain in (short, long):
+        predicted = Rollouts(chain, recording).predict(each[:, chain.columns])
+        error = np.sqrt(np.mean((newton[:, :, chain.columns] - predicted) ** 2, axis=(1, 2)))
+        assert error.max() < 1e-3
+    assert np.abs(predicted[1:] - predicted[0]).max(axis=(1, 2)).min() > 0.02, "what was set shows"
+    assert counterparts(hand, ("f0_j1", "f0_j2")) == {}, "no finger is like it"
 
 
 def test_commands_act_from_when_they_were_sent():

@@ -99,7 +99,7 @@ def test_commands_may_be_sent_at_other_times_than_the_stamps(tmp_path):
     ("changes", "words"),
     [
         ({"format": "vd-recording/9"}, ("format", "vd-recording/9", "vd-recording/1")),
-        ({"model": "dclaw7"}, ("unknown model 'dclaw7'", "dclaw3", "servo")),
+        ({"model": "dclaw7"}, ("no hand is called 'dclaw7'", "dclaw3", "servo")),
         ({"joints": ["f0_j1", "f9_j2"]}, ("unknown joint 'f9_j2'", "f2_j3")),
         ({"encoder_resolution_rad": None}, ("encoder_resolution_rad", "0.001534")),
         ({"encoder_resolution_rad": 360.0 / 4096}, ("degrees", "71.5 counts a turn")),

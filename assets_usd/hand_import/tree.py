@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import HandError, compose, invert
 from vd.assets_usd.hand_import.description import Description, Drive
 from vd.assets_usd.hand_import.source import IDENTITY, Joint, Link, Shape, Source
-from vd.assets_usd.hand_model import MAX_JOINTS
 from vd.assets_usd.objects.geometry import hull_volume
+from vd.kernels.servo.actuators import MAX_JOINTS
 
 KINDS = ("box", "sphere", "capsule", "cylinder", "mesh", "ellipsoid")
 """What collides."""

@@ -16,7 +16,8 @@ from vd.assets_usd.hand_data import CameraModel
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.finding import Finding, finding, listed, show
 from vd.deploy.hardware.answers import BusError, GarbledError, LateError
-from vd.deploy.hardware.connect import Connection, HandOptions, connect
+from vd.deploy.hardware.aside import aside
+from vd.deploy.hardware.connect import Connection, HandOptions, connect, motors_of
 from vd.deploy.hardware.joints import CalibrationError
 from vd.deploy.hardware.registers import RESTART, Register, different, kept
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
@@ -234,24 +235,28 @@ def _cycles(bus: "MotorBus") -> Finding:
 
 
 def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
-    """Move every joint alone through most of its range and back to the start, slowly.
+    """Move every joint alone through most of its range, the other fingers aside, and then back, slowly.
 
     Raises:
         StoppedError: A limit was passed.
     """
+    hand = connection.hand
+    poses = [aside(hand, finger) for finger in hand.joint_finger]  # before the hand has to be told to hold
     home = safe.arm().position
     lower, upper = safe.limits.lower, safe.limits.upper
     centre, half = 0.5 * (lower + upper), 0.5 * RANGE_SHARE * (upper - lower)
     for axis, name in enumerate(connection.joints.names):
         worst, low, high = 0.0, centre[axis] - half[axis], centre[axis] + half[axis]
-        for end in (low, high, home[axis]):
-            goal = home.copy()
+        goal = poses[axis]
+        for end in (low, high, goal[axis]):
+            goal = goal.copy()
             goal[axis] = end
             worst = max(worst, abs(safe.move(goal, RANGE_SPEED_RAD_S)[axis]))
         ok = worst < FOLLOW_RAD
         why = "" if ok else ": blocked, a wrong sign, or a wrong joint's ID?"
         found = f"{low:.2f} to {high:.2f} rad, at most {worst:.2f} from its goal{why}"
         yield Finding(f"range of {name}", ok, found)
+    safe.move(home, RANGE_SPEED_RAD_S)
 
 
 def ready(
@@ -304,6 +309,9 @@ def camera_preflight(cfg: CheckCfg, connection: Connection) -> Iterator[Finding]
     from vd.deploy.camera.check_camera import camera_findings
 
     hand, twin = connection.hand, connection.twin
+    if hand.mounted_camera is None and cfg.camera_layer is None:
+        yield Finding("camera", True, f"{hand.name} has none")
+        return
     place = hand.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
     try:
         camera = open_camera(cfg.camera, twin, place)
@@ -318,7 +326,8 @@ def camera_preflight(cfg: CheckCfg, connection: Connection) -> Iterator[Finding]
 def check(cfg: CheckCfg) -> int:
     """Look, and print a table; 1 if something is wrong."""
     with contextlib.ExitStack() as stack:
-        connection = stack.enter_context(connect(cfg, object=None if cfg.no_camera else "cube"))
+        sees = not cfg.no_camera and motors_of(cfg).hand.mounted_camera is not None
+        connection = stack.enter_context(connect(cfg, object="cube" if sees else None))
         findings = show(preflight(connection), quiet=cfg.json)
         if not cfg.no_camera:
             findings += show(camera_preflight(cfg, connection), quiet=cfg.json)

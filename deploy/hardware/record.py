@@ -16,6 +16,7 @@ from scipy.stats import theilslopes
 from vd.config import require
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
+from vd.deploy.hardware.aside import aside
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import ready
 from vd.deploy.hardware.connect import Connection, HandOptions, connect, motors_of
@@ -38,14 +39,12 @@ ROUNDING_S = 1e-6
 """Of times on the grid of samples."""
 SPEED_RAD_S = 1.0
 """Of the way to where a motion starts."""
-ASIDE = 0.8
-"""Where the other fingers swing to meanwhile, outward, as a share of half their range: on the three-finger
-hand a straight finger that bends through its range would press on its neighbour."""
 WIDE = SafetyCfg(step_rad=4.0)
 """Steps go through most of a joint's range at once, which a policy must not."""
-TWIN_HZ = 3840.0
-"""Steps of the twin so short that its integrator is as exact as vd-gap's: at 960 Hz it is off by 0.3 mrad
-(median of a moving hand; up to 0.9), two thirds of what the encoders round."""
+TWIN_JOINT_HZ = 9 * 3840.0
+"""Steps of the twin a second, times its joints: half of what a core does. At 3840 Hz its integrator is as
+exact as vd-gap's; at 960 it is off by 0.3 mrad (median of a moving hand; up to 0.9), two thirds of what the
+encoders round."""
 RATE_SHARE = 0.95
 """Share of the rate that is wanted below which a recording says that it missed it."""
 AGAIN_S = 0.01
@@ -138,11 +137,9 @@ def _finger(joint: str) -> str:
 def _motion(file: str, excitation: "Excitation", motors: "Joints") -> Motion:
     """An excitation with the fingers aside that it does not move, and the usual gain if it names none."""
     hand, command = motors.hand, excitation.command.copy()
-    moved = {_finger(name) for name in excitation.joints}
-    for swing in (finger.start for finger in hand.fingers):
-        if _finger(hand.joint_names[swing]) not in moved:
-            low, high = hand.lower[swing], hand.upper[swing]
-            command[:, swing] = 0.5 * (low + high) + ASIDE * 0.5 * (high - low)
+    moving = hand.joint_finger[hand.joint_names.index(excitation.joints[0])]
+    others = hand.joint_finger != moving
+    command[:, others] = aside(hand, int(moving))[others]
     conditions = {"p_gain": float(motors.p_gain), **excitation.conditions}
     return Motion(file, replace(excitation, command=command, conditions=conditions))
 
@@ -230,8 +227,10 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
     """
     excitation, bus = motion.excitation, safe.bus
     safe.move(excitation.command[0], SPEED_RAD_S)
-    gain = int(float(excitation.conditions["p_gain"]))
-    _set_gains(bus, {bus.ids[column]: gain for column in columns})
+    # Of motors whose gains differ, each has the same share of its own.
+    share = float(excitation.conditions["p_gain"]) / safe.joints.p_gain
+    own = {bus.ids[column]: safe.joints.motors[column].p_gain for column in columns}
+    _set_gains(bus, {id: round(share * gain) for id, gain in own.items()})
     samples = list[Sample]()
     pacer = Pacer(rate_hz, bus.clock)
     pacer.wait()
@@ -251,7 +250,7 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
         pacer.wait()
     if not on.all():
         safe.switch(np.ones_like(on))
-    _set_gains(bus, {bus.ids[column]: safe.joints.motors[column].p_gain for column in columns})
+    _set_gains(bus, own)
     return _trajectory(motion, columns, samples)
 
 
@@ -302,7 +301,7 @@ def record(cfg: RecordCfg) -> int:
     else:
         motions = read_plan(cfg.plan, motors)
     with (
-        connect(cfg, physics_hz=TWIN_HZ, realtime=cfg.realtime) as connection,
+        connect(cfg, physics_hz=TWIN_JOINT_HZ / motors.hand.num_joints, realtime=cfg.realtime) as connection,
         undisturbed(cfg.realtime),
     ):
         recording = _begun(cfg, connection, joints)
@@ -365,17 +364,15 @@ def _session(
 
 def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":
     """The recording in the folder, or an empty one."""
-    from vd.assets_usd.hands import HANDS
+    from vd.assets_usd.hands import called
     from vd.gap.recording import Recording, read_recording
 
-    hand = connection.hand
+    model = called(connection.hand)
     if (cfg.out / "recording.json").exists():
         found = read_recording(cfg.out)
-        if found.joints != joints or found.model != hand.name:
+        if found.joints != joints or found.model != model:
             raise RecordError(
                 f"{cfg.out} is of {found.model}, {', '.join(found.joints)}; choose another --out"
             )
         return found
-    if hand.name not in HANDS:
-        raise RecordError(f"a recording names its hand, and {hand.name} is none of {', '.join(HANDS)}")
-    return Recording(cfg.out, hand.name, joints, connection.joints.servo(), RAD_PER_COUNT, ())
+    return Recording(cfg.out, model, joints, connection.joints.servo(), RAD_PER_COUNT, ())

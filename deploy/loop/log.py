@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.assets_usd.hands import HANDS
+from vd.assets_usd.hands import called
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.hardware.control_table import RAD_PER_COUNT
 from vd.files import make_folder, write_json, writing
@@ -66,14 +66,14 @@ class LogWriter:
         self._clock, self.started_s = clock, clock.now()
         self._run = {
             "format": LOG_FORMAT,
-            "hand": hand.name,
+            "hand": called(hand),
             "joints": list(hand.joint_names),
             "unix_s": time.time(),
             **run,
         }
         recording = {
             "format": RECORDING_FORMAT,
-            "model": hand.name if hand.name in HANDS else "servo",
+            "model": called(hand),
             "joints": list(hand.joint_names),
             "servo": dict(servo),
             "encoder_resolution_rad": RAD_PER_COUNT,

@@ -204,8 +204,9 @@ class ControlLoop:
         self._log.step(state.time_s, self._pacer.due_s + times.sent_s, joints, values, truth)
         self.times.append(times)
         if len(self.times) % STATUS_STEPS == 0:
+            doing = f"distance {distance:.2f} rad" if acting else "holding"
             print(
-                f"goal {number + 1}{'' if acting else ', holding'} | distance {distance:.2f} rad"
+                f"goal {number + 1} | {doing}"
                 + (f", true {truth[-1]:.2f}" if truth else "")
                 + f" | loop {1e3 * times.sent_s:.0f} ms | missed {self._pacer.missed}"
                 f" | {state.temperature.max():.0f} deg C | {np.abs(state.current).max():.2f} A",

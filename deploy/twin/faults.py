@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vd.assets_usd.hands import load_hand
+from vd.assets_usd.hands import called, load_hand
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import preflight, write_settings
 from vd.deploy.hardware.connect import Connection
@@ -112,9 +112,9 @@ class Scene:
     error: Exception | None = None
     """What the loop raises."""
 
-    def motor(self, id: int) -> Motor:
-        """A motor of the twin, by its ID."""
-        return next(motor for motor in self.twin.motors if motor.id == id)
+    def motor(self, axis: int) -> Motor:
+        """The motor of a joint."""
+        return self.twin.motors[axis]
 
     def axes(self) -> FirstOrderPlant:
         """The axes without mass that stand for the hand."""
@@ -152,15 +152,20 @@ def _line(**values: float) -> Inject:
     return lambda scene: vars(scene.twin.faults).update(values)
 
 
-def _put(item: str, value: int, *motors: int) -> Inject:
-    """An item of some motors, or all, that is not as it should be."""
+def _put(item: str, value: int, axis: int) -> Inject:
+    """An item of a joint's motor that is not as it should be."""
+    return lambda scene: scene.motor(axis).put(item, value)
 
-    def inject(scene: Scene) -> None:
-        for motor in scene.twin.motors:
-            if not motors or motor.id in motors:
-                motor.put(item, value)
 
-    return inject
+def _renamed(scene: Scene) -> None:
+    """A motor with an ID that none has."""
+    scene.motor(1).put("id", 1 + max(motor.id for motor in scene.twin.motors))
+
+
+def _low(scene: Scene) -> None:
+    """A fifth of the supply's voltage is lost in the wires."""
+    for motor in scene.twin.motors:
+        motor.put("present_input_voltage", round(8.0 * motor.model.supply_v))
 
 
 def _block(scene: Scene) -> None:
@@ -174,7 +179,7 @@ def _at(axis: int, angle: float) -> Inject:
 
 def _twice(scene: Scene) -> None:
     """Two motors with one ID, at different angles as any two are."""
-    _put("id", 11, 12)(scene)
+    scene.motor(2).put("id", scene.motor(1).id)
     _at(2, 0.4)(scene)
 
 
@@ -196,16 +201,16 @@ MOVING = (
     Fault("every packet lost", _line(lose=1.0)),
     Fault("every packet corrupted", _line(corrupt=1.0)),
     Fault("every packet 0.1 s late", _line(late=1.0)),
-    Fault("cable of one motor loose", lambda s: s.twin.faults.cut_off.add(11)),
+    Fault("cable of one motor loose", lambda s: s.twin.faults.cut_off.add(s.motor(1).id)),
     Fault("cable of all motors loose", lambda s: s.twin.faults.cut_off.update(m.id for m in s.twin.motors)),
     Fault("adapter unplugged", lambda s: s.bus.close()),
-    Fault("a motor warms by 50 deg C/s", lambda s: setattr(s.motor(21), "heat_c_per_s", 50.0)),
-    Fault("a motor shuts down, too hot", lambda s: setattr(s.motor(21), "heat_c_per_s", 5000.0)),
+    Fault("a motor warms by 50 deg C/s", lambda s: setattr(s.motor(4), "heat_c_per_s", 50.0)),
+    Fault("a motor shuts down, too hot", lambda s: setattr(s.motor(4), "heat_c_per_s", 5000.0)),
     Fault("a joint is blocked", _block, stops=False, blockable=True),
     Fault("a joint is blocked, goals far away", _block, cfg=WIDE, reach_rad=2.0, blockable=True),
-    Fault("a motor shuts down, overload", _put("hardware_error_status", HardwareError.OVERLOAD, 22)),
-    Fault("a motor restarts", lambda s: s.motor(32).reboot()),
-    Fault("a motor takes another ID", _put("id", 13, 11)),
+    Fault("a motor shuts down, overload", _put("hardware_error_status", HardwareError.OVERLOAD, 5)),
+    Fault("a motor restarts", lambda s: s.motor(-1).reboot()),
+    Fault("a motor takes another ID", _renamed),
     Fault("the camera stops", _set(camera=False), camera=True),
     Fault("every step takes 0.15 s", _set(pause_s=0.15)),
     Fault("the loop stands", _set(pause_s=2.0)),
@@ -215,16 +220,16 @@ MOVING = (
 )
 """Faults of a moving hand."""
 BEFORE: dict[str, Inject] = {
-    "a motor has a wrong ID": _put("id", 13, 11),
+    "a motor has a wrong ID": _renamed,
     "two motors have the same ID": _twice,
     "a motor does not keep its limit": _stubborn,
-    "a motor's direction was reversed": _put("drive_mode", 1, 20),
-    "a motor has an overload": _put("hardware_error_status", HardwareError.OVERLOAD, 22),
+    "a motor's direction was reversed": _put("drive_mode", 1, 3),
+    "a motor has an overload": _put("hardware_error_status", HardwareError.OVERLOAD, 5),
     "a motor is hot": lambda scene: setattr(scene.twin.motors[0], "temperature", 66.0),
-    "the supply is low": _put("present_input_voltage", 190),
+    "the supply is low": _low,
     "a joint is out of its range": _at(5, 2.6),
     "a joint was turned round": _at(5, 2.0 * np.pi),
-    "a cable is loose": lambda scene: scene.twin.faults.cut_off.add(32),
+    "a cable is loose": lambda scene: scene.twin.faults.cut_off.add(scene.motor(-1).id),
 }
 """What the preflight has to find."""
 PROCESS = {
@@ -311,7 +316,8 @@ def try_fault(fault: Fault, joints: Joints) -> Outcome:
         time.sleep(REST_S)
         report = safe.report
         assert report is not None
-        if not fault.stops:
+        # At its largest current a motor whose mode keeps it may go on.
+        if not fault.stops or (fault.blockable and joints.capped.any()):
             right = report.reason == FINISHED
             happened = f"went on; {safe.repeated} readings repeated" if right else report.reason
             return _outcome(scene, fault.name, happened, joints, right=right)
@@ -376,7 +382,7 @@ def try_process(name: str, joints: Joints) -> Outcome:
     with scene_of(joints) as scene:
         scene.bus.close()  # one program at a time has the port
         command = [sys.executable, "-m", "vd.deploy.cli", "home", "--port", scene.twin.path, "--yes"]
-        command += ["--hand", joints.hand.name, "--speed", "0.2"]
+        command += ["--hand", called(joints.hand), "--speed", "0.2"]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         end = time.monotonic() + START_S
         while (
@@ -401,7 +407,7 @@ class FaultsCommand:
     """Inject every fault into the twin of a hand, and print what happened."""
 
     hand: str = "dclaw3"
-    """dclaw3 or dclaw4."""
+    """dclaw3, dclaw4, an imported hand or a hand's USD."""
     only: str = ""
     """Only faults whose name holds this."""
     json: Path | None = None

@@ -81,6 +81,7 @@ class NewtonHand:
                 self._control,
                 self._state.joint_q.reshape((1, -1)),
                 hand.servo,
+                hand.fingers,
                 physics_dt=cfg.physics_dt,
                 control_dt=SHORTEST_COMMAND_S,
             )

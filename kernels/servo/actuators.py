@@ -19,6 +19,9 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+MAX_JOINTS = 6
+"""Joints of a finger at most."""
+
 # Columns of a parameter row. The baseline first; neutral values are in vd.kernels.servo.effects.
 KP = 0
 KD = 1
@@ -53,11 +56,9 @@ PAYLOAD_INERTIA = 29
 ELASTIC_STIFFNESS = 30
 ELASTIC_DAMPING = 31
 ELASTIC_INERTIA = 32
-COUPLING_0 = 33
-COUPLING_1 = 34
-COUPLING_2 = 35
-OFF_DAMPING = 36
-PARAMETER_COLUMNS = 37
+COUPLING_0 = 33  # and so on, one for each joint of a finger
+OFF_DAMPING = 39
+PARAMETER_COLUMNS = 40
 
 # Columns of a state row.
 STATE_FILTERED = 0

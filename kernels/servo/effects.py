@@ -174,10 +174,9 @@ EFFECTS: dict[str, Effect] = {
         Effect(
             "joint_coupling",
             "the motion of another joint of the chain drives this one",
-            (
-                Parameter("from_1", "rad/rad", servo.COUPLING_0, 0.0, 1.0, 0.05, signed=True),
-                Parameter("from_2", "rad/rad", servo.COUPLING_1, 0.0, 1.0, 0.05, signed=True),
-                Parameter("from_3", "rad/rad", servo.COUPLING_2, 0.0, 1.0, 0.05, signed=True),
+            tuple(
+                Parameter(f"from_{i + 1}", "rad/rad", servo.COUPLING_0 + i, 0.0, 1.0, 0.05, signed=True)
+                for i in range(servo.MAX_JOINTS)
             ),
         ),
     )

@@ -2,7 +2,7 @@
 
 Order in a physics step: :func:`replay_command_kernel`, the servo and the solver's step, then
 :func:`sample_position_kernel`, and the step is counted. Every finger of every world follows its own
-trajectory: a track. W worlds, F fingers of three joints, D = 3F; S samples of all trajectories one
+trajectory: a track. W worlds, F fingers, D joints; S samples of all trajectories one
 after the other, J recorded joints. Times, delays and lost commands are those of
 :mod:`vd.kernels.servo.chains`.
 """
@@ -11,7 +11,7 @@ import warp as wp
 
 from vd.kernels.servo.actuators import COUPLING_0, ENCODER_BIAS, KP, READ_DELAY, rest_play, shape_command
 from vd.kernels.servo.chains import Samples, arrival, split_steps
-from vd.kernels.servo.joint_servo import JOINTS_PER_FINGER
+from vd.kernels.servo.joint_servo import coupled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,6 +21,7 @@ class Tracks:
     """What each finger of each world follows."""
 
     column: wp.array[int]  # [D] recorded column of every hand joint, or -1
+    finger: wp.array[int]  # [D] finger of every hand joint
     first: wp.array2d[int]  # [W, F] first sample of the track
     last: wp.array2d[int]  # [W, F] sample after the last
     stream: wp.array2d[int]  # [W, F] random stream of the track's trajectory
@@ -30,6 +31,7 @@ class Tracks:
 def rest_play_kernel(
     # Model:
     parameters: wp.array2d[float],  # [W D, PARAMETER_COLUMNS] parameter rows
+    first: wp.array[int],  # [D] first joint of each joint's finger
     # In:
     held_in: wp.array2d[float],  # [W, D] commands in force [rad]
     power_in: wp.array2d[float],  # [W, D] their power factors
@@ -42,12 +44,9 @@ def rest_play_kernel(
     world, joint = wp.tid()
     row = world * held_in.shape[1] + joint
     power = power_in[world, joint]
-    first = joint - joint % JOINTS_PER_FINGER
-    coupled = wp.float32(0.0)
-    for slot in range(JOINTS_PER_FINGER):
-        if first + slot != joint:
-            coupled += parameters[row, COUPLING_0 + slot] * joint_q_in[world, first + slot]
-    load = load_in[world, joint] + power * parameters[row, KP] * coupled
+    pulled = coupled(joint, first, parameters, row, joint_q_in[world])
+    own = parameters[row, COUPLING_0 + joint - first[joint]] * joint_q_in[world, joint]
+    load = load_in[world, joint] + power * parameters[row, KP] * (pulled - own)
     rest_play(held_in[world, joint], joint_q_in[world, joint], load, power, parameters, row, state_out)
 
 
@@ -77,7 +76,7 @@ def replay_command_kernel(
     """
     world, joint = wp.tid()
     column = tracks.column[joint]
-    finger = joint // JOINTS_PER_FINGER
+    finger = tracks.finger[joint]
     row = world * write.shape[1] + joint
     now = step_in[0]
     upcoming = write[world, joint]
@@ -146,7 +145,7 @@ def sample_position_kernel(
     column = tracks.column[joint]
     if column < 0:
         return
-    finger = joint // JOINTS_PER_FINGER
+    finger = tracks.finger[joint]
     row = world * read.shape[1] + joint
     now = step_in[0]
     before = joint_q_prev_in[world, joint]

@@ -6,7 +6,7 @@ Order in a control step: :func:`send_command_kernel` once; before every physics 
 :mod:`vd.kernels.servo.actuators`; here its result goes where MuJoCo Warp reads it, per world and physics
 step.
 
-N worlds, D hand joints, which couple in threes, as fingers of three do; joint ``j`` of world ``w`` has row
+N worlds, D hand joints, which couple within their finger; joint ``j`` of world ``w`` has row
 ``w D + j`` of the parameters and states. Arrays ``[N, *]`` hold at least D columns, the hand joints first. A
 world's clock is ``STATE_TIME``, zero at its reset.
 """
@@ -22,6 +22,7 @@ from vd.kernels.servo.actuators import (
     JITTER_DROP,
     JITTER_SIGMA,
     LOAD_FRICTION,
+    MAX_JOINTS,
     NO_EFFORT_LIMIT,
     PAYLOAD_INERTIA,
     READ_DELAY,
@@ -35,7 +36,6 @@ from vd.kernels.servo.chains import CENTRED, implicitness
 
 wp.set_module_options({"enable_backward": False})
 
-JOINTS_PER_FINGER = wp.constant(3)
 MAX_JITTER_SIGMAS = 4.0
 """Longest extra delay of a command in standard deviations: it bounds the commands in transit."""
 FRICTION_IMPEDANCE = wp.constant(0.999)
@@ -137,10 +137,28 @@ def receive_command_kernel(
     reference_out[world, joint] = reference + rest * shape_command(value, rest * dt, parameters, row, state)
 
 
+@wp.func
+def coupled(
+    joint: int,
+    first: wp.array[int],  # [D] first joint of each joint's finger
+    parameters: wp.array2d[float],  # [N D, PARAMETER_COLUMNS] parameter rows
+    row: int,
+    joint_q: wp.array[float],  # [*] joint positions [rad]
+) -> float:
+    """What the joints of a finger add to the reference of one of them [rad]."""
+    result = wp.float32(0.0)
+    for slot in range(MAX_JOINTS):
+        other = first[joint] + slot
+        if other < first.shape[0] and first[other] == first[joint]:
+            result += parameters[row, COUPLING_0 + slot] * joint_q[other]
+    return result
+
+
 @wp.kernel
 def drive_joint_kernel(
     # Model:
     parameters: wp.array2d[float],  # [N D, PARAMETER_COLUMNS] parameter rows
+    first: wp.array[int],  # [D] first joint of each joint's finger
     inverse_inertia: wp.array2d[float],  # [N, *] diagonal of the inverse inertia matrix [1/(kg m^2)]
     effort: wp.array2d[float],  # [N, *] largest torques of the drives [N m], which the solver keeps
     # In:
@@ -173,14 +191,9 @@ def drive_joint_kernel(
     """
     world, joint = wp.tid()
     row = world * reference_in.shape[1] + joint
-    first = joint - joint % JOINTS_PER_FINGER
-    coupled = wp.float32(0.0)
-    for k in range(JOINTS_PER_FINGER):
-        if first + k < reference_in.shape[1]:
-            coupled += parameters[row, COUPLING_0 + k] * joint_q_in[world, first + k]
     speed = joint_qd_in[world, joint]
     drive = drive_joint(
-        reference_in[world, joint] + coupled,
+        reference_in[world, joint] + coupled(joint, first, parameters, row, joint_q_in[world]),
         0.0,
         0.0,
         joint_q_in[world, joint],

@@ -1,5 +1,7 @@
 """Rollouts of chains against MuJoCo's C engine, a finer NumPy integration, and closed forms."""
 
+from functools import cache
+
 import mujoco
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from kernel_oracle import EXAMPLES, launch
 
 from vd.gap.rollout import links_of
 from vd.kernels.servo import actuators as servo
-from vd.kernels.servo.chain_bodies import Links, chain_dynamics
+from vd.kernels.servo.chain_bodies import chain_dynamics, links_of_size, room_for
 from vd.kernels.servo.chains import DIVERGED, rollout_kernel
 from vd.kernels.servo.effects import EFFECTS, neutral_row
 
@@ -58,10 +60,11 @@ def roll(device, rows, time, command, start, *, bodies=None, dt=DT, power=None, 
     inputs = [samples, run * count, np.full(rolls, count), np.arange(rolls) * count, run]
     inputs += [np.tile(start, (sets, 1))]
     inputs += [np.full(rolls, -1), np.arange(n), np.full(n, -stops), np.full(n, stops), np.full(n, effort)]
-    inputs += [int(bodies is not None), Links() if bodies is None else links_of(**bodies, gravity=GRAVITY)]
+    links = links_of_size(room_for(n))() if bodies is None else links_of(**bodies, gravity=GRAVITY)
+    inputs += [int(bodies is not None), links]
     inputs += [np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS), dt]
     shapes = [(rolls, n, servo.STATE_COLUMNS), (rolls * count, n)]
-    _, predicted = launch(rollout_kernel, rolls, inputs, device, *shapes)
+    _, predicted = launch(rollout_kernel(room_for(n)), rolls, inputs, device, *shapes)
     result = predicted.astype(float)
     assert np.isfinite(result).all(), "a sample was not written, or is no number"
     return result.reshape(sets, runs, count, n)
@@ -82,18 +85,24 @@ def excitation(rng, seconds=2.0):
 # --- Bodies ---
 
 
-@wp.kernel
-def dynamics_kernel(
-    q: wp.array[wp.vec3],
-    speed: wp.array[wp.vec3],
-    links: Links,
-    mass_out: wp.array[wp.mat33],
-    bias_out: wp.array[wp.vec3],
-):
-    i = wp.tid()
-    mass, bias = chain_dynamics(q[i], speed[i], links)
-    mass_out[i] = mass
-    bias_out[i] = bias
+@cache
+def dynamics_kernel(size):
+    vector, matrix = wp.types.vector(size, float), wp.types.matrix((size, size), float)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def dynamics(
+        q: wp.array[vector],
+        speed: wp.array[vector],
+        links: links_of_size(size),
+        mass_out: wp.array[matrix],
+        bias_out: wp.array[vector],
+    ):
+        i = wp.tid()
+        mass, bias = chain_dynamics(q[i], speed[i], links)
+        mass_out[i] = mass
+        bias_out[i] = bias
+
+    return dynamics
 
 
 def mujoco_chain(bodies, gravity, armature=0.0, damping=0.0, friction=0.0):
@@ -122,12 +131,14 @@ def mujoco_chain(bodies, gravity, armature=0.0, damping=0.0, friction=0.0):
 
 
 @EXAMPLES
-@given(seed=st.integers(0, 2**31), n=st.integers(1, 3))
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 6))
 def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
     rng = np.random.default_rng(seed)
     bodies = random_bodies(rng, n)
-    q, speed = rng.uniform(-3, 3, (5, 3)), rng.uniform(-6, 6, (5, 3))
-    mass, bias = launch(dynamics_kernel, 5, [q, speed, links_of(**bodies, gravity=GRAVITY)], device, 5, 5)
+    size = room_for(n)
+    q, speed = rng.uniform(-3, 3, (5, size)), rng.uniform(-6, 6, (5, size))
+    inputs = [q, speed, links_of(**bodies, gravity=GRAVITY)]
+    mass, bias = launch(dynamics_kernel(size), 5, inputs, device, 5, 5)
     model, data = mujoco_chain(bodies, GRAVITY)
     for i in range(5):
         data.qpos[:], data.qvel[:] = q[i, :n], speed[i, :n]
@@ -140,7 +151,7 @@ def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
         assert not mass[i, n:].any() and not bias[i, n:].any()
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
 @pytest.mark.parametrize("friction", [0.0, 0.08])
 def test_finger_follows_mujoco(device, n, friction):
     rng = np.random.default_rng(n)

@@ -9,6 +9,10 @@ import warp as wp
 from vd.envs.cfg import CurriculumCfg
 from vd.envs.curriculum import Stage, first_stage
 from vd.envs.task_state import TaskState
+from vd.kernels.servo.actuators import COUPLING_0, PARAMETER_COLUMNS
+
+EARLIER_COLUMNS = 37
+"""Servo parameters of checkpoints from before fingers had up to six joints."""
 
 
 def save_state(task: TaskState, arrays: Mapping[str, wp.array], stage: Stage, steps: int) -> dict[str, Any]:
@@ -58,6 +62,11 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
     # Earlier ones counted goals, or remembered grasps.
     for gone in ("goals_reached", "grasps", "grasp_count"):
         arrays.pop(gone, None)
+    # And from before fingers had couplings for more than three joints: there are none.
+    rows = arrays.get("servo_parameters")
+    if rows is not None and rows.shape[1] == EARLIER_COLUMNS:
+        none = [COUPLING_0 + 3] * (PARAMETER_COLUMNS - EARLIER_COLUMNS)
+        arrays["servo_parameters"] = np.insert(rows, none, 0.0, axis=1)
     if arrays.keys() != here.keys():
         raise ValueError(
             "the saved environment has other servos, frames, memory or latency; resume with "

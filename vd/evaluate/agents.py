@@ -152,11 +152,11 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
     Raises:
         vd.bundle.contract.ContractError: A bundle of another hand, or a policy whose hand has changed since;
             names field, found, expected and remedy.
-        ValueError: The hand has another number of joints, or cannot be read.
+        ValueError: The hand has another name or number of joints, or cannot be read.
     """
     if policy is None:
         return
-    from vd.assets_usd.hands import load_hand
+    from vd.assets_usd.hands import load_hand, root_name
 
     task = _on_hand(ReorientCfg.of(policy), hand, hand_layer)
     model, path = load_hand(task.hand, task.fingertip, task.hand_layer), find_policy(name)
@@ -165,10 +165,11 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
         from vd.bundle.store import read_contract
 
         return check_hand(read_contract(path), model, path)
-    if policy.num_actions != len(model.actuated):
+    own = ReorientCfg.of(policy).hand
+    if policy.num_actions != len(model.actuated) or (task.hand != own and root_name(own) != model.name):
         raise ValueError(
-            f"{name} moves {policy.num_actions} joints, the hand {model.name} has {len(model.actuated)}; "
-            f"use the hand it was trained for: --hand {ReorientCfg.of(policy).hand}"
+            f"{name} moves {policy.num_actions} joints of {own}, the hand {model.name} has "
+            f"{len(model.actuated)}; use the hand it was trained for: --hand {own}"
         )
     if policy.kind == "teacher" and policy.trained_hand:
         from vd.bundle.contract import check_trained_hand

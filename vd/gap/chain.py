@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import HandModel
 from vd.gap.recording import Recording
 from vd.kernels.servo import actuators as servo
-from vd.kernels.servo.chain_bodies import MAX_JOINTS
 from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
 
 GRAVITY_M_S2 = 9.81
@@ -58,7 +57,7 @@ class Chain:
         columns: Their columns in the recording [n].
         baseline_free: Names of the parameters that the baseline fits.
         start_row: Nominal parameter rows, every effect off [n, PARAMETER_COLUMNS].
-        slot: Place of each joint in its finger, of a longer one in the chain: its column of the coupling [n].
+        slot: Place of each joint in its finger, which is its column of the coupling [n].
         bodies: Whether the links have mass; if not, each joint is its own inertia.
         axis: Unit joint axes in the base frame, all joints at zero, as all that follows [n, 3].
         offset: From the joint before (the base) to the joint [n, 3] [m].
@@ -112,8 +111,8 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
     Joints of a finger that are not recorded are taken to stand at zero.
 
     Raises:
-        ValueError: The recording is of a hand and none is given, it has joints that the hand has not, or too
-            many of one finger.
+        ValueError: The recording is of a hand and none is given, it has joints that the hand has not, or
+            joints follow others.
     """
     gains = [t.conditions["p_gain"] for t in recording.trajectories if "p_gain" in t.conditions]
     p_gain = max((float(gain) for gain in gains), default=None)
@@ -127,14 +126,11 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
             f"{recording.path}: joints {', '.join(unknown)} are not joints of {hand.name} "
             f"({', '.join(hand.joint_names)}); name the hand that was recorded"
         )
+    if (hand.mimic >= 0).any():
+        raise ValueError(f"{hand.name}: some joints follow others, which the gap workflow does not model")
     found = []
     for finger in hand.fingers:
         names = tuple(name for name in hand.joint_names[finger] if name in recording.joints)
-        if len(names) > MAX_JOINTS:
-            raise ValueError(
-                f"{recording.path}: {', '.join(names)} are {len(names)} joints of one finger; a chain "
-                f"may have {MAX_JOINTS}; leave those out that stood at zero"
-            )
         if names:
             found.append(_finger(recording, hand, finger, names, p_gain))
     return found
@@ -230,7 +226,7 @@ def _finger(
         columns=np.array([recording.joints.index(name) for name in names]),
         baseline_free=("kp", "kd", "velocity_limit"),
         start_row=rows,
-        slot=np.array(slots) if length <= MAX_JOINTS else np.arange(n),
+        slot=np.array(slots),
         bodies=True,
         axis=np.array(axes),
         offset=np.diff(np.array(origins), axis=0, prepend=np.zeros((1, 3))),

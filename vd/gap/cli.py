@@ -249,6 +249,13 @@ class Identify:
         if hand is None:
             raise ValueError(f"{self.recording}: a bare {recording.model} is no hand; use vd-gap run")
 
+        print(
+            f"identify: {self.generations} generations of {self.population} candidates, every motion of each "
+            "in Newton; the first also compiles",
+            file=sys.stderr,
+            flush=True,
+        )
+
         def show(generation: int, best: dict[str, float]) -> None:
             errors = ", ".join(f"{finger} {1e3 * error:.2f} mrad" for finger, error in best.items())
             print(f"generation {generation}/{self.generations}: {errors}", file=sys.stderr, flush=True)

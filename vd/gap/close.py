@@ -51,7 +51,7 @@ def write_identified(
     held = (*report.effects, *report.provisional)
     source = {joint: joint for joint in fitted}
     if every_finger and hand is not None:
-        source |= counterparts(hand.joint_names, tuple(fitted))
+        source |= counterparts(hand, tuple(fitted))
     write_layer(
         path,
         hand if hand is not None else recording.model,
@@ -76,14 +76,17 @@ def _finger(joint: str) -> str:
     return joint.partition("_")[0]
 
 
-def counterparts(joints: tuple[str, ...], known: tuple[str, ...]) -> dict[str, str]:
-    """The identified joint at the same place of another finger, for joints that have none of their own."""
-    place = {joint.partition("_")[2]: joint for joint in reversed(known)}
-    return {
-        joint: place[joint.partition("_")[2]]
-        for joint in joints
-        if joint not in known and joint.partition("_")[2] in place
-    }
+def counterparts(hand: "HandModel", known: tuple[str, ...]) -> dict[str, str]:
+    """The identified joint at the same place of another finger, for joints that have none of their own.
+
+    Of a finger with as many joints, and with the same motor where the hand says which it has.
+    """
+    like = dict[str, object]()
+    for joint, finger, motor in zip(hand.joint_names, hand.joint_finger, hand.motors, strict=True):
+        kind = None if motor is None else replace(motor, id=0, sign=1.0, offset_rad=0.0)
+        like[joint] = joint.partition("_")[2], np.count_nonzero(hand.joint_finger == finger), kind
+    place = {like[joint]: joint for joint in reversed(known)}
+    return {j: place[like[j]] for j in hand.joint_names if j not in known and like[j] in place}
 
 
 def _effects(

@@ -18,7 +18,6 @@ from vd.gap.holding import Holding
 from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
 from vd.gap.sample_weighting import SampleWeighting
-from vd.kernels.servo.chains import MAX_JOINTS
 
 RIDGE = 0.01
 """Pull towards the start, as information in units of the noise floor: holds directions that the data
@@ -240,7 +239,7 @@ class JointProblem:
     def fitted(self, effects: Sequence[str]) -> list[str]:
         """Keys of what a model with these effects fits on this joint."""
         others = others_in(self.rollouts.chain, self.joint)
-        absent = {f"joint_coupling.from_{slot + 1}" for slot in range(MAX_JOINTS) if slot not in others}
+        absent = {f"joint_coupling.from_{slot + 1}" for slot in range(servo.MAX_JOINTS) if slot not in others}
         return [key for key in keys(effects, self.baseline) if key not in absent]
 
     def jacobian(self, fit: JointFit) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hand_model import HandModel
 from vd.gap.close import counterparts
-from vd.gap.newton import DEFAULT_DT, JOINTS_PER_FINGER, HandReplay
+from vd.gap.newton import DEFAULT_DT, HandReplay
 from vd.gap.recording import Recording
 from vd.kernels.servo.actuators import KD, KP, VELOCITY_LIMIT
 from vd.kernels.servo.effects import BASELINE
@@ -80,7 +80,7 @@ def pack_tracks(recording: Recording, hand: HandModel, fingers: Sequence[int]) -
 
 def finger_joints(hand: HandModel, finger: int) -> tuple[str, ...]:
     """Names of the joints of a finger."""
-    return hand.joint_names[JOINTS_PER_FINGER * finger : JOINTS_PER_FINGER * (finger + 1)]
+    return hand.joint_names[hand.fingers[finger]]
 
 
 def identify(
@@ -121,12 +121,12 @@ def identify(
         raise ValueError(f"{recording.path}: joints {', '.join(missing)} are not recorded; leave them out")
     base = np.array(hand.servo, dtype=float)
     chosen = [hand.joint_names.index(name) for name in names]
-    fingers = sorted({joint // JOINTS_PER_FINGER for joint in chosen})
+    fingers = sorted({int(hand.joint_finger[joint]) for joint in chosen})
     tracks = pack_tracks(recording, hand, fingers)
     slots = len(tracks)
     replay = HandReplay(recording, hand, np.tile(tracks, (population, 1)), dt=dt, device=device)
 
-    members = {f: [j for j in chosen if j // JOINTS_PER_FINGER == f] for f in fingers}
+    members = {f: [j for j in chosen if hand.joint_finger[j] == f] for f in fingers}
     searches = {f: _search(base[members[f]], population, seed + f + 1) for f in fingers}
     samples = {
         f: sum(len(recording.trajectories[i].time) for i in tracks[:, f] if i >= 0) * len(scored)
@@ -137,9 +137,9 @@ def identify(
     def evaluate(rows: np.ndarray) -> dict[int, np.ndarray]:
         """Mean squared error of each finger for rows [population, D, P]."""
         replay.run(np.repeat(rows, slots, axis=0))
-        error = replay.squared_error.numpy().reshape(population, slots, -1, JOINTS_PER_FINGER)
-        error = np.nan_to_num(error.astype(float), nan=np.inf).sum(axis=(1, 3))
-        return {f: error[:, f] / samples[f] for f in fingers}
+        error = replay.squared_error.numpy().reshape(population, slots, -1)
+        error = np.nan_to_num(error.astype(float), nan=np.inf)
+        return {f: error[:, :, hand.fingers[f]].sum(axis=(1, 2)) / samples[f] for f in fingers}
 
     first = evaluate(np.tile(base, (population, 1, 1)))  # also compiles every kernel
     start_rmse = {f"f{f}": float(np.sqrt(first[f][0])) for f in fingers}
@@ -210,7 +210,7 @@ def write_drives(
     """
     source = {joint: joint for joint in found.joints}
     if every_finger:
-        source |= counterparts(hand.joint_names, found.joints)
+        source |= counterparts(hand, found.joints)
     columns = {"kp": found.kp, "kd": found.kd, "velocity_limit": found.velocity_limit}
     baseline = {
         joint: {name: float(values[found.joints.index(known)]) for name, values in columns.items()}

@@ -33,11 +33,10 @@ from vd.sim.engine import make_solver
 from vd.sim.joint_servo import JointServo
 from vd.sim.scene import build_hand, new_builder
 
-JOINTS_PER_FINGER = 3
 DEFAULT_DT = 1.0 / 480.0
 """Physics step [s]: a quarter of training's, at which the integrator's error is under a milliradian."""
-CONSTRAINT_ROWS = 32
-"""Rows of a hand without contacts: one per joint for its limit and one for its friction."""
+CONSTRAINT_ROWS = 3
+"""Rows of a joint without contacts: its limit, its friction, and that it follows another."""
 CONTACTS = 4
 """The solver wants room for some contacts even if there are none."""
 GRADIENT_STEP = 1.0e-5
@@ -73,13 +72,8 @@ class HandReplay:
             keep_positions: Keep the predicted positions, not just their squared errors.
 
         Raises:
-            ValueError: The recording has joints that the hand has not, or fingers are not of three joints.
+            ValueError: The recording has joints that the hand has not.
         """
-        if any(finger.stop - finger.start != JOINTS_PER_FINGER for finger in hand.fingers):
-            raise ValueError(
-                f"{hand.name}: whole hands are replayed with fingers of {JOINTS_PER_FINGER} joints alone; "
-                "vd-gap run takes one finger"
-            )
         unknown = [name for name in recording.joints if name not in hand.joint_names]
         if unknown:
             raise ValueError(
@@ -133,8 +127,9 @@ class HandReplay:
         self.duration = float(max(trajectories[i].time[-1] for i in tracks.flat if i >= 0))
 
         # Where every joint starts, and the command it has had: rest where nothing is recorded.
-        by_joint = np.repeat(first, JOINTS_PER_FINGER, axis=1)
-        recorded = (np.repeat(tracks, JOINTS_PER_FINGER, axis=1) >= 0) & (column >= 0)
+        finger = self.hand.joint_finger
+        by_joint = first[:, finger]
+        recorded = (tracks[:, finger] >= 0) & (column >= 0)
         idle = np.clip(0.0, self.hand.lower, self.hand.upper)
         self._start = np.where(recorded, position[by_joint, column], idle)
         self._start_command = np.where(recorded, command[by_joint, column], idle)
@@ -152,7 +147,7 @@ class HandReplay:
         self._samples.sent_fraction = array(sent - np.floor(sent))
         self._samples.command, self._samples.power = array(command), array(power)
         self._tracks = Tracks()
-        self._tracks.column = array(column, int)
+        self._tracks.column, self._tracks.finger = array(column, int), array(finger, int)
         self._tracks.first, self._tracks.last = array(first, int), array(last, int)
         self._tracks.stream = array(streams[tracks], int)
 
@@ -162,7 +157,7 @@ class HandReplay:
             physics_hz=1.0 / self.dt,
             control_hz=0.5 / self.dt,
             contact_time_constant_s=max(SimCfg().contact_time_constant_s, 2.0 * self.dt),
-            njmax=CONSTRAINT_ROWS,
+            njmax=CONSTRAINT_ROWS * self.num_joints,
             nconmax=CONTACTS,
         )
         world = build_hand(self.hand, cfg, visuals=False)
@@ -180,6 +175,7 @@ class HandReplay:
             self.control,
             self._q[0],
             self.hand.servo,
+            self.hand.fingers,
             physics_dt=self.dt,
             control_dt=self.duration,  # commands come from the recording, none is in transit
         )
@@ -202,7 +198,8 @@ class HandReplay:
         self.servo.reset(wp.ones(self.num_worlds, dtype=wp.int32, device=self.device), command=self._held)
         if rows[..., BACKLASH_WIDTH].any():
             load = wp.array(gravity_load(self.hand, start), dtype=float, device=self.device)
-            inputs = [self.servo.parameters, self._held, self._held_power, load, self._q[0]]
+            servo = [self.servo.parameters, self.servo.first]
+            inputs = [*servo, self._held, self._held_power, load, self._q[0]]
             shape = (self.num_worlds, self.num_joints)
             wp.launch(
                 rest_play_kernel, dim=shape, inputs=inputs, outputs=[self.servo.state], device=self.device

@@ -175,22 +175,15 @@ def _check_model(file: Path, model: Any, joints: tuple[str, ...]) -> None:
         raise RecordingError(f"{file}: 'model' is {model!r}; name a hand, a USD file, 'servo' or 'pendulum'")
     if model in BARE_MODELS:
         return
-    from vd.assets_usd.hands import HANDS, hand_usd
+    from vd.assets_usd.hands import load_hand
 
-    if model not in HANDS and not model.endswith(USD_SUFFIXES):
-        choices = ", ".join((*HANDS, *BARE_MODELS))
-        raise RecordingError(
-            f"{file}: unknown model {model!r}; choose one of {choices}, or name a USD file beside it"
-        )
-    usd = hand_usd(model) if model in HANDS else file.parent / model
-    if not usd.is_file():
-        raise RecordingError(f"{file}: 'model' is {model!r}, but there is no {usd}; put the USD file there")
-    from vd.assets_usd.hand_model import HandError, read_hand
-
+    name = str(file.parent / model) if model.endswith(USD_SUFFIXES) else model
     try:
-        known = list(read_hand(usd).joint_names)
-    except HandError as error:
-        raise RecordingError(f"{file}: 'model': {error}") from error
+        known = list(load_hand(name).joint_names)
+    except ValueError as error:
+        raise RecordingError(
+            f"{file}: 'model': {error}; it is a hand, a USD file beside it, {' or '.join(BARE_MODELS)}"
+        ) from error
     for joint in joints:
         if joint not in known:
             raise RecordingError(

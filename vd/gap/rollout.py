@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -18,7 +19,8 @@ from vd.gap.chain import Chain, load_of
 from vd.gap.launch_batch import LaunchBatch
 from vd.gap.recording import Recording
 from vd.kernels.servo import actuators as servo
-from vd.kernels.servo.chains import MAX_JOINTS, Links, Samples, rollout_kernel
+from vd.kernels.servo.chain_bodies import links_of_size, room_for
+from vd.kernels.servo.chains import Samples, rollout_kernel
 
 STEP_S = 1.0 / 480.0
 """Time step [s]: four of the simulator's, a fifth of a servo's fastest time constant (inertia / kd)."""
@@ -39,9 +41,10 @@ def links_of(
     com: np.ndarray,
     inertia: np.ndarray,
     gravity: np.ndarray,
-) -> Links:
-    """The bodies of a chain [n, ..] of up to ``MAX_JOINTS`` joints as kernels take them: :class:`Links`."""
-    links = Links()
+) -> Any:
+    """The bodies of a chain [n, ..] as kernels take them."""
+    size = room_for(len(mass))
+    links = links_of_size(size)()
     for name, values in (
         ("axis", axis),
         ("offset", offset),
@@ -49,7 +52,7 @@ def links_of(
         ("com", com),
         ("inertia", inertia),
     ):
-        rows = np.zeros((MAX_JOINTS, *values.shape[1:]))
+        rows = np.zeros((size, *values.shape[1:]))
         rows[: len(values)] = values
         setattr(links, name, type(getattr(links, name))(*rows.ravel().tolist()))
     links.gravity = wp.vec3(*np.asarray(gravity, float).tolist())
@@ -182,7 +185,7 @@ class Rollouts:
         return float(conditions.get("p_gain", reference)) / reference if reference else 1.0
 
     @cached_property
-    def _links(self) -> tuple[Links, wp.array, wp.array, wp.array, wp.array]:
+    def _links(self) -> tuple[Any, wp.array, wp.array, wp.array, wp.array]:
         """The links; slots; lower and upper stops; efforts."""
         chain = self.chain
         links = links_of(chain.axis, chain.offset, chain.mass, chain.com, chain.inertia, chain.gravity)
@@ -313,7 +316,7 @@ class Rollouts:
 
         first = self._first[trajectory]
         wp.launch(
-            rollout_kernel,
+            rollout_kernel(room_for(self.num_joints)),
             dim=len(trajectory),
             inputs=[
                 self._samples,

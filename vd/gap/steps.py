@@ -123,9 +123,14 @@ class Analysis:
         """The hand with the layer that the analysis starts from, None for a bare servo or pendulum."""
         if self.hand_name is None:
             return None
-        from vd.assets_usd.hands import load_hand
+        from vd.assets_usd.hands import load_hand, root_name
 
-        hand = load_hand(self.hand_name, layer=self.settings.hand_layer)
+        hand, model = load_hand(self.hand_name, layer=self.settings.hand_layer), self.recording.model
+        model = root_name(str(self.recording.path / model) if model.endswith(USD_SUFFIXES) else model)
+        if model != hand.name:
+            raise ValueError(
+                f"{self.recording.path} is of {model}, not of {hand.name}; name the hand that was recorded"
+            )
         if stray := [joint for joint in self.recording.joints if joint not in hand.joint_names]:
             raise ValueError(
                 f"{self.recording.path}: {hand.name} has no joint {', '.join(stray)}, only "

@@ -5,6 +5,7 @@ The solver's own drive knows kp, kd and an effort limit. :class:`JointServo` put
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import newton
@@ -58,6 +59,7 @@ class JointServo:
         control: newton.Control,
         joint_q: wp.array2d,
         rows: np.ndarray,
+        fingers: Sequence[slice],
         *,
         physics_dt: float,
         control_dt: float,
@@ -71,6 +73,7 @@ class JointServo:
                 its joint forces the torques besides the drives'.
             joint_q: Positions, hand joints first, shape [N, *]; read at every reset.
             rows: Parameter rows, shape [D, P] or [N, D, P].
+            fingers: Each finger's joints, as columns.
             physics_dt: Physics step [s].
             control_dt: Time between commands [s].
             seed: Seed of the random delays and losses of commands.
@@ -96,6 +99,9 @@ class JointServo:
         """Parameter rows, shape [N D, P]. May be written on the device (then :meth:`push_inertia`)."""
         self.state = zeros(n * d, STATE_COLUMNS)
         """State rows, shape [N D, STATE_COLUMNS]."""
+        first = np.concatenate([np.full(finger.stop - finger.start, finger.start) for finger in fingers])
+        self.first = wp.array(first, dtype=int, device=self.device)
+        """First joint of each joint's finger [D]."""
         self._dim = n, d
         self.power = wp.ones((n, d), dtype=float, device=self.device)
         """Factor on the controllers' gains; 0 switches the torque off, shape [N, D]."""
@@ -201,7 +207,7 @@ class JointServo:
 
         Positions [rad] and velocities [rad/s] are those at the start of the step, shape [N, *].
         """
-        model = [self.parameters, self._inverse_inertia, self._effort]
+        model = [self.parameters, self.first, self._inverse_inertia, self._effort]
         inputs = [self.dt, self.reference, self.power, joint_q, joint_qd]
         launch(drive_joint_kernel, self._dim, [*model, *inputs], [self.state, *self._outputs])
 

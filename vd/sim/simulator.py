@@ -117,6 +117,7 @@ class Simulator:
                 self.control,
                 self.joint_q,
                 servo_rows,
+                scene.hand.fingers,
                 physics_dt=cfg.physics_dt,
                 control_dt=cfg.control_dt,
                 seed=servo_seed,
