@@ -18,7 +18,7 @@ header = {
     "encoder_resolution_rad": 2.0 * np.pi / 4096,
     "trajectories": [{"file": "step.csv", "excitation": "step", "joints": ["joint"]}],
 }
-Path("mine").mkdir()
+Path("mine").mkdir(exist_ok=True)
 np.savetxt("mine/step.csv", table, delimiter=",", header="t,command.joint,position.joint", comments="")
 Path("mine/recording.json").write_text(json.dumps(header))
 

@@ -44,7 +44,7 @@ def test_every_preset_parses_validates_and_survives_a_file(name, tmp_path, monke
         (2, ["--device", "cuda:1"], "gpu"),
     ],
 )
-def test_the_machine_decides_where_no_preset_is_named(monkeypatch, gpus, flags, name):
+def test_the_machine_decides_where_no_preset_is_named(monkeypatch, capsys, gpus, flags, name):
     monkeypatch.setattr("torch.cuda.is_available", lambda: gpus > 0)
     monkeypatch.setattr("torch.cuda.device_count", lambda: gpus)
     said: list[str] = []
@@ -52,6 +52,9 @@ def test_the_machine_decides_where_no_preset_is_named(monkeypatch, gpus, flags, 
     assert cfg.preset == name and cfg.env.seed == 5
     assert cfg.ppo == PRESETS[name]().ppo and cfg.run.out == PRESETS[name]().run.out
     assert len(said) == 1 and f"preset {name}, since none is named" in said[0]
+    with pytest.raises(SystemExit):
+        parse_teacher([*flags, "--print-config"])
+    assert f"preset: {name}\n" in capsys.readouterr().out
     assert parse_teacher(["--preset", "paper"], say=said.append).ppo == PRESETS["paper"]().ppo
     assert parse_teacher(["--smoke"], say=said.append).smoke and len(said) == 1
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 import tyro
 
-from vd.command_line import ConfigFile, parse, take_config
+from vd.command_line import PRINT, ConfigFile, parse, take_config
 from vd.config import from_dict, to_dict
 from vd.device import resolve_device
 from vd.evaluate.agents import check_names
@@ -81,7 +81,7 @@ def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | No
         start = settings_of(init, PRESETS["gpu"]())
     elif preset is None and not saved:
         # Wrong flags and names, and --help, do not wait for torch.
-        _parsed(arguments, PRESETS["gpu"](), file)
+        _parsed([word for word in arguments if word != PRINT], PRESETS["gpu"](), file)
         preset, reason = machine_preset(value_of(arguments, "--device"))
         start = PRESETS[preset]()
     else:

@@ -58,11 +58,12 @@ def evaluate_policies(*policies: str, **settings: Any) -> "Result":
         FileNotFoundError: There is no such policy.
         ValueError: A setting or a set of objects cannot be used.
     """
+    from vd.config import from_dict
     from vd.evaluate.agents import check_names
     from vd.evaluate.cfg import EvalCfg, parse_groups
     from vd.evaluate.compare import compare
 
-    cfg = EvalCfg(policies=policies, **settings)
+    cfg = from_dict(EvalCfg, {"policies": policies, **settings})
     cfg.validate()
     check_names(
         cfg.agent_names, [s for sets in parse_groups(cfg.object_sets).values() for s in sets], cfg.hand

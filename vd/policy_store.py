@@ -41,6 +41,7 @@ BLOCK = 1 << 20
 """Bytes read at a time."""
 TIMEOUT_S = 60.0
 """Longest silence of a server."""
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 PLACE = "a folder, a URL, or hf://OWNER/NAME of Hugging Face"
 
@@ -75,11 +76,16 @@ def read_store(place: str | Path) -> Store:
     with _reading(str(place), POLICY_LIST) as stream:
         text = stream.read()
     try:
-        store = from_dict(Store, json.loads(text))
+        values = json.loads(text)
+        if not isinstance(values, dict):
+            raise ValueError("it is no list of policies; vd-policies push makes one")
+        store = from_dict(Store, values)
         if store.format != STORE_FORMAT:
             raise ValueError(f"format is {store.format!r}, this version reads {STORE_FORMAT!r}")
-        for name in store.policies:
+        for name, entry in store.policies.items():
             check_name(name)
+            if not _DIGEST.fullmatch(entry.sha256):
+                raise ValueError(f"sha256 of {name} is {entry.sha256!r}, not 64 digits of 0 to f")
     except (ValueError, TypeError) as error:
         raise ValueError(f"{place}/{POLICY_LIST}: {error}") from error
     return store

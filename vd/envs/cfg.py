@@ -408,6 +408,8 @@ class ReorientCfg:
         self.table.validate()
         if self.start.at_rest and self.start.poses < 1:
             raise ValueError(f"start.at_rest needs start.poses >= 1 (now {self.start.poses})")
+        if isinstance(self.objects, str):
+            raise ValueError(f"objects is {self.objects!r}; write ({self.objects!r},)")
         require(self, "", "positive", "num_envs")
         if self.max_episode_steps < 1:
             raise ValueError(f"episode_s = {self.episode_s} is shorter than one control step")
