@@ -1,14 +1,11 @@
 """What is chosen once, when environments are built: sizes of objects, tables that leave, starts at rest."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
-
-if TYPE_CHECKING:
-    from vd.envs.reorient import ReorientEnv
 
 ALWAYS = 2**31 - 1
 """Last step of a table that stays."""
@@ -45,8 +42,8 @@ def chosen(cfg: ReorientCfg, share: float) -> np.ndarray:
     return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
 
 
-def rest_poses(env: "ReorientEnv") -> np.ndarray:
-    """Drop every object a few times; where they came to lie, float, shape [N, K, 7].
+def rest_poses(env: Any) -> np.ndarray:
+    """Drop every object of a ReorientEnv a few times; where they came to lie, float, shape [N, K, 7].
 
     A drop that left the claw is replaced by one of the same environment that did not, or, if all did, by the
     start. Each is a position [m] and a quaternion xyzw.
