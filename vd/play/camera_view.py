@@ -21,7 +21,7 @@ def camera_view(actor: Any, world: int) -> np.ndarray:
         world: Environment.
 
     Returns:
-        RGB bytes, of half the image's height and width.
+        RGB bytes [H, W, 3], of the half of the image about the hand.
     """
     camera = actor.camera
     depth = wp.to_torch(camera.depth)[world].cpu().numpy()
@@ -39,7 +39,8 @@ def camera_view(actor: Any, world: int) -> np.ndarray:
     middle = model.project(actor.hand.tip_poses(actor.hand.start)[:, :3].mean(axis=0))[:2]
     size = np.array(picture.size)
     left, top = np.clip(middle - size / 4, 0, size // 2).astype(int)
-    return np.asarray(picture)[top : top + picture.height // 2, left : left + picture.width // 2]
+    box = left, top, left + picture.width // 2, top + picture.height // 2
+    return np.asarray(picture.resize(picture.size, box=box))
 
 
 def _share(depth: np.ndarray) -> np.ndarray:
