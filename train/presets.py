@@ -50,8 +50,8 @@ class TeacherCfg:
     """Difficulty and tightness of the curriculum at which a run with --init begins. None: those of what it
     begins from; 1 and 1 for a policy that does not say, which is the task as configured."""
     smoke: bool = False
-    """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute. It learns nothing,
-    and keeps nothing unless --out is given."""
+    """Check the installation: the preset, cpu-demo if none is named, tiny, on the CPU, for at most a minute.
+    It learns nothing, and keeps nothing unless --out is given."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     ppo: PpoCfg = field(default_factory=PpoCfg)
     policy: PolicyCfg = field(default_factory=PolicyCfg)
@@ -252,15 +252,16 @@ def for_hand(cfg: TeacherCfg, hand: str | None) -> TeacherCfg:
     return replace(cfg, env=replace(cfg.env, observation=replace(cfg.env.observation, view="goal")))
 
 
-def smoke() -> TeacherCfg:
-    """The cpu-demo preset shrunk to run through everything in at most a minute. It learns nothing."""
-    cfg = cpu_demo()
+def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
+    """A preset, by default cpu-demo, shrunk to run through everything in at most a minute. It learns nothing."""
+    cfg = cfg or cpu_demo()
     return replace(
         cfg,
         smoke=True,
         run=replace(
             cfg.run,
             out=SMOKE_RUN,
+            device="cpu",
             max_steps=2048,
             max_minutes=1.0,
             save_every=1,
