@@ -253,7 +253,7 @@ def for_hand(cfg: TeacherCfg, hand: str | None) -> TeacherCfg:
 
 
 def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
-    """A preset, by default cpu-demo, shrunk to run through everything in at most a minute. It learns nothing."""
+    """A preset, cpu-demo by default, shrunk to run all parts in at most a minute. It learns nothing."""
     cfg = cfg or cpu_demo()
     return replace(
         cfg,
