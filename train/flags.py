@@ -76,7 +76,7 @@ def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | No
         raise ValueError(f"--preset {preset} is none; {instead}")
     reason = ""
     if "--smoke" in arguments:
-        start = smoke()
+        start = smoke(PRESETS[preset or "cpu-demo"]())
     elif preset is None and init is not None:
         start = settings_of(init, PRESETS["gpu"]())
     elif preset is None and not saved:
