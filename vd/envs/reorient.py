@@ -11,6 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from vd.device import warp_device
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.followers import ActuatedActions
@@ -64,7 +65,7 @@ class ReorientEnv:
 
         Args:
             cfg: The task.
-            device: Warp device; the first GPU, or else the CPU, by default.
+            device: cpu or cuda:N; by default, and for auto, the first GPU, or else the CPU.
 
         Raises:
             ValueError: For a configuration that cannot work, naming field and remedy.
@@ -76,7 +77,7 @@ class ReorientEnv:
             from vd.envs.terms import OwnTerms  # needs torch, which the task alone does not
 
             self._terms = OwnTerms(cfg)
-        self.device = str(wp.get_device(device))
+        self.device = warp_device(device)
         self.state = state = build_task(cfg, self.device)
         """What this and its parts share."""
         self._launch = state.launch
@@ -212,7 +213,7 @@ class ReorientEnv:
         """Simulate one control step; environments that end are reset, and the observation is fresh.
 
         Args:
-            action: Actions in [-1, 1], shape [N, A]: a Warp array or anything ``wp.copy`` takes.
+            action: Actions in [-1, 1], shape [N, A]: a Warp array; ``wp.from_torch`` makes one of a tensor.
         """
         if self._terms is None:
             self._take(action)
@@ -248,6 +249,9 @@ class ReorientEnv:
 
     def _take(self, action: Any) -> None:
         """Put the actions of a step where the graph reads them."""
+        given = f"{type(action).__name__} {getattr(action, 'shape', '')}"
+        if not isinstance(action, wp.array) or action.shape != self.action.shape:
+            raise ValueError(f"actions are a Warp array {self.action.shape} (wp.from_torch), not {given}")
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
         self.steps += 1
