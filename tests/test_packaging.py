@@ -14,6 +14,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from vd.evaluate.agents import DEFAULT_POLICY, POLICY_LIST, SHIPPED_POLICIES
+from vd.interrupt import EXTRAS, command
+from vd.train.cli import main
 from vd.train.demo import CAMERA_POLICY
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,7 +53,7 @@ def required_distributions() -> set[str]:
             if not child.marker or any(child.marker.evaluate({"extra": extra}) for extra in extras):
                 child.marker = None
                 waiting.append(str(child))
-    return {key.split("[")[0] for key in needed}
+    return {key.split("[")[0] for key in needed} - {canonicalize_name(project["name"])}
 
 
 @pytest.fixture(scope="module")
@@ -122,11 +124,26 @@ def test_constraints_pin_everything():
     assert not missing, f"add to constraints.txt: {sorted(missing)}"
 
 
-def test_what_messages_and_pages_tell_to_install_exists():
+def test_what_may_be_missing_is_in_the_extra_that_messages_and_pages_name():
+    extras = PROJECT["project"]["optional-dependencies"]
+    for extra, packages in EXTRAS.items():
+        brought = {canonicalize_name(Requirement(text).name) for text in extras[extra]}
+        needed = {canonicalize_name(importlib.metadata.packages_distributions()[p][0]) for p in packages}
+        assert needed <= brought, extra
     told = set()
     for folder in (*PACKAGE_DIRS.values(), "docs"):
         for path in (ROOT / folder).rglob("*.*"):
             if path.suffix in (".py", ".md"):
-                told |= set(re.findall(r"pip install [^\n`]*?'([^'\n]*\[[^'\n]*)'", path.read_text()))
-    assert told == {f".[{extra}]" for extra in ("hardware", "export", "gym", "docs")}
-    assert {"hardware", "export", "gym", "docs"} <= PROJECT["project"]["optional-dependencies"].keys()
+                told |= set(re.findall(r"'visual-dexterity\[(\w+)\]'", path.read_text()))
+    assert {"hardware", "gym"} <= told <= EXTRAS.keys()
+
+
+def test_a_missing_extra_is_named_before_anything_slow(monkeypatch, capsys):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main(["teacher"]) == 1 and "'visual-dexterity[train]'" in capsys.readouterr().err
+
+    @command("vd-some")
+    def imports_it() -> None:
+        raise ModuleNotFoundError(name="pyarrow.parquet")
+
+    assert imports_it() == 1 and "'visual-dexterity[recordings]'" in capsys.readouterr().err

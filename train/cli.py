@@ -73,6 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"vd-train: {f'{name!r} is no more; {GONE[name]}' if name in GONE else known}", file=sys.stderr)
         return interrupt.USAGE_ERROR
     module, function = COMMANDS[name]
+    if name in ("teacher", "student") and not {"-h", "--help"} & set(arguments):
+        interrupt.need("rsl_rl", "tensordict")
     try:
         return int(getattr(importlib.import_module(module), function)(arguments, started))
     except KeyboardInterrupt:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
+from vd import interrupt
 from vd.command_line import parse
 from vd.files import atomic_path, check_file, check_folder
 
@@ -105,15 +106,15 @@ def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path) -> None:
     ``offset`` [N, 3] [m] and ``error`` [N] [rad] of :class:`vd.vision.alignment.Residual`. N, G and S vary.
 
     Raises:
-        RuntimeError: What the export needs is not installed, or outputs differ by more than rounding.
+        ModuleNotFoundError: What the export needs is not installed.
+        RuntimeError: Outputs differ by more than rounding.
     """
     import torch
 
     from vd.policy import TrainedPolicy
     from vd.vision.alignment import Residual
 
-    if find_spec("onnxscript") is None:
-        raise RuntimeError("ONNX export needs onnxscript: pip install -e '.[export]'")
+    interrupt.need("onnxscript")
     teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
     drawn = torch.randn(CHECKED, teacher.num_observations, generator=torch.Generator().manual_seed(0))
     _export(teacher.network, {"observation": drawn}, ["action"], path)
@@ -159,7 +160,7 @@ def _export(network: "Module", inputs: dict[str, "Tensor"], outputs: list[str], 
             verbose=False,
         )
         if find_spec("onnxruntime") is None:
-            print(f"{path}: onnxruntime is not installed: not checked (pip install -e '.[export]')")
+            print(f"{path}: onnxruntime is not installed: not checked ({interrupt.remedy('onnxruntime')})")
             return
         worst, ours, theirs = _compared(network, inputs, temporary)
         if not worst <= TOLERANCE:

@@ -1,6 +1,6 @@
 """The environment for Gymnasium: ``gymnasium.make_vec("vd.gym:VisualDexterity-v0", num_envs=4096)``.
 
-Needs the extra ``gym``: pip install '.[gym]'.
+Needs the extra ``gym``: pip install 'visual-dexterity[gym]'.
 """
 
 from typing import Any

@@ -5,6 +5,7 @@ terminal is gone.
 """
 
 import functools
+import importlib.util
 import os
 import signal
 import sys
@@ -60,6 +61,16 @@ GONE = {
 }
 """Flags of earlier versions that are no more, and what to do, or why."""
 
+EXTRAS = {
+    "train": ("rsl_rl", "tensordict", "tensorboard"),
+    "video": ("imageio_ffmpeg",),
+    "hardware": ("dynamixel_sdk", "serial", "pyrealsense2", "cv2"),
+    "recordings": ("pyarrow", "rosbags"),
+    "gym": ("gymnasium",),
+    "export": ("onnx", "onnxscript", "onnxruntime"),
+}
+"""Packages that not every user needs, by the extra that brings them."""
+
 P = ParamSpec("P")
 
 _last = 0
@@ -74,6 +85,23 @@ def note(number: int) -> None:
     """A signal came, and is handled elsewhere."""
     global _last
     _last = number
+
+
+def need(*packages: str) -> None:
+    """Refuse at once what needs packages of :data:`EXTRAS` that are not installed.
+
+    Raises:
+        ModuleNotFoundError: The first that is missing, and how to install it.
+    """
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise ModuleNotFoundError(f"{package} is not installed: {remedy(package)}", name=package)
+
+
+def remedy(package: str) -> str:
+    """The command that installs a package of :data:`EXTRAS`; empty for others."""
+    extra = next((extra for extra, packages in EXTRAS.items() if package in packages), "")
+    return extra and f"pip install 'visual-dexterity[{extra}]'"
 
 
 def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
@@ -102,12 +130,8 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
                 except SystemExit as end:
                     end.code = _status(end.code)
                     raise
-                except (ValueError, OSError, RuntimeError) as error:
-                    if os.environ.get("VD_DEBUG"):
-                        traceback.print_exc()
-                    print(f"{name}: {error}", file=sys.stderr)
-                    asked = int(getattr(error, "signal", 0))  # a moving hand is stopped first
-                    return 128 + asked if asked else FAILED
+                except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
+                    return _failed(name, error)
                 except KeyboardInterrupt as error:
                     print(f"\n{name}: stopped", file=sys.stderr)
                     return 128 + _last if isinstance(error, Terminated) else INTERRUPTED
@@ -116,6 +140,19 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
         return run
 
     return wrap
+
+
+def _failed(name: str, error: Exception) -> int:
+    """Tell a user what is wrong; returns the exit status."""
+    if os.environ.get("VD_DEBUG"):
+        traceback.print_exc()
+    if isinstance(error, ModuleNotFoundError):
+        if not (install := remedy(package := (error.name or "").partition(".")[0])):
+            raise error
+        error = ModuleNotFoundError(f"{package} is not installed: {install}")
+    print(f"{name}: {error}", file=sys.stderr)
+    asked = int(getattr(error, "signal", 0))  # a moving hand is stopped first
+    return 128 + asked if asked else FAILED
 
 
 def _renamed(arguments: Sequence[str]) -> str:

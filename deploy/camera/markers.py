@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vd import interrupt
 from vd.deploy.camera.camera import CameraError
 from vd.files import atomic_path
 
@@ -33,7 +34,7 @@ def opencv() -> ModuleType:
     try:
         import cv2
     except ImportError as error:
-        raise CameraError(f"OpenCV cannot be imported ({error}); pip install -e '.[hardware]'") from error
+        raise CameraError(f"OpenCV cannot be imported ({error}); {interrupt.remedy('cv2')}") from error
     return cv2
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from vd import interrupt
 from vd.assets_usd.hand_data import Intrinsics
 from vd.config import require
 from vd.deploy.camera.camera import CameraError, Frame, StaleCamera
@@ -56,7 +57,7 @@ def sdk() -> ModuleType:
         import pyrealsense2
     except ImportError as error:
         # Its wheel takes one library from the system.
-        remedy = "apt install libusb-1.0-0" if "libusb" in str(error) else "pip install -e '.[hardware]'"
+        remedy = "apt install libusb-1.0-0" if "libusb" in str(error) else interrupt.remedy("pyrealsense2")
         raise CameraError(f"the RealSense SDK cannot be imported ({error}); {remedy}") from error
     return pyrealsense2
 

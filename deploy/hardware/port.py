@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from vd import interrupt
 from vd.deploy.hardware.answers import BusError
 
 BAUD_RATE = 1_000_000
@@ -28,7 +29,7 @@ def sdk() -> ModuleType:
     try:
         import dynamixel_sdk
     except ImportError as error:
-        raise BusError("motors need dynamixel-sdk: pip install -e '.[hardware]'") from error
+        raise BusError(f"motors need dynamixel-sdk: {interrupt.remedy('dynamixel_sdk')}") from error
     return dynamixel_sdk
 
 

@@ -67,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cfg: PlayCfg = parse(PlayCfg, arguments, prog="vd-play")
     cfg.validate()
     if cfg.video is not None:
+        interrupt.need("imageio_ffmpeg")
         check_file(cfg.video)
     recorded = is_log(cfg.policy)
     if not recorded:
