@@ -78,7 +78,7 @@ def test_another_hand_is_refused_before_anything_is_built(policy, tmp_path, caps
     other = tmp_path / "other.usda"
     other.write_text(hand_usd("dclaw4").read_text().replace("dclaw4", "other"))
     assert main([policy, "--hand", str(other), "--device", "cpu", "--out", str(tmp_path)]) == 1
-    assert "the hand other has 12" in capsys.readouterr().err
+    assert "not for other (12)" in capsys.readouterr().err
 
 
 def test_start_goals_and_layer_are_as_trained_unless_asked_otherwise():
