@@ -113,9 +113,8 @@ class ReorientEnv:
         """The symmetry frames in which the policy observes and acts; None where that is the world frame."""
         self.acts_in_frame = True
         """Whether :meth:`step` takes actions in the symmetry frames, if any, or in the world's order."""
-        self._table_steps: wp.array | None = None
-        if cfg.table.away_share > 0.0:
-            self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device)
+        leaves = cfg.table.away_share > 0.0
+        self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device) if leaves else None
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
@@ -249,9 +248,8 @@ class ReorientEnv:
 
     def _take(self, action: Any) -> None:
         """Put the actions of a step where the graph reads them."""
-        given = f"{type(action).__name__} {getattr(action, 'shape', '')}"
-        if not isinstance(action, wp.array) or action.shape != self.action.shape:
-            raise ValueError(f"actions are a Warp array {self.action.shape} (wp.from_torch), not {given}")
+        if getattr(action, "ptr", None) is None or action.shape != self.action.shape:
+            raise ValueError(f"actions are a wp.array {self.action.shape} (wp.from_torch), not {action!r:.60}")
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
         self.steps += 1
