@@ -249,7 +249,7 @@ class ReorientEnv:
     def _take(self, action: Any) -> None:
         """Put the actions of a step where the graph reads them."""
         if getattr(action, "ptr", None) is None or action.shape != self.action.shape:
-            raise ValueError(f"actions are a wp.array {self.action.shape} (wp.from_torch), not {action!r:.60}")
+            raise ValueError(f"actions are an array {self.action.shape} of wp.from_torch, not {action!r:.40}")
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
         self.steps += 1
