@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vd import interrupt
+from vd.command_line import behind_command, parse
 
 OK, FAILED = 0, interrupt.FAILED
 """Exit statuses: done, or not, with the reason; after a signal 128 and its number."""
@@ -67,7 +68,7 @@ def _no_policy(text: str) -> str:
 @interrupt.command("vd-deploy")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-deploy``; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    arguments = behind_command(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments in (["-h"], ["--help"]):
         print(usage())
         return OK
@@ -77,8 +78,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     elif not arguments[0].startswith("-") and (wrong := _no_policy(arguments[0])):
         print(f"vd-deploy: {wrong}", file=sys.stderr)
         return FAILED
-    from vd.command_line import parse
-
     module = importlib.import_module(f"vd.deploy.{COMMANDS[name][0]}")
     options_of = getattr(module, f"{name.capitalize()}Cfg")
     options = parse(options_of, arguments, prog=f"vd-deploy {name}", description=module.__doc__)

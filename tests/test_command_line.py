@@ -34,6 +34,10 @@ LINES = {
 REFUSED = {
     ("vd-train teacher", "ppo: {epoch: 3}"): "bad.yaml: ppo has no field epoch; is it epochs?",
     ("vd-train teacher", "out: runs/x"): "bad.yaml: TeacherCfg has no field out; is it run.out?",
+    ("vd-train teacher", "run: {out: 5}"): "bad.yaml: run.out: expected Path, got 5",
+    ("vd-train teacher", "true: 1"): "bad.yaml: TeacherCfg has no field True",
+    ("vd-train teacher", "env: {seed: 1, seed: 2}"): "seed is there twice; keep one",
+    ("vd-train teacher --preset gpu", "preset: cpu-demo"): "--preset gpu: the settings of",
     ("vd-train teacher", "preset: huge"): "--preset huge is none; one of paper",
     ("vd-eval zero", "objects: cube"): "bad.yaml: objects: expected a list, ['cube']",
     ("vd-eval zero", "episodes: 0"): "--episodes is 0; it has to be positive",
@@ -42,6 +46,7 @@ REFUSED = {
     ("vd-play", "seed"): "bad.yaml has no fields",
     ("vd-play --config a.yaml", "seed: 1"): "names a.yaml and",
     ("vd-play", None): "there is no file",
+    ("vd-play --config --seed 1", "seed: 1"): "--config needs a file",
 }
 
 
@@ -95,7 +100,11 @@ def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
     cfg, preset = parse_teacher(["--config", str(path), "--ppo.gamma", "0.5"]), PRESETS["cpu-demo"]()
     assert (cfg.ppo.epochs, cfg.ppo.gamma, cfg.run.out) == (3, 0.5, Path("a"))
     assert cfg.ppo.minibatch_size == preset.ppo.minibatch_size and cfg.env.observation.view == "goal"
-    assert parse_teacher(["--config", str(path), "--preset", "gpu"]).policy == PRESETS["gpu"]().policy
+    path.write_text("ppo: {epochs: 3}")
+    cfg = parse_teacher(["--config", str(path), "--preset", "gpu"])
+    assert cfg.policy == PRESETS["gpu"]().policy and cfg.ppo.epochs == 3
+    for line in ("--config {} --print-config teacher", "--print-config teacher --config={}"):
+        assert "epochs: 3" in run(f"vd-train {line.format(path)}")[1]
     path.write_text("stage: 1\npreset: cpu-demo")
     assert parse_student(["--config", str(path)]).run.out.name == "cpu-stage1"
 

@@ -320,7 +320,7 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(tmp_path, cap
     ("flags", "error"),
     [
         ("--hand dclaw3 --port /dev/none dclaw3", "no robot senses; vd-train tracker"),
-        ("--hand dclaw4 --twin dclaw3-tracking", "moves 9 joints of dclaw3, the hand dclaw4 has 12"),
+        ("--hand dclaw4 --twin dclaw3-tracking", "was trained for dclaw3 (9 motors), not for dclaw4 (12)"),
         ("--hand dclaw3 --port /dev/none", "name the policy"),
         ("--hand dclaw3 --twin zero --goal 1,2,3", "give a quaternion"),
     ],

@@ -60,11 +60,11 @@ def test_another_hand_is_refused_before_anything_is_built(policy, tmp_path, caps
     for command, flags in ((main, ["--out", str(tmp_path)]), (play, ["--video", str(tmp_path / "m.mp4")])):
         assert command([policy, "--hand", "dclaw3", "--device", "cpu", *flags]) == 1
         error = capsys.readouterr().err
-        assert f"{policy} moves 12 joints of dclaw4, the hand dclaw3 has 9; use" in error
+        assert f"{policy} was trained for dclaw4 (12 motors), not for dclaw3 (9); use" in error
     other = tmp_path / "other.usda"
     other.write_text(hand_usd("dclaw4").read_text().replace("dclaw4", "other"))
     assert main([policy, "--hand", str(other), "--device", "cpu", "--out", str(tmp_path)]) == 1
-    assert "the hand other has 12" in capsys.readouterr().err
+    assert "not for other (12)" in capsys.readouterr().err
 
 
 def test_start_goals_and_layer_are_as_trained_unless_asked_otherwise():

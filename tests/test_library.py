@@ -75,12 +75,44 @@ def test_a_term_that_is_none_or_gives_what_cannot_be_is_named(beside_examples, m
             observing(name)
     env = observing("own_terms:height")
     given[0] = torch.full((2,), torch.nan)
-    env.observe()
+    with pytest.raises(ValueError, match="own_terms:height gave a value that is not finite"):
+        env.renew()
     with pytest.raises(ValueError, match="own_terms:height gave a value that is not finite"):
         env.check()
     given[0] = torch.zeros(2, 2)
     with pytest.raises(ValueError, match=r"own_terms:height gave \(2, 2\)"):
-        env.observe()
+        env.renew()
+    given.clear()
+    with pytest.raises(ValueError, match="own_terms:height raised IndexError: list index"):
+        env.renew()
+
+
+def test_what_is_no_file_of_ours_is_refused_with_file_and_remedy(tmp_path):
+    path = tmp_path / "odd"
+    with pytest.raises(FileNotFoundError, match=f"there is no {path}"):
+        vd.read(path)
+    for text in (b"", b"[]", b"\xff", b"{}", b'{"format": "visual-dexterity policies 1"}'):
+        path.write_bytes(text)
+        with pytest.raises(
+            ValueError, match=f"{path} has .*format.*; give the folder of a recording, bundle"
+        ):
+            vd.read(path)
+    path.write_text('{"format": "visual-dexterity evaluation 7"}')
+    with pytest.raises(ValueError, match=f"{path}: Result has no .*; run vd-eval again"):
+        vd.read(path)
+    path.unlink()
+    path.mkdir()
+    good = {"run.json": '{"format": "vd-hand-log/1", "joints": [], "goals": []}', "steps.csv": "t\n1\n"}
+    for name, text in (("events.jsonl", "{\n"), ("steps.csv", "t,a\n1,2\n3,4,5\n"), ("run.json", "{")):
+        for file, written in {**good, name: text}.items():
+            (path / file).write_text(written)
+        with pytest.raises(ValueError, match=f"{path / name} is damaged .*; copy the whole folder again"):
+            vd.read(path)
+    path = tmp_path / "a.pt"
+    torch.save(torch.nn.Linear(1, 1), path)
+    with pytest.raises(ValueError, match=r"or holds more than weights, .*; copy it again") as said:
+        vd.load_policy(path, device="cpu")
+    assert "weights_only" not in str(said.value)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import warp as wp
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
@@ -11,7 +12,10 @@ from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.cli import main
 from vd.evaluate.conditions import CONDITIONS, EXACT
 from vd.evaluate.result import Result
+from vd.kernels.inverse_weights import inverse_weights_kernel
+from vd.kernels.launch import launch
 from vd.sim.cfg import SimCfg, in_mujoco
+from vd.sim.engine import mend_weights
 
 WORLDS = 4
 FINE = in_mujoco(SimCfg())
@@ -56,6 +60,17 @@ def test_both_engines_move_alike_in_equal_steps(changes):
     np.testing.assert_allclose(mujoco[:, :, :12], newton[:, :, :12], atol=1e-4)
     np.testing.assert_allclose(mujoco[:, :, 12:], newton[:, :, 12:], atol=1e-3)
     assert not np.array_equal(mujoco, newton), "two engines"
+
+
+def test_the_weight_of_links_that_only_turn_is_that_of_rotation():
+    """Rounding of 4e-15 in place of 0 made an Allegro's contact with its palm 1e15 times too stiff."""
+    given = np.array([[[0, 0], [0, 300], [4e-15, 500], [0.03, 400], [10, 12000]]], np.float32)
+    expected = [[[0, 0], [300, 300], [500, 500], [0.03, 400], [10, 12000]]]
+    weights = wp.array(given, dtype=wp.vec2)
+    launch(inverse_weights_kernel, weights.shape, [], [weights])
+    mend_weights(given)
+    for mended in (weights.numpy(), given):
+        np.testing.assert_array_equal(mended, np.float32(expected))
 
 
 def test_the_table_carries_what_each_object_weighs_until_it_leaves():

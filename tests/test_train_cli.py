@@ -56,6 +56,8 @@ def test_the_machine_decides_where_no_preset_is_named(monkeypatch, capsys, gpus,
     assert f"preset: {name}\n" in capsys.readouterr().out
     assert parse_teacher(["--preset", "paper"], say=said.append).ppo == PRESETS["paper"]().ppo
     assert parse_teacher(["--smoke"], say=said.append).smoke and len(said) == 1
+    tiny = parse_teacher(["--preset", "leap-cube", "--smoke"])
+    assert tiny.smoke and tiny.env.hand == "leap" and tiny.run.device == "cpu" and tiny.env.num_envs == 16
 
 
 def test_a_preset_for_a_hand_of_its_own_serves_the_other():

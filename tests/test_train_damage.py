@@ -20,7 +20,7 @@ def iterations(folder: Path) -> list[int]:
 
 DAMAGES = {
     "empty": "is damaged: it is empty",
-    "cut short": "is damaged, or is no file of torch",
+    "cut short": "is damaged, or holds more than weights",
     "not finite": "is damaged: actor_state_dict has weights that are not finite",
 }
 

@@ -268,7 +268,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="parts side by side")
     args = parser.parse_args()
     if not args.objects.is_dir():
-        words = ("import", SHARED / "objects" / "test", "--out", args.objects, "--split", "test")
+        words = ("import", SHARED / "objects" / "test", "--out", args.objects)
         call("-m", "vd.assets_usd.cli", *words, log=args.objects.with_suffix(".log"))
     if args.what == "steps":
         step_tasks(args.objects, args.folder)

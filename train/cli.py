@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 
 from vd import interrupt
+from vd.command_line import behind_command
 
 USAGE = """usage: vd-train COMMAND [flags]
 
@@ -62,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status: 0 at the end, 1 on an error, 130 after Ctrl-C and 143 after SIGTERM, if saved.
     """
     started = time.monotonic()
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    arguments = behind_command(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0 if arguments else interrupt.USAGE_ERROR

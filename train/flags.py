@@ -26,9 +26,10 @@ CONFIG_NAME = "config.json"
 
 TEACHER_HELP = """Train the teacher: PPO on the simulator's state.
 
-Flags start from --preset, or with --resume from the run's config.json. Without either the machine decides:
-gpu, and cpu-demo where there is no GPU. Short forms: --hand, --hand-layer,
---objects, --num-envs and --seed stand for --env.hand and so on, --randomise for --env.randomisation.enabled.
+Flags start from --preset, or with --resume from the run's config.json; what a --config says wins over these.
+Without either the machine decides: gpu, and cpu-demo where there is no GPU. Short forms: --hand,
+--hand-layer, --objects, --num-envs and --seed stand for --env.hand and so on, --randomise for
+--env.randomisation.enabled.
 Ctrl-C saves. --help-all lists the flags of physics, reward, success and of the ranges of Table S3 too."""
 
 _RARE = {
@@ -76,7 +77,7 @@ def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | No
         raise ValueError(f"--preset {preset} is none; {instead}")
     reason = ""
     if "--smoke" in arguments:
-        start = smoke()
+        start = smoke(PRESETS[preset or "cpu-demo"]())
     elif preset is None and init is not None:
         start = settings_of(init, PRESETS["gpu"]())
     elif preset is None and not saved:
@@ -99,12 +100,20 @@ def starting(arguments: list[str], gone: Collection[str] = ()) -> tuple[list[str
     """A command line with what a ``--config`` says of where to start from before it, and that file.
 
     A file of a preset that is ``gone`` was written by an earlier version, and has all settings.
+
+    Raises:
+        ValueError: The file and ``--preset`` name two presets.
     """
     arguments, file = take_config(arguments)
     if file is None:
         return arguments, None
     words = file.words(STARTS)
-    if value_of(words, "--preset") in gone:
+    own, asked = value_of(words, "--preset"), value_of(arguments, "--preset")
+    if own is not None and asked not in (None, own):
+        raise ValueError(
+            f"--preset {asked}: the settings of {file.path} are those of {own}; name one of the two"
+        )
+    if own in gone:
         words[:2] = ["--preset", "gpu"]
     return words + arguments, file
 

@@ -1,5 +1,6 @@
 """What the package offers to programs, where no other module has it under its stable name (:mod:`vd`)."""
 
+import contextlib
 import json
 import multiprocessing
 from pathlib import Path
@@ -88,14 +89,15 @@ class ObjectTracker:
             hand: The hand (:func:`load_hand`), whose own points are left out.
             item: The object (:func:`load_objects`).
             camera: Lens, and pose in the base frame; the hand's own by default (``hand.camera``).
-            device: Warp device.
+            device: auto, cpu or cuda:N.
         """
+        from vd.device import resolve_device
         from vd.kernels.task.observations import teacher_observation_size
         from vd.paper import PAPER
         from vd.sensors.depth_cloud import CameraCloud
         from vd.tracking.camera_observer import CameraObserver
 
-        camera = camera or hand.camera
+        camera, device = camera or hand.camera, resolve_device(device)
         self._cloud = CameraCloud(camera, np.asarray(hand.mount), device=device)
         self._observer = CameraObserver(
             hand,
@@ -182,6 +184,8 @@ def read(path: str | Path) -> Any:
     from vd.hand_log import is_log, read_log
 
     path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"there is no {path}")
     if is_bundle(path):
         from vd.bundle.store import read_bundle
 
@@ -190,9 +194,16 @@ def read(path: str | Path) -> Any:
         return read_log(path)
     if path.is_dir():
         return read_recording(path)
-    values = json.loads(path.read_text())
-    of_gap = isinstance(values, dict) and str(values.get("format")).startswith("vd-gap")
-    return Report.read(path) if of_gap else Result.read(path)
+    found = ""
+    with contextlib.suppress(ValueError, LookupError, TypeError):
+        found = str(json.loads(path.read_text())["format"])
+    for start, kind in (("vd-gap", Report), ("visual-dexterity evaluation", Result)):
+        if found.startswith(start):
+            return kind.read(path)
+    raise ValueError(
+        f"{path} has {f'the format {found!r}' if found else 'no format'}; give the folder of a recording, "
+        "bundle or log, report.json or eval.json (load_policy reads policies, load_hand and load_objects USD)"
+    )
 
 
 def write(value: Any, path: str | Path) -> None:

@@ -97,6 +97,15 @@ def parse(
     return cfg
 
 
+def behind_command(words: Sequence[str]) -> list[str]:
+    """A command line that begins with ``--config FILE`` or ``--print-config``: these behind the rest."""
+    left, moved = list(words), list[str]()
+    while left and left[0].partition("=")[0] in (CONFIG, PRINT):
+        count = 2 if left[0] == CONFIG else 1
+        moved, left = moved + left[:count], left[count:]
+    return left + moved
+
+
 def take_config(words: Sequence[str]) -> tuple[list[str], ConfigFile | None]:
     """A command line without ``--config FILE``, and that file.
 
@@ -111,7 +120,7 @@ def take_config(words: Sequence[str]) -> tuple[list[str], ConfigFile | None]:
         flag, equals, value = word.partition("=")
         if flag != CONFIG:
             left.append(word)
-        elif path := value if equals else next(rest, ""):
+        elif (path := value if equals else next(rest, "")) and not path.startswith("-"):
             paths.append(path)
         else:
             raise ValueError(f"{CONFIG} needs a file; {PRINT} shows what it may hold")
@@ -125,7 +134,15 @@ def _read(path: Path) -> ConfigFile:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """Takes 3e-4 for a number."""
+        """Takes 3e-4 for a number, and refuses a name that is there twice."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            """A mapping."""
+            names = [key.value for key, _ in node.value]
+            if twice := [key for i, (key, _) in enumerate(node.value) if key.value in names[:i]]:
+                problem = f"{twice[0].value} is there twice; keep one"
+                raise yaml.constructor.ConstructorError(None, None, problem, twice[0].start_mark)
+            return super().construct_mapping(node, deep)
 
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789"))
     try:

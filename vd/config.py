@@ -68,7 +68,7 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "", over:
     hints = typing.get_type_hints(cls)
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     names = {field.name for field in fields}
-    unknown = sorted(set(values) - names)
+    unknown = sorted(map(str, set(values) - names))
     if unknown:
         meant = _meant(unknown[0], names, hints)
         raise ValueError(
@@ -173,8 +173,14 @@ def _convert_plain(kind: type, value: Any, where: str) -> Any:
     """``value`` as a number, text, path or enumeration."""
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if issubclass(kind, (Path, Enum)):
-        return kind(value)
+    if issubclass(kind, Enum):
+        try:
+            return kind(value)
+        except ValueError as error:
+            options = ", ".join(repr(one.value) for one in kind)
+            raise ValueError(f"{where}: {value!r} is not one of {options}") from error
+    if kind is Path and isinstance(value, str):
+        return Path(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise ValueError(f"{where}: expected {kind.__name__}, got {value!r}")
     return value

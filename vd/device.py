@@ -3,6 +3,21 @@
 import os
 
 
+def warp_device(name: str | None) -> str:
+    """The Warp device ``name``; without a name, and for ``auto``, the first GPU, or else the CPU.
+
+    Raises:
+        ValueError: The device does not exist here.
+    """
+    import warp as wp
+
+    try:
+        return str(wp.get_device(None if name == "auto" else name))
+    except (ValueError, RuntimeError) as error:
+        here = ", ".join(map(str, wp.get_devices()))
+        raise ValueError(f"device is {name!r}; it has to be auto, or of those here: {here}") from error
+
+
 def resolve_device(name: str) -> str:
     """The device for Warp and torch: ``auto`` is this process's GPU (torchrun), the first, or the CPU.
 

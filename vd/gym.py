@@ -3,7 +3,6 @@
 Needs the extra ``gym``: pip install 'visual-dexterity[gym]'.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -14,6 +13,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
 
@@ -48,13 +48,14 @@ class ReorientVectorEnv(VectorEnv):
             cfg: The task; the paper's by default.
             device: As of :class:`ReorientEnv`.
             autoreset_mode: SAME_STEP is the fastest. DISABLED: ``reset(options={"reset_mask": ..})`` resets.
-            settings: Fields of the task to replace, such as ``objects``.
+            settings: Fields of the task to replace, such as ``objects``; of a group some, by name.
 
         Raises:
             ValueError: For a task that cannot work, naming field and remedy.
         """
         self._mode = AutoresetMode(autoreset_mode)
-        task = replace(cfg or ReorientCfg(), num_envs=num_envs, **settings)
+        fields = {"num_envs": num_envs, **to_dict(settings)}
+        task = from_dict(ReorientCfg, fields, over=cfg or ReorientCfg())
         self.metadata = {"autoreset_mode": self._mode, "torch": True}
         self.env = env = ReorientEnv(task, device)
         self.num_envs = num_envs
@@ -79,6 +80,10 @@ class ReorientVectorEnv(VectorEnv):
             self._over.zero_()
         else:
             chosen = torch.as_tensor(mask, device=self._over.device)
+            if chosen.dtype != torch.bool or chosen.shape != self._over.shape:
+                raise ValueError(
+                    f"reset_mask is {chosen.dtype} {tuple(chosen.shape)}; give booleans, ({self.num_envs},)"
+                )
             self.env.renew(wp.from_torch(chosen.int()))
             self._over &= ~chosen
         return self._observation.clone(), {}
@@ -87,7 +92,10 @@ class ReorientVectorEnv(VectorEnv):
         self, actions: Any
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """One control step with actions [N, A] in [-1, 1]; those beyond are clipped."""
-        self._action.copy_(torch.as_tensor(actions))
+        given = torch.as_tensor(actions)
+        if given.shape != self._action.shape:
+            raise ValueError(f"actions have shape {tuple(given.shape)}, not {tuple(self._action.shape)}")
+        self._action.copy_(given)
         self.env.advance(self.env.action)
         ended, success, fell = (flag > 0 for flag in self._flags)
         reward, terminated = self._reward.clone(), fell.clone()

@@ -138,11 +138,13 @@ def read_log(path: str | Path) -> HandLog:
         raise LogError(
             f"{path} is no log: there is no {RUN_FILE}; give a folder that vd-deploy wrote"
         ) from None
-    except json.JSONDecodeError as error:
-        raise LogError(f"{path / RUN_FILE} is damaged ({error})") from error
+    except ValueError as error:
+        raise LogError(f"{path / RUN_FILE} is damaged ({error}); copy the whole folder again") from error
     found = run.get("format") if isinstance(run, dict) else None
     if found != LOG_FORMAT:
         raise LogError(f"{path / RUN_FILE}: format is {found!r}; this version reads {LOG_FORMAT!r}")
+    if not {"joints", "goals"} <= run.keys():
+        raise LogError(f"{path / RUN_FILE} has no joints or no goals; copy the whole folder again")
     return HandLog(path, run, read_columns(path / STEPS_FILE), _events(path / EVENTS_FILE))
 
 
@@ -154,21 +156,27 @@ def read_columns(file: Path) -> dict[str, np.ndarray]:
     """
     if not file.is_file():
         raise LogError(f"{file} is missing; copy the whole folder again")
-    with file.open(newline="") as stream:
-        header, *rows = csv.reader(stream)
-    if rows and len(rows[-1]) < len(header):  # the last row of a log that was cut short
-        rows.pop()
-    if not rows:
-        raise LogError(f"{file} has no rows")
     try:
+        with file.open(newline="") as stream:
+            header, *rows = [*csv.reader(stream)] or [[]]
+        if rows and len(rows[-1]) < len(header):  # the last row of a log that was cut short
+            rows.pop()
+        for number, row in enumerate(rows, 2):
+            if len(row) != len(header):
+                raise ValueError(f"row {number} has {len(row)} values for {len(header)} columns")
         values = np.array([[float(cell) for cell in row] for row in rows])
     except ValueError as error:
-        raise LogError(f"{file} is damaged ({error})") from error
+        raise LogError(f"{file} is damaged ({error}); copy the whole folder again") from error
+    if not rows:
+        raise LogError(f"{file} has no rows")
     return dict(zip(header, values.T, strict=True))
 
 
 def _events(file: Path) -> list[dict[str, Any]]:
     if not file.is_file():
         return []
-    lines = file.read_text().splitlines(keepends=True)
-    return [json.loads(line) for line in lines if line.endswith("\n")]
+    try:
+        lines = file.read_text().splitlines(keepends=True)
+        return [json.loads(line) for line in lines if line.endswith("\n")]
+    except ValueError as error:
+        raise LogError(f"{file} is damaged ({error}); copy the whole folder again") from error

@@ -3,6 +3,7 @@
 Reading a policy needs torch only, no simulator and no rsl-rl, and executes nothing in the file.
 """
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,7 +149,9 @@ def read_state(path: str | Path, device: str = "cpu", *, remedy: str) -> dict[st
     """
     path = Path(path)
     try:
-        state = torch.load(path, map_location=device, weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch tells how to load what executes
+            state = torch.load(path, map_location=device, weights_only=True)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"there is no file {path}; {remedy}") from error
     except Exception as error:
@@ -163,11 +166,11 @@ def read_state(path: str | Path, device: str = "cpu", *, remedy: str) -> dict[st
 
 def _damage(path: Path, error: Exception) -> str:
     """What is wrong with a file that torch cannot read."""
-    if isinstance(error, OSError):
+    if isinstance(error, OSError) and error.filename:
         return f"cannot be read ({error.strerror})"
     if path.stat().st_size == 0:
         return "is damaged: it is empty"
-    return f"is damaged, or is no file of torch ({(str(error) or type(error).__name__).splitlines()[0]})"
+    return "is damaged, or holds more than weights, which is not loaded since it could run programs"
 
 
 def _tensors_finite(value: Any) -> Iterator[bool]:

@@ -3,18 +3,18 @@
 Such a place holds ``NAME.pt`` for each policy, and ``policies.json``, which tells of them all.
 """
 
+import dataclasses
 import hashlib
 import json
 import os
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from http.client import HTTPException
 from pathlib import Path
-from typing import IO, Annotated, Any
+from typing import Annotated, Any
 from urllib.request import Request, urlopen
 
 import tyro
@@ -33,12 +33,10 @@ from vd.evaluate.agents import (
     policy_name,
     pulled_folder,
 )
-from vd.files import OutputError, atomic_path, make_folder, write_json, writing
+from vd.files import atomic_path, write_json
 
 STORE_FORMAT = "visual-dexterity policies 1"
 HUB, HUB_URL = "hf://", "https://huggingface.co"
-BLOCK = 1 << 20
-"""Bytes read at a time."""
 TIMEOUT_S = 60.0
 """Longest silence of a server."""
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -73,10 +71,8 @@ def read_store(place: str | Path) -> Store:
         OSError: The place does not answer.
         ValueError: Its list is none.
     """
-    with _reading(str(place), POLICY_LIST) as stream:
-        text = stream.read()
     try:
-        values = json.loads(text)
+        values = json.loads(_read(str(place), POLICY_LIST))
         if not isinstance(values, dict):
             raise ValueError("it is no list of policies; vd-policies push makes one")
         store = from_dict(Store, values)
@@ -97,12 +93,14 @@ def check_name(name: str) -> None:
     Raises:
         ValueError: It cannot.
     """
-    if not _NAME.fullmatch(name) or name in BUILT_IN:
-        raise ValueError(f"{name!r} is no name of a policy: letters, digits, and . _ - between them")
+    if not _NAME.fullmatch(name) or name in BUILT_IN or name.endswith(".pt"):
+        raise ValueError(
+            f"{name!r} is no name of a policy: letters, digits, and . _ - between them; no .pt at its end"
+        )
 
 
 def pull(name: str, place: str, *, replace: bool = False) -> Path:
-    """Fetch a policy; what an earlier call began goes on.
+    """Fetch a policy.
 
     Raises:
         FileExistsError: There is another policy of this name, and ``replace`` is not set.
@@ -119,16 +117,14 @@ def pull(name: str, place: str, *, replace: bool = False) -> Path:
     if here.exists() and (name in SHIPPED_POLICIES or not replace):
         remedy = "which stays" if name in SHIPPED_POLICIES else "--replace takes the one there"
         raise FileExistsError(f"{here} is another policy than {name} at {place}; {remedy}")
-    part = make_folder(target.parent) / f".{name}.{entry.sha256[:12]}.part"
-    _download(place, f"{name}.pt", part, entry.bytes)
-    if _digest(part) != entry.sha256:
-        part.unlink()
+    data = _read(place, f"{name}.pt")
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise ValueError(
             f"{place}/{name}.pt is not the file that {POLICY_LIST} there tells of (SHA-256 differs)"
         )
-    with writing(target):
-        part.replace(target)
-    _tell(target.parent, name, entry)
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(data)
+    _tell(target.parent, name, dataclasses.replace(entry, bytes=len(data)))
     return target
 
 
@@ -203,49 +199,23 @@ def _commit(repository: str, path: Path, name: str, store: Store) -> None:
     )
 
 
-def _download(place: str, file: str, part: Path, size: int) -> None:
-    """Have ``part`` hold all of a file; what it holds already is not asked for."""
-    have = part.stat().st_size if part.exists() else 0
-    if have < size:
-        with writing(part):
-            grown = part.open("ab")
-        with grown, _reading(place, file, have) as stream:
-            while block := stream.read(BLOCK):
-                with writing(part):
-                    grown.write(block)
-        have = part.stat().st_size
-    if have < size:
-        raise OSError(f"{place}/{file} ended after {have} of {size} bytes; the same command goes on")
-
-
-@contextmanager
-def _reading(place: str, file: str, skip: int = 0) -> Iterator[IO[bytes]]:
-    """A file of a place, without its first bytes."""
+def _read(place: str, file: str) -> bytes:
+    """A file of a place."""
     try:
-        with _open(place, file, skip) as stream:
-            yield stream
-    except OutputError:
-        raise
+        if "://" not in place:
+            return (Path(place) / file).read_bytes()
+        hub, token = place.startswith(HUB), os.environ.get("HF_TOKEN")
+        url = f"{HUB_URL}/{place.removeprefix(HUB)}/resolve/main" if hub else place.rstrip("/")
+        request = Request(f"{url}/{file}")
+        if hub and token:  # of private repositories; not for who they redirect to
+            request.add_unredirected_header("Authorization", f"Bearer {token}")
+        with urlopen(request, timeout=TIMEOUT_S) as stream:
+            data: bytes = stream.read()
+            return data
     except (OSError, HTTPException) as error:
         missing = isinstance(error, FileNotFoundError) or getattr(error, "code", None) == 404
         kind = FileNotFoundError if missing else ConnectionError
         raise kind(f"{place}/{file} cannot be read ({error}); --at names {PLACE}") from error
-
-
-def _open(place: str, file: str, skip: int) -> IO[bytes]:
-    if "://" not in place:
-        stream: Any = (Path(place) / file).open("rb")
-        stream.seek(skip)
-        return stream
-    url = f"{HUB_URL}/{place.removeprefix(HUB)}/resolve/main" if place.startswith(HUB) else place.rstrip("/")
-    request = Request(f"{url}/{file}", headers={"Range": f"bytes={skip}-"} if skip else {})
-    token = os.environ.get("HF_TOKEN")
-    if place.startswith(HUB) and token:  # of private repositories; not for who they redirect to
-        request.add_unredirected_header("Authorization", f"Bearer {token}")
-    stream = urlopen(request, timeout=TIMEOUT_S)
-    if skip and stream.status != 206:  # it gives all or nothing
-        stream.read(skip)
-    return stream
 
 
 def _digest(path: Path) -> str:
@@ -276,7 +246,7 @@ class List:
 
 @dataclass(frozen=True)
 class Pull:
-    """Fetch policies; commands then know them by name. An interrupted download goes on."""
+    """Fetch policies; commands then know them by name."""
 
     names: tyro.conf.Positional[tuple[str, ...]]
     """Policies, as vd-policies list --at names them."""

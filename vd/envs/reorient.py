@@ -11,6 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from vd.device import warp_device
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.followers import ActuatedActions
@@ -64,7 +65,7 @@ class ReorientEnv:
 
         Args:
             cfg: The task.
-            device: Warp device; the first GPU, or else the CPU, by default.
+            device: cpu or cuda:N; by default, and for auto, the first GPU, or else the CPU.
 
         Raises:
             ValueError: For a configuration that cannot work, naming field and remedy.
@@ -76,7 +77,7 @@ class ReorientEnv:
             from vd.envs.terms import OwnTerms  # needs torch, which the task alone does not
 
             self._terms = OwnTerms(cfg)
-        self.device = str(wp.get_device(device))
+        self.device = warp_device(device)
         self.state = state = build_task(cfg, self.device)
         """What this and its parts share."""
         self._launch = state.launch
@@ -112,9 +113,8 @@ class ReorientEnv:
         """The symmetry frames in which the policy observes and acts; None where that is the world frame."""
         self.acts_in_frame = True
         """Whether :meth:`step` takes actions in the symmetry frames, if any, or in the world's order."""
-        self._table_steps: wp.array | None = None
-        if cfg.table.away_share > 0.0:
-            self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device)
+        leaves = cfg.table.away_share > 0.0
+        self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device) if leaves else None
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
@@ -212,7 +212,7 @@ class ReorientEnv:
         """Simulate one control step; environments that end are reset, and the observation is fresh.
 
         Args:
-            action: Actions in [-1, 1], shape [N, A]: a Warp array or anything ``wp.copy`` takes.
+            action: Actions in [-1, 1], shape [N, A]: a Warp array; ``wp.from_torch`` makes one of a tensor.
         """
         if self._terms is None:
             self._take(action)
@@ -248,6 +248,8 @@ class ReorientEnv:
 
     def _take(self, action: Any) -> None:
         """Put the actions of a step where the graph reads them."""
+        if getattr(action, "ptr", None) is None or action.shape != self.action.shape:
+            raise ValueError(f"actions are an array {self.action.shape} of wp.from_torch, not {action!r:.40}")
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
         self.steps += 1

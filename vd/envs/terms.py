@@ -16,6 +16,9 @@ import warp as wp
 from vd.envs.cfg import ReorientCfg
 from vd.kernels.task.rewards import REWARD_TERMS
 
+CHECKED = 128
+"""Steps on a GPU between two looks at whether values were finite, for which it is waited."""
+
 
 class OwnTerms:
     """The own terms of a task.
@@ -34,6 +37,7 @@ class OwnTerms:
             raise ValueError(f"observation.terms: {wrong[0]} has to give 1 value or more")
         self._functions = {name: _function(name) for name in self._coefficients.keys() | self._sizes.keys()}
         self._not_finite: dict[str, torch.Tensor] = {}
+        self._steps = 0
 
     @torch.no_grad()
     def pay(self, env: Any) -> None:
@@ -55,6 +59,9 @@ class OwnTerms:
             for array in (observer.world_values, observer.all_values):
                 wp.to_torch(array)[:, column : column + size] = value
             column += size
+        self._steps += 1
+        if not env.sim.failed.device.is_cuda or self._steps % CHECKED == 0:
+            self.check()
 
     def check(self) -> None:
         """Refuse values that were not finite; waits for the device.
@@ -68,11 +75,17 @@ class OwnTerms:
 
     def _value(self, env: Any, name: str, size: int) -> torch.Tensor:
         """What a function gives [N, K]."""
-        value = self._functions[name](env)
-        shape = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
-        if shape not in {(env.num_envs, size), (env.num_envs,) if size == 1 else None}:
+        try:
+            value = self._functions[name](env)
+        except Exception as error:
+            raise ValueError(f"the own term {name} raised {type(error).__name__}: {error}") from error
+        shape: Any = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
+        fits = shape in {(env.num_envs, size), (env.num_envs,) if size == 1 else None}
+        if not fits or value.device != torch.device(env.device):
+            where = f" on {value.device}" if fits else ""
             raise ValueError(
-                f"the own term {name} gave {shape}; return a torch tensor of shape ({env.num_envs}, {size})"
+                f"the own term {name} gave {shape}{where}; return a torch tensor of shape "
+                f"({env.num_envs}, {size}) on {env.device}"
             )
         bad = ~torch.isfinite(value).all()
         self._not_finite[name] = self._not_finite.get(name, bad) | bad
@@ -86,7 +99,7 @@ def _function(name: str) -> Callable[[Any], torch.Tensor]:
     sys.path.append(here)
     try:
         found: Any = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError, ValueError) as error:
+    except Exception as error:
         raise ValueError(
             f"the own term {name!r} is not found ({error}); name it module:function, and run where that "
             "module can be imported"

@@ -168,8 +168,8 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
     own = ReorientCfg.of(policy).hand
     if policy.num_actions != len(model.actuated) or (task.hand != own and root_name(own) != model.name):
         raise ValueError(
-            f"{name} moves {policy.num_actions} joints of {own}, the hand {model.name} has "
-            f"{len(model.actuated)}; use the hand it was trained for: --hand {own}"
+            f"{name} was trained for {own} ({policy.num_actions} motors), not for {model.name} "
+            f"({len(model.actuated)}); use the hand it was trained for: --hand {own}"
         )
     if policy.kind == "teacher" and policy.trained_hand:
         from vd.bundle.contract import check_trained_hand

@@ -276,7 +276,10 @@ class Result:
         found = values.get("format") if isinstance(values, dict) else None
         if found != RESULT_FORMAT:
             raise ValueError(f"{path}: format is {found!r}, expected {RESULT_FORMAT!r}; run vd-eval again")
-        return from_dict(Result, values)
+        try:
+            return from_dict(Result, values)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}; run vd-eval again") from error
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ import warp as wp
 from mujoco.batch import MODEL_FIELDS, Batch
 from newton.solvers import SolverMuJoCo
 
+from vd.kernels.inverse_weights import LEAST_LEVER_M, inverse_weights_kernel
+from vd.kernels.launch import launch
 from vd.sim.cfg import CONE, IMPRATIO, JACOBIAN, TOLERANCE, SimCfg
 
 # Work space of convex pairs (5 kB each) is shared by all worlds; few worlds have no average to rely on:
@@ -41,6 +43,12 @@ class WarpSolver(SolverMuJoCo):
 
     captured = True
     """Whether a step is device work alone, which a graph replays."""
+
+    def notify_model_changed(self, flags: newton.ModelFlags | int) -> None:
+        """As of SolverMuJoCo, without inverse weights that are rounding errors."""
+        super().notify_model_changed(flags)
+        weights = self.mjw_model.body_invweight0
+        launch(inverse_weights_kernel, weights.shape, [], [weights])
 
     def publish_contacts(self) -> None:
         """Have the contacts of the last step, with their normal forces, in ``mjw_data``: they are there."""
@@ -131,6 +139,7 @@ class _Run:
         if model_changed:
             self._copy_model(model, [field.name for field in fields(model) if field.name in MODEL_FIELDS])
             batch.set_const()
+            mend_weights(batch.expand("body_invweight0"))
             # Tables are moved: their place counts, also if it was that of their body when this was computed.
             batch.expand("geom_sameframe")[:, self._fixed] = 0
         places = data.geom_xpos.numpy()[rows, self._geoms[self._fixed]]
@@ -169,6 +178,12 @@ class _Run:
             contact.worldid.numpy()[found:end] = self._rows.start + world
             found = end
         return found
+
+
+def mend_weights(weights: np.ndarray) -> None:
+    """:func:`inverse_weights_kernel` for MuJoCo's arrays, in place; shape [N, B, 2]."""
+    lost = weights[..., 0] < LEAST_LEVER_M**2 * weights[..., 1]
+    weights[lost, 0] = weights[lost, 1]
 
 
 def threads() -> int:
