@@ -46,8 +46,8 @@ PAGES: dict[str, tuple[tuple[str, ...], str]] = {
     ),
 }
 """Of each picture the commands, and the page that they leave; the viewer is one itself."""
-LOOK_S, START_S = 20, 600.0
-"""Time that the viewer is watched for [s], and the longest it takes to start."""
+LOOK_S, START_S = 60, 600.0
+"""Time that the viewer is watched for [s]: its panel unfolds slowly; and the longest it takes to start."""
 
 
 def main(names: list[str]) -> None:
@@ -87,7 +87,7 @@ def wait_for(address: str) -> None:
     while time.monotonic() < begun + START_S:
         try:
             urlopen(address).close()
-            return time.sleep(LOOK_S)
+            return time.sleep(10.0)
         except URLError:
             time.sleep(1.0)
     raise SystemExit(f"{address} does not answer")

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -71,7 +71,7 @@ def convert(asked: Convert) -> Recording:
         raise ValueError(f"--out {asked.out} holds a recording; name another folder")
     if bad := [pair for pair in asked.rename if "=" not in pair]:
         raise ValueError(f"--rename {bad[0]!r} is no OLD=NEW")
-    rename = dict(tuple(pair.split("=", 1)) for pair in asked.rename)
+    rename = {old: new for old, _, new in (pair.partition("=") for pair in asked.rename)}
     format = asked.format or format_of(asked.source)
     told = Told(asked.unit, rename, asked.state_topic, asked.command_topic)
     motions = list(FORMATS[format](asked.source, told))
@@ -95,7 +95,7 @@ def _trajectory(asked: Convert, motion: Motion, joints: tuple[str, ...], moved_r
     if missing := [joint for joint in joints if joint not in motion.joints]:
         raise RecordingError(f"{where}: no joint {missing[0]!r}; there are {', '.join(motion.joints)}")
     picked = [motion.joints.index(joint) for joint in joints]
-    channels = {
+    channels: dict[str, Any] = {
         name: values[:, picked]
         for name, values in motion.channels.items()
         if name not in asked.drop and not np.isnan(values[:, picked]).all()

@@ -104,7 +104,7 @@ def _column(file: Path, text: str, told: Told) -> tuple[str, float | None]:
     units = UNITS[channel]
     stated = told.unit if units is ANGLES else next(iter(units)) if len(units) == 1 else None
     unit = given or own or stated
-    if unit not in units:
+    if unit is None or unit not in units:
         said = f"has the unit {unit!r}" if unit else "has no unit"
         raise RecordingError(f"{file}: column {text!r} {said}; write '{name} [{'] or ['.join(units)}]'")
     return name, units[unit]
@@ -239,7 +239,7 @@ def _topic(
     if given is None and len(fit) == 1:
         return fit[0]
     if given in fit:
-        return given  # type: ignore[return-value]
+        return str(given)
     there = ", ".join(f"{topic} ({kind})" for topic, kind in kinds.items())
     found = f"{given} is none" if given else "there is none" if not fit else "there are several"
     raise RecordingError(

@@ -154,7 +154,7 @@ def _policies() -> list[str]:
     from vd.evaluate.agents import POLICY_FOLDER, POLICY_LIST, installed_policies, pulled_folder
     from vd.policy_store import read_store
 
-    told = {}
+    told: dict[str, Any] = {}
     for folder in (POLICY_FOLDER, pulled_folder()):
         if (folder / POLICY_LIST).exists():
             told |= read_store(folder).policies
