@@ -92,7 +92,7 @@ def test_a_sample_of_each_format_is_read_as_it_was_made(make, tmp_path, capsys):
     np.testing.assert_allclose(motion.command, COMMAND[:, :joints], atol=2e-6)
     np.testing.assert_allclose(motion.position, POSITION[:, :joints], atol=2e-6)
     np.testing.assert_allclose(motion.sent, TIME - 1e-3 * (make in (ros, mcap)), atol=2e-6)
-    assert motion.conditions.get("p_gain", 8) == 8
+    assert motion.conditions.get("p_gain", 8) == 8 and (motion.excitation == "sin") == (make is bam)
     before = (out / "recording.json").read_bytes()
     assert main(["convert", str(source), "--out", str(out), "--counts-per-turn", "4096", *flags]) == 1
     assert (

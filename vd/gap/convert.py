@@ -109,7 +109,7 @@ def _trajectory(asked: Convert, motion: Motion, joints: tuple[str, ...], moved_r
     begun = motion.time[0] if len(motion.time) else 0.0
     return Trajectory(
         file=f"{motion.name}.csv",
-        excitation=motion.name,
+        excitation=motion.kind or motion.name,
         joints=tuple(joint for joint, on in zip(joints, excited, strict=True) if on) or joints,
         conditions=dict(motion.conditions),
         time=motion.time - begun,

@@ -45,6 +45,7 @@ class Motion:
         channels: ``command`` and ``position`` [T, J] [rad], and telemetry as :mod:`vd.gap.motions` has it.
         command_time: When the command of a row was sent [T] [s]; None: at its time stamp.
         conditions: What was varied on purpose.
+        kind: Kind of motion, the unit of held-out splits; empty: of its own.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Motion:
     channels: Mapping[str, np.ndarray]
     command_time: np.ndarray | None = None
     conditions: Mapping[str, Any] = field(default_factory=dict)
+    kind: str = ""
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,8 @@ def read_bam(path: Path, told: Told) -> Iterator[Motion]:
                 "timestamp, position and goal_position"
             ) from error
         joint = told.rename.get("pendulum", "pendulum")
-        yield Motion(name, (joint,), time, {k: v[:, None] for k, v in channels.items()}, None, conditions)
+        values = {channel: of_joint[:, None] for channel, of_joint in channels.items()}
+        yield Motion(name, (joint,), time, values, None, conditions, str(log["trajectory"]))
 
 
 def read_lerobot(path: Path, told: Told) -> Iterator[Motion]:
