@@ -167,9 +167,10 @@ def _policies() -> list[str]:
 
 
 def _session(cfg: PlayCfg) -> "Session":
+    opened = _open(cfg, num_envs=1)  # what cannot be opened is refused before anything slow
     from vd.play.session import Session
 
-    return Session(*_open(cfg, num_envs=1), seed=cfg.seed)
+    return Session(*opened, seed=cfg.seed)
 
 
 def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any]:
