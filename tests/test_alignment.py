@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.quaternions import relative_rotation, rotation_distance
-from vd.train.checkpoint import list_checkpoints, save_checkpoint
+from vd.train.checkpoint import list_checkpoints
 from vd.train.config import RunCfg
 from vd.train.student.align import AlignTrainer, alignment_losses, make_scenes
 from vd.train.student.config import AlignCfg
@@ -263,15 +263,3 @@ def test_shapes_are_renewed_from_the_oldest(scenes):
     bank.renew(4)
     same = (bank._shapes == before).flatten(1).all(dim=1)
     assert int((~same).sum()) == 7
-
-
-def test_other_files_and_sizes_are_refused(tmp_path):
-    save_checkpoint(tmp_path / "student.pt", {"format": "visual-dexterity student 1"})
-    with pytest.raises(ValueError, match="no network of alignment"):
-        load_alignment(tmp_path / "student.pt")
-    with pytest.raises(FileNotFoundError, match="give an alignment"):
-        load_alignment(tmp_path / "none.pt")
-    with pytest.raises(ValueError, match=r"--align\.points is 4"):
-        replace(QUICK, points=4).validate()
-    with pytest.raises(ValueError, match="must divide"):
-        replace(QUICK, network=replace(TINY, heads=3)).validate()

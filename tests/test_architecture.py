@@ -225,10 +225,3 @@ def test_every_constant_names_its_source():
             assert tag == "C", f"{name}: *_code is for values of the released code"
         numbers = value if isinstance(value, tuple) else (value,)
         assert all(math.isfinite(number) for number in numbers), name
-
-
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
-def test_documents_name_targets_of_make_that_exist(document):
-    makefile = (ROOT / "Makefile").read_text()
-    for target in re.findall(r"`make ([a-z]+)", document.read_text()):
-        assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"{document.name}: no `make {target}`"

@@ -144,6 +144,8 @@ def test_a_battery_goes_on_where_it_ended_and_names_what_is_hidden(tmp_path, mon
     some = {"out": tmp_path, "model": "servo", "effects": effects, "sizes": (3,), "seeds": 1}
     monkeypatch.setattr(gap, "NOTHING_A_SEED", 1)
     GapCommand(**some, kinds=("none",)).run()
+    GapCommand(**some, kinds=("single",), shard="1/2").run()
+    assert len(ran) == 2 and "coulomb" not in (tmp_path / "summary.md").read_text(), "others are at work"
     GapCommand(**some, kinds=("single",)).run()
     results = {one.effects: json.loads((tmp_path / f"{one.name}.json").read_text()) for one in ran}
     assert len(ran) == 3 and not any(r["false"] for r in results.values())

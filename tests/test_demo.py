@@ -18,7 +18,6 @@ from vd.deploy.loop.log import LogWriter
 from vd.evaluate.result import Result
 from vd.gap.report import write_report
 from vd.hand_log import JOINT_CHANNELS
-from vd.train import demo
 from vd.train.demo import Demo, Part, main
 from vd.train.metrics import PROGRESS_FILE
 
@@ -123,14 +122,6 @@ def test_quick_ends_after_the_first_part_and_a_demo_again_replaces_the_one_befor
     assert main(["--out", str(tmp_path), "--quick"]) == 0
     assert not (tmp_path / "camera" / "old.txt").exists() and (tmp_path / "mine.txt").exists()
     assert Result.read(tmp_path / "camera" / "eval.json").rows
-
-
-def test_training_gets_what_the_other_parts_leave_and_a_minute_at_least(played, tmp_path):
-    for minutes, expected in (("8", 8.0 - demo.AROUND_TRAINING_MIN), ("1", demo.LEAST_TRAINING_MIN)):
-        assert main(["--out", str(tmp_path), "--minutes", minutes]) == 0
-        (line,) = [line for line in played if "teacher" in line]
-        assert float(option(line, "--max-minutes").name) == pytest.approx(expected, abs=0.5)
-        played.clear()
 
 
 def test_meshes_are_turned_in_place_of_built_in_objects(played, tmp_path, monkeypatch):

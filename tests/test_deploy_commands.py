@@ -21,7 +21,7 @@ from vd.assets_usd.hands import load_hand
 from vd.deploy import cli
 from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.hardware import check, home, record
-from vd.deploy.hardware.connect import Connection, HandOptions, connect
+from vd.deploy.hardware.connect import Connection
 from vd.deploy.hardware.joints import read_joints
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import StoppedError
@@ -275,21 +275,6 @@ def test_a_fault_of_the_table_ends_safely(hand):
     fault = next(fault for fault in MOVING if fault.name == "Ctrl-C")
     outcome = try_fault(fault, read_joints(hand))
     assert not outcome.energised and not outcome.pushing and outcome.detected_s is not None
-
-
-def test_options_and_commands_that_cannot_be_are_refused(capsys):
-    for options, error in (
-        (HandOptions(), "--port"),
-        (HandOptions(port=PORT, motor="XL430"), "no motor is called XL430"),
-    ):
-        with pytest.raises(ValueError, match=error), connect(options):
-            pass
-    assert cli.main(["record", "--twin", "--fingers", "7"]) == cli.FAILED
-    said = capsys.readouterr().err
-    assert "dclaw3 has fingers 0 to 2" in said and "starting the twin" not in said
-    assert cli.main(["fly"]) == cli.FAILED and "no policy 'fly'" in capsys.readouterr().err
-    assert cli.main(["set-id", "1", "11"]) == cli.FAILED and "Wizard" in capsys.readouterr().err
-    assert cli.main([]) == cli.OK and "vd-deploy COMMAND" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

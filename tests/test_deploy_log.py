@@ -11,6 +11,7 @@ import pytest
 from simulated_clock import SimulatedClock
 
 from vd.assets_usd.hands import load_hand
+from vd.deploy.loop import run_page
 from vd.deploy.loop.log import LogWriter
 from vd.gap.recording import read_recording
 from vd.hand_log import JOINT_CHANNELS, STEP_COLUMNS, STEPS_FILE, TRUTH_COLUMNS, LogError, is_log, read_log
@@ -79,6 +80,14 @@ def test_a_log_is_shown(folder, tmp_path, capsys):
     (folder / "run.json").write_text(json.dumps(run))
     assert play([str(folder), "--video", str(tmp_path / "gone.mp4")]) == 1
     assert "cannot be shown" in capsys.readouterr().err
+
+
+def test_without_its_encoder_there_is_a_page_without_a_film(folder, monkeypatch):
+    monkeypatch.setattr(run_page, "find_spec", lambda _: None)
+    log = read_log(folder)
+    log.run.update(policy="one", twin=True)
+    page = run_page.write_page(log, run_page.goal_results(log))
+    assert "visual-dexterity[video]" in page.read_text() and not (folder / "run.mp4").exists()
 
 
 def test_the_viewer_steps_through_a_log(folder, monkeypatch):

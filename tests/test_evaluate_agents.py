@@ -51,20 +51,6 @@ def test_names_mean_files_and_files_have_names(tmp_path, monkeypatch):
     assert find_policy(tmp_path) == find_policy(tmp_path / "policy.pt") == tmp_path / "policy.pt"
 
 
-def test_what_is_not_there_is_refused_with_the_names_there_are(tmp_path, capsys):
-    from vd.play.cli import main as play
-
-    assert main(["dclaw4-cubes", "--device", "cpu"]) == 1
-    error = capsys.readouterr().err
-    assert "dclaw4-cubes" in error and "dclaw4-cube" in error.replace("dclaw4-cubes", "")
-    assert main([]) == 1
-    assert "dclaw4-cube" in capsys.readouterr().err
-    missing = str(tmp_path / "identified.usda")
-    for command in (main, play):
-        assert command(["zero", "--hand-layer", missing, "--device", "cpu"]) == 1
-        assert f"{missing}: no such hand layer" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("policy", ["dclaw4", "dclaw4-tracking"])
 def test_another_hand_is_refused_before_anything_is_built(policy, tmp_path, capsys, monkeypatch):
     from vd.envs import reorient

@@ -105,6 +105,14 @@ def test_everything_is_run_once_and_only_what_changed_again(tmp_path, asked, mon
         monkeypatch.setattr(suite_run, "fingerprint", lambda name: "new weights")
 
 
+def test_jobs_of_an_array_share_the_work_and_the_whole_command_merges_it(tmp_path, asked):
+    for part in ("0/2", "1/2"):
+        assert not run(tmp_path, shard=part).missing
+        assert not (tmp_path / "out" / "paper.html").exists(), "others are at work"
+    assert sorted(asked) == sorted((name, TEACHER) for name in OF_TEACHERS)
+    assert not run(tmp_path).missing and len(asked) == len(OF_TEACHERS)
+
+
 def test_the_reduced_suite_ends_in_its_time_and_shows_what_it_has(tmp_path, asked, monkeypatch):
     whole, now = suite_run.compare, [0.0]
     monkeypatch.setattr(suite_run.time, "monotonic", lambda: now[0])
@@ -234,8 +242,9 @@ def test_our_objects_stand_for_the_papers_where_none_are_given_and_the_reduced_s
     [
         (["--suite", "paper", "--condition", "mixed"], "--condition is decided by --suite paper"),
         (["--suite", "paper", "--in-air"], "--in-air is decided by --suite paper"),
-        (["dclaw4-cube", "--jobs", "2"], "--quick and --jobs are of a suite; add --suite paper"),
+        (["dclaw4-cube", "--jobs", "2"], "--quick, --jobs and --shard are of a suite; add --suite paper"),
         (["--suite", "paper", "--jobs", "0"], "--jobs is 0; it has to be positive"),
+        (["--suite", "paper", "--shard", "2/2"], "--shard is '2/2'; it has to be I/N"),
         (
             ["zero", "--condition", "mixed", "--table-friction", "0"],
             "--condition and --table-friction exclude",

@@ -55,12 +55,6 @@ def test_a_file_that_cannot_grow_is_named_and_the_old_one_stays(tmp_path, name):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_an_error_of_the_writer_itself_stays_what_it_is(tmp_path):
-    with pytest.raises(ZeroDivisionError), atomic_path(tmp_path / "a.txt") as temporary:
-        temporary.write_text(str(1 / 0))
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_bundle_that_does_not_fit_is_not_there(tmp_path):
     load_hand("dclaw3")  # authored on first use
     policy = open_policy("dclaw3", "cpu")

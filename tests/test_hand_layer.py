@@ -155,11 +155,6 @@ def test_wrong_layers_name_file_prim_and_attribute(tmp_path, text, message):
     assert "bad.usda" in str(error.value)
 
 
-def test_a_missing_layer_is_named(tmp_path):
-    with pytest.raises(HandError, match=r"none\.usda: no such hand layer"):
-        read(tmp_path / "none.usda")
-
-
 @pytest.mark.parametrize(
     ("baseline", "effects", "message"),
     [

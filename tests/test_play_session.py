@@ -1,19 +1,15 @@
 """What the viewer's buttons do to a running environment, and what recordings show."""
 
-from pathlib import Path
-
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from fake_env import FakeEnv, FakeObject
-from scipy.spatial.transform import Rotation
 
 from vd.evaluate.statistics import rotation_angle
-from vd.play.cli import PlayCfg, spread
+from vd.play.cli import spread
 from vd.play.session import Session
-from vd.play.video import STRIP_HEIGHT, Composer, Snapshot, Watcher, act
-from vd.render import Picture
+from vd.play.video import Watcher, act
 
 
 class Turn:
@@ -66,54 +62,10 @@ def test_watcher_counts_goals_and_drops_of_its_worlds_alone():
     assert shots[0].time_s == pytest.approx(0.5)
 
 
-def shot_of(**changes):
-    quat = Rotation.identity().as_quat()
-    values = dict(
-        name="thing",
-        time_s=1.0,
-        joint_q=np.concatenate([np.zeros(12), quat]),
-        goal_quat=quat,
-        error_rad=1.0,
-        success=False,
-        fell=False,
-        goals=0,
-        drops=0,
-    )
-    return Snapshot(**{**values, **changes})
-
-
-def blank(width=320, height=200):
-    return Picture(np.full((height, width, 3), 200, np.uint8), np.full((60, 60, 3), 230, np.uint8))
-
-
-def test_frames_hold_picture_goal_and_strip_and_are_even():
-    composer = Composer(3)
-    frame = composer.frame([blank(319, 201)] * 3, [shot_of()] * 3)
-    assert frame.shape[0] % 2 == 0 and frame.shape[1] % 2 == 0
-    assert frame.shape[0] >= 2 * (201 + STRIP_HEIGHT) and frame.shape[1] >= 2 * 319
-    assert (frame[40, 40] == 200).all()
-    assert (frame[30, 319 - 30] == 230).all()  # the goal, upper right of the first cell
-
-
-def test_success_and_drop_colour_the_edge_for_a_while():
-    composer = Composer(1)
-    edge = [composer.frame([blank()], [shot_of(success=i == 1)])[2, 160] for i in range(12)]
-    is_green = [int(p[1]) - int(p[0]) > 60 for p in edge]
-    assert is_green == [False] + [True] * 6 + [False] * 5
-    dropped = composer.frame([blank()], [shot_of(fell=True)])[2, 160]
-    assert int(dropped[0]) - int(dropped[1]) > 60
-
-
 def test_cells_show_different_objects_first():
     assert spread([0, 0, 0, 1, 1, 2], 3) == [0, 3, 5]
     assert spread([0, 0, 0, 1, 1, 2], 4) == [0, 1, 3, 5]
     assert spread([0], 1) == [0]
-
-
-def test_bad_settings_are_refused_by_flag():
-    for fields, message in (({"cells": 0}, "--cells is 0"), ({"video": Path("a.gif")}, "ends in .mp4")):
-        with pytest.raises(ValueError, match=message):
-            PlayCfg(policy="zero", **fields).validate()
 
 
 @pytest.mark.slow

@@ -5,9 +5,13 @@ import inspect
 import shutil
 import subprocess
 import time
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+import warp as wp
 from fake_env import FakeEnv
 from PIL import Image
 from test_play_session import Turn
@@ -32,11 +36,37 @@ FLAGS = (
 PATIENCE_S = 300.0
 
 
+def session(policy=None, hand="dclaw3"):
+    objects = [box("brick", [0.09, 0.05, 0.03]), box("stick", [0.14, 0.02, 0.02])]
+    env = FakeEnv(objects, num_envs=2, max_episode_steps=10_000, tolerance=-1.0, hand=load_hand(hand))
+    return Session(env, policy or Turn(1.0))
+
+
+class Sees(Turn):
+    """Sees by a camera a plane at half a metre, and believes the object in the middle of it."""
+
+    def __init__(self):
+        super().__init__(1.0)
+        self.hand, self.predicted = load_hand("dclaw4"), torch.full((2,), 0.25)
+        camera = replace(self.hand.camera, position=np.zeros(3), quaternion=np.array([0.0, 0.0, 0.0, 1.0]))
+        self.camera = SimpleNamespace(camera=camera, depth=wp.full((2, camera.height, camera.width), 0.5))
+        tips = self.hand.tip_poses(self.hand.start)[:, :3].mean(axis=0)
+        finder = SimpleNamespace(pose=torch.tensor([*tips, 0.0, 0.0, 0.0, 1.0]).expand(2, 1, 7))
+        self.tracker = SimpleNamespace(observer=SimpleNamespace(finder=finder))
+
+    def surface(self, world):
+        """A point, the origin."""
+        return np.zeros((1, 3))
+
+
 @pytest.fixture
 def player():
-    objects = [box("brick", [0.09, 0.05, 0.03]), box("stick", [0.14, 0.02, 0.02])]
-    env = FakeEnv(objects, num_envs=2, max_episode_steps=10_000, tolerance=-1.0, hand=load_hand("dclaw3"))
-    viewer = PlayViewer(Session(env, Turn(1.0)), verbose=False)
+    def reopen(name):
+        if name == "broken":
+            raise ValueError("it is broken")
+        return session(Sees(), "dclaw4")
+
+    viewer = PlayViewer(session(), policies=("turn", "broken", "sees"), reopen=reopen, verbose=False)
     yield viewer
     viewer.close()
 
@@ -94,3 +124,18 @@ def test_controls_reach_the_simulation(player):
     assert session.object_name == "stick" and "stick" in player._status.content
     use(player, "Reset")
     assert session.snapshot.time_s == 0.0
+
+
+def test_another_policy_brings_its_hand_and_what_its_camera_sees(player):
+    use(player, "Object", "stick")
+    before = player.session
+    use(player, "Policy", "broken")
+    assert player.session is before and player._eye is None
+    use(player, "Policy", "sees")
+    assert player.session.hand.name == "dclaw4" and player.session.object_name == "stick"
+    assert "believed 0.25" in player._status.content and "ms" in player._status.content
+    seen, camera = player.session.view(), player.session.hand.camera
+    assert seen.shape == (camera.height, camera.width, 3)
+    assert (seen[..., 1] > seen[..., 0] + 100).any(), "the believed surface"
+    shown = player.viewer._viewer_option_handles.keys()
+    assert "show_triangles" not in shown and "show_visual" in shown, "no menus of what is not there"

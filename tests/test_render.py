@@ -1,12 +1,10 @@
 """The headless renderer: things are where the camera model says, in their colours, and files decode."""
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.model import ObjectModel
-from vd.play.video import write_frames
 from vd.render import Camera, Renderer
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0]
@@ -130,15 +128,3 @@ def test_fingertips_are_drawn_where_kinematics_puts_them(hand, name):
     inside = mount.apply(model.tip_poses(joints)[:, :3]) + np.array([0.0, 0.0, 0.25 + 0.012])
     column, row = project(renderer.camera, inside, 320, 240).round().astype(int).T
     assert (np.abs(hands - none).sum(axis=2)[row, column] > 20).all()
-
-
-def frames(count, height=64, width=96):
-    ramp = np.linspace(0, 255, count).astype(np.uint8)
-    return (np.full((height, width, 3), value, np.uint8) for value in ramp)
-
-
-def test_video_decodes_to_its_frames(tmp_path):
-    assert write_frames(tmp_path / "clip.mp4", frames(17), 12.0) == 17
-    decoded = iio.imread(tmp_path / "clip.mp4")
-    assert decoded.shape[:3] == (17, 64, 96)
-    np.testing.assert_allclose(decoded.reshape(17, -1).mean(axis=1), np.linspace(0, 255, 17), atol=6)

@@ -5,7 +5,6 @@ import os
 import socket
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,13 +13,13 @@ from test_alignment import QUICK, TINY, make_runner
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy
+from vd.evaluate.agents import SHIPPED_POLICIES, find_policy
 from vd.policy import load_policy
 from vd.tracking.policy import TrackingPolicy, TrackingSpec
 from vd.train.cli import main
 from vd.train.metrics import read_progress
 from vd.train.student.align import CLOUDS, mesh_points
-from vd.train.student.config import PRESETS, LooksCfg
+from vd.train.student.config import LooksCfg
 from vd.train.student.looks import SimulatedLooks
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.alignment import AlignmentNetwork
@@ -64,29 +63,6 @@ def test_a_batch_is_of_both():
     runner.looks.collect(lambda: False)
     assert len(runner.pairs().goal) == QUICK.batch
     assert {"looks/success_per_goal", "loss/rotation"} <= runner._iterate().keys()
-
-
-def test_presets_are_valid_and_bad_settings_named():
-    for preset in PRESETS.values():
-        for number in (0, 1):
-            preset(number).validate()
-    first = PRESETS["gpu"](1)
-    with pytest.raises(ValueError, match=r"--looks\.share is 2"):
-        replace(first, looks=LooksCfg(share=2.0)).validate()
-
-
-def test_what_is_missing_or_of_before_is_explained(tmp_path, capsys):
-    base = ["student", "--preset", "cpu-demo", "--out", str(tmp_path / "run"), "--device", "cpu"]
-    assert main([*base, "--stage", "1"]) == 1
-    assert "give its alignment.pt as --init" in capsys.readouterr().err
-    assert main(["student", "--device", "cpu", "--out", str(tmp_path / "run")]) == 1
-    assert "--teacher is missing" in capsys.readouterr().err
-    torch.save({"spec": {}, "student_state_dict": {}, "task": {}, "depth": {}}, tmp_path / "student.pt")
-    assert main([*base, "--stage", "1", "--init", str(tmp_path / "student.pt")]) == 1
-    assert "holds no network of alignment" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="vd-train tracker TEACHER --alignment"):
-        open_policy(str(tmp_path / "student.pt"), "cpu")
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow

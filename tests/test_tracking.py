@@ -12,13 +12,12 @@ from sensed_world import state_of
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.config import to_dict
-from vd.deploy.cli import main as vd_deploy
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.policy_runner import TrackingRunner
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
-from vd.evaluate.agents import REPLACED, SHIPPED_POLICIES, find_policy, open_policy, sees_clouds, task_for
+from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy, sees_clouds, task_for
 from vd.evaluate.result import Result
 from vd.evaluate.trace import Trace
 from vd.evaluate.tracking import TrackingActor, sensed
@@ -223,14 +222,6 @@ def test_files_come_back_and_a_damaged_one_is_told(tmp_path):
     assert torch.equal(found.alignment(*clouds).rotation, vision.alignment(*clouds).rotation)
 
 
-@pytest.mark.parametrize("name", sorted(REPLACED))
-def test_a_former_name_is_refused_with_the_one_to_take(name, capsys, tmp_path):
-    assert cli.main([name, "--out", str(tmp_path)]) == 1
-    assert REPLACED[name] in capsys.readouterr().err
-    assert vd_deploy([name, "--twin"]) == 1
-    assert REPLACED[name] in capsys.readouterr().err
-
-
 def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
     policy = read_policy(find_policy("dclaw3-tracking"))
     plain, real = (TrackingActor(env, policy, sensor_errors=errs).camera.cfg for errs in (False, True))
@@ -283,13 +274,6 @@ def test_an_evaluation_in_the_air_by_scans(tmp_path):
     assert (row.kind, row.sees, row.stopped_by) == ("tracking", "rendered clouds", "prediction")
     assert row.protocol.goals == "scan" and row.protocol.sensor_errors and row.protocol.in_air
     assert row.prediction is not None and row.held is not None
-
-
-@pytest.mark.slow
-def test_it_is_shown(tmp_path):
-    from vd.play.cli import PlayCfg, record_video
-
-    assert record_video(PlayCfg(policy="dclaw3-tracking", seconds=0.5, device="cpu"), tmp_path / "m.mp4") == 7
 
 
 def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(tmp_path, monkeypatch, capsys):

@@ -9,8 +9,7 @@ import pytest
 
 from vd.assets_usd.hands import HANDS
 from vd.config import from_dict, to_dict
-from vd.device import resolve_device
-from vd.train.cli import GONE, main
+from vd.train.cli import main
 from vd.train.config import validate
 from vd.train.flags import OF_HELP_ALL, parse_teacher
 from vd.train.presets import PRESETS, TeacherCfg
@@ -156,26 +155,6 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path, capsys):
         said = capsys.readouterr()
         assert "add --resume" in said.err and "building" not in said.out, "before anything slow"
     assert not (tmp_path / "config.json").exists()
-
-
-def test_unknown_commands_devices_and_missing_files_are_explained(tmp_path, monkeypatch, capsys):
-    assert main(["pupil"]) == 2
-    assert "no command 'pupil'" in capsys.readouterr().err
-    for command, instead in GONE.items():
-        assert main([command, str(tmp_path)]) == 2
-        assert f"'{command}' is no more; {instead}" in capsys.readouterr().err
-    assert main(["export", str(tmp_path / "x.pt")]) == 1
-    for device in ("gpu", "cuda:97", "cuda:x"):
-        with pytest.raises(ValueError, match="--device"):
-            resolve_device(device)
-    assert resolve_device("cpu") == "cpu"
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("vd.train.tracker.tracker_command", interrupted)
-    assert main(["tracker", "dclaw3"]) == 130
-    assert "stopped at once\n" in capsys.readouterr().err, "there is no checkpoint to resume from"
 
 
 def test_export_commands(tmp_path, capsys):

@@ -10,7 +10,6 @@ import warp as wp
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
 from vd.policy import TrainedPolicy
-from vd.train.config import PolicyCfg, PpoCfg, RunCfg, validate
 from vd.train.distribution import BoundedStdGaussian
 from vd.train.metrics import GoalWindow, StepMeans, read_progress
 from vd.train.ppo import RUNAWAY_KL
@@ -165,25 +164,6 @@ def test_step_means_and_window_ratios():
     assert result["mean_reward"] == 2.0
     # The third iteration pushes the first out.
     assert window.add(row | {"task/timed_out": 0.6})["success_per_goal"] == pytest.approx(0.25)
-
-
-@pytest.mark.parametrize(
-    ("ppo", "policy", "flag"),
-    [
-        (PpoCfg(epochs=0), PolicyCfg(), "--ppo.epochs"),
-        (PpoCfg(gamma=1.5), PolicyCfg(), "--ppo.gamma"),
-        (PpoCfg(bound_coefficient=-0.1), PolicyCfg(), "--ppo.bound-coefficient"),
-        (PpoCfg(actor_learning_rate=float("nan")), PolicyCfg(), "--ppo.actor-learning-rate"),
-        (PpoCfg(), PolicyCfg(initial_std=2.0, std_range=(0.1, 1.0)), "--policy.std-range"),
-        (PpoCfg(), PolicyCfg(hidden=(64, 0)), "--policy.hidden"),
-        (PpoCfg(), dataclasses.replace(SMALL_POLICY, quiet_std=0.03), "--policy.quiet-std"),
-        (PpoCfg(), dataclasses.replace(SMALL_POLICY, quiet_std=0.0), "--policy.quiet-std"),
-        (PpoCfg(), PolicyCfg(quiet_std=1e-7), "--policy.quiet-std"),
-    ],
-)
-def test_bad_settings_are_named(ppo, policy, flag):
-    with pytest.raises(ValueError, match=flag):
-        validate(ppo, policy, RunCfg())
 
 
 @pytest.mark.parametrize("distribution", ["state-dependent", "gaussian"])

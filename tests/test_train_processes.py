@@ -2,8 +2,11 @@
 
 import json
 import os
+import re
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -53,35 +56,36 @@ PATIENCE_S = 300.0
 """For processes to end: two that load torch on a fresh, busy machine have taken more than a minute."""
 
 
-def _two_processes(code: str, **options) -> list[subprocess.Popen]:
-    import socket
-
+def _two_nodes(script: Path, **options) -> list[subprocess.Popen]:
+    """Starts torchrun on two addresses of this machine, as on two machines, with a process each."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        port = str(probe.getsockname()[1])
+        port = probe.getsockname()[1]
+    flags = "--nnodes 2 --nproc-per-node 1 --rdzv-backend c10d --rdzv-endpoint"
+    run = [sys.executable, "-m", "torch.distributed.run", *flags.split(), f"127.0.0.1:{port}", "--local-addr"]
     # No PATH: nothing may depend on a git binary, which rsl-rl's logger looks for.
-    shared = os.environ | {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "PATH": ""}
-    return [
-        subprocess.Popen(
-            [sys.executable, "-c", code], env=shared | {"RANK": str(r), "LOCAL_RANK": str(r)}, **options
-        )
-        for r in range(2)
-    ]
+    options["env"] = os.environ | {"PATH": ""}
+    return [subprocess.Popen([*run, f"127.0.0.{node}", script], **options) for node in (1, 2)]
 
 
 @pytest.mark.slow
-def test_two_processes_keep_the_same_parameters_and_their_own_worlds_until_one_hangs(tmp_path):
-    code = HANGING.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
-    processes = _two_processes(code, stderr=subprocess.PIPE, text=True)
+def test_two_nodes_keep_the_same_parameters_and_their_own_worlds_until_one_hangs(tmp_path):
+    script = tmp_path / "run.py"
+    script.write_text(HANGING.format(tests=str(Path(__file__).parent), folder=str(tmp_path)))
+    nodes = _two_nodes(script, stderr=subprocess.PIPE, text=True)
+    said, deadline = [], time.monotonic() + PATIENCE_S
     try:
-        _, error = processes[0].communicate(timeout=PATIENCE_S)
-        assert processes[0].returncode == 1
-        assert "process 0 failed and ends the run; --resume" in error  # the wait reached its limit
+        # The wait of one of them reaches its limit, and so do the others.
+        while all(node.poll() is None for node in nodes):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
     finally:
-        for process in processes:
-            process.kill()
-    _, error = processes[1].communicate()
-    assert "in hang" in error and "distributed" not in error.split("Thread")[-1], "its stack was shown"
+        for node in nodes:
+            node.terminate()  # it ends its process with itself
+            said.append(node.communicate(timeout=PATIENCE_S)[1])
+    said = "".join(said)
+    assert "process 0 failed and ends the run; --resume" in said
+    assert re.search(r"most recent call first\):\n  File .* in hang\n", said), "the stack of who hangs"
     one, two = (json.loads((tmp_path / f"rank{r}.json").read_text()) for r in range(2))
     assert one["weights"] == two["weights"]
     assert one["draw"] != two["draw"] and one["target"] != two["target"]

@@ -54,7 +54,6 @@ GONE = {
     "--allegro": "vd-assets hand import makes an Allegro of its URDF",
     "--env.randomisation.restitution": "contacts are damped springs (docs/limitations.md)",
     "--keep-every": "weight averaging gained too little (docs/lessons.md)",
-    "--shard": "give each machine other --kinds",
     "--collect": "give the same command again: it runs what is missing and prints the tables",
     "--depth.focal-noise": "a calibrated camera knows its focal length",
     "--second-view": "symmetry-view selection gained too little (docs/lessons.md)",

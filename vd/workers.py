@@ -19,6 +19,20 @@ LONGEST_WAIT_S = 1.0
 """Between two looks at the clock [s]."""
 
 
+def shard(tasks: Sequence[Any], part: str | None) -> list[Any]:
+    """Every N-th of the tasks from the I-th on, counted from 0, for a ``part`` ``I/N``; all without.
+
+    Raises:
+        ValueError: It is no such part.
+    """
+    if part is None:
+        return list(tasks)
+    index, _, count = part.partition("/")
+    if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
+        raise ValueError(f"--shard is {part!r}; it has to be I/N, with I from 0 to N - 1, such as 0/8")
+    return list(tasks[int(index) :: int(count)])
+
+
 def one_thread_without_gpu(device: str) -> None:
     """Keep torch to one thread where it computes on a CPU, unless OMP_NUM_THREADS says how many.
 

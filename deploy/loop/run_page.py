@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
+from vd import interrupt
 from vd.hand_log import HandLog
 from vd.page import write_html
 
@@ -70,7 +72,7 @@ def summary_line(results: Sequence[GoalResult], goals: int) -> str:
 
 
 def write_page(log: HandLog, results: Sequence[GoalResult]) -> Path:
-    """Write the film of a run and the page that shows it, into its folder.
+    """Write the film of a run, if the extra ``video`` is there, and the page that shows it, into its folder.
 
     Returns:
         The page.
@@ -80,14 +82,17 @@ def write_page(log: HandLog, results: Sequence[GoalResult]) -> Path:
     """
     from vd.play.replay import film
 
-    film(log, log.path / FILM_FILE)
+    filmed = find_spec("imageio_ffmpeg") is not None
+    if filmed:
+        film(log, log.path / FILM_FILE)
     write_html(
         log.path / PAGE_FILE,
         "run.html",
         run=log.run,
         goals=len(log.goals),
         summary=summary_line(results, len(log.goals)),
-        film=log.path / FILM_FILE,
+        film=log.path / FILM_FILE if filmed else None,
+        remedy=interrupt.remedy("imageio_ffmpeg"),
         rows=[
             (
                 one.goal + 1,

@@ -132,8 +132,7 @@ class DepthCommand(Measurement):
 class GapCommand:
     """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
 
-    One result file per case: run it again to go on. Several machines take different kinds; once their files
-    are together, a run of all kinds prints the tables.
+    One result file per case: run it again to go on.
     """
 
     out: Path = Path("runs/gap-battery")
@@ -156,11 +155,17 @@ class GapCommand:
     method once."""
     jobs: int = 1
     """Cases at a time, one process and one thread each."""
+    shard: str | None = None
+    """I/N: every N-th case from the I-th, from 0, for arrays of jobs. The same command without it runs what
+    is missing in --out and writes the tables."""
     device: str = "cpu"
     """Warp device."""
 
     def run(self) -> int:
         """Run the cases, then write and print the tables."""
+        from vd.workers import shard
+
+        shard((), self.shard)  # before anything slow
         from vd.bench.gap import battery, run_battery
         from vd.bench.gap_score import markdown
         from vd.files import write_text
@@ -174,8 +179,10 @@ class GapCommand:
             first_seed=self.first_seed,
             which=self.battery,
         )
-        device = resolve_device(self.device)
+        device, cases = resolve_device(self.device), shard(cases, self.shard)
         results = run_battery(cases, self.out, jobs=max(self.jobs, 1), device=device)
+        if self.shard is not None:
+            return 0
         write_text(self.out / "summary.md", markdown(results))
         print(markdown(results))
         return 0

@@ -3,7 +3,7 @@
 Every case is a recording from :mod:`vd.bench.hide`, analysed by :mod:`vd.gap.workflow` from the recording
 alone, and compared with the truth: every effect of the table at four sizes, all pairs at one, nothing
 hidden, and effects outside the table. Results are one JSON file per case, so that a run can be
-interrupted, resumed and split over machines by kinds.
+interrupted, resumed and split over machines.
 """
 
 import itertools

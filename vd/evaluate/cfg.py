@@ -16,6 +16,7 @@ from vd.evaluate.conditions import CONDITIONS, Condition
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, Goals, GoalSeries
 from vd.paper import PAPER
 from vd.sim.cfg import Engine
+from vd.workers import shard
 
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0
@@ -126,6 +127,9 @@ class EvalCfg(HandFlags, EpisodeFlags):
     """Of the suite only a part, with few objects and episodes: minutes on two CPU cores."""
     jobs: int = 1
     """Of a suite, evaluations side by side, each in a process of its own, spread over the GPUs."""
+    shard: str | None = None
+    """I/N: of a suite every N-th evaluation from the I-th, from 0, for arrays of jobs. The same command
+    without it runs what is missing in --out and writes the page."""
     objects: tuple[str, ...] = ()
     """Object sets by name, folders or files (vd-assets makes them); cube by default. NAME=SET puts one into a
     group, which gets figures of its own: training=FOLDER held-out=FOLDER symmetric=symmetric."""
@@ -215,8 +219,11 @@ class EvalCfg(HandFlags, EpisodeFlags):
         for names in EXCLUSIVE:
             if len(both := [flag(name) for name in names if name in given]) > 1:
                 raise ValueError(f"{' and '.join(both)} exclude each other; give one of them")
-        if self.suite is None and (self.quick or self.jobs > 1):
-            raise ValueError("--quick and --jobs are of a suite; add --suite paper, or leave them out")
+        shard((), self.shard)
+        if self.suite is None and (self.quick or self.jobs > 1 or self.shard):
+            raise ValueError(
+                "--quick, --jobs and --shard are of a suite; add --suite paper, or leave them out"
+            )
         decided = [flag(name) for name in OF_THE_SUITE if self.suite and name in given]
         if decided:
             raise ValueError(f"{' and '.join(decided)} is decided by --suite {self.suite}; leave it out")

@@ -40,7 +40,9 @@ def _evaluate(cfg: EvalCfg) -> int:
         write_page(result, page)
     else:
         result = run_suite(cfg)
-    if not cfg.json:
+    if cfg.shard is not None:
+        print(f"{cfg.out}: part {cfg.shard}; the same command without --shard writes the page")
+    elif not cfg.json:
         print(f"{terminal_text(result)}\n{written}\n{page}")
     else:
         print(json.dumps(result.summary(), indent=1) if cfg.suite is None else written.read_text())

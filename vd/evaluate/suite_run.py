@@ -35,7 +35,7 @@ from vd.evaluate.suite import (
     share_text,
 )
 from vd.files import make_folder, write_json
-from vd.workers import run_tasks
+from vd.workers import run_tasks, shard
 
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
@@ -45,7 +45,7 @@ OUT_OF_TIME = "out of time; the same command goes on from here"
 """Why evaluations of the reduced suite were not run."""
 NOT_RUN = "not run; the same command goes on from here"
 # Settings that say where and how an evaluation runs, not what it measures.
-_NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs")
+_NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs", "shard")
 
 Objects = tuple[tuple[str, ...], str]
 """The objects of a group: what vd-eval is given, sets or chosen files of them, and the same for a reader."""
@@ -94,7 +94,7 @@ def run_suite(cfg: EvalCfg) -> Result:
     suite = SUITES[cfg.suite]
     groups = object_groups(cfg.objects, {c.objects for c in suite}, quick=cfg.quick)
     conditions = tuple(c for c in suite if (c.quick or not cfg.quick) and c.objects in groups)
-    tasks = make_tasks(cfg, conditions, groups)
+    tasks = shard(make_tasks(cfg, conditions, groups), cfg.shard)
     found: dict[tuple[str, str], Result | str] = {task.key: task.there() or NOT_RUN for task in tasks}
     waiting = [task for task in tasks if isinstance(found[task.key], str)]
     print(f"{len(tasks) - len(waiting)} of {len(tasks)} evaluations were done before", file=sys.stderr)
@@ -113,7 +113,8 @@ def run_suite(cfg: EvalCfg) -> Result:
         rows = tuple(row for one in measured for row in one.rows if row.stopped_by != SUCCESS)
         left = tuple((*key, why) for key, why in found.items() if isinstance(why, str))
         result = Result(rows, measured[0].software if measured else {}, left)
-        _write(result, cfg, conditions, groups)
+        if cfg.shard is None:
+            _write(result, cfg, conditions, groups)
     return result
 
 
@@ -188,6 +189,7 @@ def settings(cfg: EvalCfg, condition: Condition, policy: str, objects: Objects, 
         suite=None,
         quick=False,
         jobs=1,
+        shard=None,
         policies=(policy,),
         objects=tuple(f"{condition.objects}={item}" for item in objects[0]),
         episodes=episodes,

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -35,6 +36,7 @@ class TrackingActor:
 
     Attributes:
         num_actions: D.
+        hand: The hand.
         camera: A depth camera in every environment.
         tracker: What decides.
         predicted: Distance to the goal that it expected before the latest action [rad], shape [N].
@@ -52,6 +54,7 @@ class TrackingActor:
     ):
         """Open its eyes in every environment, with ``sensor_errors`` those of a real camera."""
         scene, camera, depth = env.scene, env.hand.camera.at(policy.spec.camera), policy.spec.depth
+        self.hand, self._surfaces = env.hand, [item.surface_points for item in env.objects]
         self.num_actions, self._env, frame_s = policy.num_actions, env, env.cfg.sim.control_dt
         env.acts_in_frame = False  # who sees by a camera acts in the world, whatever its teacher does
         depth = depth.with_errors() if sensor_errors else depth
@@ -70,6 +73,11 @@ class TrackingActor:
         place = wp.device_to_torch(env.device)
         self.predicted = torch.zeros(env.num_envs, device=place)
         self.active = torch.ones(env.num_envs, dtype=torch.bool, device=place)
+
+    def surface(self, world: int) -> np.ndarray:
+        """Points on the surface of an environment's object, in the frame that is found [m] [P, 3]."""
+        scene = self._env.scene
+        return self._surfaces[scene.world_object[world]] * scene.world_scale[world]
 
     def act(self, _observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] for what is sensed now; the teacher's observation is not looked at."""

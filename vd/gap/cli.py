@@ -13,6 +13,7 @@ from vd import interrupt
 from vd.command_line import parse
 from vd.device import resolve_device
 from vd.files import check_file, check_folder
+from vd.gap.convert import Convert
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -293,13 +294,14 @@ Command = (
     | Annotated[Plan, tyro.conf.subcommand("plan")]
     | Annotated[Identify, tyro.conf.subcommand("identify")]
     | Annotated[Hide, tyro.conf.subcommand("hide")]
+    | Annotated[Convert, tyro.conf.subcommand("convert")]
 )
 
 
 @interrupt.command("vd-gap")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
-    command: Run | Find | Explain | Close | Report | Plan | Identify | Hide = parse(
+    command: Run | Find | Explain | Close | Report | Plan | Identify | Hide | Convert = parse(
         Command, arguments, prog="vd-gap", description=__doc__
     )
     from vd.gap.recording import RecordingError

@@ -5,6 +5,7 @@
 
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -84,10 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         frames = film(log, cfg.video)
     else:
         if cfg.video is None:
-            opened = _open(cfg, num_envs=1)
-            from vd.play.session import Session
-
-            serve(Session(*opened, seed=cfg.seed), cfg)
+            serve(_session(cfg), cfg)
             return 0
         frames = record_video(cfg, cfg.video)
     print(f"{cfg.video} ({frames} frames)")
@@ -126,21 +124,53 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
 
 def serve(session: "Session | Replay", cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C."""
+    from vd.play.replay import Replay
     from vd.play.viewer import PlayViewer
 
-    viewer = PlayViewer(session, host=cfg.host, port=cfg.port, verbose=False)
+    chosen: dict[str, Any] = {}
+    if not isinstance(session, Replay):
+        names = tuple(dict.fromkeys((cfg.policy, *_policies())))
+        chosen = {
+            "policies": names,
+            "reopen": lambda name: _session(replace(cfg, policy=name, hand=None, hand_layer=None)),
+        }
+    viewer = PlayViewer(session, host=cfg.host, port=cfg.port, verbose=False, **chosen)
     print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
     try:
         viewer.run()
     finally:
         viewer.close()
-        session.close()
 
 
 def spread(world_object: Sequence[int], cells: int) -> list[int]:
     """Environments to show: of different objects first, then more of the same."""
     rank = [list(world_object[:world]).count(index) for world, index in enumerate(world_object)]
     return sorted(sorted(range(len(rank)), key=rank.__getitem__)[:cells])
+
+
+def _policies() -> list[str]:
+    """Policies that are installed, of hands that are."""
+    from vd.assets_usd.hands import check_hand_name
+    from vd.evaluate.agents import POLICY_FOLDER, POLICY_LIST, installed_policies, pulled_folder
+    from vd.policy_store import read_store
+
+    told: dict[str, Any] = {}
+    for folder in (POLICY_FOLDER, pulled_folder()):
+        if (folder / POLICY_LIST).exists():
+            told |= read_store(folder).policies
+    names = []
+    for name in installed_policies().keys() & told.keys():
+        with suppress(ValueError):  # of a hand that has to be imported
+            check_hand_name(told[name].hand)
+            names.append(name)
+    return sorted(names)
+
+
+def _session(cfg: PlayCfg) -> "Session":
+    opened = _open(cfg, num_envs=1)  # what cannot be opened is refused before anything slow
+    from vd.play.session import Session
+
+    return Session(*opened, seed=cfg.seed)
 
 
 def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any]:

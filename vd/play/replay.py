@@ -23,7 +23,7 @@ class Replay:
     """
 
     def __init__(self, log: HandLog):
-        self.log, self._now = log, 0
+        self.log, self._now, self.sees = log, 0, False
         self.control_hz = float(log.run["control_hz"])
         try:
             self.hand: HandModel = load_hand(log.run["hand"])
@@ -65,6 +65,7 @@ class Replay:
         if pose is None:  # nobody measured it
             pose = np.tile(OUT_OF_SIGHT, (steps, 1))
         error = columns.get("error", columns["distance"])
+        heard = columns.get("image_s", columns.get("sensed_s"))
         ends = {stop.goal: stop for stop in log.stops}
         reached = lost = 0
         for step in range(steps):
@@ -88,6 +89,8 @@ class Replay:
                 goals=reached,
                 drops=lost,
                 table=not self.hand.palm_up,
+                believed_rad=float(columns["distance"][step]),
+                latency_s=None if heard is None else float(columns["sent_s"][step] - heard[step]),
             )
 
 

@@ -1,18 +1,29 @@
 """A running environment that is watched: what the viewer shows and its buttons change."""
 
+import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from vd.evaluate.rollout import draw_goals
-from vd.play.video import Snapshot, Watcher, act
+from vd.evaluate.statistics import symmetric_error
+from vd.evaluate.trace import advance
+from vd.play.camera_view import camera_view
+from vd.play.video import Snapshot, Watcher
 
 
 class Session:
-    """One environment is watched at a time, ``snapshot`` shows it; all run, one for each object at least."""
+    """One environment is watched at a time, ``snapshot`` shows it; all run, one for each object at least.
+
+    Attributes:
+        sees: Whether the policy sees by a camera.
+    """
 
     def __init__(self, env: Any, policy: Any, *, seed: int = 0):
         self.env, self._policy = env, policy
+        self.sees = hasattr(policy, "camera")
         self.hand, self.objects, self.control_hz = env.hand, env.objects, env.cfg.sim.control_hz
         self.close = env.close
         self._rng = np.random.default_rng(seed)
@@ -34,9 +45,25 @@ class Session:
 
     def step(self) -> Snapshot:
         """One control step of all environments."""
-        act(self.env, self._policy)
-        self.snapshot = self._watcher.read()[0]
-        return self.snapshot
+        begun = time.perf_counter()
+        action = self._policy.act(wp.to_torch(self.env.observation))
+        wp.synchronize_device(self.env.device)
+        took = time.perf_counter() - begun
+        advance(self.env, action)
+        shot = replace(self._watcher.read()[0], latency_s=took)
+        if self.sees:
+            item = self.env.objects[self.env.world_object[self.world]]
+            shot = replace(
+                shot,
+                believed_rad=float(self._policy.predicted[self.world]),
+                alike_rad=float(symmetric_error(shot.joint_q[-4:], shot.goal_quat, item.symmetry)),
+            )
+        self.snapshot = shot
+        return shot
+
+    def view(self) -> np.ndarray:
+        """What the policy's camera saw last, RGB bytes [H, W, 3]; with ``sees`` alone."""
+        return camera_view(self._policy, self.world)
 
     def reset(self) -> Snapshot:
         """Start all environments anew, with new goals; counts go on."""

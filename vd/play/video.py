@@ -56,6 +56,12 @@ class Snapshot:
     """Drops since the recording began."""
     table: bool = True
     """The table was there."""
+    believed_rad: float | None = None
+    """The error that a policy which sees by camera expected, to the nearest goal that looks alike."""
+    alike_rad: float | None = None
+    """The true error to that."""
+    latency_s: float | None = None
+    """Time that the policy took to decide; on a hand from the image, or the joints, to the command."""
 
 
 class Watcher:

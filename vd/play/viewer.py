@@ -1,4 +1,4 @@
-"""The web viewer: Newton's viser viewer with goal ghost and a choice of object.
+"""The web viewer: Newton's viser viewer with goal ghost, menus of policies and objects, a camera's view.
 
 Browser events arrive on viser's threads; they are queued and handled between steps on the thread that runs
 the simulation. Everything is served from this machine, so it works without a network.
@@ -7,7 +7,7 @@ the simulation. Everything is served from this machine, so it works without a ne
 import math
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from html import escape
 from typing import Any
@@ -26,28 +26,44 @@ from vd.render import Camera, PictureModel
 GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
 # The viewer's camera stands this much farther than that of videos: a browser window has panels around it.
 CAMERA_DISTANCE = 1.25
+# Options of Newton's viewer that show something here; others are of cloth, particles, contacts.
+SHOWN_OPTIONS = ("show_visual", "show_joints", "show_com", "wireframe")
 
 
 class PlayViewer:
-    """Shows a session in the browser and lets it be steered from there.
+    """Shows a session in the browser and lets it be steered from there; :meth:`close` closes the session too.
 
     It serves on ``host``, of which ``127.0.0.1`` keeps it on this machine, and the next free port.
+
+    Args:
+        session: What is shown first.
+        policies: Names of policies to choose from, that of the session first.
+        reopen: Gives a session of another of them; it may raise ValueError, OSError or RuntimeError.
+        host: Address.
+        port: Port.
+        verbose: Whether Newton's viewer says that it begins.
     """
 
     def __init__(
-        self, session: Session | Replay, *, host: str = "127.0.0.1", port: int = 8080, verbose: bool = True
+        self,
+        session: Session | Replay,
+        *,
+        policies: Sequence[str] = (),
+        reopen: Callable[[str], Session] | None = None,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        verbose: bool = True,
     ):
-        self.session = session
+        self._policies, self._reopen = policies, reopen
+        self._eye: tuple[Any, Any] | None = None
         self.viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=verbose)
-        self.camera = Camera.for_hand(session.hand)
+        options = self.viewer._viewer_option_handles
+        for name in options.keys() - set(SHOWN_OPTIONS):
+            options.pop(name).remove()
         self._events: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
-        self._models: dict[str, PictureModel] = {}
-        x, y, _ = GHOST_RIGHT * self.camera.rotation[:, 0]
-        self._ghost = float(x), float(y), GHOST_HEIGHT
-        self._show_object()
-        self._set_camera()
+        self._show(session)
         self._build_panel()
-        self.viewer.set_reset_callback(self.session.reset)
+        self.viewer.set_reset_callback(lambda: self.session.reset())
         self.draw()
 
     @property
@@ -82,11 +98,22 @@ class PlayViewer:
         self.viewer.log_state(self._pictured.state)
         self.viewer.log_scalar("orientation error [rad]", shot.error_rad)
         self._status.content = status_html(shot)
+        self._show_view()
         self.viewer.end_frame()
 
     def close(self) -> None:
-        """Stop serving."""
+        """Stop serving, and close the session."""
         self.viewer.close()
+        self.session.close()
+
+    def _show(self, session: Session | Replay) -> None:
+        self.session = session
+        self.camera = Camera.for_hand(session.hand)
+        self._models: dict[str, PictureModel] = {}
+        x, y, _ = GHOST_RIGHT * self.camera.rotation[:, 0]
+        self._ghost = float(x), float(y), GHOST_HEIGHT
+        self._show_object()
+        self._set_camera()
 
     def _show_object(self) -> None:
         """Show the model of the chosen object; models are kept, since building one takes a second."""
@@ -96,6 +123,19 @@ class PlayViewer:
             self._models[name] = PictureModel(self.session.hand, [item], ghost_in_scene=True)
         self._pictured = self._models[name]
         self.viewer.set_model(self._pictured.model)
+
+    def _show_view(self) -> None:
+        """What the policy's camera sees, in a folder that others do not have."""
+        if isinstance(self.session, Session) and self.session.sees:
+            image = self.session.view()
+            if self._eye is None:
+                folder = self.viewer.server.gui.add_folder("Camera, believed pose drawn in", order=-0.5)
+                with folder:
+                    self._eye = folder, self.viewer.server.gui.add_image(image, format="jpeg")
+            self._eye[1].image = image
+        elif self._eye is not None:
+            self._eye[0].remove()
+            self._eye = None
 
     def _set_camera(self) -> None:
         eye, target = np.asarray(self.camera.eye), np.asarray(self.camera.target)
@@ -110,30 +150,63 @@ class PlayViewer:
         gui, session = self.viewer.server.gui, self.session
         with gui.add_folder("Policy", order=-1.0):
             self._status = gui.add_html(status_html(session.snapshot))
-            chosen = gui.add_dropdown("Object", session.object_names, initial_value=session.object_name)
+            if len(self._policies) > 1:
+                self._menu("Policy", self._policies, self._policies[0], self._choose_policy)
+            if len(session.object_names) > 1:
+                self._menu("Object", session.object_names, session.object_name, self._choose_object)
             new_goal = gui.add_button("New goal")
-
-        @chosen.on_update
-        def _(event: Any) -> None:
-            if event.client_id is not None:
-                self._events.put(partial(self._choose_object, chosen.value))
 
         @new_goal.on_click
         def _(_event: Any) -> None:
-            self._events.put(session.new_goal)
+            self._events.put(lambda: self.session.new_goal())
+
+    def _menu(self, label: str, names: Sequence[str], now: str, choose: Callable[[str], None]) -> None:
+        menu = self.viewer.server.gui.add_dropdown(label, tuple(names), initial_value=now)
+
+        @menu.on_update
+        def _(event: Any) -> None:
+            if event.client_id is not None:
+                self._events.put(partial(choose, menu.value))
 
     def _choose_object(self, name: str) -> None:
         self.session.choose_object(name)
         self._show_object()
 
+    def _choose_policy(self, name: str) -> None:
+        assert self._reopen is not None
+        watched, notes = (
+            self.session.object_name,
+            self._tell(f"{name} begins", "building the scene", loading=True),
+        )
+        try:
+            session = self._reopen(name)
+        except (ValueError, OSError, RuntimeError) as error:
+            self._tell(f"{name} cannot be shown", str(error))
+            return
+        finally:
+            for note in notes:
+                note.remove()
+        self.session.close()
+        session.choose_object(watched)
+        self._show(session)
+
+    def _tell(self, title: str, body: str, *, loading: bool = False) -> list[Any]:
+        """Tell everybody who looks."""
+        clients = self.viewer.server.get_clients().values()
+        return [client.add_notification(title, body, loading=loading) for client in clients]
+
 
 def status_html(shot: Snapshot) -> str:
-    """Error, time and counts as HTML."""
+    """Error, what the policy believes of it, latency, time and counts as HTML."""
+    live = [] if shot.alike_rad is None else [f"up to symmetry {shot.alike_rad:.2f}"]
+    live += [] if shot.believed_rad is None else [f"believed {shot.believed_rad:.2f}"]
+    live += [] if shot.latency_s is None else [f"latency {1e3 * shot.latency_s:.0f} ms"]
     color = "#12a150" if shot.error_rad <= PAPER.success.rotation_rad else "inherit"
     return (
         '<div style="padding:.2em .8em;font-variant-numeric:tabular-nums">'
         f"<b>{escape(shot.name)}</b>"
         f'<div style="font-size:1.5em;color:{color}">{shot.error_rad:.2f} rad</div>'
+        f"<div>{' &middot; '.join(live)}</div>"
         f'<div style="opacity:.75">{shot.time_s:.1f} s &middot; goals reached {shot.goals}'
         f" &middot; drops {shot.drops}</div></div>"
     )

@@ -1,0 +1,52 @@
+"""What a policy's depth camera sees, with the object drawn in where the policy believes it to be."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+from PIL import Image, ImageDraw
+from scipy.spatial.transform import Rotation
+
+FOUND_COLOR, AXES = (60, 230, 120), ((235, 70, 60), (90, 200, 60), (70, 120, 255))
+"""Colours of the believed surface, and of its x, y and z."""
+AXIS_M = 0.06
+"""Length of the axes that are drawn [m]."""
+
+
+def camera_view(actor: Any, world: int) -> np.ndarray:
+    """The depth image about the hand, near is bright, with surface points and axes of the believed pose.
+
+    Args:
+        actor: A :class:`vd.evaluate.tracking.TrackingActor` that has acted.
+        world: Environment.
+
+    Returns:
+        RGB bytes [H, W, 3], of the half of the image about the hand.
+    """
+    camera = actor.camera
+    depth = wp.to_torch(camera.depth)[world].cpu().numpy()
+    model = camera.camera
+    shade = np.where(depth > 0.0, 235.0 - 180.0 * _share(depth), 20.0)
+    picture = Image.fromarray(np.repeat(shade.astype(np.uint8)[..., None], 3, axis=2))
+    pose = actor.tracker.observer.finder.pose[world, 0].cpu().numpy().astype(float)
+    turn, draw = Rotation.from_quat(pose[3:]), ImageDraw.Draw(picture)
+    for u, v, ahead in model.project(pose[:3] + turn.apply(actor.surface(world))):
+        if ahead > 0.0:
+            draw.ellipse((u - 1, v - 1, u + 1, v + 1), fill=FOUND_COLOR)
+    origin, *tips = model.project(pose[:3] + np.vstack([np.zeros(3), AXIS_M * turn.as_matrix().T]))
+    for color, tip in zip(AXES, tips, strict=True):
+        draw.line((*origin[:2], *tip[:2]), fill=color, width=3)
+    middle = model.project(actor.hand.tip_poses(actor.hand.start)[:, :3].mean(axis=0))[:2]
+    size = np.array(picture.size)
+    left, top = np.clip(middle - size / 4, 0, size // 2).astype(int)
+    box = left, top, left + picture.width // 2, top + picture.height // 2
+    return np.asarray(picture.resize(picture.size, box=box))
+
+
+def _share(depth: np.ndarray) -> np.ndarray:
+    """Depth [H, W] from the nearest 0 to the farthest 1 of what is measured."""
+    measured = depth[depth > 0.0]
+    if not len(measured):
+        return depth
+    near, far = np.percentile(measured, (1, 99))
+    return np.clip((depth - near) / max(far - near, 1e-6), 0.0, 1.0)
