@@ -8,7 +8,8 @@ import numpy as np
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
-from vd.hand_log import HandLog, LogError
+from vd.hand_log import HandLog
+from vd.log_format import LogError
 from vd.play.video import SINGLE_CELL, Snapshot, drawn, write_frames
 from vd.render import OUT_OF_SIGHT, Renderer
 
@@ -62,8 +63,8 @@ class Replay:
         log, columns = self.log, self.log.columns
         steps = len(columns["t"])
         position, pose = log.channel("position"), log.object_pose
-        if pose is None:  # nobody measured it
-            pose = np.tile(OUT_OF_SIGHT, (steps, 1))
+        unknown = np.tile(OUT_OF_SIGHT, (steps, 1))
+        pose = unknown if pose is None else np.where(np.isfinite(pose), pose, unknown)
         error = columns.get("error", columns["distance"])
         ends = {stop.goal: stop for stop in log.stops}
         reached = lost = 0
