@@ -21,6 +21,7 @@ from vd.log_format import FOUND_COLUMNS, JOINT_CHANNELS, STEP_COLUMNS, STEPS_FIL
 from vd.mcap_log import McapLog
 from vd.play.cli import main as play
 from vd.play.replay import Replay
+from vd.render import OUT_OF_SIGHT
 
 STEPS = 30
 SENT_S = 0.02
@@ -120,6 +121,14 @@ def test_a_log_is_shown(folder, tmp_path, capsys):
     # Stopped 0.9 rad from its goal.
     assert [shot.success for shot in shots].index(True) == 9 and shots[-1].goals == 1
     assert [shot.fell for shot in shots].index(True) == STEPS - 1
+    real = read_log(folder)  # where nobody knows the truth it is shown as it was found last
+    for name in TRUTH_COLUMNS:
+        del real.columns[name]
+    for name in FOUND_COLUMNS:
+        real.columns[name][[0, 4, 5]] = np.nan
+    shots = Replay(real).snapshots
+    np.testing.assert_allclose([s.joint_q[9] for s in shots[1:7]], [0.1, 0.2, 0.3, 0.3, 0.3, 0.6], atol=1e-6)
+    np.testing.assert_allclose(shots[0].joint_q[9:], OUT_OF_SIGHT)
     assert play([str(folder), "--video", str(tmp_path / "log.mp4")]) == 0
     assert iio.imread(tmp_path / "log.mp4").shape[0] == STEPS
     run = json.loads((folder / "run.json").read_text())

@@ -62,9 +62,11 @@ class Replay:
     def _snapshots(self) -> Iterator[Snapshot]:
         log, columns = self.log, self.log.columns
         steps = len(columns["t"])
-        position, pose = log.channel("position"), log.object_pose
-        unknown = np.tile(OUT_OF_SIGHT, (steps, 1))
-        pose = unknown if pose is None else np.where(np.isfinite(pose), pose, unknown)
+        position = log.channel("position")
+        pose = np.full((steps, 7), np.nan) if log.object_pose is None else log.object_pose
+        known = np.where(np.isfinite(pose).all(axis=1), np.arange(steps), 0)
+        pose = pose[np.maximum.accumulate(known)]  # nobody looks while the hand is held
+        pose = np.where(np.isfinite(pose), pose, OUT_OF_SIGHT)
         error = columns.get("error", columns["distance"])
         ends = {stop.goal: stop for stop in log.stops}
         reached = lost = 0
