@@ -110,20 +110,22 @@ def test_a_hand_behind_ros_pursues_goals_of_the_service_until_it_is_told_to_fini
     driver.start()
 
     def person():
-        driver.until("goal", 0)
-        node = NODES[0]
-        values = [1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]
+        while len(driver.sent) < 100:  # it is held at its start until there is a goal
+            time.sleep(0.02)
+        node, one = NODES[0], [0.0, 0.0, 1.0, 1.0]
         judge = node.add_on_set_parameters_callback.call_args.args[0]
-        answers.extend(judge([Message(name="goal", value=value)]) for value in values)
-        driver.until("stop", 1)
+        for number, value in enumerate([one[1:], one, one]):
+            answers.append(judge([Message(name="goal", value=value)]))
+            if number:
+                driver.until("stop", number - 1)
         node.create_service.call_args.args[2](None, Message())
 
     threading.Thread(target=person, daemon=True).start()
-    line = "zero --ros2 --yes --no-realtime --goal 0,0,1@90 --episode-s 0.8 --hold-s 0.2 --log"
+    line = "zero --ros2 --yes --no-realtime --episode-s 0.8 --hold-s 0.2 --log"
     assert cli.main([*line.split(), str(tmp_path / "log")]) == 0
     driver.over.set()
-    assert [answer.successful for answer in answers] == [False, True]
-    assert "give a quaternion x,y,z,w" in answers[0].reason and answers[1].reason == "goal 2"
+    assert [answer.successful for answer in answers] == [False, True, True]
+    assert "give a quaternion x,y,z,w" in answers[0].reason and answers[2].reason == "goal 2"
     log = read_log(tmp_path / "log")
     assert [stop.outcome for stop in log.stops] == ["time limit"] * 2 and not NODES
     np.testing.assert_allclose(log.goals, np.sqrt(0.5) * np.array([[0, 0, 1, 1]] * 2), atol=1e-6)

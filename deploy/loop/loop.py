@@ -87,16 +87,12 @@ class ControlLoop:
             StoppedError: The hand was stopped.
             StaleCamera: There is no new image.
         """
-        outcomes = []
-        self._runner.begin()
+        outcomes, waited = [], True
         while not len(goals) and self._more():
             self.step(0, NO_SYMMETRY[0], acting=False)
-        if len(goals):  # to find the object takes longer than to follow it, and than a step may
-            sensed, *_ = self._sense(goals[0])
-            found = self._pacer.clock.beside(lambda: self._runner.decide(sensed))
-            while not found():
-                self.step(0, goals[0], acting=False)
         for number, goal in enumerate(goals):
+            if waited:
+                self._look(number, goal)
             outcome, distance = self._pursue(number, goal)
             outcomes.append(outcome)
             self._log.event("stop", goal=number, outcome=outcome, distance=distance)
@@ -104,9 +100,19 @@ class ControlLoop:
                 break
             for _ in range(round(self._hold_s / self._pacer.period_s)):
                 self.step(number, goal, acting=False)
+            waited = False
             while len(goals) == number + 1 and self._more():
                 self.step(number, goal, acting=False)
+                waited = True
         return outcomes
+
+    def _look(self, number: int, goal: np.ndarray) -> None:
+        """Find the object anew, which takes longer than to follow it, and than a step may."""
+        self._runner.begin()
+        sensed, *_ = self._sense(goal)
+        found = self._pacer.clock.beside(lambda: self._runner.decide(sensed))
+        while not found():
+            self.step(number, goal, acting=False)
 
     def _pursue(self, number: int, goal: np.ndarray) -> tuple[str, float | None]:
         """Act until one goal is reached or given up: outcome, and the distance that was known then [rad]."""
@@ -214,11 +220,12 @@ class ControlLoop:
         self.times.append(times)
         if len(self.times) % STATUS_STEPS == 0:
             doing = f"distance {decision.distance:.2f} rad" if acting else "holding"
+            motors = f" | {state.temperature.max():.0f} deg C | {np.abs(state.current).max():.2f} A"
             print(
                 f"goal {number + 1} | {doing}"
                 + (f", true {truth[-1]:.2f}" if truth else "")
                 + f" | loop {1e3 * times.sent_s:.0f} ms | missed {self._pacer.missed}"
-                f" | {state.temperature.max():.0f} deg C | {np.abs(state.current).max():.2f} A",
+                + motors * bool(np.isfinite(state.temperature).all()),
                 file=sys.stderr,
                 flush=True,
             )

@@ -176,7 +176,9 @@ def run(cfg: RunCfg) -> int:
             fault = error
     try:
         log = read_log(folder)
-    except LogError as error:  # it ended before the first step
+        if not len(log.goals):
+            raise LogError(f"{folder} has no goal to show")
+    except LogError as error:  # it ended before the first step, or goal
         raise fault or error from None
     print("drawing the film (the first one compiles its kernels) ...", file=sys.stderr, flush=True)
     print(f"page: {write_page(log, goal_results(log))}")

@@ -25,6 +25,8 @@ class Replay:
 
     def __init__(self, log: HandLog):
         self.log, self._now = log, 0
+        if not len(log.goals):
+            raise LogError(f"{log.path} has no goal to show")
         self.control_hz = float(log.run["control_hz"])
         try:
             self.hand: HandModel = load_hand(log.run["hand"])
@@ -71,7 +73,7 @@ class Replay:
         ends = {stop.goal: stop for stop in log.stops}
         reached = lost = 0
         for step in range(steps):
-            number = int(columns["goal"][step])
+            number = min(int(columns["goal"][step]), len(log.goals) - 1)  # one may not have begun
             stop = ends.get(number)
             # Events have the time of their writing: the last step before it is the one that ended the goal.
             over = stop is not None and columns["t"][step] <= stop.time_s
