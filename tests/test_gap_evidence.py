@@ -1,10 +1,10 @@
-"""What decides, on made-up fits: gains on unseen motions, ties, bounds, structure, and other joints."""
+"""What decides, on made-up fits: gains on unseen motions, ties, bounds, and other joints."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from gap_recordings import COUNT, FLOOR, made_up
+from gap_recordings import FLOOR, made_up
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.consensus import share
@@ -49,38 +49,6 @@ def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: 
     stuck = replace(stuck, coordinates=(*stuck.coordinates[:-1], end), x=np.array([0.0, 0.0, 0.0, 9.0]))
     inside = made_up(("dead_zone",), 0.005)
     assert stuck.at_bound == ("backlash.width_rad",) and judge.winner([stuck, inside]) is inside
-
-
-def concluded(judge: Verdicts, left: float = FLOOR, **options: object) -> Explanation:
-    """A conclusion about Coulomb friction that is beyond doubt but for ``options``."""
-    final = made_up(("coulomb_friction",), left)
-    rivals = {"coulomb_friction": [final, made_up(("backlash",), 0.004)]}
-    return judge.conclude(made_up((), 0.010), final, rivals, [], "", **options)  # type: ignore[arg-type]
-
-
-def test_two_searches_that_disagree_by_more_than_the_gain_give_no_name(judge: Verdicts) -> None:
-    left, name = 1.5 * FLOOR, ("coulomb_friction",)
-    # Its gain is what the next best leaves: 4 - 1.5 mrad.
-    near = concluded(judge, left, again=made_up(name, 0.0035))
-    assert near.verdict == "effects" and near.accepted[0].named
-    far = concluded(judge, left, again=made_up(name, 0.0045))
-    assert far.verdict == "unknown" and not far.accepted[0].named
-    assert "two searches" in far.reason and "3.00 mrad" in far.reason
-    assert concluded(judge, again=made_up(name, 0.0095)).verdict == "effects", "at the floor it says nothing"
-
-
-def test_what_leaves_structure_is_not_explained(judge: Verdicts) -> None:
-    final, pairs = made_up(("coulomb_friction",), FLOOR), np.full(10, 400.0)
-
-    def with_structure(share: float, rms: float = 1.1 * FLOOR) -> Explanation:
-        left = replace(final, sse=COUNT * rms**2, structure=np.stack([share * FLOOR**2 * pairs, pairs]))
-        return concluded(judge, refined=left)
-
-    assert with_structure(0.03).verdict == "effects", "what the right models leave"
-    lacking = with_structure(0.3)
-    assert lacking.verdict == "unknown" and "structure" in lacking.reason
-    # Far from the floor a real machine's repeatability is not known.
-    assert with_structure(8.0, rms=5.0 * FLOOR).verdict == "effects"
 
 
 def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:

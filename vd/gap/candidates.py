@@ -8,7 +8,7 @@ import numpy as np
 
 from vd.gap.coordinates import Scales, beside, best_two, sizes, smaller, torque_power
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import AT_FLOOR, EXPLAINED, JITTER, SHARP
+from vd.gap.judge import EXPLAINED, JITTER
 from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.servo.effects import EFFECTS, equivalent
 
@@ -27,22 +27,13 @@ HOPELESS = 1.5
 IDLE = 0.99
 """Share of the error before it that a further effect leaves at least half way if it does nothing: where more
 than noise is left such a fit is not finished either."""
-NEARLY_ALL = 0.05
-"""Share of the error before a round that its best leaves, up to which only what comes near it is tried from
-every start: what else is missing is another effect beside it, or the bottom of its valley."""
 SCREEN_ITERATIONS = 6
 HALF_ITERATIONS = 4
 FULL_ITERATIONS = 12
-SEARCHES = 3
-"""Searches for the final model from elsewhere, until one comes back to it; and in a row beside a model for a
-better one, which a narrow valley that bends takes many to follow."""
 ASTRAY = 2.0
 """Factor from the nominal model beyond which a fit starts from that as well."""
-SEED_STEP = 1000
-SLOWER = 0.3
-"""Share of the squared error that a binding speed limit has to promise for fits to start from one."""
 BETTER = 0.98
-"""Share of the error from which another search for the same model has found a better one."""
+"""Share of the error from which a fit of the same model is a better one."""
 
 IN_RICHER = {
     "stribeck_friction": ("tau_s_nm", "tau_c_nm"),
@@ -69,15 +60,12 @@ class CandidateFits:
         candidates: Effects to consider.
         scales: Sizes of the joint's motion.
         refits: Steps of each refit without a fold (:meth:`vd.gap.fit.JointProblem.fit`).
-        seed: Of the second search for the final model.
         vetoes: Effects that telemetry contradicts, with the reason.
         nominal: Nominal values of the baseline's parameters, by key.
         promised: Share of the squared error that each candidate of the last round could remove at best.
         added: The last fits with one more effect, by the effects of the model to which it was added: that
             model first.
         behind_jitter: Whether samples are weighted by what random delays do to them.
-        fine: Whether rollouts have the step at which estimates are finished.
-        clocked: The same by what errors of the clock do (:mod:`vd.gap.clock_sensitivity`).
     """
 
     floor: float
@@ -87,14 +75,11 @@ class CandidateFits:
     candidates: Sequence[str]
     scales: Scales
     refits: int = 0
-    seed: int = 0
     vetoes: Mapping[str, str] = field(default_factory=dict)
     nominal: Mapping[str, float] = field(default_factory=dict)
     promised: dict[str, float] = field(default_factory=dict)
     added: dict[frozenset[str], tuple[JointFit, ...]] = field(default_factory=dict)
     behind_jitter: bool = False
-    fine: bool = False
-    clocked: bool = False
 
     def fit_candidates(
         self,
@@ -165,7 +150,6 @@ class CandidateFits:
         most = min(most, HOPELESS * min(finalists[0].rmse, least))
         near = [fit for fit in finalists if fit.rmse <= most]
         last = [*go_on(near, FULL_ITERATIONS), *finalists[len(near) :]]
-        last = self.slowed(present, last)
         fits = {fit.effects[-1]: fit for fit in (*last, *screened[len(finalists) :])}
         # Nothing added can do worse than nothing: such a fit began too large, and no descent led back.
         astray = [name for name, fit in fits.items() if fit.rmse > present.rmse]
@@ -197,89 +181,13 @@ class CandidateFits:
             return None  # these are tried here, and were not there
         return {fit.effects[-1]: fit for fit in fits if fit.effects[-1] not in skip}
 
-    def slowed(self, present: JointFit, fits: list[JointFit]) -> list[JointFit]:
-        """The fits, or better ones whose speed limit binds where that promises to explain what is left.
-
-        Without the effect the baseline may have put it above all speeds, where it has no slope to descend.
-        """
-        best = min(fits, key=lambda fit: fit.rmse)
-        start = {"velocity_limit": self.scales.speed}
-        if best.rmse < AT_FLOOR * self.floor or best.values.get("velocity_limit", 0.0) <= self.scales.speed:
-            return fits
-        call = {"fit": best, "starts": [start], "scales": self.scales}
-        if self.run([("promise", call)])[0][0] < SLOWER:
-            return fits
-        near = [fit for fit in fits if fit.rmse < HOPELESS * best.rmse]
-        calls = [self.call(present, f.effects[-1], [{**f.values, **start}], FULL_ITERATIONS) for f in near]
-        found = dict(zip([fit.effects for fit in near], self.run(calls), strict=True))
-        return [min(fit, found.get(fit.effects, fit), key=lambda one: one.rmse) for fit in fits]
-
-    def search_nearby(self, fit: JointFit, whole: float) -> JointFit:
-        """The fit, or a better one beside it where nearly all of the error is gone.
-
-        A profile that cannot follow its command leaves an error with many sharp valleys.
-
-        Args:
-            fit: What was found.
-            whole: Error without any effect [rad].
-        """
-        number = failed = 0
-        while failed < SEARCHES and AT_FLOOR * self.floor < fit.rmse < SHARP * whole:
-            call = {"fit": fit, "scales": self.scales, "seed": self.seed + number * SEED_STEP}
-            found = self.run([("nearby", call)])[0]
-            better = found.rmse < BETTER * fit.rmse
-            fit = self.refit(found, found.effects) if better else fit
-            number, failed = number + 1, 0 if better else failed + 1
-        return fit
-
-    def look_wider(self, present: JointFit, fits: Mapping[str, JointFit]) -> dict[str, JointFit]:
-        """The fits of a round, and those of all candidates from every start where these are better."""
-        out = {*present.effects, *self.vetoes, JITTER}
-        least = min(fit.rmse for fit in fits.values())
-        if least < NEARLY_ALL * present.rmse:
-            out |= {name for name in self.candidates if name not in fits or fits[name].rmse > BEHIND * least}
-        names = [name for name in self.candidates if name not in out]
-        calls = [
-            self.call(present, name, self.starts(present, self.sized(present, name)), SCREEN_ITERATIONS)
-            for name in names
-        ]
-        found = sorted(self.run(calls), key=lambda fit: fit.rmse)
-        better = [
-            fit
-            for fit in found[:FINALISTS]
-            if fit.rmse < BETTER * (fits[fit.effects[-1]].rmse if fit.effects[-1] in fits else np.inf)
-            and fit.rmse < BEHIND * least
-        ]
-        refits = self.run(
-            [self.call(present, fit.effects[-1], [fit.values], FULL_ITERATIONS) for fit in better]
-        )
-        result = dict(fits)
-        for refit in refits:
-            known = result.get(refit.effects[-1])
-            if known is None or refit.held_out_rmse < known.held_out_rmse:
-                result[refit.effects[-1]] = refit
-        return result
-
     def plain(self, baseline: JointFit) -> Call:
         """The call that fits the plain model anew."""
         call = {"base": baseline.rows, "effects": (), "starts": [{}, self.nominal], "scales": self.scales}
         return "fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits}
 
-    def search_again(self, present: JointFit) -> JointFit | None:
-        """The final model as searches from elsewhere find it; None at the noise floor: none is better."""
-        if present.rmse < AT_FLOOR * self.floor:
-            return None
-        best: JointFit | None = None
-        for number in range(SEARCHES):
-            call = {"fit": present, "scales": self.scales, "seed": self.seed + number * SEED_STEP}
-            found = self.run([("again", call)])[0]
-            best = found if best is None or found.rmse < best.rmse else best
-            if best.rmse < present.rmse / BETTER:
-                break
-        return best
-
     def refined(self, fit: JointFit) -> JointFit:
-        """A fit at finer time steps, with the structure of what it leaves."""
+        """A fit at finer time steps."""
         return self.run([("refine", {"fit": fit, "scales": self.scales})])[0]
 
     def starts(self, present: JointFit, added: Sequence[dict[str, float]]) -> list[dict[str, float]]:
@@ -329,27 +237,6 @@ class CandidateFits:
         kept = tuple(effect for effect in present.effects if effect != name)
         call = {"base": rows, "effects": (*kept, simpler), "starts": [start], "scales": self.scales}
         return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0]
-
-    def from_present(
-        self, present: JointFit, without: JointFit, fits: Mapping[str, JointFit]
-    ) -> dict[str, JointFit]:
-        """The fits with others in the place of an effect that are better from where the present model is.
-
-        In a sharp valley, as beside a profile that cannot follow, they end where they entered it.
-
-        Args:
-            present: The model.
-            without: The model without the effect.
-            fits: With others in its place, by name.
-        """
-        near = {name: fit for name, fit in fits.items() if present.rmse < fit.rmse < BEHIND * present.rmse}
-        kept = {key: present.values[key] for key in without.values}
-        calls = []
-        for name, fit in near.items():
-            own = {key: value for key, value in fit.values.items() if key.startswith(f"{name}.")}
-            calls.append(self.call(without, name, [{**kept, **own}], FULL_ITERATIONS))
-        found = dict(zip(near, self.run(calls), strict=True))
-        return {name: fit for name, fit in found.items() if fit.rmse < near[name].rmse}
 
     def refit(self, present: JointFit, effects: Sequence[str]) -> JointFit:
         """The fit with only some of a model's effects."""

@@ -3,35 +3,21 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from vd.gap.candidates import FULL_ITERATIONS
-from vd.gap.clock_sensitivity import clock_sensitivity, told, weighted
-from vd.gap.coordinates import sizes
-from vd.gap.explanation import NAMED, Explanation, Trial, added, certain, estimates, intervals
+from vd.gap.explanation import NAMED, Explanation, added, certain, estimates, intervals
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import (
-    AT_FLOOR,
-    CONTAINED_FLOORS,
     EXPLAINED,
     JITTER,
     MIN_GAIN,
     MIN_GAIN_FLOORS,
     NESTED,
-    RECOVERED,
     SMALL_EXCESS_FLOORS,
 )
-from vd.gap.search import Search
-from vd.gap.verdict import CANCELLING, UNEXPLAINED, explains
+from vd.gap.verdict import CANCELLING, explains
 from vd.gap.warming import LEVELS
 
 OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}
 """What all joints of a machine have or have not: its bus, its supply, gravity."""
-
-CEILINGS = {"torque_limit": "torque_speed_limit"}
-"""What a slow joint shows of a motor, and a quick one."""
-
-SHOWN_TAIL = 0.4
-"""Share of the resamples that may see no gain from an effect that another joint has for sure: one motion of a
-dozen can be all that shows it, and a third of the resamples leave that out."""
 
 CHANGING = "its friction changes over the recording, as another joint of the finger shows"
 """Why a constant friction is no name, nor what is found beside it."""
@@ -40,117 +26,6 @@ Polish = Callable[[JointFit], JointFit]
 """Fits a model to the end."""
 Fit = Callable[[tuple[str, ...], Sequence[Mapping[str, float]]], JointFit]
 """Fits the model with these effects to the end, from these starts."""
-
-
-def as_another(search: Search, baseline: JointFit, loose: str) -> Explanation | None:
-    """The explanation of a joint by what another of its finger certainly lacks, without a search of its own.
-
-    The joints of a finger are built alike, and what leaves noise can only be equalled. None where it leaves
-    more than that, or where a further effect promises to do better. What is not needed here is not named.
-
-    Args:
-        search: Of the joint; :attr:`~vd.gap.search.Search.like` is what the other lacks.
-        baseline: The plain model.
-        loose: What of the baseline the motions leave open.
-    """
-    effects, values = search.like
-    if not effects or {*effects} & {*search.vetoes}:
-        return None
-    starts = [{**baseline.values, **values}, {**search.nominal, **values}]
-    fit = search.run([search.call(baseline, effects, starts, FULL_ITERATIONS)])[0]
-    if weighting := clock_sensitivity(search, fit):
-        inner = weighted(search, weighting)
-        found = as_another(inner, inner.run([inner.plain(baseline)])[0], loose)
-        return found and told(found, weighting)
-    if search.too_coarse(fit):
-        search = search.finer()
-        baseline, fit = search.run(
-            [search.plain(baseline), search.call(baseline, effects, [fit.values], FULL_ITERATIONS)]
-        )
-    if fit.at_bound or not search.noise_only(fit, AT_FLOOR):
-        fuller = _fuller(search, baseline)
-        return as_another(fuller, baseline, loose) if fuller else None
-    others = [name for name in search.candidates if name not in {*effects, *search.vetoes, JITTER}]
-    further = [start for name in others for start in sizes(name, search.others, search.scales)]
-    promise = search.run([("promise", {"fit": fit, "starts": further, "scales": search.scales})])[0]
-    if promise.max(initial=0.0) > CONTAINED_FLOORS**2:
-        return None
-    for name in effects:
-        rest = tuple(other for other in effects if other != name)
-        without = search.refit(fit, rest)
-        needed, why = search.better(without, fit, SHOWN_TAIL)
-        if not needed and rest:
-            simpler = as_another(replace(search, like=(rest, values)), baseline, loose)
-            # Small as it is, the joint lacks it: the rest does not explain it, and the motions are sure.
-            if simpler is not None or search.gain(without, fit)[1][0] <= 0.0:
-                return simpler
-            needed = True
-        if not needed:
-            row = Trial(1, name, fit, *search.gain(baseline, fit), "rejected", why)
-            gap = baseline.held_out_rmse > UNEXPLAINED * search.floor
-            return None if gap else search.conclude(baseline, baseline, {}, [row], loose)
-        search.without[name] = without.held_out_rmse
-    return _as_named(search, baseline, fit, loose)
-
-
-def _as_named(search: Search, baseline: JointFit, fit: JointFit, loose: str) -> Explanation:
-    """The explanation by a fit with what another joint lacks, and its control."""
-    effects, (gain, ci) = fit.effects, search.gain(baseline, fit)
-    names = " and ".join(effects)
-    before, after = 1e3 * baseline.held_out_rmse, 1e3 * fit.held_out_rmse
-    search.report(f"+ {names}, as on another joint: {before:.2f} -> {after:.2f} mrad held out")
-    reason = "as on another joint: leaves noise, and no other effect promises more"
-    trials = [Trial(1, name, fit, gain, ci, "named", reason) for name in effects]
-    control = search.run([("placebo", {"before": baseline, "after": fit})])[0]
-    text = f"{names} with its times reversed and its trajectories exchanged: must be rejected"
-    trials.append(Trial(1, effects[-1], fit, control, (control, control), reason=text, placebo=True))
-    rivals = {name: [fit] for name in effects}
-    refined = search.refined(fit)
-    return search.explained(search.conclude(baseline, fit, rivals, trials, loose, refined))
-
-
-def _fuller(search: Search, baseline: JointFit) -> Search | None:
-    """The search with the line of a motor whose ceiling another joint shows; None where it is not that.
-
-    A slow joint shows the ceiling of the torque and not how it falls with speed, a quick one both.
-    """
-    effects, values = search.like
-    for ceiling, line in CEILINGS.items():
-        if ceiling not in effects or line not in {*search.candidates} - {*search.vetoes, *effects}:
-            continue
-        fuller = (*(name for name in effects if name != ceiling), line)
-        rest = {key: value for key, value in values.items() if not key.startswith(f"{ceiling}.")}
-        starts = [{**baseline.values, **rest, **start} for start in search.sized(baseline, line)]
-        fit = search.run([search.call(baseline, fuller, starts, FULL_ITERATIONS)])[0]
-        if not fit.at_bound and search.noise_only(fit, AT_FLOOR):
-            return replace(search, like=added(fit))
-    return None
-
-
-def as_changing(search: Search, baseline: JointFit, loose: str) -> Explanation | None:
-    """No names on a joint, without a search, where another of its finger has a friction that changes.
-
-    None where that friction does not explain most of the gap here, too.
-
-    Args:
-        search: Of the joint; :attr:`~vd.gap.search.Search.changing` is the other joint's model.
-        baseline: The plain model.
-        loose: What of the baseline the motions leave open.
-    """
-    effects, values = search.changing
-    if not effects or {*effects} & {*search.vetoes}:
-        return None
-    starts = [{**baseline.values, **values}, {**search.nominal, **values}]
-    fit = search.run([search.call(baseline, effects, starts, FULL_ITERATIONS)])[0]
-    if fit.held_out_rmse**2 > (1.0 - RECOVERED) * baseline.held_out_rmse**2:
-        return None
-    names, (gain, ci) = " and ".join(effects), search.gain(baseline, fit)
-    before, after = 1e3 * baseline.held_out_rmse, 1e3 * fit.held_out_rmse
-    search.report(f"+ {names}, as on another joint: {before:.2f} -> {after:.2f} mrad held out")
-    trials = [Trial(1, name, fit, gain, ci, "rejected", CHANGING) for name in effects]
-    rivals = {name: [fit] for name in effects}
-    found = search.conclude(baseline, fit, rivals, trials, loose, search.refined(fit))
-    return replace(found, verdict="unknown", reason=f"{names} as on another joint: {CHANGING}")
 
 
 def share(

@@ -7,7 +7,6 @@ import numpy as np
 
 from vd.gap.fit import RIDGE
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import JITTER
 from vd.gap.result import Verdict
 from vd.gap.sample_weighting import SampleWeighting
 from vd.gap.statistics import covariance, half_width
@@ -112,24 +111,3 @@ def added(fit: JointFit) -> tuple[tuple[str, ...], dict[str, float]]:
 def certain(explanation: Explanation) -> bool:
     """Whether every effect of the final model is the answer rather than one of a set."""
     return explanation.verdict == "effects" and all(one.named for one in explanation.accepted)
-
-
-def lacking(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
-    """The effects that a joint is certain to lack, and their values by key; none where it is not."""
-    if not certain(explanation) or JITTER in explanation.final.effects:
-        return (), {}
-    return added(explanation.final)
-
-
-def jitter_of(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
-    """The random delays of a joint and what it is certain to lack beside them, and their values by key.
-
-    None where it has none. One of a set is no certainty: another joint has to search for itself, or the first
-    one's luck among several that fit alike would be the answer of all.
-    """
-    effects, values = added(explanation.final)
-    if JITTER not in effects:
-        return (), {}
-    if certain(explanation):
-        return effects, values
-    return (JITTER,), {key: value for key, value in values.items() if key.startswith(f"{JITTER}.")}

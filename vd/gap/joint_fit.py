@@ -30,8 +30,6 @@ class JointFit:
         gradient: J^T r of each trajectory, [S, P].
         held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad]; None where not taken.
         step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
-        structure: Sum of products of successive residuals in motion, and their number, of each trajectory
-            [2, S] [rad^2]: zero on average if only noise is left; None where not estimated.
         extents: 95 % intervals by key, of parameters for which the matrices do not give them.
     """
 
@@ -46,7 +44,6 @@ class JointFit:
     gradient: np.ndarray
     held_out_abs: np.ndarray | None = None
     step_error: np.ndarray | None = None
-    structure: np.ndarray | None = None
     extents: Mapping[str, tuple[float, float]] | None = None
 
     @property

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.consensus import agree, no_constant_friction, no_spring, share
 from vd.gap.explanation import Explanation, polished
 from vd.gap.finger_masses import masses_alone, masses_beside
-from vd.gap.jitter_search import FIXED
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import JITTER
 from vd.gap.masses import widened
@@ -28,9 +26,9 @@ def explain_joints(explainer: Explainer) -> list[Explanation]:
     pool, joints = explainer.pool, explainer.joints
     masses = masses_alone(pool, joints)
 
-    def one(joint: Joint, explained: Explained, own: Explanation | None = None) -> Explanation:
+    def one(joint: Joint, explained: Explained) -> Explanation:
         if joint.spec.chain not in masses:
-            return explainer.explain(joint, explained, own)
+            return explainer.explain(joint, explained)
         text = f"the plain model is within the noise floor {masses[joint.spec.chain].text}"
         explainer.progress(f"explain: {joint.name}: no_gap: {text}")
         return Explanation(joint.fit, joint.fit, "no_gap", text)
@@ -66,21 +64,14 @@ def _finished(
     return fitted(fit.effects, [fit.values])
 
 
-class _Explain(Protocol):
-    """Explains a joint, knowing those of its finger that are explained already."""
-
-    def __call__(
-        self, joint: Joint, explained: Explained, own: Explanation | None = None, /
-    ) -> Explanation: ...
-
-
-def _in_turn(joints: Sequence[Joint], explain: _Explain) -> list[Explanation]:
+def _in_turn(
+    joints: Sequence[Joint], explain: Callable[[Joint, Explained], Explanation]
+) -> list[Explanation]:
     """Explanations of all joints: of each finger from its tip on, as a joint's motion shakes those before it.
 
     Args:
         joints: The joints.
-        explain: Explains a joint, knowing those of its finger that are explained already; one that was
-            explained before random delays were found on another once more.
+        explain: Explains a joint, knowing those of its finger that are explained already.
     """
 
     def finger(chain: int) -> Explained:
@@ -88,11 +79,6 @@ def _in_turn(joints: Sequence[Joint], explain: _Explain) -> list[Explanation]:
         own = [joint for joint in joints if joint.spec.chain == chain]
         for joint in sorted(own, key=lambda each: -each.spec.joint):
             found.append((joint, explain(joint, found)))
-        late = [JITTER in explanation.final.effects for _, explanation in found]
-        for i, (joint, before) in enumerate(found[: late.index(True) if any(late) else 0]):
-            # What a late command is the mean of, or what nothing explained.
-            if FIXED in before.final.effects or before.verdict in ("unknown", "ambiguous"):
-                found[i] = joint, explain(joint, [*found[:i], *found[i + 1 :]], before)
         return found
 
     explained = parallel(finger, sorted({joint.spec.chain for joint in joints}))

@@ -7,13 +7,12 @@ import numpy as np
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.explanation import NAMED, Accepted, Explanation, Trial, estimates, intervals
-from vd.gap.joint_fit import ONE_SIDED, JointFit
+from vd.gap.joint_fit import DRY, ONE_SIDED, JointFit
 from vd.gap.judge import (
     AT_FLOOR,
     FORMS,
     FULLER_FLOORS,
     JITTER,
-    MIN_SHARE,
     NESTED,
     RECOVERED,
     REPEATABLE,
@@ -21,15 +20,10 @@ from vd.gap.judge import (
     Judge,
 )
 from vd.gap.warming import warming
-from vd.kernels.servo.effects import BESIDE
+from vd.kernels.servo.effects import BESIDE, TOGETHER
 
 UNEXPLAINED = 1.5
 """A baseline beyond this factor of the noise floor has a gap, whether or not an effect explains it."""
-STRUCTURE = 0.09
-"""Mean product of successive residuals in motion, in squared noise floors, from which a model lacks
-something: the right ones leave 0.05 at most (the noise of the first sample, which starts a rollout)."""
-STRUCTURE_SURE = 0.02
-"""The same for the low end of its interval over trajectories."""
 CANCELLING = ("gravity_load", "encoder_bias")
 """Effects that hold a joint off its command at rest. Where they cancel there, they are no two causes but one
 that pulls with the travel from there, a spring, which the table has not."""
@@ -47,13 +41,11 @@ class Verdicts(Judge):
 
     Attributes:
         equivalent: Effects that one stands for, since the recording cannot tell them apart.
-        apart: Fits with several effects in the place of one that they are together, by its name.
         joint: Index of the joint in its chain.
         when: Time of each trajectory [S] [s]; None where it is not known.
     """
 
     equivalent: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    apart: dict[str, JointFit] = field(default_factory=dict)
     joint: int = 0
     when: np.ndarray | None = None
 
@@ -82,7 +74,6 @@ class Verdicts(Judge):
         trials: Sequence[Trial],
         loose: str,
         refined: JointFit | None = None,
-        again: JointFit | None = None,
         known: Sequence[Accepted] = (),
     ) -> Explanation:
         """Confidence, sets and verdict of the final model.
@@ -94,7 +85,6 @@ class Verdicts(Judge):
             trials: The evidence.
             loose: What of the baseline the motions leave open.
             refined: The final model at finer time steps, whose values are reported.
-            again: The final model as another search finds it.
             known: Effects that are judged already.
         """
         told = final if refined is None else refined
@@ -104,8 +94,7 @@ class Verdicts(Judge):
             fits = rivals.get(name, [final])
             one = self.accept(final, name, fits, spread, told)
             if not one.tied:
-                doubt = self.disagreement(baseline, final, name, fits, again)
-                one = replace(one, doubt=doubt or self.beside_sharp(final, name))
+                one = replace(one, doubt=self.beside_sharp(final, name))
             accepted.append(one)
         explanation = Explanation(baseline, told, "unknown", "", tuple(accepted), tuple(trials), rivals)
         if not accepted:
@@ -118,10 +107,6 @@ class Verdicts(Judge):
         if share < RECOVERED and JITTER not in final.effects:
             text = f"the best candidate recovers {100.0 * share:.0f} % of the squared gap, less than half"
             return replace(explanation, reason=text)
-        lack = self.lack_of_fit(told)
-        if lack:
-            names = " and ".join(a.name for a in accepted)
-            return replace(explanation, reason=f"{names} come nearest, but {lack}: the cause is another")
         warms = self.warms(told)
         if warms:
             text = f"{warms}: the cause is a friction that changes, as with temperature"
@@ -138,55 +123,11 @@ class Verdicts(Judge):
             return replace(explanation, verdict="under_excited", reason=loose)
         return replace(explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}")
 
-    def lack_of_fit(self, fit: JointFit) -> str:
-        """Why residuals near the noise floor are more than noise, in words; empty if they are not.
-
-        A wrong model that is flexible enough comes near the floor, and what it leaves is a function of
-        the motion: successive residuals agree, where noise has no memory.
-        """
-        if fit.structure is None or fit.rmse > REPEATABLE * self.floor:
-            return ""
-        products, count = fit.structure / np.array([[self.floor**2], [1.0]])
-        if count.sum() <= 0.0:
-            return ""
-        mean = float(products.sum() / count.sum())
-        drawn = (self.weights @ products) / np.maximum(self.weights @ count, 1.0)
-        sure = float(np.quantile(drawn, 0.025))
-        small = mean < (MIN_SHARE * self.whole / self.floor) ** 2
-        if mean < STRUCTURE or sure < STRUCTURE_SURE or small:
-            return ""
-        return f"what is left has structure ({np.sqrt(mean):.2f} noise floors that are not noise)"
-
     def warms(self, fit: JointFit) -> str:
         """Which friction of a model near the floor changes over the recording, in words, or nothing."""
         if self.when is None or self.behind_jitter or fit.rmse > REPEATABLE * self.floor:
             return ""
         return warming(fit, self.when, self.floor)
-
-    def disagreement(
-        self,
-        baseline: JointFit,
-        final: JointFit,
-        name: str,
-        rivals: Sequence[JointFit],
-        again: JointFit | None,
-    ) -> str:
-        """Why two searches for the final model contradict each other about an effect, or nothing.
-
-        Its gain is what it leaves less than the next best that is no form of it.
-        """
-        if again is None or final.rmse < AT_FLOOR * self.floor:
-            return ""
-        same = {name, *NESTED.get(name, ()), *(k for k, simpler in NESTED.items() if name in simpler)}
-        without = [fit.rmse for fit in rivals if fit is not final and not same & set(fit.effects[-1:])]
-        gain = min([baseline.rmse, *without]) - final.rmse
-        apart = abs(again.rmse - final.rmse)
-        if apart <= max(gain, 0.0) or gain <= 0.0:
-            return ""
-        return (
-            f"two searches for {name} end {1e3 * apart:.2f} mrad apart, more than the {1e3 * gain:.2f} mrad "
-            "that it gains"
-        )
 
     def beside_sharp(self, final: JointFit, name: str) -> str:
         """Why an effect is no name beside one whose sharp optimum was not found, or nothing.
@@ -212,6 +153,7 @@ class Verdicts(Judge):
         mine = final if own is None or any(fit is final for fit in rivals) else own
         means = (*self.equivalent.get(name, ()), *self.same_beside(final, name))
         others = [fit for fit in rivals if fit is not mine and fit.effects[-1] not in (name, *means)]
+        alone = not {*DRY, *TOGETHER.get(name, ())} & {*final.effects}
         white = self.white(mine)
         choice = np.argmin(self.scores([mine, *others], self.weights, fitted=white), axis=0)
         simple = {i + 1 for i, fit in enumerate(others) if name in NESTED.get(fit.effects[-1], ())}
@@ -235,15 +177,11 @@ class Verdicts(Judge):
         if share < NAMED and not tied:
             rival = int(np.argmax(np.bincount(choice, minlength=len(others) + 1)[1:]))
             tied.append(others[rival].effects[-1])
-        split = self.apart.get(name)
-        if split is not None and {*split.effects} > {*final.effects} - {name}:
-            same, _ = self.tied(mine, split, loose=True)
-            means += tuple(other for other in split.effects if same and other not in final.effects)
         return Accepted(
             name=name,
             confidence=share,
             estimates=estimates(told, name, spread),
-            equivalent=means,
+            equivalent=(*means, *TOGETHER.get(name, ())) if alone else means,
             alternatives=tuple(alternatives),
             tied=tuple(tied),
             at_bound=any(key.startswith(f"{name}.") for key in final.at_bound),
