@@ -11,8 +11,7 @@ from vd.gap.joint_fit import JointFit
 from vd.gap.judge import EXCESS_FLOORS, JITTER, NESTED, NO_GAP
 from vd.gap.masses import Masses, fit_masses, widened, with_free_masses
 from vd.gap.one_joint import REFITS, Explained, Joint, rest
-from vd.gap.statistics import resamples
-from vd.gap.verdict import Verdicts, cancelled, explains
+from vd.gap.verdict import cancelled, explains
 from vd.gap.worker_pool import WorkerPool, parallel
 from vd.kernels.servo.effects import EFFECTS
 
@@ -119,11 +118,7 @@ def _all_with(pool: WorkerPool, known: Explained, core: tuple[str, ...]) -> _Fin
     if not masses.other or (masses.errors >= NO_GAP * floors).any():
         return None
     reason, explanations = f"{explains(core)}, {masses.text}", []
-    for (joint, found), fit, structure in zip(known, fits, masses.structure, strict=True):
-        weights = resamples(len(fit.sse), np.random.default_rng(joint.spec.joint))
-        judge = Verdicts(floor=joint.spec.floor, weights=weights, whole=joint.fit.held_out_rmse)
-        if judge.lack_of_fit(replace(fit, structure=structure)):
-            return None  # other masses are not the rest either
+    for (joint, found), fit in zip(known, fits, strict=True):
         column = int(pool.problems.chains[joint.spec.chain].columns[joint.spec.joint])
         resting = rest(pool.problems.recording, column, joint.spec.trajectories)
         if cancelled(fit, joint.spec.joint, resting):

@@ -38,13 +38,11 @@ class Masses:
     Attributes:
         factors: Masses as shares of the model's, one a joint [n].
         errors: RMSE of each joint's motions [J] [rad].
-        structure: Of what is left of each joint's motions, as in :class:`~vd.gap.joint_fit.JointFit`.
         x: Coordinates: logarithms of the factors [n], and those of the joints' fits one after the other.
     """
 
     factors: np.ndarray
     errors: np.ndarray
-    structure: tuple[np.ndarray, ...]
     x: np.ndarray
 
     @property
@@ -74,7 +72,6 @@ def fit_masses(problems: Sequence[JointProblem], fits: Sequence[JointFit]) -> Ma
     return Masses(
         factors=np.exp(found.x[0, :links]),
         errors=np.array([np.sqrt(np.mean(part**2)) for part in parts]),
-        structure=tuple(p.structure(part) for p, part in zip(problems, parts, strict=True)),
         x=found.x[0],
     )
 
