@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.coordinates import Scales, beside, best_two, sizes, smaller, torque_power
+from vd.gap.coordinates import Scales, best_two, sizes, torque_power
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import EXPLAINED, JITTER
 from vd.gap.telemetry import BEHIND_SENSOR
@@ -34,14 +34,6 @@ ASTRAY = 2.0
 """Factor from the nominal model beyond which a fit starts from that as well."""
 BETTER = 0.98
 """Share of the error from which a fit of the same model is a better one."""
-
-IN_RICHER = {
-    "stribeck_friction": ("tau_s_nm", "tau_c_nm"),
-    "asymmetric_friction": ("tau_plus_nm", "tau_minus_nm"),
-    "torque_speed_limit": ("tau_stall_nm",),
-    "elastic_transmission": ("j_kgm2",),
-}
-"""Parameters of an effect whose mean is the only one of the simpler effect in it."""
 
 Call = tuple[str, dict[str, Any]]
 Run = Callable[[list[Call]], list[Any]]
@@ -101,9 +93,7 @@ class CandidateFits:
         white = 0.0 if self.behind_jitter else EXPLAINED * self.floor
         least = known.rmse if known is not None and known.rmse < white else np.inf
         names = [name for name in self.candidates if name not in out]
-        starts = {
-            name: [*self.sized(present, name), *beside(name, present.values, self.scales)] for name in names
-        }
+        starts = {name: self.sized(present, name) for name in names}
         flat = [(name, start) for name in names for start in starts[name]]
         if not flat:
             return {}
@@ -151,18 +141,6 @@ class CandidateFits:
         near = [fit for fit in finalists if fit.rmse <= most]
         last = [*go_on(near, FULL_ITERATIONS), *finalists[len(near) :]]
         fits = {fit.effects[-1]: fit for fit in (*last, *screened[len(finalists) :])}
-        # Nothing added can do worse than nothing: such a fit began too large, and no descent led back.
-        astray = [name for name, fit in fits.items() if fit.rmse > present.rmse]
-        small = {name: smaller(flat[order[name][0]][1]) for name in astray}
-        again = [name for name in astray if small[name] is not None]
-        calls = [
-            self.call(present, name, [{**present.values, **(small[name] or {})}], SCREEN_ITERATIONS)
-            for name in again
-        ]
-        found = [fit for fit in self.run(calls) if fit.rmse < fits[fit.effects[-1]].rmse]
-        fits |= {fit.effects[-1]: fit for fit in found}
-        near = [fit for fit in found if fit.rmse <= most]
-        fits |= {fit.effects[-1]: fit for fit in go_on(near, FULL_ITERATIONS)}
         return fits
 
     def sized(self, present: JointFit, name: str) -> list[dict[str, float]]:
@@ -224,19 +202,6 @@ class CandidateFits:
                 "refits": self.refits if iterations == FULL_ITERATIONS else 0,
             },
         )
-
-    def from_richer(self, present: JointFit, name: str, simpler: str) -> JointFit:
-        """The fit with a simpler effect in the place of one that contains it, from what that one found."""
-        rows, values = present.rows.copy(), present.values
-        own = {p.name: values[f"{name}.{p.name}"] for p in EFFECTS[name].parameters}
-        for parameter in EFFECTS[name].parameters:
-            rows[self.joint, parameter.column] = parameter.neutral
-        size = float(np.mean([own[key] for key in IN_RICHER[name]]))
-        start = {key: value for key, value in values.items() if not key.startswith(f"{name}.")}
-        start[f"{simpler}.{EFFECTS[simpler].parameters[0].name}"] = size
-        kept = tuple(effect for effect in present.effects if effect != name)
-        call = {"base": rows, "effects": (*kept, simpler), "starts": [start], "scales": self.scales}
-        return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0]
 
     def refit(self, present: JointFit, effects: Sequence[str]) -> JointFit:
         """The fit with only some of a model's effects."""

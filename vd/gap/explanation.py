@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+import vd.kernels.servo.actuators as servo
 from vd.gap.fit import RIDGE
 from vd.gap.joint_fit import JointFit
 from vd.gap.result import Verdict
@@ -45,13 +46,20 @@ class Accepted:
     at_bound: bool
     equivalent: tuple[str, ...] = ()
     """Effects that leave the same positions whatever the motion; the name stands for them too."""
-    doubt: str = ""
-    """Why it is no name in spite of all."""
 
     @property
     def named(self) -> bool:
         """Whether it is the answer rather than one of a set."""
-        return not self.tied and not self.at_bound and not self.doubt and self.confidence >= NAMED
+        return not self.tied and not self.at_bound and self.shown and self.confidence >= NAMED
+
+    @property
+    def shown(self) -> bool:
+        """Whether the interval of its size is sure of some of it; several sizes stand in for each other."""
+        parameters = {p.name: p for p in EFFECTS[self.name].parameters if p.column != servo.GRAVITY_PHASE}
+        if any(p.lower > 0.0 == p.neutral for p in parameters.values()):
+            return True  # its absence is no value of it
+        sizes = [v for key, v in self.estimates.items() if key in parameters and parameters[key].lower == 0.0]
+        return len(sizes) != 1 or not sizes[0][1] <= 0.0 <= sizes[0][2]
 
 
 @dataclass(frozen=True)

@@ -158,7 +158,7 @@ def _row_with(joint: Joint, found: Explanation, core: tuple[str, ...]) -> np.nda
 def _can_have(found: Explanation, name: str) -> Iterator[tuple[Accepted, dict[str, float]]]:
     """An effect as a joint has it, or could have it in the place of another that it is not told from."""
     for one in found.accepted:
-        if one.at_bound or one.doubt:
+        if one.at_bound or not one.shown:
             continue
         if one.name == name:
             yield one, found.final.values

@@ -134,7 +134,6 @@ def behind(search: Search, weighting: SampleWeighting) -> Search:
         candidates=[name for name in search.candidates if name != JITTER],
         behind_jitter=True,
         report=lambda line: search.report(f"beside {JITTER}: {line}"),
-        without={},
         promised={},
         added={},
     )

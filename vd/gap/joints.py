@@ -1,13 +1,13 @@
 """Explain the joints of a recording, those of a finger in turn, each knowing what the others have."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from vd.gap.candidates import FULL_ITERATIONS
-from vd.gap.consensus import agree, no_constant_friction, no_spring, share
+from vd.gap.consensus import no_constant_friction, share
 from vd.gap.explanation import Explanation, polished
 from vd.gap.finger_masses import masses_alone, masses_beside
 from vd.gap.joint_fit import JointFit
@@ -35,33 +35,18 @@ def explain_joints(explainer: Explainer) -> list[Explanation]:
 
     floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))
     alone = _in_turn(joints, one)
-    fits = [partial(_fitted, pool, list(zip(joints, alone, strict=True)), joint) for joint in joints]
-    ends = [partial(_finished, fit) for fit in fits]
-    agreed = agree(share(alone, floors, fingers, ends), floors, fingers, fits)
-    found = _consistent(pool, joints, masses_beside(pool, joints, agreed))
-    return no_constant_friction(no_spring(found, fingers), fingers)
+    ends = [partial(_finished, pool, list(zip(joints, alone, strict=True)), joint) for joint in joints]
+    shared = share(alone, floors, fingers, ends)
+    return no_constant_friction(_consistent(pool, joints, masses_beside(pool, joints, shared)), fingers)
 
 
-def _fitted(
-    pool: WorkerPool,
-    known: Explained,
-    joint: Joint,
-    effects: tuple[str, ...],
-    starts: Sequence[Mapping[str, float]],
-) -> JointFit:
-    """A model of a joint with these effects, fitted to the end beside the joints as they are known."""
-    call = {"base": beside(joint, known), "effects": effects, "starts": list(starts), "scales": joint.scales}
-    call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
+def _finished(pool: WorkerPool, known: Explained, joint: Joint, fit: JointFit) -> JointFit:
+    """A model fitted to the end from where it is, beside the joints as they are known."""
+    call = {"base": beside(joint, known), "effects": fit.effects, "starts": [fit.values]}
+    call |= {"scales": joint.scales, "iterations": FULL_ITERATIONS, "refits": REFITS}
     weighting = weighting_of(next(found for other, found in known if other is joint))
     whole = pool.run(joint.spec, [("fit", {**call, **weighting})])[0]
     return pool.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales, **weighting})])[0]
-
-
-def _finished(
-    fitted: Callable[[tuple[str, ...], Sequence[Mapping[str, float]]], JointFit], fit: JointFit
-) -> JointFit:
-    """A model fitted to the end from where it is."""
-    return fitted(fit.effects, [fit.values])
 
 
 def _in_turn(

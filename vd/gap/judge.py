@@ -5,7 +5,7 @@ the choice inside the resampling. :mod:`vd.gap.verdict` has the last word on the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,9 +30,6 @@ JITTER_GAIN_FLOORS = 0.3
 """The same beside random delays: an effect of six floors leaves half of one there."""
 MEMORY = 8.0
 """Samples in a row that say the same beside them: what a late command does lasts that long."""
-MIN_SHARE = 0.02
-"""The same in whole gaps: no fit of a large effect is better than that. With half of it, an acceleration
-limit of 300 noise floors, whose optimum is sharp, comes with a second effect that is not there."""
 PENALTY = 0.01
 """Relative RMSE that a further parameter must earn to be preferred."""
 TIE_TAIL = 0.05
@@ -40,32 +37,16 @@ TIE_TAIL = 0.05
 what a name may lose."""
 EXPLAINED = 1.1
 """A winner within this factor of the noise floor leaves white residuals ..."""
-EXCESS_FLOORS = 0.08
+EXCESS_FLOORS = 0.07
 """... so that an alternative that leaves this much more, in noise floors, is worse: thousands of samples
-carry that difference. Of 300 hidden effects the right one was never worse than a wrong one, other than a form
-that contains it, by more than 0.03."""
-SMALL_EXCESS_FLOORS = 0.05
-"""The same for one that leaves more on nearly every choice of motions."""
+carry that difference."""
 CONTAINED_FLOORS = 0.15
 """The same for one that the winner contains: with more parameters it imitates what the integrator misses."""
-FULLER_FLOORS = 0.04
-"""What a fuller form of a loss must leave less, in noise floors, not to be the simpler one: luck gives
-that much in one of two hundred recordings."""
-SHARP_SHARE = 0.002
-"""All three in whole gaps: beside an acceleration limit of 283 noise floors one right model ended 0.5 floors
-above a wrong one, as no descent ends at the very bottom of so sharp an optimum."""
 RECOVERED = 0.5
 """Share of the squared gap that the named effects must recover; less is an unknown cause."""
 REPEATABLE = 2.0
 """Final error, in noise floors, up to which residuals are held against noise alone. A real machine that is
 farther from it does not repeat its motions that well; how well is not known from one recording of each."""
-AT_FLOOR = 1.3
-"""Final error, in noise floors, which no other optimum of the same model can improve much: one that another
-search ends in above it is that search's failure."""
-FORMS = {"torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag"}
-"""Forms of one loss, of torque where much is asked."""
-SHARP = 0.1
-"""Share of an error from which what an effect leaves of it lies in a valley that is sharp."""
 JITTER = "command_jitter"
 """The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
 
@@ -77,16 +58,12 @@ class Judge:
     Attributes:
         floor: Noise floor [rad].
         weights: Bootstrap weights of the trajectories [R, S].
-        whole: Held-out RMSE of the baseline [rad]; what is small beside it is the model's own error.
-        without: Held-out RMSE of the present model without each of its effects [rad].
         moves: Whether the joint's command changes, of each trajectory [S]; None: in all.
         behind_jitter: Whether samples are weighted by what random delays do (:mod:`vd.gap.sample_weighting`).
     """
 
     floor: float
     weights: np.ndarray
-    whole: float = 0.0
-    without: dict[str, float] = field(default_factory=dict)
     moves: np.ndarray | None = None
     behind_jitter: bool = False
 
@@ -124,8 +101,7 @@ class Judge:
         inside = [fit for fit in fits if not fit.at_bound] or list(fits)
         best = self.best(inside)
         simpler = [f for f in inside if f.effects[-1] in NESTED.get(best.effects[-1], ())]
-        loose = best.effects[-1] not in FORMS
-        return next((fit for fit in simpler if self.tied(best, fit, loose)[0]), best)
+        return next((fit for fit in simpler if self.tied(best, fit, loose=True)[0]), best)
 
     def gain(self, before: JointFit, after: JointFit) -> tuple[float, tuple[float, float]]:
         """Share of the held-out RMSE removed, with its interval over trajectories."""
@@ -164,8 +140,6 @@ class Judge:
             return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
         if low <= 0.0:
             return False, "its gain over trajectories is not distinguishable from 0"
-        if closed < MIN_SHARE * self.whole and not white:
-            return False, "what it removes is small beside the whole gap"
         if closed < (JITTER_GAIN_FLOORS if self.behind_jitter else MIN_GAIN_FLOORS) * self.floor:
             return False, "what it removes is below the noise floor"
         return True, ""
@@ -224,25 +198,8 @@ class Judge:
                 more = max(len(other.x) - len(winner.x), 0)
                 excess += 2.0 * PENALTY * more * (winner.rmse / self.floor) ** 2
             excess /= MEMORY if self.behind_jitter else 1.0
-            least = SHARP_SHARE * self.whole / self.floor
-            contained, small, sure = (
-                max(floors, least) ** 2 for floors in (CONTAINED_FLOORS, SMALL_EXCESS_FLOORS, EXCESS_FLOORS)
-            )
-            if loose or excess < small or excess >= sure:
-                return excess < (contained if loose else small), (low, high)
-            return float(np.quantile(self.weights @ (other.sse - winner.sse), TIE_TAIL)) <= 0.0, (low, high)
+            return excess < (CONTAINED_FLOORS if loose else EXCESS_FLOORS) ** 2, (low, high)
         return float(np.quantile(error - best, TIE_TAIL)) <= 0.0, (low, high)
-
-    def same_loss(self, name: str, mine: JointFit, fit: JointFit) -> bool:
-        """Whether another form of a loss does most of what this one does in a model far from the floor.
-
-        What such a model lacks elsewhere is more than the forms differ by, and would decide between them.
-        """
-        if not {name, fit.effects[-1]} <= FORMS or name not in self.without:
-            return False
-        gap = self.without[name] ** 2
-        done, needed = gap - fit.held_out_rmse**2, gap - mine.held_out_rmse**2
-        return mine.held_out_rmse > REPEATABLE * self.floor and done > RECOVERED * needed > 0.0
 
 
 def _likelihood_gain(before: JointFit, after: JointFit, weights: np.ndarray) -> np.ndarray:

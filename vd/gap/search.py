@@ -78,7 +78,7 @@ class Search(CandidateFits, Verdicts):
                 ]
             )
 
-        return replace(self, run=run, clocked=True, without={}, promised={}, added={})
+        return replace(self, run=run, clocked=True, promised={}, added={})
 
     def search(self, baseline: JointFit) -> tuple[JointFit, Rivals, list[Trial]]:
         """Forward and backward steps from the plain model; what is added is tentative until the end."""
@@ -116,7 +116,7 @@ class Search(CandidateFits, Verdicts):
             if not fits:
                 break
             best = self.winner(list(fits.values()))
-            best, accepted, why = self.earned(present, best, fits)
+            accepted, why = self.better(present, best, SEARCH_TAIL)
             trials += self.judge(number, present, fits, best, accepted, why)
             trials += self.screened_out(number, present, fits)
             if not accepted:
@@ -134,19 +134,6 @@ class Search(CandidateFits, Verdicts):
         """Whether no further effect is to be added to a model."""
         full = len(present.effects) >= MAX_EFFECTS
         return full or self.no_gap(present) or self.clock_sensitivity(present) is not None
-
-    def earned(
-        self, present: JointFit, best: JointFit, fits: Mapping[str, JointFit]
-    ) -> tuple[JointFit, bool, str]:
-        """The candidate that a round adds, whether it is earned, and if not why."""
-        accepted, why = self.better(present, best, SEARCH_TAIL)
-        if accepted:
-            return best, True, ""
-        # The simpler of two stands for the one that contains it only if it earns its place as well.
-        name = best.effects[-1]
-        richer = [f for f in fits.values() if name in NESTED.get(f.effects[-1], ()) and not f.at_bound]
-        earned = [f for f in richer if self.better(present, f, SEARCH_TAIL)[0]]
-        return (earned[int(np.argmin(self.scores(earned)))], True, "") if earned else (best, False, why)
 
     def revise(self, present: JointFit) -> tuple[JointFit, Rivals]:
         """Backward check: drop what is not needed, exchange what another effect does better.
@@ -179,22 +166,12 @@ class Search(CandidateFits, Verdicts):
         """The model itself, and fits with other effects in the place of one of its own."""
         if without is None:
             without = self.refit(present, [e for e in present.effects if e != name])
-        self.without[name] = without.held_out_rmse
         # Beside Coulomb friction, a friction that contains it is no other cause.
         contains = [c for c, simpler in NESTED.items() if set(simpler) & set(without.effects)]
         skip, tried = (name, *contains), tuple(BEHIND_SENSOR)
         fits = self.tried_beside(without, present, skip)
         if fits is None:
             fits = self.fit_candidates(without, skip=skip, vetoed=tried, known=present)
-        for simpler in {*NESTED.get(name, ())} & {*self.candidates} - {
-            *self.vetoes,
-            *contains,
-            *without.effects,
-        }:
-            # Near a sharp optimum a simpler effect is found from what contains it, if from anywhere.
-            inside = self.from_richer(present, name, simpler)
-            if simpler not in fits or inside.rmse < fits[simpler].rmse:
-                fits[simpler] = inside
         own = replace(present, effects=(*without.effects, name))  # by its last effect it is known
         self.added[frozenset(without.effects)] = (without, own, *fits.values())
         return [present, *fits.values()]

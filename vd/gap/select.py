@@ -24,7 +24,6 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
         baseline: The plain model.
     """
     loose = search.undetermined(baseline)
-    search.whole = baseline.held_out_rmse
     if nothing := _nothing_to_explain(search, baseline, loose):
         return nothing
     if weighting := search.clock_sensitivity(baseline):  # with an identified limit in it

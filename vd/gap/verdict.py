@@ -9,14 +9,10 @@ import vd.kernels.servo.actuators as servo
 from vd.gap.explanation import NAMED, Accepted, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import DRY, ONE_SIDED, JointFit
 from vd.gap.judge import (
-    AT_FLOOR,
-    FORMS,
-    FULLER_FLOORS,
     JITTER,
     NESTED,
     RECOVERED,
     REPEATABLE,
-    SHARP,
     Judge,
 )
 from vd.gap.warming import warming
@@ -92,10 +88,7 @@ class Verdicts(Judge):
         accepted = [*known]
         for name in [n for n in final.effects if n not in {one.name for one in known}]:
             fits = rivals.get(name, [final])
-            one = self.accept(final, name, fits, spread, told)
-            if not one.tied:
-                one = replace(one, doubt=self.beside_sharp(final, name))
-            accepted.append(one)
+            accepted.append(self.accept(final, name, fits, spread, told))
         explanation = Explanation(baseline, told, "unknown", "", tuple(accepted), tuple(trials), rivals)
         if not accepted:
             return self.nothing_earned(explanation, loose)
@@ -129,17 +122,6 @@ class Verdicts(Judge):
             return ""
         return warming(fit, self.when, self.floor)
 
-    def beside_sharp(self, final: JointFit, name: str) -> str:
-        """Why an effect is no name beside one whose sharp optimum was not found, or nothing.
-
-        It may stand for what the other fit still lacks.
-        """
-        sharp = [o for o in final.effects if o != name and SHARP * self.without.get(o, 0.0) > final.rmse]
-        if not sharp or final.rmse < AT_FLOOR * self.floor:
-            return ""
-        floors = final.rmse / self.floor
-        return f"{name} can be what the fit of {sharp[0]} lacks, which ends {floors:.1f} noise floors off"
-
     def accept(
         self,
         final: JointFit,
@@ -163,17 +145,10 @@ class Verdicts(Judge):
             other = fit.effects[-1]
             same, ci = self.tied(mine, fit)
             alternatives.append((other, fit.held_out_rmse, ci))
-            if same or self.same_loss(name, mine, fit):
+            if same:
                 tied.append(other)
         # In a tie the simpler one is meant: none beside an effect that it contains.
-        # A fuller form of a loss stays in the set if it is better, by too little to be the name.
-        fuller = {
-            fit.effects[-1]
-            for fit in others
-            if {name, fit.effects[-1]} <= FORMS
-            and mine.rmse**2 - fit.rmse**2 > (FULLER_FLOORS * self.floor) ** 2
-        }
-        tied = [o for o in tied if o in fuller or not {name, *tied} & set(NESTED.get(o, ()))]
+        tied = [o for o in tied if not {name, *tied} & set(NESTED.get(o, ()))]
         if share < NAMED and not tied:
             rival = int(np.argmax(np.bincount(choice, minlength=len(others) + 1)[1:]))
             tied.append(others[rival].effects[-1])
@@ -208,8 +183,9 @@ def _by_names(explanation: Explanation) -> Explanation:
         return replace(explanation, reason=f"{accepted[0].name} fits only with a parameter at its bound")
     sets = [" or ".join((a.name, *a.tied)) for a in accepted if a.tied and not a.at_bound]
     if not sets:
-        doubts = [a.doubt for a in accepted if a.doubt]
-        return replace(explanation, reason=(doubts or ["nothing is chosen often enough"])[0])
+        absent = [a.name for a in accepted if not a.shown]
+        text = f"{absent[0]} can be nothing at all" if absent else "nothing is chosen often enough"
+        return replace(explanation, reason=text)
     return replace(explanation, verdict="ambiguous", reason=f"{'; '.join(sets)}: not told apart")
 
 
