@@ -8,27 +8,16 @@ import numpy as np
 
 from vd.gap.coordinates import Scales, best_two, sizes, torque_power
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXPLAINED, JITTER
-from vd.gap.telemetry import BEHIND_SENSOR
+from vd.gap.judge import JITTER
 from vd.kernels.servo.effects import EFFECTS, equivalent
 
 SHORT_LIST = 10
 """Candidates of a round that are fitted, after the linear screening of all."""
 FINALISTS = 6
 """Candidates of a round that are fitted to the end."""
-FIRST = 4
-"""Candidates that are fitted before the rest of the short list."""
-ALIKE = 0.5
-"""Share of the best promise that a candidate must have to be fitted once another explains everything."""
-BEHIND = 3.0
+BEHIND = 2.0
 """Finalists have at most this many times the error of the best after screening."""
-HOPELESS = 1.5
-"""The same factor half way: those beyond it are not fitted to the end."""
-IDLE = 0.99
-"""Share of the error before it that a further effect leaves at least half way if it does nothing: where more
-than noise is left such a fit is not finished either."""
 SCREEN_ITERATIONS = 6
-HALF_ITERATIONS = 4
 FULL_ITERATIONS = 12
 ASTRAY = 2.0
 """Factor from the nominal model beyond which a fit starts from that as well."""
@@ -55,8 +44,7 @@ class CandidateFits:
         vetoes: Effects that telemetry contradicts, with the reason.
         nominal: Nominal values of the baseline's parameters, by key.
         promised: Share of the squared error that each candidate of the last round could remove at best.
-        added: The last fits with one more effect, by the effects of the model to which it was added: that
-            model first.
+        seen: Models to which an effect was added, by their effects.
         behind_jitter: Whether samples are weighted by what random delays do to them.
     """
 
@@ -70,7 +58,7 @@ class CandidateFits:
     vetoes: Mapping[str, str] = field(default_factory=dict)
     nominal: Mapping[str, float] = field(default_factory=dict)
     promised: dict[str, float] = field(default_factory=dict)
-    added: dict[frozenset[str], tuple[JointFit, ...]] = field(default_factory=dict)
+    seen: dict[frozenset[str], JointFit] = field(default_factory=dict)
     behind_jitter: bool = False
 
     def fit_candidates(
@@ -86,78 +74,36 @@ class CandidateFits:
             present: Model to which they are added.
             skip: Effects to leave out.
             vetoed: Effects to try in spite of a veto.
-            known: A fit with one that is left out; where it explains everything, what stays far from it is
-                not fitted to the end.
+            known: A fit with one that is left out: what stays far behind it is not fitted to the end.
         """
         out = {*present.effects, *(set(self.vetoes) - set(vetoed)), *skip, JITTER}
-        white = 0.0 if self.behind_jitter else EXPLAINED * self.floor
-        least = known.rmse if known is not None and known.rmse < white else np.inf
-        names = [name for name in self.candidates if name not in out]
-        starts = {name: self.sized(present, name) for name in names}
-        flat = [(name, start) for name in names for start in starts[name]]
+        starts = {name: self.sized(present, name) for name in self.candidates if name not in out}
+        flat = [(name, start) for name, given in starts.items() for start in given]
         if not flat:
             return {}
-        promise = self.run(
-            [("promise", {"fit": present, "starts": [s for _, s in flat], "scales": self.scales})]
-        )[0]
-        self.promised = {
-            name: max(float(promise[i]) for i, (own, _) in enumerate(flat) if own == name) for name in names
-        }
-        order: dict[str, list[int]] = {name: [] for name in names}
+        call = {"fit": present, "starts": [start for _, start in flat], "scales": self.scales}
+        promise = self.run([("promise", call)])[0]
+        best_first: dict[str, list[dict[str, float]]] = {}
+        self.promised = {}
         for i in np.argsort(-promise):
-            order[flat[i][0]].append(int(i))
-        ranked = sorted(names, key=lambda name: -promise[order[name][0]])[:SHORT_LIST]
-
-        def screen(chosen: Sequence[str]) -> list[JointFit]:
-            calls = [
-                self.call(
-                    present,
-                    name,
-                    self.starts(present, best_two([flat[i][1] for i in order[name]])),
-                    SCREEN_ITERATIONS,
-                )
-                for name in chosen
+            name, start = flat[i]
+            best_first.setdefault(name, []).append(start)
+            self.promised.setdefault(name, float(promise[i]))
+        screened = self.run(
+            [
+                self.call(present, name, self.starts(present, best_two(given)), SCREEN_ITERATIONS)
+                for name, given in list(best_first.items())[:SHORT_LIST]
             ]
-            return self.run(calls)
-
-        screened = screen(ranked[:FIRST])
-        rest = ranked[FIRST:]
-        if min(least, *(fit.rmse for fit in screened)) < white:
-            # What explains everything has only those to fear that promised nearly as much.
-            enough = ALIKE * promise[order[ranked[0]][0]]
-            rest = [name for name in rest if promise[order[name][0]] > enough]
-        screened += screen(rest)
-        screened.sort(key=lambda fit: fit.rmse)
-        finalists = [fit for fit in screened[:FINALISTS] if fit.rmse < BEHIND * screened[0].rmse]
-
-        def go_on(chosen: Sequence[JointFit], iterations: int) -> list[JointFit]:
-            return self.run([self.call(present, f.effects[-1], [f.values], iterations) for f in chosen])
-
-        if len(finalists) > 1 or np.isfinite(least):
-            finalists = sorted(go_on(finalists, HALF_ITERATIONS), key=lambda fit: fit.rmse)
-        # The fit of what does nothing is not finished, but that of the best is.
-        most = max(finalists[0].rmse, white, IDLE * present.rmse)
-        most = min(most, HOPELESS * min(finalists[0].rmse, least))
-        near = [fit for fit in finalists if fit.rmse <= most]
-        last = [*go_on(near, FULL_ITERATIONS), *finalists[len(near) :]]
-        fits = {fit.effects[-1]: fit for fit in (*last, *screened[len(finalists) :])}
-        return fits
+        )
+        least = min(fit.rmse for fit in (*screened, *([] if known is None else [known])))
+        near = sorted((fit for fit in screened if fit.rmse < BEHIND * least), key=lambda fit: fit.rmse)
+        calls = [self.call(present, f.effects[-1], [f.values], FULL_ITERATIONS) for f in near[:FINALISTS]]
+        return {fit.effects[-1]: fit for fit in (*screened, *self.run(calls))}
 
     def sized(self, present: JointFit, name: str) -> list[dict[str, float]]:
         """Starting values of an effect added to a model: none that differ only in what that does not fit."""
         starts = sizes(name, self.others, self.scales)
         return [start for start in starts if all("." in key or key in present.values for key in start)]
-
-    def tried_beside(
-        self, without: JointFit, present: JointFit, skip: Sequence[str]
-    ) -> dict[str, JointFit] | None:
-        """The fits with other effects in the place of a model's last, if it was chosen from among them."""
-        before, *fits = self.added.get(frozenset(without.effects), (None,))
-        if before is None or not any(fit is present for fit in fits) or without.rmse < BETTER * before.rmse:
-            return None
-        if {*BEHIND_SENSOR} & {*self.vetoes}:
-            return None  # these are tried here, and were not there
-        return {fit.effects[-1]: fit for fit in fits if fit.effects[-1] not in skip}
 
     def plain(self, baseline: JointFit) -> Call:
         """The call that fits the plain model anew."""
@@ -202,6 +148,15 @@ class CandidateFits:
                 "refits": self.refits if iterations == FULL_ITERATIONS else 0,
             },
         )
+
+    def without(self, present: JointFit, name: str) -> JointFit:
+        """The fit without one of a model's effects: the one to which it was added where that is as good.
+
+        What was fitted beside that one is known.
+        """
+        fit = self.refit(present, [effect for effect in present.effects if effect != name])
+        seen = self.seen.get(frozenset(fit.effects), fit)
+        return seen if BETTER * seen.rmse <= fit.rmse else fit
 
     def refit(self, present: JointFit, effects: Sequence[str]) -> JointFit:
         """The fit with only some of a model's effects."""

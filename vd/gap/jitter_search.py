@@ -135,5 +135,5 @@ def behind(search: Search, weighting: SampleWeighting) -> Search:
         behind_jitter=True,
         report=lambda line: search.report(f"beside {JITTER}: {line}"),
         promised={},
-        added={},
+        seen={},
     )

@@ -20,7 +20,7 @@ from vd.gap.verdict import Verdicts
 
 MAX_EFFECTS = 3
 MAX_ROUNDS = 6
-"""Rounds in all, with those after a revision."""
+"""Forward steps, some of which a backward step takes back."""
 UNEARNED = float(np.hypot(1.0, MIN_GAIN_FLOORS))
 """Error, in noise floors, from which down to the floor no further effect can close what it has to."""
 SEARCH_TAIL = 0.4
@@ -32,9 +32,6 @@ earned is not lost to the luck of another local fit."""
 GROWN = 1.5
 """Spread of the samples of a motion, in that of the noise alone, from which they are weighted. Motions that
 do not let errors grow have 1.05 at most (our choice)."""
-
-Rivals = dict[str, list[JointFit]]
-"""Fits with others in the place of an effect, by its name."""
 
 
 @dataclass(kw_only=True)
@@ -78,113 +75,70 @@ class Search(CandidateFits, Verdicts):
                 ]
             )
 
-        return replace(self, run=run, clocked=True, promised={}, added={})
+        return replace(self, run=run, clocked=True, promised={}, seen={})
 
-    def search(self, baseline: JointFit) -> tuple[JointFit, Rivals, list[Trial]]:
-        """Forward and backward steps from the plain model; what is added is tentative until the end."""
-        present, trials, tried, rivals = baseline, [], 0, {}
-        while tried < MAX_ROUNDS:
-            begun = set(present.effects)
-            longer, added, rows = self.extend(present, tried)
-            trials += rows
-            tried = max((row.round for row in rows), default=MAX_ROUNDS)
-            rivals.update(added)
-            grown = longer is not present
-            present = longer
-            if not grown or self.clock_sensitivity(present):
-                break
-            if len(present.effects) > 1:
-                revised, rivals = self.revise(present)
-                settled = set(revised.effects) in (set(present.effects), begun)  # or back where it began
-                present = revised
-                if settled:
-                    break
-            if self.is_last(present):
-                break
-        return present, rivals, trials
-
-    def extend(self, present: JointFit, done: int) -> tuple[JointFit, Rivals, list[Trial]]:
-        """Add effects one by one while they are earned.
+    def search(self, baseline: JointFit) -> tuple[JointFit, list[Trial]]:
+        """Forward steps from the plain model, each checked backward; what they add is tentative.
 
         Returns:
-            The larger model, the fits with others in the place of each added effect, and the evidence.
+            The model, and the evidence.
         """
-        rivals: Rivals = {}
-        trials: list[Trial] = []
-        for number in range(done + 1, MAX_ROUNDS + 1):
-            fits = self.fit_candidates(present)
+        present, trials, visited = baseline, [], {frozenset[str]()}
+        for number in range(1, MAX_ROUNDS + 1):
+            fits = {} if self.is_last(present) else self.fit_candidates(present)
             if not fits:
                 break
             best = self.winner(list(fits.values()))
-            accepted, why = self.better(present, best, SEARCH_TAIL)
-            trials += self.judge(number, present, fits, best, accepted, why)
+            earned, why = self.better(present, best, SEARCH_TAIL)
+            trials += self.judge(number, present, fits, best, earned, why)
             trials += self.screened_out(number, present, fits)
-            if not accepted:
+            if not earned:
                 break
             name, before, after = best.effects[-1], present.held_out_rmse, best.held_out_rmse
             self.report(f"+ {name}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
-            rivals[name] = list(fits.values())
-            self.added[frozenset(present.effects)] = (present, *fits.values())
-            present = best
-            if self.is_last(present):
-                break
-        return present, rivals, trials
+            self.seen[frozenset(present.effects)] = present
+            present = self.revise(best)
+            if frozenset(present.effects) in visited:
+                break  # back where it was before
+            visited.add(frozenset(present.effects))
+        return present, trials
 
     def is_last(self, present: JointFit) -> bool:
         """Whether no further effect is to be added to a model."""
         full = len(present.effects) >= MAX_EFFECTS
         return full or self.no_gap(present) or self.clock_sensitivity(present) is not None
 
-    def revise(self, present: JointFit) -> tuple[JointFit, Rivals]:
-        """Backward check: drop what is not needed, exchange what another effect does better.
-
-        Returns the revised model and, for each of its effects, the fits with others in its place.
-        """
-        rivals: Rivals = {}
+    def revise(self, present: JointFit) -> JointFit:
+        """Backward check: drop what is not needed, exchange what another effect does better."""
         for _ in range(MAX_EFFECTS):
-            rivals, changed = {}, False
-            for name in present.effects:
-                if len(present.effects) < 2:
-                    break
-                without = self.refit(present, [e for e in present.effects if e != name])
-                if not self.better(without, present, KEEP_TAIL)[0]:
-                    self.report(f"- {name}: not needed beside the others")
-                    present, changed = without, True
-                    break
-                rivals[name] = self.rivals(present, name, without)
-                best = self.winner([fit for fit in rivals[name] if not set(fit.effects) & set(self.vetoes)])
-                simpler = len(best.x) < len(present.x)
-                if best is not present and (simpler or not self.tied(best, present)[0]):
-                    self.report(f"~ {name} exchanged for {best.effects[-1]}")
-                    present, changed = best, True
-                    break
-            if not changed:
+            changed = self._revised(present)
+            if changed is None:
                 break
-        return present, rivals
+            present = changed
+        return present
+
+    def _revised(self, present: JointFit) -> JointFit | None:
+        """The model without an effect that it does not need, or with a better one in its place, or None."""
+        for name in present.effects if len(present.effects) > 1 else ():
+            without = self.without(present, name)
+            if not self.better(without, present, KEEP_TAIL)[0]:
+                self.report(f"- {name}: not needed beside the others")
+                return without
+            fits = self.rivals(present, name, without)
+            best = self.winner([fit for fit in fits if not set(fit.effects) & set(self.vetoes)])
+            simpler = len(best.x) < len(present.x)
+            if best is not present and (simpler or not self.tied(best, present)[0]):
+                self.report(f"~ {name} exchanged for {best.effects[-1]}")
+                return best
+        return None
 
     def rivals(self, present: JointFit, name: str, without: JointFit | None = None) -> list[JointFit]:
         """The model itself, and fits with other effects in the place of one of its own."""
-        if without is None:
-            without = self.refit(present, [e for e in present.effects if e != name])
+        without = self.without(present, name) if without is None else without
         # Beside Coulomb friction, a friction that contains it is no other cause.
         contains = [c for c, simpler in NESTED.items() if set(simpler) & set(without.effects)]
-        skip, tried = (name, *contains), tuple(BEHIND_SENSOR)
-        fits = self.tried_beside(without, present, skip)
-        if fits is None:
-            fits = self.fit_candidates(without, skip=skip, vetoed=tried, known=present)
-        own = replace(present, effects=(*without.effects, name))  # by its last effect it is known
-        self.added[frozenset(without.effects)] = (without, own, *fits.values())
+        fits = self.fit_candidates(without, (name, *contains), tuple(BEHIND_SENSOR), known=present)
         return [present, *fits.values()]
-
-    def all_rivals(self, present: JointFit, rivals: Rivals) -> Rivals:
-        """Fits with others in the place of each effect of a model, made anew where they are of another."""
-        behind = set(BEHIND_SENSOR) & set(self.vetoes) & set(self.candidates)
-        stale = any(len(fit.effects) != len(present.effects) for fits in rivals.values() for fit in fits)
-        if not present.effects or JITTER in present.effects:
-            return rivals
-        if behind or stale or set(rivals) != set(present.effects):
-            return {name: self.rivals(present, name) for name in present.effects}
-        return rivals
 
     def judge(
         self,

@@ -28,7 +28,7 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
         return nothing
     if weighting := search.clock_sensitivity(baseline):  # with an identified limit in it
         return _explain_weighted(search, baseline, weighting)
-    present, rivals, rows = search.search(baseline)
+    present, rows = search.search(baseline)
     trials = [*search.contradicted(baseline), *rows]
     if weighting := search.clock_sensitivity(present):
         return _explain_weighted(search, baseline, weighting)
@@ -36,18 +36,15 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
         earned, why = search.better(baseline, present)
         if not earned:
             search.report(f"taken back: {why}")
-            present, rivals = baseline, {}
+            present = baseline
     known = ()
     if not search.no_gap(present) and present.rmse > UNEARNED * search.floor:
         found, known, rows = try_jitter(search, explain, baseline, present)
-        if found is not present:
-            present, rivals = found, {}
-            if JITTER not in present.effects:
-                present, rivals = search.revise(present)
+        present = found if found is present or JITTER in found.effects else search.revise(found)
         trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
-    rivals = search.all_rivals(present, rivals)
     evidence = search.settle(trials, present)
     random = JITTER in present.effects
+    rivals = {} if random else {name: search.rivals(present, name) for name in present.effects}
     refined = None if random or not present.effects else search.refined(present)
     found = search.conclude(baseline, present, rivals, evidence, loose, refined, known)
     return found if random else _with_notes(search, found)
