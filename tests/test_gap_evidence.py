@@ -9,17 +9,17 @@ from gap_recordings import FLOOR, made_up
 import vd.kernels.servo.actuators as servo
 from vd.gap.consensus import share
 from vd.gap.coordinates import Coordinate
+from vd.gap.evidence import Evidence
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.statistics import resamples
-from vd.gap.verdict import Verdicts
 
 
 @pytest.fixture
-def judge() -> Verdicts:
-    return Verdicts(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
+def judge() -> Evidence:
+    return Evidence(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
 
 
-def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(judge: Verdicts) -> None:
+def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(judge: Evidence) -> None:
     before, name = made_up((), 0.010), ("backlash",)
     assert judge.better(before, made_up(name, 0.005))[0]
     assert not judge.better(before, made_up(name, 0.0097))[0]
@@ -31,14 +31,14 @@ def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(
     assert not accepted and "noise floor" in why
 
 
-def test_a_tie_on_unseen_motions_is_a_set(judge: Verdicts) -> None:
+def test_a_tie_on_unseen_motions_is_a_set(judge: Evidence) -> None:
     noise = np.random.default_rng(1).normal(0.0, 1e-3, 10)
     winner = made_up(("coulomb_friction",), 0.004)
     assert judge.tied(winner, made_up(("dead_zone",), 0.004 + noise - noise.mean()))[0]
     assert not judge.tied(winner, made_up(("backlash",), 0.006))[0]
 
 
-def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: Verdicts) -> None:
+def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: Evidence) -> None:
     simple = made_up(("coulomb_friction",), 1.000e-3)
     fuller = made_up(("stribeck_friction",), 0.970e-3, fitted=0.999e-3)
     assert judge.winner([fuller, simple]) is simple
@@ -96,6 +96,6 @@ def test_a_friction_that_changes_from_motion_to_motion_is_no_name(falls: float, 
     )
     gap = count * (10.0 * FLOOR) ** 2
     plain = replace(final, effects=(), held_out=gap, sse=gap)
-    judge = Verdicts(floor=FLOOR, weights=resamples(len(when), np.random.default_rng(0)), when=when)
+    judge = Evidence(floor=FLOOR, weights=resamples(len(when), np.random.default_rng(0)), when=when)
     found = judge.conclude(plain, final, {"coulomb_friction": [final]}, [], "")
     assert found.verdict == verdict and ("changes" in found.reason) == bool(falls)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from vd.gap.coordinates import Scales, best_two, sizes, torque_power
+from vd.gap.evidence import JITTER
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import JITTER
 from vd.kernels.servo.effects import EFFECTS, equivalent
 
 SHORT_LIST = 10

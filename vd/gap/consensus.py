@@ -3,10 +3,9 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from vd.gap.evidence import MIN_GAIN, explains
 from vd.gap.explanation import NAMED, Explanation, estimates, intervals
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import MIN_GAIN
-from vd.gap.verdict import explains
 from vd.gap.warming import LEVELS
 
 OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}

@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vd.gap.candidates import FULL_ITERATIONS
+from vd.gap.evidence import EXCESS_FLOORS, JITTER, NESTED, NO_GAP, cancelled, explains
 from vd.gap.explanation import NAMED, Accepted, Explanation, polished
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXCESS_FLOORS, JITTER, NESTED, NO_GAP
 from vd.gap.masses import Masses, fit_masses, widened, with_free_masses
 from vd.gap.one_joint import REFITS, Explained, Joint, rest
-from vd.gap.verdict import cancelled, explains
 from vd.gap.worker_pool import WorkerPool, parallel
 from vd.kernels.servo.effects import EFFECTS
 

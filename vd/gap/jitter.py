@@ -16,9 +16,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from vd.gap.coordinates import Scales, coordinate
+from vd.gap.evidence import JITTER
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import JITTER
 from vd.gap.rollout import Rollouts
 from vd.gap.sample_weighting import SampleWeighting
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from vd.gap.candidates import Call
+from vd.gap.evidence import JITTER, REPEATABLE
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import JITTER, NO_GAP, REPEATABLE
 from vd.gap.sample_weighting import SampleWeighting
 from vd.gap.search import Search
 
@@ -56,14 +56,11 @@ def try_jitter(
     others = [name for name in random.effects if name != JITTER]
     if others:
         rest = search.refit(random, others)
-        if search.white(rest) and not search.better(rest, random)[0]:
+        if search.white(rest) and not search.likelier(rest, random)[0]:
             # No jitter is needed: it has only smoothed the way to where the search before did not come.
             search.report(f"+ {' and '.join(others)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")
             return rest, (), []
-    accepted, why = search.better(present, random)
-    if not accepted and len(random.effects) <= len(present.effects) and left < NO_GAP * search.floor:
-        # In the place of as many effects they are no further one.
-        accepted = search.likelier(present, random)
+    accepted, why = search.likelier(present, random)
     if left > REPEATABLE * search.floor:
         accepted, why = False, f"leaves {left / search.floor:.1f} noise floors besides, more than chance does"
     gain, ci = search.gain(present, random)

@@ -8,10 +8,10 @@ import numpy as np
 
 from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.consensus import no_constant_friction, share
+from vd.gap.evidence import JITTER
 from vd.gap.explanation import Explanation, polished
 from vd.gap.finger_masses import masses_alone, masses_beside
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import JITTER
 from vd.gap.masses import widened
 from vd.gap.one_joint import REFITS, Explained, Explainer, Joint, beside, weighting_of
 from vd.gap.worker_pool import WorkerPool, parallel

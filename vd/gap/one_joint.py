@@ -10,10 +10,10 @@ import numpy as np
 from vd.gap.candidates import alike, stood_for
 from vd.gap.chain import candidates, others_in
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
+from vd.gap.evidence import EXPLAINED, JITTER
 from vd.gap.explanation import Explanation
 from vd.gap.jitter_search import FIXED
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXPLAINED, JITTER
 from vd.gap.recording import Recording
 from vd.gap.search import Search
 from vd.gap.select import explain

@@ -1,6 +1,6 @@
 """Search for the effects that a joint's servo lacks: forward selection with full refits, checked backward.
 
-A step of the search is tentative; :mod:`vd.gap.verdict` has the last word.
+A step of the search is tentative; :mod:`vd.gap.evidence` has the last word.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from vd.gap.candidates import Call, CandidateFits
+from vd.gap.evidence import JITTER, MIN_GAIN_FLOORS, NESTED, Evidence
 from vd.gap.explanation import Trial
 from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import JITTER, MIN_GAIN_FLOORS, NESTED
 from vd.gap.sample_weighting import SampleWeighting
 from vd.gap.telemetry import BEHIND_SENSOR
-from vd.gap.verdict import Verdicts
 
 MAX_EFFECTS = 3
 MAX_ROUNDS = 6
@@ -35,7 +34,7 @@ do not let errors grow have 1.05 at most (our choice)."""
 
 
 @dataclass(kw_only=True)
-class Search(CandidateFits, Verdicts):
+class Search(CandidateFits, Evidence):
     """Forward and backward selection for one joint.
 
     Attributes:

@@ -2,14 +2,13 @@
 
 from dataclasses import replace
 
+from vd.gap.evidence import JITTER, cancelled
 from vd.gap.explanation import Explanation
 from vd.gap.jitter_search import try_jitter
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import JITTER
 from vd.gap.sample_weighting import SampleWeighting
 from vd.gap.search import MAX_ROUNDS, UNEARNED, Search
 from vd.gap.telemetry import BEHIND_SENSOR
-from vd.gap.verdict import cancelled
 
 MIN_TRAJECTORIES = 3
 WEIGHTED = "where errors of the recording's clock grow, samples count by how surely they are known"
