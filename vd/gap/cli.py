@@ -2,6 +2,7 @@
 
 import json
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,8 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
 
+SILENT_S = 10.0
+"""Longest time without a line while something is simulated [s]."""
 OK, UNUSABLE = 0, 2
 """Exit statuses: a verdict was reached, something else is wrong, the recording cannot be used."""
 
@@ -257,6 +260,14 @@ class Identify:
             flush=True,
         )
 
+        told = time.monotonic()
+
+        def working(share: float) -> None:
+            nonlocal told
+            if time.monotonic() - told > SILENT_S:
+                told = time.monotonic()
+                print(f"  {100.0 * share:.0f} % of a generation", file=sys.stderr, flush=True)
+
         def show(generation: int, best: dict[str, float]) -> None:
             errors = ", ".join(f"{finger} {1e3 * error:.2f} mrad" for finger, error in best.items())
             print(f"generation {generation}/{self.generations}: {errors}", file=sys.stderr, flush=True)
@@ -270,6 +281,7 @@ class Identify:
             device=resolve_device(self.device),
             seed=self.seed,
             progress=show,
+            working=working,
         )
         write_drives(found, self.out, hand, recording, every_finger=self.every_finger)
         if self.json:
