@@ -7,10 +7,10 @@ import pytest
 from gap_recordings import FLOOR, made_up
 
 import vd.kernels.servo.actuators as servo
-from vd.gap.consensus import share
 from vd.gap.coordinates import Coordinate
 from vd.gap.evidence import Evidence
 from vd.gap.explanation import Accepted, Explanation
+from vd.gap.joints import share
 from vd.gap.statistics import resamples
 
 
@@ -58,8 +58,8 @@ def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:
         verdict = verdict or ("ambiguous" if tied else "effects")
         return Explanation(made_up((), 0.02), fits[0], verdict, "", (accepted,), (), {name: fits})
 
-    def names(*explanations: Explanation, groups: list[int] | None = None) -> list[str]:
-        shared = share(explanations, [FLOOR] * len(explanations), groups)
+    def names(*explanations: Explanation, groups: tuple[int, ...] = (0, 0)) -> list[str]:
+        shared = share(explanations, [FLOOR] * 2, groups, [lambda fit: fit] * 2)
         return [e.accepted[0].name if e.accepted[0].named else "?" for e in shared]
 
     one, other = explanation("backlash", "dead_zone"), explanation("backlash", "coulomb_friction")
@@ -67,9 +67,9 @@ def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:
     assert names(one, explanation("dead_zone")) == ["dead_zone", "dead_zone"]
     assert names(one, explanation("thermal_drift")) == ["?", "thermal_drift"]
     # Separate servos share gravity, not the play of one gear.
-    assert names(one, explanation("backlash"), groups=[0, 1]) == ["?", "backlash"]
+    assert names(one, explanation("backlash"), groups=(0, 1)) == ["?", "backlash"]
     load = explanation("encoder_bias", "gravity_load")
-    assert names(load, explanation("gravity_load"), groups=[0, 1]) == ["gravity_load", "gravity_load"]
+    assert names(load, explanation("gravity_load"), groups=(0, 1)) == ["gravity_load", "gravity_load"]
     # What comes nearest where nothing explains the gap settles no other joint's set.
     assert names(one, explanation("backlash", verdict="unknown"))[0] == "?"
 

@@ -7,9 +7,8 @@ import numpy as np
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.fit import RIDGE
-from vd.gap.joint_fit import JointFit
+from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.result import Verdict
-from vd.gap.sample_weighting import SampleWeighting
 from vd.gap.statistics import covariance, half_width
 from vd.kernels.servo.effects import EFFECTS
 

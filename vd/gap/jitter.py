@@ -3,7 +3,7 @@
 Many draws of the delays give the mean and variance of the position at every sample. The likelihood of
 what was measured, under a normal distribution with that mean and that variance on top of the noise
 floor, is maximised over the jitter's two parameters; the rest of the model is fitted through what the
-delays do to the samples (:mod:`vd.gap.sample_weighting`). The result stands in the table as the RMSE that a
+delays do to the samples (:mod:`vd.gap.joint_fit`). The result stands in the table as the RMSE that a
 normal distribution of constant width would need for the same likelihood.
 """
 
@@ -18,9 +18,8 @@ from scipy.optimize import minimize
 from vd.gap.coordinates import Scales, coordinate
 from vd.gap.evidence import JITTER
 from vd.gap.fit import JointProblem
-from vd.gap.joint_fit import JointFit
+from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
-from vd.gap.sample_weighting import SampleWeighting
 
 DRAWS = 16
 """Realisations of the delays."""

@@ -1,7 +1,7 @@
 """Random delays as the cause of what a search leaves, and the search for what there is beside them.
 
 No single prediction shows them (:mod:`vd.gap.jitter`). So the same search is made once more with samples
-weighted by what delays do (:mod:`vd.gap.sample_weighting`); they and what is found beside them are looked for
+weighted by what delays do (:mod:`vd.gap.joint_fit`); they and what is found beside them are looked for
 in turn.
 """
 
@@ -14,8 +14,7 @@ import numpy as np
 from vd.gap.candidates import Call
 from vd.gap.evidence import JITTER, REPEATABLE
 from vd.gap.explanation import Accepted, Explanation, Trial
-from vd.gap.joint_fit import JointFit
-from vd.gap.sample_weighting import SampleWeighting
+from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.search import Search
 
 Explain = Callable[[Search, JointFit], Explanation]

@@ -13,8 +13,7 @@ from vd.gap.candidates import Call, CandidateFits
 from vd.gap.evidence import JITTER, MIN_GAIN_FLOORS, NESTED, Evidence
 from vd.gap.explanation import Trial
 from vd.gap.jitter import CALLS
-from vd.gap.joint_fit import JointFit
-from vd.gap.sample_weighting import SampleWeighting
+from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.telemetry import BEHIND_SENSOR
 
 MAX_EFFECTS = 3
@@ -53,7 +52,7 @@ class Search(CandidateFits, Evidence):
         A profile of bounded acceleration that cannot follow its command turns at moments that hang on ever
         smaller things: a tenth of a millisecond is tens of milliradians some seconds later, and no fit of the
         right model leaves noise there. Weighted by how surely they are known
-        (:mod:`vd.gap.sample_weighting`), samples are noise again under the right model.
+        (:mod:`vd.gap.joint_fit`), samples are noise again under the right model.
         """
         if self.clocked or self.behind_jitter or JITTER in fit.effects or self.no_gap(fit):
             return None

@@ -306,8 +306,8 @@ def _close(analysis: Analysis, _: str) -> None:
 
 
 def _report(analysis: Analysis, _: str) -> None:
-    from vd.gap.cautions import cautions
     from vd.gap.plan import PLAN_JSON
+    from vd.gap.recording_checks import cautions
     from vd.gap.report import write_report
 
     closing = from_dict(Closing, json.loads((analysis.out / CLOSE).read_text()))

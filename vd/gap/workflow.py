@@ -21,12 +21,12 @@ from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.chain import Chain, chains
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.design import design, pieces
+from vd.gap.explain import POLISH_ITERATIONS, REFITS, Explainer, Joint, Progress
 from vd.gap.find import findings
 from vd.gap.fit_cache import FOLDER, FitCache
 from vd.gap.joint_fit import JointFit
 from vd.gap.joints import explain_joints
 from vd.gap.launch_batch import LaunchBatch
-from vd.gap.one_joint import POLISH_ITERATIONS, REFITS, Explainer, Joint, Progress
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S

@@ -1,7 +1,7 @@
-"""Explain one joint of a finger, knowing what the others of it have been found to lack."""
+"""Explain one joint: search, weigh samples that say little, try random delays, conclude."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -10,18 +10,90 @@ import numpy as np
 from vd.gap.candidates import alike, stood_for
 from vd.gap.chain import candidates, others_in
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.evidence import EXPLAINED, JITTER
+from vd.gap.evidence import EXPLAINED, JITTER, cancelled, middles
 from vd.gap.explanation import Explanation
-from vd.gap.jitter_search import FIXED
-from vd.gap.joint_fit import JointFit
+from vd.gap.jitter_search import FIXED, try_jitter
+from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.recording import Recording
-from vd.gap.search import Search
-from vd.gap.select import explain
+from vd.gap.search import MAX_ROUNDS, UNEARNED, Search
 from vd.gap.statistics import resamples
-from vd.gap.telemetry import vetoes
-from vd.gap.warming import middles
+from vd.gap.telemetry import BEHIND_SENSOR, vetoes
 from vd.gap.worker_pool import JointSpec, WorkerPool
 from vd.kernels.servo.effects import EFFECTS
+
+MIN_TRAJECTORIES = 3
+WEIGHTED = "where errors of the recording's clock grow, samples count by how surely they are known"
+"""What a reason says of it."""
+
+
+def explain(search: Search, baseline: JointFit) -> Explanation:
+    """Select effects, starting from the fitted plain model.
+
+    Args:
+        search: Of the joint.
+        baseline: The plain model.
+    """
+    loose = search.undetermined(baseline)
+    if nothing := _nothing_to_explain(search, baseline, loose):
+        return nothing
+    if weighting := search.clock_sensitivity(baseline):  # with an identified limit in it
+        return _explain_weighted(search, baseline, weighting)
+    present, rows = search.search(baseline)
+    trials = [*search.contradicted(baseline), *rows]
+    if weighting := search.clock_sensitivity(present):
+        return _explain_weighted(search, baseline, weighting)
+    if present.effects:
+        earned, why = search.better(baseline, present)
+        if not earned:
+            search.report(f"taken back: {why}")
+            present = baseline
+    known = ()
+    if not search.no_gap(present) and present.rmse > UNEARNED * search.floor:
+        found, known, rows = try_jitter(search, explain, baseline, present)
+        present = found if found is present or JITTER in found.effects else search.revise(found)
+        trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
+    evidence = search.settle(trials, present)
+    random = JITTER in present.effects
+    rivals = {} if random else {name: search.rivals(present, name) for name in present.effects}
+    refined = None if random or not present.effects else search.refined(present)
+    found = search.conclude(baseline, present, rivals, evidence, loose, refined, known)
+    return found if random else _with_notes(search, found)
+
+
+def _nothing_to_explain(search: Search, baseline: JointFit, loose: str) -> Explanation | None:
+    """The explanation of a joint whose plain model leaves nothing to search for, or cannot be judged."""
+    if len(baseline.sse) < MIN_TRAJECTORIES:
+        text = f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_TRAJECTORIES} at least"
+        return Explanation(baseline, baseline, "under_excited", text)
+    if not search.no_gap(baseline):
+        return None
+    text = "the plain model is within the noise floor"
+    return Explanation(baseline, baseline, "under_excited" if loose else "no_gap", loose or text)
+
+
+def _explain_weighted(search: Search, baseline: JointFit, weighting: SampleWeighting) -> Explanation:
+    """What a search finds with samples weighted by how surely they are known, which says so."""
+    search.report("errors of the clock grow: samples are weighted by how surely they are known")
+    inner = search.weighted(weighting)
+    found = explain(inner, inner.run([inner.plain(baseline)])[0])
+    return replace(found, weighting=weighting, reason=f"{found.reason}; {WEIGHTED}")
+
+
+def _with_notes(search: Search, explanation: Explanation) -> Explanation:
+    """The explanation with what its names do not say.
+
+    What a member of a set means that telemetry contradicts by its name; and no names where two effects are
+    but one that is not in the table.
+    """
+    alike = cancelled(explanation.final, search.joint, search.rest)
+    if alike and explanation.verdict in ("effects", "ambiguous"):
+        return replace(explanation, verdict="unknown", reason=alike)
+    tied = {name for one in explanation.accepted for name in one.tied}
+    notes = [
+        f"{name} {BEHIND_SENSOR[name]}" for name in sorted(tied & set(BEHIND_SENSOR) & set(search.vetoes))
+    ]
+    return replace(explanation, reason="; ".join([explanation.reason, *notes]))
+
 
 POLISH_ITERATIONS = 5
 """Steps of a fit that has to follow small changes of the other joints."""
@@ -65,7 +137,7 @@ class Explainer:
 
     @cached_property
     def when(self) -> np.ndarray:
-        """When each trajectory was recorded (:func:`vd.gap.warming.middles`)."""
+        """When each trajectory was recorded (:func:`vd.gap.evidence.middles`)."""
         return middles(self.pool.problems.recording)
 
     def explain(self, joint: Joint, explained: Explained) -> Explanation:
