@@ -11,7 +11,7 @@ from vd.gap.candidates import alike, stood_for
 from vd.gap.chain import candidates, others_in
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.evidence import EXPLAINED, JITTER, cancelled, middles
-from vd.gap.explanation import Explanation
+from vd.gap.explanation import Accepted, Explanation
 from vd.gap.jitter_search import FIXED, try_jitter
 from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.recording import Recording
@@ -47,7 +47,7 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
         if not earned:
             search.report(f"taken back: {why}")
             present = baseline
-    known = ()
+    known: tuple[Accepted, ...] = ()
     if not search.no_gap(present) and present.rmse > UNEARNED * search.floor:
         found, known, rows = try_jitter(search, explain, baseline, present)
         present = found if found is present or JITTER in found.effects else search.revise(found)
@@ -56,8 +56,8 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
     random = JITTER in present.effects
     rivals = {} if random else {name: search.rivals(present, name) for name in present.effects}
     refined = None if random or not present.effects else search.refined(present)
-    found = search.conclude(baseline, present, rivals, evidence, loose, refined, known)
-    return found if random else _with_notes(search, found)
+    result = search.conclude(baseline, present, rivals, evidence, loose, refined, known)
+    return result if random else _with_notes(search, result)
 
 
 def _nothing_to_explain(search: Search, baseline: JointFit, loose: str) -> Explanation | None:
