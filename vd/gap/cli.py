@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
@@ -96,30 +96,34 @@ class Run(_Step):
 
 
 @dataclass(frozen=True)
-class Find(_Step):
+class _OneStep(_Step):
+    name: ClassVar[str]
+
+    def run(self) -> int:
+        """Run the step."""
+        analysis = self.analysis()
+        analysis.run(self.name, first=self.name, fresh=self.fresh)
+        path = analysis.out / f"{self.name}.json"
+        print(path.read_text() if self.json else path)
+        return OK
+
+
+class Find(_OneStep):
     """Fit the plain servo model of every joint, and say where and in what motion it fails."""
 
-    def run(self) -> int:
-        """Run the step."""
-        return _print_step(self, "find", "find.json")
+    name = "find"
 
 
-@dataclass(frozen=True)
-class Explain(_Step):
+class Explain(_OneStep):
     """Try every effect on motions that the fit has not seen, and name what is missing, or abstain."""
 
-    def run(self) -> int:
-        """Run the step."""
-        return _print_step(self, "explain", "explain.json")
+    name = "explain"
 
 
-@dataclass(frozen=True)
-class Close(_Step):
+class Close(_OneStep):
     """Write identified.usda and simulate the recorded commands again with it, a hand in Newton."""
 
-    def run(self) -> int:
-        """Run the step."""
-        return _print_step(self, "close", "close.json")
+    name = "close"
 
 
 @dataclass(frozen=True)
@@ -327,14 +331,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("vd-gap: stopped; the same command goes on with the step it was in", file=sys.stderr)
         return interrupt.INTERRUPTED
-
-
-def _print_step(step: _Step, name: str, file: str) -> int:
-    analysis = step.analysis()
-    analysis.run(name, first=name, fresh=step.fresh)
-    path = analysis.out / file
-    print(path.read_text() if step.json else path)
-    return OK
 
 
 def _print_report(analysis: "Analysis", as_json: bool) -> int:
