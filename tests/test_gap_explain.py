@@ -85,7 +85,7 @@ ALIKE = {
         {servo.FRICTION_PLUS: 0.09, servo.FRICTION_MINUS: 0.04},
         ("coulomb_friction", "asymmetric_friction", "encoder_bias", "gravity_load"),
         {"asymmetric_friction"},
-        ("asymmetric_friction", "coulomb_friction", "encoder_bias"),
+        ("asymmetric_friction", "coulomb_friction", "dead_zone", "encoder_bias"),
     ),
     "a direction beside Stribeck friction": (
         {**STRIBECK, servo.FRICTION_PLUS: 0.05},
