@@ -10,7 +10,7 @@ import vd.kernels.servo.actuators as servo
 from vd.gap.coordinates import Coordinate
 from vd.gap.evidence import Evidence
 from vd.gap.explanation import Accepted, Explanation
-from vd.gap.joints import share
+from vd.gap.joints import doubted, share
 from vd.gap.statistics import resamples
 
 
@@ -72,6 +72,18 @@ def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:
     assert names(load, explanation("gravity_load"), groups=(0, 1)) == ["gravity_load", "gravity_load"]
     # What comes nearest where nothing explains the gap settles no other joint's set.
     assert names(one, explanation("backlash", verdict="unknown"))[0] == "?"
+
+
+def test_a_cause_outside_the_table_on_one_joint_of_a_finger_is_one_on_the_others() -> None:
+    def explanation(*names: str, verdict: str = "effects", warms: bool = False) -> Explanation:
+        return Explanation(made_up((), 0.02), made_up(names, 0.001), verdict, "", warms=warms)
+
+    pair, friction = ("gravity_load", "encoder_bias"), "coulomb_friction"
+    spring, warm = explanation(*pair, verdict="unknown"), explanation(friction, verdict="unknown", warms=True)
+    for other, mine in ((spring, explanation(*pair)), (warm, explanation(friction, "backlash"))):
+        found = doubted([other, mine, mine], [0, 0, 1])
+        assert [e.verdict for e in found] == ["unknown", "unknown", "effects"]
+        assert doubted([other, explanation("backlash")], [0, 0])[1].verdict == "effects"
 
 
 @pytest.mark.parametrize(("falls", "verdict"), [(0.0, "effects"), (-0.8, "unknown")])

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from vd.gap.candidates import FULL_ITERATIONS
-from vd.gap.evidence import JITTER, LEVELS, MIN_GAIN, explains
+from vd.gap.evidence import CANCELLING, JITTER, LEVELS, MIN_GAIN, explains
 from vd.gap.explain import REFITS, Explained, Explainer, Joint, beside, weighting_of
 from vd.gap.explanation import NAMED, Explanation, estimates, intervals, polished
 from vd.gap.joint_fit import JointFit
@@ -19,6 +19,9 @@ OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag",
 
 CHANGING = "its friction changes over the recording, as another joint of the finger shows"
 """Why a constant friction is no name, nor what is found beside it."""
+
+SPRUNG = f"{explains(CANCELLING)} here, but cancel at rest on another joint of the finger, as a spring does"
+"""Why a load and an offset are no names."""
 
 Polish = Callable[[JointFit], JointFit]
 """Fits a model to the end."""
@@ -54,23 +57,31 @@ def share(
     return result
 
 
-def no_constant_friction(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[Explanation]:
-    """Explanations without a friction that is seen to change on another joint of the finger.
+def doubted(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[Explanation]:
+    """Explanations without what another joint of the finger shows to be a cause that is not in the table.
 
-    Where it moves only early in a recording, or late, a joint shows no change of its own, and a play or a
-    coupling stands for it.
+    A friction that changes there: where it moves only early in a recording, or late, a joint shows no change
+    of its own, and a play or a coupling stands for it. And a load and an offset that cancel at rest there:
+    where a joint travels little they imitate the same spring.
 
     Args:
         explanations: Of the joints.
         groups: Number of the finger of each joint.
     """
-    changing = {group for e, group in zip(explanations, groups, strict=True) if e.warms}
-    return [
-        replace(e, verdict="unknown", reason=CHANGING)
-        if group in changing and _answered(e) and {*LEVELS} & {*e.final.effects}
-        else e
-        for e, group in zip(explanations, groups, strict=True)
-    ]
+    both, pairs = {*CANCELLING}, list(zip(explanations, groups, strict=True))
+    changing = {group for e, group in pairs if e.warms}
+    sprung = {group for e, group in pairs if e.verdict == "unknown" and both <= {*e.final.effects}}
+
+    def judged(e: Explanation, group: int) -> Explanation:
+        if not _answered(e):
+            return e
+        if group in changing and {*LEVELS} & {*e.final.effects}:
+            return replace(e, verdict="unknown", reason=CHANGING)
+        if group in sprung and both == {*e.final.effects}:
+            return replace(e, verdict="unknown", reason=SPRUNG)
+        return e
+
+    return [judged(e, group) for e, group in pairs]
 
 
 def _answered(explanation: Explanation) -> bool:
@@ -141,7 +152,7 @@ def explain_joints(explainer: Explainer) -> list[Explanation]:
     alone = _in_turn(joints, one)
     ends = [partial(_finished, pool, list(zip(joints, alone, strict=True)), joint) for joint in joints]
     shared = share(alone, floors, fingers, ends)
-    return no_constant_friction(_consistent(pool, joints, masses_beside(pool, joints, shared)), fingers)
+    return doubted(_consistent(pool, joints, masses_beside(pool, joints, shared)), fingers)
 
 
 def _finished(pool: WorkerPool, known: Explained, joint: Joint, fit: JointFit) -> JointFit:
