@@ -93,6 +93,9 @@ JITTER_GAIN_FLOORS = 0.3
 """The same beside random delays: an effect of six floors leaves half of one there."""
 MEMORY = 8.0
 """Samples in a row that say the same beside them: what a late command does lasts that long."""
+MIN_SHARE = 0.02
+"""The same in whole gaps: no fit of a large effect is better than that. Of a friction of 97 noise floors a
+second effect came with a share of 0.015 that was not there."""
 PENALTY = 0.01
 """Relative RMSE that a further parameter must earn to be preferred."""
 TIE_TAIL = 0.05
@@ -137,6 +140,7 @@ class Evidence:
     Attributes:
         floor: Noise floor [rad].
         weights: Bootstrap weights of the trajectories [R, S].
+        whole: Held-out RMSE of the plain model [rad]; what is small beside it is a model's own error.
         moves: Whether the joint's command changes, of each trajectory [S]; None: in all.
         behind_jitter: Whether samples are weighted by what random delays do (:mod:`vd.gap.joint_fit`).
         equivalent: Effects that one stands for, since the recording cannot tell them apart.
@@ -146,6 +150,7 @@ class Evidence:
 
     floor: float
     weights: np.ndarray
+    whole: float = 0.0
     moves: np.ndarray | None = None
     behind_jitter: bool = False
     equivalent: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -206,7 +211,8 @@ class Evidence:
             after: The larger.
             tail: Share of the resamples that may see no gain.
         """
-        if self.white(before) or self.white(after):
+        white = self.white(before) or self.white(after)
+        if white:
             before, after = (replace(fit, held_out=fit.sse) for fit in (before, after))
         old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
         gain = 1.0 - after.held_out_rmse / before.held_out_rmse
@@ -215,6 +221,8 @@ class Evidence:
             return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
         if float(np.quantile(1.0 - new / old, tail)) <= 0.0:
             return False, "its gain over trajectories is not distinguishable from 0"
+        if closed < MIN_SHARE * self.whole and not white:
+            return False, "what it removes is small beside the whole gap"
         if closed < (JITTER_GAIN_FLOORS if self.behind_jitter else MIN_GAIN_FLOORS) * self.floor:
             return False, "what it removes is below the noise floor"
         return True, ""

@@ -33,7 +33,7 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
         search: Of the joint.
         baseline: The plain model.
     """
-    loose = search.undetermined(baseline)
+    loose, search.whole = search.undetermined(baseline), baseline.held_out_rmse
     if nothing := _nothing_to_explain(search, baseline, loose):
         return nothing
     if weighting := search.clock_sensitivity(baseline):  # with an identified limit in it
