@@ -3,7 +3,7 @@
 A step of the search is tentative; :mod:`vd.gap.evidence` has the last word.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,9 +27,16 @@ alone can make some motions worse."""
 KEEP_TAIL = 0.1
 """Share of the resamples that may see no gain from an effect that is in the model already: what was
 earned is not lost to the luck of another local fit."""
+PLAIN_FRICTION = "coulomb_friction"
 GROWN = 1.5
 """Spread of the samples of a motion, in that of the noise alone, from which they are weighted. Motions that
 do not let errors grow have 1.05 at most (our choice)."""
+
+
+def doubled(effects: Sequence[str]) -> list[str]:
+    """Frictions that one of a model is with other numbers, and that are none beside it."""
+    fuller = [name for name, simpler in NESTED.items() if PLAIN_FRICTION in simpler]
+    return fuller if PLAIN_FRICTION in effects else [PLAIN_FRICTION] if {*fuller} & {*effects} else []
 
 
 @dataclass(kw_only=True)
@@ -83,7 +90,7 @@ class Search(CandidateFits, Evidence):
         """
         present, trials, visited = baseline, [], {frozenset[str]()}
         for number in range(1, MAX_ROUNDS + 1):
-            fits = {} if self.is_last(present) else self.fit_candidates(present)
+            fits = {} if self.is_last(present) else self.fit_candidates(present, doubled(present.effects))
             if not fits:
                 break
             best = self.winner(list(fits.values()))
