@@ -1,8 +1,8 @@
 """How a goal's cloud has to be turned to lie on what a camera sees of an object, learned.
 
 A transformer reads patches of both clouds together, and predicts by how much the goal is still to be turned.
-From far off that is ambiguous, from near it is not: so many starts are improved by several passes, and the
-one with the least predicted error is kept.
+From far off that is ambiguous, from near it is not: so many starts are improved by several passes, and laid
+onto what is seen (:mod:`.icp`). What fits best is believed.
 
 B clouds, P points of a cloud, T tokens, E the width; N objects, H hypotheses. Clouds are in metres, in axes
 that goal and object share (the world's); a rotation turns the goal onto the object: seen ~ R goal + offset.
@@ -47,8 +47,6 @@ class Residual:
     """By how much the goal is still to be turned, matrices [B, 3, 3]."""
     offset: torch.Tensor
     """Where the goal's mean lies on the object, from the mean of what is seen [m] [B, 3]."""
-    error: torch.Tensor
-    """Angle by which that rotation is expected to be wrong [rad] [B]."""
 
 
 class Patches(nn.Module):
@@ -116,7 +114,7 @@ class AlignmentNetwork(nn.Module):
                 name: nn.Sequential(
                     nn.Linear(cfg.width, 2 * cfg.width), nn.GELU(), nn.Linear(2 * cfg.width, n)
                 )
-                for name, n in {"rotation": 6, "offset": 3, "error": 1}.items()
+                for name, n in {"rotation": 6, "offset": 3}.items()
             }
         )
 
@@ -136,11 +134,7 @@ class AlignmentNetwork(nn.Module):
             tokens = layer(tokens)
         summary = self.norm(last(tokens, first=1)[:, 0])
         found = {name: head(summary).float() for name, head in self.heads.items()}
-        return Residual(
-            matrices(found["rotation"]),
-            CLOUD_M * found["offset"],
-            functional.softplus(found["error"]).squeeze(-1),
-        )
+        return Residual(matrices(found["rotation"]), CLOUD_M * found["offset"])
 
     def forward(
         self, goal: torch.Tensor, seen: torch.Tensor, near: Sequence[torch.Tensor] | None = None
