@@ -1,4 +1,4 @@
-"""Iterated closest points to planes (Chen and Medioni 1992): clouds that lie nearly right are brought to lie right.
+"""Iterated closest points to planes (Chen and Medioni 1992): clouds that lie nearly right are laid right.
 
 B pairs of clouds, P points of a goal, S of what is seen. Metres.
 """
@@ -12,7 +12,7 @@ NEIGHBOURS = 12
 NEAREST = 0.9
 """Share of seen points that pull, the nearest: others may be the hand's, or of a side that a goal lacks."""
 UNIT_M = 0.08
-"""Unit of places [m], so that turns and shifts of a step count alike: half the length of the largest objects."""
+"""Unit of places [m], so that turns and shifts count alike: half the length of the largest objects."""
 DAMPING = 1e-4
 """Of steps that no plane hinders: along a flat face nothing tells where it is."""
 STEP_RAD = 0.2
