@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 
@@ -11,12 +13,16 @@ import pytest
 from simulated_clock import SimulatedClock
 
 from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop import run_page
 from vd.deploy.loop.log import LogWriter
 from vd.gap.recording import read_recording
-from vd.hand_log import JOINT_CHANNELS, STEP_COLUMNS, STEPS_FILE, TRUTH_COLUMNS, LogError, is_log, read_log
+from vd.hand_log import is_log, read_log
+from vd.log_format import FOUND_COLUMNS, JOINT_CHANNELS, STEP_COLUMNS, STEPS_FILE, TRUTH_COLUMNS, LogError
+from vd.mcap_log import McapLog
 from vd.play.cli import main as play
 from vd.play.replay import Replay
+from vd.render import OUT_OF_SIGHT
 
 STEPS = 30
 SENT_S = 0.02
@@ -34,13 +40,15 @@ def folder(tmp_path):
         "tolerance_rad": 1.0,
     }
     log = LogWriter(tmp_path / "log", hand, run, servo={"p_gain": 200}, truth=True, clock=clock)
+    log.also_to(lambda said: McapLog(tmp_path / "log.mcap", said, np.array(hand.workspace.goal_m)))
     for step in range(STEPS):
         wave = 0.3 * np.sin(0.5 * step + np.arange(9))
         joints = {channel: wave + 0.01 * i for i, channel in enumerate(JOINT_CHANNELS)}
         values = [float(step >= 10), 1.0, 0.5, 0.001, -0.03, 0.002, 0.02, 0.02, 0.0]
         assert len(values) == len(STEP_COLUMNS)
         now = clock.now()
-        log.step(now, now + SENT_S, joints, values, [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step])
+        truth, depth = [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step], np.full((2, 3), 0.5, np.float32)
+        log.step(now, now + SENT_S, joints, values, truth, [0.1 * step] * 7, depth)
         if step == 9:
             log.event("stop", goal=0, outcome="stopped", distance=0.2)
         clock.sleep(1 / 12)
@@ -63,6 +71,49 @@ def test_what_is_written_is_read(folder):
     assert len(TRUTH_COLUMNS) == 8
 
 
+def test_the_mcap_beside_it_has_all_of_it_and_ros_2_messages_for_others(folder, capsys):
+    reader = pytest.importorskip("mcap.reader")
+    from mcap_ros2.decoder import DecoderFactory
+
+    log, file = read_log(folder), folder.with_suffix(".mcap")
+    same = read_log(file)
+    assert is_log(file) and (same.run, same.events) == (log.run, log.events)
+    assert same.columns.keys() == log.columns.keys() >= set(FOUND_COLUMNS)
+    for name, values in same.columns.items():
+        np.testing.assert_allclose(values, log.columns[name], atol=1e-6)
+    with file.open("rb") as stream:
+        whole = reader.make_reader(stream, decoder_factories=[DecoderFactory()])
+        told = list(whole.iter_decoded_messages())
+    topics = [channel.topic for _, channel, _, _ in told]
+    assert (
+        topics.count("/joint_states") == topics.count("/goal_pose") == STEPS and topics.count("/depth") == 3
+    )
+    depth = told[topics.index("/depth")][3]
+    assert (depth.encoding, depth.height, depth.width) == ("16UC1", 2, 3)
+    assert np.frombuffer(depth.data, "<u2").tolist() == [500] * 6
+    pose = told[topics.index("/object_pose")][3]
+    assert pose.header.frame_id == "world" and (pose.pose.position.z, pose.pose.orientation.w) == (0.03, 1.0)
+    file.write_bytes(file.read_bytes()[:2000])
+    assert play([str(file)]) == 1 and "is damaged" in capsys.readouterr().err
+
+
+def test_rerun_reads_what_is_written_for_it(folder, tmp_path):
+    pytest.importorskip("rerun")
+    from vd.deploy.loop.rerun_log import RerunLog
+
+    hand, log, path = load_hand("dclaw3"), read_log(folder), tmp_path / "log.rrd"
+    sink = RerunLog(path, log.run, hand, load_set("cube")[0], hand.camera)
+    for step in range(STEPS):
+        sink.step({name: values[step] for name, values in log.columns.items()}, np.ones((2, 3), np.float32))
+    sink.event(log.events[0])
+    sink.close(log.run)
+    told = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "print", str(path)], capture_output=True, text=True
+    )
+    for name in ("/world/found", "/world/camera/depth", "/joints/position", "/loop/sent_s", "/events"):
+        assert name in told.stdout
+
+
 def test_a_log_is_shown(folder, tmp_path, capsys):
     shots = Replay(read_log(folder)).snapshots
     assert len(shots) == STEPS
@@ -71,6 +122,14 @@ def test_a_log_is_shown(folder, tmp_path, capsys):
     # Stopped 0.9 rad from its goal.
     assert [shot.success for shot in shots].index(True) == 9 and shots[-1].goals == 1
     assert [shot.fell for shot in shots].index(True) == STEPS - 1
+    real = read_log(folder)  # where nobody knows the truth it is shown as it was found last
+    for name in TRUTH_COLUMNS:
+        del real.columns[name]
+    for name in FOUND_COLUMNS:
+        real.columns[name][[0, 4, 5]] = np.nan
+    shots = Replay(real).snapshots
+    np.testing.assert_allclose([s.joint_q[9] for s in shots[1:7]], [0.1, 0.2, 0.3, 0.3, 0.3, 0.6], atol=1e-6)
+    np.testing.assert_allclose(shots[0].joint_q[9:], OUT_OF_SIGHT)
     assert play([str(folder), "--video", str(tmp_path / "log.mp4")]) == 0
     assert iio.imread(tmp_path / "log.mp4").shape[0] == STEPS
     run = json.loads((folder / "run.json").read_text())

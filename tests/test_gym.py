@@ -70,5 +70,5 @@ def test_widths_masks_devices_and_settings_that_cannot_be_are_refused():
         env.step(np.zeros(9))
     with pytest.raises(ValueError, match=r"reset_mask is torch.int64 \(2,\); give booleans, \(2,\)"):
         env.reset(options={"reset_mask": np.array([0, 1])})
-    with pytest.raises(ValueError, match=r"actions are a Warp array \(2, 9\) .*, not Tensor"):
+    with pytest.raises(ValueError, match=r"actions are an array \(2, 9\) of wp.from_torch, not tensor"):
         env.unwrapped.env.step(torch.zeros(2, 9))

@@ -15,34 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from vd.paper import PAPER
-
-LOG_FORMAT = "vd-hand-log/1"
-RUN_FILE, STEPS_FILE, EVENTS_FILE, RECORDING_FILE = "run.json", "steps.csv", "events.jsonl", "recording.json"
-JOINT_CHANNELS = ("command", "position", "velocity", "current", "temperature", "action", "smoothed")
-"""Columns ``channel.joint``: goal sent [rad], measured [rad], [rad/s], [A], [deg C]; the policy's action, and
-its moving average as it was before that action."""
-STEP_COLUMNS = (
-    "goal",
-    "acting",
-    "distance",
-    "late_s",
-    "image_s",
-    "sensed_s",
-    "sent_s",
-    "cpu_s",
-    "missed",
+from vd.log_format import (
+    EVENTS_FILE,
+    FOUND_COLUMNS,
+    LOG_FORMAT,
+    MCAP,
+    RUN_FILE,
+    STEPS_FILE,
+    TRUTH_COLUMNS,
+    LogError,
 )
-"""Number of the goal; whether the policy acts, or the hand holds still after a stop; distance to the goal
-that the stopping rule sees [rad]; how late the step began, and from its due time, the image's exposure, the
-state's reading and the sending of goals [s]; processor time of the process for this step [s]; deadlines
-missed so far."""
-TRUTH_COLUMNS = (*(f"object.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")), "error")
-"""Pose of the object and its angle to the goal, up to symmetry: a twin's only."""
-
-
-class LogError(ValueError):
-    """A log that cannot be used; names file and remedy."""
+from vd.paper import PAPER
 
 
 @dataclass(frozen=True)
@@ -114,24 +97,30 @@ class HandLog:
 
     @property
     def object_pose(self) -> np.ndarray | None:
-        """Pose of the object [T, 7]; None where it is not known."""
-        if TRUTH_COLUMNS[0] not in self.columns:
-            return None
-        return np.stack([self.columns[name] for name in TRUTH_COLUMNS[:7]], axis=1)
+        """Pose of the object [T, 7]: the true one, or else as it was found; None where neither is known."""
+        for names in (TRUTH_COLUMNS[:7], FOUND_COLUMNS):
+            if names[0] in self.columns:
+                pose = np.stack([self.columns[name] for name in names], axis=1)
+                return pose if np.isfinite(pose).any() else None
+        return None
 
 
 def is_log(path: str | Path) -> bool:
-    """Whether a folder is a log."""
-    return (Path(path) / RUN_FILE).is_file()
+    """Whether a folder, or an MCAP file, is a log."""
+    return (Path(path) / RUN_FILE).is_file() or (Path(path).suffix == MCAP and Path(path).is_file())
 
 
 def read_log(path: str | Path) -> HandLog:
-    """Read a log, also one that was cut short.
+    """Read a log, also one that was cut short; of an MCAP file, what that has of it.
 
     Raises:
         LogError: It is none, or damaged.
     """
     path = Path(path)
+    if path.suffix == MCAP:
+        from vd.mcap_log import read_mcap
+
+        return HandLog(path, *read_mcap(path))
     try:
         run = json.loads((path / RUN_FILE).read_text())
     except FileNotFoundError:

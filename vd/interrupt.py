@@ -66,6 +66,7 @@ EXTRAS = {
     "hardware": ("dynamixel_sdk", "serial", "pyrealsense2", "cv2"),
     "recordings": ("pyarrow", "rosbags"),
     "gym": ("gymnasium",),
+    "log": ("mcap_ros2", "rerun"),
     "export": ("onnx", "onnxscript", "onnxruntime"),
 }
 """Packages that not every user needs, by the extra that brings them."""

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -22,7 +22,7 @@ from vd.deploy.hardware.joints import CalibrationError
 from vd.deploy.hardware.registers import RESTART, Register, different, kept
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import SafeHand
-from vd.deploy.twin.child import TwinCamera, TwinChild
+from vd.deploy.twin.child import TwinCamera
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -78,7 +78,10 @@ def preflight(connection: Connection) -> Iterator[Finding]:
 
     What could not be looked at because of what came before is not in the findings.
     """
-    bus = connection.bus
+    bus: Any = connection.bus
+    if connection.ros is not None:
+        yield from bus.findings()
+        return
     try:
         yield from adapter_findings(bus.port)
         missing = bus.missing()
@@ -269,7 +272,8 @@ def ready(
     """
     _stop_at_wrong(show(itertools.chain(preflight(connection), more), quiet=quiet))
     confirm(question, yes=yes)
-    _stop_at_wrong(show([write_settings(connection)], quiet=quiet))
+    if connection.ros is None:
+        _stop_at_wrong(show([write_settings(connection)], quiet=quiet))
 
 
 def _stop_at_wrong(findings: Iterable[Finding]) -> None:
@@ -293,12 +297,17 @@ def confirm(question: str, *, yes: bool) -> None:
         raise RuntimeError("nothing moves: not confirmed")
 
 
-def open_camera(cfg: RealSenseCfg, twin: TwinChild | None, place: CameraModel) -> "Camera":
-    """The depth camera, or that of a twin, which it was told to have at this place.
+def open_camera(cfg: RealSenseCfg, connection: Connection, place: CameraModel) -> "Camera":
+    """The depth camera, that of ROS, or that of a twin, which it was told to have at this place.
 
     Raises:
         CameraError: There is none, or it has no such images.
     """
+    if connection.ros is not None:
+        from vd.deploy.camera.ros_camera import RosCamera
+
+        return RosCamera(connection.ros)
+    twin = connection.twin
     return RealSense(find_device(cfg.serial), cfg) if twin is None else TwinCamera(twin, place)
 
 
@@ -314,7 +323,7 @@ def camera_preflight(cfg: CheckCfg, connection: Connection) -> Iterator[Finding]
         return
     place = hand.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
     try:
-        camera = open_camera(cfg.camera, twin, place)
+        camera = open_camera(cfg.camera, connection, place)
     except CameraError as error:
         yield Finding("camera", False, str(error))
         return

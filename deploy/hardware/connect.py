@@ -50,6 +50,8 @@ class Connection:
     """Its motors, in the joints' order."""
     twin: "TwinChild | None" = None
     """The twin, if it is one."""
+    ros: Any = None
+    """The node, where the hand is behind ROS 2."""
 
     @property
     def hand(self) -> "HandModel":

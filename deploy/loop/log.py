@@ -6,10 +6,12 @@ A write can wait for the disk as long as other programs keep that busy, and the 
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -20,8 +22,9 @@ from vd.deploy.hardware.control_table import RAD_PER_COUNT
 from vd.files import make_folder, write_json, writing
 from vd.gap.recording import COMMAND_TIME
 from vd.gap.recording import FORMAT as RECORDING_FORMAT
-from vd.hand_log import (
+from vd.log_format import (
     EVENTS_FILE,
+    FOUND_COLUMNS,
     JOINT_CHANNELS,
     LOG_FORMAT,
     RECORDING_FILE,
@@ -32,6 +35,22 @@ from vd.hand_log import (
 )
 
 DIGITS = 6
+DEPTH_STEPS = 12
+"""Control steps from one depth image that is logged to the next: a second."""
+NOWHERE = (float("nan"),) * len(FOUND_COLUMNS)
+
+
+class Sink(Protocol):
+    """What else a run is written to; each call comes from the log's thread."""
+
+    def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:
+        """A control step, by columns of steps.csv; now and then with its depth image [m] [H, W]."""
+
+    def event(self, line: Mapping[str, Any]) -> None:
+        """An event, as of events.jsonl."""
+
+    def close(self, run: Mapping[str, Any]) -> None:
+        """The run has ended; ``run`` is what run.json says."""
 
 
 class LogWriter:
@@ -43,6 +62,7 @@ class LogWriter:
         run: What runs: policy, object, goals (quaternions xyzw), and whatever is worth to know.
         servo: What is known of the motors: model, gains.
         truth: Whether the object's pose is known: a twin's.
+        without: Those of JOINT_CHANNELS that nobody measures.
         clock: Time.
 
     Raises:
@@ -57,6 +77,7 @@ class LogWriter:
         *,
         servo: Mapping[str, Any],
         truth: bool = False,
+        without: Collection[str] = (),
         clock: Clock = MONOTONIC,
     ):
         if (folder / RUN_FILE).exists():
@@ -79,21 +100,29 @@ class LogWriter:
             "encoder_resolution_rad": RAD_PER_COUNT,
             "trajectories": [{"file": STEPS_FILE, "excitation": "policy", "joints": list(hand.joint_names)}],
         }
+        self._sinks: list[Sink] = []
+        self._count = 0
+        self._channels = [channel for channel in JOINT_CHANNELS if channel not in without]
         self._columns = [
             "t",
             COMMAND_TIME,
-            *(f"{channel}.{joint}" for channel in JOINT_CHANNELS for joint in hand.joint_names),
+            *(f"{channel}.{joint}" for channel in self._channels for joint in hand.joint_names),
             *STEP_COLUMNS,
+            *FOUND_COLUMNS,
             *(TRUTH_COLUMNS if truth else ()),
         ]
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
         self._steps = os.open(folder / STEPS_FILE, flags, 0o644)
         self._events = os.open(folder / EVENTS_FILE, flags, 0o644)
         self._writer = ThreadPoolExecutor(1, "log")
-        self._written: Future[Any] | None = None
+        self._pending: deque[Future[Any]] = deque()
         self._append(self._steps, ",".join(self._columns))
         write_json(folder / RECORDING_FILE, recording)
         write_json(folder / RUN_FILE, self._run)
+
+    def also_to(self, make: Callable[[Mapping[str, Any]], Sink]) -> None:
+        """Write to a sink too, made of what run.json says."""
+        self._sinks.append(make(self._run))
 
     def since(self, time_s: float) -> float:
         """Seconds from the start of the log to a time of the monotonic clock."""
@@ -106,6 +135,8 @@ class LogWriter:
         joints: Mapping[str, np.ndarray],
         values: Sequence[float],
         truth: Sequence[float] = (),
+        found: Sequence[float] = NOWHERE,
+        depth: np.ndarray | None = None,
     ) -> None:
         """Append a control step.
 
@@ -115,20 +146,38 @@ class LogWriter:
             joints: Each of JOINT_CHANNELS [D].
             values: In the order of STEP_COLUMNS.
             truth: In the order of TRUTH_COLUMNS, if they are logged.
+            found: In the order of FOUND_COLUMNS.
+            depth: The depth image that was seen [m] [H, W]; sinks get some of them.
         """
         row = [
             self.since(time_s),
             self.since(sent_s),
-            *(v for channel in JOINT_CHANNELS for v in joints[channel]),
+            *(v for channel in self._channels for v in joints[channel]),
             *values,
+            *found,
             *truth,
         ]
         self._append(self._steps, ",".join(f"{value:.{DIGITS}f}" for value in row))
+        if self._sinks:
+            image = depth.copy() if depth is not None and self._count % DEPTH_STEPS == 0 else None
+            told = dict(zip(self._columns, map(float, row), strict=True))
+            self._tell(lambda sink: sink.step(told, image))
+        self._count += 1
+
+    def goal(self, number: int, goal: np.ndarray) -> None:
+        """A goal [4] is begun; one that was not known when the log began is noted first."""
+        goals = self._run["goals"]
+        if number == len(goals):
+            goals.append([float(value) for value in goal])
+            run = {**self._run, "goals": list(goals)}
+            self._later(lambda: write_json(self.folder / RUN_FILE, run))
+        self.event("goal", goal=number)
 
     def event(self, event: str, **values: Any) -> None:
         """Append an event of this moment."""
         line = {"t": round(self.since(self._clock.now()), DIGITS), "event": event, **values}
         self._append(self._events, json.dumps(line))
+        self._tell(lambda sink: sink.event(line))
 
     def finish(self, reason: str, **summary: Any) -> None:
         """Say how it ended, and close the files.
@@ -137,19 +186,30 @@ class LogWriter:
             OSError: Something could not be written.
         """
         self.event("end", reason=reason)
+        run = {**self._run, "end": {"reason": reason, **summary}}
+        self._tell(lambda sink: sink.close(run))
         self._writer.shutdown()
         os.close(self._steps)
         os.close(self._events)
-        write_json(self.folder / RUN_FILE, {**self._run, "end": {"reason": reason, **summary}})
+        write_json(self.folder / RUN_FILE, run)
         self._check()
 
     def _append(self, file: int, line: str) -> None:
-        self._check()
         data = line.encode() + b"\n"
-        self._written = self._writer.submit(lambda: os.write(file, data))  # one call: whole, or not at all
+        self._later(lambda: os.write(file, data))  # one call: whole, or not at all
+
+    def _tell(self, say: Callable[[Sink], None]) -> None:
+        """Have the thread tell all sinks."""
+        for sink in self._sinks:
+            self._later(partial(say, sink))
+
+    def _later(self, do: Callable[[], object]) -> None:
+        """Have the thread do something."""
+        self._check()
+        self._pending.append(self._writer.submit(do))
 
     def _check(self) -> None:
         """Raise what went wrong in writing: a run without its log is not worth going on with."""
-        if self._written is not None and self._written.done():
+        while self._pending and self._pending[0].done():
             with writing(self.folder):
-                self._written.result()
+                self._pending.popleft().result()

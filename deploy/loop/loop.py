@@ -5,8 +5,8 @@ One step is :meth:`ControlLoop.step`: wait, sense, decide, filter, send, log.
 
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,8 +14,8 @@ from vd.deploy.camera.camera import Camera
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.loop.action import ActionFilter
-from vd.deploy.loop.log import LogWriter
-from vd.deploy.loop.policy_runner import PolicyRunner, Sensed
+from vd.deploy.loop.log import NOWHERE, LogWriter
+from vd.deploy.loop.policy_runner import Decision, PolicyRunner, Sensed
 from vd.deploy.safety.safety import SafeHand
 from vd.deploy.twin.child import TwinChild
 from vd.evaluate.statistics import symmetric_error
@@ -53,6 +53,7 @@ class ControlLoop:
         hold_s: How long the hand holds still after each stop [s], before it goes on.
         camera: Depth camera; None: the policy needs none.
         twin: Knows the object's true state; None on a real hand.
+        more: Whether more goals may come than there are; the hand is held until then.
         symmetry: Rotations that map the object to itself [K, 4], for the true error.
     """
 
@@ -69,29 +70,29 @@ class ControlLoop:
         camera: Camera | None = None,
         twin: TwinChild | None = None,
         symmetry: np.ndarray = NO_SYMMETRY,
+        more: Callable[[], bool] = lambda: False,
     ):
         self._safe, self._runner, self._actions, self._pacer, self._log = safe, runner, actions, pacer, log
         self._episode_s, self._hold_s = episode_s, hold_s
         self._camera, self._twin, self._symmetry = camera, twin, symmetry
+        self._more = more
         self._target = safe.hand.start
         self.times: list[StepTimes] = []
         """Of every step so far."""
 
     def run(self, goals: Sequence[np.ndarray]) -> list[str]:
-        """Pursue all goals [4]; the outcome of each.
+        """Pursue all goals [4], those too that are added meanwhile; the outcome of each.
 
         Raises:
             StoppedError: The hand was stopped.
             StaleCamera: There is no new image.
         """
-        outcomes = []
-        self._runner.begin()
-        if len(goals):  # to find the object takes longer than to follow it, and than a step may
-            sensed, *_ = self._sense(goals[0])
-            found = self._pacer.clock.beside(lambda: self._runner.decide(sensed))
-            while not found():
-                self.step(0, goals[0], acting=False)
+        outcomes, waited = [], True
+        while not len(goals) and self._more():
+            self.step(0, NO_SYMMETRY[0], acting=False)
         for number, goal in enumerate(goals):
+            if waited:
+                self._look(number, goal)
             outcome, distance = self._pursue(number, goal)
             outcomes.append(outcome)
             self._log.event("stop", goal=number, outcome=outcome, distance=distance)
@@ -99,13 +100,25 @@ class ControlLoop:
                 break
             for _ in range(round(self._hold_s / self._pacer.period_s)):
                 self.step(number, goal, acting=False)
+            waited = False
+            while len(goals) == number + 1 and self._more():
+                self.step(number, goal, acting=False)
+                waited = True
         return outcomes
+
+    def _look(self, number: int, goal: np.ndarray) -> None:
+        """Find the object anew, which takes longer than to follow it, and than a step may."""
+        self._runner.begin()
+        sensed, *_ = self._sense(goal)
+        found = self._pacer.clock.beside(lambda: self._runner.decide(sensed))
+        while not found():
+            self.step(number, goal, acting=False)
 
     def _pursue(self, number: int, goal: np.ndarray) -> tuple[str, float | None]:
         """Act until one goal is reached or given up: outcome, and the distance that was known then [rad]."""
         self._runner.new_goal()
         self._actions.reset()
-        self._log.event("goal", goal=number)
+        self._log.goal(number, goal)
         distance = np.nan
         outcome = "time limit"
         for step in range(round(self._episode_s / self._pacer.period_s)):
@@ -131,20 +144,21 @@ class ControlLoop:
         """
         late_s, busy_s, due_s = self._pacer.wait(), time.process_time(), self._pacer.due_s
         sensed, state, image_s = self._sense(goal)
-        action, distance, ended = np.zeros_like(sensed.smoothed), np.nan, ""
+        decision, ended = Decision(np.zeros_like(sensed.smoothed), np.nan), ""
         if acting:
             decision = self._runner.decide(sensed)
-            distance, ended = decision.distance, self._ended(decision.distance, sensed, first=first)
-            if not ended:
-                action = decision.action
-                self._target = self._actions.goal(action, state.position)
+            ended = self._ended(decision.distance, sensed, first=first)
+            if ended:
+                decision = replace(decision, action=np.zeros_like(decision.action))
+            else:
+                self._target = self._actions.goal(decision.action, state.position)
         sent = self._safe.command(self._target)
         sent_s = self._pacer.clock.now() - due_s
         self._safe.beat(missed=self._pacer.end())
         busy_s = time.process_time() - busy_s
         times = StepTimes(late_s, image_s - due_s, state.time_s - due_s, sent_s, busy_s)
-        self._note(number, sensed, state, action, sent, distance, acting, times)
-        return ended, distance
+        self._note(number, sensed, state, decision, sent, acting, times)
+        return ended, decision.distance
 
     def _sense(self, goal: np.ndarray) -> tuple[Sensed, HandState, float]:
         """Read the camera, then the joints: what the policy is told, all that was measured, the image's time.
@@ -179,9 +193,8 @@ class ControlLoop:
         number: int,
         sensed: Sensed,
         state: HandState,
-        action: np.ndarray,
+        decision: Decision,
         sent: np.ndarray,
-        distance: float,
         acting: bool,
         times: StepTimes,
     ) -> None:
@@ -197,19 +210,22 @@ class ControlLoop:
             "velocity": state.velocity,
             "current": state.current,
             "temperature": state.temperature,
-            "action": action,
+            "action": decision.action,
             "smoothed": sensed.smoothed,
         }
-        values = [number, acting, distance, *vars(times).values(), self._pacer.missed]
-        self._log.step(state.time_s, self._pacer.due_s + times.sent_s, joints, values, truth)
+        values = [number, acting, decision.distance, *vars(times).values(), self._pacer.missed]
+        found = NOWHERE if decision.found is None else decision.found.tolist()
+        sent_s = self._pacer.due_s + times.sent_s
+        self._log.step(state.time_s, sent_s, joints, values, truth, found, sensed.depth)
         self.times.append(times)
         if len(self.times) % STATUS_STEPS == 0:
-            doing = f"distance {distance:.2f} rad" if acting else "holding"
+            doing = f"distance {decision.distance:.2f} rad" if acting else "holding"
+            motors = f" | {state.temperature.max():.0f} deg C | {np.abs(state.current).max():.2f} A"
             print(
                 f"goal {number + 1} | {doing}"
                 + (f", true {truth[-1]:.2f}" if truth else "")
                 + f" | loop {1e3 * times.sent_s:.0f} ms | missed {self._pacer.missed}"
-                f" | {state.temperature.max():.0f} deg C | {np.abs(state.current).max():.2f} A",
+                + motors * bool(np.isfinite(state.temperature).all()),
                 file=sys.stderr,
                 flush=True,
             )

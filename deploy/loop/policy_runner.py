@@ -52,6 +52,8 @@ class Decision:
     """Mean action [D]."""
     distance: float
     """Distance to the goal by which it is stopped [rad], as it is predicted; NaN: not known."""
+    found: np.ndarray | None = None
+    """Pose of the object as it was found [7]; None: it was not looked for."""
 
 
 class PolicyRunner:
@@ -190,8 +192,10 @@ class TrackingRunner(PolicyRunner):
         points = seen_points(self.eye, sensed.depth)
         senses = senses_of(sensed, points, fresh=self._fresh)
         decided = self._tracker.step(senses)
-        self._fresh = False
-        return Decision(decided.action[0].numpy().copy(), float(decided.angle[0]))
+        self._fresh, found = False, self._tracker.observer.found
+        assert found is not None
+        pose = np.concatenate([found.position[0].numpy(), found.orientation[0].numpy()])
+        return Decision(decided.action[0].numpy().copy(), float(decided.angle[0]), pose)
 
 
 def load_runner(

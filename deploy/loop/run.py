@@ -4,10 +4,11 @@ The policy sees joints and a depth camera: a tracking or vision policy. A twin t
 """
 
 import contextlib
+import importlib.util
 import select
 import sys
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
+from vd import interrupt
 from vd.config import require
 from vd.deploy.camera.camera import Camera
 from vd.deploy.camera.realsense import RealSenseCfg
@@ -26,15 +28,20 @@ from vd.deploy.safety.safety import MOVE_S, SafeHand, StoppedError
 from vd.deploy.timely import undisturbed
 from vd.evaluate.agents import check_names
 from vd.files import check_folder
-from vd.hand_log import LogError, read_log
+from vd.hand_log import read_log
+from vd.log_format import MCAP, LogError
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
+    from vd.assets_usd.hand_data import CameraModel, HandModel
     from vd.assets_usd.objects.model import ObjectModel
+    from vd.deploy.loop.log import Sink
     from vd.deploy.loop.policy_runner import PolicyRunner
     from vd.deploy.twin.child import TwinChild
 
+LOG_FILES = {MCAP: "mcap_ros2", ".rrd": "rerun"}
+"""Endings of files that a log can be written to besides, and the package that each needs."""
 LOGS = Path("runs/deploy")
 """Folder of the logs that are not named."""
 HOME_RAD_S = 0.5
@@ -80,7 +87,12 @@ class RunCfg(HandOptions):
     safety: SafetyCfg = field(default_factory=SafetyCfg)
     """Limits."""
     log: Path | None = None
-    """Folder of the log; runs/deploy/ and the time by default."""
+    """Folder of the log; runs/deploy/ and the time by default. NAME.mcap (ROS 2 messages) or NAME.rrd (Rerun)
+    is written beside the folder NAME."""
+    ros2: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Drive a hand behind ROS 2 in place of --port. Goals come from a service too (vd.deploy.ros)."""
+    ros2_args: str = ""
+    """Arguments of ROS: --ros2-args="-r commands:=/forward_position_controller/commands"."""
     seed: int = 0
     """Of drawn goals and of the choice of points."""
     realtime: bool = True
@@ -100,11 +112,19 @@ class RunCfg(HandOptions):
 
         require(self, "--", "positive", "random_goals episode_s")
         require(self, "--", "zero or positive", "hold_s")
+        if self.ros2 and (self.twin or self.port):
+            raise ValueError("--ros2 is in place of --port and --twin; name one")
+        if self.ros2 and importlib.util.find_spec("rclpy") is None:
+            raise ValueError("--ros2 needs rclpy: source the setup.bash of a ROS 2 for this Python")
         if self.realistic and not self.twin:
             raise ValueError("--realistic is for --twin")
         if self.twin and Path(self.object).suffix.lower() in SCAN_SUFFIXES:
             raise ValueError(f"--object {self.object}: a twin cannot hold a scan; vd-assets import it first")
-        if self.policy is None and not self.twin:
+        if self.log is not None and (package := LOG_FILES.get(self.log.suffix)):
+            if self.log.exists():
+                raise FileExistsError(f"--log {self.log} is there; choose another name")
+            interrupt.need(package)
+        if self.policy is None and not (self.twin or self.ros2):
             raise ValueError("name the policy: the folder of a bundle that vd-train bundle wrote")
 
 
@@ -115,17 +135,19 @@ def run(cfg: RunCfg) -> int:
         StoppedError: A limit or a fault stopped the hand; the page of what it did is written before.
     """
     cfg.validate()
-    check_folder(cfg.log or LOGS)
+    check_folder(cfg.log.parent if cfg.log else LOGS)
     import torch
 
+    from vd.assets_usd.hands import load_hand
     from vd.deploy.hardware.connect import motors_of
     from vd.deploy.loop.goals import make_goals, one_object
     from vd.deploy.loop.policy_runner import load_runner
+    from vd.deploy.ros import connect_ros
 
     quiet_warp()
     torch.set_num_threads(1)  # of several, some would wait for one that has no core
-    goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
-    hand = motors_of(cfg).hand
+    goals = make_goals(cfg.goal, 0 if cfg.ros2 else cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
+    hand = load_hand(cfg.hand, layer=cfg.hand_layer) if cfg.ros2 else motors_of(cfg).hand
     item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
     tolerance = cfg.tolerance_rad
     told = cfg.object if cfg.twin else None
@@ -136,14 +158,16 @@ def run(cfg: RunCfg) -> int:
             "vd-train tracker finds a better one",
             file=sys.stderr,
         )
-    folder = cfg.log or LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
+    folder = LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
+    if cfg.log is not None:
+        folder = cfg.log.with_suffix("") if cfg.log.suffix in LOG_FILES else cfg.log
     fault: StoppedError | None = None
     status = 0
     camera = runner.camera or hand.mounted_camera
     camera_pose = None if camera is None else (*map(float, camera.position), *map(float, camera.quaternion))
-    with connect(
-        cfg, object=cfg.object, camera=camera_pose, realistic=cfg.realistic, realtime=cfg.realtime
-    ) as connection:
+    twin: dict[str, Any] = {"object": cfg.object, "camera": camera_pose}
+    twin |= {"realistic": cfg.realistic, "realtime": cfg.realtime}
+    with connect_ros(cfg, cfg.ros2_args) if cfg.ros2 else connect(cfg, **twin) as connection:
         try:
             status = _pursue(cfg, name, runner, connection, item, goals, folder)
         except StoppedError as error:
@@ -152,7 +176,9 @@ def run(cfg: RunCfg) -> int:
             fault = error
     try:
         log = read_log(folder)
-    except LogError as error:  # it ended before the first step
+        if not len(log.goals):
+            raise LogError(f"{folder} has no goal to show")
+    except LogError as error:  # it ended before the first step, or goal
         raise fault or error from None
     print("drawing the film (the first one compiles its kernels) ...", file=sys.stderr, flush=True)
     print(f"page: {write_page(log, goal_results(log))}")
@@ -167,7 +193,7 @@ def _pursue(
     runner: "PolicyRunner",
     connection: Connection,
     item: "ObjectModel",
-    goals: Sequence[np.ndarray],
+    goals: list[np.ndarray],
     folder: Path,
 ) -> int:
     """Preflight, way to the start, the loop, and its log in a folder; the exit status."""
@@ -177,7 +203,8 @@ def _pursue(
     from vd.deploy.hardware.check import open_camera, ready
     from vd.deploy.loop.action import ActionFilter
     from vd.deploy.loop.log import LogWriter
-    from vd.deploy.loop.loop import ControlLoop, summary
+    from vd.deploy.loop.loop import NO_SYMMETRY, ControlLoop, summary
+    from vd.deploy.ros import UNKNOWN, RosGoals
 
     hand, twin, hz = connection.hand, connection.twin, runner.task.sim.control_hz
     pose = hand.start
@@ -185,29 +212,32 @@ def _pursue(
         camera: Camera | None = None
         seen: Iterable[Finding] = ()
         if runner.camera is not None:
-            camera = open_camera(cfg.camera, twin, runner.camera)
+            camera = open_camera(cfg.camera, connection, runner.camera)
             stack.callback(camera.close)
             where = runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
             runner.look_by(camera.intrinsics.seen_from(where))
             seen = camera_findings(
                 camera, runner.camera, hand.goal_in_base, fps=cfg.camera.fps if twin is None else hz
             )
-        warm_up(runner, pose, goals[0], camera)
+        warm_up(runner, pose, [*goals, NO_SYMMETRY[0]][0], camera)
         stack.enter_context(undisturbed(cfg.realtime))
-        question = f"The hand will pursue {len(goals)} goals."
+        question = f"The hand will pursue {len(goals)} goals{', and those it is given' * cfg.ros2}."
         ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=seen)
-        log = LogWriter(
-            folder,
-            hand,
-            _description(cfg, name, runner, item, goals),
-            servo=connection.joints.servo(),
-            truth=twin is not None,
-        )
+        said, servo = _description(cfg, name, runner, item, goals), connection.joints.servo()
+        without = () if connection.ros is None else UNKNOWN
+        log = LogWriter(folder, hand, said, servo=servo, truth=twin is not None, without=without)
+        file = cfg.log
+        if file is not None and file.suffix in LOG_FILES:
+            log.also_to(lambda run: _sink(file, run, hand, item, runner.camera))
+        served = None if connection.ros is None else RosGoals(connection.ros, goals)
+        if served is not None:
+            log.also_to(lambda _: served)
         pacer = Pacer(hz, latest=LATEST)
         reason, outcomes = "aborted", list[str]()
         loop: ControlLoop | None = None
         try:
-            with SafeHand(connection.bus, connection.joints, cfg.safety) as safe:
+            safety = replace(cfg.safety, then="hold") if cfg.ros2 else cfg.safety  # torque is the driver's
+            with SafeHand(connection.bus, connection.joints, safety) as safe:
                 safe.arm()
                 safe.move(pose, HOME_RAD_S)
                 place(safe, pose, twin, yes=cfg.yes)
@@ -222,6 +252,7 @@ def _pursue(
                     camera=camera,
                     twin=twin,
                     symmetry=item.symmetry,
+                    more=(lambda: False) if served is None else served.more,
                 )
                 outcomes = loop.run(goals)
                 reason = "lost" if "lost" in outcomes else "all goals pursued"
@@ -234,6 +265,19 @@ def _pursue(
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
             report(folder, steps, pacer.missed, times)
     return int(reason == "lost")
+
+
+def _sink(
+    file: Path, run: Mapping[str, Any], hand: "HandModel", item: "ObjectModel", camera: "CameraModel | None"
+) -> "Sink":
+    """What writes the file of a log."""
+    if file.suffix == MCAP:
+        from vd.mcap_log import McapLog
+
+        return McapLog(file, run, np.asarray(hand.workspace.goal_m))
+    from vd.deploy.loop.rerun_log import RerunLog
+
+    return RerunLog(file, run, hand, item, camera)
 
 
 def warm_up(runner: "PolicyRunner", pose: np.ndarray, goal: np.ndarray, camera: Camera | None) -> None:

@@ -8,7 +8,8 @@ import numpy as np
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
-from vd.hand_log import HandLog, LogError
+from vd.hand_log import HandLog
+from vd.log_format import LogError
 from vd.play.video import SINGLE_CELL, Snapshot, drawn, write_frames
 from vd.render import OUT_OF_SIGHT, Renderer
 
@@ -24,6 +25,8 @@ class Replay:
 
     def __init__(self, log: HandLog):
         self.log, self._now, self.sees = log, 0, False
+        if not len(log.goals):
+            raise LogError(f"{log.path} has no goal to show")
         self.control_hz = float(log.run["control_hz"])
         try:
             self.hand: HandModel = load_hand(log.run["hand"])
@@ -61,15 +64,17 @@ class Replay:
     def _snapshots(self) -> Iterator[Snapshot]:
         log, columns = self.log, self.log.columns
         steps = len(columns["t"])
-        position, pose = log.channel("position"), log.object_pose
-        if pose is None:  # nobody measured it
-            pose = np.tile(OUT_OF_SIGHT, (steps, 1))
+        position = log.channel("position")
+        pose = np.full((steps, 7), np.nan) if log.object_pose is None else log.object_pose
+        known = np.where(np.isfinite(pose).all(axis=1), np.arange(steps), 0)
+        pose = pose[np.maximum.accumulate(known)]  # nobody looks while the hand is held
+        pose = np.where(np.isfinite(pose), pose, OUT_OF_SIGHT)
         error = columns.get("error", columns["distance"])
         heard = columns.get("image_s", columns.get("sensed_s"))
         ends = {stop.goal: stop for stop in log.stops}
         reached = lost = 0
         for step in range(steps):
-            number = int(columns["goal"][step])
+            number = min(int(columns["goal"][step]), len(log.goals) - 1)  # one may not have begun
             stop = ends.get(number)
             # Events have the time of their writing: the last step before it is the one that ended the goal.
             over = stop is not None and columns["t"][step] <= stop.time_s

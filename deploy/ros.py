@@ -1,0 +1,258 @@
+"""A hand and its camera behind ROS 2: in place of motors, camera, and command line for the control loop.
+
+The node ``visual_dexterity`` reads JointState on ``joint_states`` and, for a policy that sees, depth of
+16UC1 or 32FC1 on ``depth/image_rect_raw``, with ``depth/camera_info``. On ``commands`` it sends
+Float64MultiArray, an angle [rad] for each joint in the order of the hand's USD, as ros2_control's
+forward_position_controller takes it. A value of its parameter ``goal``, a quaternion xyzw, is a further
+goal: ``ros2 param set`` calls the service ``set_parameters``, which says why it refuses one. The service
+``~/finish`` (Trigger) ends the run after the last goal. ``~/events`` (String) tells of goals and stops.
+Topics get other names by remapping.
+
+Motors stay in the care of the driver: their torque, temperature and current are not looked at.
+"""
+
+import contextlib
+import json
+import shlex
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+
+from vd.assets_usd.hand_data import HandModel, MotorModel
+from vd.assets_usd.hands import load_hand
+from vd.deploy.camera.ros_camera import FIRST_S, monotonic
+from vd.deploy.clock import MONOTONIC
+from vd.deploy.finding import Finding, finding
+from vd.deploy.hardware.answers import HandState, SilentError
+from vd.deploy.hardware.connect import Connection, HandOptions
+from vd.deploy.hardware.joints import Joints
+from vd.deploy.loop.goals import GoalError, make_goals
+from vd.paper import PAPER
+
+NODE = "visual_dexterity"
+STATES, COMMANDS = "joint_states", "commands"
+UNKNOWN = ("current", "temperature")
+"""What a log has no columns of: a JointState does not tell."""
+STATE_S = 0.05
+"""Oldest state that the loop acts on, and how long a new one is waited for."""
+LOOK_S = 2.0
+"""How long messages are counted before the hand moves."""
+FEWEST = 2.0
+"""States for each control step, at least."""
+OUTSIDE_RAD = 0.1
+"""How far out of its range a joint may be and still be brought back."""
+
+
+class _Joints(Joints):
+    """Joints whose motors nobody here knows: of each angles and limits are the joint's own."""
+
+    def __init__(self, hand: HandModel):
+        stand_in = [MotorModel("XM430-W210", axis) for axis in range(len(hand.joint_names))]
+        super().__init__(hand, tuple(stand_in))
+
+    def servo(self) -> dict[str, str | int]:
+        """What a log says of the motors."""
+        return {"model": "behind ROS 2"}
+
+
+class RosHand:
+    """What :class:`vd.deploy.safety.safety.SafeHand` asks of a bus, over topics; stops hold, torque stays on.
+
+    Args:
+        hand: The hand, whose joints have the same names there.
+        node: Of rclpy.
+    """
+
+    clock = MONOTONIC
+
+    def __init__(self, hand: HandModel, node: Any):
+        from rclpy.qos import qos_profile_sensor_data
+        from sensor_msgs.msg import JointState
+        from std_msgs.msg import Float64MultiArray
+
+        self.hand, self.ids, self._message = hand, tuple(range(len(hand.joint_names))), Float64MultiArray
+        self._node, self._state, self._wrong, self.count = node, cast(HandState | None, None), "", 0
+        self._arrived = threading.Condition()
+        self._commands = node.create_publisher(Float64MultiArray, COMMANDS, 1)
+        node.create_subscription(JointState, STATES, self._take, qos_profile_sensor_data)
+
+    def _take(self, message: Any) -> None:
+        """Called with every JointState; those of other joints alone are passed over."""
+        places = {name: index for index, name in enumerate(message.name)}
+        missing = [name for name in self.hand.joint_names if name not in places]
+        if len(missing) == len(self.hand.joint_names):
+            return
+        none = np.full(len(self.ids), np.nan)
+        with self._arrived:
+            if missing or not len(message.position) == len(message.velocity) == len(places):
+                lacks = f"lacks {missing[0]}" if missing else "has no position and velocity for each joint"
+                self._wrong = f"JointState {lacks}; names are those of the hand's USD"
+                return
+            order = [places[name] for name in self.hand.joint_names]
+            self._state = HandState(
+                time_s=monotonic(message.header.stamp),
+                position=np.asarray(message.position, dtype=float)[order],
+                velocity=np.asarray(message.velocity, dtype=float)[order],
+                current=none,
+                pwm=none,
+                voltage=none,
+                temperature=none,
+                alert=np.zeros(len(order), dtype=bool),
+                tick=np.zeros(len(order)),
+            )
+            self.count += 1
+            self._arrived.notify_all()
+
+    def findings(self) -> Iterator[Finding]:
+        """What has to be right before it moves; nothing is sent."""
+        topic = self._node.resolve_topic_name(STATES)
+        with self._arrived:
+            came = self._arrived.wait_for(lambda: self._state is not None, FIRST_S)
+        if not came:
+            why = self._wrong or f"none of {self.hand.name} on {topic}: start its driver, or remap {STATES}"
+            yield Finding("joint states", False, why)
+            return
+        begin, first, ages = self.clock.now(), self.count, []
+        while self.clock.now() < begin + LOOK_S:
+            assert self._state is not None
+            ages.append(self.clock.now() - self._state.time_s)
+            self.clock.sleep(STATE_S)
+        rate, age = (self.count - first) / LOOK_S, float(np.median(ages))
+        wrong = []
+        if rate < FEWEST * PAPER.scene.control_hz:
+            wrong.append(f"{rate:.0f} a second, fewer than {FEWEST * PAPER.scene.control_hz:.0f}")
+        if not abs(age) <= STATE_S:
+            wrong.append(f"{1e3 * age:.0f} ms old: stamp them when they are read, and set clocks (NTP)")
+        yield finding("joint states", wrong, f"{rate:.0f} a second on {topic}, {1e3 * age:.0f} ms old")
+        listen = self._commands.get_subscription_count()
+        remedy = f"nobody listens on {self._node.resolve_topic_name(COMMANDS)}: start a controller, or remap"
+        yield finding("commands", [] if listen else [remedy], f"{listen} listen")
+        assert self._state is not None
+        q = self._state.position
+        out = np.maximum(self.hand.lower - q, q - self.hand.upper) > OUTSIDE_RAD
+        bad = [f"{self.hand.joint_names[axis]}: {q[axis]:.2f} rad" for axis in np.flatnonzero(out)]
+        yield finding("pose within limits", bad, "every joint")
+
+    def read_state(self, *, retries: int | None = None) -> HandState:
+        """The newest state.
+
+        Raises:
+            SilentError: It is too old, and no new one comes.
+        """
+
+        def fresh() -> bool:
+            return self._state is not None and self.clock.now() - self._state.time_s < STATE_S
+
+        with self._arrived:
+            if not self._arrived.wait_for(fresh, STATE_S) or self._state is None:
+                raise SilentError(f"no new JointState on {self._node.resolve_topic_name(STATES)}")
+            return self._state
+
+    def write_goals(self, goals: np.ndarray, *, with_state: bool = False) -> None:
+        """Send an angle for each joint [rad]."""
+        self._commands.publish(self._message(data=[float(goal) for goal in goals]))
+
+    def freeze(self) -> None:
+        """Have joints stay where they were last."""
+        if self._state is not None:
+            self.write_goals(self._state.position)
+
+    def torque(self, on: bool, ids: Sequence[int] | None = None) -> dict[int, str]:
+        """The driver's: nothing fails here."""
+        return {}
+
+    def read_torque(self) -> np.ndarray:
+        """Taken to be on."""
+        return np.ones(len(self.ids), dtype=bool)
+
+    def hardware_errors(self) -> dict[int, str]:
+        """None that we know."""
+        return {}
+
+    def watch(self, seconds: float) -> None:
+        """The driver's."""
+
+    def release(self) -> None:
+        """The driver's."""
+
+
+class RosGoals:
+    """Goals that others give while a hand is driven; also a sink of the log, whose events it publishes."""
+
+    def __init__(self, node: Any, goals: list[np.ndarray]):
+        from rcl_interfaces.msg import SetParametersResult
+        from std_msgs.msg import String
+        from std_srvs.srv import Trigger
+
+        self._goals, self._result, self._string = goals, SetParametersResult, String
+        self._finished = threading.Event()
+        self._events = node.create_publisher(String, "~/events", 10)
+        node.declare_parameter("goal", [0.0, 0.0, 0.0, 1.0])
+        node.add_on_set_parameters_callback(self._set)
+        node.create_service(Trigger, "~/finish", self._finish)
+
+    def more(self) -> bool:
+        """Whether a further goal may come."""
+        return not self._finished.is_set()
+
+    def _set(self, parameters: Sequence[Any]) -> Any:
+        try:
+            new = [make_goals([",".join(map(str, one.value))])[0] for one in parameters if one.name == "goal"]
+        except (GoalError, TypeError) as error:
+            return self._result(successful=False, reason=str(error))
+        self._goals.extend(new)
+        return self._result(successful=True, reason=f"goal {len(self._goals)}")
+
+    def _finish(self, _: Any, answer: Any) -> Any:
+        self._finished.set()
+        answer.success, answer.message = True, "ends after the last goal"
+        return answer
+
+    def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:
+        """Steps are not published."""
+
+    def event(self, line: Mapping[str, Any]) -> None:
+        """Publish an event."""
+        self._events.publish(self._string(data=json.dumps(line)))
+
+    def close(self, run: Mapping[str, Any]) -> None:
+        """The node goes on."""
+
+
+@contextlib.contextmanager
+def connect_ros(options: HandOptions, arguments: str = "") -> Iterator[Connection]:
+    """A hand behind ROS 2, while its node is there.
+
+    Args:
+        options: The hand.
+        arguments: Of ROS, such as ``-r commands:=/forward_position_controller/commands``.
+
+    Raises:
+        ValueError: The hand cannot be used.
+    """
+    import rclpy
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    hand = load_hand(options.hand, layer=options.hand_layer)
+    words = ["--ros-args", *shlex.split(arguments)]
+    rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)  # a signal stops the hand first
+    node = rclpy.create_node(NODE)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+
+    def spin() -> None:
+        with contextlib.suppress(ExternalShutdownException):
+            executor.spin()
+
+    thread = threading.Thread(target=spin, name="ros", daemon=True)
+    try:
+        bus = RosHand(hand, node)
+        thread.start()
+        yield Connection(_Joints(hand), cast(Any, bus), ros=node)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.shutdown()
