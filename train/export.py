@@ -102,8 +102,8 @@ def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path) -> None:
 
     The layers of a teacher, or of that of a camera policy, take ``observation`` [N, O], which they normalise,
     to the mean ``action`` [N, D]. The network of a vision policy goes to NAME-alignment.onnx: clouds about
-    their means, ``goal_points`` [N, G, 3] and ``seen_points`` [N, S, 3] [m], to ``rotation`` [N, 3, 3],
-    ``offset`` [N, 3] [m] and ``error`` [N] [rad] of :class:`vd.vision.alignment.Residual`. N, G and S vary.
+    their means, ``goal_points`` [N, G, 3] and ``seen_points`` [N, S, 3] [m], to ``rotation`` [N, 3, 3]
+    and ``offset`` [N, 3] [m] of :class:`vd.vision.alignment.Residual`. N, G and S vary.
 
     Raises:
         ModuleNotFoundError: What the export needs is not installed.

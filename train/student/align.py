@@ -35,9 +35,6 @@ CLOUDS = 5
 """Points of a shape, in clouds: one is the goal's, of the others the camera sees a part."""
 SHAPES_AT_ONCE = 128
 """Shapes made at a time: their bodies' points take 0.5 GB."""
-ERROR_WEIGHT = 0.3
-"""Of the predicted error [1/rad] against the chord of the rotation: it is read from the same summary, and
-chooses among hypotheses only."""
 OFFSET_WEIGHT = 10.0
 """Of the offset [1/m]: a centimetre counts as 0.1 rad, which moves the surface by about as much."""
 GRAD_NORM = 1.0
@@ -144,7 +141,6 @@ def alignment_losses(found: Residual, pairs: Pairs) -> tuple[dict[str, torch.Ten
     chord = ((found.rotation - pairs.rotation).square().sum((-1, -2)) + 1e-6).sqrt()
     losses = {
         "rotation": chord.mean(),
-        "error": ERROR_WEIGHT * (found.error - error).abs().mean(),
         "offset": OFFSET_WEIGHT * (found.offset - pairs.offset).norm(dim=-1).mean(),
     }
     return losses, error
@@ -260,8 +256,7 @@ class AlignTrainer(TrainingLoop):
     def searched(self, pairs: Pairs, near: Sequence[torch.Tensor]) -> Pairs:
         """Pairs of which some goals are turned as the network says, once or twice: as a search meets them.
 
-        Among random rotations those that it wrongly holds for right are rare, and these it has to tell. The
-        neighbours of both clouds, ``near``, stay.
+        The neighbours of both clouds, ``near``, stay.
         """
         goal, rotation, surface = pairs.goal.clone(), pairs.rotation.clone(), pairs.surface.clone()
         rows = torch.randperm(len(goal), device=goal.device)[: round(self.cfg.searched_share * len(goal))]

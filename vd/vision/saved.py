@@ -56,5 +56,6 @@ def load_alignment(path: str | Path, device: str = "cpu") -> tuple[AlignmentNetw
 def alignment_network(cfg: AlignmentCfg, weights: dict[str, Any], device: str) -> AlignmentNetwork:
     """A network of alignment with weights, in evaluation mode and without gradients."""
     network = AlignmentNetwork(cfg).to(device)
-    network.load_state_dict(weights)
+    # Files of before have a head that predicted errors.
+    network.load_state_dict({name: v for name, v in weights.items() if not name.startswith("heads.error")})
     return network.eval().requires_grad_(False)
