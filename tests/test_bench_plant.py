@@ -2,11 +2,15 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
+from test_hand_import import MESH, MIMIC, PARTS, write_urdf
 
+from vd.assets_usd.hand_import.importer import import_hand
+from vd.assets_usd.hands import load_hand
 from vd.bench.gap_sizes import effect_at
-from vd.bench.hidden_finger import FingerBody
+from vd.bench.hidden_finger import body_of
 from vd.bench.hidden_physics import Physics
 from vd.bench.hidden_plant import Plant, Run, simulate
 from vd.bench.hide import COUPLING, NOISE_RAD, Hiding, _Session, simulate_hidden
@@ -117,36 +121,13 @@ def test_gears_ripple_and_noise_has_a_colour_but_no_other_size():
         assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(memory, abs=0.05)
 
 
-FINGER = FingerBody(
-    mass=np.array([0.09, 0.08, 0.03]),
-    com=np.array([0.05, 0.045, 0.04]),
-    inertia=np.array([[1.3e-5, 2e-5, 1e-5], [1.5e-5, 1.2e-5, 0.9e-5], [1e-5, 8e-6, 5e-6]]),
-    spacing=0.07,
-    offset=0.066,
-    tip=0.074,
-)
-
-
 @pytest.mark.parametrize("payload", [0.0, 0.05])
-def test_the_finger_moves_as_in_another_engine(payload):
+def test_a_finger_moves_as_by_the_steps_of_another_integrator(payload):
     """Also with a load at its tip [kg]."""
-    import mujoco
-
-    def link(number, axis, height, inner):
-        m, c = FINGER.mass[number], FINGER.com[number]
-        x, y, z = FINGER.inertia[number]
-        return (
-            f'<body pos="0 0 {height}"><joint axis="{axis}" armature="0.001"/>'
-            f'<inertial pos="0 0 {c}" mass="{m}" diaginertia="{x} {y} {z}"/>{inner}</body>'
-        )
-
-    load = f'<body pos="0 0 {FINGER.tip}"><inertial pos="0 0 0" mass="{payload}" diaginertia="0 0 0"/></body>'
-    chain = link(2, "0 1 0", FINGER.spacing, load if payload else "")
-    chain = link(0, "1 0 0", 0, link(1, "0 1 0", FINGER.offset, chain))
-    model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><option timestep="1e-4" gravity="0 0 9.81" integrator="RK4"/><worldbody>{chain}'
-        "</worldbody></mujoco>"
-    )
+    body = body_of(load_hand("dclaw3"), 0, np.ones(3))
+    model = body.model(payload)
+    model.opt.timestep, model.opt.integrator = 1e-4, mujoco.mjtIntegrator.mjINT_RK4
+    model.dof_armature[:] = 1e-3
     data = mujoco.MjData(model)
     start = np.array([0.8, -1.0, 1.4])
     data.qpos[:] = start
@@ -155,7 +136,7 @@ def test_the_finger_moves_as_in_another_engine(payload):
         expected.append(data.qpos.copy())
         mujoco.mj_step(model, data, 50)
     ones = np.ones(3)
-    plant = Plant(("a", "b", "c"), ones, 0.02 * ones, 99 * ones, 1e-3 * ones, 0 * ones, body=FINGER)
+    plant = Plant(("a", "b", "c"), ones, 0.02 * ones, 99 * ones, 1e-3 * ones, 0 * ones, body=body)
     # Switched off at the start, and so without damping: it falls and swings, bends driving each other.
     time = np.arange(100) * 5e-3
     off = np.zeros((100, 3), dtype=bool)
@@ -163,6 +144,24 @@ def test_the_finger_moves_as_in_another_engine(payload):
     (moved,) = simulate([Run(plant, time, np.tile(start, (100, 1)), off, conditions)], dt=1e-4)
     assert np.ptp(moved.position, axis=0).min() > 0.1
     np.testing.assert_allclose(moved.position, np.array(expected), atol=2e-3)
+
+
+def test_a_finger_of_any_hand_moves_as_the_rollouts_say(tmp_path, monkeypatch):
+    """Four joints about skewed axes, links off them, and dry friction; rounded to encoder counts."""
+    monkeypatch.setattr("vd.bench.hide.NOISE_RAD", 0.0)
+    parts = [part.replace(MIMIC, "").replace(MESH, '<sphere radius="0.01"/>') for part in PARTS]
+    hand = import_hand(write_urdf(tmp_path, parts), tmp_path / "out").hand
+    names = hand.joint_names[hand.fingers[1]]
+    friction = {"coulomb_friction": {"tau_c_nm": 0.02}}
+    exact = {"joints": names, "base_spread": 0.0, "excitations": ("torque_release",)}
+    (made,) = simulate_hidden([Hiding(str(hand.path), friction, seed=1, **exact)])
+    (chain,) = chains(made.recording, hand)
+    rows = np.stack([chain.start_row] * 2)
+    rows[0, :, kernel.COULOMB_TORQUE] = 0.02
+    measured = np.concatenate([t.position for t in made.recording.trajectories])
+    predicted = Rollouts(chain, made.recording, dt=1.0 / 1920.0).predict(rows)
+    true, without = np.sqrt(np.mean((predicted - measured) ** 2, axis=(1, 2)))
+    assert len(names) == 4 and true < 1.5e-3 and without > 3.0 * true, f"{true:.1e}, {without:.1e} rad"
 
 
 def test_too_stiff_a_spring_is_refused():

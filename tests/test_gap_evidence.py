@@ -1,25 +1,25 @@
-"""What decides, on made-up fits: gains on unseen motions, ties, bounds, structure, and other joints."""
+"""What decides, on made-up fits: gains on unseen motions, ties, bounds, and other joints."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from gap_recordings import COUNT, FLOOR, made_up
+from gap_recordings import FLOOR, made_up
 
 import vd.kernels.servo.actuators as servo
-from vd.gap.consensus import share
 from vd.gap.coordinates import Coordinate
+from vd.gap.evidence import Evidence
 from vd.gap.explanation import Accepted, Explanation
+from vd.gap.joints import doubted, share
 from vd.gap.statistics import resamples
-from vd.gap.verdict import Verdicts
 
 
 @pytest.fixture
-def judge() -> Verdicts:
-    return Verdicts(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
+def judge() -> Evidence:
+    return Evidence(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
 
 
-def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(judge: Verdicts) -> None:
+def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(judge: Evidence) -> None:
     before, name = made_up((), 0.010), ("backlash",)
     assert judge.better(before, made_up(name, 0.005))[0]
     assert not judge.better(before, made_up(name, 0.0097))[0]
@@ -31,14 +31,14 @@ def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(
     assert not accepted and "noise floor" in why
 
 
-def test_a_tie_on_unseen_motions_is_a_set(judge: Verdicts) -> None:
+def test_a_tie_on_unseen_motions_is_a_set(judge: Evidence) -> None:
     noise = np.random.default_rng(1).normal(0.0, 1e-3, 10)
     winner = made_up(("coulomb_friction",), 0.004)
     assert judge.tied(winner, made_up(("dead_zone",), 0.004 + noise - noise.mean()))[0]
     assert not judge.tied(winner, made_up(("backlash",), 0.006))[0]
 
 
-def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: Verdicts) -> None:
+def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: Evidence) -> None:
     simple = made_up(("coulomb_friction",), 1.000e-3)
     fuller = made_up(("stribeck_friction",), 0.970e-3, fitted=0.999e-3)
     assert judge.winner([fuller, simple]) is simple
@@ -51,38 +51,6 @@ def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: 
     assert stuck.at_bound == ("backlash.width_rad",) and judge.winner([stuck, inside]) is inside
 
 
-def concluded(judge: Verdicts, left: float = FLOOR, **options: object) -> Explanation:
-    """A conclusion about Coulomb friction that is beyond doubt but for ``options``."""
-    final = made_up(("coulomb_friction",), left)
-    rivals = {"coulomb_friction": [final, made_up(("backlash",), 0.004)]}
-    return judge.conclude(made_up((), 0.010), final, rivals, [], "", **options)  # type: ignore[arg-type]
-
-
-def test_two_searches_that_disagree_by_more_than_the_gain_give_no_name(judge: Verdicts) -> None:
-    left, name = 1.5 * FLOOR, ("coulomb_friction",)
-    # Its gain is what the next best leaves: 4 - 1.5 mrad.
-    near = concluded(judge, left, again=made_up(name, 0.0035))
-    assert near.verdict == "effects" and near.accepted[0].named
-    far = concluded(judge, left, again=made_up(name, 0.0045))
-    assert far.verdict == "unknown" and not far.accepted[0].named
-    assert "two searches" in far.reason and "3.00 mrad" in far.reason
-    assert concluded(judge, again=made_up(name, 0.0095)).verdict == "effects", "at the floor it says nothing"
-
-
-def test_what_leaves_structure_is_not_explained(judge: Verdicts) -> None:
-    final, pairs = made_up(("coulomb_friction",), FLOOR), np.full(10, 400.0)
-
-    def with_structure(share: float, rms: float = 1.1 * FLOOR) -> Explanation:
-        left = replace(final, sse=COUNT * rms**2, structure=np.stack([share * FLOOR**2 * pairs, pairs]))
-        return concluded(judge, refined=left)
-
-    assert with_structure(0.03).verdict == "effects", "what the right models leave"
-    lacking = with_structure(0.3)
-    assert lacking.verdict == "unknown" and "structure" in lacking.reason
-    # Far from the floor a real machine's repeatability is not known.
-    assert with_structure(8.0, rms=5.0 * FLOOR).verdict == "effects"
-
-
 def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:
     def explanation(name: str, *tied: str, verdict: str = "") -> Explanation:
         accepted = Accepted(name, 0.6 if tied else 1.0, {}, (), tied, False)
@@ -90,8 +58,8 @@ def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:
         verdict = verdict or ("ambiguous" if tied else "effects")
         return Explanation(made_up((), 0.02), fits[0], verdict, "", (accepted,), (), {name: fits})
 
-    def names(*explanations: Explanation, groups: list[int] | None = None) -> list[str]:
-        shared = share(explanations, [FLOOR] * len(explanations), groups)
+    def names(*explanations: Explanation, groups: tuple[int, ...] = (0, 0)) -> list[str]:
+        shared = share(explanations, [FLOOR] * 2, groups, [lambda fit: fit] * 2)
         return [e.accepted[0].name if e.accepted[0].named else "?" for e in shared]
 
     one, other = explanation("backlash", "dead_zone"), explanation("backlash", "coulomb_friction")
@@ -99,11 +67,23 @@ def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:
     assert names(one, explanation("dead_zone")) == ["dead_zone", "dead_zone"]
     assert names(one, explanation("thermal_drift")) == ["?", "thermal_drift"]
     # Separate servos share gravity, not the play of one gear.
-    assert names(one, explanation("backlash"), groups=[0, 1]) == ["?", "backlash"]
+    assert names(one, explanation("backlash"), groups=(0, 1)) == ["?", "backlash"]
     load = explanation("encoder_bias", "gravity_load")
-    assert names(load, explanation("gravity_load"), groups=[0, 1]) == ["gravity_load", "gravity_load"]
+    assert names(load, explanation("gravity_load"), groups=(0, 1)) == ["gravity_load", "gravity_load"]
     # What comes nearest where nothing explains the gap settles no other joint's set.
     assert names(one, explanation("backlash", verdict="unknown"))[0] == "?"
+
+
+def test_a_cause_outside_the_table_on_one_joint_of_a_finger_is_one_on_the_others() -> None:
+    def explanation(*names: str, verdict: str = "effects", warms: bool = False) -> Explanation:
+        return Explanation(made_up((), 0.02), made_up(names, 0.001), verdict, "", warms=warms)
+
+    pair, friction = ("gravity_load", "encoder_bias"), "coulomb_friction"
+    spring, warm = explanation(*pair, verdict="unknown"), explanation(friction, verdict="unknown", warms=True)
+    for other, mine in ((spring, explanation(*pair)), (warm, explanation(friction, "backlash"))):
+        found = doubted([other, mine, mine], [0, 0, 1])
+        assert [e.verdict for e in found] == ["unknown", "unknown", "effects"]
+        assert doubted([other, explanation("backlash")], [0, 0])[1].verdict == "effects"
 
 
 @pytest.mark.parametrize(("falls", "verdict"), [(0.0, "effects"), (-0.8, "unknown")])
@@ -128,6 +108,6 @@ def test_a_friction_that_changes_from_motion_to_motion_is_no_name(falls: float, 
     )
     gap = count * (10.0 * FLOOR) ** 2
     plain = replace(final, effects=(), held_out=gap, sse=gap)
-    judge = Verdicts(floor=FLOOR, weights=resamples(len(when), np.random.default_rng(0)), when=when)
+    judge = Evidence(floor=FLOOR, weights=resamples(len(when), np.random.default_rng(0)), when=when)
     found = judge.conclude(plain, final, {"coulomb_friction": [final]}, [], "")
     assert found.verdict == verdict and ("changes" in found.reason) == bool(falls)

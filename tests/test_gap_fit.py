@@ -61,7 +61,7 @@ def test_effect_is_recovered_with_the_baseline(effect: str, column: int, value: 
     assert fit.rmse < 1.2 * problem.floor
 
 
-def test_a_refined_fit_depends_less_on_the_step_and_a_wrong_model_leaves_structure() -> None:
+def test_a_refined_fit_depends_less_on_the_step() -> None:
     """Values at a coarse step come near those at a fine one, and say how near."""
     problem = problem_of(recorded({servo.COULOMB_TORQUE: 0.1}))
     scales = problem.scales(problem.rollouts.chain.start_row[0], 1e-2)
@@ -74,11 +74,6 @@ def test_a_refined_fit_depends_less_on_the_step_and_a_wrong_model_leaves_structu
     assert off[0] > 0.05 and off[1] < 0.4 * off[0]
     assert (refined.step_error > 0.0).all()
     np.testing.assert_array_equal(refined.held_out, coarse.held_out)
-    products, count = refined.structure
-    assert count.sum() > 200 and abs(products.sum() / count.sum()) < 0.15 * problem.floor**2
-    wrong = problem.refine(fitted(problem, "dead_zone"), scales)
-    products, count = wrong.structure
-    assert products.sum() / count.sum() > 0.15 * problem.floor**2
 
 
 @pytest.mark.parametrize("refits", [0, 3])

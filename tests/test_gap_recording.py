@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from vd.bench.hide import Hiding, simulate_hidden
-from vd.gap.cautions import cautions
 from vd.gap.recording import Recording, RecordingError, Trajectory, read_recording, write_recording
-from vd.gap.recording_checks import check_motion
+from vd.gap.recording_checks import cautions, check_motion
 
 SAMPLES = 200
 COUNT = 2.0 * np.pi / 4096

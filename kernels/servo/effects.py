@@ -212,10 +212,10 @@ def equivalent(model: str, beside: Iterable[str] = ()) -> dict[str, tuple[str, .
 
 
 TOGETHER: dict[str, tuple[str, ...]] = {
-    "asymmetric_friction": ("coulomb_friction", "dead_zone", "encoder_bias", "gravity_load"),
+    "asymmetric_friction": ("coulomb_friction", "dead_zone", "encoder_bias"),
 }
 """Effects that are the same as two others together, of those listed: friction that differs between the
-directions is friction that does not, and a constant torque or offset."""
+directions is friction that does not, or a dead zone, and an offset."""
 
 
 def neutral_row() -> list[float]:

@@ -1,43 +1,88 @@
-"""A finger of three joints in closed form, for the hidden plant: equations of Lagrange and dry friction."""
+"""A finger for the hidden plant: mass matrix and bias by MuJoCo's engine in C, dry friction of our own."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-FRICTION_SWEEPS = 3
-"""Gauss-Seidel sweeps between two joints; their coupling is one part in ten."""
+from vd.assets_usd.hand_data import HandModel
+
+FRICTION_SWEEPS = 8
+"""Gauss-Seidel sweeps over the joints: their coupling is one part in ten, of a LEAP hand one in three."""
 GRAVITY_M_S2 = 9.81
 
 
 @dataclass(frozen=True, eq=False)
 class FingerBody:
-    """A finger that hangs from its mount: the first joint swings it about x, two bend it about y.
-
-    Frames: that of the first joint, z along the straight finger, gravity along ``gravity`` z.
+    """Links of n joints, one after the other, with all joints at zero and in the axes of the base.
 
     Attributes:
-        mass: Masses of the links [3] [kg].
-        com: Distances of the centres of mass from the joints, along the links [3] [m].
-        inertia: Principal moments about x, y, z of the links [3, 3] [kg m^2].
-        spacing: Distance from the second joint to the third [m].
-        offset: Distance from the first joint to the second [m].
-        tip: Distance from the third joint to the fingertip [m], where a payload hangs.
-        gravity: Acceleration along +z [m/s^2].
+        axis: Unit axes of the joints [n, 3].
+        offset: From the joint before to the joint [n, 3] [m].
+        mass: Masses of the links [n] [kg].
+        com: From each joint to its link's centre of mass [n, 3] [m].
+        inertia: Of the links about their centres [n, 3, 3] [kg m^2].
+        tip: From the last joint to the fingertip [3] [m], where a payload hangs.
+        gravity: Acceleration [3] [m/s^2].
     """
 
+    axis: np.ndarray
+    offset: np.ndarray
     mass: np.ndarray
     com: np.ndarray
     inertia: np.ndarray
-    spacing: float
-    offset: float
-    tip: float
-    gravity: float = GRAVITY_M_S2
+    tip: np.ndarray
+    gravity: np.ndarray
+
+    def model(self, payload: float) -> Any:
+        """MuJoCo's model of it, with a point mass [kg] at its tip."""
+        spec = mujoco.MjSpec()
+        spec.option.gravity = self.gravity
+        spec.compiler.autolimits = False
+        body = spec.worldbody
+        for i in range(len(self.mass)):
+            x = self.inertia[i]
+            full = [x[0, 0], x[1, 1], x[2, 2], x[0, 1], x[0, 2], x[1, 2]]
+            body = body.add_body(
+                pos=self.offset[i],
+                mass=self.mass[i],
+                ipos=self.com[i],
+                fullinertia=full,
+                explicitinertial=True,
+            )
+            body.add_joint(axis=self.axis[i])
+        if payload:
+            tiny = [1e-12] * 3  # of a point, as small as the engine takes it
+            body.add_body(pos=self.tip, mass=payload, inertia=tiny, explicitinertial=True)
+        return spec.compile()
+
+
+def body_of(hand: HandModel, finger: int, heavier: np.ndarray) -> FingerBody:
+    """A finger of a hand, the masses and inertias of its links times factors [n]."""
+    joints = np.arange(hand.num_joints)[hand.fingers[finger]]
+    poses = hand.forward_kinematics(np.zeros(hand.num_joints))
+    parents, frames = poses[hand.joint_parent[joints]], hand.joint_parent_frame[joints]
+    turns = Rotation.from_quat(parents[:, 3:])
+    place = parents[:, :3] + turns.apply(frames[:, :3])
+    links = hand.joint_child[joints]
+    own = Rotation.from_quat(poses[links, 3:])
+    matrix = own.as_matrix()
+    return FingerBody(
+        axis=(turns * Rotation.from_quat(frames[:, 3:])).apply(hand.joint_axis[joints]),
+        offset=np.diff(place, axis=0, prepend=np.zeros((1, 3))),
+        mass=hand.link_mass[links] * heavier,
+        com=poses[links, :3] + own.apply(hand.link_com[links]) - place,
+        inertia=matrix @ hand.link_inertia[links] @ matrix.transpose(0, 2, 1) * heavier[:, None, None],
+        tip=poses[links[-1], :3] + own[-1].apply(hand.tip_frame[finger, :3]) - place[-1],
+        gravity=GRAVITY_M_S2 * hand.down,
+    )
 
 
 class Finger:
-    """Equations of motion of fingers [B] in closed form; see :class:`FingerBody` for the frames.
+    """Equations of motion of fingers [B] with n joints each.
 
     Args:
         bodies: The fingers.
@@ -45,54 +90,23 @@ class Finger:
     """
 
     def __init__(self, bodies: Sequence[FingerBody], payload: np.ndarray):
-        mass = np.stack([b.mass for b in bodies])
-        com = np.stack([b.com for b in bodies])
-        inertia = np.stack([b.inertia for b in bodies])
-        tip = np.array([b.tip for b in bodies])
-        # A point mass at the tip moves the last link's centre of mass and adds to its inertia about it.
-        total = mass[:, 2] + payload
-        apart = mass[:, 2] * payload / total * (tip - com[:, 2]) ** 2
-        com[:, 2] = (mass[:, 2] * com[:, 2] + payload * tip) / total
-        mass[:, 2] = total
-        self.l1 = np.array([b.offset for b in bodies])
-        self.l2 = np.array([b.spacing for b in bodies])
-        self.g = np.array([b.gravity for b in bodies])
-        self.m1, self.m2, self.m3 = mass.T
-        self.r1, self.r2, self.r3 = com.T
-        self.x2, self.x3 = inertia[:, 1, 0], inertia[:, 2, 0] + apart
-        self.z2, self.z3 = inertia[:, 1, 2], inertia[:, 2, 2]
-        self.d2, self.d3 = self.z2 - self.x2, self.z3 - self.x3
-        self.swing = self.m1 * self.r1**2 + inertia[:, 0, 0] + self.x2 + self.x3
-        y2, y3 = inertia[:, 1, 1], inertia[:, 2, 1] + apart
-        self.m33 = y3 + self.m3 * self.r3**2
-        self.cross = self.m3 * self.l2 * self.r3
-        self.m22 = y2 + self.m2 * self.r2**2 + self.m3 * self.l2**2 + self.m33
-        self.first = self.m1 * self.r1
-
-    def _geometry(self, q: np.ndarray) -> tuple[Any, ...]:
-        """First moments of mass along and across the straight finger, and sines and cosines."""
-        s, c = np.sin(q), np.cos(q)
-        s23 = s[:, 1] * c[:, 2] + c[:, 1] * s[:, 2]
-        c23 = c[:, 1] * c[:, 2] - s[:, 1] * s[:, 2]
-        b2, b3 = self.l2 * s[:, 1], self.r3 * s23  # the third joint, and the last centre from it, along x
-        h2 = self.l1 + self.r2 * c[:, 1]  # heights along z of the two centres of mass
-        h3 = self.l1 + self.l2 * c[:, 1] + self.r3 * c23
-        return s, c, s23, c23, b2, b3, h2, h3
+        self._models = [body.model(float(mass)) for body, mass in zip(bodies, payload, strict=True)]
+        self._data = [mujoco.MjData(model) for model in self._models]
 
     def weight(self, q: np.ndarray) -> np.ndarray:
-        """Torques that hold the finger against gravity [B, 3] [N m]."""
-        s, c, _, _, b2, b3, h2, h3 = self._geometry(q)
-        return self._weight(s, c, b2, b3, h2, h3)
+        """Torques that hold the fingers against gravity [B, n] [N m]."""
+        return self._forward(q, np.zeros_like(q))[1]
 
-    def _weight(
-        self, s: np.ndarray, c: np.ndarray, b2: np.ndarray, b3: np.ndarray, h2: np.ndarray, h3: np.ndarray
-    ) -> np.ndarray:
-        upright = self.g * c[:, 0]
-        out = np.empty_like(s)
-        out[:, 0] = self.g * s[:, 0] * (self.first + self.m2 * h2 + self.m3 * h3)
-        out[:, 2] = upright * self.m3 * b3
-        out[:, 1] = upright * (self.m2 * self.r2 * s[:, 1] + self.m3 * b2) + out[:, 2]
-        return out
+    def _forward(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mass matrices [B, n, n] [kg m^2], and what gravity and speeds pull [B, n] [N m]."""
+        mass, bias = np.empty((*q.shape, q.shape[1])), np.empty_like(q)
+        for i, (model, data) in enumerate(zip(self._models, self._data, strict=True)):
+            data.qpos[:], data.qvel[:] = q[i], v[i]
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            mujoco.mj_fullM(model, data, mass[i])
+            bias[i] = data.qfrc_bias
+        return mass, bias
 
     def velocity(
         self,
@@ -105,41 +119,27 @@ class Finger:
         inertia: np.ndarray,
         dt: float,
     ) -> np.ndarray:
-        """Speeds after a step [B, 3]: equations of Lagrange, dry friction by complementarity."""
-        s, c, s23, c23, b2, b3, h2, h3 = self._geometry(q)
-        v1, v2, v3 = v[:, 0], v[:, 1], v[:, 2]
-        # Swing inertia and its derivatives by the two bends.
-        m11 = (
-            self.swing
-            + self.m2 * h2 * h2
-            + self.m3 * h3 * h3
-            + self.d2 * s[:, 1] * s[:, 1]
-            + self.d3 * s23 * s23
-        )
-        by3 = 2.0 * s23 * (self.d3 * c23 - self.m3 * h3 * self.r3)
-        by2 = by3 + 2.0 * (s[:, 1] * (self.d2 * c[:, 1] - self.m2 * h2 * self.r2) - self.m3 * h3 * b2)
-        m23 = self.m33 + self.cross * c[:, 2]
-        m22 = self.m22 + 2.0 * self.cross * c[:, 2]
-        bend = self.cross * s[:, 2]
-        force = push - self._weight(s, c, b2, b3, h2, h3)
-        swing2 = 0.5 * v1 * v1
-        force[:, 0] -= v1 * (by2 * v2 + by3 * v3)
-        force[:, 1] += swing2 * by2 + bend * v3 * (2.0 * v2 + v3)
-        force[:, 2] += swing2 * by3 - bend * v2 * v2
+        """Speeds after a step [B, n]: the engine's equations, dry friction by complementarity.
 
-        mass = inertia / dt + resisting
-        mass[:, 0] += m11 / dt
-        mass[:, 1] += m22 / dt
-        mass[:, 2] += self.m33 / dt
-        link = m23 / dt
-        momentum = mass * v + force
-        momentum[:, 1] += link * v3
-        momentum[:, 2] += link * v2
+        Args:
+            q: Positions [B, n] [rad].
+            v: Speeds before [B, n] [rad/s].
+            push: Torques of drives and loads [B, n] [N m].
+            resisting: What resists the speed, as an impedance [B, n] [N m s/rad].
+            minus: Dry friction against moving back [B, n] [N m].
+            plus: And forth [B, n] [N m].
+            inertia: Of the drives [B, n] [kg m^2].
+            dt: Time step [s].
+        """
+        links, bias = self._forward(q, v)
+        system, n = links / dt, q.shape[1]
+        system[:, np.arange(n), np.arange(n)] += inertia / dt + resisting
+        momentum = np.einsum("bij,bj->bi", system, v) + push - bias
         new = v.copy()
-        new[:, 0] = slip(momentum[:, 0], minus[:, 0], plus[:, 0]) / mass[:, 0]
         for _ in range(FRICTION_SWEEPS):
-            new[:, 1] = slip(momentum[:, 1] - link * new[:, 2], minus[:, 1], plus[:, 1]) / mass[:, 1]
-            new[:, 2] = slip(momentum[:, 2] - link * new[:, 1], minus[:, 2], plus[:, 2]) / mass[:, 2]
+            for i in range(n):
+                left = momentum[:, i] - np.einsum("bj,bj->b", system[:, i], new) + system[:, i, i] * new[:, i]
+                new[:, i] = slip(left, minus[:, i], plus[:, i]) / system[:, i, i]
         return new
 
 

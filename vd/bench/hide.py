@@ -14,7 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from vd.assets_usd.hands import load_hand
-from vd.bench.hidden_finger import FingerBody
+from vd.bench.hidden_finger import body_of
 from vd.bench.hidden_physics import TUNED, Physics
 from vd.bench.hidden_plant import OUTSIDE, Motion, Plant, Run, simulate
 from vd.files import write_json
@@ -39,8 +39,6 @@ PAUSE_S = 2.0
 """Between two trajectories of a session."""
 FULL_P_GAIN = 400.0
 """P gain, in the units of Dynamixel X servos, at which the stiffness is the plant's."""
-FINGERS = ("dclaw3", "dclaw4")
-"""Hands of whose fingers there is a closed form: a swing about x, two bends about y, links along z."""
 CHUNK = 48
 """Trajectories simulated together: enough to amortise Python, few enough for memory."""
 
@@ -330,28 +328,20 @@ def _spread(rng: np.random.Generator, width: float, shape: tuple[int, ...]) -> n
 
 
 def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
-    if hiding.model not in FINGERS:
-        raise ValueError(f"model {hiding.model!r}: choose {', '.join((*FINGERS, *BARE_MODELS))}")
-    hand = load_hand(hiding.model)
-    joints = tuple(hiding.joints or hand.joint_names[:3])
-    fingers = [tuple(hand.joint_names[i : i + 3]) for i in range(0, hand.num_joints, 3)]
+    try:
+        hand = load_hand(hiding.model)
+    except ValueError as error:
+        raise ValueError(f"model {hiding.model!r}: {error}; or take {' or '.join(BARE_MODELS)}") from error
+    fingers = [tuple(hand.joint_names[finger]) for finger in hand.fingers]
+    joints = tuple(hiding.joints or fingers[0])
     if joints not in fingers:
-        raise ValueError(f"joints {', '.join(joints)}: name the three joints of one finger, in order")
-    finger = fingers.index(joints)
-    index = [3 * finger, 3 * finger + 1, 3 * finger + 2]
-    links = [int(hand.joint_child[i]) for i in index]
-    com, inertia = hand.link_com[links], hand.link_inertia[links]
-    frames, tip = hand.joint_parent_frame[index[1:]], hand.tip_frame[finger]
-    near = _spread(rng, hiding.base_spread, (3, 3))
-    heavy = _spread(rng, hiding.mass_spread, (3,))
-    body = FingerBody(
-        mass=hand.link_mass[links] * heavy,
-        com=com[:, 2],
-        inertia=np.einsum("lii->li", inertia) * heavy[:, None],
-        offset=float(frames[0, 2]),
-        spacing=float(frames[1, 2]),
-        tip=float(tip[2]),
-    )
+        raise ValueError(f"joints {', '.join(joints)}: name the joints of one finger, in order")
+    if (hand.mimic >= 0).any():
+        raise ValueError(f"{hand.name}: some joints follow others, which the gap workflow does not model")
+    finger, n = fingers.index(joints), len(joints)
+    index = hand.fingers[finger]
+    near = _spread(rng, hiding.base_spread, (3, n))
+    heavy = _spread(rng, hiding.mass_spread, (n,))
     reach = JointRange(joints, hand.lower[index], hand.upper[index], FULL_P_GAIN)
     return reach, Plant(
         joints=joints,
@@ -359,8 +349,8 @@ def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
         kd=hand.kd[index] * near[1],
         velocity_limit=hand.velocity_limit[index] * near[2],
         inertia=hand.armature[index],
-        gravity_torque=np.zeros(3),
-        body=body,
+        gravity_torque=np.zeros(n),
+        body=body_of(hand, finger, heavy),
         full_gain=FULL_P_GAIN,
         effort=hand.effort[index],
     )

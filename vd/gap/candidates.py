@@ -6,51 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.coordinates import Scales, beside, best_two, sizes, smaller, torque_power
+from vd.gap.coordinates import Scales, best_two, sizes, torque_power
+from vd.gap.evidence import JITTER
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import AT_FLOOR, EXPLAINED, JITTER, SHARP
-from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.servo.effects import EFFECTS, equivalent
 
 SHORT_LIST = 10
 """Candidates of a round that are fitted, after the linear screening of all."""
 FINALISTS = 6
 """Candidates of a round that are fitted to the end."""
-FIRST = 4
-"""Candidates that are fitted before the rest of the short list."""
-ALIKE = 0.5
-"""Share of the best promise that a candidate must have to be fitted once another explains everything."""
-BEHIND = 3.0
+BEHIND = 2.0
 """Finalists have at most this many times the error of the best after screening."""
-HOPELESS = 1.5
-"""The same factor half way: those beyond it are not fitted to the end."""
-IDLE = 0.99
-"""Share of the error before it that a further effect leaves at least half way if it does nothing: where more
-than noise is left such a fit is not finished either."""
-NEARLY_ALL = 0.05
-"""Share of the error before a round that its best leaves, up to which only what comes near it is tried from
-every start: what else is missing is another effect beside it, or the bottom of its valley."""
 SCREEN_ITERATIONS = 6
-HALF_ITERATIONS = 4
 FULL_ITERATIONS = 12
-SEARCHES = 3
-"""Searches for the final model from elsewhere, until one comes back to it; and in a row beside a model for a
-better one, which a narrow valley that bends takes many to follow."""
 ASTRAY = 2.0
 """Factor from the nominal model beyond which a fit starts from that as well."""
-SEED_STEP = 1000
-SLOWER = 0.3
-"""Share of the squared error that a binding speed limit has to promise for fits to start from one."""
 BETTER = 0.98
-"""Share of the error from which another search for the same model has found a better one."""
-
-IN_RICHER = {
-    "stribeck_friction": ("tau_s_nm", "tau_c_nm"),
-    "asymmetric_friction": ("tau_plus_nm", "tau_minus_nm"),
-    "torque_speed_limit": ("tau_stall_nm",),
-    "elastic_transmission": ("j_kgm2",),
-}
-"""Parameters of an effect whose mean is the only one of the simpler effect in it."""
+"""Share of the error from which a fit of the same model is a better one."""
 
 Call = tuple[str, dict[str, Any]]
 Run = Callable[[list[Call]], list[Any]]
@@ -69,15 +41,11 @@ class CandidateFits:
         candidates: Effects to consider.
         scales: Sizes of the joint's motion.
         refits: Steps of each refit without a fold (:meth:`vd.gap.fit.JointProblem.fit`).
-        seed: Of the second search for the final model.
         vetoes: Effects that telemetry contradicts, with the reason.
         nominal: Nominal values of the baseline's parameters, by key.
         promised: Share of the squared error that each candidate of the last round could remove at best.
-        added: The last fits with one more effect, by the effects of the model to which it was added: that
-            model first.
+        seen: Models to which an effect was added, by their effects.
         behind_jitter: Whether samples are weighted by what random delays do to them.
-        fine: Whether rollouts have the step at which estimates are finished.
-        clocked: The same by what errors of the clock do (:mod:`vd.gap.clock_sensitivity`).
     """
 
     floor: float
@@ -87,14 +55,11 @@ class CandidateFits:
     candidates: Sequence[str]
     scales: Scales
     refits: int = 0
-    seed: int = 0
     vetoes: Mapping[str, str] = field(default_factory=dict)
     nominal: Mapping[str, float] = field(default_factory=dict)
     promised: dict[str, float] = field(default_factory=dict)
-    added: dict[frozenset[str], tuple[JointFit, ...]] = field(default_factory=dict)
+    seen: dict[frozenset[str], JointFit] = field(default_factory=dict)
     behind_jitter: bool = False
-    fine: bool = False
-    clocked: bool = False
 
     def fit_candidates(
         self,
@@ -109,177 +74,44 @@ class CandidateFits:
             present: Model to which they are added.
             skip: Effects to leave out.
             vetoed: Effects to try in spite of a veto.
-            known: A fit with one that is left out; where it explains everything, what stays far from it is
-                not fitted to the end.
+            known: A fit with one that is left out: what stays far behind it is not fitted to the end.
         """
         out = {*present.effects, *(set(self.vetoes) - set(vetoed)), *skip, JITTER}
-        white = 0.0 if self.behind_jitter else EXPLAINED * self.floor
-        least = known.rmse if known is not None and known.rmse < white else np.inf
-        names = [name for name in self.candidates if name not in out]
-        starts = {
-            name: [*self.sized(present, name), *beside(name, present.values, self.scales)] for name in names
-        }
-        flat = [(name, start) for name in names for start in starts[name]]
+        starts = {name: self.sized(present, name) for name in self.candidates if name not in out}
+        flat = [(name, start) for name, given in starts.items() for start in given]
         if not flat:
             return {}
-        promise = self.run(
-            [("promise", {"fit": present, "starts": [s for _, s in flat], "scales": self.scales})]
-        )[0]
-        self.promised = {
-            name: max(float(promise[i]) for i, (own, _) in enumerate(flat) if own == name) for name in names
-        }
-        order: dict[str, list[int]] = {name: [] for name in names}
+        call = {"fit": present, "starts": [start for _, start in flat], "scales": self.scales}
+        promise = self.run([("promise", call)])[0]
+        best_first: dict[str, list[dict[str, float]]] = {}
+        self.promised = {}
         for i in np.argsort(-promise):
-            order[flat[i][0]].append(int(i))
-        ranked = sorted(names, key=lambda name: -promise[order[name][0]])[:SHORT_LIST]
-
-        def screen(chosen: Sequence[str]) -> list[JointFit]:
-            calls = [
-                self.call(
-                    present,
-                    name,
-                    self.starts(present, best_two([flat[i][1] for i in order[name]])),
-                    SCREEN_ITERATIONS,
-                )
-                for name in chosen
+            name, start = flat[i]
+            best_first.setdefault(name, []).append(start)
+            self.promised.setdefault(name, float(promise[i]))
+        screened = self.run(
+            [
+                self.call(present, name, self.starts(present, best_two(given)), SCREEN_ITERATIONS)
+                for name, given in list(best_first.items())[:SHORT_LIST]
             ]
-            return self.run(calls)
-
-        screened = screen(ranked[:FIRST])
-        rest = ranked[FIRST:]
-        if min(least, *(fit.rmse for fit in screened)) < white:
-            # What explains everything has only those to fear that promised nearly as much.
-            enough = ALIKE * promise[order[ranked[0]][0]]
-            rest = [name for name in rest if promise[order[name][0]] > enough]
-        screened += screen(rest)
-        screened.sort(key=lambda fit: fit.rmse)
-        finalists = [fit for fit in screened[:FINALISTS] if fit.rmse < BEHIND * screened[0].rmse]
-
-        def go_on(chosen: Sequence[JointFit], iterations: int) -> list[JointFit]:
-            return self.run([self.call(present, f.effects[-1], [f.values], iterations) for f in chosen])
-
-        if len(finalists) > 1 or np.isfinite(least):
-            finalists = sorted(go_on(finalists, HALF_ITERATIONS), key=lambda fit: fit.rmse)
-        # The fit of what does nothing is not finished, but that of the best is.
-        most = max(finalists[0].rmse, white, IDLE * present.rmse)
-        most = min(most, HOPELESS * min(finalists[0].rmse, least))
-        near = [fit for fit in finalists if fit.rmse <= most]
-        last = [*go_on(near, FULL_ITERATIONS), *finalists[len(near) :]]
-        last = self.slowed(present, last)
-        fits = {fit.effects[-1]: fit for fit in (*last, *screened[len(finalists) :])}
-        # Nothing added can do worse than nothing: such a fit began too large, and no descent led back.
-        astray = [name for name, fit in fits.items() if fit.rmse > present.rmse]
-        small = {name: smaller(flat[order[name][0]][1]) for name in astray}
-        again = [name for name in astray if small[name] is not None]
-        calls = [
-            self.call(present, name, [{**present.values, **(small[name] or {})}], SCREEN_ITERATIONS)
-            for name in again
-        ]
-        found = [fit for fit in self.run(calls) if fit.rmse < fits[fit.effects[-1]].rmse]
-        fits |= {fit.effects[-1]: fit for fit in found}
-        near = [fit for fit in found if fit.rmse <= most]
-        fits |= {fit.effects[-1]: fit for fit in go_on(near, FULL_ITERATIONS)}
-        return fits
+        )
+        least = min(fit.rmse for fit in (*screened, *([] if known is None else [known])))
+        near = sorted((fit for fit in screened if fit.rmse < BEHIND * least), key=lambda fit: fit.rmse)
+        calls = [self.call(present, f.effects[-1], [f.values], FULL_ITERATIONS) for f in near[:FINALISTS]]
+        return {fit.effects[-1]: fit for fit in (*screened, *self.run(calls))}
 
     def sized(self, present: JointFit, name: str) -> list[dict[str, float]]:
         """Starting values of an effect added to a model: none that differ only in what that does not fit."""
         starts = sizes(name, self.others, self.scales)
         return [start for start in starts if all("." in key or key in present.values for key in start)]
 
-    def tried_beside(
-        self, without: JointFit, present: JointFit, skip: Sequence[str]
-    ) -> dict[str, JointFit] | None:
-        """The fits with other effects in the place of a model's last, if it was chosen from among them."""
-        before, *fits = self.added.get(frozenset(without.effects), (None,))
-        if before is None or not any(fit is present for fit in fits) or without.rmse < BETTER * before.rmse:
-            return None
-        if {*BEHIND_SENSOR} & {*self.vetoes}:
-            return None  # these are tried here, and were not there
-        return {fit.effects[-1]: fit for fit in fits if fit.effects[-1] not in skip}
-
-    def slowed(self, present: JointFit, fits: list[JointFit]) -> list[JointFit]:
-        """The fits, or better ones whose speed limit binds where that promises to explain what is left.
-
-        Without the effect the baseline may have put it above all speeds, where it has no slope to descend.
-        """
-        best = min(fits, key=lambda fit: fit.rmse)
-        start = {"velocity_limit": self.scales.speed}
-        if best.rmse < AT_FLOOR * self.floor or best.values.get("velocity_limit", 0.0) <= self.scales.speed:
-            return fits
-        call = {"fit": best, "starts": [start], "scales": self.scales}
-        if self.run([("promise", call)])[0][0] < SLOWER:
-            return fits
-        near = [fit for fit in fits if fit.rmse < HOPELESS * best.rmse]
-        calls = [self.call(present, f.effects[-1], [{**f.values, **start}], FULL_ITERATIONS) for f in near]
-        found = dict(zip([fit.effects for fit in near], self.run(calls), strict=True))
-        return [min(fit, found.get(fit.effects, fit), key=lambda one: one.rmse) for fit in fits]
-
-    def search_nearby(self, fit: JointFit, whole: float) -> JointFit:
-        """The fit, or a better one beside it where nearly all of the error is gone.
-
-        A profile that cannot follow its command leaves an error with many sharp valleys.
-
-        Args:
-            fit: What was found.
-            whole: Error without any effect [rad].
-        """
-        number = failed = 0
-        while failed < SEARCHES and AT_FLOOR * self.floor < fit.rmse < SHARP * whole:
-            call = {"fit": fit, "scales": self.scales, "seed": self.seed + number * SEED_STEP}
-            found = self.run([("nearby", call)])[0]
-            better = found.rmse < BETTER * fit.rmse
-            fit = self.refit(found, found.effects) if better else fit
-            number, failed = number + 1, 0 if better else failed + 1
-        return fit
-
-    def look_wider(self, present: JointFit, fits: Mapping[str, JointFit]) -> dict[str, JointFit]:
-        """The fits of a round, and those of all candidates from every start where these are better."""
-        out = {*present.effects, *self.vetoes, JITTER}
-        least = min(fit.rmse for fit in fits.values())
-        if least < NEARLY_ALL * present.rmse:
-            out |= {name for name in self.candidates if name not in fits or fits[name].rmse > BEHIND * least}
-        names = [name for name in self.candidates if name not in out]
-        calls = [
-            self.call(present, name, self.starts(present, self.sized(present, name)), SCREEN_ITERATIONS)
-            for name in names
-        ]
-        found = sorted(self.run(calls), key=lambda fit: fit.rmse)
-        better = [
-            fit
-            for fit in found[:FINALISTS]
-            if fit.rmse < BETTER * (fits[fit.effects[-1]].rmse if fit.effects[-1] in fits else np.inf)
-            and fit.rmse < BEHIND * least
-        ]
-        refits = self.run(
-            [self.call(present, fit.effects[-1], [fit.values], FULL_ITERATIONS) for fit in better]
-        )
-        result = dict(fits)
-        for refit in refits:
-            known = result.get(refit.effects[-1])
-            if known is None or refit.held_out_rmse < known.held_out_rmse:
-                result[refit.effects[-1]] = refit
-        return result
-
     def plain(self, baseline: JointFit) -> Call:
         """The call that fits the plain model anew."""
         call = {"base": baseline.rows, "effects": (), "starts": [{}, self.nominal], "scales": self.scales}
         return "fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits}
 
-    def search_again(self, present: JointFit) -> JointFit | None:
-        """The final model as searches from elsewhere find it; None at the noise floor: none is better."""
-        if present.rmse < AT_FLOOR * self.floor:
-            return None
-        best: JointFit | None = None
-        for number in range(SEARCHES):
-            call = {"fit": present, "scales": self.scales, "seed": self.seed + number * SEED_STEP}
-            found = self.run([("again", call)])[0]
-            best = found if best is None or found.rmse < best.rmse else best
-            if best.rmse < present.rmse / BETTER:
-                break
-        return best
-
     def refined(self, fit: JointFit) -> JointFit:
-        """A fit at finer time steps, with the structure of what it leaves."""
+        """A fit at finer time steps."""
         return self.run([("refine", {"fit": fit, "scales": self.scales})])[0]
 
     def starts(self, present: JointFit, added: Sequence[dict[str, float]]) -> list[dict[str, float]]:
@@ -317,39 +149,14 @@ class CandidateFits:
             },
         )
 
-    def from_richer(self, present: JointFit, name: str, simpler: str) -> JointFit:
-        """The fit with a simpler effect in the place of one that contains it, from what that one found."""
-        rows, values = present.rows.copy(), present.values
-        own = {p.name: values[f"{name}.{p.name}"] for p in EFFECTS[name].parameters}
-        for parameter in EFFECTS[name].parameters:
-            rows[self.joint, parameter.column] = parameter.neutral
-        size = float(np.mean([own[key] for key in IN_RICHER[name]]))
-        start = {key: value for key, value in values.items() if not key.startswith(f"{name}.")}
-        start[f"{simpler}.{EFFECTS[simpler].parameters[0].name}"] = size
-        kept = tuple(effect for effect in present.effects if effect != name)
-        call = {"base": rows, "effects": (*kept, simpler), "starts": [start], "scales": self.scales}
-        return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0]
+    def without(self, present: JointFit, name: str) -> JointFit:
+        """The fit without one of a model's effects: the one to which it was added where that is as good.
 
-    def from_present(
-        self, present: JointFit, without: JointFit, fits: Mapping[str, JointFit]
-    ) -> dict[str, JointFit]:
-        """The fits with others in the place of an effect that are better from where the present model is.
-
-        In a sharp valley, as beside a profile that cannot follow, they end where they entered it.
-
-        Args:
-            present: The model.
-            without: The model without the effect.
-            fits: With others in its place, by name.
+        What was fitted beside that one is known.
         """
-        near = {name: fit for name, fit in fits.items() if present.rmse < fit.rmse < BEHIND * present.rmse}
-        kept = {key: present.values[key] for key in without.values}
-        calls = []
-        for name, fit in near.items():
-            own = {key: value for key, value in fit.values.items() if key.startswith(f"{name}.")}
-            calls.append(self.call(without, name, [{**kept, **own}], FULL_ITERATIONS))
-        found = dict(zip(near, self.run(calls), strict=True))
-        return {name: fit for name, fit in found.items() if fit.rmse < near[name].rmse}
+        fit = self.refit(present, [effect for effect in present.effects if effect != name])
+        seen = self.seen.get(frozenset(fit.effects), fit)
+        return seen if BETTER * seen.rmse <= fit.rmse else fit
 
     def refit(self, present: JointFit, effects: Sequence[str]) -> JointFit:
         """The fit with only some of a model's effects."""

@@ -2,10 +2,11 @@
 
 import json
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
@@ -19,6 +20,8 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
 
+SILENT_S = 10.0
+"""Longest time without a line while something is simulated [s]."""
 OK, UNUSABLE = 0, 2
 """Exit statuses: a verdict was reached, something else is wrong, the recording cannot be used."""
 
@@ -93,30 +96,34 @@ class Run(_Step):
 
 
 @dataclass(frozen=True)
-class Find(_Step):
+class _OneStep(_Step):
+    name: ClassVar[str]
+
+    def run(self) -> int:
+        """Run the step."""
+        analysis = self.analysis()
+        analysis.run(self.name, first=self.name, fresh=self.fresh)
+        path = analysis.out / f"{self.name}.json"
+        print(path.read_text() if self.json else path)
+        return OK
+
+
+class Find(_OneStep):
     """Fit the plain servo model of every joint, and say where and in what motion it fails."""
 
-    def run(self) -> int:
-        """Run the step."""
-        return _print_step(self, "find", "find.json")
+    name = "find"
 
 
-@dataclass(frozen=True)
-class Explain(_Step):
+class Explain(_OneStep):
     """Try every effect on motions that the fit has not seen, and name what is missing, or abstain."""
 
-    def run(self) -> int:
-        """Run the step."""
-        return _print_step(self, "explain", "explain.json")
+    name = "explain"
 
 
-@dataclass(frozen=True)
-class Close(_Step):
+class Close(_OneStep):
     """Write identified.usda and simulate the recorded commands again with it, a hand in Newton."""
 
-    def run(self) -> int:
-        """Run the step."""
-        return _print_step(self, "close", "close.json")
+    name = "close"
 
 
 @dataclass(frozen=True)
@@ -257,6 +264,14 @@ class Identify:
             flush=True,
         )
 
+        told = time.monotonic()
+
+        def working(share: float) -> None:
+            nonlocal told
+            if time.monotonic() - told > SILENT_S:
+                told = time.monotonic()
+                print(f"  {100.0 * share:.0f} % of a generation", file=sys.stderr, flush=True)
+
         def show(generation: int, best: dict[str, float]) -> None:
             errors = ", ".join(f"{finger} {1e3 * error:.2f} mrad" for finger, error in best.items())
             print(f"generation {generation}/{self.generations}: {errors}", file=sys.stderr, flush=True)
@@ -270,6 +285,7 @@ class Identify:
             device=resolve_device(self.device),
             seed=self.seed,
             progress=show,
+            working=working,
         )
         write_drives(found, self.out, hand, recording, every_finger=self.every_finger)
         if self.json:
@@ -315,14 +331,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("vd-gap: stopped; the same command goes on with the step it was in", file=sys.stderr)
         return interrupt.INTERRUPTED
-
-
-def _print_step(step: _Step, name: str, file: str) -> int:
-    analysis = step.analysis()
-    analysis.run(name, first=name, fresh=step.fresh)
-    path = analysis.out / file
-    print(path.read_text() if step.json else path)
-    return OK
 
 
 def _print_report(analysis: "Analysis", as_json: bool) -> int:

@@ -1,7 +1,7 @@
 """Coordinates in which the servo model is fitted, and sizes at which the search for an effect starts."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,6 @@ GRAVITY = EFFECTS["gravity_load"].parameters[0]
 BASELINE_PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAVITY)}
 """Everything that a baseline can fit, by name."""
 
-NEARLY_OFF = 0.1
-"""Share of a starting size from which a fit begins anew that ended worse than without the effect."""
 LOG_STEP = 0.01
 """Finite-difference step of a logarithmic coordinate: above the noise of single precision."""
 LINEAR_STEP = 0.05
@@ -34,10 +32,6 @@ SLOW_RESONANCES = tuple(0.2 * 1.2**i for i in range(10))
 hardly damped is some 15 % wide to either side, and from farther off a descent damps it until it is gone."""
 RINGING_MASS, RINGING_DAMPING = 0.5, 0.04
 """Its inertia, in the joint's, and its damping ratio at these starts; from 0.1 a descent can end at more."""
-LEVELS = {"torque_limit": "torque_limit.tau_max_nm", "torque_saturation": "torque_saturation.tau_s_nm"}
-"""Losses of torque beside which a line that falls with the speed can act, and the torque of each."""
-STEEPER = 2.0
-"""Torque at rest of the line beside one of them, in that of what stands for both."""
 FLATTEST = 1e-3
 """Scale of angles at least [rad], if the residual is smaller."""
 
@@ -248,47 +242,7 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
     return starts
 
 
-def beside(effect: str, present: Mapping[str, float], scales: Scales) -> list[dict[str, float]]:
-    """Starting values of an effect and of one that it has to leave room beside, by key.
-
-    Args:
-        effect: Name of the effect.
-        present: Values of the model to which it is added.
-        scales: Sizes of the joint's motion.
-    """
-    line = "torque_speed_limit.tau_stall_nm"
-
-    def room(torque: float) -> dict[str, float]:
-        # One that stands for both has bent to where they are; the line of two rises to what the speeds ask.
-        end = {"torque_speed_limit.omega_0_rad_s": scales.speed, "velocity_limit": FREE_SPEED * scales.speed}
-        return {line: STEEPER * torque, **end}
-
-    if effect in LEVELS and line in present:
-        return [{LEVELS[effect]: present[line], **room(present[line])}]
-    if effect == "torque_speed_limit":
-        return [room(present[level]) for level in LEVELS.values() if level in present]
-    return []
-
-
-def smaller(start: Mapping[str, float]) -> dict[str, float] | None:
-    """A start at which the effect is nearly off; None for one whose zero is not off."""
-    parameters = {key: _parameter(key) for key in start if "." in key}
-    if any(p.lower > 0.0 and p.neutral == 0.0 for p in parameters.values()):
-        return None
-    return {
-        key: NEARLY_OFF * value if parameters[key].lower == 0.0 else value
-        for key, value in start.items()
-        if key in parameters
-    }
-
-
 def best_two(starts: Sequence[dict[str, float]]) -> list[dict[str, float]]:
     """The best of starts in order of promise, and the best that changes other parameters, if any does."""
     other = next((start for start in starts[1:] if start.keys() != starts[0].keys()), None)
     return [starts[0], *([other] if other is not None else starts[1:2])]
-
-
-def _parameter(key: str) -> Parameter:
-    """The parameter of an effect by its key."""
-    effect, _, name = key.rpartition(".")
-    return next(p for p in EFFECTS[effect].parameters if p.name == name)

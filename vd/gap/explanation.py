@@ -5,11 +5,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+import vd.kernels.servo.actuators as servo
 from vd.gap.fit import RIDGE
-from vd.gap.joint_fit import JointFit
-from vd.gap.judge import JITTER
+from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.result import Verdict
-from vd.gap.sample_weighting import SampleWeighting
 from vd.gap.statistics import covariance, half_width
 from vd.kernels.servo.effects import EFFECTS
 
@@ -46,13 +45,20 @@ class Accepted:
     at_bound: bool
     equivalent: tuple[str, ...] = ()
     """Effects that leave the same positions whatever the motion; the name stands for them too."""
-    doubt: str = ""
-    """Why it is no name in spite of all."""
 
     @property
     def named(self) -> bool:
         """Whether it is the answer rather than one of a set."""
-        return not self.tied and not self.at_bound and not self.doubt and self.confidence >= NAMED
+        return not self.tied and not self.at_bound and self.shown and self.confidence >= NAMED
+
+    @property
+    def shown(self) -> bool:
+        """Whether the interval of its size is sure of some of it; several sizes stand in for each other."""
+        parameters = {p.name: p for p in EFFECTS[self.name].parameters if p.column != servo.GRAVITY_PHASE}
+        if any(p.lower > 0.0 == p.neutral for p in parameters.values()):
+            return True  # its absence is no value of it
+        sizes = [v for key, v in self.estimates.items() if key in parameters and parameters[key].lower == 0.0]
+        return len(sizes) != 1 or not sizes[0][1] <= 0.0 <= sizes[0][2]
 
 
 @dataclass(frozen=True)
@@ -112,24 +118,3 @@ def added(fit: JointFit) -> tuple[tuple[str, ...], dict[str, float]]:
 def certain(explanation: Explanation) -> bool:
     """Whether every effect of the final model is the answer rather than one of a set."""
     return explanation.verdict == "effects" and all(one.named for one in explanation.accepted)
-
-
-def lacking(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
-    """The effects that a joint is certain to lack, and their values by key; none where it is not."""
-    if not certain(explanation) or JITTER in explanation.final.effects:
-        return (), {}
-    return added(explanation.final)
-
-
-def jitter_of(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
-    """The random delays of a joint and what it is certain to lack beside them, and their values by key.
-
-    None where it has none. One of a set is no certainty: another joint has to search for itself, or the first
-    one's luck among several that fit alike would be the answer of all.
-    """
-    effects, values = added(explanation.final)
-    if JITTER not in effects:
-        return (), {}
-    if certain(explanation):
-        return effects, values
-    return (JITTER,), {key: value for key, value in values.items() if key.startswith(f"{JITTER}.")}

@@ -12,12 +12,55 @@ import numpy as np
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import others_in
-from vd.gap.coordinates import BASELINE_PARAMETERS, Coordinate, Scales, coordinate, keys, sizes
+from vd.gap.coordinates import Coordinate, Scales, coordinate, keys
 from vd.gap.descent import FIRST_DAMPING, LOG_TRUST, Descent, LeastSquares
-from vd.gap.holding import Holding
-from vd.gap.joint_fit import JointFit
+from vd.gap.joint_fit import JointFit, SampleWeighting
+from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
-from vd.gap.sample_weighting import SampleWeighting
+
+STILL_COUNTS = 0.05
+"""Encoder counts within which a prediction stands still."""
+
+
+class Holding:
+    """The trajectories in which a joint's command never changes.
+
+    A rollout starts at the first reading. Where dry friction holds the joint, the prediction stays there,
+    with the reading's error of up to a count, although the model is right; and so does the middle of what
+    play or a dead zone leave free, however the joint is shaken within.
+
+    Args:
+        recording: The recording.
+        column: The joint's column in it.
+        trajectories: Indices of the trajectories that are used.
+    """
+
+    def __init__(self, recording: Recording, column: int, trajectories: Sequence[int] | np.ndarray):
+        parts = {int(t): recording.trajectories[int(t)] for t in trajectories}
+        self._holds = {t: not np.ptp(part.command[:, column]) for t, part in parts.items()}
+        self._length = {t: len(part.time) for t, part in parts.items()}
+        self._least = STILL_COUNTS * recording.encoder_resolution_rad
+
+    def forgive(
+        self, residual: np.ndarray, predicted: np.ndarray, chosen: Sequence[int], free: np.ndarray
+    ) -> None:
+        """Take the mean from the residuals [C, N] of held motions, as far as the start can be its cause.
+
+        Args:
+            residual: Measured minus predicted, trajectory by trajectory; changed in place.
+            predicted: Predicted positions [C, N] [rad].
+            chosen: Indices of the trajectories.
+            free: Width in which nothing holds the joint [C] [rad]; all of a mean can be the start's where the
+                prediction stands still.
+        """
+        ends = np.cumsum([self._length[t] for t in chosen])[:-1]
+        parts = zip(chosen, np.split(residual, ends, axis=1), np.split(predicted, ends, axis=1), strict=True)
+        for trajectory, part, path in parts:
+            if self._holds[trajectory]:
+                still = np.ptp(path, axis=1) < self._least
+                most, mean = np.where(still, np.inf, free), part.mean(axis=1)
+                part -= np.clip(mean, -most, most)[:, None]
+
 
 RIDGE = 0.01
 """Pull towards the start, as information in units of the noise floor: holds directions that the data
@@ -34,16 +77,6 @@ to it, where the model is all but linear."""
 FINER = (2, 4)
 """Divisors of the time step at which an estimate is finished: what the last one changes is its error."""
 FINER_ITERATIONS = 4
-MOVING_COUNTS = 1.5
-"""Encoder counts between two samples from which their rounding errors are independent."""
-OTHER_STARTS = 4
-OTHER_SPREAD = 0.2
-"""Standard deviation of the logarithm of the baseline's parameters at other starts."""
-EFFECT_SPREAD = 0.5
-"""The same of the effects' parameters."""
-OTHER_ITERATIONS = 16
-NEARBY = (0.001, 0.003, 0.01, 0.03)
-"""Standard deviations of the logarithms of all parameters at starts beside an optimum."""
 
 Trajectories = Sequence[int] | np.ndarray | None
 """Indices of trajectories; None: all."""
@@ -318,13 +351,12 @@ class JointProblem:
     def refine(self, fit: JointFit, scales: Scales) -> JointFit:
         """The same model fitted on with finer time steps, for values that do not depend on the step.
 
-        What the last halving changes is kept as the error that is left, and the structure of the
-        residuals is measured. Slopes are those of the problem's own time step: they need not be finer.
-        Held-out errors are those of ``fit``, to be compared with other models'.
+        What the last halving changes is kept as the error that is left. Slopes are those of the
+        problem's own time step: they need not be finer. Held-out errors are those of
+        ``fit``, to be compared with other models'.
         """
         x, error, result = fit.x, np.zeros(len(fit.x)), fit
-        given = self.rollouts, self.coarse
-        self.coarse = self.coarse or self.rollouts
+        self.coarse = given = self.rollouts
         try:
             for divisor in FINER:
                 self.rollouts = self.coarse.at(self.coarse.dt / divisor)
@@ -337,82 +369,14 @@ class JointProblem:
                     trajectories=self.trajectories,
                 )
                 x, error = result.x, np.abs(result.x - x)
-            residual = self.residuals(result.rows[None])[0]
         finally:
-            self.rollouts, self.coarse = given
-        structure = None if self._growth else self.structure(residual)  # jitter has a memory
+            self.rollouts, self.coarse = given, None
         return replace(
             result,
             held_out=fit.held_out,
             held_out_abs=fit.held_out_abs,
             step_error=error,
-            structure=structure,
         )
-
-    def structure(self, residual: np.ndarray) -> np.ndarray:
-        """Products of successive residuals in motion [2, S]; at rest the rounding to counts repeats."""
-        count = self.rollouts.recording.encoder_resolution_rad
-        sums = []
-        for t, part in zip(self.trajectories, self.split(residual), strict=True):
-            moving = np.abs(np.diff(self._measured[int(t)])) > MOVING_COUNTS * count
-            sums.append((float(np.sum((part[1:] * part[:-1])[moving])), float(moving.sum())))
-        return np.array(sums).T
-
-    def again(self, fit: JointFit, scales: Scales, *, seed: int) -> JointFit:
-        """The same model searched for from elsewhere, without what the first search knows.
-
-        Args:
-            fit: What the first search found.
-            scales: Sizes of the joint's motion.
-            seed: Of the starts: the baseline's parameters at random about what was found, every effect
-                at one of its starting sizes or, in every other start, at random about what was found too.
-
-        Returns:
-            The best of ``OTHER_STARTS`` fits, without held-out errors.
-        """
-        rng = np.random.default_rng(seed)
-        others = others_in(self.rollouts.chain, self.joint)
-        starts = []
-        for number in range(OTHER_STARTS):
-            middle = fit.values if number < OTHER_STARTS - 1 else self._nominal()
-            start = {key: middle[key] * np.exp(rng.normal(0.0, OTHER_SPREAD)) for key in self.baseline}
-            # A limit above all speeds has no slope to descend.
-            start["velocity_limit"] = min(start["velocity_limit"], scales.speed)
-            for effect in fit.effects:
-                options = sizes(effect, others, scales)
-                start.update(options[int(rng.integers(len(options)))])
-            if number % 2:
-                inside = [key for key in fit.values if "." in key]
-                start.update(
-                    {key: fit.values[key] * np.exp(rng.normal(0.0, EFFECT_SPREAD)) for key in inside}
-                )
-            starts.append(start)
-        return self._elsewhere(fit, starts, scales)
-
-    def nearby(self, fit: JointFit, scales: Scales, *, seed: int) -> JointFit:
-        """The same model from starts close by, where an optimum is so sharp that there are others beside it.
-
-        Args:
-            fit: What was found.
-            scales: Sizes of the joint's motion.
-            seed: Of the starts.
-
-        Returns:
-            The best, without held-out errors.
-        """
-        rng = np.random.default_rng(seed)
-        values = fit.values.items()
-        starts = [{key: value * np.exp(rng.normal(0.0, near)) for key, value in values} for near in NEARBY]
-        return self._elsewhere(fit, starts, scales)
-
-    def _elsewhere(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> JointFit:
-        """The best fit of the same model from other starts, without held-out errors."""
-        number, every = OTHER_ITERATIONS, self.trajectories
-        return self.fit(fit.rows, fit.effects, starts, scales, iterations=number, trajectories=every)
-
-    def _nominal(self) -> dict[str, float]:
-        row = self.rollouts.chain.start_row[self.joint]
-        return {key: float(row[BASELINE_PARAMETERS[key].column]) for key in self.baseline}
 
     def promise(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> np.ndarray:
         """Share of the squared error that each start could remove, the present parameters readjusted.

@@ -20,8 +20,7 @@ FOLDER = "fit-cache"
 """Where an analysis keeps what a step has found, while it runs."""
 MADE_OF = {
     "vd.gap.coordinates": {"Coordinate", "Scales"},
-    "vd.gap.joint_fit": {"JointFit"},
-    "vd.gap.sample_weighting": {"SampleWeighting"},
+    "vd.gap.joint_fit": {"JointFit", "SampleWeighting"},
     "numpy": {"dtype", "ndarray"},
     "numpy._core.multiarray": {"_reconstruct", "scalar"},
     "numpy._core.numeric": {"_frombuffer"},

@@ -93,7 +93,8 @@ def identify(
     dt: float = DEFAULT_DT,
     device: str = "cpu",
     seed: int = 0,
-    progress: Callable[[int, dict[str, float]], None] | None = None,
+    progress: Callable[[int, dict[str, float]], None] = lambda generation, best: None,
+    working: Callable[[float], None] = lambda share: None,
 ) -> Identified:
     """Identify stiffness, damping and velocity limits as the paper does: CMA-ES on parallel simulations.
 
@@ -110,6 +111,7 @@ def identify(
         device: Warp device.
         seed: Seed of the search.
         progress: Called after each generation with its number and the best error of each finger [rad].
+        working: Called in each generation with the share that is done.
 
     Raises:
         ValueError: A joint is not recorded or its finger was never excited.
@@ -136,7 +138,7 @@ def identify(
 
     def evaluate(rows: np.ndarray) -> dict[int, np.ndarray]:
         """Mean squared error of each finger for rows [population, D, P]."""
-        replay.run(np.repeat(rows, slots, axis=0))
+        replay.run(np.repeat(rows, slots, axis=0), working)
         error = replay.squared_error.numpy().reshape(population, slots, -1)
         error = np.nan_to_num(error.astype(float), nan=np.inf)
         return {f: error[:, :, hand.fingers[f]].sum(axis=(1, 2)) / samples[f] for f in fingers}
@@ -158,8 +160,7 @@ def identify(
             winner = int(np.argmin(scores[f]))
             if scores[f][winner] < best[f][0]:
                 best[f] = (scores[f][winner], rows[winner][np.ix_(members[f], SEARCHED)])
-        if progress is not None:
-            progress(generation + 1, {f"f{f}": float(np.sqrt(best[f][0])) for f in fingers})
+        progress(generation + 1, {f"f{f}": float(np.sqrt(best[f][0])) for f in fingers})
     found = base.copy()
     for f in fingers:
         found[np.ix_(members[f], SEARCHED)] = best[f][1]

@@ -3,7 +3,7 @@
 Many draws of the delays give the mean and variance of the position at every sample. The likelihood of
 what was measured, under a normal distribution with that mean and that variance on top of the noise
 floor, is maximised over the jitter's two parameters; the rest of the model is fitted through what the
-delays do to the samples (:mod:`vd.gap.sample_weighting`). The result stands in the table as the RMSE that a
+delays do to the samples (:mod:`vd.gap.joint_fit`). The result stands in the table as the RMSE that a
 normal distribution of constant width would need for the same likelihood.
 """
 
@@ -16,11 +16,10 @@ import numpy as np
 from scipy.optimize import minimize
 
 from vd.gap.coordinates import Scales, coordinate
+from vd.gap.evidence import JITTER
 from vd.gap.fit import JointProblem
-from vd.gap.joint_fit import JointFit
-from vd.gap.judge import JITTER
+from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
-from vd.gap.sample_weighting import SampleWeighting
 
 DRAWS = 16
 """Realisations of the delays."""
@@ -43,8 +42,6 @@ DAMPING = 1e-4
 TRUST = 0.5
 """Largest shift of a coordinate of the rest of the model in a round."""
 EVALUATIONS = 30
-STEP = 0.1
-"""Relative step of the finite differences of the likelihood: above the error of the draws."""
 LEAST_DROP = 1e-4
 FACTORS = (0.5, 0.71, 0.85, 1.0, 1.18, 1.41, 2.0)
 """Multiples of the best standard deviation at which the likelihood is looked at for the intervals ..."""
@@ -223,33 +220,9 @@ class JitterFit:
         return self._limited(sigma, drop)
 
     def result(self, sigma: float, drop: float) -> JointFit:
-        """Equivalent errors, and the likelihood's curvature in the place of the Gauss-Newton matrices."""
-        x = np.array([c.inverse(v) for c, v in zip(self.coordinates, (sigma, drop), strict=True)])
-        steps = np.maximum(STEP * x, [c.inverse(LEAST_DROP) for c in self.coordinates])
-        here = self.losses(sigma, drop)
-        sides = np.empty((2, 2, self.size))
-        for i in range(2):
-            for k, sign in enumerate((1.0, -1.0)):
-                moved = x.copy()
-                moved[i] = max(moved[i] + sign * steps[i], 0.0)
-                pair = [float(c.value(v)) for c, v in zip(self.coordinates, moved, strict=True)]
-                sides[i, k] = self.losses(pair[0], pair[1])
-        curved, slope = np.empty((2, self.size)), np.empty((2, self.size))
-        for i in range(2):
-            curvature = (sides[i, 0] + sides[i, 1] - 2.0 * here) / steps[i] ** 2
-            # No trajectory alone may bend the wrong way by the error of the draws; the sum is what counts.
-            curved[i] = max(float(curvature.sum()), 1e-6) / self.size
-            slope[i] = -(sides[i, 0] - sides[i, 1]) / (2.0 * steps[i])
-        fit = self._as_fit(sigma, drop, here)
-        floor = self.problem.floor**2
-        for i in range(2):
-            fit.gram[:, i - 2, i - 2], fit.gradient[:, i - 2] = curved[i] * floor, slope[i] * floor
-        return fit
-
-    def _as_fit(self, sigma: float, drop: float, here: np.ndarray) -> JointFit:
-        """A pair of values, and the losses there, as a fit whose matrices leave them out."""
+        """A pair of values as any other fit, with equivalent errors; its matrices leave the pair out."""
         x = [c.inverse(v) for c, v in zip(self.coordinates, (sigma, drop), strict=True)]
-        size, equivalent = len(self.base.x) + 2, self._equivalent(here)
+        size, equivalent = len(self.base.x) + 2, self._equivalent(self.losses(sigma, drop))
         gram, gradient = np.zeros((self.size, size, size)), np.zeros((self.size, size))
         gram[:, : size - 2, : size - 2], gradient[:, : size - 2] = self.base.gram, self.base.gradient
         return JointFit(

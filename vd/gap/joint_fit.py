@@ -1,4 +1,4 @@
-"""The result of a fit: a model of one joint, its errors, and the matrices that intervals are made of."""
+"""A model of one joint as a fit leaves it, and how samples are weighted in one."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,8 +30,6 @@ class JointFit:
         gradient: J^T r of each trajectory, [S, P].
         held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad]; None where not taken.
         step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
-        structure: Sum of products of successive residuals in motion, and their number, of each trajectory
-            [2, S] [rad^2]: zero on average if only noise is left; None where not estimated.
         extents: 95 % intervals by key, of parameters for which the matrices do not give them.
     """
 
@@ -46,7 +44,6 @@ class JointFit:
     gradient: np.ndarray
     held_out_abs: np.ndarray | None = None
     step_error: np.ndarray | None = None
-    structure: np.ndarray | None = None
     extents: Mapping[str, tuple[float, float]] | None = None
 
     @property
@@ -74,3 +71,19 @@ class JointFit:
             sides = {key: value for key, value in self.values.items() if key.startswith(ONE_SIDED)}
             bound += [key for key, value in sides.items() if value <= SPARED * max(sides.values())]
         return tuple(bound)
+
+
+@dataclass(frozen=True, eq=False)
+class SampleWeighting:
+    """The mean and the spread that random delays, or errors of the clock, add to N samples.
+
+    A sample counts by how surely it is known: a residual, less the mean of what delays do, is divided by the
+    growth of its standard deviation. What a right model leaves is the noise floor again.
+
+    Attributes:
+        shift: Mean change of the position [N] [rad].
+        growth: Standard deviation with them, in that of the noise alone [N].
+    """
+
+    shift: np.ndarray
+    growth: np.ndarray

@@ -1,22 +1,135 @@
-"""Explain the joints of a recording, those of a finger in turn, each knowing what the others have."""
+"""Explain the joints of a recording, those of a finger in turn, and what they tell each other."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
 from vd.gap.candidates import FULL_ITERATIONS
-from vd.gap.consensus import agree, no_constant_friction, no_spring, share
-from vd.gap.explanation import Explanation, polished
-from vd.gap.finger_masses import masses_alone, masses_beside
-from vd.gap.jitter_search import FIXED
+from vd.gap.evidence import CANCELLING, JITTER, LEVELS, MIN_GAIN, explains
+from vd.gap.explain import REFITS, Explained, Explainer, Joint, beside, weighting_of
+from vd.gap.explanation import NAMED, Explanation, estimates, intervals, polished
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import JITTER
-from vd.gap.masses import widened
-from vd.gap.one_joint import REFITS, Explained, Explainer, Joint, beside, weighting_of
+from vd.gap.masses import masses_alone, masses_beside, widened
 from vd.gap.worker_pool import WorkerPool, parallel
+
+OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}
+"""What all joints of a machine have or have not: its bus, its supply, gravity."""
+
+CHANGING = "its friction changes over the recording, as another joint of the finger shows"
+"""Why a constant friction is no name, nor what is found beside it."""
+
+SPRUNG = f"{explains(CANCELLING)} here, but cancel at rest on another joint of the finger, as a spring does"
+"""Why a load and an offset are no names."""
+
+Polish = Callable[[JointFit], JointFit]
+"""Fits a model to the end."""
+
+
+def share(
+    explanations: Sequence[Explanation],
+    floors: Sequence[float],
+    groups: Sequence[int],
+    polish: Sequence[Polish],
+) -> list[Explanation]:
+    """Name on a joint that member of a set which another joint names, or which all such sets share.
+
+    The joints of a finger are built alike: one cause on all of them is simpler than another on each. Joints
+    that have nothing in common but the machine share its bus, its supply, and that it stands in gravity, but
+    not the friction or the play of one gear. What comes nearest on a joint whose gap nothing explains is no
+    answer: other joints do not make it one, nor does it settle theirs.
+
+    Args:
+        explanations: Of the joints.
+        floors: Their noise floors [rad].
+        groups: Number of the finger of each joint.
+        polish: Of each joint: fits a member of a set to the end, which the search for the best one did not.
+    """
+    result = []
+    for explanation, floor, finger, end in zip(explanations, floors, groups, polish, strict=True):
+        if not _answered(explanation):
+            result.append(explanation)
+            continue
+        alike = [e for e, other in zip(explanations, groups, strict=True) if other == finger]
+        named = _named(alike) | (_named(explanations) & OF_THE_MACHINE)
+        result.append(_adopt(explanation, named, floor, end))
+    return result
+
+
+def doubted(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[Explanation]:
+    """Explanations without what another joint of the finger shows to be a cause that is not in the table.
+
+    A friction that changes there: where it moves only early in a recording, or late, a joint shows no change
+    of its own, and a play or a coupling stands for it. And a load and an offset that cancel at rest there:
+    where a joint travels little they imitate the same spring.
+
+    Args:
+        explanations: Of the joints.
+        groups: Number of the finger of each joint.
+    """
+    both, pairs = {*CANCELLING}, list(zip(explanations, groups, strict=True))
+    changing = {group for e, group in pairs if e.warms}
+    sprung = {group for e, group in pairs if e.verdict == "unknown" and both <= {*e.final.effects}}
+
+    def judged(e: Explanation, group: int) -> Explanation:
+        if not _answered(e):
+            return e
+        if group in changing and {*LEVELS} & {*e.final.effects}:
+            return replace(e, verdict="unknown", reason=CHANGING)
+        if group in sprung and both == {*e.final.effects}:
+            return replace(e, verdict="unknown", reason=SPRUNG)
+        return e
+
+    return [judged(e, group) for e, group in pairs]
+
+
+def _answered(explanation: Explanation) -> bool:
+    """Whether it gives names or sets; one that does not keeps the effects that come nearest."""
+    return explanation.verdict in ("effects", "ambiguous")
+
+
+def _named(explanations: Sequence[Explanation]) -> set[str]:
+    """What some joint names, and the only effect that is in the set of every joint that has one set."""
+    answers = [e for e in explanations if _answered(e)]
+    named = {a.name for e in answers for a in e.accepted if a.named}
+    open_sets = [[{a.name, *a.tied} for a in e.accepted if a.tied and not a.at_bound] for e in answers]
+    sets = [of_joint[0] for of_joint in open_sets if len(of_joint) == 1]
+    if len(sets) > 1:
+        common = set.intersection(*sets)
+        named |= common if len(common) == 1 else set()
+    return named
+
+
+def _adopt(explanation: Explanation, named: set[str], floor: float, polish: Polish) -> Explanation:
+    """One joint's explanation with what the other joints name in the place of its sets.
+
+    A set stays where that model is worse by as much as an effect must gain.
+    """
+    final, accepted = explanation.final, list(explanation.accepted)
+    for i, own in enumerate(accepted):
+        others = [name for name in own.tied if name in named]
+        if not own.tied or own.at_bound or (own.name not in named and len(others) != 1):
+            continue
+        if own.name not in named:
+            fits = explanation.rivals.get(own.name, ())
+            fit = next((fit for fit in fits if fit.effects[-1] == others[0]), None)
+            if fit is None or set(fit.effects) != {*final.effects, others[0]} - {own.name}:
+                continue
+            fit = polish(fit)
+            if fit.held_out_rmse * (1.0 - MIN_GAIN) > final.held_out_rmse:
+                continue
+            final = fit
+            own = replace(own, name=others[0])
+        accepted[i] = replace(own, tied=(), confidence=max(own.confidence, NAMED))
+    if final is not explanation.final:
+        spread = intervals(final, floor)
+        accepted = [replace(a, estimates=estimates(final, a.name, spread)) for a in accepted]
+    verdict, reason = explanation.verdict, explanation.reason
+    names = [a.name for a in accepted if a.named]
+    if names and len(names) > sum(a.named for a in explanation.accepted):
+        verdict, reason = "effects", f"{explains(names)}, as on the other joints"
+    return replace(explanation, final=final, accepted=tuple(accepted), verdict=verdict, reason=reason)
 
 
 def explain_joints(explainer: Explainer) -> list[Explanation]:
@@ -28,59 +141,37 @@ def explain_joints(explainer: Explainer) -> list[Explanation]:
     pool, joints = explainer.pool, explainer.joints
     masses = masses_alone(pool, joints)
 
-    def one(joint: Joint, explained: Explained, own: Explanation | None = None) -> Explanation:
+    def one(joint: Joint, explained: Explained) -> Explanation:
         if joint.spec.chain not in masses:
-            return explainer.explain(joint, explained, own)
+            return explainer.explain(joint, explained)
         text = f"the plain model is within the noise floor {masses[joint.spec.chain].text}"
         explainer.progress(f"explain: {joint.name}: no_gap: {text}")
         return Explanation(joint.fit, joint.fit, "no_gap", text)
 
     floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))
     alone = _in_turn(joints, one)
-    fits = [partial(_fitted, pool, list(zip(joints, alone, strict=True)), joint) for joint in joints]
-    ends = [partial(_finished, fit) for fit in fits]
-    agreed = agree(share(alone, floors, fingers, ends), floors, fingers, fits)
-    found = _consistent(pool, joints, masses_beside(pool, joints, agreed))
-    return no_constant_friction(no_spring(found, fingers), fingers)
+    ends = [partial(_finished, pool, list(zip(joints, alone, strict=True)), joint) for joint in joints]
+    shared = share(alone, floors, fingers, ends)
+    return doubted(_consistent(pool, joints, masses_beside(pool, joints, shared)), fingers)
 
 
-def _fitted(
-    pool: WorkerPool,
-    known: Explained,
-    joint: Joint,
-    effects: tuple[str, ...],
-    starts: Sequence[Mapping[str, float]],
-) -> JointFit:
-    """A model of a joint with these effects, fitted to the end beside the joints as they are known."""
-    call = {"base": beside(joint, known), "effects": effects, "starts": list(starts), "scales": joint.scales}
-    call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
+def _finished(pool: WorkerPool, known: Explained, joint: Joint, fit: JointFit) -> JointFit:
+    """A model fitted to the end from where it is, beside the joints as they are known."""
+    call = {"base": beside(joint, known), "effects": fit.effects, "starts": [fit.values]}
+    call |= {"scales": joint.scales, "iterations": FULL_ITERATIONS, "refits": REFITS}
     weighting = weighting_of(next(found for other, found in known if other is joint))
     whole = pool.run(joint.spec, [("fit", {**call, **weighting})])[0]
     return pool.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales, **weighting})])[0]
 
 
-def _finished(
-    fitted: Callable[[tuple[str, ...], Sequence[Mapping[str, float]]], JointFit], fit: JointFit
-) -> JointFit:
-    """A model fitted to the end from where it is."""
-    return fitted(fit.effects, [fit.values])
-
-
-class _Explain(Protocol):
-    """Explains a joint, knowing those of its finger that are explained already."""
-
-    def __call__(
-        self, joint: Joint, explained: Explained, own: Explanation | None = None, /
-    ) -> Explanation: ...
-
-
-def _in_turn(joints: Sequence[Joint], explain: _Explain) -> list[Explanation]:
+def _in_turn(
+    joints: Sequence[Joint], explain: Callable[[Joint, Explained], Explanation]
+) -> list[Explanation]:
     """Explanations of all joints: of each finger from its tip on, as a joint's motion shakes those before it.
 
     Args:
         joints: The joints.
-        explain: Explains a joint, knowing those of its finger that are explained already; one that was
-            explained before random delays were found on another once more.
+        explain: Explains a joint, knowing those of its finger that are explained already.
     """
 
     def finger(chain: int) -> Explained:
@@ -88,11 +179,6 @@ def _in_turn(joints: Sequence[Joint], explain: _Explain) -> list[Explanation]:
         own = [joint for joint in joints if joint.spec.chain == chain]
         for joint in sorted(own, key=lambda each: -each.spec.joint):
             found.append((joint, explain(joint, found)))
-        late = [JITTER in explanation.final.effects for _, explanation in found]
-        for i, (joint, before) in enumerate(found[: late.index(True) if any(late) else 0]):
-            # What a late command is the mean of, or what nothing explained.
-            if FIXED in before.final.effects or before.verdict in ("unknown", "ambiguous"):
-                found[i] = joint, explain(joint, [*found[:i], *found[i + 1 :]], before)
         return found
 
     explained = parallel(finger, sorted({joint.spec.chain for joint in joints}))

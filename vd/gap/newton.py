@@ -7,6 +7,7 @@ finger. Contacts are off; SI units, radians.
 import dataclasses
 import math
 import zlib
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -180,11 +181,12 @@ class HandReplay:
             control_dt=self.duration,  # commands come from the recording, none is in transit
         )
 
-    def run(self, rows: np.ndarray) -> None:
+    def run(self, rows: np.ndarray, progress: Callable[[float], None] = lambda share: None) -> None:
         """Simulate all trajectories from rest at the first recorded positions.
 
         Args:
             rows: Servo parameters, shape [D, P] or [W, D, P].
+            progress: Called with the share that is done.
         """
         rows = np.asarray(rows, dtype=float)
         self.servo.set_rows(rows)
@@ -209,8 +211,10 @@ class HandReplay:
         self._write.assign(self._first_sample)
         self._read.assign(self._first_sample)
         steps = math.ceil(self.duration / self.dt) + 1
-        for _ in range(math.ceil(steps / GRAPH_STEPS)):
+        graphs = math.ceil(steps / GRAPH_STEPS)
+        for number in range(graphs):
             self._advance()
+            progress((number + 1) / graphs)
 
     def _advance(self) -> None:
         """Some physics steps as one graph, once every kernel is loaded: a tenth of the time, on a CPU too."""

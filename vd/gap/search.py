@@ -1,131 +1,203 @@
-"""A search for what a joint lacks, as its variations see it: with jitter, a weighting, another's effects."""
+"""Search for the effects that a joint's servo lacks: forward selection with full refits, checked backward.
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
+A step of the search is tentative; :mod:`vd.gap.evidence` has the last word.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from vd.gap.candidates import Call
-from vd.gap.explanation import Explanation, Trial
-from vd.gap.frictions import Frictions
+from vd.gap.candidates import Call, CandidateFits
+from vd.gap.evidence import JITTER, MIN_GAIN_FLOORS, NESTED, Evidence
+from vd.gap.explanation import Trial
 from vd.gap.jitter import CALLS
-from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXPLAINED, MIN_GAIN_FLOORS, MIN_SHARE, REPEATABLE
+from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.telemetry import BEHIND_SENSOR
-from vd.gap.verdict import cancelled
 
-WIDE = 15.0
-"""Error of a round's best, in noise floors, up to which every start of every candidate is tried: a linear
-promise is no guide to where an effect that rings or brakes can be found."""
-LOOKS = 2
-"""Rounds in which they are: each costs as much as several others."""
+MAX_EFFECTS = 3
+MAX_ROUNDS = 6
+"""Forward steps, some of which a backward step takes back."""
 UNEARNED = float(np.hypot(1.0, MIN_GAIN_FLOORS))
 """Error, in noise floors, from which down to the floor no further effect can close what it has to."""
-COARSE = 0.9
-"""Share of an error that a finer time step leaves, at which the search is made with that."""
-NEAR = 4.0
-"""Error, in noise floors, up to which a model stands for a cause that the table has not."""
+SEARCH_TAIL = 0.4
+"""Share of the resamples that may see no gain from an effect while the search goes on: one of two causes
+alone can make some motions worse."""
+KEEP_TAIL = 0.1
+"""Share of the resamples that may see no gain from an effect that is in the model already: what was
+earned is not lost to the luck of another local fit."""
+PLAIN_FRICTION = "coulomb_friction"
+GROWN = 1.5
+"""Spread of the samples of a motion, in that of the noise alone, from which they are weighted. Motions that
+do not let errors grow have 1.05 at most (our choice)."""
+
+
+def doubled(effects: Sequence[str]) -> list[str]:
+    """Frictions that one of a model is with other numbers, and that are none beside it."""
+    fuller = [name for name, simpler in NESTED.items() if PLAIN_FRICTION in simpler]
+    return fuller if PLAIN_FRICTION in effects else [PLAIN_FRICTION] if {*fuller} & {*effects} else []
 
 
 @dataclass(kw_only=True)
-class Search(Frictions, ABC):
-    """A search for one joint, which can be made again with samples weighted, or from another's effects.
+class Search(CandidateFits, Evidence):
+    """Forward and backward selection for one joint.
 
     Attributes:
-        looks: Rounds in which every start may be tried (:meth:`look_wider`).
-        wide: Whether more is tried than the best starts and one effect after the other.
-        like: What another joint of the finger certainly lacks: effects, and values by key.
-        changing: The same of one whose friction changes over the recording: what comes nearest there.
-        jittered: The same of one that has random delays, these among the effects: what is sure beside them.
+        report: Called with a line of progress.
+        rest: Where the joint rests before it moves [rad].
+        clocked: Whether samples are weighted by what errors of the clock do.
     """
 
-    looks: int = LOOKS
-    wide: bool = True
-    like: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
-    changing: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
-    jittered: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
+    report: Callable[[str], None] = lambda line: None
+    rest: float = 0.0
+    clocked: bool = False
 
-    @abstractmethod
-    def explain(self, baseline: JointFit, start: tuple[JointFit, list[Trial]] | None = None) -> Explanation:
-        """Select effects, starting from the fitted baseline.
+    def clock_sensitivity(self, fit: JointFit) -> SampleWeighting | None:
+        """What errors of the clock do under a model that leaves more than noise; None where they do not grow.
 
-        Args:
-            baseline: The plain model.
-            start: A model that leaves noise, and the evidence for it, where a search with a coarser step has
-                found one: it is only compared with others.
+        A profile of bounded acceleration that cannot follow its command turns at moments that hang on ever
+        smaller things: a tenth of a millisecond is tens of milliradians some seconds later, and no fit of the
+        right model leaves noise there. Weighted by how surely they are known
+        (:mod:`vd.gap.joint_fit`), samples are noise again under the right model.
         """
+        if self.clocked or self.behind_jitter or JITTER in fit.effects or self.no_gap(fit):
+            return None
+        weighting = self.run([("clock_weighting", {"fit": fit, "scales": self.scales})])[0]
+        ends = np.cumsum(fit.count.astype(int))[:-1]
+        spread = [float(np.sqrt(np.mean(part**2))) for part in np.split(weighting.growth, ends)]
+        return weighting if max(spread) > GROWN else None
 
-    def finer(self) -> "Search":
-        """The same search with the step at which estimates are finished."""
+    def weighted(self, weighting: SampleWeighting) -> "Search":
+        """The same search with samples weighted by how surely the clock lets them be known."""
 
         def run(calls: list[Call]) -> list[Any]:
-            every = [
-                (name, options if name in CALLS else {**options, "finer": True}) for name, options in calls
-            ]
-            return self.run(every)
+            # What jitter does is more than what the clock does, and is measured on the samples themselves.
+            return self.run(
+                [
+                    (name, options if name in CALLS else {"weighting": weighting, **options})
+                    for name, options in calls
+                ]
+            )
 
-        return replace(self, run=run, fine=True, looks=LOOKS, without={}, apart={}, added={})
+        return replace(self, run=run, clocked=True, promised={}, seen={})
 
-    def finished(self, present: JointFit) -> bool:
-        """Whether a model leaves nothing to explain: noise, of no more than its size."""
-        return self.no_gap(present) and not self.lack_of_fit(self.refined(present))
+    def search(self, baseline: JointFit) -> tuple[JointFit, list[Trial]]:
+        """Forward steps from the plain model, each checked backward; what they add is tentative.
 
-    def too_coarse(self, present: JointFit) -> bool:
-        """Whether it is the time step of the search that keeps a model from leaving no more than noise."""
-        if self.fine or self.behind_jitter or not present.effects:
-            return False
-        if self.no_gap(present) or self.white(present):
-            return False
-        if present.rmse > WIDE * self.floor:
-            return False
-        return self.refined(present).rmse < COARSE * present.rmse
-
-    def a_spring(self, present: JointFit) -> bool:
-        """Whether a model is near enough to stand for a cause that the table has not: it is no answer."""
-        return present.rmse < NEAR * self.floor and bool(cancelled(present, self.joint, self.rest))
-
-    def noise_only(self, present: JointFit, floors: float = UNEARNED) -> bool:
-        """Whether a model leaves noise on what it was fitted to: no other search finds a better one.
-
-        It may be a little more than the floor: at rest the rounding to counts repeats. Beside a gap of some
-        sixty noise floors more than that is what no fit is better than: the times of a recording are good to
-        0.1 ms, a milliradian where a joint is fast.
-
-        Args:
-            present: The model.
-            floors: Error up to which it may be noise, in noise floors.
+        Returns:
+            The model, and the evidence.
         """
-        best = max(floors * self.floor, min(MIN_SHARE * self.whole, REPEATABLE * self.floor))
-        if not self.behind_jitter and COARSE * present.rmse > best:
-            return False
-        refined = self.refined(present)  # without what the time step of the search leaves
-        return (self.behind_jitter or refined.rmse < best) and not self.lack_of_fit(refined)
+        present, trials, visited = baseline, [], {frozenset[str]()}
+        for number in range(1, MAX_ROUNDS + 1):
+            fits = {} if self.is_last(present) else self.fit_candidates(present, doubled(present.effects))
+            if not fits:
+                break
+            best = self.winner(list(fits.values()))
+            earned, why = self.better(present, best, SEARCH_TAIL)
+            trials += self.judge(number, present, fits, best, earned, why)
+            trials += self.screened_out(number, present, fits)
+            if not earned:
+                break
+            name, before, after = best.effects[-1], present.held_out_rmse, best.held_out_rmse
+            self.report(f"+ {name}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
+            self.seen[frozenset(present.effects)] = present
+            present = self.revise(best)
+            if frozenset(present.effects) in visited:
+                break  # back where it was before
+            visited.add(frozenset(present.effects))
+        return present, trials
 
-    def whitens(self, before: JointFit, after: JointFit) -> bool:
-        """Whether a larger model leaves noise where the smaller leaves structure.
+    def is_last(self, present: JointFit) -> bool:
+        """Whether no further effect is to be added to a model."""
+        full = len(present.effects) >= MAX_EFFECTS
+        return full or self.no_gap(present) or self.clock_sensitivity(present) is not None
 
-        Such a step is earned however little of the error it removes: two limits of one motor do nearly the
-        same, and the smaller model would be refused for what it leaves.
-        """
-        if after.at_bound or after.rmse > EXPLAINED * self.floor or before.rmse > REPEATABLE * self.floor:
-            return False
-        if float(np.quantile(self.weights @ (before.sse - after.sse), 0.025)) <= 0.0:
-            return False
-        return bool(self.lack_of_fit(self.refined(before))) and not self.lack_of_fit(self.refined(after))
+    def revise(self, present: JointFit) -> JointFit:
+        """Backward check: drop what is not needed, exchange what another effect does better."""
+        for _ in range(MAX_EFFECTS):
+            changed = self._revised(present)
+            if changed is None:
+                break
+            present = changed
+        return present
 
-    def explained(self, explanation: Explanation) -> Explanation:
-        """The explanation with what its names do not say.
+    def _revised(self, present: JointFit) -> JointFit | None:
+        """The model without an effect that it does not need, or with a better one in its place, or None."""
+        for name in present.effects if len(present.effects) > 1 else ():
+            without = self.without(present, name)
+            if not self.better(without, present, KEEP_TAIL)[0]:
+                self.report(f"- {name}: not needed beside the others")
+                return without
+            fits = self.rivals(present, name, without)
+            best = self.winner([fit for fit in fits if not set(fit.effects) & set(self.vetoes)])
+            simpler = len(best.x) < len(present.x)
+            if best is not present and (simpler or not self.tied(best, present)[0]):
+                self.report(f"~ {name} exchanged for {best.effects[-1]}")
+                return best
+        return None
 
-        What a member of a set means that telemetry contradicts by its name; and no names where two
-        effects are but one that is not in the table.
-        """
-        alike = cancelled(explanation.final, self.joint, self.rest)
-        if alike and explanation.verdict in ("effects", "ambiguous"):
-            return replace(explanation, verdict="unknown", reason=alike)
-        tied = {name for one in explanation.accepted for name in one.tied}
-        notes = [
-            f"{name} {BEHIND_SENSOR[name]}" for name in sorted(tied & set(BEHIND_SENSOR) & set(self.vetoes))
+    def rivals(self, present: JointFit, name: str, without: JointFit | None = None) -> list[JointFit]:
+        """The model itself, and fits with other effects in the place of one of its own."""
+        without = self.without(present, name) if without is None else without
+        # Beside Coulomb friction, a friction that contains it is no other cause.
+        contains = [c for c, simpler in NESTED.items() if set(simpler) & set(without.effects)]
+        fits = self.fit_candidates(without, (name, *contains), tuple(BEHIND_SENSOR), known=present)
+        return [present, *fits.values()]
+
+    def judge(
+        self,
+        number: int,
+        before: JointFit,
+        fits: Mapping[str, JointFit],
+        best: JointFit,
+        accepted: bool,
+        why: str,
+    ) -> list[Trial]:
+        """The rows of one round for the evidence table, best first, placebo last."""
+        rows = []
+        for name, fit in sorted(fits.items(), key=lambda item: item[1].held_out_rmse):
+            gain, ci = self.gain(before, fit)
+            decision, reason = "rejected", why or f"{best.effects[-1]} predicts unseen motions better"
+            if fit is best and accepted:
+                decision, reason = "named", "best on unseen motions"
+            elif accepted and self.tied(best, fit)[0]:
+                decision, reason = "tied", f"not told from {best.effects[-1]} by this recording"
+                if set(NESTED.get(name, ())) & {best.effects[-1]}:
+                    decision, reason = "rejected", f"contains {best.effects[-1]} and adds nothing to it"
+            rows.append(Trial(number, name, fit, gain, ci, decision, reason))
+        if accepted:
+            gain = self.run([("placebo", {"before": before, "after": best})])[0]
+            text = (
+                f"{best.effects[-1]} with its times reversed and its trajectories exchanged: must be rejected"
+            )
+            rows.append(Trial(number, best.effects[-1], best, gain, (gain, gain), reason=text, placebo=True))
+        return rows
+
+    def screened_out(self, number: int, before: JointFit, fits: Mapping[str, JointFit]) -> list[Trial]:
+        """The rows of candidates that promised too little to be fitted in a round."""
+        promises = sorted(self.promised.items(), key=lambda item: -item[1])
+        return [
+            self.untried(
+                number,
+                name,
+                before,
+                f"screened out: promised {100.0 * max(promise, 0.0):.0f} % of the squared error",
+            )
+            for name, promise in promises
+            if name not in fits
         ]
-        return replace(explanation, reason="; ".join([explanation.reason, *notes]))
+
+    def contradicted(self, baseline: JointFit) -> list[Trial]:
+        """The rows of candidates that telemetry rules out."""
+        return [
+            self.untried(1, name, baseline, why)
+            for name, why in self.vetoes.items()
+            if name in self.candidates
+        ]
+
+    def untried(self, number: int, name: str, before: JointFit, reason: str) -> Trial:
+        """The row of a candidate that was not fitted."""
+        unknown = float("nan")
+        fit = replace(before, held_out=before.held_out * unknown)
+        return Trial(number, name, fit, unknown, (unknown, unknown), reason=reason)

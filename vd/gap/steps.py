@@ -37,6 +37,8 @@ OUTPUTS = {
     "report": ("report.json", PAGE),
 }
 """What each step writes, in the order of the steps."""
+METHOD = 11
+"""Of the analysis; what another one made is made again."""
 STEPS = tuple(OUTPUTS)
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 _PACKAGES = ("visual-dexterity", "warp-lang", "newton", "cma", "numpy")
@@ -192,7 +194,7 @@ class Analysis:
         write_json(self.out / RUN, record)
         print(f"{name}: {_DOES[name]}", file=sys.stderr)
         began = time.perf_counter()
-        _RUN[name](self)
+        _RUN[name](self, made_from)
         record["steps"][name] = {"made_from": made_from, "seconds": time.perf_counter() - began}
         write_json(self.out / RUN, record)
 
@@ -208,7 +210,7 @@ class Analysis:
 
     def _digest(self, name: str) -> str:
         """Of everything a step is made from."""
-        digest = hashlib.sha256(name.encode())
+        digest = hashlib.sha256(f"{name} {METHOD}".encode())
         digest.update(json.dumps(to_dict(replace(self.settings, recording=Path()))).encode())
         recording = self.recording
         digest.update((recording.path / "recording.json").read_bytes())
@@ -258,21 +260,21 @@ def _show(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _find(analysis: Analysis) -> None:
+def _find(analysis: Analysis, key: str) -> None:
     from vd.gap import workflow
 
-    workflow.find(analysis.recording, analysis.hand, analysis.out, **analysis.options())
+    workflow.find(analysis.recording, analysis.hand, analysis.out, key=key, **analysis.options())
 
 
-def _explain(analysis: Analysis) -> None:
+def _explain(analysis: Analysis, key: str) -> None:
     from vd.gap import workflow
     from vd.gap.torque_unit import in_known_unit
 
-    workflow.explain(analysis.recording, analysis.hand, analysis.out, **analysis.options())
+    workflow.explain(analysis.recording, analysis.hand, analysis.out, key=key, **analysis.options())
     in_known_unit(analysis.explained(), analysis.recording).write(analysis.out / EXPLAIN)
 
 
-def _close(analysis: Analysis) -> None:
+def _close(analysis: Analysis, _: str) -> None:
     from vd.gap.close import WHOLE_HAND_LAYER, one_finger, simulate_again, write_identified
     from vd.gap.plan import discard_plan, plan, write_plan
 
@@ -303,9 +305,9 @@ def _close(analysis: Analysis) -> None:
     write_json(analysis.out / CLOSE, to_dict(closing))
 
 
-def _report(analysis: Analysis) -> None:
-    from vd.gap.cautions import cautions
+def _report(analysis: Analysis, _: str) -> None:
     from vd.gap.plan import PLAN_JSON
+    from vd.gap.recording_checks import cautions
     from vd.gap.report import write_report
 
     closing = from_dict(Closing, json.loads((analysis.out / CLOSE).read_text()))
@@ -328,7 +330,7 @@ def _report(analysis: Analysis) -> None:
     write_report(report, Predictions.read(analysis.out / CLOSING_CURVES), analysis.out)
 
 
-_RUN: dict[str, Callable[[Analysis], None]] = {
+_RUN: dict[str, Callable[[Analysis, str], None]] = {
     "find": _find,
     "explain": _explain,
     "close": _close,

@@ -108,10 +108,9 @@ class Problems:
         return self._problems[key]
 
     def call(self, spec: JointSpec, call: Call) -> Made:
-        """Run a method of the problem, its samples weighted if its arguments say how, or at a finer step."""
+        """Run a method of the problem, its samples weighted if its arguments say how."""
         name, options = call[0], dict(call[1])
-        weighting, finer = options.pop("weighting", None), options.pop("finer", False)
-        problem = self.of(spec).finer() if finer else self.of(spec)
+        weighting, problem = options.pop("weighting", None), self.of(spec)
         # Calls side by side count, and change the time step.
         problem = copy.copy(problem) if weighting is None else problem.weighted(weighting)
         problem.simulated, begin = 0, time.perf_counter()

@@ -1,11 +1,10 @@
 """Find and explain a gap: from a recording to a :class:`vd.gap.result.Report` without a closing.
 
 ``find`` identifies the baseline and says where it fails (``DIR/find.json``); ``explain`` selects the
-effects (``DIR/explain.json``, ``DIR/predictions.npz``). Both are skipped where their result is there
-already and its inputs are the same, and a step that was interrupted goes on from the fits that it had made.
+effects (``DIR/explain.json``, ``DIR/predictions.npz``). With a key, a step that was interrupted goes on from
+the fits that it had made under that key.
 """
 
-import hashlib
 import json
 import os
 import time
@@ -22,12 +21,12 @@ from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.chain import Chain, chains
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.design import design, pieces
+from vd.gap.explain import POLISH_ITERATIONS, REFITS, Explainer, Joint, Progress
 from vd.gap.find import findings
 from vd.gap.fit_cache import FOLDER, FitCache
 from vd.gap.joint_fit import JointFit
 from vd.gap.joints import explain_joints
 from vd.gap.launch_batch import LaunchBatch
-from vd.gap.one_joint import POLISH_ITERATIONS, REFITS, Explainer, Joint, Progress
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S
@@ -36,8 +35,6 @@ from vd.gap.worker_pool import JointSpec, Problems, WorkerPool, parallel
 from vd.kernels.servo.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"
-VERSION = 10
-"""Of the method; a result of another version is not resumed."""
 CMA_GENERATIONS = 20
 BASELINE_ITERATIONS = 15
 LONG_STEP_S = 1.0 / 240.0
@@ -89,6 +86,7 @@ def find(
     hand: HandModel | None,
     out: Path,
     *,
+    key: str = "",
     progress: Progress = _silent,
     **options: Any,
 ) -> list[Finding]:
@@ -98,6 +96,7 @@ def find(
         recording: The recording or its folder.
         hand: The hand, for a recording of one.
         out: Folder for ``find.json``.
+        key: Of all that the fits depend on, under which they are kept while this runs; without, they are not.
         progress: Called with lines of progress.
         options: Fields of :class:`Options`.
 
@@ -111,13 +110,8 @@ def find(
     chosen = Options(**options)
     recording = read_recording(recording) if isinstance(recording, Path | str) else recording
     out = Path(out)
-    key = fingerprint(recording, hand, chosen)
-    known = _read(out / "find.json", key)
-    if known is not None:
-        progress("find: already done")
-        return [Finding(**f) for f in known["findings"]]
     begin = time.perf_counter()
-    cache = FitCache(out / FOLDER, key)
+    cache = FitCache(out / FOLDER if key else None, key)
     with _workers(recording, hand, chosen, cache) as pool:
         joints = _identify(pool, _specs(recording, pool.problems.chains), chosen, progress)
         predicted = curves(recording, pool.problems, [(j.name, j.spec, j.fit.rows) for j in joints])
@@ -125,7 +119,6 @@ def find(
         found = findings(recording, predicted, floors)
         value = {
             "format": FIND_FORMAT,
-            "key": key,
             "findings": [asdict(f) for f in found],
             "joints": {j.name: {"rows": j.fit.rows.tolist(), "rmse_rad": j.fit.rmse} for j in joints},
             "simulated": pool.simulated,
@@ -144,15 +137,17 @@ def explain(
     hand: HandModel | None,
     out: Path,
     *,
+    key: str = "",
     progress: Progress = _silent,
     **options: Any,
 ) -> Report:
-    """Name what the baseline lacks; runs :func:`find` first where it has not been run.
+    """Name what the baseline lacks; runs :func:`find` first where the folder has no ``find.json``.
 
     Args:
         recording: The recording or its folder.
         hand: The hand, for a recording of one.
         out: Folder for ``explain.json`` and ``predictions.npz``.
+        key: As of :func:`find`.
         progress: Called with lines of progress.
         options: Fields of :class:`Options`.
 
@@ -166,14 +161,11 @@ def explain(
     chosen = Options(**options)
     recording = read_recording(recording) if isinstance(recording, Path | str) else recording
     out = Path(out)
-    key = fingerprint(recording, hand, chosen)
-    if _read(out / "explain.key.json", key) is not None and (out / "explain.json").is_file():
-        progress("explain: already done")
-        return Report.read(out / "explain.json")
-    found = find(recording, hand, out, progress=progress, **options)
+    if not (out / "find.json").is_file():
+        find(recording, hand, out, key=key, progress=progress, **options)
     known = json.loads((out / "find.json").read_text())
     begin = time.perf_counter()
-    cache = FitCache(out / FOLDER, key)
+    cache = FitCache(out / FOLDER if key else None, key)
     with _workers(recording, hand, chosen, cache) as pool:
         joints = _resume(pool, _specs(recording, pool.problems.chains), known["joints"])
         explained = explain_joints(Explainer(pool, joints, chosen.effects, chosen.seed, progress))
@@ -188,7 +180,7 @@ def explain(
             hand,
             pool.problems,
             analysed,
-            found,
+            [Finding(**f) for f in known["findings"]],
             seed=chosen.seed,
             seconds=seconds,
             simulated=simulated,
@@ -196,42 +188,9 @@ def explain(
         progress(f"explain: {pool.summary}")
     predictions.write(out / "predictions.npz")
     report.write(out / "explain.json")
-    write_json(out / "explain.key.json", {"key": key})
     cache.forget()
     progress(f"explain: {report.verdict} after {seconds:.0f} s")
     return report
-
-
-def fingerprint(recording: Recording, hand: HandModel | None, options: Options) -> str:
-    """What a result depends on, as a hash."""
-    digest = hashlib.sha256()
-    digest.update(
-        repr((VERSION, recording.model, recording.joints, recording.encoder_resolution_rad)).encode()
-    )
-    for trajectory in recording.trajectories:
-        digest.update(repr((trajectory.file, trajectory.excitation, trajectory.joints)).encode())
-        digest.update(repr(sorted(trajectory.conditions.items())).encode())
-        for array in (trajectory.time, trajectory.command, trajectory.position, trajectory.enabled):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        for channel in (trajectory.pwm, trajectory.voltage, trajectory.current, trajectory.command_time):
-            digest.update(b"-" if channel is None else np.ascontiguousarray(channel).tobytes())
-    if hand is not None:
-        for chain in chains(recording, hand):
-            for value in (chain.start_row, chain.mass, chain.com, chain.inertia, chain.offset, chain.axis):
-                digest.update(np.ascontiguousarray(value).tobytes())
-    digest.update(repr((options.effects, options.seed)).encode())
-    for joint, row in sorted(options.start.items()):
-        digest.update(joint.encode() + np.ascontiguousarray(row).tobytes())
-    return digest.hexdigest()
-
-
-def _read(path: Path, key: str) -> dict[str, Any] | None:
-    """The JSON of an earlier run with the same inputs."""
-    try:
-        value = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return None
-    return value if isinstance(value, dict) and value.get("key") == key else None
 
 
 def _workers(recording: Recording, hand: HandModel | None, options: Options, cache: FitCache) -> WorkerPool:

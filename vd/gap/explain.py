@@ -1,29 +1,99 @@
-"""Explain one joint of a finger, knowing what the others of it have been found to lack."""
+"""Explain one joint: search, weigh samples that say little, try random delays, conclude."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
+from vd.gap.candidates import alike, stood_for
 from vd.gap.chain import candidates, others_in
-from vd.gap.clock_sensitivity import clock_sensitivity, explain_weighted
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.explanation import Explanation, added, jitter_of, lacking
-from vd.gap.jitter_search import FIXED, jitter_as_another
-from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXPLAINED, JITTER
+from vd.gap.evidence import EXPLAINED, JITTER, cancelled, middles
+from vd.gap.explanation import Accepted, Explanation
+from vd.gap.jitter_search import FIXED, try_jitter
+from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.recording import Recording
-from vd.gap.search import LOOKS
-from vd.gap.select import Selection
+from vd.gap.search import MAX_ROUNDS, UNEARNED, Search
 from vd.gap.statistics import resamples
-from vd.gap.telemetry import vetoes
-from vd.gap.warm_start import rough_model, warm_starts
-from vd.gap.warming import middles
+from vd.gap.telemetry import BEHIND_SENSOR, vetoes
 from vd.gap.worker_pool import JointSpec, WorkerPool
 from vd.kernels.servo.effects import EFFECTS
+
+MIN_TRAJECTORIES = 3
+WEIGHTED = "where errors of the recording's clock grow, samples count by how surely they are known"
+"""What a reason says of it."""
+
+
+def explain(search: Search, baseline: JointFit) -> Explanation:
+    """Select effects, starting from the fitted plain model.
+
+    Args:
+        search: Of the joint.
+        baseline: The plain model.
+    """
+    loose, search.whole = search.undetermined(baseline), baseline.held_out_rmse
+    if nothing := _nothing_to_explain(search, baseline, loose):
+        return nothing
+    if weighting := search.clock_sensitivity(baseline):  # with an identified limit in it
+        return _explain_weighted(search, baseline, weighting)
+    present, rows = search.search(baseline)
+    trials = [*search.contradicted(baseline), *rows]
+    if weighting := search.clock_sensitivity(present):
+        return _explain_weighted(search, baseline, weighting)
+    if present.effects:
+        earned, why = search.better(baseline, present)
+        if not earned:
+            search.report(f"taken back: {why}")
+            present = baseline
+    known: tuple[Accepted, ...] = ()
+    if not search.no_gap(present) and present.rmse > UNEARNED * search.floor:
+        found, known, rows = try_jitter(search, explain, baseline, present)
+        present = found if found is present or JITTER in found.effects else search.revise(found)
+        trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
+    evidence = search.settle(trials, present)
+    random = JITTER in present.effects
+    rivals = {} if random else {name: search.rivals(present, name) for name in present.effects}
+    refined = None if random or not present.effects else search.refined(present)
+    result = search.conclude(baseline, present, rivals, evidence, loose, refined, known)
+    return result if random else _with_notes(search, result)
+
+
+def _nothing_to_explain(search: Search, baseline: JointFit, loose: str) -> Explanation | None:
+    """The explanation of a joint whose plain model leaves nothing to search for, or cannot be judged."""
+    if len(baseline.sse) < MIN_TRAJECTORIES:
+        text = f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_TRAJECTORIES} at least"
+        return Explanation(baseline, baseline, "under_excited", text)
+    if not search.no_gap(baseline):
+        return None
+    text = "the plain model is within the noise floor"
+    return Explanation(baseline, baseline, "under_excited" if loose else "no_gap", loose or text)
+
+
+def _explain_weighted(search: Search, baseline: JointFit, weighting: SampleWeighting) -> Explanation:
+    """What a search finds with samples weighted by how surely they are known, which says so."""
+    search.report("errors of the clock grow: samples are weighted by how surely they are known")
+    inner = search.weighted(weighting)
+    found = explain(inner, inner.run([inner.plain(baseline)])[0])
+    return replace(found, weighting=weighting, reason=f"{found.reason}; {WEIGHTED}")
+
+
+def _with_notes(search: Search, explanation: Explanation) -> Explanation:
+    """The explanation with what its names do not say.
+
+    What a member of a set means that telemetry contradicts by its name; and no names where two effects are
+    but one that is not in the table.
+    """
+    alike = cancelled(explanation.final, search.joint, search.rest)
+    if alike and explanation.verdict in ("effects", "ambiguous"):
+        return replace(explanation, verdict="unknown", reason=alike)
+    tied = {name for one in explanation.accepted for name in one.tied}
+    notes = [
+        f"{name} {BEHIND_SENSOR[name]}" for name in sorted(tied & set(BEHIND_SENSOR) & set(search.vetoes))
+    ]
+    return replace(explanation, reason="; ".join([explanation.reason, *notes]))
+
 
 POLISH_ITERATIONS = 5
 """Steps of a fit that has to follow small changes of the other joints."""
@@ -57,7 +127,6 @@ class Explainer:
         effects: Effects to consider.
         seed: Of everything random.
         progress: Called with lines of progress.
-        rough: Rough models of joints that are not explained yet, by chain: each has a thread of its own.
     """
 
     pool: WorkerPool
@@ -65,48 +134,28 @@ class Explainer:
     effects: Sequence[str]
     seed: int
     progress: Progress
-    rough: dict[int, dict[Joint, JointFit]] = field(default_factory=dict)
 
     @cached_property
     def when(self) -> np.ndarray:
-        """When each trajectory was recorded (:func:`vd.gap.warming.middles`)."""
+        """When each trajectory was recorded (:func:`vd.gap.evidence.middles`)."""
         return middles(self.pool.problems.recording)
 
-    def explain(self, joint: Joint, explained: Explained, own: Explanation | None = None) -> Explanation:
+    def explain(self, joint: Joint, explained: Explained) -> Explanation:
         """What a joint lacks.
 
         Args:
             joint: The joint.
             explained: Joints of its finger that are explained already.
-            own: What it was found to lack before random delays were found on another: only these are tried.
         """
-        selection = self.selection(joint, explained)
-        baseline = self.plain(joint, explained)
-        if own is not None:
-            return jitter_as_another(selection, baseline, selection.undetermined(baseline)) or own
-        found = None if explained else rough_model(selection, baseline)
-        if found is not None:
-            self.warm_start(joint, found)
-            baseline = self.plain(joint, explained)
-            (found,) = selection.run(
-                [selection.call(baseline, found.effects, [found.values], FULL_ITERATIONS)]
-            )
-        weighting = None if found is None else clock_sensitivity(selection, found)
-        result = (
-            explain_weighted(selection, baseline, weighting) if weighting else selection.explain(baseline)
-        )
+        result = explain(self.search(joint, explained), self.plain(joint, explained))
         self.progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
         return result
 
-    def selection(self, joint: Joint, explained: Explained) -> Selection:
+    def search(self, joint: Joint, explained: Explained) -> Search:
         """The search for what a joint lacks, with what the others of its finger say of it."""
         chain, spec = self.pool.problems.chains[joint.spec.chain], joint.spec
         recording = self.pool.problems.recording
         column = int(chain.columns[spec.joint])
-        jittered = next((like for _, found in explained if (like := jitter_of(found))[0]), ((), {}))
-        # What is none of the table on one joint is none on the others, and jitter on one is jitter on
-        # all: what is plain to see is enough there.
-        hidden = bool(jittered[0]) or any(found.verdict == "unknown" for _, found in explained)
         names = candidates(chain, self.effects)
         if _no_jitter(explained):
             names = [name for name in names if name != JITTER]
@@ -114,13 +163,12 @@ class Explainer:
         pairs = alike(self.effects, recording.model).items()
         same = {name: others for name, others in pairs if not {name, *others} & set(told)}
         rng = np.random.default_rng([self.seed, spec.chain, spec.joint])
-        return Selection(
+        return Search(
             run=lambda calls: self.pool.run(spec, calls),
             joint=spec.joint,
             others=others_in(chain, spec.joint),
             candidates=names,
             equivalent=same,
-            seed=self.seed,
             nominal={
                 key: float(chain.start_row[spec.joint, BASELINE_PARAMETERS[key].column])
                 for key in spec.baseline
@@ -129,46 +177,21 @@ class Explainer:
             scales=joint.scales,
             weights=resamples(len(spec.trajectories), rng),
             refits=REFITS,
-            looks=0 if hidden else LOOKS,
             vetoes={**stood_for(same), **told},
             report=lambda line: self.progress(f"explain: {joint.name}: {line}"),
             rest=rest(recording, column, spec.trajectories),
             moves=moves(recording, column, spec.trajectories),
             when=self.when[list(spec.trajectories)],
-            like=next((like for _, found in explained if (like := lacking(found))[0]), ((), {})),
-            changing=next((added(found.final) for _, found in explained if found.warms), ((), {})),
-            jittered=jittered,
         )
 
     def plain(self, joint: Joint, explained: Explained) -> JointFit:
         """The plain model, fitted again beside joints of which more is known than theirs."""
         rows = beside(joint, explained)
-        known = {joint, *(other for other, _ in explained)}
-        for other, model in self.rough.get(joint.spec.chain, {}).items():
-            if other not in known:
-                rows[other.spec.joint] = model.rows[other.spec.joint]
         if np.array_equal(rows, joint.fit.rows):
             return joint.fit
         call = {"base": rows, "effects": (), "starts": [{}], "scales": joint.scales}
         call |= {"iterations": POLISH_ITERATIONS, "refits": REFITS}
         return self.pool.run(joint.spec, [("fit", call)])[0]
-
-    def warm_start(self, joint: Joint, found: JointFit) -> None:
-        """Begin the other joints of a finger with rough models, beside a rough one of its first."""
-
-        def fit(other: Joint, effects: tuple[str, ...], values: Mapping[str, float]) -> JointFit:
-            rows = other.fit.rows.copy()
-            rows[joint.spec.joint] = found.rows[joint.spec.joint]
-            call = {"base": rows, "effects": effects, "starts": [values], "scales": other.scales}
-            return self.pool.run(other.spec, [("fit", {**call, "iterations": FULL_ITERATIONS})])[0]
-
-        others = {j.name: j for j in self.joints if j.spec.chain == joint.spec.chain and j is not joint}
-        fits = {name: partial(fit, other) for name, other in others.items()}
-        models = warm_starts(found, {name: other.fit for name, other in others.items()}, fits)
-        self.rough[joint.spec.chain] = {others[name]: model for name, model in models.items()}
-        if models:
-            names = " and ".join(models)
-            self.progress(f"explain: {names}: roughly with {' and '.join(found.effects)} as well")
 
 
 def _no_jitter(explained: Explained) -> bool:
