@@ -34,7 +34,8 @@ points fewer (0.6 to 7.8) of 1664 validation episodes stop at what looks like th
 the goal. It rests on these and on two comparisons of the same sign, 4.1 (1.2 to 7.6) and 3 (0 to 7), made
 when predicted errors chose."""
 STEPS = 4
-"""Steps of Gauss and Newton by which an improved hypothesis is laid onto what is seen."""
+"""Steps of Gauss and Newton by which an improved hypothesis is laid onto what is seen. With none 5.4
+points fewer (2.6 to 8.8) of those episodes stop at the goal; 8 are no better."""
 GOAL, SEEN = 0, 1
 """Kinds of clouds, in the order in which they are given."""
 
