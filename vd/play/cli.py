@@ -58,6 +58,8 @@ class PlayCfg(HandFlags, TaskFlags):
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
         require(self, "--", "positive", "cells seconds")
+        if not 0 < self.port < 65536:
+            raise ValueError(f"--port is {self.port}; it has to be from 1 to 65535")
         if self.video is not None and self.video.suffix.lower() != ".mp4":
             raise ValueError(f"--video is {self.video}; use a name that ends in .mp4")
 
