@@ -106,7 +106,9 @@ def test_orientations_are_read_as_written(tmp_path):
         assert first[3] > 0.0 or (first[3] == 0.0 and first[1] > 0.0)
 
 
-@pytest.mark.parametrize("text", ["1,2,3", "0,0,0@90", "0,0,0,0", "a,b,c,d", "0,0,1,0@90", "nan,0,0,1"])
+@pytest.mark.parametrize(
+    "text", ["1,2,3", "0,0,0@90", "0,0,0,0", "a,b,c,d", "0,0,1,0@90", "nan,0,0,1", "0,0,1@nan"]
+)
 def test_what_is_no_orientation_is_refused(text, tmp_path):
     with pytest.raises(GoalError, match="such as 0,0,1@90"):
         make_goals([text])

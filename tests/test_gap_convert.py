@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from vd.gap.cli import UNUSABLE, main
+from vd.gap.cli import main
 from vd.gap.recording import read_recording
 
 RATE, COUNT = 100.0, 2.0 * np.pi / 4096
@@ -69,7 +69,14 @@ def ros(folder, *, mcap=False):
             header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](7, 0), "")
             told = kinds[array](layout, command)
             measured = kinds[state](header, list(JOINTS), position, np.zeros(0), np.zeros(0))
-            for kind, message, late in ((array, told, 0), (state, measured, 1_000_000)):
+            gripper = kinds[state](header, ["gripper"], np.ones(1), np.ones(1), np.zeros(0))
+            turned = kinds[state](header, list(JOINTS[::-1]), position[::-1].copy(), np.zeros(0), np.zeros(0))
+            measured = turned if round(t * RATE) % 2 else measured  # names say which is which
+            for kind, message, late in (
+                (array, told, 0),
+                (state, measured, 1_000_000),
+                (state, gripper, 2_000_000),  # of another device, on the same topic
+            ):
                 writer.write(to[kind], stamp + late, store.serialize_cdr(message, kind))
     return (folder / "bag" / "bag.mcap" if mcap else folder / "bag"), []
 
@@ -111,13 +118,17 @@ def test_a_sample_of_each_format_is_read_as_it_was_made(make, tmp_path, capsys):
             ["--rename", "clock=t", "command.wrist [deg]=x", "--joints", "wrist"],
             "command of wrist has gaps",
         ),
+        (csv, ["--rename", "clock=t", "elbow angle=x"], "has no 'elbow angle'"),
+        (csv, ["--rename", "clock=t", "--out", "."], "a.csv, which would be lost"),
+        (csv, ["--rename", "clock=t", "command.wrist [deg]=command.elbow [deg]"], "two columns are"),
         (csv, ["--format", "bam"], "no log of BAM"),
         (lerobot, [], "give --unit deg or rad"),
         (ros, ["--state-topic", "/nosuch"], "/nosuch is none; give --state-topic"),
     ],
 )
-def test_what_a_source_does_not_say_is_asked_for(make, flags, said, tmp_path, capsys):
+def test_what_a_source_does_not_say_is_asked_for(make, flags, said, tmp_path, capsys, monkeypatch):
     source, _ = make(tmp_path)
     out = tmp_path / "rec"
-    assert main(["convert", str(source), "--out", str(out), "--counts-per-turn", "4096", *flags]) == UNUSABLE
+    monkeypatch.chdir(tmp_path)
+    assert main(["convert", str(source), "--out", str(out), "--counts-per-turn", "4096", *flags]) != 0
     assert said in capsys.readouterr().err and not out.exists()

@@ -130,7 +130,7 @@ def test_another_policy_brings_its_hand_and_what_its_camera_sees(player):
     use(player, "Object", "stick")
     before = player.session
     use(player, "Policy", "broken")
-    assert player.session is before and player._eye is None
+    assert player.session is before and player._eye is None and player._policy_menu.value == "turn"
     use(player, "Policy", "sees")
     assert player.session.hand.name == "dclaw4" and player.session.object_name == "stick"
     assert "believed 0.25" in player._status.content and "ms" in player._status.content

@@ -151,7 +151,7 @@ def _read(path: Path) -> ConfigFile:
         raise FileNotFoundError(
             f"{CONFIG}: there is no file {path}; {PRINT} prints settings to begin from"
         ) from error
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+    except (OSError, yaml.YAMLError, ValueError) as error:  # of dates such as 2020-13-01 too
         raise ValueError(f"{CONFIG} {path} cannot be read: {error}") from error
     if not isinstance(values, dict):
         raise ValueError(f"{CONFIG} {path} has no fields; {PRINT} shows what it may hold")

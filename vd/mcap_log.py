@@ -6,6 +6,7 @@ of steps.csv whole, ``/events``, and the metadata ``run``, which is run.json. Ne
 """
 
 import json
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -150,7 +151,9 @@ def read_mcap(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[d
                     steps.append(message)
                 else:
                     events.append(json.loads(message.data))
-    except (McapError, ValueError, KeyError, OSError) as error:
+    except LogError:
+        raise
+    except (McapError, struct.error, ValueError, KeyError, OSError) as error:
         raise LogError(f"{path} is damaged ({error}); read the folder beside it") from error
     if not steps:
         raise LogError(f"{path} has no steps")

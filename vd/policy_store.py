@@ -87,6 +87,19 @@ def read_store(place: str | Path) -> Store:
     return store
 
 
+def installed_entries() -> dict[str, Entry]:
+    """What is told of the policies that are installed, by name.
+
+    Raises:
+        ValueError: A list is damaged.
+    """
+    told: dict[str, Entry] = {}
+    for folder in (POLICY_FOLDER, pulled_folder()):
+        if (folder / POLICY_LIST).exists():
+            told = read_store(folder).policies | told
+    return {name: told[name] for name in sorted(told.keys() & installed_policies().keys())}
+
+
 def check_name(name: str) -> None:
     """Refuse what cannot be a policy's name, such as a path.
 
@@ -113,6 +126,8 @@ def pull(name: str, place: str, *, replace: bool = False) -> Path:
     entry, target = found[name], pulled_folder() / f"{name}.pt"
     here = SHIPPED_POLICIES.get(name, target)
     if here.exists() and _digest(here) == entry.sha256:
+        if here == target:  # its list may be lost
+            _tell(target.parent, name, dataclasses.replace(entry, bytes=target.stat().st_size))
         return here
     if here.exists() and (name in SHIPPED_POLICIES or not replace):
         remedy = "which stays" if name in SHIPPED_POLICIES else "--replace takes the one there"
@@ -233,12 +248,9 @@ class List:
     def run(self) -> int:
         """Print a line for each."""
         there = {} if self.at is None else read_store(self.at).policies
-        for folder in (POLICY_FOLDER, pulled_folder()):
-            known = read_store(folder).policies if (folder / POLICY_LIST).exists() else {}
-            for name, entry in known.items():
-                if (folder / f"{name}.pt").exists():
-                    same = there.pop(name, entry).sha256 == entry.sha256
-                    _show(name, entry, "installed" if same else f"installed; another one at {self.at}")
+        for name, entry in installed_entries().items():
+            same = there.pop(name, entry).sha256 == entry.sha256
+            _show(name, entry, "installed" if same else f"installed; another one at {self.at}")
         for name, entry in there.items():
             _show(name, entry, f"vd-policies pull {name} --at {self.at}")
         return 0

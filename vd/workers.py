@@ -28,7 +28,7 @@ def shard(tasks: Sequence[Any], part: str | None) -> list[Any]:
     if part is None:
         return list(tasks)
     index, _, count = part.partition("/")
-    if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
+    if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
         raise ValueError(f"--shard is {part!r}; it has to be I/N, with I from 0 to N - 1, such as 0/8")
     return list(tasks[int(index) :: int(count)])
 

@@ -142,18 +142,14 @@ def _goal(text: str, where: str) -> np.ndarray:
     turn, _, degrees = text.partition("@")
     try:
         numbers = np.array([float(part) for part in turn.split(",")])
-        angle = np.radians(float(degrees)) if degrees else None
+        angle = np.radians(float(degrees)) if "@" in text else 0.0
     except ValueError:
-        numbers, angle = np.zeros(0), None
+        numbers, angle = np.zeros(0), 0.0
     wanted = 4 if "@" not in text else 3
     length = float(np.linalg.norm(numbers))
-    if (
-        len(numbers) != wanted
-        or not (np.isfinite(length) and length > 0.0)
-        or (wanted == 3 and angle is None)
-    ):
+    if len(numbers) != wanted or not (np.isfinite(length + angle) and length > 0.0):
         raise GoalError(f"{where}: give a quaternion x,y,z,w or a turn x,y,z@degrees, such as 0,0,1@90")
-    if angle is None:
+    if wanted == 4:
         return canonical_quat(numbers / length)
     return canonical_quat(Rotation.from_rotvec(angle * numbers / length).as_quat())
 

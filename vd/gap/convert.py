@@ -73,11 +73,15 @@ def convert(asked: Convert) -> Recording:
         raise ValueError(f"--rename {bad[0]!r} is no OLD=NEW")
     rename = {old: new for old, _, new in (pair.partition("=") for pair in asked.rename)}
     format = asked.format or format_of(asked.source)
-    told = Told(asked.unit, rename, asked.state_topic, asked.command_topic)
+    told = Told(asked.unit, rename, asked.state_topic, asked.command_topic, asked.joints)
     motions = list(FORMATS[format](asked.source, told))
+    if unused := sorted(rename.keys() - told.used):
+        raise ValueError(f"--rename {unused[0]}={rename[unused[0]]}: {asked.source} has no {unused[0]!r}")
     joints = asked.joints or motions[0].joints
     resolution = 2.0 * math.pi / asked.counts_per_turn
     trajectories = tuple(_trajectory(asked, one, joints, MOVING_COUNTS * resolution) for one in motions)
+    if there := [one.file for one in trajectories if (asked.out / one.file).exists()]:
+        raise ValueError(f"--out {asked.out} holds {there[0]}, which would be lost; name another folder")
     model = asked.model or ("pendulum" if format == "bam" else "servo")
     with TemporaryDirectory() as work:
         write_recording(Recording(Path(work), model, joints, {}, resolution, trajectories), work)

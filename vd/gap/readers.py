@@ -6,7 +6,7 @@ Every reader yields a :class:`Motion` for each episode, bag or file. ``FORMATS``
 import csv
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,8 @@ UNITS: dict[str, Mapping[str, float]] = {
 """Units that a column may have, and how many of ours one of them is."""
 JOINT_STATE, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+_Heard = tuple[float, float, Any]
+"""A message, after its own stamp and the bag's [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,26 +68,44 @@ class Told:
         rename: Column or joint of the file -> our name.
         state_topic: Topic of the measured joints.
         command_topic: Topic of the commands.
+        joints: Joints that are wanted, by our names; empty: all.
+        used: What of ``rename`` the file had.
     """
 
     unit: str | None = None
     rename: Mapping[str, str] = field(default_factory=dict)
     state_topic: str | None = None
     command_topic: str | None = None
+    joints: tuple[str, ...] = ()
+    used: set[str] = field(default_factory=set)
+
+    def called(self, old: str, default: str) -> str:
+        """Our name of what the file calls ``old``."""
+        if old in self.rename:
+            self.used.add(old)
+        return self.rename.get(old, default)
 
 
 def read_csv(path: Path, told: Told) -> Iterator[Motion]:
     """A CSV whose header names ``t [ms]``, ``position.JOINT [deg]``, ...; a folder: every CSV in it."""
     for file in _files(path, ".csv"):
-        with file.open(newline="", encoding="utf-8-sig") as stream:
-            header, *rows = [row for row in csv.reader(stream) if any(cell.strip() for cell in row)] or [[]]
+        try:
+            with file.open(newline="", encoding="utf-8-sig") as stream:
+                lines = [row for row in csv.reader(stream) if any(cell.strip() for cell in row)]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise RecordingError(f"{file}: no CSV in UTF-8 ({error}); save it as that") from error
+        header, *rows = lines or [[]]
         columns: dict[str, np.ndarray] = {}
         for i, text in enumerate(header):
             name, scale = _column(file, text.strip(), told)
             if scale is not None:
+                if name in columns:
+                    raise RecordingError(f"{file}: two columns are {name!r}; --rename one to 'unused'")
                 columns[name] = scale * _numbers(file, text, [row[i : i + 1] for row in rows])
         if "t" not in columns:
             raise RecordingError(f"{file}: no column 't'; give --rename 'ITS TIME=t' with its unit: 't [ms]'")
+        if not rows:
+            raise RecordingError(f"{file} has no rows; drop it")
         joints = tuple(dict.fromkeys(name.partition(".")[2] for name in columns if "." in name))
         channels = {}
         for channel in CHANNELS:
@@ -99,7 +119,7 @@ def read_csv(path: Path, told: Told) -> Iterator[Motion]:
 def _column(file: Path, text: str, told: Told) -> tuple[str, float | None]:
     """Our name of a column, and its unit in ours; None: it is not used."""
     bare, own = _name_and_unit(text)
-    name, given = _name_and_unit(told.rename.get(text, told.rename.get(bare, bare)))
+    name, given = _name_and_unit(told.called(text, told.called(bare, bare)))
     channel = name.partition(".")[0]
     if channel not in UNITS or (channel == "t") == ("." in name):
         return name, None
@@ -147,13 +167,13 @@ def read_bam(path: Path, told: Told) -> Iterator[Motion]:
             channels["enabled"] = np.array([float(row.get("torque_enable", 1)) for row in rows])
             conditions = {"p_gain": log["kp"], "payload_kg": log["mass"], "arm_length_m": log["length"]}
             conditions |= {"supply_v": log["vin"]} if "vin" in log else {}
-            name = f"{log['trajectory']}_p{log['kp']:g}_{file.stem}"
+            name = f"{log['trajectory']}_p{log['kp']:g}_{file.stem}".replace("/", "_")
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(
                 f"{file}: no log of BAM ({error!r}); it has mass, length, kp, trajectory, and entries of "
                 "timestamp, position and goal_position"
             ) from error
-        joint = told.rename.get("pendulum", "pendulum")
+        joint = told.called("pendulum", "pendulum")
         values = {channel: of_joint[:, None] for channel, of_joint in channels.items()}
         yield Motion(name, (joint,), time, values, None, conditions, str(log["trajectory"]))
 
@@ -161,8 +181,6 @@ def read_bam(path: Path, told: Told) -> Iterator[Motion]:
 def read_lerobot(path: Path, told: Told) -> Iterator[Motion]:
     """Episodes of a LeRobot dataset, v2 or v3: ``action`` commands, ``observation.state`` is measured."""
     need("pyarrow")
-    import pyarrow.parquet as pq
-
     info = path / "meta" / "info.json"
     try:
         features = json.loads(info.read_text())["features"]
@@ -179,17 +197,9 @@ def read_lerobot(path: Path, told: Told) -> Iterator[Motion]:
     joints = [joint for joint in names[1] if joint in names[0]]
     if not joints:
         raise RecordingError(f"{info}: 'action' has {names[0]}, 'observation.state' {names[1]}: none in both")
-    wanted = ["episode_index", "timestamp", "action", "observation.state"]
-    columns: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
-    for file in sorted(path.glob("data/**/*.parquet")):
-        table = pq.read_table(file, columns=wanted)
-        for name in wanted:
-            columns[name].append(np.array(table[name].to_pylist(), dtype=float))
-    if not columns["timestamp"]:
-        raise RecordingError(f"{path}: no data/**/*.parquet; download the dataset's data folder")
-    index, time, action, state = (np.concatenate(columns[name]) for name in wanted)
+    index, time, action, state = _lerobot_rows(path, names)
     scale = ANGLES[told.unit]
-    ours = tuple(told.rename.get(joint, joint.removesuffix(".pos")) for joint in joints)
+    ours = tuple(told.called(joint, joint.removesuffix(".pos")) for joint in joints)
     picked = [[each.index(joint) for joint in joints] for each in names]
     for episode in np.unique(index):
         rows = index == episode
@@ -197,6 +207,30 @@ def read_lerobot(path: Path, told: Told) -> Iterator[Motion]:
         yield Motion(
             f"episode_{int(episode):06d}", ours, time[rows], {key: scale * v for key, v in both.items()}
         )
+
+
+def _lerobot_rows(path: Path, names: Sequence[list[str]]) -> list[np.ndarray]:
+    """Episodes [T], time [T], commands [T, J] and measured [T, J], which ``names`` name."""
+    import pyarrow.parquet as pq
+
+    wanted = ["episode_index", "timestamp", "action", "observation.state"]
+    columns: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
+    for file in sorted(path.glob("data/**/*.parquet")):
+        try:
+            table = pq.read_table(file, columns=wanted)
+            found = [np.array(table[name].to_pylist(), dtype=float) for name in wanted]
+        except (ValueError, OSError, KeyError) as error:
+            raise RecordingError(f"{file} cannot be read ({error}); download it again") from error
+        for name, values in zip(wanted, found, strict=True):
+            if len(values):
+                columns[name].append(values)
+    if not columns["timestamp"]:
+        raise RecordingError(f"{path}: no rows in data/**/*.parquet; download the dataset's data folder")
+    rows = [np.concatenate(columns[name]) for name in wanted]
+    for values, of in zip(rows[2:], names, strict=True):
+        if values.shape[1:] != (len(of),):
+            raise RecordingError(f"{path}: {len(of)} names for values of shape {values.shape[1:]}")
+    return rows
 
 
 def _lerobot_names(feature: Mapping[str, Any]) -> list[str]:
@@ -210,7 +244,8 @@ def read_ros(path: Path, told: Told) -> Iterator[Motion]:
 
     Measured are JointState, commanded JointState, JointTrajectory of one point, or Float64MultiArray in the
     order of the measured joints. A command holds until the next. Stamps are those of the headers where all
-    have one, else of the bag.
+    have one, else of the bag. Of a topic that several devices share, states of the joints that are asked for
+    are taken, or of those in its first message.
     """
     need("rosbags")
     from rosbags.highlevel import AnyReader, AnyReaderError
@@ -222,15 +257,17 @@ def read_ros(path: Path, told: Told) -> Iterator[Motion]:
             state = _topic(path, "state", told.state_topic, kinds, (JOINT_STATE,), ())
             allowed = (JOINT_STATE, TRAJECTORY, ARRAY)
             command = _topic(path, "command", told.command_topic, kinds, allowed, (state,))
-            heard: dict[str, list[tuple[float, float, Any]]] = {state: [], command: []}
+            heard: dict[str, list[_Heard]] = {state: [], command: []}
             chosen = [one for one in reader.connections if one.topic in heard]
             for connection, stamp, raw in reader.messages(connections=chosen):
                 message: Any = reader.deserialize(raw, connection.msgtype)
                 header = getattr(message, "header", None)
                 own = header.stamp.sec + 1e-9 * header.stamp.nanosec if header else 0.0
                 heard[connection.topic].append((own, 1e-9 * stamp, message))
-    except (AnyReaderError, OSError) as error:
+    except (AnyReaderError, OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: no bag that can be read: {error}") from error
+    if empty := [topic for topic, messages in heard.items() if not messages]:
+        raise RecordingError(f"{path}: no message on {empty[0]}; record it, or name another topic")
     yield _held(path, heard[state], heard[command], told)
 
 
@@ -250,12 +287,20 @@ def _topic(
     )
 
 
-def _held(path: Path, states: list, commands: list, told: Told) -> Motion:
+def _held(path: Path, states: list[_Heard], commands: list[_Heard], told: Told) -> Motion:
     """The measured rows, each with the command that was sent last."""
+    ours = [{told.called(name, name) for name in message.name} for *_, message in states]
+    first = next((i for i, names in enumerate(ours) if names.issuperset(told.joints)), None)
+    if first is None:
+        raise RecordingError(f"{path}: no state of {', '.join(told.joints)}; there are {sorted(ours[0])}")
+    joints = list(states[first][2].name)
+    states = [row for row, names in zip(states, ours, strict=True) if names & ours[first]]
     stamped = all(own > 0.0 for own, _, _ in (*states, *commands))
-    joints = list(states[0][2].name)
     time = np.array([row[0 if stamped else 1] for row in states])
-    position, velocity = (np.array([getattr(m, key) for *_, m in states]) for key in ("position", "velocity"))
+    position, velocity = (
+        np.stack([_in_order(path, m.name, getattr(m, key), joints) for *_, m in states])
+        for key in ("position", "velocity")
+    )
     sent = np.array([row[0 if stamped else 1] for row in commands])
     wanted = np.stack([_goal(path, message, joints) for *_, message in commands])
     order = np.argsort(sent, kind="stable")
@@ -266,10 +311,8 @@ def _held(path: Path, states: list, commands: list, told: Told) -> Motion:
     last = last[last >= 0]
     new = np.concatenate([[True], np.diff(last) > 0])
     time = time[kept]
-    channels = {"command": wanted[last], "position": position[kept]}
-    if velocity.shape == position.shape:
-        channels["velocity"] = velocity[kept]
-    named = tuple(told.rename.get(joint, joint) for joint in joints)
+    channels = {"command": wanted[last], "position": position[kept], "velocity": velocity[kept]}
+    named = tuple(told.called(joint, joint) for joint in joints)
     # A command is new in one row; in those after it, it is held.
     return Motion(path.stem, named, time, channels, np.where(new, np.minimum(sent[last], time), time))
 
@@ -288,9 +331,14 @@ def _goal(path: Path, message: Any, joints: list[str]) -> np.ndarray:
         values = points[0].positions
     else:
         names, values = message.name, message.position
-    if len(values) != len(names):
-        raise RecordingError(f"{path}: a command has {len(values)} positions for {len(names)} joints")
-    told = dict(zip(names, values, strict=True))
+    return _in_order(path, names, values, joints)
+
+
+def _in_order(path: Path, names: Sequence[str], values: Any, joints: Sequence[str]) -> np.ndarray:
+    """Values of a message in the order of the joints; NaN for those it leaves out."""
+    if len(values) not in (0, len(names)):
+        raise RecordingError(f"{path}: a message has {len(values)} values for {len(names)} joints")
+    told = dict(zip(names, values, strict=False))
     return np.array([told.get(joint, np.nan) for joint in joints])
 
 

@@ -58,6 +58,8 @@ class PlayCfg(HandFlags, TaskFlags):
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
         require(self, "--", "positive", "cells seconds")
+        if not 0 < self.port < 65536:
+            raise ValueError(f"--port is {self.port}; it has to be from 1 to 65535")
         if self.video is not None and self.video.suffix.lower() != ".mp4":
             raise ValueError(f"--video is {self.video}; use a name that ends in .mp4")
 
@@ -151,19 +153,17 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
 def _policies() -> list[str]:
     """Policies that are installed, of hands that are."""
     from vd.assets_usd.hands import check_hand_name
-    from vd.evaluate.agents import POLICY_FOLDER, POLICY_LIST, installed_policies, pulled_folder
-    from vd.policy_store import read_store
+    from vd.policy_store import installed_entries
 
-    told: dict[str, Any] = {}
-    for folder in (POLICY_FOLDER, pulled_folder()):
-        if (folder / POLICY_LIST).exists():
-            told |= read_store(folder).policies
     names = []
-    for name in installed_policies().keys() & told.keys():
-        with suppress(ValueError):  # of a hand that has to be imported
-            check_hand_name(told[name].hand)
-            names.append(name)
-    return sorted(names)
+    try:
+        for name, entry in installed_entries().items():
+            with suppress(ValueError):  # of a hand that has to be imported
+                check_hand_name(entry.hand)
+                names.append(name)
+    except (OSError, ValueError) as error:  # of what was pulled; the policy that is asked for needs no list
+        print(f"vd-play: no menu of policies: {error}", file=sys.stderr)
+    return names
 
 
 def _session(cfg: PlayCfg) -> "Session":

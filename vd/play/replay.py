@@ -74,6 +74,7 @@ class Replay:
         ends = {stop.goal: stop for stop in log.stops}
         reached = lost = 0
         for step in range(steps):
+            believed = float(columns["distance"][step])
             number = min(int(columns["goal"][step]), len(log.goals) - 1)  # one may not have begun
             stop = ends.get(number)
             # Events have the time of their writing: the last step before it is the one that ended the goal.
@@ -94,7 +95,7 @@ class Replay:
                 goals=reached,
                 drops=lost,
                 table=not self.hand.palm_up,
-                believed_rad=float(columns["distance"][step]),
+                believed_rad=believed if np.isfinite(believed) else None,  # not while the hand is held
                 latency_s=None if heard is None else float(columns["sent_s"][step] - heard[step]),
             )
 

@@ -151,7 +151,8 @@ class PlayViewer:
         with gui.add_folder("Policy", order=-1.0):
             self._status = gui.add_html(status_html(session.snapshot))
             if len(self._policies) > 1:
-                self._menu("Policy", self._policies, self._policies[0], self._choose_policy)
+                self._acting = self._policies[0]
+                self._policy_menu = self._menu("Policy", self._policies, self._acting, self._choose_policy)
             if len(session.object_names) > 1:
                 self._menu("Object", session.object_names, session.object_name, self._choose_object)
             new_goal = gui.add_button("New goal")
@@ -160,13 +161,15 @@ class PlayViewer:
         def _(_event: Any) -> None:
             self._events.put(lambda: self.session.new_goal())
 
-    def _menu(self, label: str, names: Sequence[str], now: str, choose: Callable[[str], None]) -> None:
+    def _menu(self, label: str, names: Sequence[str], now: str, choose: Callable[[str], None]) -> Any:
         menu = self.viewer.server.gui.add_dropdown(label, tuple(names), initial_value=now)
 
         @menu.on_update
         def _(event: Any) -> None:
             if event.client_id is not None:
                 self._events.put(partial(choose, menu.value))
+
+        return menu
 
     def _choose_object(self, name: str) -> None:
         self.session.choose_object(name)
@@ -182,11 +185,13 @@ class PlayViewer:
             session = self._reopen(name)
         except (ValueError, OSError, RuntimeError) as error:
             self._tell(f"{name} cannot be shown", str(error))
+            self._policy_menu.value = self._acting
             return
         finally:
             for note in notes:
                 note.remove()
         self.session.close()
+        self._acting = name
         session.choose_object(watched)
         self._show(session)
 
