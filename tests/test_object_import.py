@@ -67,13 +67,8 @@ def imported(tmp_path_factory: pytest.TempPathFactory):
         rows.writerow(["bracket", "our workshop (CC0-1.0)", "train"])
     settings = replace(FAST, licence="MIT")
     seen = []
-    results = import_meshes(
-        [folder, notes],
-        root / "out",
-        settings,
-        jobs=2,
-        progress=lambda r, i, n: seen.append((r.job.name, i, n)),
-    )
+    told = {"progress": lambda r, i, n: seen.append((r.job.name, i, n))}
+    results = import_meshes([folder, notes], root / "out", settings, jobs=2, **told)
     assert [i for _, i, _ in seen] == list(range(1, len(results) + 1))
     return folder, root / "out", settings, {r.job.name: r for r in results}
 
