@@ -82,13 +82,6 @@ def test_a_file_that_cannot_be_used_is_refused_by_name(line, text, tmp_path, run
     assert status == 1 and REFUSED[line, text] in said
 
 
-def test_only_one_place_reads_command_lines():
-    sources = [
-        path for part in ("vd", "train", "deploy", "assets_usd") for path in (ROOT / part).rglob("*.py")
-    ]
-    assert [path.name for path in sources if "tyro.cli(" in path.read_text()] == ["command_line.py"]
-
-
 def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
     path = tmp_path / "run.yaml"
     path.write_text("objects: [cuboid]\nin_air: true\nquick: true\ntable_friction: 3e-1\npolicies: [random]")

@@ -7,7 +7,6 @@ import pytest
 
 sdk = pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
-from simulated_clock import SimulatedClock  # noqa: E402
 from simulated_hand import simulated_bus  # noqa: E402
 
 from vd.assets_usd.hands import load_hand  # noqa: E402
@@ -21,11 +20,11 @@ from vd.deploy.hardware.answers import (  # noqa: E402
     StateCheck,
 )
 from vd.deploy.hardware.bus import MotorBus  # noqa: E402
-from vd.deploy.hardware.control_table import MODELS, to_angle, to_counts  # noqa: E402
+from vd.deploy.hardware.control_table import MODELS, to_angle  # noqa: E402
 from vd.deploy.hardware.joints import read_joints  # noqa: E402
 from vd.deploy.hardware.packets import Failure  # noqa: E402
 from vd.deploy.hardware.registers import MotorSettings  # noqa: E402
-from vd.deploy.twin.line import Faults, MotorLine  # noqa: E402
+from vd.deploy.twin.line import Faults  # noqa: E402
 from vd.deploy.twin.motor import Motor  # noqa: E402
 from vd.deploy.twin.twin import Twin  # noqa: E402
 
@@ -133,36 +132,6 @@ def test_a_blocked_motor_shuts_down_and_says_why_until_rebooted(bus, twin):
     twin.motors[1].reboot()
     bus.configure(dict.fromkeys(IDS, full))
     assert bus.hardware_errors() == {}
-
-
-def test_a_loose_cable_and_a_wrong_id_are_named(bus, twin):
-    twin.faults.cut_off = {11}
-    assert "does not answer" in bus.missing()[11]
-    begin = time.monotonic()
-    with pytest.raises(BusError, match="motor 11"):
-        bus.read_state()
-    assert time.monotonic() - begin < 30.0  # 21 readings, each about 40 ms on an idle machine
-    twin.faults.cut_off = set()
-    twin.motors[0].put("id", 13)
-    assert list(bus.missing()) == [10]
-    with pytest.raises(BusError, match="motor 10"):
-        bus.read_state()
-
-
-def test_the_bus_watchdog_stops_a_motor_that_hears_nothing():
-    clock = SimulatedClock()
-    motor = Motor(MODELS[MODEL], 1)
-    line = MotorLine([motor], clock=clock, put=lambda data: None)
-    motor.put("torque_enable", 1)
-    motor.put("goal_position", to_counts(1.0))
-    motor.put("bus_watchdog", 5)
-    for _ in range(30):
-        clock.sleep(0.005)
-        line.go_on()
-    assert motor.get("bus_watchdog") == -1
-    held = motor.get("present_position")
-    assert motor.get("goal_position") == held < to_counts(0.9)
-    assert motor.write(motor.items["goal_position"].address, bytes(4)) == Failure.ACCESS
 
 
 @pytest.mark.parametrize("starved_s", [0.0, 0.05])

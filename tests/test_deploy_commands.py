@@ -24,7 +24,6 @@ from vd.deploy.hardware import check, home, record
 from vd.deploy.hardware.connect import Connection
 from vd.deploy.hardware.joints import read_joints
 from vd.deploy.safety.limits import SafetyCfg
-from vd.deploy.safety.safety import StoppedError
 from vd.deploy.twin.faults import BEFORE, MOVING, try_fault, try_preflight
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.deploy.twin.plant import Drive
@@ -121,17 +120,6 @@ def on_the_way(line):
         stops.append(clock.every(4.0, once))
 
     return schedule
-
-
-def test_torque_that_goes_off_stops_every_command_that_moves(line, on_the_way, plan, tmp_path):
-    settings = {"port": PORT, "yes": True, "safety": QUICK}
-    on_the_way(lambda: line.motors[3].put("torque_enable", 0))
-    with pytest.raises(StoppedError, match="torque went off: f1_j1, motor 20"):
-        home.home(home.HomeCfg(**settings, speed=0.02))
-    on_the_way(lambda: [motor.put("torque_enable", 0) for motor in line.motors])
-    motions = {"out": tmp_path / "rec", "plan": plan / "f0_j1.json", "realtime": False}
-    with pytest.raises(StoppedError, match=r"f0_j1, motor 10: another program .*; and 6 more"):
-        record.record(record.RecordCfg(**settings, **motions))
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

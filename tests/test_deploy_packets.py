@@ -1,21 +1,17 @@
 """The packet codec against known bytes, dynamixel-sdk's own, and noise."""
 
 import random
-from unittest import mock
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vd.deploy.hardware.packets import (
-    BROADCAST,
     HEADER,
     LONGEST,
     Instruction,
     Packet,
     PacketReader,
     encode,
-    numbers,
 )
 
 packets = st.builds(
@@ -35,17 +31,6 @@ def test_packets_of_the_published_examples():
     assert encode(Packet(1, Instruction.PING, b"")).hex(" ") == "ff ff fd 00 01 03 00 01 19 4e"
     read = Packet(1, Instruction.READ, bytes([132, 0, 4, 0]))
     assert encode(read).hex(" ") == "ff ff fd 00 01 07 00 02 84 00 04 00 1d 15"
-
-
-def test_goals_are_sent_as_by_dynamixel_sdk():
-    """What has to be stuffed is left out: the SDK drops its own stuffing."""
-    sdk = pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
-    port = mock.Mock(is_using=False)
-    rows = [byte for id in (10, 11) for byte in (id, *(2030 + id).to_bytes(4, "little"))]
-    with mock.patch.object(port, "writePort", side_effect=len) as written:
-        sdk.PacketHandler(2.0).syncWriteTxOnly(port, 116, 4, rows, len(rows))
-    ours = encode(Packet(BROADCAST, Instruction.SYNC_WRITE, numbers(116, 4) + bytes(rows)))
-    assert bytes(written.call_args.args[0]) == ours
 
 
 @settings(max_examples=100, deadline=None)

@@ -223,8 +223,7 @@ def test_a_saved_past_goes_on_exactly():
 
 
 @pytest.mark.parametrize(
-    ("force_s", "share", "sim"),
-    [(1.0 / 60.0, 0.2, coarser(SimCfg())), (STEP_S, 1.0, SimCfg())],
+    ("force_s", "share", "sim"), [(1.0 / 60.0, 0.2, coarser(SimCfg())), (STEP_S, 1.0, SimCfg())]
 )
 def test_a_force_gives_its_impulse_in_the_time_it_acts(force_s, share, sim):
     random = dataclasses.replace(EXACT, force_probability=1.0, force_s=force_s)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_envs_reorient import run
 
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hand_layer import write_layer
@@ -47,18 +48,6 @@ def layer(hand, tmp_path):
 def make(hand_layer: str | None = None, **changes) -> ReorientEnv:
     cfg = ReorientCfg(hand="dclaw3", hand_layer=hand_layer, num_envs=WORLDS, randomisation=STILL)
     return ReorientEnv(dataclasses.replace(cfg, **changes), "cpu")
-
-
-def run(env: ReorientEnv, steps: int, seed: int = 0) -> np.ndarray:
-    """Random actions; returns the observations of every step, [steps, N, O]."""
-    rng = np.random.default_rng(seed)
-    seen = []
-    for _ in range(steps):
-        env.action.assign(rng.uniform(-1, 1, (env.num_envs, env.num_actions)).astype(np.float32))
-        env.step(env.action)
-        seen.append(env.observation.numpy().copy())
-    env.check()
-    return np.array(seen)
 
 
 def rows(env: ReorientEnv) -> np.ndarray:

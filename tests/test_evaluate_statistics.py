@@ -102,14 +102,6 @@ def test_a_sample_without_spread_has_an_exact_interval(unit):
     assert (none.low, none.high, every.low, every.high) == pytest.approx((0.0, width, 1 - width, 1.0))
 
 
-def test_one_success_is_never_less_certain_than_none():
-    """The exact interval without a success joins the one with one."""
-    outcomes = np.zeros((2, 10, 6), dtype=bool)
-    outcomes[1, 3, 2] = True
-    none, one = rate_intervals(outcomes, "object")
-    assert none.high < one.high + 0.02
-
-
 @pytest.mark.parametrize("shape", list(itertools.product([1, 2, 9], [1, 2, 7])))
 @pytest.mark.parametrize("unit", ["object", "episode"])
 def test_small_samples_give_finite_intervals(shape, unit):

@@ -253,11 +253,7 @@ def replaced(old: str, new: str) -> list[str]:
     return [part.replace(old, new) for part in PARTS]
 
 
-TWO_ON_ONE = [
-    *PARTS,
-    link("c_1", 0.05),
-    joint("c1", "b_1", "c_1", 'xyz="0 -0.03 0"'),
-]
+TWO_ON_ONE = [*PARTS, link("c_1", 0.05), joint("c1", "b_1", "c_1", 'xyz="0 -0.03 0"')]
 ARM = [
     *itertools.chain.from_iterable(
         [

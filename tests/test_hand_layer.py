@@ -123,10 +123,8 @@ def test_another_hand_is_refused(hand, tmp_path):
         (overs("f0_j9", "custom double vd:backlash:width_rad = 0.1"), "/dclaw3/f0_j9: dclaw3 has no such"),
         (overs("f0_j1", "custom double vd:backlsh:width_rad = 0.1"), "no effect is called 'backlsh'; one of"),
         (overs("f0_j1", "custom double vd:backlash:width = 0.1"), "no attribute of backlash; one of vd:back"),
-        (overs("f0_j1", "custom double vd:backlash = 0.1"), "'vd:backlash' is no attribute of backlash"),
         (overs("f0_j1", "custom double vd:backlash:width_rad = -1"), "is -1 rad; it cannot be negative"),
         (overs("f0_j1", "custom double vd:backlash:width_rad = nan"), "it must be a finite number"),
-        (overs("f0_j1", 'custom string vd:backlash:width_rad = "a"'), "'a'; it must be a finite number"),
         (overs("f0_j1", "custom float2 vd:backlash:width_rad:ci95 = (0, 1)"), "interval without a value"),
         (
             overs(
@@ -136,13 +134,11 @@ def test_another_hand_is_refused(hand, tmp_path):
             ),
             "low comes first",
         ),
-        (overs("f0_j1", "custom double vd:backlash:width_rad:mean = 0.1"), "is no attribute of backlash"),
         (
             overs("f0_j1", "custom double vd:baseline:kp = 2"),
             "no attribute of baseline; one of drive:angular:physics:stif",
         ),
         (overs("f0_j1", "custom double vd:torque_speed_limit:tau_stall_nm = 1"), "omega_0_rad_s'; author it"),
-        (overs("f0_j1", "custom double vd:torque_limit:tau_max_nm = 0"), "it must be positive"),
         (overs("f0_j1", "float drive:angular:physics:stiffness = -1"), "stiffness' is -1.0; it must be pos"),
         ("not USD at all", "not a USD layer"),
     ],
@@ -160,10 +156,8 @@ def test_wrong_layers_name_file_prim_and_attribute(tmp_path, text, message):
     [
         ({"f9_j1": {"kp": 1.0}}, {}, "dclaw3 has no joint 'f9_j1'; it has f0_j1"),
         ({"f0_j1": {"stiffness": 1.0}}, {}, "baseline has no parameter 'stiffness'; one of kp"),
-        ({"f0_j1": {"kp": 0.0}}, {}, "it must be positive"),
         ({}, {"f0_j1": {"wear": {"x": 1.0}}}, "no effect is called 'wear'"),
         ({}, {"f0_j1": {"backlash": {"width_rad": 1.0, "d": 1.0}}}, "backlash has no parameter 'd'"),
-        ({}, {"f0_j1": {"backlash": {"width_rad": (0.1, 0.3, 0.2)}}}, "low comes first"),
         (
             {},
             {"f0_j1": {"elastic_transmission": {"k_nm_rad": 1.0}}},

@@ -20,10 +20,7 @@ def imported(request: pytest.FixtureRequest) -> tuple[HandModel, newton.ModelBui
     path = hand_usd(name)
     builder = newton.ModelBuilder()
     builder.add_usd(
-        open_stage(path, fingertip),
-        xform=wp.transform(*MOUNT),
-        floating=False,
-        load_visual_shapes=False,
+        open_stage(path, fingertip), xform=wp.transform(*MOUNT), floating=False, load_visual_shapes=False
     )
     return read_hand(path, fingertip=fingertip), builder
 

@@ -118,12 +118,7 @@ def test_a_default_set_has_the_objects_of_one_folder(
             0.006,
             "does not fit the hand at its real size of 0.006 m",
         ),
-        (
-            ImportSettings("in", keep_size=True, density=1000.0),
-            0.59,
-            0.1524,
-            "mean width 0.140 m",
-        ),
+        (ImportSettings("in", keep_size=True, density=1000.0), 0.59, 0.1524, "mean width 0.140 m"),
         (ImportSettings("in", mass=0.25), 0.25, 0.1524, "mass 0.25 kg as given"),
     ],
 )

@@ -65,16 +65,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source / name)
     folder = tmp_path_factory.mktemp("wheel")
-    command = [
-        "wheel",
-        "--quiet",
-        "--no-deps",
-        "--no-index",
-        "--no-build-isolation",
-        "--wheel-dir",
-        folder,
-        source,
-    ]
+    flags = ["--no-deps", "--no-index", "--no-build-isolation", "--wheel-dir"]
+    command = ["wheel", "--quiet", *flags, folder, source]
     subprocess.run([sys.executable, "-m", "pip", *map(str, command)], check=True)
     (path,) = folder.glob("*.whl")
     return path

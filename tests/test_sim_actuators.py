@@ -68,20 +68,6 @@ def response(sim: Simulator, offset: float = 0.2, steps: int = STEPS) -> tuple[n
     return np.array(true), np.array(measured)
 
 
-def test_without_rows_nothing_of_the_servo_is_launched(monkeypatch):
-    sim = simulator(None)
-    launched, launch = [], wp.launch
-
-    def record(kernel: wp.Kernel, *args: object, **kwargs: object) -> object:
-        launched.append(kernel)
-        return launch(kernel, *args, **kwargs)
-
-    monkeypatch.setattr(wp, "launch", record)
-    sim.step()
-    assert sim.servo is None and sim.target.ptr == sim.control.joint_target_q.ptr
-    assert launched and not any("joint_servo" in kernel.module.name for kernel in launched)
-
-
 def test_a_servo_without_effects_moves_as_the_plain_drive():
     plain, _ = response(simulator(None))
     with_servo, measured = response(simulator(rows()))

@@ -93,18 +93,6 @@ def test_an_object_of_as_many_parts_as_an_import_makes_fits_beside_a_hand(cube, 
     assert (meets | meets.T)[np.ix_(on_object, ~on_object)].all()
 
 
-@pytest.mark.parametrize(("parts", "contacts", "rows"), [(1, 32, 160), (8, 32, 216), (12, 48, 280)])
-def test_room_for_contacts_grows_with_convex_parts(cube, parts, contacts, rows):
-    """Half of the worlds have a cube, the others one cut into slabs: room for their mean, rows for most."""
-    builder = new_builder()
-    for item in (cube, sliced(cube, 2 * parts - 1)):
-        world = new_builder()
-        add_object(world, item, CFG, scale=1.0, visuals=False)
-        builder.add_world(world)
-    data = SmallScene(builder, CFG, "cpu").solver.mjw_data
-    assert (data.naconmax, data.njmax) == (2 * contacts, rows)
-
-
 @pytest.mark.parametrize("joint", [0, 1, 2])
 def test_step_response_of_a_joint_is_the_pd_closed_form(joint):
     """A joint with inertia J follows J q'' + kd q' + kp q = kp target; gravity off, the others hold."""

@@ -68,18 +68,6 @@ def test_what_is_before_hides_what_is_behind(hands, monkeypatch):
     assert not visible(hands, row, turned)[0].any(), "a surface shows its outside alone"
 
 
-def test_of_a_ball_the_half_towards_the_camera_is_seen(hands, monkeypatch):
-    empty(hands, monkeypatch)
-    torch.manual_seed(0)
-    ball = torch.nn.functional.normalize(torch.randn(1, 3000, 3), dim=-1)
-    middle = hands.box.mean(dim=0)
-    shown = visible(hands, torch.zeros(1, dtype=torch.long), torch.cat([middle + 0.04 * ball, ball], dim=-1))[
-        0
-    ]
-    towards = (ball[0] @ torch.nn.functional.normalize(hands.eye - middle, dim=0)).numpy()
-    assert shown[towards > 0.3].float().mean() > 0.97 and not shown[towards < -0.01].any()
-
-
 def test_the_hand_hides_what_is_behind_it_and_takes_what_it_touches(hand):
     """Against a search through all of the hand's points, angle by angle."""
     torch.manual_seed(3)

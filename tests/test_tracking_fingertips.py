@@ -6,16 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hands import load_hand
-from vd.envs.cfg import RandomisationCfg, ReorientCfg
-from vd.envs.reorient import ReorientEnv
-from vd.kernels.task.observations import FINGERTIP_VALUES, teacher_observation_slices
+from vd.kernels.task.observations import FINGERTIP_VALUES
 from vd.tracking.fingertips import Fingertips
 
 HANDS = ("dclaw3", "dclaw4")
@@ -46,25 +43,6 @@ def test_poses_and_velocities_are_those_of_the_tree_of_links(name, seed):
         assert (Rotation.from_quat(tip[3:7]) * turn.inv()).magnitude() < 1e-5
         np.testing.assert_allclose(tip[7:10], (place_after - place) / STEP_S, atol=1e-4)
         np.testing.assert_allclose(tip[10:], (turn_after * turn.inv()).as_rotvec() / STEP_S, atol=1e-3)
-
-
-@pytest.mark.parametrize("name", HANDS)
-def test_a_teacher_observes_them_so(name):
-    """Signs of the quaternions included."""
-    exact = RandomisationCfg(enabled=False)
-    env = ReorientEnv(ReorientCfg(hand=name, objects=("cube",), num_envs=3, randomisation=exact), "cpu")
-    torch.manual_seed(0)
-    for _ in range(6):
-        wp.to_torch(env.action).uniform_(-1.0, 1.0)
-        env.step(env.action)
-    joints = env.num_actions
-    position, velocity = (wp.to_torch(state)[:, :joints] for state in (env.sim.joint_q, env.sim.joint_qd))
-    observed = wp.to_torch(env.observation)[
-        :, teacher_observation_slices(env.num_fingers, env.num_actions)["fingertips"]
-    ]
-    tips = Fingertips(env.hand)
-    torch.testing.assert_close(tips(position, velocity), observed, atol=2e-5, rtol=1e-4)
-    env.close()
 
 
 def test_a_finger_that_is_no_chain_is_refused():

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.assets_usd.objects.sets import load_set
-from vd.tracking.registration import KEPT, POINTS, ROTATIONS, Registration, even_rotations
+from vd.tracking.registration import KEPT, POINTS, Registration
 
 SPACING_RAD = 0.3
 """Farthest that a rotation may be from the nearest one tried at the first look."""
@@ -53,20 +53,8 @@ def errors(found: torch.Tensor, pose: np.ndarray) -> np.ndarray:
 
 
 def registration(item: ObjectModel, envs: int, device: str = "cpu", camera=None) -> Registration:
-    return Registration(
-        [item],
-        world_object=np.zeros(envs, dtype=int),
-        world_scale=np.ones(envs),
-        camera=camera,
-        device=device,
-    )
-
-
-def test_rotations_lie_evenly():
-    tried = Rotation.from_quat(even_rotations(ROTATIONS))
-    np.testing.assert_allclose(np.linalg.norm(even_rotations(ROTATIONS), axis=1), 1.0, atol=1e-12)
-    for turn in Rotation.random(200, rng=np.random.default_rng(0)):
-        assert (tried * turn.inv()).magnitude().min() < SPACING_RAD
+    of = {"world_object": np.zeros(envs, dtype=int), "world_scale": np.ones(envs)}
+    return Registration([item], **of, camera=camera, device=device)
 
 
 def test_distances_are_those_of_the_mesh_where_the_samples_lie_on_it(device):

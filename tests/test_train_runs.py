@@ -13,11 +13,7 @@ from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
 from vd.envs.curriculum import Stage
 from vd.policy import load_policy
-from vd.train.checkpoint import (
-    find_checkpoint,
-    list_checkpoints,
-    load_checkpoint,
-)
+from vd.train.checkpoint import find_checkpoint, list_checkpoints, load_checkpoint
 from vd.train.loop import Interrupted, TrainingDivergedError
 from vd.train.metrics import GoalWindow, read_progress
 

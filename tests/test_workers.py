@@ -1,9 +1,7 @@
 """Tasks of a battery: one that hangs or dies costs itself only."""
 
-import multiprocessing
 import os
 import time
-from pathlib import Path
 
 from vd.workers import SINGLE, run_tasks
 
@@ -38,33 +36,3 @@ def test_workers_have_one_thread_each_and_no_gpu():
     run_tasks(work, [("threads", 0)], lambda task, result, why: answers.append(result), jobs=1, limit_s=60.0)
     assert answers == [["1"] * len(SINGLE) + [""]]
     assert dict(os.environ) == before
-
-
-def begin_and_wait(folder):
-    """Of a process that is then killed: one worker that says its number and hangs."""
-    run_tasks(say_and_hang, [folder], lambda *a: None, jobs=1, limit_s=600.0)
-
-
-def say_and_hang(folder):
-    (folder / "began").write_text(str(os.getpid()))
-    time.sleep(600)
-
-
-def wait_for(condition):
-    end = time.monotonic() + 60.0
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.1)
-    return condition()
-
-
-def test_a_worker_ends_with_a_parent_that_is_killed(tmp_path):
-    parent = multiprocessing.get_context("spawn").Process(target=begin_and_wait, args=(tmp_path,))
-    parent.start()
-    try:
-        assert wait_for(lambda: (tmp_path / "began").exists() and (tmp_path / "began").read_text())
-    finally:
-        parent.kill()
-        parent.join()
-    worker = Path("/proc") / (tmp_path / "began").read_text() / "cmdline"
-    # A process that ended but was not waited for has no command line any more.
-    assert wait_for(lambda: not worker.exists() or not worker.read_bytes())
