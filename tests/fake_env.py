@@ -56,7 +56,7 @@ class FakeEnv:
         self.rotation_error, self.goal_quat = zeros(n), zeros(n, wp.quat)
         self.step_count = zeros(n, wp.int32)
         self.object_pose_end = zeros(n, wp.transform)
-        self.sim = SimpleNamespace(joint_q=zeros((n, self.num_actions + 7)))
+        self.sim = SimpleNamespace(joint_q=zeros((n, self.num_actions + 7)), failed=zeros(n, wp.int32))
         self._rng = np.random.default_rng(0)
         self.resets = 0
         self.reset()

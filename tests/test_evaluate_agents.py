@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from vd.assets_usd.hands import hand_usd
 from vd.evaluate.agents import (
@@ -92,6 +93,23 @@ def test_conditions_replace_what_a_policy_was_trained_in_and_nobody_tells_a_crit
         assert task.observation.dynamics == "none" and task.observation.canonical
     assert not CONDITIONS["nominal"].enabled and CONDITIONS["mixed"].observation_latency_s == (0.0, 0.12)
     assert CONDITIONS["hard"].force_s == 5.0 * CONDITIONS["s3"].force_s
+
+
+@pytest.mark.parametrize("extra", [[], ["--consecutive"], ["--engine", "mujoco"]], ids=str)
+def test_an_environment_whose_physics_fails_costs_its_episode_alone(tmp_path, monkeypatch, capsys, extra):
+    def act(env, policy, envs):
+        if env.step_count.numpy()[1] == 2:
+            env.sim.joint_qd.numpy()[1, 0] = np.nan
+        return policy.act(wp.to_torch(env.observation))
+
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
+    monkeypatch.setattr(f"vd.evaluate.{'in_a_row' if '--consecutive' in extra else 'trace'}.act_in", act)
+    flags = ["--objects", "cube", "--episodes", "3", "--episode-s", "0.5", "--device", "cpu", *extra]
+    assert main(["zero", *flags, "--out", str(tmp_path)]) == 0
+    assert "warning zero cube: physics failed in 1 of 3 episodes" in capsys.readouterr().out
+    row = Result.read(tmp_path / "eval.json").rows[0]
+    assert [e.steps <= 3 for e in row.episodes] == [False, True, False] and not row.episodes[1].stopped
+    assert math.isfinite(row.overall.median_error_rad.value)
 
 
 @pytest.mark.slow

@@ -283,7 +283,7 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
         asked.append(cfg)
         seen = np.zeros((1, 1, 4))
         norms, quat = np.array([[[0.0, 0.5, 0.4, 0.3]]]), np.zeros((1, 1, 4))
-        ends = np.full((1, 1), 4), np.zeros((1, 1), bool)
+        ends = np.full((1, 1), 4), np.zeros((1, 1), bool), np.zeros((1, 1), bool)
         return Trace(quat, quat, seen, seen, norms, seen, *ends, still=seen == 0.0)
 
     monkeypatch.setattr("vd.evaluate.compare.run_episodes", spy)

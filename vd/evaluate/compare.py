@@ -31,7 +31,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
     Raises:
         ValueError: A setting, object set or policy cannot be used.
         FileNotFoundError: There is no such policy.
-        vd.sim.simulator.SimulationError: Contacts were lost, or an environment left the finite numbers.
+        vd.sim.simulator.SimulationError: Contacts were lost.
     """
     quiet_warp()
     from vd.device import resolve_device
@@ -103,6 +103,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         at_rest=cfg.rest,
         hand_layer=cfg.hand_layer,
         condition=cfg.randomisation,
+        failures_per_million=1e6,  # whose episodes end there, and are counted
     )
     if cfg.condition is not None:
         task = in_condition(task, cfg.condition)

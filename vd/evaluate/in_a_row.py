@@ -56,6 +56,7 @@ class SeriesTrace:
         held: Whether the object was still there when the first goal was given, bool [K, M].
         reached: Goals reached, one after the other, int [K, M].
         lost: Whether the object was lost, bool [K, M].
+        failed: Whether the physics failed, which ends an episode, bool [K, M].
         let_go: Of objects with which the first goal was reached, whether they were lost while they
             were held: 0 or 1; NaN for the others [K, M].
     """
@@ -68,6 +69,7 @@ class SeriesTrace:
     held: np.ndarray
     reached: np.ndarray
     lost: np.ndarray
+    failed: np.ndarray
     let_go: np.ndarray
 
     def of(self, objects: Sequence[int]) -> "SeriesTrace":
@@ -114,6 +116,7 @@ def record_series(
         held=np.zeros(shape, dtype=bool),
         reached=np.zeros(shape, dtype=int),
         lost=np.zeros(shape, dtype=bool),
+        failed=np.zeros(shape, dtype=bool),
         let_go=np.full(shape, np.nan),
     )
     for numbers, state in drawn_rounds(env, shape[1], starts, goals):
@@ -165,6 +168,7 @@ def judge_series(
         protocol,
         objects,
         agent,
+        trace.failed,
         group=group,
         condition=condition,
         stopped_by=stopped_by,
@@ -245,6 +249,7 @@ class _Round:
             on_step()
             self._age[self._age >= 0] += 1
             trace.lost[self._of(self._envs[env.fell.numpy()[self._envs] != 0])] = True
+            trace.failed[self._of(self._envs)] = env.sim.failed.numpy()[self._envs] != 0
             self._go_on((env.done.numpy() == 0) & (trace.reached[self._place] < series.most))
             if step == first - 1:
                 due = self._envs

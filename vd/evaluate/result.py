@@ -190,7 +190,8 @@ class Row:
     prediction: Prediction | None = None
     """What its predictions are worth; None: they do not stop it."""
     warnings: dict[str, str]
-    """By name of an object: what its import says may be wrong with it."""
+    """By name of an object: what its import says may be wrong with it; and by policy, object and condition
+    in how many episodes the physics failed, which ended there."""
     episodes: tuple[Episode, ...]
     """K x M, object by object; of goals in a row those of the first."""
     in_air: InAir | None = None
@@ -337,6 +338,7 @@ def judge(
                 protocol,
                 objects,
                 agent,
+                trace.failed,
                 group=group,
                 condition=condition,
                 stopped_by=stopped_by,
@@ -356,9 +358,16 @@ def judge(
 
 
 def row_of(
-    episodes: tuple[Episode, ...], protocol: Protocol, objects: list[Any], agent: Agent, **rest: Any
+    episodes: tuple[Episode, ...],
+    protocol: Protocol,
+    objects: list[Any],
+    agent: Agent,
+    failed: np.ndarray,
+    *,
+    condition: str,
+    **rest: Any,
 ) -> Row:
-    """A row from its episodes; ``rest`` are the fields that they do not give."""
+    """A row from its episodes, and which of them the physics failed [K, M]; ``rest`` are its other fields."""
     names, count = tuple(item.name for item in objects), protocol.episodes
     return Row(
         policy=agent.policy,
@@ -371,7 +380,13 @@ def row_of(
             summarise(name, episodes[k * count : (k + 1) * count], protocol, "episode")
             for k, name in enumerate(names)
         ),
-        warnings={item.name: "; ".join(item.warnings) for item in objects if item.warnings},
+        condition=condition,
+        warnings={item.name: "; ".join(item.warnings) for item in objects if item.warnings}
+        | {
+            " ".join((agent.policy, name, condition)).strip(): f"physics failed in {bad} of {count} episodes"
+            for name, bad in zip(names, failed.sum(axis=1), strict=True)
+            if bad
+        },
         episodes=episodes,
         **rest,
     )

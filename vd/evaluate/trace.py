@@ -70,6 +70,7 @@ class Trace:
         predicted: What a camera policy predicts of ``error`` there; None for other policies [K, M, T + 1].
         steps: Steps to the fall or the time limit [K, M].
         fell: Whether the object was lost [K, M].
+        failed: Whether the physics failed, which ends an episode like the time limit [K, M].
         still: Whether hand and object are as still after t steps as success asks [K, M, T + 1].
         held: By the way to stop that was to be held: error to the very goal after the hold, pi where the
             object was lost, NaN where nothing stopped [K, M].
@@ -83,6 +84,7 @@ class Trace:
     predicted: np.ndarray | None
     steps: np.ndarray
     fell: np.ndarray
+    failed: np.ndarray
     still: np.ndarray
     held: dict[Way, np.ndarray] = field(default_factory=dict)
 
@@ -188,6 +190,7 @@ def record(
         predicted=blank() if hasattr(policy, "predicted") else None,
         steps=np.full(shape, env.max_episode_steps),
         fell=np.zeros(shape, dtype=bool),
+        failed=np.zeros(shape, dtype=bool),
         still=np.zeros((*shape, env.max_episode_steps + 1), dtype=bool),
         held={way: np.full(shape, np.nan) for way in held},
     )
@@ -279,6 +282,7 @@ class _Round:
             advance(env, action)
             self._write_errors(envs, step + 1, unit_quats(env.object_pose_end.numpy()[envs, 3:7]))
             trace.still[(*place, step + 1)] = env.still.numpy()[envs] != 0
+            trace.failed[place] = env.sim.failed.numpy()[envs] != 0
             done = env.done.numpy()[envs] != 0
             trace.fell[self._place(envs[done])] = env.fell.numpy()[envs[done]] != 0
             trace.steps[self._place(envs[done])] = step + 1
