@@ -28,7 +28,7 @@ from vd.deploy.safety.safety import MOVE_S, SafeHand, StoppedError
 from vd.deploy.timely import undisturbed
 from vd.evaluate.agents import check_names
 from vd.files import check_folder
-from vd.hand_log import read_log
+from vd.hand_log import is_log, read_log
 from vd.log_format import MCAP, LogError
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
@@ -135,7 +135,12 @@ def run(cfg: RunCfg) -> int:
         StoppedError: A limit or a fault stopped the hand; the page of what it did is written before.
     """
     cfg.validate()
-    check_folder(cfg.log.parent if cfg.log else LOGS)
+    folder = LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
+    if cfg.log is not None:
+        folder = cfg.log.with_suffix("") if cfg.log.suffix in LOG_FILES else cfg.log
+    check_folder(folder)
+    if is_log(folder):
+        raise FileExistsError(f"{folder} holds a log; choose another folder")
     import torch
 
     from vd.assets_usd.hands import load_hand
@@ -158,9 +163,6 @@ def run(cfg: RunCfg) -> int:
             "vd-train tracker finds a better one",
             file=sys.stderr,
         )
-    folder = LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
-    if cfg.log is not None:
-        folder = cfg.log.with_suffix("") if cfg.log.suffix in LOG_FILES else cfg.log
     fault: StoppedError | None = None
     status = 0
     camera = runner.camera or hand.mounted_camera
