@@ -12,7 +12,7 @@ from vd.config import from_dict, to_dict
 from vd.train.cli import main
 from vd.train.config import validate
 from vd.train.flags import OF_HELP_ALL, parse_teacher
-from vd.train.presets import PRESETS, TeacherCfg
+from vd.train.presets import PRESETS, TeacherCfg, smoke
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
@@ -56,7 +56,7 @@ def test_the_machine_decides_where_no_preset_is_named(monkeypatch, capsys, gpus,
     assert f"preset: {name}\n" in capsys.readouterr().out
     assert parse_teacher(["--preset", "paper"], say=said.append).ppo == PRESETS["paper"]().ppo
     assert parse_teacher(["--smoke"], say=said.append).smoke and len(said) == 1
-    tiny = parse_teacher(["--preset", "leap-cube", "--smoke"])
+    tiny = smoke(PRESETS["leap-cube"]())
     assert tiny.smoke and tiny.env.hand == "leap" and tiny.run.device == "cpu" and tiny.env.num_envs == 16
 
 
