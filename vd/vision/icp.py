@@ -8,9 +8,11 @@ import torch
 from vd.vision.rotations import matrices, rotations_about, two_columns
 
 NEIGHBOURS = 12
-"""Points of which a goal's normals are taken: of 500 they reach about 1.5 cm."""
+"""Points of which a goal's normals are taken: of 500 they reach about 1.5 cm.
+On validation 8 do the same, on scans 24."""
 NEAREST = 0.9
-"""Share of seen points that pull, the nearest: others may be the hand's, or of a side that a goal lacks."""
+"""Share of seen points that pull, the nearest: others may be the hand's, or of a side that a goal lacks.
+On scans 0.8 does the same."""
 UNIT_M = 0.08
 """Unit of places [m], so that turns and shifts count alike: half the length of the largest objects."""
 DAMPING = 1e-4
