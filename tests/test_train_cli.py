@@ -9,6 +9,7 @@ import pytest
 
 from vd.assets_usd.hands import HANDS
 from vd.config import from_dict, to_dict
+from vd.device import resolve_device
 from vd.train.cli import main
 from vd.train.config import validate
 from vd.train.flags import OF_HELP_ALL, parse_teacher
@@ -155,6 +156,12 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path, capsys):
         said = capsys.readouterr()
         assert "add --resume" in said.err and "building" not in said.out, "before anything slow"
     assert not (tmp_path / "config.json").exists()
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:97", "cuda:x"])
+def test_devices_that_do_not_exist_are_named(name):
+    with pytest.raises(ValueError, match=f"--device is '{name}'"):
+        resolve_device(name)
 
 
 def test_export_commands(tmp_path, capsys):

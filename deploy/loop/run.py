@@ -69,7 +69,7 @@ class RunCfg(HandOptions):
     """Orientations of the object to reach, one after the other, in the world frame: quaternions x,y,z,w,
     turns x,y,z@degrees about an axis, or files (.txt, .csv) with one on each line."""
     random_goals: int = 1
-    """How many goals to draw where --goal names none."""
+    """How many goals to draw where --goal names none; with --ros2 none are drawn."""
     max_goal_angle: float = np.pi
     """Drawn goals lie within this angle [rad] of the one before."""
     episode_s: float = PAPER.scene.episode_s

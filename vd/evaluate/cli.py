@@ -41,7 +41,9 @@ def _evaluate(cfg: EvalCfg) -> int:
     else:
         result = run_suite(cfg)
     if cfg.shard is not None:
-        print(f"{cfg.out}: part {cfg.shard}; the same command without --shard writes the page")
+        print(
+            f"{cfg.out}: part {cfg.shard}; the same command without --shard writes the page", file=sys.stderr
+        )
     elif not cfg.json:
         print(f"{terminal_text(result)}\n{written}\n{page}")
     else:

@@ -177,10 +177,8 @@ class PlayViewer:
 
     def _choose_policy(self, name: str) -> None:
         assert self._reopen is not None
-        watched, notes = (
-            self.session.object_name,
-            self._tell(f"{name} begins", "building the scene", loading=True),
-        )
+        watched = self.session.object_name
+        notes = self._tell(f"{name} begins", "building the scene", loading=True)
         try:
             session = self._reopen(name)
         except (ValueError, OSError, RuntimeError) as error:

@@ -16,13 +16,11 @@ from torch import nn
 from torch.nn import functional
 
 from vd.vision.cfg import AlignmentCfg, SearchCfg
-from vd.vision.icp import normals, refine
+from vd.vision.icp import CLOUD_M, normals, refine
 from vd.vision.rotations import cube_rotations, matrices
 
 PATCH_M = 0.03
 """Unit of places within a patch [m]: about its size."""
-CLOUD_M = 0.08
-"""Unit of places within a cloud, and of offsets [m]: half the length of the largest objects."""
 WAVES = (1.5, 3.0, 6.0, 12.0)
 """Frequencies at which a token knows its place [rad per CLOUD_M]: half a wave is from 17 to 2 cm."""
 PAIRS_AT_ONCE = 4096

@@ -13,8 +13,9 @@ On validation 8 do the same, on scans 24."""
 NEAREST = 0.9
 """Share of seen points that pull, the nearest: others may be the hand's, or of a side that a goal lacks.
 On scans 0.8 does the same."""
-UNIT_M = 0.08
-"""Unit of places [m], so that turns and shifts count alike: half the length of the largest objects."""
+CLOUD_M = 0.08
+"""Unit of places in a cloud and of offsets [m], so that turns and shifts count alike: half the length of the
+largest objects."""
 DAMPING = 1e-4
 """Of steps that no plane hinders: along a flat face nothing tells where it is."""
 STEP_RAD = 0.2
@@ -55,12 +56,12 @@ def refine(
         near, facing, apart = _matched(goal, normal, seen, rotation, offset)
         away = (facing * (seen - near)).sum(dim=-1)
         weight = (apart <= apart.kthvalue(int(NEAREST * seen.shape[1]), dim=1, keepdim=True).values).float()
-        slope = torch.cat([torch.linalg.cross(near / UNIT_M, facing), facing], dim=-1)
+        slope = torch.cat([torch.linalg.cross(near / CLOUD_M, facing), facing], dim=-1)
         pulled = slope * weight[..., None]
         square = pulled.transpose(-1, -2) @ slope
         square = square + DAMPING * seen.shape[1] * torch.eye(6, device=seen.device)
         step = torch.linalg.solve(square, (pulled * away[..., None]).sum(dim=1))
-        turn = step[:, :3] / UNIT_M
+        turn = step[:, :3] / CLOUD_M
         turn = matrices(two_columns(rotations_about(turn, turn.norm(dim=-1).clamp(max=STEP_RAD))))
         rotation = turn @ rotation
         offset = (turn @ offset[..., None]).squeeze(-1) + step[:, 3:]
