@@ -6,11 +6,15 @@ import os
 def warp_device(name: str | None) -> str:
     """The Warp device ``name``; without a name, and for ``auto``, the first GPU, or else the CPU.
 
+    Unless told otherwise, Warp then keeps to warnings: it would tell of every kernel that it loads.
+
     Raises:
         ValueError: The device does not exist here.
     """
     import warp as wp
 
+    if wp.config.log_level == wp.LOG_INFO:
+        wp.config.log_level = wp.LOG_WARNING
     try:
         return str(wp.get_device(None if name == "auto" else name))
     except (ValueError, RuntimeError) as error:

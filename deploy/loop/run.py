@@ -68,8 +68,8 @@ class RunCfg(HandOptions):
     goal: tuple[str, ...] = ()
     """Orientations of the object to reach, one after the other, in the world frame: quaternions x,y,z,w,
     turns x,y,z@degrees about an axis, or files (.txt, .csv) with one on each line."""
-    random_goals: int = 1
-    """How many goals to draw where --goal names none; with --ros2 none are drawn."""
+    random_goals: int | None = None
+    """How many goals to draw, 1 by default, in place of --goal; with --ros2 none are drawn."""
     max_goal_angle: float = np.pi
     """Drawn goals lie within this angle [rad] of the one before."""
     episode_s: float = PAPER.scene.episode_s
@@ -114,6 +114,8 @@ class RunCfg(HandOptions):
         require(self, "--", "zero or positive", "hold_s")
         if self.ros2 and (self.twin or self.port):
             raise ValueError("--ros2 is in place of --port and --twin; name one")
+        if self.random_goals is not None and (self.ros2 or self.goal):
+            raise ValueError("--random-goals is in place of --ros2 and --goal; leave one out")
         if self.ros2 and importlib.util.find_spec("rclpy") is None:
             raise ValueError("--ros2 needs rclpy: source the setup.bash of a ROS 2 for this Python")
         if self.realistic and not self.twin:
@@ -151,7 +153,8 @@ def run(cfg: RunCfg) -> int:
 
     quiet_warp()
     torch.set_num_threads(1)  # of several, some would wait for one that has no core
-    goals = make_goals(cfg.goal, 0 if cfg.ros2 else cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
+    drawn = 0 if cfg.ros2 else cfg.random_goals or 1
+    goals = make_goals(cfg.goal, drawn, cfg.max_goal_angle, seed=cfg.seed)
     hand = load_hand(cfg.hand, layer=cfg.hand_layer) if cfg.ros2 else motors_of(cfg).hand
     item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
     tolerance = cfg.tolerance_rad
