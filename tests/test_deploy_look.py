@@ -53,7 +53,7 @@ def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
     image = np.full((36, 64), 0.6, dtype=np.float32)
 
     def middle():
-        points = seen_points(runner.eye, image)[0].numpy()
+        points = seen_points(runner.eye, image).numpy()[0]
         return points[np.isfinite(points).all(axis=1)]
 
     runner.look_by(LENS.seen_from(runner.camera))

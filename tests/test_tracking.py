@@ -60,6 +60,7 @@ def observer_of(env: ReorientEnv) -> CameraObserver:
         camera=env.hand.camera,
         control_hz=env.cfg.sim.control_hz,
         device="cpu",
+        library=torch,
     )
 
 

@@ -107,6 +107,8 @@ class RunCfg(HandOptions):
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
+        if self.random_goals is not None and (self.ros2 or self.goal):
+            raise ValueError("--random-goals is in place of --ros2 and --goal; leave one out")
         check_names([] if self.policy is None else [self.policy], [self.object], self.hand)
         from vd.deploy.loop.goals import SCAN_SUFFIXES
 
@@ -114,8 +116,6 @@ class RunCfg(HandOptions):
         require(self, "--", "zero or positive", "hold_s")
         if self.ros2 and (self.twin or self.port):
             raise ValueError("--ros2 is in place of --port and --twin; name one")
-        if self.random_goals is not None and (self.ros2 or self.goal):
-            raise ValueError("--random-goals is in place of --ros2 and --goal; leave one out")
         if self.ros2 and importlib.util.find_spec("rclpy") is None:
             raise ValueError("--ros2 needs rclpy: source the setup.bash of a ROS 2 for this Python")
         if self.realistic and not self.twin:
@@ -143,8 +143,6 @@ def run(cfg: RunCfg) -> int:
     check_folder(folder)
     if is_log(folder):
         raise FileExistsError(f"{folder} holds a log; choose another folder")
-    import torch
-
     from vd.assets_usd.hands import load_hand
     from vd.deploy.hardware.connect import motors_of
     from vd.deploy.loop.goals import make_goals, one_object
@@ -152,7 +150,6 @@ def run(cfg: RunCfg) -> int:
     from vd.deploy.ros import connect_ros
 
     quiet_warp()
-    torch.set_num_threads(1)  # of several, some would wait for one that has no core
     drawn = 0 if cfg.ros2 else cfg.random_goals or 1
     goals = make_goals(cfg.goal, drawn, cfg.max_goal_angle, seed=cfg.seed)
     hand = load_hand(cfg.hand, layer=cfg.hand_layer) if cfg.ros2 else motors_of(cfg).hand
@@ -160,6 +157,8 @@ def run(cfg: RunCfg) -> int:
     tolerance = cfg.tolerance_rad
     told = cfg.object if cfg.twin else None
     runner = load_runner(name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told)
+    if "torch" in sys.modules:  # of several threads, some would wait for one that has no core
+        sys.modules["torch"].set_num_threads(1)
     if not runner.calibrated:
         print(
             f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that distance; "
