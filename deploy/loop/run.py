@@ -109,7 +109,10 @@ class RunCfg(HandOptions):
         """Raise ValueError naming the flag and the remedy."""
         if self.random_goals is not None and (self.ros2 or self.goal):
             raise ValueError("--random-goals is in place of --ros2 and --goal; leave one out")
-        check_names([] if self.policy is None else [self.policy], [self.object], self.hand)
+        default = f"{self.hand}-tracking" if self.twin and not Path(self.hand).suffix else None
+        named = self.policy or default
+        check_names([], [self.object], self.hand)
+        check_names([] if named is None else [named], [])
         from vd.deploy.loop.goals import SCAN_SUFFIXES
 
         require(self, "--", "positive", "random_goals episode_s")
