@@ -71,8 +71,7 @@ class OnnxTeacher:
 
 def onnx_metadata(policy: "TrainedPolicy | TrackingPolicy") -> dict[str, str]:
     """What a policy's ONNX file says of it, besides its layers."""
-    by_camera = isinstance(policy, TrackingPolicy)
-    teacher: Any = policy.teacher if by_camera else policy
+    teacher: Any = policy.teacher if isinstance(policy, TrackingPolicy) else policy
     told = {
         "format": ONNX_FORMAT,
         "task": teacher.task,
@@ -80,7 +79,7 @@ def onnx_metadata(policy: "TrainedPolicy | TrackingPolicy") -> dict[str, str]:
         "num_observations": teacher.num_observations,
         "num_actions": teacher.num_actions,
         "offset": teacher.network.offset[0].tolist(),
-        **({"tracking": to_dict(policy.spec)} if by_camera else {}),
+        **({"tracking": to_dict(policy.spec)} if isinstance(policy, TrackingPolicy) else {}),
     }
     return {METADATA: json.dumps(told)}
 
@@ -107,4 +106,4 @@ def read_onnx(path: Path) -> "OnnxTeacher | TrackingPolicy":
         return teacher
     if spec.alignment is not None:
         raise ValueError(f"{path} is of a vision policy, whose search computes with torch; give policy.pt")
-    return TrackingPolicy(teacher, spec)
+    return TrackingPolicy(cast(Any, teacher), spec)
