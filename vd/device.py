@@ -45,7 +45,7 @@ def resolve_device(name: str) -> str:
 
 
 def _keep_to_warnings() -> None:
-    """Have Warp keep to warnings, unless it was told otherwise: it would tell of every kernel that it loads."""
+    """Have Warp keep to warnings, unless it was told otherwise: it tells of every kernel that it loads."""
     import warp as wp
 
     if wp.config.log_level == wp.LOG_INFO:
