@@ -122,7 +122,7 @@ def _check_teacher(name: str) -> None:
     if policy is None:
         raise ValueError(f"{name} has learned nothing; name a trained teacher")
     if isinstance(policy, TrackingPolicy):
-        network = "" if policy.alignment is None else " --alignment alignment.pt"
+        network = "" if policy.alignment is None else f" --alignment {name}"
         raise ValueError(
             f"{name} sees by camera; adapt its teacher, {policy.spec.teacher}, and let that see again: "
             f"vd-train tracker runs/adapted --objects SET{network}"
