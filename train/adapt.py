@@ -132,12 +132,12 @@ def _check_teacher(name: str) -> None:
 def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object]) -> None:
     """Compare the policy before and after, in the nominal and in the identified model, and write the page."""
     from vd.evaluate.compare import compare
-    from vd.evaluate.page import percent, shown_name, write_page
+    from vd.evaluate.page import asked, percent, shown_name, write_page
     from vd.evaluate.result import SUCCESS, Result
 
     say("comparing the policy before and after, in the nominal and in the identified model ...")
     before, after = cfg.policy, str(cfg.out)
-    asked = EvalCfg(
+    evaluation = EvalCfg(
         policies=(before, after),
         objects=run.env.objects,
         episodes=cfg.episodes,
@@ -146,7 +146,7 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
     )
     found = []
     for model, layer in ((NOMINAL, NO_LAYER), (IDENTIFIED, str(cfg.hand_layer))):
-        found.append(compare(replace(asked, hand_layer=layer, out=cfg.out / model), model))
+        found.append(compare(replace(evaluation, hand_layer=layer, out=cfg.out / model), model))
     rows = tuple(row for one in found for row in one.rows if row.stopped_by != SUCCESS)
     result, page = Result(rows, found[0].software), cfg.out / PAGE
     rate = {
@@ -160,5 +160,6 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
         f"{run.env.hand}, in {rate[IDENTIFIED, before]} in the identified one ({layer}), and "
         f"adapted to that in {rate[IDENTIFIED, after]}."
     )
-    write_page(result, page, title=f"{cfg.policy}, adapted to an identified hand", lead=told)
+    title, how = f"{before}, adapted to an identified hand", asked([rows[0].protocol])
+    write_page(result, page, title=title, lead=told, notes=(f"{how}.",))
     say(f"{told}\n{page}")
