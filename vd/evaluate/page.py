@@ -295,7 +295,7 @@ def _stopped_by(row: Row) -> str:
 
 
 def _heading(row: Row, short: dict[str, str]) -> str:
-    return f"{short[row.policy]}, {row.group}, stopped by {_stopped_by(row)}"
+    return f"{short[row.policy]}, {_where(row)}, stopped by {_stopped_by(row)}"
 
 
 def _where(row: Row) -> str:
