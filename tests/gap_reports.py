@@ -44,16 +44,7 @@ def servo_curves(folder, rows):
             model[0, column] = value
     rollouts = Rollouts(chain, found)
     predicted = rollouts.predict(models)
-    return Predictions(
-        time=rollouts.time,
-        trajectory=rollouts.sample_trajectory,
-        command=np.concatenate([t.command for t in found.trajectories]),
-        measured=rollouts.measured,
-        baseline=predicted[0].astype(float),
-        identified=predicted[1].astype(float),
-        joints=found.joints,
-        files=tuple(t.file for t in found.trajectories),
-    )
+    return Predictions.of(found, *predicted.astype(float))
 
 
 def base_columns():
@@ -65,9 +56,9 @@ def base_columns():
     }
 
 
-def servo_report(folder, *, verdict="effects", ambiguous=()):
+def servo_report(folder, *, verdict="effects", ambiguous=(), friction=FRICTION):
     """What a fit might say about the recording, and its curves."""
-    curves = servo_curves(folder, ({}, {actuators.COULOMB_TORQUE: FRICTION}))
+    curves = servo_curves(folder, ({}, {actuators.COULOMB_TORQUE: friction}))
     before = float(np.sqrt(np.mean((curves.baseline - curves.measured) ** 2)))
     after = float(np.sqrt(np.mean((curves.identified - curves.measured) ** 2)))
     friction = NamedEffect(

@@ -70,11 +70,14 @@ def test_telemetry_speaks_against_sag_latency_and_backlash(pendulum):
 
 
 def test_the_pendulum_is_predicted_at_gains_left_out(pendulum):
-    gains = pendulum.held_out.left_out
-    assert [group.condition for group in gains] == ["p_gain"] * 3
+    gains = [[row for row in pendulum.trajectories if f"_p{gain}." in row.file] for gain in (100, 400, 800)]
     # Coulomb and viscous friction alone leave 63.9 mrad, a load-dependent Stribeck model 51.7.
     assert pendulum.held_out.identified_mae_rad < MAE_RAD
-    assert all(group.identified_mae_rad < 0.8 * group.baseline_mae_rad for group in gains)
+    for rows in gains:  # their motions are about equally long
+        before, after = (
+            np.mean([getattr(r, f"{m}_mae_rad") for r in rows]) for m in ("baseline", "identified")
+        )
+        assert after < 0.8 * before
     # It swings freely once the torque is off, and what damping is left then is not dry friction's.
     joint = pendulum.joints[0].joint
     parameters = pendulum.identified.parameters[joint]

@@ -17,7 +17,7 @@ from vd.assets_usd.hands import load_hand
 from vd.gap import cli
 from vd.gap.chain import chains
 from vd.gap.close import counterparts
-from vd.gap.excitations import JointRange, steps_and_sines
+from vd.gap.excitations import JointRange, excitation_set
 from vd.gap.identify import identify, write_drives
 from vd.gap.newton import HandReplay, simulate_hand
 from vd.gap.recording import Recording, Trajectory, write_recording
@@ -46,7 +46,7 @@ def motions(kind: str, joints: tuple[str, ...], seconds: float, hand: HandModel 
     """The start of one of the paper's excitations on some joints, with the commands as positions."""
     reach = JointRange(hand.joint_names, hand.lower, hand.upper)
     trajectories = []
-    for motion in steps_and_sines(reach):
+    for motion in excitation_set(reach):
         if motion.name == kind and motion.joints[0] in joints:
             keep = motion.time <= seconds
             command = motion.command[keep]

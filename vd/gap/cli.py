@@ -335,7 +335,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _print_report(analysis: "Analysis", as_json: bool) -> int:
     from vd.gap.result import Report as Contents
-    from vd.gap.words import finding_text, next_step, open_questions, verdict_sentence
+    from vd.gap.words import next_step, open_questions, verdict_sentence
 
     path = analysis.out / "report.json"
     if as_json:
@@ -344,7 +344,7 @@ def _print_report(analysis: "Analysis", as_json: bool) -> int:
     report = Contents.read(path)
     print(verdict_sentence(report))
     for finding in report.findings:
-        print(f"  {finding_text(finding)}")
+        print(f"  {finding.where}")
     print(next_step(report))
     for line in open_questions(report):
         print(f"  open: {line}")

@@ -15,8 +15,8 @@ CONDITION_VALUES = 3
 """Values of a condition from which on its values, not the motions, are held out."""
 MAX_MOTION_S = 150.0
 """Motion of a joint that is fitted [s]: twice what the paper records; the rest is held out for good."""
-MIN_PIECE_S = 5.0
-"""Shortest piece of a trajectory that is worth fitting [s]."""
+MAX_MOTIONS = 30
+"""Trajectories of a joint that are fitted, spread over the recording: each is worth 5 s then."""
 NEARLY = 0.95
 """Share of the widest range that a piece must cover to be taken for being the earliest."""
 
@@ -37,34 +37,23 @@ def design(recording: Recording, chain: Chain, joint: int) -> tuple[tuple[int, .
         for i, t in enumerate(recording.trajectories)
         if name in t.joints and float(np.ptp(t.command[:, column])) > 0.0
     ]
-    own = _within_budget(recording, own)
     if not own:
         return (), ()
+    own = [own[i] for i in np.unique(np.linspace(0, len(own) - 1, MAX_MOTIONS).round().astype(int))]
     chosen = set(own)
     for other in range(len(chain.joints)):
         if other != joint:
-            chosen |= set(_largest(recording, chain.joints[other], int(chain.columns[other]))[:BYSTANDERS])
+            alone = [i for i, t in enumerate(recording.trajectories) if t.joints == (chain.joints[other],)]
+            size = {i: np.ptp(recording.trajectories[i].command[:, chain.columns[other]]) for i in alone}
+            chosen |= set(sorted(alone, key=lambda i: -size[i])[:BYSTANDERS])
     trajectories = sorted(chosen)
     condition = varied([recording.trajectories[i] for i in own])
-    labels = [_label(recording.trajectories[i], condition) for i in trajectories]
+    parts = [recording.trajectories[i] for i in trajectories]
+    labels = [str(t.conditions.get(condition)) if condition else t.excitation for t in parts]
     kinds = sorted(set(labels))
     if len(kinds) < 2:
         labels, kinds = [str(i) for i in trajectories], [str(i) for i in trajectories]
     return tuple(trajectories), tuple(kinds.index(label) % MAX_FOLDS for label in labels)
-
-
-def _largest(recording: Recording, name: str, column: int) -> list[int]:
-    """Trajectories that excite a joint alone, by the size of the motion."""
-    alone = [i for i, t in enumerate(recording.trajectories) if t.joints == (name,)]
-    return sorted(alone, key=lambda i: -float(np.ptp(recording.trajectories[i].command[:, column])))
-
-
-def _within_budget(recording: Recording, own: list[int]) -> list[int]:
-    """As many trajectories as leave each a piece that is worth fitting, spread over the recording."""
-    most = int(MAX_MOTION_S / MIN_PIECE_S)
-    if len(own) <= most or sum(_length(recording, i) for i in own) <= MAX_MOTION_S:
-        return own
-    return [own[i] for i in np.linspace(0, len(own) - 1, most).round().astype(int)]
 
 
 def pieces(recording: Recording, chain: Chain, trajectories: Sequence[int]) -> tuple[tuple[int, int], ...]:
@@ -73,7 +62,7 @@ def pieces(recording: Recording, chain: Chain, trajectories: Sequence[int]) -> t
     Different motions say more than long ones: of a long recording, a piece of every trajectory, the one that
     covers the widest range of those that begin at rest, as a simulation must.
     """
-    lengths = np.array([_length(recording, i) for i in trajectories])
+    lengths = np.array([recording.trajectories[i].time[-1] for i in trajectories])
     if lengths.sum() <= MAX_MOTION_S:
         return ()
     left, share = MAX_MOTION_S, 0.0
@@ -102,10 +91,6 @@ def _widest(recording: Recording, chain: Chain, trajectory: Trajectory, share: f
     return int(starts[best]), int(ends[best])
 
 
-def _length(recording: Recording, index: int) -> float:
-    return float(recording.trajectories[index].time[-1])
-
-
 def varied(trajectories: list[Trajectory]) -> str | None:
     """The condition whose values are held out: the one with the most values, if they are enough."""
     names = sorted({name for t in trajectories for name in t.conditions})
@@ -114,8 +99,3 @@ def varied(trajectories: list[Trajectory]) -> str | None:
     }
     best = max(names, key=lambda name: counts[name], default=None)
     return best if best is not None and counts[best] >= CONDITION_VALUES else None
-
-
-def _label(trajectory: Trajectory, condition: str | None) -> str:
-    """What is held out together."""
-    return str(trajectory.conditions.get(condition)) if condition else trajectory.excitation

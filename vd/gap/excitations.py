@@ -4,8 +4,8 @@ The paper commands steps and sines of 0.05 to 1.5 Hz, amplitudes in proportion t
 Commands are in rad, times in seconds.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,23 +13,6 @@ RATE_HZ = 100.0
 """Rate at which commands are written."""
 AMPLITUDE = 0.7
 """Largest command, as a share of half the joint's range: room for overshoot before the stops."""
-REST_S = 0.5
-"""Hold before a step, so that the onset is in the recording."""
-STEPS: Mapping[str, tuple[float, ...]] = {
-    "step_small": (0.12, -0.12),
-    "step_medium": (0.4, -0.2),
-    "step_large": (-0.9, 0.9),
-}
-"""Levels of the steps, held in turn, as shares of the amplitude."""
-STEP_HOLD_S = 1.75
-SINES: Mapping[float, float] = {0.05: 12.0, 0.2: 7.5, 0.5: 6.0, 1.0: 5.0, 1.5: 4.0}
-"""Frequency [Hz] to duration [s]; the slowest covers one reversal."""
-GAIN_LADDER = (1.0, 0.5, 0.25)
-"""P gains of the ladder, as shares of the full gain."""
-SECOND_PAYLOAD_KG = 0.05
-"""A payload that a finger carries at its tip: two links' weight."""
-RELEASE_S = 2.0
-"""Time at which a torque release switches the servo off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,151 +50,109 @@ class JointRange:
         lower: Lower limits [J] [rad].
         upper: Upper limits [J] [rad].
         p_gain: Full P gain of the servos as recordings name it; the ladder's top.
+        payloads_kg: The usual payload and a second one; of a finger two links' weight at its tip.
     """
 
     joints: tuple[str, ...]
     lower: np.ndarray
     upper: np.ndarray
     p_gain: float = 1.0
-
-    @property
-    def centre(self) -> np.ndarray:
-        """Where joints that are not excited hold, and motions start [J] [rad]."""
-        return 0.5 * (self.lower + self.upper)
-
-    @property
-    def amplitude(self) -> np.ndarray:
-        """Largest command about the centre [J] [rad]."""
-        return 0.5 * AMPLITUDE * (self.upper - self.lower)
+    payloads_kg: tuple[float, float] = (0.0, 0.05)
 
 
-def sampled(duration: float) -> np.ndarray:
-    """Regular stamps from 0 to ``duration`` [s]."""
-    return np.arange(round(duration * RATE_HZ) + 1) / RATE_HZ
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion of the menu, of any joint.
+
+    Attributes:
+        name: Kind of motion.
+        shape: Command at ``RATE_HZ`` [T], in shares of the amplitude.
+        gain: P gain as a share of the full one, where it is varied.
+        payload: Index of the payload, where it is varied.
+        release_s: When the torque is switched off [s].
+    """
+
+    name: str
+    shape: np.ndarray
+    gain: float | None = None
+    payload: int | None = None
+    release_s: float = np.inf
+
+    def of(self, reach: JointRange, joint: int) -> Excitation:
+        """This motion of one joint about the centre of its range, while the others hold there."""
+        time = np.arange(len(self.shape)) / RATE_HZ
+        command = np.tile(0.5 * (reach.lower + reach.upper), (len(time), 1))
+        command[:, joint] += 0.5 * AMPLITUDE * (reach.upper - reach.lower)[joint] * self.shape
+        enabled = np.ones(command.shape, dtype=bool)
+        enabled[time >= self.release_s, joint] = False
+        conditions: dict[str, float | str] = {}
+        if self.gain is not None:
+            conditions["p_gain"] = self.gain * reach.p_gain
+        if self.payload is not None:
+            conditions["payload_kg"] = reach.payloads_kg[self.payload]
+        return Excitation(self.name, (reach.joints[joint],), time, command, conditions, enabled)
 
 
-def excite(
-    reach: JointRange,
-    joint: int,
-    name: str,
-    time: np.ndarray,
-    shape: np.ndarray,
-    *,
-    conditions: Mapping[str, float | str] | None = None,
-    release_s: float | None = None,
-) -> Excitation:
-    """Move one joint by ``shape`` [T], in shares of its amplitude, while the others hold."""
-    command = np.tile(reach.centre, (len(time), 1))
-    command[:, joint] += reach.amplitude[joint] * shape
-    enabled = np.ones(command.shape, dtype=bool)
-    if release_s is not None:
-        enabled[time >= release_s, joint] = False
-    return Excitation(name, (reach.joints[joint],), time, command, dict(conditions or {}), enabled)
+def _levels(name: str, hold_s: float, *levels: float) -> Motion:
+    """Levels held in turn, after half a second at zero so that the onset is in the recording."""
+    time = _time(0.5 + hold_s * len(levels))
+    place = np.floor((time - 0.5) / hold_s + 1e-9).astype(int) + 1
+    return Motion(name, np.array([0.0, *levels])[np.clip(place, 0, len(levels))])
 
 
-def staircase(levels: Sequence[float], hold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps and shape of ``levels`` held in turn for ``hold`` [s] each, after a rest at zero."""
-    time = sampled(REST_S + hold * len(levels))
-    steps = np.concatenate([[0.0], np.asarray(levels, dtype=float)])
-    index = np.clip(np.floor((time - REST_S) / hold + 1e-9).astype(int) + 1, 0, len(levels))
-    return time, steps[index]
+def _sine(name: str, frequency_hz: float, duration_s: float) -> Motion:
+    return Motion(name, np.sin(2.0 * np.pi * frequency_hz * _time(duration_s)))
 
 
-def _triangle(time: np.ndarray, period: float) -> np.ndarray:
-    phase = time / period
-    return 4.0 * np.abs(phase - 0.25 - np.floor(phase - 0.25 + 0.5)) - 1.0
+def _triangle(name: str, period_s: float, duration_s: float) -> Motion:
+    return Motion(name, -2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi / period_s * _time(duration_s))))
 
 
-def steps_and_sines(reach: JointRange) -> list[Excitation]:
-    """The paper's excitation: every joint in turn by steps and sines, the others holding."""
-    motions = []
-    for joint in range(len(reach.joints)):
-        for name, levels in STEPS.items():
-            motions.append(excite(reach, joint, name, *staircase(levels, STEP_HOLD_S)))
-        for frequency, duration in SINES.items():
-            time = sampled(duration)
-            shape = np.sin(2.0 * np.pi * frequency * time)
-            motions.append(excite(reach, joint, f"sine_{frequency:.2f}hz", time, shape))
-    return motions
+def _chirp(name: str, size: float, first_hz: float, last_hz: float, duration_s: float) -> Motion:
+    """A sine whose frequency grows exponentially."""
+    time = _time(duration_s)
+    rate = np.log(last_hz / first_hz) / duration_s
+    return Motion(name, size * np.sin(2.0 * np.pi * first_hz * np.expm1(rate * time) / rate))
 
 
-def slow_triangle(reach: JointRange) -> list[Excitation]:
-    """A constant slow speed both ways: friction against its direction, play at its reversals."""
-    time = sampled(20.0)
-    shape = _triangle(time, 16.0)
-    return [excite(reach, j, "slow_triangle", time, shape) for j in range(len(reach.joints))]
+def _time(duration_s: float) -> np.ndarray:
+    return np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ
 
 
-def gain_ladder(reach: JointRange) -> list[Excitation]:
-    """The same steps and sine at falling P gains: what scales with the gain is the servo's."""
-    motions = []
-    sine = sampled(5.0)
-    for joint in range(len(reach.joints)):
-        for share in GAIN_LADDER:
-            conditions = {"p_gain": share * reach.p_gain}
-            time, shape = staircase(STEPS["step_medium"], STEP_HOLD_S)
-            motions.append(excite(reach, joint, "ladder_step", time, shape, conditions=conditions))
-            shape = np.sin(2.0 * np.pi * 0.4 * sine)
-            motions.append(excite(reach, joint, "ladder_sine", sine, shape, conditions=conditions))
-    return motions
-
-
-def second_payload(reach: JointRange) -> list[Excitation]:
-    """The same motion without and with a mass at the tip: what grows with the load."""
-    time = sampled(8.0)
-    shape = np.sin(2.0 * np.pi * 0.25 * time)
-    return [
-        excite(reach, joint, "payload_sine", time, shape, conditions={"payload_kg": mass})
-        for joint in range(len(reach.joints))
-        for mass in (0.0, SECOND_PAYLOAD_KG)
-    ]
-
-
-def torque_release(reach: JointRange) -> list[Excitation]:
-    """Lift, then switch the torque off: what is left is gravity, friction and inertia."""
-    time = sampled(5.0)
-    shape = np.where(time < REST_S, 0.0, 0.8)
-    return [
-        excite(reach, j, "torque_release", time, shape, release_s=RELEASE_S) for j in range(len(reach.joints))
-    ]
-
-
-def long_holds(reach: JointRange) -> list[Excitation]:
-    """Levels held for seconds: creep, warming, and where the joint comes to rest."""
-    time, shape = staircase((0.5, 0.9, -0.3, -0.8), 4.0)
-    return [excite(reach, j, "long_holds", time, shape) for j in range(len(reach.joints))]
-
-
-def reversal_staircase(reach: JointRange) -> list[Excitation]:
-    """Small steps up and down with more and more reversals: play, dead zone, stiction."""
-    levels = (0.04, 0.08, 0.12, 0.08, 0.04, 0.08, 0.04, 0.0, -0.04, 0.0, -0.08, -0.04, -0.08, 0.0)
-    time, shape = staircase(levels, 0.8)
-    return [excite(reach, j, "reversal_staircase", time, shape) for j in range(len(reach.joints))]
-
-
-def chirp(reach: JointRange) -> list[Excitation]:
-    """A small sine of rising frequency: delay against filter against inertia."""
-    time, first, last = sampled(10.0), 0.2, 6.0
-    rate = np.log(last / first) / time[-1]
-    shape = 0.25 * np.sin(2.0 * np.pi * first * np.expm1(rate * time) / rate)
-    return [excite(reach, j, "chirp", time, shape) for j in range(len(reach.joints))]
-
-
-MENU: dict[str, Callable[[JointRange], list[Excitation]]] = {
-    "steps_and_sines": steps_and_sines,
-    "slow_triangle": slow_triangle,
-    "gain_ladder": gain_ladder,
-    "second_payload": second_payload,
-    "torque_release": torque_release,
-    "long_holds": long_holds,
-    "reversal_staircase": reversal_staircase,
-    "chirp": chirp,
+_LADDER = _levels("ladder_step", 1.75, 0.4, -0.2), _sine("ladder_sine", 0.4, 5.0)
+_LIFT = _sine("payload_sine", 0.25, 8.0)
+_SMALL = (0.04, 0.08, 0.12, 0.08, 0.04, 0.08, 0.04, 0.0, -0.04, 0.0, -0.08, -0.04, -0.08, 0.0)
+MENU: dict[str, tuple[Motion, ...]] = {
+    "steps_and_sines": (
+        _levels("step_small", 1.75, 0.12, -0.12),
+        _levels("step_medium", 1.75, 0.4, -0.2),
+        _levels("step_large", 1.75, -0.9, 0.9),
+        _sine("sine_0.05hz", 0.05, 12.0),  # one reversal
+        _sine("sine_0.20hz", 0.2, 7.5),
+        _sine("sine_0.50hz", 0.5, 6.0),
+        _sine("sine_1.00hz", 1.0, 5.0),
+        _sine("sine_1.50hz", 1.5, 4.0),
+    ),
+    # A constant slow speed both ways: friction against its direction, play at its reversals.
+    "slow_triangle": (_triangle("slow_triangle", 16.0, 20.0),),
+    # Steps and sines at falling P gains: what scales with the gain is the servo's.
+    "gain_ladder": tuple(replace(motion, gain=gain) for gain in (1.0, 0.5, 0.25) for motion in _LADDER),
+    # The same sine with two payloads: what grows with the load.
+    "second_payload": tuple(replace(_LIFT, payload=payload) for payload in (0, 1)),
+    # Lifted, then the torque is switched off: what is left is gravity, friction and inertia.
+    "torque_release": (replace(_levels("torque_release", 4.5, 0.8), release_s=2.0),),
+    # Levels held for seconds: creep, warming, and where the joint comes to rest.
+    "long_holds": (_levels("long_holds", 4.0, 0.5, 0.9, -0.3, -0.8),),
+    # Small steps with more and more reversals: play, dead zone, stiction.
+    "reversal_staircase": (_levels("reversal_staircase", 0.8, *_SMALL),),
+    # A small sine of rising frequency: delay against filter against inertia.
+    "chirp": (_chirp("chirp", 0.25, 0.2, 6.0, 10.0),),
 }
 """Sets of motions by name."""
 
 
 def excitation_set(reach: JointRange, names: Sequence[str] = ("steps_and_sines",)) -> list[Excitation]:
-    """The motions of several sets, in order.
+    """The motions of several sets, in order, joint by joint.
 
     Args:
         reach: Joints and limits.
@@ -223,4 +164,5 @@ def excitation_set(reach: JointRange, names: Sequence[str] = ("steps_and_sines",
     for name in names:
         if name not in MENU:
             raise ValueError(f"unknown excitation {name!r}; choose from {', '.join(MENU)}")
-    return [motion for name in names for motion in MENU[name](reach)]
+    joints = range(len(reach.joints))
+    return [motion.of(reach, joint) for name in names for joint in joints for motion in MENU[name]]

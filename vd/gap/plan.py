@@ -1,17 +1,15 @@
 """Plan the next experiment: the motions on which the models that are still possible disagree most.
 
-Every set of motions of the menu is simulated under every model in question, together with what has been
-recorded. Two models differ by what refitting cannot absorb: the part of their difference along small changes
-of their parameters is taken out, as far as each goes on explaining the recording, and so is what one of them
-explains worse of it. The set of motions that tells most pairs of models apart is proposed.
+Every set of motions of the menu is simulated under every model in question. The disagreement of two models is
+the criterion of Buzzi-Ferraris and Forzatti (1983) for telling rivals apart: the difference of their
+predictions in units of the noise, less what the uncertainty of their parameters explains, which the recorded
+motions bound. Noise is all that the identified model leaves of them. The set of motions on which the models
+disagree most is proposed.
 """
 
 import contextlib
-import csv
-import io
 import itertools
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,15 +17,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-import vd.kernels.servo.actuators as servo
+from vd.config import to_dict
 from vd.files import write_json, write_text
 from vd.gap.chain import Chain, chains
-from vd.gap.excitations import MENU, Excitation, JointRange
+from vd.gap.coordinates import BASELINE_PARAMETERS
+from vd.gap.design import design, pieces
+from vd.gap.excitations import MENU, Excitation, JointRange, excitation_set
+from vd.gap.fit import FINER
 from vd.gap.recording import BARE_MODELS, Recording, Trajectory
-from vd.gap.result import Report, parameter_columns, parameter_of
+from vd.gap.result import Report, parameter_columns, parameters_of
 from vd.gap.rollout import STEP_S, Rollouts
-from vd.gap.words import joints_text, listing, plain
-from vd.kernels.servo.effects import BASELINE, EFFECTS
+from vd.gap.words import causes, joints_text
+from vd.kernels.servo.effects import EFFECTS
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
@@ -36,33 +37,12 @@ FORMAT = "vd-experiment/1"
 PLAN_JSON = "next_experiment.json"
 PLAN_FOLDER = "next_experiment"
 UNCERTAINTY = 0.1
-"""Relative standard deviation that the parameters of a model are given: what old data leave open."""
-STEP = 0.05
-"""Relative change of a parameter by which its influence is computed."""
-KNOWN_S = 60.0
-"""Recorded time that refits are held to [s]."""
-FINE_STEP_S = 1.0 / 2400.0
-"""Time step [s]: rivals differ by less than a delay of the fit's own step."""
+"""Relative standard deviation of the parameters of a model before any data."""
 VISIBLE = 1.5
-"""Disagreement, in noise floors, from which a recording is expected to decide: who is wrong leaves 1.8 floors
-there, noise included, and 1.3 are the most that an accepted model may leave."""
+"""Disagreement, in units of the noise, from which a recording is expected to decide: who is wrong leaves 1.8
+there, noise included."""
 PLAIN = "plain servo"
 """The model without any further effect."""
-PAYLOAD_SET = "second_payload"
-"""Set that changes the load; only a pendulum's load is modelled."""
-PAYLOAD_FACTORS = (1.0, 2.0)
-"""Loads of that set in units of the one that was recorded."""
-CONCLUSIONS = {
-    "steps_and_sines": "steps and sines",
-    "slow_triangle": "a slow triangle",
-    "gain_ladder": "the same motions at three P gains",
-    "second_payload": "the same motion with a second payload",
-    "torque_release": "lifting and then switching the torque off",
-    "long_holds": "levels held for several seconds",
-    "reversal_staircase": "a staircase of small steps with many reversals",
-    "chirp": "a small sine of rising frequency",
-}
-"""Sets of motions in words."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +51,13 @@ class Score:
 
     name: str
     """Key of :data:`vd.gap.excitations.MENU`."""
+    disagreement: float
+    """Of two models, RMS in units of the noise; of several pairs the one at which as much is learnt, which is
+    log(1 + disagreement^2) in the mean."""
     told: int
-    """Pairs of models in question that differ by more than :data:`VISIBLE` noise floors."""
+    """Pairs of models that disagree by more than :data:`VISIBLE`."""
     pairs: int
     """Pairs in question."""
-    floors: float
-    """RMS difference of two models in noise floors of the joint, refitting taken into account: the median."""
     seconds: float
     """Length of all its motions."""
 
@@ -117,41 +98,42 @@ def plan(
     Raises:
         ValueError: The recording has no joint with a model to compare.
     """
-    targets, floors = _targets(report), {one.joint: one.noise_floor_rad for one in report.joints}
-    reach = _reach(recording, hand)
-    pairs: dict[str, list[float]] = {}
+    targets = _targets(report)
+    noise = {one.joint: max(one.noise_floor_rad, one.identified_rmse_rad) for one in report.joints}
+    menu = _menu(recording, hand)
     motions: dict[str, list[Excitation]] = {}
+    found: dict[str, list[float]] = {}
     competing: dict[str, list[tuple[str, ...]]] = {}
     for chain in chains(recording, hand):
         base = _base(chain, report, start or {})
         for joint in (name for name in chain.joints if name in targets):
-            menu = {name: found for name in MENU if (found := _motions(name, reach, recording, joint))}
-            for name, found in menu.items():
-                motions.setdefault(name, []).extend(found)
-            for group in targets[joint] or ((),):
+            own = {name: [m for m in every if m.joints == (joint,)] for name, every in menu.items()}
+            for name, new in own.items():
+                motions.setdefault(name, []).extend(new)
+            for group in targets[joint]:
                 models = _models(report, chain, joint, base, group)
                 competing.setdefault(joint, []).append(tuple(models))
-                step, floor = FINE_STEP_S if group else STEP_S, floors.get(joint, report.noise_floor_rad)
-                differences = _disagreements(chain, recording, menu, joint, models, floor, step, device)
-                for name, values in differences.items():
-                    pairs.setdefault(name, []).extend(value / floor for value in values)
-    if not pairs:
+                values_of = _compare(chain, recording, own, joint, models, noise[joint], device)
+                for name, values in values_of.items():
+                    found.setdefault(name, []).extend(values)
+    if not found:
         raise ValueError(
-            f"{recording.path}: no joint has a fitted model to plan from, or every motion of the menu has "
-            "been recorded; run vd-gap explain first"
+            f"{recording.path}: no joint has a fitted model to plan from; run vd-gap explain first"
         )
-    total = max(map(len, pairs.values()))
-    scores = [
-        Score(
-            name,
-            sum(value > VISIBLE for value in values),
-            total,
-            float(np.median(values)),
-            sum(motion.duration for motion in motions[name]),
-        )
-        for name, values in pairs.items()
-    ]
-    ranking = sorted(scores, key=lambda score: (-score.told, -score.floors))
+    total = max(map(len, found.values()))
+    ranking = sorted(
+        (
+            Score(
+                name,
+                disagreement=float(np.sqrt(np.expm1(np.mean(np.log1p(np.square(values)))))),
+                told=sum(value > VISIBLE for value in values),
+                pairs=total,
+                seconds=sum(motion.duration for motion in motions[name]),
+            )
+            for name, values in found.items()
+        ),
+        key=lambda score: -score.disagreement,
+    )
     return Plan(
         model=recording.model,
         joints=recording.joints,
@@ -172,33 +154,22 @@ def write_plan(result: Plan, folder: Path) -> Path:
         The JSON file.
     """
     discard_plan(folder)
-    entries = []
+    path, entries = Path(folder) / PLAN_JSON, []
     for index, motion in enumerate(result.motions):
-        name = f"{index:03d}_{motion.joints[0]}_{motion.name}.csv"
-        write_text(Path(folder) / PLAN_FOLDER / name, _csv(motion, result.joints))
+        name = f"{PLAN_FOLDER}/{index:03d}_{motion.joints[0]}_{motion.name}.csv"
+        write_text(Path(folder) / name, _csv(motion, result.joints))
         entries.append(
             {
-                "file": f"{PLAN_FOLDER}/{name}",
+                "file": name,
                 "excitation": motion.name,
                 "joints": list(motion.joints),
                 "conditions": motion.conditions,
                 "duration_s": motion.duration,
             }
         )
-    path = Path(folder) / PLAN_JSON
-    write_json(
-        path,
-        {
-            "format": FORMAT,
-            "model": result.model,
-            "joints": list(result.joints),
-            "sentence": result.sentence,
-            "excitation": result.ranking[0].name,
-            "competing": {joint: [list(names) for names in sets] for joint, sets in result.competing.items()},
-            "ranking": [vars(score) for score in result.ranking],
-            "trajectories": entries,
-        },
-    )
+    contents = {name: value for name, value in vars(result).items() if name != "motions"}
+    contents |= {"format": FORMAT, "excitation": result.ranking[0].name, "trajectories": entries}
+    write_json(path, to_dict(contents))
     return path
 
 
@@ -217,14 +188,40 @@ def discard_plan(folder: Path) -> None:
 
 
 def _targets(report: Report) -> dict[str, tuple[tuple[str, ...], ...]]:
-    """Joints in question with the sets of effects that compete on each; none means that all do."""
+    """Fitted joints in question with the sets of effects that compete on each; an empty set is of all."""
     targets = {one.joint: one.open_sets for one in report.joints if one.open_sets}
     if not targets:
-        shaky = [
-            one.joint for one in report.joints if one.verdict in ("under_excited", "ambiguous", "unknown")
-        ]
-        targets = {joint: () for joint in shaky or report.recording.joints}
+        shaky = [one.joint for one in report.joints if one.verdict not in ("effects", "no_gap")]
+        targets = {joint: ((),) for joint in shaky or report.recording.joints}
     return {joint: groups for joint, groups in targets.items() if joint in report.identified.parameters}
+
+
+def _menu(recording: Recording, hand: "HandModel | None") -> dict[str, list[Excitation]]:
+    """The menu for this machine, under the conditions that its recording has throughout.
+
+    Joints move in the hand's range, or in that of the commands before. Only a pendulum's load is modelled.
+    """
+    parts = recording.trajectories
+    common = {
+        key: float(value) if isinstance(value, int) else value
+        for key, value in parts[0].conditions.items()
+        if all(t.conditions.get(key) == value for t in parts)
+    }
+    commands = np.concatenate([t.command for t in parts])
+    lower, upper = commands.min(axis=0), commands.max(axis=0)
+    if hand is not None:
+        index = [hand.joint_names.index(name) for name in recording.joints]
+        lower, upper = hand.lower[index], hand.upper[index]
+    gain = max((float(t.conditions["p_gain"]) for t in parts if "p_gain" in t.conditions), default=1.0)
+    load, names = common.get("payload_kg"), list(MENU)
+    if recording.model not in BARE_MODELS or not isinstance(load, float) or "arm_length_m" not in common:
+        load = 0.0
+        names.remove("second_payload")
+    reach = JointRange(recording.joints, lower, upper, gain, (load, 2.0 * load))
+    return {
+        name: [replace(m, conditions={**common, **m.conditions}) for m in excitation_set(reach, (name,))]
+        for name in names
+    }
 
 
 def _base(chain: Chain, report: Report, start: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -241,242 +238,169 @@ def _models(
     report: Report, chain: Chain, joint: str, base: np.ndarray, group: Sequence[str]
 ) -> dict[str, np.ndarray]:
     """Parameter rows [n, P] of every model in question, by name."""
-    index = chain.joints.index(joint)
-    models = {}
-    base = base.copy()
-    for name in group:  # one of them stands in the identified model for all
-        for parameter in EFFECTS[name].parameters:
-            base[index, parameter.column] = parameter.neutral
-    held = {e.name for e in (*report.effects, *report.provisional) if joint in e.joints}
-    for name in group:
-        values = {p.column: p.typical for p in EFFECTS[name].parameters}
-        for key, value in _fitted(report, joint, name, held - set(group)).items():
-            values[parameter_of(key, name).column] = value
-        models[name] = base.copy()
-        for column, value in values.items():
-            models[name][index, column] = value
-    if len(models) >= 2:
-        return models
-    # Nothing in particular competes: which motion would show the most of everything?
-    models = {PLAIN: base}
-    for effect in EFFECTS.values():
-        if effect.name == "joint_coupling" and len(chain.joints) == 1:
-            continue
-        models[effect.name] = base.copy()
-        for parameter in effect.parameters:
-            models[effect.name][index, parameter.column] = parameter.typical
-    return models
+    index, base = chain.joints.index(joint), base.copy()
+
+    def having(name: str, values: Mapping[str, float]) -> np.ndarray:
+        rows = base.copy()
+        for key, parameter in parameters_of(name).items():
+            rows[index, parameter.column] = values.get(key, parameter.typical)
+        return rows
+
+    if len(group) < 2:  # nothing in particular competes: which motion would show the most of everything?
+        alone = len(chain.joints) == 1
+        effects = [name for name in EFFECTS if not (alone and name == "joint_coupling")]
+        return {PLAIN: base, **{name: having(name, {}) for name in effects}}
+    for parameter in (p for name in group for p in EFFECTS[name].parameters):
+        base[index, parameter.column] = parameter.neutral  # one of them stands in the model for all
+    held = {e.name for e in (*report.effects, *report.provisional) if joint in e.joints} - {*group}
+    return {name: having(name, _fitted(report, joint, name, held)) for name in group}
 
 
 def _fitted(report: Report, joint: str, name: str, given: set[str]) -> dict[str, float]:
     """Parameters of an effect on a joint as they were fitted beside the effects given, or else last."""
-    found = [
-        row
-        for row in report.evidence
-        if row.name == name and joint in row.joints and row.parameters and not row.placebo
-    ]
-    beside = [row for row in found if set(row.given) == given]
-    return (beside or found)[-1].parameters if found else {}
+    rows = [row for row in report.evidence if row.name == name and joint in row.joints and not row.placebo]
+    rows = [row for row in rows if row.parameters]
+    beside = [row for row in rows if {*row.given} == given]
+    return (beside or rows)[-1].parameters if rows else {}
 
 
-def _reach(recording: Recording, hand: "HandModel | None") -> JointRange:
-    """Range of motion of the recorded joints: the hand's, or what was commanded before."""
-    gains = [float(t.conditions["p_gain"]) for t in recording.trajectories if "p_gain" in t.conditions]
-    p_gain = max(gains, default=1.0)
-    if hand is not None:
-        index = [hand.joint_names.index(name) for name in recording.joints]
-        return JointRange(recording.joints, hand.lower[index], hand.upper[index], p_gain)
-    commands = np.concatenate([t.command for t in recording.trajectories])
-    return JointRange(recording.joints, commands.min(axis=0), commands.max(axis=0), p_gain)
-
-
-def _motions(name: str, reach: JointRange, recording: Recording, joint: str) -> list[Excitation]:
-    """Motions of a set that move the joint; none if the set cannot be predicted for this machine."""
-    common = _common(recording)
-    recorded = {
-        (t.excitation, t.conditions.get("p_gain")) for t in recording.trajectories if joint in t.joints
-    }
-    motions = [
-        motion
-        for motion in MENU[name](reach)
-        if motion.joints == (joint,)
-        and (motion.name, motion.conditions.get("p_gain", common.get("p_gain"))) not in recorded
-    ]
-    if name == PAYLOAD_SET:
-        mass = common.get("payload_kg")
-        if recording.model not in BARE_MODELS or not isinstance(mass, float) or "arm_length_m" not in common:
-            return []
-        motions = [
-            replace(motion, conditions={**motion.conditions, "payload_kg": factor * mass})
-            for motion, factor in zip(motions, PAYLOAD_FACTORS, strict=False)
-        ]
-    return [replace(motion, conditions={**common, **motion.conditions}) for motion in motions]
-
-
-def _common(recording: Recording) -> dict[str, float | str]:
-    """Conditions that were the same in all recorded motions, and the full gain."""
-    first = dict(recording.trajectories[0].conditions)
-    return {
-        key: float(value) if isinstance(value, int) else value
-        for key, value in first.items()
-        if all(t.conditions.get(key) == value for t in recording.trajectories)
-    }
-
-
-def _disagreements(
+def _compare(
     chain: Chain,
     recording: Recording,
     menu: Mapping[str, Sequence[Excitation]],
     joint: str,
     models: Mapping[str, np.ndarray],
-    floor: float,
-    dt: float,
+    noise: float,
     device: str,
 ) -> dict[str, list[float]]:
-    """What every two rivals, or each and the plain servo, say differently about each set of motions [rad]."""
-    known = _known(recording, joint)
-    motions = [(name, motion) for name, found in menu.items() for motion in found]
-    imagined = replace(
-        recording,
-        trajectories=known
-        + tuple(
-            Trajectory(
-                file=f"{index}_{name}",
-                excitation=motion.name,
-                joints=motion.joints,
-                conditions=motion.conditions,
-                time=motion.time,
-                command=motion.command,
-                position=motion.command,
-                enabled=motion.enabled,
-            )
-            for index, (name, motion) in enumerate(motions)
-        ),
-    )
-    rollouts = Rollouts(chain, imagined, dt=dt, device=device)
-    old = np.arange(len(rollouts.sample_trajectory)) < sum(len(trajectory.time) for trajectory in known)
-    owner = np.array([""] * len(known) + [name for name, _ in motions])[rollouts.sample_trajectory]
+    """Disagreement of every two rivals, or of each and the plain servo, on each set of motions."""
     index = chain.joints.index(joint)
-    rows, free = [], []
-    for model in models.values():
-        columns = _free(chain, model, index)
-        free.append(columns)
-        rows.append(model)
-        for column in columns:
-            changed = model.copy()
-            changed[index, column] *= 1.0 + STEP
-            rows.append(changed)
-    predicted = rollouts.predict(np.array(rows))[:, :, index].astype(float)
-    curves, slopes, place = [], [], 0
-    for columns in free:
-        curves.append(predicted[place])
-        slopes.append((predicted[place + 1 : place + 1 + len(columns)] - predicted[place]) / STEP)
-        place += 1 + len(columns)
-    left = rollouts.measured[old, index]
-    count = len(models)
-    plain_first = PLAIN in models  # then every effect is one of many, and is compared with none
-    pairs = (
-        [(0, b) for b in range(1, count)] if plain_first else list(itertools.combinations(range(count), 2))
-    )
-    result: dict[str, list[float]] = {}
-    for name in menu:
-        new = owner == name
-        rivals = [
-            _Rival(left - curve[old], curve[new], np.concatenate([slope[:, old], slope[:, new]], axis=1))
-            for curve, slope in zip(curves, slopes, strict=True)
-        ]
-        result[name] = [_left_over(rivals[a], rivals[b], floor) for a, b in pairs]
+    known = _analysed(recording, chain, index)
+    owner = [""] * len(known) + [name for name, new in menu.items() for _ in new]
+    imagined = [
+        Trajectory(
+            file=str(number),
+            excitation=motion.name,
+            joints=motion.joints,
+            conditions=motion.conditions,
+            time=motion.time,
+            command=motion.command,
+            position=motion.command,
+            enabled=motion.enabled,
+        )
+        for number, motion in enumerate(itertools.chain(*menu.values()))
+    ]
+    everything = replace(recording, trajectories=(*known, *imagined))
+    # Rivals differ by less than a delay of the fit's own step.
+    rollouts = Rollouts(chain, everything, dt=STEP_S / FINER[-1], device=device)
+    of = np.array(owner)[rollouts.sample_trajectory]
+    varied = [_varied(chain, rows, index) for rows in models.values()]
+    predicted = rollouts.predict(np.concatenate(varied))[:, :, index].astype(float) / noise
+    ends = np.cumsum([len(rows) for rows in varied])[:-1]
+    measured = rollouts.measured[:, index] / noise
+    rivals = [Rival.of(curves, measured, of == "", len(known)) for curves in np.split(predicted, ends)]
+    pairs = list(itertools.combinations(rivals, 2))
+    if PLAIN in models:  # then every effect is one of many
+        pairs = [(rivals[0], other) for other in rivals[1:]]
+    return {name: [disagreement(a, b, of == name) for a, b in pairs] for name in menu}
+
+
+def _analysed(recording: Recording, chain: Chain, joint: int) -> tuple[Trajectory, ...]:
+    """What the joint was fitted to."""
+    chosen, _ = design(recording, chain, joint)
+    parts = pieces(recording, chain, chosen)
+    cut = recording.cut(dict(zip(chosen, parts, strict=True)) if parts else {})
+    return tuple(cut.trajectories[i] for i in chosen)
+
+
+def _varied(chain: Chain, rows: np.ndarray, joint: int) -> np.ndarray:
+    """A model, and it with each parameter that a fit could change one standard deviation up [1 + P, n, C]."""
+    columns = [BASELINE_PARAMETERS[name].column for name in chain.baseline_free]
+    effects = (p for effect in EFFECTS.values() for p in effect.parameters)
+    columns += [p.column for p in effects if rows[joint, p.column] != p.neutral]
+    columns = [column for column in dict.fromkeys(columns) if rows[joint, column] != 0.0]
+    result = np.tile(rows, (1 + len(columns), 1, 1))
+    result[np.arange(1, len(result)), joint, columns] *= 1.0 + UNCERTAINTY
     return result
 
 
-def _free(chain: Chain, rows: np.ndarray, joint: int) -> list[int]:
-    """Columns that a fit of the model could change: the baseline's and those of effects that act."""
-    columns = [p.column for p in BASELINE if p.name in chain.baseline_free]
-    for effect in EFFECTS.values():
-        columns += [p.column for p in effect.parameters if rows[joint, p.column] != p.neutral]
-    if servo.GRAVITY_TORQUE not in columns and "tau_g_nm" in chain.baseline_free:
-        columns.append(servo.GRAVITY_TORQUE)
-    return [column for column in columns if rows[joint, column] != 0.0]
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """A model in question, refitted to what is recorded; S samples, recorded and imagined, P parameters.
 
+    Errors within a motion are correlated: each recorded motion counts as one observation.
 
-def _known(recording: Recording, joint: str) -> tuple[Trajectory, ...]:
-    """Recorded motions of the joint that a refit has to go on explaining, the shortest first."""
-    own = sorted((t for t in recording.trajectories if joint in t.joints), key=lambda t: t.time[-1])
-    ends = np.cumsum([t.time[-1] for t in own])
-    return tuple(own[: max(int(np.searchsorted(ends, KNOWN_S, side="right")), 1)])
+    Attributes:
+        curve: Its positions [S] [noise].
+        slopes: Their change with each parameter, one prior standard deviation [P, S] [noise].
+        precision: Of the parameters, in those standard deviations, by prior and recording [P, P].
+    """
 
-
-@dataclass(frozen=True)
-class _Rival:
-    """A model in question: K samples that are recorded, then M imagined ones, P parameters."""
-
-    recorded: np.ndarray
-    """What it leaves of the recording [K] [rad]."""
-    imagined: np.ndarray
-    """What it predicts of new motions [M] [rad]."""
+    curve: np.ndarray
     slopes: np.ndarray
-    """Change of its predictions with the logarithm of each parameter [P, K + M] [rad]."""
+    precision: np.ndarray
+
+    @staticmethod
+    def of(curves: np.ndarray, measured: np.ndarray, recorded: np.ndarray, motions: int) -> "Rival":
+        """From curves of the model and of it with each parameter changed [1 + P, S]."""
+        slopes = curves[1:] - curves[0]
+        left, own = (measured - curves[0])[recorded], slopes[:, recorded]
+        weight = motions / len(left)
+        precision = np.eye(len(own)) + weight * own @ own.T
+        step = np.linalg.solve(precision, weight * own @ left)
+        return Rival(curves[0] + step @ slopes, slopes, precision)
 
 
-def _left_over(a: _Rival, b: _Rival, floor: float) -> float:
-    """What two models say differently about new motions once both have been refitted.
-
-    Each may change its parameters as far as it goes on explaining what is recorded; the changes are those
-    that bring the two together. What one explains worse of the recording is known, and tells nothing new.
+def disagreement(one: Rival, other: Rival, new: np.ndarray) -> float:
+    """What two models say differently about new motions, their parameters adapted to each other's.
 
     Args:
-        a: A model.
-        b: Its rival.
-        floor: Noise floor [rad].
+        one: A model.
+        other: Its rival.
+        new: Samples of the new motions [S] bool; together they count as one observation.
 
     Returns:
-        RMS of their difference [rad].
+        RMS of the difference, and how far the parameters had to go for it [noise].
     """
-    known, new, count = len(a.recorded), len(a.imagined), len(a.slopes)
-    blank = np.zeros((known, count)), np.zeros((known, len(b.slopes)))
-    # One sigma of a parameter weighs as one floor on all samples.
-    ridge = math.sqrt(new) * floor / UNCERTAINTY
-    system = np.block(
-        [
-            [a.slopes[:, :known].T, blank[1]],
-            [blank[0], b.slopes[:, :known].T],
-            [a.slopes[:, known:].T, -b.slopes[:, known:].T],
-        ]
-    )
-    target = np.concatenate([a.recorded, b.recorded, b.imagined - a.imagined])
-    free = count + len(b.slopes)
-    bounded = np.concatenate([system, ridge * np.eye(free)]), np.concatenate([target, np.zeros(free)])
-    left = target - system @ np.linalg.lstsq(*bounded, rcond=None)[0]
-    worse = abs(float(np.sum(left[:known] ** 2) - np.sum(left[known : 2 * known] ** 2))) / max(known, 1)
-    return math.sqrt(max(float(np.mean(left[2 * known :] ** 2)) - worse, 0.0))
+    apart = (other.curve - one.curve)[new]
+    slopes = np.concatenate([one.slopes[:, new], -other.slopes[:, new]])
+    pull = slopes @ apart / len(apart)
+    stiffness = slopes @ slopes.T / len(apart)
+    count = len(one.slopes)
+    stiffness[:count, :count] += one.precision
+    stiffness[count:, count:] += other.precision
+    return float(np.sqrt(max(apart @ apart / len(apart) - pull @ np.linalg.solve(stiffness, pull), 0.0)))
 
 
 def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
-    sets = [list(dict.fromkeys(map(plain, group))) for group in report.open_sets]
-    one = listing(sets[0]) if len(sets) == 1 else ""  # several are listed by themselves
-    if best.told == 0:
-        goal = f"decide between {one}" if one else "decide" if sets else "show more than these do"
+    """What to record, and what it would show."""
+    sets = report.open_sets
+    between = f" between {causes(sets[0], 'and')}" if len(sets) == 1 else ""
+    if not best.told:
         return (
-            f"No motion of the menu would {goal}: on all of them the models in question differ by less than "
-            f"{VISIBLE:g} times the noise floor, so either serves in simulation. To decide, record another "
-            f"quantity, such as current or an external sensor. The best of the menu is in {PLAN_FOLDER}/."
+            f"No motion of the menu would decide{between}: on all of them the models in question differ by "
+            f"less than {VISIBLE:g} times the noise, so either serves in simulation. To decide, record "
+            "another quantity, such as current or an external sensor. The best of the menu is in "
+            f"{PLAN_FOLDER}/."
         )
-    goal = f" to decide between {one}" if one else "" if sets else " to see what these motions do not show"
-    shows = f"there the models in question differ by {best.floors:.1f} times the noise floor"
+    goal = f"to decide{between}" if sets else "to see what these motions do not show"
+    shows = f"the models in question differ by {best.disagreement:.1f} times the noise"
     if best.pairs > 1:
-        shows = f"that tells {best.told} of {best.pairs} pairs of possible models apart"
+        shows = f"{best.told} of {best.pairs} pairs of possible models differ by more than the noise"
     return (
-        f"Record {CONCLUSIONS[best.name]} on {joints_text(joints)} ({best.seconds:.0f} s){goal}: {shows}. "
+        f"Record {best.name} on {joints_text(joints)} ({best.seconds:.0f} s) {goal}: there {shows}. "
         f"The commands are in {PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
     )
 
 
 def _csv(motion: Excitation, joints: Sequence[str]) -> str:
-    off = not motion.enabled.all()
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["t", *(f"command.{j}" for j in joints), *(f"enabled.{j}" for j in joints if off)])
-    for row, time in enumerate(motion.time):
-        cells = [f"{time:.6f}", *(f"{value:.6f}" for value in motion.command[row])]
-        writer.writerow(cells + ([str(int(on)) for on in motion.enabled[row]] if off else []))
-    return text.getvalue()
+    """The commands of a motion, and where its torque is on if it is not always."""
+    columns = {
+        "t": motion.time,
+        **{f"command.{joint}": motion.command[:, i] for i, joint in enumerate(joints)},
+    }
+    cells = [[f"{value:.6f}" for value in column] for column in columns.values()]
+    if not motion.enabled.all():
+        columns |= {f"enabled.{joint}": motion.enabled[:, i] for i, joint in enumerate(joints)}
+        cells += motion.enabled.astype(int).astype(str).T.tolist()
+    return "\n".join(map(",".join, [list(columns), *zip(*cells, strict=True)])) + "\n"

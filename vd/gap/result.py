@@ -8,16 +8,17 @@ radians, errors are of the recorded joint position, intervals are 95 %.
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import atomic_path, write_json
-from vd.kernels.servo.effects import BASELINE, EFFECTS, TOGETHER, Parameter, equivalent
+from vd.gap.motions import Recording
+from vd.kernels.servo.effects import BASELINE, EFFECTS, Parameter
 
 FORMAT = "vd-gap-report/1"
 LAYER = "identified.usda"
@@ -25,7 +26,8 @@ LAYER = "identified.usda"
 _OPTIONAL = ("hand", "hand_layer", "closing")
 """Fields of a report in which None means none, not a number that is unknown."""
 
-Verdict = Literal["effects", "no_gap", "ambiguous", "under_excited", "unknown"]
+Verdict = Literal["effects", "ambiguous", "unknown", "under_excited", "no_gap"]
+"""That of a recording is the first of these that some joint has."""
 Decision = Literal["named", "tied", "rejected"]
 Interval = tuple[float, float]
 
@@ -106,18 +108,6 @@ class HeldOut:
     """Of the reduction, trajectories resampled."""
     baseline_mae_rad: float = math.nan
     identified_mae_rad: float = math.nan
-    left_out: tuple["LeftOut", ...] = ()
-    """By the value of a condition that was left out as a whole, where one was varied."""
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """Mean absolute errors at one value of a condition, by models that were fitted at the others."""
-
-    condition: str
-    value: str
-    baseline_mae_rad: float
-    identified_mae_rad: float
 
 
 @dataclass(frozen=True)
@@ -154,7 +144,7 @@ class Candidate:
     reason: str
     """Why, in a few words."""
     parameters: dict[str, float] = field(default_factory=dict)
-    """Fitted values by ``effect.parameter``, a parameter of this effect, or a baseline's name."""
+    """Fitted values by name."""
     placebo: bool = False
     """A negative control (an effect driven by shuffled time), which must be rejected."""
     given: tuple[str, ...] = ()
@@ -241,7 +231,6 @@ class Report:
     """What a reader should know about the data or the fit, in plain sentences."""
     rollouts: int = 0
     """Simulated trajectories."""
-    rollouts_per_s: float = 0.0
     seed: int = 0
     command: str = ""
     """Command that repeats the analysis."""
@@ -255,8 +244,6 @@ class Report:
         """
         if self.format != FORMAT:
             raise ValueError(f"format is {self.format!r}; this version reads {FORMAT!r}: run vd-gap again")
-        if self.verdict not in get_args(Verdict):
-            raise ValueError(f"verdict is {self.verdict!r}, not one of {', '.join(get_args(Verdict))}")
         if (self.verdict == "effects") != bool(self.effects):
             raise ValueError(f"verdict is {self.verdict!r}, but effects names {len(self.effects)}")
         if self.verdict == "ambiguous" and not self.ambiguous:
@@ -264,27 +251,11 @@ class Report:
         named = {name for group in self.ambiguous for name in group} | {e.name for e in self.effects}
         if unknown := sorted(named - set(EFFECTS)):
             raise ValueError(f"no effects are called {', '.join(unknown)}; there are {', '.join(EFFECTS)}")
-        for effect in (*self.effects, *self.provisional):
-            wanted = {parameter.name for parameter in EFFECTS[effect.name].parameters}
-            if extra := sorted(set(effect.parameters) - wanted):
-                raise ValueError(f"effects: {effect.name} has no parameter {', '.join(extra)}")
-            if stray := sorted(set(effect.joints) - set(self.recording.joints)):
-                raise ValueError(f"effects: {effect.name} is on joints not recorded: {', '.join(stray)}")
         return self
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionary for JSON; numbers that are not finite become None."""
-        return _finite(to_dict(self))
-
-    @staticmethod
-    def from_dict(values: Mapping[str, Any]) -> "Report":
-        """The report that :meth:`to_dict` wrote.
-
-        Raises:
-            ValueError: A field is unknown, of a wrong type, or contradicts another.
-        """
-        absent = {name: None for name in _OPTIONAL if values.get(name) is None}
-        return from_dict(Report, {**_nan(values), **absent}).validate()
+        return _each_number(to_dict(self), lambda x: x if x is None or math.isfinite(x) else None)
 
     def write(self, path: Path) -> None:
         """Write it as JSON, atomically, after :meth:`validate`."""
@@ -299,25 +270,16 @@ class Report:
         """
         try:
             values = json.loads(Path(path).read_text())
-            return Report.from_dict(values)
+            known = _each_number(values, lambda x: math.nan if x is None else x)
+            absent = {name: None for name in _OPTIONAL if values.get(name) is None}
+            return from_dict(Report, {**known, **absent}).validate()
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: not a report of vd-gap ({error})") from error
 
     @property
     def open_sets(self) -> tuple[tuple[str, ...], ...]:
-        """The sets in ``ambiguous`` that another recording can split.
-
-        The others hold a named effect and those for which it stands: one other (:func:`equivalent`), or
-        several together (:data:`TOGETHER`).
-        """
-        named = {effect.name for effect in self.effects}
-        same = equivalent(self.recording.model, named)
-
-        def closed(group: tuple[str, ...]) -> bool:
-            both = set(TOGETHER.get(group[0], ())) if group[0] in named else set()
-            return set(group[1:]) <= {*same.get(group[0], ()), *both}
-
-        return tuple(group for group in self.ambiguous if not closed(group))
+        """The sets in ``ambiguous`` that another recording can split, without what their names stand for."""
+        return tuple({frozenset(group): group for one in self.joints for group in one.open_sets}.values())
 
 
 @dataclass(frozen=True)
@@ -340,20 +302,25 @@ class Predictions:
     files: tuple[str, ...]
     """Of each trajectory."""
 
+    @staticmethod
+    def of(recording: Recording, baseline: np.ndarray, identified: np.ndarray) -> "Predictions":
+        """Both models beside all that was recorded."""
+        parts = recording.trajectories
+        return Predictions(
+            time=np.concatenate([t.time for t in parts]),
+            trajectory=np.repeat(np.arange(len(parts)), [len(t.time) for t in parts]),
+            command=np.concatenate([t.command for t in parts]),
+            measured=np.concatenate([t.position for t in parts]),
+            baseline=baseline,
+            identified=identified,
+            joints=recording.joints,
+            files=tuple(t.file for t in parts),
+        )
+
     def write(self, path: Path) -> None:
         """Write a compressed .npz, atomically."""
         with atomic_path(path) as temporary:
-            np.savez_compressed(
-                temporary,
-                time=self.time,
-                trajectory=self.trajectory,
-                command=self.command,
-                measured=self.measured,
-                baseline=self.baseline,
-                identified=self.identified,
-                joints=np.array(self.joints),
-                files=np.array(self.files),
-            )
+            np.savez_compressed(temporary, **vars(self))
 
     @staticmethod
     def read(path: Path) -> "Predictions":
@@ -364,43 +331,28 @@ class Predictions:
         """
         try:
             with np.load(path) as data:
-                arrays = {name: data[name] for name in ("time", "trajectory", *_CURVES)}
-                joints, files = (tuple(str(n) for n in data[key]) for key in ("joints", "files"))
+                arrays = {one.name: data[one.name] for one in fields(Predictions)}
         except (KeyError, OSError, ValueError) as error:
             raise ValueError(f"{path}: not curves of vd-gap ({error}); run vd-gap explain again") from error
-        shape = (len(arrays["time"]), len(joints))
-        for name in _CURVES:
-            if arrays[name].shape != shape:
-                raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape}")
-        return Predictions(**arrays, joints=joints, files=files)
+        names = {key: tuple(arrays[key].tolist()) for key in ("joints", "files")}
+        shape = len(arrays["time"]), len(names["joints"])
+        for key in ("command", "measured", "baseline", "identified"):
+            if arrays[key].shape != shape:
+                raise ValueError(f"{path}: {key} has shape {arrays[key].shape}, expected {shape}")
+        return Predictions(**{**arrays, **names})
 
 
-_CURVES = ("command", "measured", "baseline", "identified")
-
-
-def parameter_of(key: str, effect: str = "") -> Parameter:
-    """The parameter that a key means: ``effect.parameter``, a parameter of ``effect``, or of the baseline.
-
-    Raises:
-        ValueError: There is none.
-    """
-    group, _, name = key.rpartition(".")
-    known = EFFECTS[group or effect].parameters if (group or effect) in EFFECTS else ()
-    for parameter in (*known, *(() if group else (*BASELINE, GRAVITY))):
-        if parameter.name == name:
-            return parameter
-    raise ValueError(f"no parameter is called {key!r}")
+def parameters_of(effect: str) -> dict[str, Parameter]:
+    """Parameters of an effect by name."""
+    return {parameter.name: parameter for parameter in EFFECTS[effect].parameters}
 
 
 def parameter_columns(report: Report, joint: str) -> dict[int, float]:
     """Columns of the joint's parameter row (:mod:`vd.kernels.servo.actuators`) that the report identified."""
     known = {p.name: p.column for p in (*BASELINE, GRAVITY)}
     columns = {known[name]: value for name, value in report.identified.parameters.get(joint, {}).items()}
-    for effect in (*report.effects, *report.provisional):
-        if joint in effect.joints:
-            for parameter in EFFECTS[effect.name].parameters:
-                if parameter.name in effect.parameters:
-                    columns[parameter.column] = effect.parameters[parameter.name].value
+    for effect, values in effect_values((*report.effects, *report.provisional), joint).items():
+        columns |= {parameters_of(effect)[name].column: value for name, (value, *_) in values.items()}
     return columns
 
 
@@ -415,18 +367,10 @@ def effect_values(
     }
 
 
-def _finite(value: Any) -> Any:
+def _each_number(value: Any, change: Callable[[float | None], float | None]) -> Any:
+    """Nested dictionaries and lists with their numbers changed; None stands for one."""
     if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
+        return {name: _each_number(item, change) for name, item in value.items()}
     if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _nan(value: Any) -> Any:
-    """None back to NaN, the only thing it can have been here."""
-    if isinstance(value, Mapping):
-        return {name: _nan(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_nan(item) for item in value]
-    return math.nan if value is None else value
+        return [_each_number(item, change) for item in value]
+    return change(value) if value is None or isinstance(value, float) else value

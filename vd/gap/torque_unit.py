@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from vd.gap.chain import load_of
 from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording
-from vd.gap.result import UNITS, Candidate, Estimate, Fit, NamedEffect, Report, parameter_of
+from vd.gap.result import UNITS, Candidate, Estimate, Fit, NamedEffect, Report, parameters_of
 
 
 def relative_torques(recording: Recording) -> bool:
@@ -96,5 +96,6 @@ def _estimate(one: Estimate, factor: float) -> Estimate:
 
 def _candidate(row: Candidate, factors: Mapping[str, float]) -> Candidate:
     factor = factors.get(row.joints[0], 1.0) if row.joints else 1.0
-    values = {key: _scaled(v, parameter_of(key, row.name).unit, factor) for key, v in row.parameters.items()}
+    known = parameters_of(row.name)
+    values = {key: _scaled(v, known[key].unit, factor) for key, v in row.parameters.items()}
     return replace(row, parameters=values)

@@ -170,14 +170,13 @@ def explain(
         joints = _resume(pool, _specs(recording, pool.problems.chains), known["joints"])
         explained = explain_joints(Explainer(pool, joints, chosen.effects, chosen.seed, progress))
         analysed = [
-            Analysed(j.name, j.spec, replace(e, baseline=j.fit), j.scales)
+            Analysed(j.name, j.spec, replace(e, baseline=j.fit))
             for j, e in zip(joints, explained, strict=True)
         ]
         seconds = known["seconds"] + time.perf_counter() - begin
         simulated = known["simulated"] + pool.simulated
         report, predictions = assemble(
             recording,
-            hand,
             pool.problems,
             analysed,
             [Finding(**f) for f in known["findings"]],
