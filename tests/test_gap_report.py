@@ -154,25 +154,25 @@ OUTCOMES = {
 
 
 @pytest.mark.parametrize("verdict", OUTCOMES)
-def test_every_verdict_has_its_sentence_and_its_page(report, tmp_path, verdict):
+def test_every_verdict_has_its_sentence_and_its_page(report, curves, tmp_path, verdict):
     changes, sentence = OUTCOMES[verdict]
     joint = dataclasses.replace(report.joints[0], open_sets=changes.get("ambiguous", ()))
     report = dataclasses.replace(report, verdict=verdict, joints=(joint,), closing=None, **changes).validate()
     assert sentence in words.verdict_sentence(report)
     assert words.next_step(report)
-    write_report(report, None, tmp_path)
+    write_report(report, curves, tmp_path)
     page = html.unescape((tmp_path / "report.html").read_text())
     assert words.next_step(report) in page
 
 
-def test_of_one_recorded_finger_the_layer_of_all_is_to_be_trained_with(report, tmp_path):
+def test_of_one_recorded_finger_the_layer_of_all_is_to_be_trained_with(report, curves, tmp_path):
     source = dataclasses.replace(report.recording, model="dclaw3")
     closing = dataclasses.replace(report.closing, whole_hand_layer="identified-all-fingers.usda")
     one = dataclasses.replace(report, recording=source, closing=closing, hand="dclaw3")
     plain = dataclasses.replace(one, closing=report.closing)
     assert "pass identified.usda with --hand-layer" in words.next_step(plain)
     assert "pass identified-all-fingers.usda with --hand-layer" in words.next_step(one)
-    write_report(one, None, tmp_path)
+    write_report(one, curves, tmp_path)
     page = (tmp_path / "report.html").read_text()
     assert "vd-train teacher --hand dclaw3 --hand-layer identified-all-fingers.usda" in page
     assert "--hand-layer identified.usda --out DIR" in page, (
@@ -181,7 +181,7 @@ def test_of_one_recorded_finger_the_layer_of_all_is_to_be_trained_with(report, t
 
 
 @pytest.mark.parametrize("told", [True, False])
-def test_torques_of_a_bare_servo_are_said_to_be_relative(report, tmp_path, told):
+def test_torques_of_a_bare_servo_are_said_to_be_relative(report, curves, tmp_path, told):
     source = dataclasses.replace(report.recording, model="servo", relative_torques=told)
-    write_report(dataclasses.replace(report, recording=source), None, tmp_path)
+    write_report(dataclasses.replace(report, recording=source), curves, tmp_path)
     assert ("Torques are relative" in (tmp_path / "report.html").read_text()) == told

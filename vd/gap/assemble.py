@@ -152,11 +152,10 @@ def _errors(joint: Analysed, predictions: Predictions) -> Errors:
     squares = np.array([np.sum(piece**2, axis=0) for piece in pieces])
     absolutes = np.array([np.sum(np.abs(piece), axis=0) for piece in pieces])
     for model, fit in enumerate((joint.explanation.baseline, joint.explanation.final)):
-        for place, index in enumerate(spec.trajectories):
+        absolute = np.full(len(fit.held_out), np.nan) if fit.held_out_abs is None else fit.held_out_abs
+        for index, *sums in zip(spec.trajectories, fit.held_out, absolute, strict=True):
             if index in own:
-                squares[own.index(index), model] = fit.held_out[place]
-                unknown = fit.held_out_abs is None
-                absolutes[own.index(index), model] = np.nan if unknown else fit.held_out_abs[place]
+                squares[own.index(index), model], absolutes[own.index(index), model] = sums
     count = np.array([len(piece) for piece in pieces], float)
     return Errors(tuple(own), np.concatenate(pieces), count, squares, absolutes)
 
@@ -273,7 +272,7 @@ def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
 
 def _sets(joints: Sequence[Analysed]) -> tuple[tuple[str, ...], ...]:
     """Sets of effects not told apart, each once."""
-    sets = {}
+    sets: dict[frozenset[str], tuple[str, ...]] = {}
     for accepted in (one for joint in joints for one in joint.found):
         if (accepted.tied and not accepted.named) or accepted.equivalent:
             members = (accepted.name, *accepted.equivalent, *accepted.tied)

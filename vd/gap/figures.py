@@ -14,7 +14,7 @@ OVERLAYS = 3
 """Joint and trajectory pairs of which curves are drawn."""
 WINDOW_S = 6.0
 """Longest piece of a trajectory that is drawn; the eye cannot follow more at the width of a page."""
-STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
+STYLE = {"axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
 
 
 def gap_figure(report: Report) -> Figure:

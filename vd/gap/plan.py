@@ -98,49 +98,40 @@ def plan(
     Raises:
         ValueError: The recording has no joint with a model to compare.
     """
-    targets = _targets(report)
+    targets, menu = _targets(report), _menu(recording, hand)
     noise = {one.joint: max(one.noise_floor_rad, one.identified_rmse_rad) for one in report.joints}
-    menu = _menu(recording, hand)
-    motions: dict[str, list[Excitation]] = {}
-    found: dict[str, list[float]] = {}
-    competing: dict[str, list[tuple[str, ...]]] = {}
+    found: dict[str, list[float]] = {name: [] for name in menu}
+    competing: dict[str, tuple[tuple[str, ...], ...]] = {}
     for chain in chains(recording, hand):
         base = _base(chain, report, start or {})
         for joint in (name for name in chain.joints if name in targets):
-            own = {name: [m for m in every if m.joints == (joint,)] for name, every in menu.items()}
-            for name, new in own.items():
-                motions.setdefault(name, []).extend(new)
+            own = {name: [m for m in motions if m.joints == (joint,)] for name, motions in menu.items()}
             for group in targets[joint]:
                 models = _models(report, chain, joint, base, group)
-                competing.setdefault(joint, []).append(tuple(models))
-                values_of = _compare(chain, recording, own, joint, models, noise[joint], device)
-                for name, values in values_of.items():
-                    found.setdefault(name, []).extend(values)
-    if not found:
-        raise ValueError(
-            f"{recording.path}: no joint has a fitted model to plan from; run vd-gap explain first"
+                competing[joint] = (*competing.get(joint, ()), tuple(models))
+                values = _compare(chain, recording, own, joint, models, noise[joint], device)
+                found = {name: [*known, *values[name]] for name, known in found.items()}
+    if not competing:
+        raise ValueError(f"{recording.path}: no joint has a fitted model; run vd-gap explain first")
+    motions = {name: [m for m in every if m.joints[0] in competing] for name, every in menu.items()}
+    scores = [
+        Score(
+            name,
+            disagreement=float(np.sqrt(np.expm1(np.mean(np.log1p(np.square(values)))))),
+            told=sum(value > VISIBLE for value in values),
+            pairs=len(values),
+            seconds=sum(motion.duration for motion in motions[name]),
         )
-    total = max(map(len, found.values()))
-    ranking = sorted(
-        (
-            Score(
-                name,
-                disagreement=float(np.sqrt(np.expm1(np.mean(np.log1p(np.square(values)))))),
-                told=sum(value > VISIBLE for value in values),
-                pairs=total,
-                seconds=sum(motion.duration for motion in motions[name]),
-            )
-            for name, values in found.items()
-        ),
-        key=lambda score: -score.disagreement,
-    )
+        for name, values in found.items()
+    ]
+    best, *others = sorted(scores, key=lambda score: -score.disagreement)
     return Plan(
         model=recording.model,
         joints=recording.joints,
-        competing={joint: tuple(groups) for joint, groups in competing.items()},
-        ranking=tuple(ranking),
-        motions=tuple(motions[ranking[0].name]),
-        sentence=_sentence(ranking[0], report, tuple(competing)),
+        competing=competing,
+        ranking=(best, *others),
+        motions=tuple(motions[best.name]),
+        sentence=_sentence(best, report, tuple(competing)),
     )
 
 
@@ -291,8 +282,9 @@ def _compare(
         for number, motion in enumerate(itertools.chain(*menu.values()))
     ]
     everything = replace(recording, trajectories=(*known, *imagined))
-    # Rivals differ by less than a delay of the fit's own step.
-    rollouts = Rollouts(chain, everything, dt=STEP_S / FINER[-1], device=device)
+    # Rivals of a set differ by less than a delay of the fit's own step.
+    step = STEP_S if PLAIN in models else STEP_S / FINER[-1]
+    rollouts = Rollouts(chain, everything, dt=step, device=device)
     of = np.array(owner)[rollouts.sample_trajectory]
     varied = [_varied(chain, rows, index) for rows in models.values()]
     predicted = rollouts.predict(np.concatenate(varied))[:, :, index].astype(float) / noise
@@ -388,8 +380,9 @@ def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
     if best.pairs > 1:
         shows = f"{best.told} of {best.pairs} pairs of possible models differ by more than the noise"
     return (
-        f"Record {best.name} on {joints_text(joints)} ({best.seconds:.0f} s) {goal}: there {shows}. "
-        f"The commands are in {PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
+        f"Record the motions {best.name} on {joints_text(joints)} ({best.seconds:.0f} s) {goal}: "
+        f"there {shows}. The commands are in {PLAN_FOLDER}/; add what was measured to the recording and run "
+        "vd-gap again."
     )
 
 

@@ -30,12 +30,12 @@ _DECISIONS = {"named": "accepted: ", "tied": "", "rejected": "rejected: "}
 Row = tuple[str, ...]
 
 
-def write_report(report: Report, curves: Predictions | None, folder: Path) -> list[Path]:
+def write_report(report: Report, curves: Predictions, folder: Path) -> list[Path]:
     """Write ``report.json``, ``report.html`` and the figures.
 
     Args:
         report: What was found.
-        curves: Curves of the overlays; None leaves them out.
+        curves: What the figures draw.
         folder: Folder to write to.
 
     Returns:
@@ -43,31 +43,32 @@ def write_report(report: Report, curves: Predictions | None, folder: Path) -> li
     """
     for path in (path for pattern in FIGURES for path in Path(folder).glob(pattern)):
         path.unlink()
-    report.write(folder / REPORT_JSON)
+    files = [folder / REPORT_HTML, folder / REPORT_JSON]
+    report.write(files[1])
+
+    def draw(name: str, figure: Figure) -> Path:
+        files.append(folder / f"{name}.png")
+        with atomic_path(files[-1]) as temporary:
+            figure.savefig(temporary, dpi=FIGURE_DPI)
+        return files[-1]
+
+    overlays, residuals = [], {}
     with mpl.rc_context(figures.STYLE):
-        chosen = figures.chosen_overlays(report, curves) if curves else []
-        gap = _picture(folder / "gap.png", figures.gap_figure(report))
-        overlays = [
-            (
-                _picture(
-                    folder / f"overlay_{joint}_{Path(curves.files[index]).stem}.png",
-                    figures.overlay_figure(report, curves, joint, index),
-                ),
-                f"{joint} in {curves.files[index]}",
-            )
-            for joint, index in chosen
-        ]
-        residuals = [
-            (
-                _picture(folder / f"residual_{joint}.png", figures.residual_figure(report, curves, joint)),
-                joint,
-            )
-            for joint in dict.fromkeys(joint for joint, _ in chosen)
-        ]
-    evidence = sorted(
-        report.evidence, key=lambda row: (*_round(row), -row.gain if row.gain == row.gain else math.inf)
-    )
-    won = {_round(row) for row in evidence if row.decision == "named"}
+        gap = draw("gap", figures.gap_figure(report))
+        for joint, index in figures.chosen_overlays(report, curves):
+            file = curves.files[index]
+            overlay = figures.overlay_figure(report, curves, joint, index)
+            overlays.append((draw(f"overlay_{joint}_{Path(file).stem}", overlay), f"{joint} in {file}"))
+            if joint not in residuals:
+                residual = figures.residual_figure(report, curves, joint)
+                residuals[joint] = draw(f"residual_{joint}", residual)
+    evidence = sorted(report.evidence, key=lambda r: (r.joints, r.round, math.isnan(r.gain), -r.gain))
+    rivals = {((one.joint,), name) for one in report.joints for group in one.open_sets for name in group}
+    kept = [
+        _evidence_row(row)[:-1]
+        for row in evidence
+        if row.decision == "named" or (row.decision == "tied" and (row.joints, row.name) in rivals)
+    ]
     write_html(
         folder / REPORT_HTML,
         "gap.html",
@@ -83,32 +84,18 @@ def write_report(report: Report, curves: Predictions | None, folder: Path) -> li
             for one in report.trajectories
         ],
         evidence=[_evidence_row(row) for row in evidence],
-        kept=[
-            _evidence_row(row)[:-1] for row in evidence if _round(row) in won and row.decision != "rejected"
-        ],
+        kept=kept,
         not_fitted=[plain(name) for name in EFFECTS if name not in {row.name for row in evidence}],
         parameters=[*_parameters(report.effects), *_parameters(report.provisional, " (not named)")],
         alternatives=[
-            (
-                plain(effect.name),
-                plain(one.name),
-                mrad(one.held_out_rmse_rad),
-                words.mrad_range(one.difference_ci95),
-            )
+            (effect.name, other.name, mrad(other.held_out_rmse_rad), words.mrad_range(other.difference_ci95))
             for effect in report.effects
-            for one in effect.alternatives
+            for other in effect.alternatives
         ],
         model=_model(report),
         glossary=[(plain(name), effect.meaning) for name, effect in EFFECTS.items()],
     )
-    return [folder / REPORT_HTML, folder / REPORT_JSON, gap, *(path for path, _ in (*overlays, *residuals))]
-
-
-def _picture(path: Path, figure: Figure) -> Path:
-    """Write a figure as a PNG file, whose bytes the page embeds."""
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=FIGURE_DPI)
-    return path
+    return files
 
 
 def _headline(report: Report) -> list[Row]:
@@ -127,10 +114,6 @@ def _headline(report: Report) -> list[Row]:
         tiles.append((mrad(held.identified_rmse_rad), "gap after", note))
     floor = mrad(report.noise_floor_rad)
     return [*tiles, (floor, "noise floor", "what no model can explain: resolution, repeatability")]
-
-
-def _round(row: Candidate) -> tuple[tuple[str, ...], int]:
-    return row.joints, row.round
 
 
 def _evidence_row(row: Candidate) -> Row:
