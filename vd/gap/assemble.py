@@ -266,7 +266,6 @@ def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
         alternatives=tuple(
             Alternative(*other) for other in max(every, key=lambda accepted: accepted.confidence).alternatives
         ),
-        at_bound=any(accepted.at_bound for accepted in every),
     )
 
 

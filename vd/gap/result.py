@@ -67,8 +67,6 @@ class NamedEffect:
     """Share of bootstrap repetitions, choice included, that name it."""
     parameters: dict[str, Estimate]
     alternatives: tuple[Alternative, ...] = ()
-    at_bound: bool = False
-    """A parameter ended at its bound, so that its value is no estimate."""
 
 
 @dataclass(frozen=True)
