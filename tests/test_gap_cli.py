@@ -16,7 +16,7 @@ from vd.assets_usd.hand_layer import read_bare_layer
 from vd.gap import cli, steps
 from vd.gap.chain import chains
 from vd.gap.close import simulate_again, write_identified
-from vd.gap.plan import discard_plan, plan, write_plan
+from vd.gap.plan import Rival, disagreement, discard_plan, plan, write_plan
 from vd.gap.recording import read_recording
 from vd.gap.result import Candidate, Report
 from vd.kernels.servo import actuators
@@ -241,6 +241,31 @@ def test_plan_counts_the_pairs_of_every_set_that_a_motion_tells_apart(recording)
     told = [score.told for score in result.ranking]
     assert told[0] > 0
     assert f"{told[0]} of 2 pairs" in result.sentence
+
+
+def test_disagreement_is_what_no_change_of_the_parameters_takes_away():
+    """Against one least-squares problem of both models' parameters, bounded by prior and recording."""
+    rng = np.random.default_rng(0)
+    seen, new = np.arange(50) < 30, np.arange(50) >= 30
+    measured, rivals, rows = rng.normal(size=50), [], []
+    for parameters in (2, 3):
+        curves = rng.normal(size=(1 + parameters, 50))
+        rivals.append(Rival.of(curves, measured, seen, 4))
+        slopes = curves[1:] - curves[0]
+        prior = np.concatenate([np.eye(parameters), np.sqrt(4 / 30) * slopes[:, seen].T])
+        target = np.concatenate([np.zeros(parameters), np.sqrt(4 / 30) * (measured - curves[0])[seen]])
+        best = np.linalg.lstsq(prior, target, rcond=None)[0]
+        np.testing.assert_allclose(rivals[-1].curve, curves[0] + best @ slopes, atol=1e-12)
+        rows.append((prior, slopes[:, new].T / np.sqrt(20)))
+    apart = (rivals[1].curve - rivals[0].curve)[new] / np.sqrt(20)
+    (first, one), (second, other) = rows
+    system = np.block(
+        [[first, np.zeros((len(first), 3))], [np.zeros((len(second), 2)), second], [one, -other]]
+    )
+    target = np.concatenate([np.zeros(len(first) + len(second)), apart])
+    left = target - system @ np.linalg.lstsq(system, target, rcond=None)[0]
+    assert disagreement(*rivals, new) == pytest.approx(np.linalg.norm(left))
+    assert disagreement(rivals[0], rivals[0], new) == 0.0
 
 
 def test_plan_for_motions_that_show_too_little(recording):

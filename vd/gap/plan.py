@@ -368,7 +368,7 @@ def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
     """What to record, and what it would show."""
     sets = report.open_sets
     between = f" between {causes(sets[0], 'and')}" if len(sets) == 1 else ""
-    if not best.told:
+    if best.disagreement < VISIBLE:
         return (
             f"No motion of the menu would decide{between}: on all of them the models in question differ by "
             f"less than {VISIBLE:g} times the noise, so either serves in simulation. To decide, record "
