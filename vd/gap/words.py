@@ -145,7 +145,7 @@ def next_step(report: Report) -> str:
     if report.verdict == "no_gap":
         return "Nothing to do. Use the identified baseline; record other motions only if the task needs them."
     if report.verdict != "effects":
-        return "Record the same joints with other motions; vd-gap plan proposes which."
+        return "The curves show when the model fails. Other motions may show why: vd-gap plan proposes which."
     layer = training_layer(report)
     use = "identified.usda has the servo's model, with every effect by name."
     if report.hand is not None:
