@@ -50,21 +50,6 @@ class Analysed:
         return self.explanation.accepted if answers else ()
 
 
-@dataclass(frozen=True, eq=False)
-class Errors:
-    """Errors of one joint in what was analysed of each trajectory that moves it, S in all."""
-
-    trajectories: tuple[int, ...]
-    residuals: np.ndarray
-    """Measured minus simulated with everything fitted [K, 2] [rad]; columns are baseline and identified."""
-    count: np.ndarray
-    """Samples [S]."""
-    squares: np.ndarray
-    """Sums of squared errors [S, 2] by models that have not seen the trajectory [rad^2]."""
-    absolutes: np.ndarray
-    """Sums of their absolute errors [S, 2] [rad]."""
-
-
 def curves(
     recording: Recording, problems: Problems, models: Sequence[tuple[str, JointSpec, np.ndarray]]
 ) -> np.ndarray:
@@ -105,17 +90,19 @@ def assemble(
     after = curves(recording, problems, [(j.name, j.spec, j.explanation.final.rows) for j in joints])
     predictions = Predictions.of(recording, before, after)
     rng = np.random.default_rng(seed)
-    errors = {j.name: _errors(j, predictions) for j in joints}
+    residuals = {j.name: _residuals(j, predictions) for j in joints}
+    rows = {j.name: _errors(j, residuals[j.name], recording) for j in joints}
+    every = [row for j in joints for row in rows[j.name]]
     verdicts = [j.explanation.verdict for j in joints]
     report = Report(
         verdict=next((v for v in get_args(Verdict) if v in verdicts), "no_gap"),
         noise_floor_rad=float(np.sqrt(np.mean([j.spec.floor**2 for j in joints]))),
-        baseline=_fit(joints, errors, 0),
+        baseline=_fit(joints, residuals, 0),
         findings=tuple(findings),
         effects=_pool(joints, named=True),
         ambiguous=_sets(joints),
-        identified=_fit(joints, errors, 1),
-        held_out=_held_out(predictions.files, list(errors.values()), rng),
+        identified=_fit(joints, residuals, 1),
+        held_out=_held_out(predictions.files, every, rng),
         next_experiment="",
         seconds=seconds,
         recording=Source(
@@ -128,44 +115,58 @@ def assemble(
             servo=str(recording.servo.get("model", "")),
         ),
         provisional=_pool(joints, named=False),
-        joints=tuple(_gap(j, errors[j.name], rng) for j in joints),
+        joints=tuple(_gap(j, rows[j.name], rng) for j in joints),
         evidence=tuple(c for j in joints for c in _evidence(j)),
-        trajectories=tuple(e for j in joints for e in _trajectories(recording, j.name, errors[j.name])),
+        trajectories=tuple(every),
         rollouts=simulated,
         seed=seed,
     )
     return report, predictions
 
 
-def _errors(joint: Analysed, predictions: Predictions) -> Errors:
-    """Held-out errors where the trajectory was in a fold, errors of the full fit where it was in no fit."""
+def _residuals(joint: Analysed, predictions: Predictions) -> dict[int, np.ndarray]:
+    """Measured minus simulated in what was analysed of each trajectory that moves a joint.
+
+    Returns:
+        By trajectory, shape [samples, 2] [rad]: of baseline and identified model, everything fitted.
+    """
     spec, column = joint.spec, predictions.joints.index(joint.name)
     models = np.stack([predictions.baseline[:, column], predictions.identified[:, column]], axis=1)
-    residuals = predictions.measured[:, column, None] - models
     parts = dict(zip(spec.trajectories, spec.pieces, strict=True)) if spec.pieces else {}
-    own, pieces = [], []
+    result = {}
     for index in range(len(predictions.files)):
-        rows = predictions.trajectory == index
+        rows = np.flatnonzero(predictions.trajectory == index)
         if np.ptp(predictions.command[rows, column]) > 0.0:
-            own.append(index)
-            pieces.append(residuals[rows][slice(*parts.get(index, (None,)))])
-    squares = np.array([np.sum(piece**2, axis=0) for piece in pieces])
-    absolutes = np.array([np.sum(np.abs(piece), axis=0) for piece in pieces])
-    for model, fit in enumerate((joint.explanation.baseline, joint.explanation.final)):
-        absolute = np.full(len(fit.held_out), np.nan) if fit.held_out_abs is None else fit.held_out_abs
-        for index, *sums in zip(spec.trajectories, fit.held_out, absolute, strict=True):
-            if index in own:
-                squares[own.index(index), model], absolutes[own.index(index), model] = sums
-    count = np.array([len(piece) for piece in pieces], float)
-    return Errors(tuple(own), np.concatenate(pieces), count, squares, absolutes)
+            rows = rows[slice(*parts.get(index, (None,)))]
+            result[index] = predictions.measured[rows, column, None] - models[rows]
+    return result
 
 
-def _fit(joints: Sequence[Analysed], errors: dict[str, Errors], model: int) -> Fit:
+def _errors(joint: Analysed, residuals: dict[int, np.ndarray], recording: Recording) -> list[TrajectoryError]:
+    """Held-out errors where the trajectory was in a fold, errors of the full fit where it was in no fit."""
+    fits, result = (joint.explanation.baseline, joint.explanation.final), []
+    for index, left in residuals.items():
+        squares, absolutes = (left**2).mean(axis=0), np.abs(left).mean(axis=0)
+        if index in joint.spec.trajectories:
+            place = joint.spec.trajectories.index(index)
+            squares = np.array([fit.held_out[place] for fit in fits]) / len(left)
+            sums = [np.nan if fit.held_out_abs is None else fit.held_out_abs[place] for fit in fits]
+            absolutes = np.array(sums) / len(left)
+        part, (old, new), (old_abs, new_abs) = recording.trajectories[index], np.sqrt(squares), absolutes
+        errors = float(old), float(new), float(old_abs), float(new_abs)
+        result.append(
+            TrajectoryError(part.file, part.excitation, joint.name, True, *errors, samples=len(left))
+        )
+    return result
+
+
+def _fit(joints: Sequence[Analysed], residuals: dict[str, dict[int, np.ndarray]], model: int) -> Fit:
     """Errors on everything analysed, and the baseline's parameters, of one of the two models."""
-    everything = np.concatenate([errors[j.name].residuals[:, model] for j in joints])
+    left = {name: np.concatenate([*of.values()])[:, model] for name, of in residuals.items()}
+    everything = np.concatenate([*left.values()])
     return Fit(
         rmse_rad=float(np.sqrt(np.mean(everything**2))),
-        per_joint={j.name: float(np.sqrt(np.mean(errors[j.name].residuals[:, model] ** 2))) for j in joints},
+        per_joint={name: float(np.sqrt(np.mean(of**2))) for name, of in left.items()},
         mae_rad=float(np.mean(np.abs(everything))),
         parameters={j.name: _baseline_values(j, model) for j in joints},
     )
@@ -181,28 +182,34 @@ def _baseline_values(joint: Analysed, model: int) -> dict[str, float]:
     return {name: float(row[BASELINE_PARAMETERS[name].column]) for name in names}
 
 
-def _held_out(files: Sequence[str], errors: Sequence[Errors], rng: np.random.Generator) -> HeldOut:
+def _sums(rows: Sequence[TrajectoryError]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Samples, and sums of squared errors of both models, of each trajectory [S]."""
+    count = np.array([row.samples for row in rows], float)
+    before, after = np.array([(row.baseline_rmse_rad, row.identified_rmse_rad) for row in rows]).T
+    return count, count * before**2, count * after**2
+
+
+def _held_out(files: Sequence[str], rows: Sequence[TrajectoryError], rng: np.random.Generator) -> HeldOut:
     """Errors before and after, over trajectories of all joints."""
-    count = np.concatenate([e.count for e in errors])
-    old, new = np.concatenate([e.squares for e in errors]).T
+    count, old, new = _sums(rows)
     weights = resamples(len(count), rng)
     samples = 1.0 - rmse(new, count, weights) / np.maximum(rmse(old, count, weights), 1e-30)
     before, after = float(rmse(old, count)), float(rmse(new, count))
-    means = np.concatenate([e.absolutes for e in errors]).sum(axis=0) / count.sum()
+    used = {row.file for row in rows}
     return HeldOut(
-        trajectories=tuple(files[i] for i in sorted({i for e in errors for i in e.trajectories})),
+        trajectories=tuple(file for file in files if file in used),
         baseline_rmse_rad=before,
         identified_rmse_rad=after,
         reduction=1.0 - after / max(before, 1e-30),
         ci95=interval(samples),
-        baseline_mae_rad=float(means[0]),
-        identified_mae_rad=float(means[1]),
+        baseline_mae_rad=float(np.average([row.baseline_mae_rad for row in rows], weights=count)),
+        identified_mae_rad=float(np.average([row.identified_mae_rad for row in rows], weights=count)),
     )
 
 
-def _gap(joint: Analysed, errors: Errors, rng: np.random.Generator) -> JointGap:
-    weights = resamples(len(errors.count), rng)
-    (old, new), count = errors.squares.T, errors.count
+def _gap(joint: Analysed, rows: Sequence[TrajectoryError], rng: np.random.Generator) -> JointGap:
+    count, old, new = _sums(rows)
+    weights = resamples(len(count), rng)
     return JointGap(
         joint=joint.name,
         noise_floor_rad=joint.spec.floor,
@@ -300,11 +307,3 @@ def _evidence(joint: Analysed) -> list[Candidate]:
         )
         for trial in joint.explanation.trials
     ]
-
-
-def _trajectories(recording: Recording, joint: str, errors: Errors) -> list[TrajectoryError]:
-    roots = np.sqrt(errors.squares / errors.count[:, None])
-    means = errors.absolutes / errors.count[:, None]
-    rows = zip(errors.trajectories, roots.tolist(), means.tolist(), strict=True)
-    parts = recording.trajectories
-    return [TrajectoryError(parts[i].file, parts[i].excitation, joint, True, *r, *m) for i, r, m in rows]

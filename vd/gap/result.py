@@ -161,6 +161,8 @@ class TrajectoryError:
     identified_rmse_rad: float
     baseline_mae_rad: float = math.nan
     identified_mae_rad: float = math.nan
+    samples: int = 0
+    """That were analysed."""
 
 
 @dataclass(frozen=True)
