@@ -380,7 +380,7 @@ def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
     if best.pairs > 1:
         shows = f"{best.told} of {best.pairs} pairs of possible models differ by more than the noise"
     return (
-        f"Record the motions {best.name} on {joints_text(joints)} ({best.seconds:.0f} s) {goal}: "
+        f"Record the motions {best.name} on {joints_text(joints)}, {best.seconds:.0f} s, {goal}: "
         f"there {shows}. The commands are in {PLAN_FOLDER}/; add what was measured to the recording and run "
         "vd-gap again."
     )

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from vd.files import atomic_path
 from vd.gap import figures, words
-from vd.gap.result import UNITS, Candidate, NamedEffect, Predictions, Report, parameters_of
+from vd.gap.result import UNITS, Candidate, JointGap, NamedEffect, Predictions, Report, parameters_of
 from vd.gap.words import amount, mrad, percent, plain
 from vd.kernels.servo.effects import EFFECTS
 from vd.page import FIGURE_DPI, write_html
@@ -62,7 +62,11 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> list[Path
             if joint not in residuals:
                 residual = figures.residual_figure(report, curves, joint)
                 residuals[joint] = draw(f"residual_{joint}", residual)
-    evidence = sorted(report.evidence, key=lambda r: (r.joints, r.round, math.isnan(r.gain), -r.gain))
+    joints = [one.joint for one in report.joints]
+    evidence = sorted(
+        report.evidence,
+        key=lambda r: (joints.index(r.joints[0]), r.round, math.isnan(r.gain), -r.gain),
+    )
     rivals = {((one.joint,), name) for one in report.joints for group in one.open_sets for name in group}
     kept = [
         _evidence_row(row)[:-1]
@@ -75,7 +79,7 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> list[Path
         report=report,
         words=words,
         headline=_headline(report),
-        joints=[(one.joint, _VERDICTS[one.verdict].lower(), plain(one.reason)) for one in report.joints],
+        joints=[_joint_row(report, one) for one in report.joints],
         gap=gap,
         overlays=overlays,
         residuals=residuals,
@@ -114,6 +118,11 @@ def _headline(report: Report) -> list[Row]:
         tiles.append((mrad(held.identified_rmse_rad), "gap after", note))
     floor = mrad(report.noise_floor_rad)
     return [*tiles, (floor, "noise floor", "what no model can explain: resolution, repeatability")]
+
+
+def _joint_row(report: Report, one: JointGap) -> Row:
+    where = [f.where.removeprefix(f"{one.joint}: ") for f in report.findings if f.joint == one.joint]
+    return one.joint, "; ".join(where) or "nothing", _VERDICTS[one.verdict].lower(), plain(one.reason)
 
 
 def _evidence_row(row: Candidate) -> Row:

@@ -274,7 +274,7 @@ class Report:
             absent = {name: None for name in _OPTIONAL if values.get(name) is None}
             return from_dict(Report, {**known, **absent}).validate()
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path}: not a report of vd-gap ({error})") from error
+            raise ValueError(f"{path}: no report of this vd-gap ({error}); run it again") from error
 
     @property
     def open_sets(self) -> tuple[tuple[str, ...], ...]:
