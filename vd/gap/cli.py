@@ -2,9 +2,8 @@
 
 import json
 import sys
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -20,8 +19,6 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
 
-SILENT_S = 10.0
-"""Longest time without a line while something is simulated [s]."""
 OK, UNUSABLE = 0, 2
 """Exit statuses: a verdict was reached, something else is wrong, the recording cannot be used."""
 
@@ -214,10 +211,10 @@ class Hide:
 
 @dataclass(frozen=True)
 class Identify:
-    """The paper's identification alone: the drives of a hand, searched for in Newton, without any effect.
+    """The paper's identification alone: CMA-ES over the drives of each finger of a hand, without any effect.
 
-    CMA-ES over stiffness, damping and velocity limit, a search for each finger and every motion of every
-    candidate simulated at once. vd-gap run needs none of it: it finds the same drives, and what they lack.
+    Every motion of every candidate is simulated at once. vd-gap run needs none of it: it finds the same
+    drives, and what they lack.
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
@@ -231,7 +228,7 @@ class Identify:
     generations: int = 100
     """Generations of the search."""
     population: int = 64
-    """Candidates of a generation; times the motions of a finger: the worlds."""
+    """Candidates of a generation."""
     rate: float = 480.0
     """Physics steps a second; training has 120, a quarter of the work."""
     seed: int = 0
@@ -243,8 +240,6 @@ class Identify:
 
     def run(self) -> int:
         """Search, and write the layer."""
-        import dataclasses
-
         from vd.gap.recording import read_recording
 
         recording = read_recording(self.recording)
@@ -257,24 +252,9 @@ class Identify:
         if hand is None:
             raise ValueError(f"{self.recording}: a bare {recording.model} is no hand; use vd-gap run")
 
-        print(
-            f"identify: {self.generations} generations of {self.population} candidates, every motion of each "
-            "in Newton; the first also compiles",
-            file=sys.stderr,
-            flush=True,
-        )
-
-        told = time.monotonic()
-
-        def working(share: float) -> None:
-            nonlocal told
-            if time.monotonic() - told > SILENT_S:
-                told = time.monotonic()
-                print(f"  {100.0 * share:.0f} % of a generation", file=sys.stderr, flush=True)
-
-        def show(generation: int, best: dict[str, float]) -> None:
-            errors = ", ".join(f"{finger} {1e3 * error:.2f} mrad" for finger, error in best.items())
-            print(f"generation {generation}/{self.generations}: {errors}", file=sys.stderr, flush=True)
+        def show(generation: int, finger: str, best: float) -> None:
+            line = f"{finger}: generation {generation}/{self.generations}: {1e3 * best:.2f} mrad"
+            print(line, file=sys.stderr, flush=True)
 
         found = identify(
             recording,
@@ -285,19 +265,16 @@ class Identify:
             device=resolve_device(self.device),
             seed=self.seed,
             progress=show,
-            working=working,
         )
         write_drives(found, self.out, hand, recording, every_finger=self.every_finger)
         if self.json:
-            values = {name: getattr(found, name).tolist() for name in ("kp", "kd", "velocity_limit")}
-            print(json.dumps({**dataclasses.asdict(found), **values}, indent=1))
+            print(json.dumps(asdict(found), indent=1))
             return OK
-        for i, joint in enumerate(found.joints):
-            print(
-                f"{joint}: {found.kp[i]:.3g} N m/rad, {found.kd[i]:.3g} N m s/rad, at most "
-                f"{found.velocity_limit[i]:.3g} rad/s"
-            )
-        print(f"{found.rollouts} motions simulated, {found.rollouts_per_second:.0f} a second\n{self.out}")
+        for joint, kp, kd, limit in zip(*list(asdict(found).values())[:4], strict=True):
+            print(f"{joint}: {kp:.3g} N m/rad, {kd:.3g} N m s/rad, at most {limit:.3g} rad/s")
+        print(
+            f"{found.rollouts} motions simulated, {found.rollouts / found.seconds:.0f} a second\n{self.out}"
+        )
         return OK
 
 

@@ -5,12 +5,12 @@ it takes the same path, in no time, to where it was ended.
 """
 
 import hashlib
+import json
 import pickle
 import shutil
-from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -28,46 +28,23 @@ MADE_OF = {
 """What a result consists of, by module: a file from elsewhere can make nothing else, and run nothing."""
 
 
-class Digest(Protocol):
-    """A hash that is fed."""
-
-    def update(self, data: bytes, /) -> None:
-        """Feed it."""
-
-
 def digest_of(*values: Any) -> str:
     """A hash of values, the same for equal ones in any process.
 
     Raises:
         TypeError: A value, or one inside, is of another kind than what calls and their results are.
     """
-    digest = hashlib.sha256()
-    _feed(digest, values)
-    return digest.hexdigest()
+    return hashlib.sha256(json.dumps(values, default=_plain, sort_keys=True).encode()).hexdigest()
 
 
-def _feed(digest: Digest, value: Any) -> None:
+def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        digest.update(f"array {value.dtype.str} {value.shape} ".encode())
-        digest.update(np.ascontiguousarray(value).tobytes())
-    elif isinstance(value, Mapping):
-        digest.update(f"mapping {len(value)} ".encode())
-        for key in sorted(value):
-            _feed(digest, key)
-            _feed(digest, value[key])
-    elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        digest.update(f"sequence {len(value)} ".encode())
-        for each in value:
-            _feed(digest, each)
-    elif is_dataclass(value):
-        digest.update(f"{type(value).__name__} ".encode())
-        for field in fields(value):
-            _feed(digest, getattr(value, field.name))
-    elif value is None or isinstance(value, str | int | float | np.integer | np.floating):
-        plain = value.item() if isinstance(value, np.generic) else value
-        digest.update(f"{plain!r} ".encode())
-    else:
-        raise TypeError(f"a {type(value).__name__} has no digest")
+        return [value.dtype.str, value.shape, np.ascontiguousarray(value).tobytes().hex()]
+    if is_dataclass(value):
+        return [type(value).__name__, *(getattr(value, field.name) for field in fields(value))]
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a {type(value).__name__} has no digest")
 
 
 class FitCache:

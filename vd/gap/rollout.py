@@ -17,7 +17,7 @@ import warp as wp
 
 from vd.gap.chain import Chain, load_of
 from vd.gap.launch_batch import LaunchBatch
-from vd.gap.recording import Recording
+from vd.gap.recording import Recording, Trajectory
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.chain_bodies import links_of_size, room_for
 from vd.kernels.servo.chains import Samples, rollout_kernel
@@ -57,6 +57,11 @@ def links_of(
         setattr(links, name, type(getattr(links, name))(*rows.ravel().tolist()))
     links.gravity = wp.vec3(*np.asarray(gravity, float).tolist())
     return links
+
+
+def random_stream(trajectory: Trajectory) -> int:
+    """The stream of a trajectory's random delays."""
+    return zlib.crc32(trajectory.file.encode()) & ((1 << STREAM_BITS) - 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +130,7 @@ class Rollouts:
         self._count = np.array(counts, np.int32)
         self._steps = np.array([(t.time[-1] - t.time[0]) / dt for t in trajectories])
         self._first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int32)
-        self._stream = np.array(
-            [zlib.crc32(t.file.encode()) & ((1 << STREAM_BITS) - 1) for t in trajectories], np.int32
-        )
+        self._stream = np.array([random_stream(t) for t in trajectories], np.int32)
         self.time = np.concatenate([t.time for t in trajectories])
         self.measured = np.concatenate([t.position[:, chain.columns] for t in trajectories])
         self.sample_trajectory = np.repeat(np.arange(len(trajectories)), counts)

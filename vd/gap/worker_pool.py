@@ -1,15 +1,14 @@
 """Who fits: worker processes that each hold the recording, or on a GPU threads that simulate together."""
 
 import copy
-import multiprocessing
 import os
 import threading
-import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import get_context
 from typing import Any
 
 from vd.gap.chain import Chain
@@ -19,14 +18,10 @@ from vd.gap.jitter import CALLS
 from vd.gap.launch_batch import LaunchBatch
 from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
-from vd.interrupt import end_with_parent
 from vd.warp_quiet import quiet_warp
+from vd.workers import begin_worker, end_worker
 
 Call = tuple[str, dict[str, Any]]
-SHORT_S = 0.1
-"""Kinds of calls that took less in all are not worth a word."""
-THREADS = 128
-"""Calls side by side on a GPU: more than the candidates of all joints of a hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +45,6 @@ class JointSpec:
     floor: float
     baseline: tuple[str, ...]
     pieces: tuple[tuple[int, int], ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class Made:
-    """What a call returned, how many trajectories it simulated, and how long it took [s]."""
-
-    result: Any
-    simulated: int
-    seconds: float
 
 
 class Problems:
@@ -107,16 +93,18 @@ class Problems:
             )
         return self._problems[key]
 
-    def call(self, spec: JointSpec, call: Call) -> Made:
-        """Run a method of the problem, its samples weighted if its arguments say how."""
+    def call(self, spec: JointSpec, call: Call) -> tuple[Any, int]:
+        """The result of a method of the problem, its samples weighted if its arguments say how.
+
+        Also how many trajectories were simulated for it.
+        """
         name, options = call[0], dict(call[1])
         weighting, problem = options.pop("weighting", None), self.of(spec)
         # Calls side by side count, and change the time step.
         problem = copy.copy(problem) if weighting is None else problem.weighted(weighting)
-        problem.simulated, begin = 0, time.perf_counter()
+        problem.simulated = 0
         method = partial(CALLS[name], problem) if name in CALLS else getattr(problem, name)
-        result = method(**options)
-        return Made(result, problem.simulated, time.perf_counter() - begin)
+        return method(**options), problem.simulated
 
 
 _problems: Problems | None = None
@@ -125,12 +113,12 @@ _problems: Problems | None = None
 
 def _start(problems: Problems, parent: int) -> None:
     global _problems
-    end_with_parent(parent)
+    begin_worker(parent)
     quiet_warp()
     _problems = problems
 
 
-def _work(spec: JointSpec, call: Call) -> Made:
+def _work(spec: JointSpec, call: Call) -> tuple[Any, int]:
     assert _problems is not None
     return _problems.call(spec, call)
 
@@ -145,73 +133,56 @@ class WorkerPool:
 
     Attributes:
         simulated: Trajectories simulated so far.
-        spent: Trajectories simulated and time taken [s], summed over workers, by kind of call.
     """
 
     def __init__(self, problems: Problems, workers: int, cache: FitCache | None = None):
         self.problems, self.workers = problems, workers
         self.cache = FitCache() if cache is None else cache
         self.simulated = 0
-        self.spent: dict[str, tuple[int, float]] = {}
         self._lock = threading.Lock()
-        self._executor: Executor | None = None
+        self._processes: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> "WorkerPool":
-        if self.problems.batch is not None:
-            self._executor = ThreadPoolExecutor(THREADS)
-        elif self.workers > 1:
-            # Not forked: Warp and its threads may be running.
-            context = multiprocessing.get_context("spawn")
-            self._executor = ProcessPoolExecutor(
+        if self.problems.batch is None and self.workers > 1:
+            context = get_context("spawn")  # Warp and its threads may be running
+            self._processes = ProcessPoolExecutor(
                 self.workers, mp_context=context, initializer=_start, initargs=(self.problems, os.getpid())
             )
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._executor is not None:
-            self._executor.shutdown(cancel_futures=True)
-
-    @property
-    def summary(self) -> str:
-        """Where the time went, in words."""
-        parts = sorted(self.spent.items(), key=lambda item: -item[1][1])
-        times = [f"{name} {seconds:.1f} s ({rolls})" for name, (rolls, seconds) in parts if seconds > SHORT_S]
-        summed = f"; summed over workers: {', '.join(times)}" if times else ""
-        return f"{self.simulated} motions simulated{summed}"
+        if self._processes is not None:
+            end_worker(self._processes)
 
     def run(self, spec: JointSpec, calls: Sequence[Call]) -> list[Any]:
-        """Results of the calls, in order; of a call that was made before, the same. For several threads."""
+        """Results of the calls, in order; of a call that was made before, the same. For several threads.
+
+        Raises:
+            ChildProcessError: A worker process was killed.
+        """
         # Searches that meet ask for the same fits.
         keys = [digest_of(spec.chain, spec.joint, call) for call in calls]
         with self._lock:
             new = {key: call for key, call in zip(keys, calls, strict=True) if key not in self.cache}
         made = dict(zip(new, self._made(spec, list(new.values())), strict=True))
         with self._lock:
-            for key, one in made.items():
-                name = new[key][0]
-                rollouts, seconds = self.spent.get(name, (0, 0.0))
-                self.spent[name] = rollouts + one.simulated, seconds + one.seconds
-                self.simulated += one.simulated
-                self.cache.add(key, one.result)
+            for key, (result, simulated) in made.items():
+                self.simulated += simulated
+                self.cache.add(key, result)
             return [self.cache[key] for key in keys]
 
-    def _made(self, spec: JointSpec, calls: Sequence[Call]) -> list[Made]:
-        """Run calls.
-
-        Raises:
-            ChildProcessError: A worker process was killed.
-        """
-        if self._executor is None:
-            with self._lock:
-                return [self.problems.call(spec, call) for call in calls]
+    def _made(self, spec: JointSpec, calls: Sequence[Call]) -> list[tuple[Any, int]]:
         batch = self.problems.batch
         if batch is not None:
             with self._lock:
                 self.problems.of(spec)  # made once, before threads ask for it
             batch.join(len(calls))
-        work = _work if batch is None else self._together
+            return parallel(partial(self._together, spec), calls)
+        if self._processes is None:
+            with self._lock:
+                return [self.problems.call(spec, call) for call in calls]
         try:
-            waiting: list[Future] = [self._executor.submit(work, spec, call) for call in calls]
+            waiting = [self._processes.submit(_work, spec, call) for call in calls]
             return [future.result() for future in waiting]
         except BrokenProcessPool as error:
             raise ChildProcessError(
@@ -219,7 +190,7 @@ class WorkerPool:
                 "give fewer processors (taskset), and run the same command again, which goes on with its step"
             ) from error
 
-    def _together(self, spec: JointSpec, call: Call) -> Made:
+    def _together(self, spec: JointSpec, call: Call) -> tuple[Any, int]:
         """Run a call in one of the threads that simulate together."""
         assert self.problems.batch is not None
         try:
