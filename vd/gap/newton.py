@@ -5,6 +5,7 @@ Every world replays one trajectory with one set of parameters. Contacts are off;
 
 import dataclasses
 import math
+import zlib
 from typing import Any
 
 import mujoco
@@ -13,8 +14,8 @@ import numpy as np
 import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
-from vd.gap.recording import Recording
-from vd.gap.rollout import STEP_S, random_stream
+from vd.gap.recording import Recording, Trajectory
+from vd.gap.rollout import STEP_S, STREAM_BITS
 from vd.kernels.launch import count_kernel, launch
 from vd.kernels.servo.actuators import BACKLASH_WIDTH, ENCODER_BIAS
 from vd.kernels.servo.chains import Samples
@@ -58,6 +59,11 @@ def simulate_hand(
     answers = np.concatenate([positions[:, k, :length] for k, length in enumerate(lengths)], axis=1)
     answers = answers[..., [hand.joint_names.index(name) for name in recording.joints]]
     return answers[0] if rows.ndim == 2 else answers
+
+
+def random_stream(trajectory: Trajectory) -> int:
+    """The stream of a trajectory's random delays, the same as in the rollouts."""
+    return zlib.crc32(trajectory.file.encode()) & ((1 << STREAM_BITS) - 1)
 
 
 class _Replay:

@@ -1,4 +1,4 @@
-"""Who fits: worker processes that each hold the recording, or on a GPU threads that simulate together."""
+"""Who fits: worker processes that each hold the recording."""
 
 import copy
 import os
@@ -13,9 +13,7 @@ from typing import Any
 
 from vd.gap.chain import Chain
 from vd.gap.fit import JointProblem
-from vd.gap.fit_cache import FitCache, digest_of
 from vd.gap.jitter import CALLS
-from vd.gap.launch_batch import LaunchBatch
 from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
 from vd.warp_quiet import quiet_warp
@@ -55,19 +53,10 @@ class Problems:
         chains: Its chains.
         dt: Time step of the rollouts [s].
         device: Warp device.
-        batch: Threads whose simulations are made together.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        chains: Sequence[Chain],
-        dt: float,
-        device: str,
-        batch: LaunchBatch | None = None,
-    ):
+    def __init__(self, recording: Recording, chains: Sequence[Chain], dt: float, device: str):
         self.recording, self.chains, self.dt, self.device = recording, chains, dt, device
-        self.batch = batch
         self._rollouts: dict[tuple[int, int | None], Rollouts] = {}
         self._problems: dict[tuple[int, int], JointProblem] = {}
 
@@ -80,9 +69,7 @@ class Problems:
             if shared not in self._rollouts:
                 parts = dict(zip(spec.trajectories, spec.pieces, strict=bool(spec.pieces)))
                 recording, chain = self.recording.cut(parts), self.chains[spec.chain]
-                self._rollouts[shared] = Rollouts(
-                    chain, recording, dt=self.dt, device=self.device, batch=self.batch
-                )
+                self._rollouts[shared] = Rollouts(chain, recording, dt=self.dt, device=self.device)
             self._problems[key] = JointProblem(
                 self._rollouts[shared],
                 spec.joint,
@@ -124,26 +111,24 @@ def _work(spec: JointSpec, call: Call) -> tuple[Any, int]:
 
 
 class WorkerPool:
-    """Runs calls in worker processes, on a GPU in threads, or one by one with ``workers`` below 2.
+    """Runs calls in worker processes, or one by one with ``workers`` below 2.
 
     Args:
         problems: The problems.
         workers: Processes.
-        cache: Results of calls that were made before, and where new ones go.
 
     Attributes:
         simulated: Trajectories simulated so far.
     """
 
-    def __init__(self, problems: Problems, workers: int, cache: FitCache | None = None):
+    def __init__(self, problems: Problems, workers: int):
         self.problems, self.workers = problems, workers
-        self.cache = FitCache() if cache is None else cache
         self.simulated = 0
         self._lock = threading.Lock()
         self._processes: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> "WorkerPool":
-        if self.problems.batch is None and self.workers > 1:
+        if self.workers > 1:
             context = get_context("spawn")  # Warp and its threads may be running
             self._processes = ProcessPoolExecutor(
                 self.workers, mp_context=context, initializer=_start, initargs=(self.problems, os.getpid())
@@ -155,48 +140,26 @@ class WorkerPool:
             end_worker(self._processes)
 
     def run(self, spec: JointSpec, calls: Sequence[Call]) -> list[Any]:
-        """Results of the calls, in order; of a call that was made before, the same. For several threads.
+        """Results of the calls, in order. For several threads.
 
         Raises:
             ChildProcessError: A worker process was killed.
         """
-        # Searches that meet ask for the same fits.
-        keys = [digest_of(spec.chain, spec.joint, call) for call in calls]
-        with self._lock:
-            new = {key: call for key, call in zip(keys, calls, strict=True) if key not in self.cache}
-        made = dict(zip(new, self._made(spec, list(new.values())), strict=True))
-        with self._lock:
-            for key, (result, simulated) in made.items():
-                self.simulated += simulated
-                self.cache.add(key, result)
-            return [self.cache[key] for key in keys]
-
-    def _made(self, spec: JointSpec, calls: Sequence[Call]) -> list[tuple[Any, int]]:
-        batch = self.problems.batch
-        if batch is not None:
-            with self._lock:
-                self.problems.of(spec)  # made once, before threads ask for it
-            batch.join(len(calls))
-            return parallel(partial(self._together, spec), calls)
         if self._processes is None:
             with self._lock:
-                return [self.problems.call(spec, call) for call in calls]
-        try:
-            waiting = [self._processes.submit(_work, spec, call) for call in calls]
-            return [future.result() for future in waiting]
-        except BrokenProcessPool as error:
-            raise ChildProcessError(
-                f"one of {self.workers} processes was killed, most often since memory ran out: free some, or "
-                "give fewer processors (taskset), and run the same command again, which goes on with its step"
-            ) from error
-
-    def _together(self, spec: JointSpec, call: Call) -> tuple[Any, int]:
-        """Run a call in one of the threads that simulate together."""
-        assert self.problems.batch is not None
-        try:
-            return self.problems.call(spec, call)
-        finally:
-            self.problems.batch.leave()
+                made = [self.problems.call(spec, call) for call in calls]
+        else:
+            try:
+                waiting = [self._processes.submit(_work, spec, call) for call in calls]
+                made = [future.result() for future in waiting]
+            except BrokenProcessPool as error:
+                raise ChildProcessError(
+                    f"one of {self.workers} processes was killed, most often since memory ran out: free "
+                    "some, or give fewer processors (taskset), and run the same command again"
+                ) from error
+        with self._lock:
+            self.simulated += sum(simulated for _, simulated in made)
+        return [result for result, _ in made]
 
 
 def parallel(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:

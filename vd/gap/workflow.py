@@ -1,15 +1,13 @@
 """Find and explain a gap: from a recording to a :class:`vd.gap.result.Report` without a closing.
 
 ``find`` identifies the baseline and says where it fails (``DIR/find.json``); ``explain`` selects the
-effects (``DIR/explain.json``, ``DIR/predictions.npz``). With a key, a step that was interrupted goes on from
-the fits that it had made under that key.
+effects (``DIR/explain.json``, ``DIR/predictions.npz``).
 """
 
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,9 +22,7 @@ from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.design import design, pieces
 from vd.gap.explain import POLISH_ITERATIONS, REFITS, Explainer, Joint, Progress
 from vd.gap.find import findings
-from vd.gap.fit_cache import FOLDER, FitCache
 from vd.gap.joints import explain_joints
-from vd.gap.launch_batch import LaunchBatch
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S
@@ -56,8 +52,6 @@ class Options:
         workers: Processes; the machine's cores by default, one on a GPU.
         start: Parameter rows [PARAMETER_COLUMNS] of joints by name, of an identified model to start from:
             its effects are part of the baseline, and what is named comes on top.
-        key: Of all that the fits depend on, under which they are kept while a step runs; without, they
-            are not.
         progress: Called with lines of progress.
     """
 
@@ -66,7 +60,6 @@ class Options:
     device: str = "cpu"
     workers: int | None = None
     start: Mapping[str, np.ndarray] = field(default_factory=dict)
-    key: str = ""
     progress: Progress = lambda line: None
 
     def __post_init__(self) -> None:
@@ -92,7 +85,7 @@ def find(recording: Recording | Path, hand: HandModel | None, out: Path, **optio
         ValueError: An unknown effect, or a recording that is not of this hand.
     """
     chosen, begin = Options(**options), time.perf_counter()
-    with _workers(recording, hand, Path(out), chosen) as pool:
+    with _workers(recording, hand, chosen) as pool:
         recording = pool.problems.recording
         joints = _identify(pool, _specs(recording, pool.problems.chains), chosen)
         predicted = curves(recording, pool.problems, [(j.name, j.spec, j.fit.rows) for j in joints])
@@ -132,7 +125,7 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
         find(recording, hand, out, **options)
     known = json.loads((out / "find.json").read_text())
     begin = time.perf_counter()
-    with _workers(recording, hand, out, chosen) as pool:
+    with _workers(recording, hand, chosen) as pool:
         recording = pool.problems.recording
         joints = _resume(pool, _specs(recording, pool.problems.chains), known["joints"])
         explained = explain_joints(Explainer(pool, joints, chosen.effects, chosen.seed, chosen.progress))
@@ -157,21 +150,13 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
     return report
 
 
-@contextmanager
-def _workers(
-    recording: Recording | Path, hand: HandModel | None, out: Path, options: Options
-) -> Iterator[WorkerPool]:
-    """Who fits; what they found is kept until what comes of it is written."""
+def _workers(recording: Recording | Path, hand: HandModel | None, options: Options) -> WorkerPool:
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
     length = sum(float(t.time[-1]) for t in recording.trajectories)
     dt = LONG_STEP_S if length > LONG_S else STEP_S
     parts = [_started(chain, options.start) for chain in chains(recording, hand)]
-    batch = None if options.device == "cpu" else LaunchBatch()
-    workers = options.workers or (len(os.sched_getaffinity(0)) if batch is None else 1)
-    cache = FitCache(out / FOLDER if options.key else None, options.key)
-    with WorkerPool(Problems(recording, parts, dt, options.device, batch), workers, cache) as pool:
-        yield pool
-    cache.forget()
+    cores = len(os.sched_getaffinity(0)) if options.device == "cpu" else 1
+    return WorkerPool(Problems(recording, parts, dt, options.device), options.workers or cores)
 
 
 def _started(chain: Chain, start: Mapping[str, np.ndarray]) -> Chain:
@@ -221,10 +206,8 @@ def _identify(pool: WorkerPool, specs: Sequence[JointSpec], options: Options) ->
         nominal = {key: float(rows[spec.joint, BASELINE_PARAMETERS[key].column]) for key in spec.baseline}
         starts += [nominal, {**nominal, "velocity_limit": SPEED_STARTS[0] * scales.speed}]
         joint = _fitted(pool, spec, searched, scales, starts=starts, iterations=BASELINE_ITERATIONS)
-        floor = 1e3 * spec.floor
-        options.progress(
-            f"find: {joint.name}: baseline {1e3 * joint.fit.rmse:.2f} mrad, noise floor {floor:.2f}"
-        )
+        error, floor = 1e3 * joint.fit.rmse, 1e3 * spec.floor
+        options.progress(f"find: {joint.name}: baseline {error:.2f} mrad, noise floor {floor:.2f}")
         return joint
 
     def again(joint: Joint) -> Joint:
