@@ -18,7 +18,7 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import make_folder, write_json
-from vd.gap.recording import BARE_MODELS, Recording, read_recording
+from vd.gap.recording import BARE_MODELS, Recording, model_path, read_recording
 from vd.gap.result import LAYER, Closing, Predictions, Report
 from vd.versions import installed_versions
 
@@ -44,7 +44,6 @@ _DOES = {
 METHOD = 11
 """Of the analysis; what another one made is made again."""
 STEPS = tuple(OUTPUTS)
-USD_SUFFIXES = (".usd", ".usda", ".usdc")
 _PACKAGES = ("visual-dexterity", "warp-lang", "newton", "cma", "numpy")
 
 
@@ -122,7 +121,7 @@ class Analysis:
             return named
         if model in BARE_MODELS:
             return None
-        return str(self.recording.path / model) if model.endswith(USD_SUFFIXES) else model
+        return model_path(self.recording.path, model)
 
     @cached_property
     def hand(self) -> "HandModel | None":
@@ -132,7 +131,7 @@ class Analysis:
         from vd.assets_usd.hands import load_hand, root_name
 
         hand, model = load_hand(self.hand_name, layer=self.settings.hand_layer), self.recording.model
-        model = root_name(str(self.recording.path / model) if model.endswith(USD_SUFFIXES) else model)
+        model = root_name(model_path(self.recording.path, model))
         if model != hand.name:
             raise ValueError(
                 f"{self.recording.path} is of {model}, not of {hand.name}; name the hand that was recorded"
