@@ -125,7 +125,12 @@ def torque_power(key: str) -> int:
     unit = next((p.unit for p in EFFECTS[effect].parameters if p.name == name), "") if effect else ""
     if unit == "1/(N m)":
         return -1
-    return int("N m" in unit or "kg" in unit)
+    return int(of_torque(unit))
+
+
+def of_torque(unit: str) -> bool:
+    """Whether a unit is of torque, or of what torques are divided by: a stiffness, an inertia."""
+    return "N m" in unit or "kg" in unit
 
 
 def keys(effects: Sequence[str], baseline: Sequence[str]) -> list[str]:

@@ -83,7 +83,7 @@ def identify(
         moved = [j for j, n in enumerate(chain.joints) if any(n in t.joints for t in recording.trajectories)]
         if not parts:
             continue
-        finger = chain.joints[0].partition("_")[0]
+        finger = chain.name
         rollouts = Rollouts(chain, recording, dt=dt, device=device)
         measured = rollouts.measured[np.isin(rollouts.sample_trajectory, parts)]
         places = np.ix_(range(population), moved, [p.column for p in SEARCHED])

@@ -269,10 +269,8 @@ def _find(analysis: Analysis) -> None:
 
 def _explain(analysis: Analysis) -> None:
     from vd.gap import workflow
-    from vd.gap.torque_unit import in_known_unit
 
     workflow.explain(analysis.recording, analysis.hand, analysis.out, **analysis.options())
-    in_known_unit(analysis.explained(), analysis.recording).write(analysis.out / EXPLAIN)
 
 
 def _close(analysis: Analysis) -> None:
