@@ -118,12 +118,6 @@ class JointProblem:
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
         self._growth: dict[int, np.ndarray] = {}
 
-    def finer(self) -> "JointProblem":
-        """The same data simulated with the step at which estimates are finished; slopes as before."""
-        fine = copy.copy(self)
-        fine.coarse, fine.rollouts = self.rollouts, self.rollouts.at(self.rollouts.dt / FINER[-1])
-        return fine
-
     def weighted(self, weighting: SampleWeighting) -> "JointProblem":
         """The same data, samples weighted by how surely they are known."""
         seen = copy.copy(self)

@@ -11,7 +11,6 @@ from vd.gap.evidence import CANCELLING, JITTER, LEVELS, MIN_GAIN, explains
 from vd.gap.explain import REFITS, Explained, Explainer, Joint, beside, weighting_of
 from vd.gap.explanation import NAMED, Explanation, estimates, intervals, polished
 from vd.gap.joint_fit import JointFit
-from vd.gap.masses import masses_alone, masses_beside, widened
 from vd.gap.worker_pool import WorkerPool, parallel
 
 OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}
@@ -139,20 +138,11 @@ def explain_joints(explainer: Explainer) -> list[Explanation]:
         explainer: Explains one.
     """
     pool, joints = explainer.pool, explainer.joints
-    masses = masses_alone(pool, joints)
-
-    def one(joint: Joint, explained: Explained) -> Explanation:
-        if joint.spec.chain not in masses:
-            return explainer.explain(joint, explained)
-        text = f"the plain model is within the noise floor {masses[joint.spec.chain].text}"
-        explainer.progress(f"explain: {joint.name}: no_gap: {text}")
-        return Explanation(joint.fit, joint.fit, "no_gap", text)
-
     floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))
-    alone = _in_turn(joints, one)
+    alone = _in_turn(joints, explainer.explain)
     ends = [partial(_finished, pool, list(zip(joints, alone, strict=True)), joint) for joint in joints]
     shared = share(alone, floors, fingers, ends)
-    return doubted(_consistent(pool, joints, masses_beside(pool, joints, shared)), fingers)
+    return doubted(_consistent(pool, joints, shared), fingers)
 
 
 def _finished(pool: WorkerPool, known: Explained, joint: Joint, fit: JointFit) -> JointFit:
@@ -203,9 +193,6 @@ def _consistent(
             return own
         rows[joint.spec.joint] = own.final.rows[joint.spec.joint]
         call = {"fit": replace(own.final, rows=rows), "scales": joint.scales, **weighting_of(own)}
-        fit = pool.run(joint.spec, [("refine", call)])[0]
-        if own.final.extents:
-            fit = widened(fit, joint.spec.floor, own.final.extents)
-        return polished(own, fit, joint.spec.floor)
+        return polished(own, pool.run(joint.spec, [("refine", call)])[0], joint.spec.floor)
 
     return parallel(again, range(len(joints)))

@@ -63,7 +63,8 @@ def read_recording(path: str | Path) -> Recording:
         f"{file}: 'encoder_resolution_rad' is {resolution!r}, {counts:.3g} counts a turn, as if in degrees; "
         "give the size of one encoder count in rad, e.g. 0.001534 for 4096 counts a turn",
     )
-    servo, entries = header.get("servo", {}), header.get("trajectories")
+    servo: Any = header.get("servo", {})
+    entries: Any = header.get("trajectories")
     require(isinstance(servo, dict), f"{file}: 'servo' is {servo!r}; make it an object")
     _check_stiffness(file, servo.get(STIFFNESS), joints)
     require(
@@ -194,7 +195,7 @@ def model_path(folder: Path, model: str) -> str:
 
 def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...]) -> Trajectory:
     where = f"{file}: trajectories[{number}]"
-    name = entry.get("file") if isinstance(entry, dict) else None
+    name: Any = entry.get("file") if isinstance(entry, dict) else None
     require(isinstance(name, str), f"{where}: no 'file'; name the CSV file of the trajectory")
     inside = not Path(name).is_absolute() and ".." not in Path(name).parts
     require(inside, f"{where}: 'file' is {name!r}; keep it in the recording's folder")

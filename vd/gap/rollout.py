@@ -3,7 +3,6 @@
 Chains: :mod:`vd.gap.chain`. Physics: :mod:`vd.kernels.servo.chains`.
 """
 
-import copy
 import itertools
 import threading
 import zlib
@@ -118,13 +117,6 @@ class Rollouts:
             if dt not in self._finer:
                 self._finer[dt] = Rollouts(self.chain, self.recording, dt=dt, device=self.device)
             return self._finer[dt]
-
-    def with_chain(self, chain: Chain) -> "Rollouts":
-        """The same motions of a chain with other links; joints and columns are the same."""
-        other = copy.copy(self)
-        other.chain, other._finer, other._recent = chain, {}, {}
-        other.__dict__.pop("_links", None)
-        return other
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the device's arrays behind: another process makes its own."""
