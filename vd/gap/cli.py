@@ -19,8 +19,8 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
 
-OK, UNUSABLE = 0, 2
-"""Exit statuses: a verdict was reached, something else is wrong, the recording cannot be used."""
+UNUSABLE = 2
+"""Exit status where the recording cannot be used."""
 
 RecordingPath = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
 
@@ -81,7 +81,7 @@ class Run(_Step):
     """Find, explain, close and report: the whole analysis of a recording.
 
     Writes DIR/report.html (one page for people), report.json, identified.usda (the identified model, for
-    --hand-layer) and the figures. An interrupted run goes on where it stopped. The exit status is 0 for
+    --hand-layer) and the figures. An interrupted run goes on with its step. The exit status is 0 for
     every verdict and 2 for a recording that cannot be used.
     """
 
@@ -102,7 +102,7 @@ class _OneStep(_Step):
         analysis.run(self.name, first=self.name, fresh=self.fresh)
         path = analysis.out / f"{self.name}.json"
         print(path.read_text() if self.json else path)
-        return OK
+        return 0
 
 
 class Find(_OneStep):
@@ -157,7 +157,7 @@ class Plan(_Step):
             print(path.read_text())
         else:
             print(f"{result.sentence}\n{path}")
-        return OK
+        return 0
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ class Hide:
             print(json.dumps(hidden.truth, indent=1))
         else:
             print(f"{self.out}: {len(hidden.recording.trajectories)} motions\n{truth_path(self.out)}")
-        return OK
+        return 0
 
 
 @dataclass(frozen=True)
@@ -269,13 +269,13 @@ class Identify:
         write_drives(found, self.out, hand, recording, every_finger=self.every_finger)
         if self.json:
             print(json.dumps(asdict(found), indent=1))
-            return OK
+            return 0
         for joint, kp, kd, limit in zip(*list(asdict(found).values())[:4], strict=True):
             print(f"{joint}: {kp:.3g} N m/rad, {kd:.3g} N m s/rad, at most {limit:.3g} rad/s")
         print(
             f"{found.rollouts} motions simulated, {found.rollouts / found.seconds:.0f} a second\n{self.out}"
         )
-        return OK
+        return 0
 
 
 Command = (
@@ -317,7 +317,7 @@ def _print_report(analysis: "Analysis", as_json: bool) -> int:
     path = analysis.out / "report.json"
     if as_json:
         print(path.read_text())
-        return OK
+        return 0
     report = Contents.read(path)
     print(verdict_sentence(report))
     for finding in report.findings:
@@ -328,7 +328,7 @@ def _print_report(analysis: "Analysis", as_json: bool) -> int:
     for line in report.warnings:
         print(f"  note: {line}")
     print(f"\n{analysis.out / 'report.html'}\n{path}")
-    return OK
+    return 0
 
 
 def _effects(text: str) -> tuple[str, ...]:

@@ -17,8 +17,9 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
+from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.chain import Chain, chains, relative_torques
-from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
+from vd.gap.coordinates import BASELINE_PARAMETERS, FREE_SPEED, Scales
 from vd.gap.design import design, pieces
 from vd.gap.explain import POLISH_ITERATIONS, REFITS, Explainer, Joint, Progress
 from vd.gap.find import findings
@@ -32,12 +33,7 @@ from vd.kernels.servo.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"
 CMA_GENERATIONS = 20
-BASELINE_ITERATIONS = 15
-LONG_STEP_S = 1.0 / 240.0
-"""Time step [s] for recordings so long that the usual step would take minutes a joint."""
-LONG_S = 600.0
-"""Total motion [s] above which a recording counts as long."""
-SPEED_STARTS = (1.05, 3.0)
+SPEED_STARTS = (1.05, FREE_SPEED)
 """Starts of the velocity limit, in largest speeds seen: one that binds, one that does not."""
 
 
@@ -85,9 +81,10 @@ def find(recording: Recording | Path, hand: HandModel | None, out: Path, **optio
         ValueError: An unknown effect, or a recording that is not of this hand.
     """
     chosen, begin = Options(**options), time.perf_counter()
-    with _workers(recording, hand, chosen) as pool:
+    pool, specs = _workers(recording, hand, chosen)
+    with pool:
         recording = pool.problems.recording
-        joints = _identify(pool, _specs(recording, pool.problems.chains), chosen)
+        joints = _identify(pool, specs, chosen)
         predicted = curves(recording, pool.problems, [(j.name, j.spec, j.fit.rows) for j in joints])
         found = findings(recording, predicted, {j.name: j.spec.floor for j in joints})
         value = {
@@ -125,9 +122,10 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
         find(recording, hand, out, **options)
     known = json.loads((out / "find.json").read_text())
     begin = time.perf_counter()
-    with _workers(recording, hand, chosen) as pool:
+    pool, specs = _workers(recording, hand, chosen)
+    with pool:
         recording = pool.problems.recording
-        joints = _resume(pool, _specs(recording, pool.problems.chains), known["joints"])
+        joints = _resume(pool, specs, known["joints"])
         explained = explain_joints(Explainer(pool, joints, chosen.effects, chosen.seed, chosen.progress))
         analysed = [
             Analysed(j.name, j.spec, replace(e, baseline=j.fit), j.scales)
@@ -152,13 +150,17 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
     return report
 
 
-def _workers(recording: Recording | Path, hand: HandModel | None, options: Options) -> WorkerPool:
+def _workers(
+    recording: Recording | Path, hand: HandModel | None, options: Options
+) -> tuple[WorkerPool, list[JointSpec]]:
+    """Who fits, and the problems of all excited joints."""
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
-    length = sum(float(t.time[-1]) for t in recording.trajectories)
-    dt = LONG_STEP_S if length > LONG_S else STEP_S
     parts = [_started(chain, options.start) for chain in chains(recording, hand)]
+    specs = _specs(recording, parts)
+    # A recording so long that pieces of it are analysed would take minutes a joint with the usual step.
+    dt = STEP_S * (2.0 if any(spec.pieces for spec in specs) else 1.0)
     cores = len(os.sched_getaffinity(0)) if options.device == "cpu" else 1
-    return WorkerPool(Problems(recording, parts, dt, options.device), options.workers or cores)
+    return WorkerPool(Problems(recording, parts, dt, options.device), options.workers or cores), specs
 
 
 def _started(chain: Chain, start: Mapping[str, np.ndarray]) -> Chain:
@@ -207,7 +209,7 @@ def _identify(pool: WorkerPool, specs: Sequence[JointSpec], options: Options) ->
         # A short search can end where the inertia is too small to show, from where no descent comes back.
         nominal = {key: float(rows[spec.joint, BASELINE_PARAMETERS[key].column]) for key in spec.baseline}
         starts += [nominal, {**nominal, "velocity_limit": SPEED_STARTS[0] * scales.speed}]
-        joint = _fitted(pool, spec, searched, scales, starts=starts, iterations=BASELINE_ITERATIONS)
+        joint = _fitted(pool, spec, searched, scales, starts=starts, iterations=FULL_ITERATIONS)
         error, floor = 1e3 * joint.fit.rmse, 1e3 * spec.floor
         options.progress(f"find: {joint.name}: baseline {error:.2f} mrad, noise floor {floor:.2f}")
         return joint
