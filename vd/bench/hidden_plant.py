@@ -16,8 +16,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from vd.bench.hidden_finger import Finger, FingerBody, slip
-from vd.bench.hidden_physics import TUNED, Physics
 
+STEP_S = 4.0e-4
+"""Time step [s]: five times finer than the fitted model's, second order where the motion is smooth."""
 FULL_DUTY_RAD = 1.2
 """Error at full P gain that asks for all of the supply [rad], as of a soft X-series servo."""
 PARTS = 8
@@ -36,6 +37,29 @@ OUTSIDE: dict[str, dict[str, float]] = {
 }
 """Effects that are not in the table, with typical sizes: torque ripple amplitude sin(n q); a cable that
 pulls back once its slack is used up; friction that falls as the joint warms over the session."""
+
+
+@dataclass(frozen=True)
+class Physics:
+    """How a plant obeys the same laws otherwise than the one that the analysis was tuned on (the default).
+
+    Attributes:
+        step_s: Time step [s].
+        presliding_rad: Travel over which dry friction builds up, as the teeth of a gear bend [rad]; 0: none.
+        noise_s: Correlation time of the reading's noise [s]; 0: white.
+        ripple_nm: Amplitude of a torque that the gears of every joint add [N m].
+        ripple_per_turn: Its periods in a radian of travel.
+    """
+
+    step_s: float = STEP_S
+    presliding_rad: float = 0.0
+    noise_s: float = 0.0
+    ripple_nm: float = 0.0
+    ripple_per_turn: float = 0.0
+
+
+TUNED = Physics()
+"""The plant that the rules of the search were tuned on."""
 
 
 @dataclass(frozen=True, eq=False)
