@@ -5,7 +5,7 @@ down as in the simulator.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -60,6 +60,8 @@ class Chain:
         baseline_free: Names of the parameters that the baseline fits.
         start_row: Nominal parameter rows, every effect off [n, PARAMETER_COLUMNS].
         slot: Place of each joint in its finger, which is its column of the coupling [n].
+        reference_p_gain: Largest ``p_gain`` of the recording, at which kp is identified; None without.
+        reference_load: A pendulum's load, at which inertia and gravity torque are identified, or None.
         bodies: Whether the links have mass; if not, each joint is its own inertia.
         axis: Unit joint axes in the base frame, all joints at zero, as all that follows [n, 3].
         offset: From the joint before (the base) to the joint [n, 3] [m].
@@ -70,8 +72,6 @@ class Chain:
         lower: Lower stops [n] [rad].
         upper: Upper stops [n] [rad].
         effort: Largest torques of the drives [n] [N m].
-        reference_p_gain: Largest ``p_gain`` of the recording, at which kp is identified; None without.
-        reference_load: A pendulum's load, at which inertia and gravity torque are identified, or None.
     """
 
     name: str
@@ -80,18 +80,18 @@ class Chain:
     baseline_free: tuple[str, ...]
     start_row: np.ndarray
     slot: np.ndarray
-    bodies: bool
-    axis: np.ndarray
-    offset: np.ndarray
-    mass: np.ndarray
-    com: np.ndarray
-    inertia: np.ndarray
-    gravity: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    effort: np.ndarray
     reference_p_gain: float | None
-    reference_load: Load | None
+    reference_load: Load | None = None
+    bodies: bool = False
+    axis: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    offset: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    mass: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    com: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    inertia: np.ndarray = field(default_factory=lambda: np.zeros((1, 3, 3)))
+    gravity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    lower: np.ndarray = field(default_factory=lambda: np.array([-FREE]))
+    upper: np.ndarray = field(default_factory=lambda: np.array([FREE]))
+    effort: np.ndarray = field(default_factory=lambda: np.array([FREE]))
 
     def inertia_scale(self, joint: int) -> float:
         """Inertia of the links about a joint with all joints at zero, without the drive's own [kg m^2]."""
@@ -170,16 +170,6 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
         baseline_free=tuple(free),
         start_row=row[None],
         slot=np.zeros(1, int),
-        bodies=False,
-        axis=np.zeros((1, 3)),
-        offset=np.zeros((1, 3)),
-        mass=np.zeros(1),
-        com=np.zeros((1, 3)),
-        inertia=np.zeros((1, 3, 3)),
-        gravity=np.zeros(3),
-        lower=np.array([-FREE]),
-        upper=np.array([FREE]),
-        effort=np.array([FREE]),
         reference_p_gain=p_gain,
         reference_load=load,
     )
@@ -229,7 +219,6 @@ def _finger(
         upper=hand.upper[joints],
         effort=hand.effort[joints],
         reference_p_gain=p_gain,
-        reference_load=None,
     )
 
 

@@ -99,8 +99,10 @@ class _OneStep(_Step):
     def run(self) -> int:
         """Run the step."""
         analysis = self.analysis()
-        analysis.run(self.name, first=self.name, fresh=self.fresh)
+        analysis.run(self.name, first=self.name, fresh=self.fresh or self.name == "report")
         path = analysis.out / f"{self.name}.json"
+        if self.name == "report":
+            return _print_report(analysis, self.json)
         print(path.read_text() if self.json else path)
         return 0
 
@@ -123,15 +125,10 @@ class Close(_OneStep):
     name = "close"
 
 
-@dataclass(frozen=True)
-class Report(_Step):
+class Report(_OneStep):
     """Write report.json, report.html and the figures from what the steps before have found."""
 
-    def run(self) -> int:
-        """Run the step."""
-        analysis = self.analysis()
-        analysis.run("report", first="report", fresh=True)
-        return _print_report(analysis, self.json)
+    name = "report"
 
 
 @dataclass(frozen=True)
