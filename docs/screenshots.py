@@ -4,6 +4,7 @@ It runs every command on a CPU and looks with a headless Chromium; minutes. Look
 commit it.
 """
 
+import json
 import shutil
 import subprocess
 import sys
@@ -27,25 +28,35 @@ FLAGS = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--hide-scrollbars",
-    "--window-size=1280,800",
+    "--disable-features=DisableLoadExtensionCommandLineSwitch",
 ]
+HIDDEN = {
+    "manifest_version": 3,
+    "name": "quiet",
+    "version": "1",
+    "content_scripts": [{"matches": ["http://127.0.0.1/*"], "css": ["quiet.css"]}],
+}
+"""An extension that hides viser's note of a browser without a GPU."""
 UNSEEN = "procedural-heldout-4-seed0"
-PAGES: dict[str, tuple[tuple[str, ...], str]] = {
-    "play": ((f"vd-play dclaw4-tracking --objects {UNSEEN} --device cpu --port {PORT}",), ""),
+PAGES: dict[str, tuple[tuple[str, ...], str, int]] = {
+    "play": ((f"vd-play dclaw4-tracking --objects {UNSEEN} --device cpu --port {PORT}",), "", 800),
     "eval": (
         (f"vd-eval dclaw4 dclaw4-cube --objects {UNSEEN} --episodes 6 --device cpu --out .",),
         "eval.html",
+        710,
     ),
     "gap": (
         ("vd-gap hide servo --effect backlash:width_rad=0.06 --out rec", "vd-gap run rec --out gap"),
         "gap/report.html",
+        738,
     ),
     "deploy": (
         ("vd-deploy --hand dclaw3 --twin --random-goals 2 --seed 1 --safety.misses 99 --log run",),
         "run/run.html",
+        780,
     ),
 }
-"""Of each picture the commands, and the page that they leave; the viewer is one itself."""
+"""Of each picture the commands, the page that they leave (the viewer is one itself), and its height."""
 LOOK_S, START_S = 60, 600.0
 """Time that the viewer is watched for [s]: its panel unfolds slowly; and the longest it takes to start."""
 
@@ -56,15 +67,21 @@ def main(names: list[str]) -> None:
     if browser is None:
         raise SystemExit("no browser found; install chromium")
     for name in names or PAGES:
-        commands, page = PAGES[name]
+        commands, page, height = PAGES[name]
         with TemporaryDirectory() as work:
             shot = Path(work) / "shot.png"
-            look = [browser, *FLAGS, f"--user-data-dir={work}/profile", f"--screenshot={shot}"]
+            quiet = Path(work) / "quiet"
+            quiet.mkdir()
+            (quiet / "manifest.json").write_text(json.dumps(HIDDEN))
+            (quiet / "quiet.css").write_text(".mantine-Notifications-root { display: none; }")
+            look = [browser, *FLAGS, f"--window-size=1280,{height}", f"--load-extension={quiet}"]
+            look += [f"--user-data-dir={work}/profile", f"--screenshot={shot}"]
             calls = [[str(BIN / command.split()[0]), *command.split()[1:]] for command in commands]
             if page:
                 for call in calls:
                     subprocess.run(call, cwd=work, check=True)
                 (file,) = Path(work).glob(page)
+                file.write_text(file.read_text().replace(" controls", ""))  # they lie over a film
                 subprocess.run([*look, file.as_uri()], check=True)
             else:
                 with subprocess.Popen(calls[0], cwd=work) as server:

@@ -28,6 +28,7 @@ LEAVES = ("vd.paper", "vd.files", "vd.interrupt", "vd.device")
 SHARED = (
     "vd.config",
     "vd.policy",
+    "vd.arrays",
     "vd.clouds",
     "vd.quaternions",
     "vd.senses",
@@ -55,11 +56,12 @@ ALLOWED: dict[str, tuple[str, ...]] = {
         "vd.assets_usd",
     ),
     "vd.sim": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim"),
+    "vd.arrays": (),
     "vd.clouds": (*LEAVES, "vd.kernels", "vd.assets_usd"),
-    "vd.quaternions": (),
-    "vd.senses": (),
+    "vd.quaternions": ("vd.arrays",),
+    "vd.senses": ("vd.arrays",),
     "vd.stopping": LEAVES,
-    "vd.frame_maps": ("vd.kernels", "vd.assets_usd", *DESCRIPTIONS),
+    "vd.frame_maps": ("vd.arrays", "vd.kernels", "vd.assets_usd", *DESCRIPTIONS),
     "vd.tracking": (
         *LEAVES,
         *SHARED,

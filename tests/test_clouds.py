@@ -27,7 +27,7 @@ def test_poses_and_points_are_those_of_the_hand(name, device):
     aligned = np.abs(np.sum(poses[:, links, 3:] * expected[..., 3:], axis=-1))
     np.testing.assert_allclose(aligned, 1.0, atol=1e-6)
     assert np.isnan(np.delete(poses, links, axis=1)).all()
-    points = cloud(body_q).cpu().numpy()
+    points = cloud(body_q).numpy()
     each = hand.link_points.shape[1]
     assert points.shape == (20, len(hand.point_link) * each, 3)
     for number, link in enumerate(hand.point_link):

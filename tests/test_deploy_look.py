@@ -1,5 +1,11 @@
 """A policy on a hand sees by the real camera's lens, from where calibration found it to be."""
 
+import os
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -10,14 +16,27 @@ from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop.policy_runner import load_runner, seen_points
+from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_policy, task_for
+from vd.sensors.depth_camera import DepthCamera
+from vd.train.cli import main
 
 SHIFT_M = 0.01
 
 
 LENS = Intrinsics(64, 36, 55.0, 55.0, 31.0, 19.0)
 """Another one than the training's."""
+WITHOUT_TORCH = """
+import pickle, sys
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.sets import load_set
+from vd.deploy.loop.policy_runner import load_runner
+name, told, file = sys.argv[1:]
+hand, item = load_hand("dclaw3"), load_set("cube")[0]
+runner = load_runner(name, "dclaw3", hand, item, object=told or None)
+print(pickle.dumps([runner.decide(state) for state in pickle.load(open(file, "rb"))]).hex())
+"""
 
 
 def test_installed_trackers_stop_by_rules_from_episodes_and_say_where_there_is_none():
@@ -53,7 +72,7 @@ def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
     image = np.full((36, 64), 0.6, dtype=np.float32)
 
     def middle():
-        points = seen_points(runner.eye, image)[0].numpy()
+        points = seen_points(runner.eye, image).numpy()[0]
         return points[np.isfinite(points).all(axis=1)]
 
     runner.look_by(LENS.seen_from(runner.camera))
@@ -70,3 +89,37 @@ def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
     runner.look_by(LENS.seen_from(read_camera(hand, tmp_path / "camera.usda")))
     # Sideways in the base is level: the crop by height keeps the same pixels.
     np.testing.assert_allclose(np.sort(middle()[:, 1]), np.sort(before[:, 1]) + SHIFT_M, atol=1e-5)
+
+
+def falling():
+    """What a hand senses of a cube that falls between moving fingers."""
+    plain = RandomisationCfg(enabled=False)
+    env = ReorientEnv(ReorientCfg(hand="dclaw3", num_envs=1, randomisation=plain), "cpu")
+    camera = DepthCamera.of_scene(env.scene, env.sim.body_q, frame_s=env.cfg.sim.control_dt)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        camera.capture()
+        yield replace(state_of(env), depth=camera.depth.numpy()[0].copy())
+        env.step(wp.array(rng.uniform(-1, 1, (1, env.num_actions)), dtype=float, device="cpu"))
+
+
+@pytest.mark.parametrize(("name", "told"), [("dclaw3-tracking", None), ("dclaw3", "cube")])
+def test_without_torch_decisions_are_those_of_torch(tmp_path, name, told):
+    pytest.importorskip("onnxruntime", reason="pip install 'visual-dexterity[export]'")
+    path, sensed, states = tmp_path / "policy.onnx", tmp_path / "states", list(falling())
+    assert main(["export", name, str(path)]) == 0
+    sensed.write_bytes(pickle.dumps(states))
+    runner = load_runner(name, "dclaw3", load_hand("dclaw3"), load_set("cube")[0], object=told)
+    (tmp_path / "torch.py").write_text("raise ModuleNotFoundError('torch is not here', name='torch')")
+    command = [sys.executable, "-c", WITHOUT_TORCH, str(path), told or "", str(sensed)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(tmp_path)}
+    )
+    assert done.returncode == 0, done.stderr
+    found = pickle.loads(bytes.fromhex(done.stdout.split()[-1]))
+    for state, there in zip(states, found, strict=True):
+        here = runner.decide(state)
+        np.testing.assert_allclose(there.action, here.action, atol=1e-3)
+        np.testing.assert_allclose(there.distance, here.distance, atol=1e-3)
+        if told is None:
+            np.testing.assert_allclose(there.found, here.found, atol=1e-3)

@@ -37,6 +37,7 @@ WRONG = {
     "vd-eval zero --hand dclaw9": "no hand is called 'dclaw9'",
     "vd-deploy --hand dclaw9 --twin": "no hand is called 'dclaw9'",
     "vd-deploy --hand dclaw3 --twin --object nosuchset": "no object set or path 'nosuchset'",
+    "vd-deploy zero --ros2 --random-goals 2": "--random-goals is in place of --ros2",
     "vd-train teacher --env.objects nosuchset": "no object set or path 'nosuchset'",
     "vd-train student --stage 1 --teacher nosuch": "no policy at nosuch",
 }

@@ -40,7 +40,10 @@ def env(request):
 
 @pytest.fixture
 def maps(env):
-    return FrameMaps(env.hand, replace(env.cfg.observation, dynamics="critic"))  # who is not asked here
+    def array(values, dtype):
+        return torch.tensor(values, dtype=getattr(torch, dtype))
+
+    return FrameMaps(env.hand, replace(env.cfg.observation, dynamics="critic"), array)  # who is not asked
 
 
 def test_views_are_chosen_seen_and_acted_in_as_in_the_simulator(env, maps):

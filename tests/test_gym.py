@@ -72,3 +72,8 @@ def test_widths_masks_devices_and_settings_that_cannot_be_are_refused():
         env.reset(options={"reset_mask": np.array([0, 1])})
     with pytest.raises(ValueError, match=r"actions are an array \(2, 9\) of wp.from_torch, not tensor"):
         env.unwrapped.env.step(torch.zeros(2, 9))
+    with pytest.raises(ValueError, match="actions are not finite"):
+        env.step(np.full((2, 9), np.nan))
+    env.close()
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="after close"):
+        env.step(np.zeros((2, 9)))

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from vd.arrays import library_on
 from vd.assets_usd.objects.geometry import mesh_volume, random_surface_points
 from vd.assets_usd.objects.model import SURFACE_POINTS
 from vd.assets_usd.objects.scans import surface_of_scan
@@ -69,7 +70,8 @@ def test_an_object_is_known_by_its_scan(device):
         # Where the scanner has been: nearer than the noise (4 mm along each axis) at most points.
         away = off(found.surface_points, (item.vertices, item.faces))
         assert np.median(away) < 0.003
-    found = Registration(known, world_object=np.arange(2), world_scale=np.ones(2), camera=None, device=device)
+    of = {"world_object": np.arange(2), "world_scale": np.ones(2), "library": library_on(device)}
+    found = Registration(known, **of, camera=None, device=device)
     assert (found._shapes.distance.numpy().min(axis=(1, 2, 3)) < 0.0).all()
     assert [len(turns) for turns in symmetries(known, device)] == [1] * 2, "noise makes nothing symmetric"
 

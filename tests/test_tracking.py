@@ -60,6 +60,7 @@ def observer_of(env: ReorientEnv) -> CameraObserver:
         camera=env.hand.camera,
         control_hz=env.cfg.sim.control_hz,
         device="cpu",
+        library=torch,
     )
 
 
@@ -305,5 +306,8 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
     save_checkpoint(tmp_path / "alignment.pt", alignment_export(state))
     assert vd_train([*flags, "--alignment", str(tmp_path / "alignment.pt")]) == 0
     assert read_policy(path).kind == "vision" and read_policy(path).spec.camera == camera
+    assert vd_train([*flags, "--alignment", "dclaw3-vision"]) == 0
+    assert read_policy(path).spec.alignment == read_policy(SHIPPED_POLICIES["dclaw3-vision"]).spec.alignment
+    assert vd_train([*flags, "--alignment", "dclaw3-tracking"]) == 1
     assert vd_train(["tracker", "dclaw3-tracking", *flags[2:]]) == 1
     assert "give a teacher" in capsys.readouterr().err

@@ -35,7 +35,7 @@ def test_poses_and_velocities_are_those_of_the_tree_of_links(name, seed):
     hand, rng = hand_named(name), np.random.default_rng(seed)
     joint_q, joint_qd = rng.uniform(hand.lower, hand.upper), rng.normal(size=hand.num_joints)
     state = (torch.tensor(values)[None] for values in (joint_q, joint_qd))
-    found = Fingertips(hand, dtype=torch.float64)(*state).numpy()
+    found = Fingertips(hand, torch.tensor)(*state).numpy()
     here, there = oracle(hand, joint_q), oracle(hand, joint_q + STEP_S * joint_qd)
     tips = zip(found.reshape(-1, FINGERTIP_VALUES), here, there, strict=True)
     for tip, (place, turn), (place_after, turn_after) in tips:
@@ -50,4 +50,4 @@ def test_a_finger_that_is_no_chain_is_refused():
     parents = hand.joint_parent.copy()
     parents[2] = 0
     with pytest.raises(ValueError, match="finger 0 of dclaw3 are no chain"):
-        Fingertips(replace(hand, joint_parent=parents))
+        Fingertips(replace(hand, joint_parent=parents), torch.tensor)

@@ -54,7 +54,7 @@ def errors(found: torch.Tensor, pose: np.ndarray) -> np.ndarray:
 
 def registration(item: ObjectModel, envs: int, device: str = "cpu", camera=None) -> Registration:
     of = {"world_object": np.zeros(envs, dtype=int), "world_scale": np.ones(envs)}
-    return Registration([item], **of, camera=camera, device=device)
+    return Registration([item], **of, camera=camera, device=device, library=torch)
 
 
 def test_distances_are_those_of_the_mesh_where_the_samples_lie_on_it(device):

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from vd.evaluate.agents import SHIPPED_POLICIES, open_policy
+from vd.onnx_policy import read_onnx
 from vd.policy import load_policy
 from vd.train.cli import main
 
@@ -38,6 +39,8 @@ def test_a_vision_policy_has_two_networks_and_looks_at_any_number_of_points(tmp_
             np.testing.assert_allclose(found, wanted.detach().numpy(), atol=1e-4)
     actions = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
     assert actions.get_inputs()[0].shape[1] == policy.teacher.num_observations
+    with pytest.raises(ValueError, match="of a vision policy, whose search computes with torch"):
+        read_onnx(tmp_path / "policy.onnx")
 
 
 def test_a_file_with_other_actions_is_not_written(tmp_path, monkeypatch):

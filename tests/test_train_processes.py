@@ -58,7 +58,10 @@ PATIENCE_S = 300.0
 
 
 def _two_nodes(script: Path, said: Path) -> list[subprocess.Popen]:
-    """Starts torchrun on two addresses of this machine, as on two machines, with a process each; stderr goes to `said`."""
+    """Starts torchrun on two addresses of this machine, as on two machines, with a process each.
+
+    What they say on stderr goes to the file `said`.
+    """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

@@ -12,6 +12,7 @@ USAGE = """usage: vd-train COMMAND [flags]
 
 commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --out runs/first
+  adapt      go on in an identified model         vd-train adapt dclaw3 --hand-layer identified.usda
   student    learn to see without a mesh          vd-train student --teacher dclaw3 --objects SET
   tracker    let it act by a camera, learn nothing vd-train tracker dclaw3 --objects SET
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
@@ -46,6 +47,7 @@ GONE = {
 
 COMMANDS = {
     "teacher": ("vd.train.teacher", "teacher_command"),
+    "adapt": ("vd.train.adapt", "adapt_command"),
     "student": ("vd.train.student.cli", "student_command"),
     "tracker": ("vd.train.tracker", "tracker_command"),
     "export": ("vd.train.export", "export_command"),
@@ -73,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"vd-train: {f'{name!r} is no more; {GONE[name]}' if name in GONE else known}", file=sys.stderr)
         return interrupt.USAGE_ERROR
     module, function = COMMANDS[name]
-    if name in ("teacher", "student") and not {"-h", "--help"} & set(arguments):
+    if name in ("teacher", "adapt", "student") and not {"-h", "--help"} & set(arguments):
         interrupt.need("rsl_rl", "tensordict")
     try:
         return int(getattr(importlib.import_module(module), function)(arguments, started))

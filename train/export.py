@@ -16,6 +16,7 @@ import tyro
 from vd import interrupt
 from vd.command_line import parse
 from vd.files import atomic_path, check_file, check_folder
+from vd.onnx_policy import ONNX
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
     from vd.tracking.policy import TrackingPolicy
 
-ONNX = ".onnx"
 CHECKED = 64
 """Random observations, or pairs of clouds, on which the runtime of ONNX is compared."""
 POINTS, CLOUD_M = 512, 0.03
@@ -111,13 +111,14 @@ def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path) -> None:
     """
     import torch
 
+    from vd.onnx_policy import onnx_metadata
     from vd.policy import TrainedPolicy
     from vd.vision.alignment import Residual
 
-    interrupt.need("onnxscript")
+    interrupt.need("onnx", "onnxscript")
     teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
     drawn = torch.randn(CHECKED, teacher.num_observations, generator=torch.Generator().manual_seed(0))
-    _export(teacher.network, {"observation": drawn}, ["action"], path)
+    _export(teacher.network, {"observation": drawn}, ["action"], path, onnx_metadata(policy))
     if not isinstance(policy, TrainedPolicy) and policy.alignment is not None:
         _have_exported(Residual)
         clouds = CLOUD_M * torch.randn(2, CHECKED, POINTS, 3, generator=torch.Generator().manual_seed(0))
@@ -134,8 +135,15 @@ def _have_exported(kind: type) -> None:
     torch.export.register_dataclass(kind)
 
 
-def _export(network: "Module", inputs: dict[str, "Tensor"], outputs: list[str], path: Path) -> None:
+def _export(
+    network: "Module",
+    inputs: dict[str, "Tensor"],
+    outputs: list[str],
+    path: Path,
+    metadata: dict[str, str] | None = None,
+) -> None:
     """Write a network whose inputs may have any size but the last, and compare it on these."""
+    import onnx
     import torch
 
     network = network.eval().requires_grad_(False)
@@ -159,6 +167,9 @@ def _export(network: "Module", inputs: dict[str, "Tensor"], outputs: list[str], 
             external_data=False,
             verbose=False,
         )
+        model = onnx.load(temporary)
+        onnx.helper.set_model_props(model, metadata or {})
+        onnx.save(model, temporary)
         if find_spec("onnxruntime") is None:
             print(f"{path}: onnxruntime is not installed: not checked ({interrupt.remedy('onnxruntime')})")
             return

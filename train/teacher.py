@@ -97,9 +97,9 @@ def teacher_command(arguments: list[str], started: float) -> int:
     say = say_of_main()
     cfg = parse_teacher(arguments, say=say)
     if not cfg.smoke or cfg.run.out != SMOKE_RUN:
-        return _train(cfg, say, started)
+        return train(cfg, say, started)
     with TemporaryDirectory(prefix="vd-smoke-") as folder:  # nobody needs what is in it, twice least of all
-        return _train(replace(cfg, run=replace(cfg.run, out=Path(folder))), say, started)
+        return train(replace(cfg, run=replace(cfg.run, out=Path(folder))), say, started)
 
 
 def say_of_main() -> Callable[[str], None]:
@@ -107,7 +107,8 @@ def say_of_main() -> Callable[[str], None]:
     return partial(print, flush=True) if os.environ.get("RANK", "0") == "0" else lambda _: None
 
 
-def _train(cfg: TeacherCfg, say: Callable[[str], None], started: float) -> int:
+def train(cfg: TeacherCfg, say: Callable[[str], None], started: float) -> int:
+    """Train as ``cfg`` says; the exit status. ``say`` and ``started`` as of :func:`build_teacher`."""
     folder = cfg.run.out
     runner = build_teacher(cfg, started=started, say=say)
     for line in _beginning(cfg, runner) if runner.iteration else []:

@@ -18,6 +18,8 @@ from vd.paper import PAPER
 if TYPE_CHECKING:
     from vd.evaluate.trace import Trace
     from vd.tracking.policy import TrackingPolicy
+    from vd.vision.alignment import AlignmentNetwork
+    from vd.vision.cfg import AlignmentCfg
 
 
 @dataclass(kw_only=True)
@@ -35,8 +37,9 @@ class TrackerCfg(EpisodeFlags):
     """The teacher: a policy.pt, a run's folder, or the name of an installed one."""
     objects: tuple[str, ...] = field()
     """Object sets to choose the stopping rules on, not those of the training."""
-    alignment: Path | None = None
-    """Network that finds objects by their goals' points, the alignment.pt of vd-train student."""
+    alignment: str | None = None
+    """Network that finds objects by their goals' points: the alignment.pt of vd-train student, or the name of
+    an installed vision policy, for that of it."""
     out: Path = Path("tracking.pt")
     """File to write."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
@@ -68,7 +71,6 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     from vd.stopping import calibrate
     from vd.tracking.policy import TrackingPolicy, TrackingSpec, tracking_export
     from vd.train.checkpoint import save_checkpoint
-    from vd.vision.saved import load_alignment
     from vd.warp_quiet import quiet_warp
 
     quiet_warp()
@@ -81,8 +83,8 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
     policy = TrackingPolicy(teacher, spec)
     if cfg.alignment is not None:
-        network, learned = load_alignment(cfg.alignment, device)
-        spec = replace(spec, camera=cfg.camera or learned.camera, alignment=learned.network)
+        network, sizes, camera = _network(cfg.alignment, device)
+        spec = replace(spec, camera=cfg.camera or camera, alignment=sizes)
         policy = TrackingPolicy(teacher, spec, network)
     trace = _episodes(cfg, policy, device)
     assert trace.predicted is not None
@@ -114,6 +116,21 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
             f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} came that near"
         )
     return 0
+
+
+def _network(name: str, device: str) -> "tuple[AlignmentNetwork, AlignmentCfg, tuple[float, ...] | None]":
+    """A network of alignment, its sizes, and the camera of its training: of a policy, or of a file."""
+    from vd.evaluate.agents import installed_policies, open_policy
+    from vd.tracking.policy import TrackingPolicy
+    from vd.vision.saved import load_alignment
+
+    if name not in installed_policies():
+        network, learned = load_alignment(name, device)
+        return network, learned.network, learned.camera
+    policy = open_policy(name, device)
+    if not isinstance(policy, TrackingPolicy) or policy.alignment is None or policy.spec.alignment is None:
+        raise ValueError(f"--alignment: {name} finds nothing by its goal's points; name a vision policy")
+    return policy.alignment, policy.spec.alignment, policy.spec.camera
 
 
 def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace":

@@ -91,6 +91,8 @@ class ObjectTracker:
             camera: Lens, and pose in the base frame; the hand's own by default (``hand.camera``).
             device: auto, cpu or cuda:N.
         """
+        import torch
+
         from vd.device import resolve_device
         from vd.kernels.task.observations import teacher_observation_size
         from vd.paper import PAPER
@@ -108,6 +110,7 @@ class ObjectTracker:
             camera=camera,
             control_hz=PAPER.scene.control_hz,
             device=device,
+            library=torch,
         )
 
     def look(self, depth: np.ndarray, joint_q: np.ndarray, *, fresh: bool = False) -> np.ndarray:
@@ -126,10 +129,11 @@ class ObjectTracker:
             ValueError: The image has another size than the camera.
         """
         import torch
+        import warp as wp
 
         from vd.senses import Senses
 
-        points = self._cloud.seen(depth)
+        points = wp.to_torch(self._cloud.seen(depth))
         joints = torch.as_tensor(joint_q, dtype=torch.float32, device=points.device)[None]
         still, anywhere = torch.zeros_like(joints), points.new_tensor([[0.0, 0.0, 0.0, 1.0]])
         begins = torch.tensor([fresh], device=points.device)

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 
 from vd.assets_usd.hand_data import HandModel
@@ -44,8 +43,8 @@ class HandCloud:
         """Write link poses in the world frame, shape [N, B], for positions [rad], shape [N, >= D]."""
         launch(forward_kinematics_kernel, joint_q.shape[0], [*self._joints, joint_q], [body_q])
 
-    def __call__(self, body_q: wp.array) -> torch.Tensor:
-        """Points in the base frame [m] [R, H, 3] for poses in the world frame [R, B]."""
+    def __call__(self, body_q: wp.array) -> wp.array:
+        """Points in the base frame [m] [R, H] for poses in the world frame [R, B]."""
         points = wp.empty((body_q.shape[0], self.count), dtype=wp.vec3, device=body_q.device)
         launch(link_points_kernel, points.shape, [*self._samples, body_q], [points])
-        return wp.to_torch(points)
+        return points

@@ -11,6 +11,7 @@ def warp_device(name: str | None) -> str:
     """
     import warp as wp
 
+    _keep_to_warnings()
     try:
         return str(wp.get_device(None if name == "auto" else name))
     except (ValueError, RuntimeError) as error:
@@ -26,6 +27,7 @@ def resolve_device(name: str) -> str:
     """
     import torch
 
+    _keep_to_warnings()
     if name == "auto":
         name = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
     if name == "cuda":
@@ -40,3 +42,11 @@ def resolve_device(name: str) -> str:
             f"--device is '{name}', but torch finds {torch.cuda.device_count()} GPUs; use auto or cpu"
         )
     return name
+
+
+def _keep_to_warnings() -> None:
+    """Have Warp keep to warnings, unless it was told otherwise: it tells of every kernel that it loads."""
+    import warp as wp
+
+    if wp.config.log_level == wp.LOG_INFO:
+        wp.config.log_level = wp.LOG_WARNING

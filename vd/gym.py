@@ -5,17 +5,23 @@ Needs the extra ``gym``: pip install 'visual-dexterity[gym]'.
 
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 import warp as wp
-from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
+from vd.envs.terms import CHECKED
+from vd.interrupt import remedy
+
+try:
+    import gymnasium
+    from gymnasium.spaces import Box
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(f"{error.name} is not installed: {remedy('gymnasium')}") from error
 
 ID = "VisualDexterity-v0"
 """What ``make_vec`` is told; ``vd.gym:`` before it imports this module."""
@@ -68,12 +74,14 @@ class ReorientVectorEnv(VectorEnv):
         self._error = wp.to_torch(env.rotation_error)
         self._flags = [wp.to_torch(array) for array in (env.ended, env.success, env.fell)]
         self._over = torch.zeros_like(self._reward, dtype=torch.bool)
+        self._bad = torch.zeros((), dtype=torch.bool, device=self._action.device)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[torch.Tensor, dict[str, Any]]:
         """Reset all environments, or those of ``options["reset_mask"]``, bool [N]."""
         super().reset(seed=seed)
+        self._bad.zero_()
         mask = (options or {}).get("reset_mask")
         if mask is None:
             self.env.reset(seed=seed)
@@ -91,11 +99,21 @@ class ReorientVectorEnv(VectorEnv):
     def step(
         self, actions: Any
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """One control step with actions [N, A] in [-1, 1]; those beyond are clipped."""
+        """One control step with actions [N, A] in [-1, 1]; those beyond are clipped.
+
+        Raises:
+            ValueError: Actions have another shape or are not finite; a GPU tells within 128 steps.
+            gymnasium.error.ClosedEnvironmentError: After :meth:`close`.
+        """
+        if self.closed:
+            raise gymnasium.error.ClosedEnvironmentError("step() after close(); make the environment anew")
         given = torch.as_tensor(actions)
         if given.shape != self._action.shape:
             raise ValueError(f"actions have shape {tuple(given.shape)}, not {tuple(self._action.shape)}")
         self._action.copy_(given)
+        self._bad |= ~self._action.isfinite().all()
+        if (not self._bad.is_cuda or self.env.steps % CHECKED == 0) and self._bad:
+            raise ValueError("actions are not finite; mend the policy, then reset()")
         self.env.advance(self.env.action)
         ended, success, fell = (flag > 0 for flag in self._flags)
         reward, terminated = self._reward.clone(), fell.clone()

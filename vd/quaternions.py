@@ -1,35 +1,37 @@
-"""Rotations as quaternions xyzw [.., 4], torch."""
+"""Rotations as quaternions xyzw [.., 4], tensors of torch or arrays of NumPy."""
 
-import torch
+from vd.arrays import Array, library_of
 
 
-def product(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+def product(first: Array, second: Array) -> Array:
     """``first * second``, quaternions xyzw [..., 4]: turns by the second, then by the first."""
-    a, aw, b, bw = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
-    vector = aw * b + bw * a + torch.linalg.cross(a, b)
-    return torch.cat([vector, aw * bw - (a * b).sum(dim=-1, keepdim=True)], dim=-1)
+    xp, a, aw, b, bw = library_of(first), first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
+    vector = aw * b + bw * a + xp.linalg.cross(a, b)
+    return xp.concatenate([vector, aw * bw - (a * b).sum(axis=-1, keepdims=True)], axis=-1)
 
 
-def canonical(quat: torch.Tensor) -> torch.Tensor:
+def canonical(quat: Array) -> Array:
     """Of q and -q, one rotation, the one whose first of w, x, y, z that is not 0 is positive [..., 4]."""
-    first = quat[..., 3]
+    xp, first = library_of(quat), quat[..., 3]
     for i in range(3):
-        first = torch.where(first == 0.0, quat[..., i], first)
-    return torch.where(first[..., None] < 0.0, -quat, quat)
+        first = xp.where(first == 0.0, quat[..., i], first)
+    return xp.where(first[..., None] < 0.0, -quat, quat)
 
 
-def relative_rotation(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+def relative_rotation(first: Array, second: Array) -> Array:
     """``first * conj(second)``, quaternions xyzw [..., 4]."""
-    return product(first, torch.cat([-second[..., :3], second[..., 3:]], dim=-1))
+    other = library_of(second).concatenate([-second[..., :3], second[..., 3:]], axis=-1)
+    return product(first, other)
 
 
-def rotation_distance(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+def rotation_distance(first: Array, second: Array) -> Array:
     """Angle between orientations, quaternions xyzw [..., 4], in [0, pi] [rad]."""
-    vector = torch.linalg.vector_norm(relative_rotation(first, second)[..., :3], dim=-1)
-    return 2.0 * torch.asin(vector.clamp(max=1.0))
+    xp, vector = library_of(first), relative_rotation(first, second)[..., :3]
+    return 2.0 * xp.asin(xp.linalg.vector_norm(vector, axis=-1).clip(max=1.0))
 
 
-def rotated(quat: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+def rotated(quat: Array, vector: Array) -> Array:
     """Vectors [..., 3] turned by quaternions xyzw [..., 4]."""
-    twice = 2.0 * torch.linalg.cross(quat[..., :3], vector)
-    return vector + quat[..., 3:] * twice + torch.linalg.cross(quat[..., :3], twice)
+    cross, axis = library_of(quat).linalg.cross, quat[..., :3]
+    twice = 2.0 * cross(axis, vector)
+    return vector + quat[..., 3:] * twice + cross(axis, twice)

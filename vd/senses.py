@@ -2,22 +2,22 @@
 
 from dataclasses import dataclass
 
-import torch
+from vd.arrays import Array
 
 
 @dataclass(frozen=True)
 class Senses:
     """What N hands sense before an action, as a simulator or a robot's drivers report it."""
 
-    joint_q: torch.Tensor
+    joint_q: Array
     """Joint positions [rad] [N, D]."""
-    joint_qd: torch.Tensor
+    joint_qd: Array
     """Joint velocities [rad/s] [N, D]."""
-    action: torch.Tensor
+    action: Array
     """Moving average of the actions so far [N, D]."""
-    goal_quat: torch.Tensor
+    goal_quat: Array
     """Wanted orientation of the object [N, 4]."""
-    points: torch.Tensor
+    points: Array
     """What the camera sees, base frame [m], NaN for none [N, K, 3]."""
-    fresh: torch.Tensor
+    fresh: Array
     """Where an episode begins: where the object was before means nothing; bool [N]."""

@@ -2,19 +2,20 @@
 
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 
+from vd.arrays import Array, as_warp, library_of, of_warp
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.agents import check_fits, open_policy, task_for
 from vd.evaluate.statistics import symmetric_error
+from vd.onnx_policy import ONNX, read_onnx
 from vd.paper import PAPER
-from vd.policy import TrainedPolicy
 from vd.senses import Senses
 from vd.sensors.depth_cloud import CameraCloud
 from vd.stopping import StoppingRule
@@ -103,7 +104,7 @@ class TeacherRunner(PolicyRunner):
 
     kind = "teacher"
 
-    def __init__(self, policy: TrainedPolicy, hand_name: str, object: str, tolerance_rad: float):
+    def __init__(self, policy: Any, hand_name: str, object: str, tolerance_rad: float):
         from vd.envs.reorient import ReorientEnv
 
         task = task_for(
@@ -141,7 +142,8 @@ class TeacherRunner(PolicyRunner):
             env.give_goals(np.zeros(1, int), sensed.goal_quat[None])
             self._begins = False
         env.observe()
-        action: Any = wp.from_torch(self._policy.act(wp.to_torch(env.observation)).contiguous())
+        seen = of_warp(env.observation, library_of(self._policy.network.offset))
+        action = as_warp(self._policy.act(seen))
         if env.symmetry_frames is not None:
             action = env.symmetry_frames.world_action(action)
         error = symmetric_error(truth[None, 3:7], sensed.goal_quat[None], env.objects[0].symmetry)
@@ -176,7 +178,7 @@ class TrackingRunner(PolicyRunner):
             CameraCloud, mount=hand.mount, points=depth.points, crop_m=depth.crop_m, seed=seed
         )
         self._tracker_of = partial(Tracker, policy, hand, [item])
-        self._fresh = True
+        self._fresh, self._library = True, library_of(policy.teacher.network.offset)
         self.look_by(hand.camera.at(policy.spec.camera))
 
     def look_by(self, camera: CameraModel) -> None:
@@ -190,12 +192,12 @@ class TrackingRunner(PolicyRunner):
     def decide(self, sensed: Sensed) -> Decision:
         """Mean action, and the expected distance."""
         points = seen_points(self.eye, sensed.depth)
-        senses = senses_of(sensed, points, fresh=self._fresh)
+        senses = senses_of(sensed, of_warp(points, self._library), fresh=self._fresh)
         decided = self._tracker.step(senses)
         self._fresh, found = False, self._tracker.observer.found
         assert found is not None
-        pose = np.concatenate([found.position[0].numpy(), found.orientation[0].numpy()])
-        return Decision(decided.action[0].numpy().copy(), float(decided.angle[0]), pose)
+        pose = np.concatenate([np.asarray(found.position[0]), np.asarray(found.orientation[0])])
+        return Decision(np.array(decided.action[0]), float(decided.angle[0]), pose)
 
 
 def load_runner(
@@ -222,7 +224,8 @@ def load_runner(
     Raises:
         ValueError: It is for another hand, or a teacher for a real one.
     """
-    policy: Any = None if name == ZERO else open_policy(name, "cpu")
+    onnx = Path(name).suffix == ONNX
+    policy: Any = None if name == ZERO else read_onnx(Path(name)) if onnx else open_policy(name, "cpu")
     if policy is None:
         if name != ZERO:
             raise ValueError(f"{name} is not for a hand; give a bundle, a policy's file, or {ZERO}")
@@ -238,8 +241,8 @@ def load_runner(
     )
 
 
-def seen_points(cloud: CameraCloud, depth: np.ndarray | None) -> torch.Tensor:
-    """What a camera sees in an image, base frame [m], NaN for none [1, K, 3]; overwritten by the next call.
+def seen_points(cloud: CameraCloud, depth: np.ndarray | None) -> wp.array:
+    """What a camera sees in an image, base frame [m], NaN for none [1, K]; overwritten by the next call.
 
     Raises:
         ValueError: There is no image.
@@ -249,7 +252,7 @@ def seen_points(cloud: CameraCloud, depth: np.ndarray | None) -> torch.Tensor:
     return cloud.seen(depth)
 
 
-def senses_of(sensed: Sensed, points: torch.Tensor, *, fresh: bool = False) -> Senses:
+def senses_of(sensed: Sensed, points: Array, *, fresh: bool = False) -> Senses:
     """What a policy that sees by a camera is told of one hand.
 
     Args:
@@ -257,9 +260,10 @@ def senses_of(sensed: Sensed, points: torch.Tensor, *, fresh: bool = False) -> S
         points: What its camera sees [1, K, 3].
         fresh: Whether an episode begins.
     """
+    xp = library_of(points)
 
-    def row(values: np.ndarray) -> torch.Tensor:
-        return torch.tensor(values, dtype=torch.float32)[None]
+    def row(values: np.ndarray) -> Array:
+        return xp.asarray(values, dtype=xp.float32, copy=True)[None]
 
     return Senses(
         joint_q=row(sensed.joint_q),
@@ -267,5 +271,5 @@ def senses_of(sensed: Sensed, points: torch.Tensor, *, fresh: bool = False) -> S
         action=row(sensed.smoothed),
         goal_quat=row(sensed.goal_quat),
         points=points,
-        fresh=torch.tensor([fresh]),
+        fresh=xp.asarray([fresh]),
     )

@@ -68,8 +68,8 @@ class RunCfg(HandOptions):
     goal: tuple[str, ...] = ()
     """Orientations of the object to reach, one after the other, in the world frame: quaternions x,y,z,w,
     turns x,y,z@degrees about an axis, or files (.txt, .csv) with one on each line."""
-    random_goals: int = 1
-    """How many goals to draw where --goal names none; with --ros2 none are drawn."""
+    random_goals: int | None = None
+    """How many goals to draw, 1 by default, in place of --goal; with --ros2 none are drawn."""
     max_goal_angle: float = np.pi
     """Drawn goals lie within this angle [rad] of the one before."""
     episode_s: float = PAPER.scene.episode_s
@@ -107,7 +107,12 @@ class RunCfg(HandOptions):
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
-        check_names([] if self.policy is None else [self.policy], [self.object], self.hand)
+        if self.random_goals is not None and (self.ros2 or self.goal):
+            raise ValueError("--random-goals is in place of --ros2 and --goal; leave one out")
+        default = f"{self.hand}-tracking" if self.twin and not Path(self.hand).suffix else None
+        named = self.policy or default
+        check_names([], [self.object], self.hand)
+        check_names([] if named is None else [named], [])
         from vd.deploy.loop.goals import SCAN_SUFFIXES
 
         require(self, "--", "positive", "random_goals episode_s")
@@ -141,8 +146,6 @@ def run(cfg: RunCfg) -> int:
     check_folder(folder)
     if is_log(folder):
         raise FileExistsError(f"{folder} holds a log; choose another folder")
-    import torch
-
     from vd.assets_usd.hands import load_hand
     from vd.deploy.hardware.connect import motors_of
     from vd.deploy.loop.goals import make_goals, one_object
@@ -150,13 +153,15 @@ def run(cfg: RunCfg) -> int:
     from vd.deploy.ros import connect_ros
 
     quiet_warp()
-    torch.set_num_threads(1)  # of several, some would wait for one that has no core
-    goals = make_goals(cfg.goal, 0 if cfg.ros2 else cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
+    drawn = 0 if cfg.ros2 else cfg.random_goals or 1
+    goals = make_goals(cfg.goal, drawn, cfg.max_goal_angle, seed=cfg.seed)
     hand = load_hand(cfg.hand, layer=cfg.hand_layer) if cfg.ros2 else motors_of(cfg).hand
     item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
     tolerance = cfg.tolerance_rad
     told = cfg.object if cfg.twin else None
     runner = load_runner(name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told)
+    if "torch" in sys.modules:  # of several threads, some would wait for one that has no core
+        sys.modules["torch"].set_num_threads(1)
     if not runner.calibrated:
         print(
             f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that distance; "

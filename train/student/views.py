@@ -154,7 +154,7 @@ def posture_points(hand: HandModel, count: int, device: str) -> torch.Tensor:
     poses = wp.empty((count, len(links)), dtype=wp.transform, device=device)
     cloud = HandCloud(hand, link_body=links, device=device)
     cloud.pose(wp.from_torch(joints), poses)
-    return cloud(poses)
+    return wp.to_torch(cloud(poses))
 
 
 def nearest(cell: torch.Tensor, depth: torch.Tensor, cells: int) -> torch.Tensor:

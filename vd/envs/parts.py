@@ -10,8 +10,8 @@ from vd.kernels.task.shapes import shape_observation_size
 def observation_parts(cfg: ObservationCfg, fingers: int, joints: int) -> dict[str, slice]:
     """Columns of the parts of an observation, in order, those included that only the critic reads.
 
-    state, shape, terms (own values), critic_terms, dynamics, present (state and shape without latency and
-    noise); parts that are off are missing.
+    state, shape, terms (own values), dynamics, present (state and shape without latency and noise),
+    critic_terms; parts that are off are missing.
     """
     told = cfg.dynamics != "none"
     state = teacher_observation_size(fingers, joints)
@@ -20,14 +20,14 @@ def observation_parts(cfg: ObservationCfg, fingers: int, joints: int) -> dict[st
         "state": state,
         "shape": shape,
         "terms": sum(cfg.terms.values()),
-        "critic_terms": sum(cfg.critic_terms.values()),
         "dynamics": dynamics_size(joints) if told else 0,
         "present": state + shape if told else 0,
+        "critic_terms": sum(cfg.critic_terms.values()),  # last, where a critic that goes on is widened
     }
     return consecutive({name: size for name, size in sizes.items() if size})
 
 
-CRITIC_ALONE = ("critic_terms", "dynamics", "present")
+CRITIC_ALONE = ("dynamics", "present", "critic_terms")
 """Parts that the actor does not read, the last of all."""
 
 

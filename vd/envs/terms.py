@@ -32,7 +32,7 @@ class OwnTerms:
         seen, told = cfg.observation.terms, cfg.observation.critic_terms
         if twice := sorted(seen.keys() & told.keys()):
             raise ValueError(f"observation.critic_terms has {twice[0]}, which the critic is shown already")
-        self._sizes, self._seen = cfg.observation.own, sum(seen.values())
+        self._sizes, self._told = cfg.observation.own, told
         if wrong := [name for name, size in self._sizes.items() if size < 1]:
             raise ValueError(f"observation.terms: {wrong[0]} has to give 1 value or more")
         self._functions = {name: _function(name) for name in self._coefficients.keys() | self._sizes.keys()}
@@ -53,12 +53,12 @@ class OwnTerms:
     def observe(self, env: Any) -> None:
         """Write own values of the present state into the observation, as they are in every frame."""
         observer = env.observer
-        column = observer.num_observations - self._seen
+        first = {part: columns.start for part, columns in observer.parts.items()}
         for name, size in self._sizes.items():
-            value = self._value(env, name, size)
+            value, part = self._value(env, name, size), "critic_terms" if name in self._told else "terms"
             for array in (observer.world_values, observer.all_values):
-                wp.to_torch(array)[:, column : column + size] = value
-            column += size
+                wp.to_torch(array)[:, first[part] : first[part] + size] = value
+            first[part] += size
         self._steps += 1
         if not env.sim.failed.device.is_cuda or self._steps % CHECKED == 0:
             self.check()

@@ -122,6 +122,8 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | TrackingPolicy | Non
         from vd.bundle.store import read_bundle
 
         return read_bundle(path, device)
+    if path.suffix == ".onnx":
+        raise ValueError(f"{path} is for vd-deploy; give the policy that it was made of")
     from vd.tracking.policy import read_policy
 
     return read_policy(path, device)

@@ -295,7 +295,7 @@ def _stopped_by(row: Row) -> str:
 
 
 def _heading(row: Row, short: dict[str, str]) -> str:
-    return f"{short[row.policy]}, {row.group}, stopped by {_stopped_by(row)}"
+    return f"{short[row.policy]}, {_where(row)}, stopped by {_stopped_by(row)}"
 
 
 def _where(row: Row) -> str:
@@ -324,12 +324,13 @@ def asked(protocols: Sequence[Protocol]) -> str:
         goals = f"uniform within {angle:g} rad of the start"
     rest = "at rest on the table, as the environment draws them"
     table = "" if protocol.table_friction is None else f" of friction {protocol.table_friction:g}"
+    times = f"{protocol.episodes} episode{'s' * (protocol.episodes > 1)}"
     limit = f"{protocol.episode_s:g} s" + (" a goal" if protocol.consecutive else "")
     place = "palm up" if protocol.palm_up else "on the table"
     parts = (
         f"{hands} {'in the air' if protocol.in_air or protocol.air_goals else place}{table}",
         *(["goal after goal"] if protocol.air_goals or protocol.consecutive else []),
-        f"{protocol.episodes} episodes of {limit} for each object, seed {protocol.seed}",
+        f"{times} of {limit} for each object, seed {protocol.seed}",
         f"starts {rest if protocol.at_rest else 'dropped into the hand, uniform on SO(3)'}",
         f"goals {goals}",
         f"stop within {protocol.stop_tolerance_rad:g} rad",

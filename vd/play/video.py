@@ -14,7 +14,6 @@ import warp as wp
 from PIL import Image, ImageDraw, ImageFont
 
 from vd.evaluate.statistics import rotation_angle
-from vd.evaluate.trace import advance
 from vd.files import atomic_path
 from vd.paper import PAPER
 from vd.render import Picture, Renderer
@@ -144,6 +143,8 @@ def drawn(
 
 def act(env: Any, policy: Any) -> None:
     """Make one control step with the policy's mean action."""
+    from vd.evaluate.trace import advance  # needs torch, which the film of a log does not
+
     advance(env, policy.act(wp.to_torch(env.observation)))
 
 

@@ -1,7 +1,6 @@
 """Point clouds from depth images: those of simulated cameras, or of a real one."""
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -19,9 +18,6 @@ from vd.kernels.sensor.depth_cloud import (
 )
 from vd.kernels.sensor.raycast import View
 from vd.paper import PAPER
-
-if TYPE_CHECKING:
-    import torch
 
 
 def make_views(camera: CameraModel, count: int, device: str) -> wp.array:
@@ -147,13 +143,12 @@ class CameraCloud:
         launch(next_frame_kernel, 1, [], [self._rng])
         return self.cloud.points, self.cloud.count
 
-    def seen(self, depth: np.ndarray) -> "torch.Tensor":
-        """The points of an image as :class:`vd.senses.Senses` has them [1, K, 3]; the next call changes them.
+    def seen(self, depth: np.ndarray) -> wp.array:
+        """The points of an image as :class:`vd.senses.Senses` has them [1, K]; the next call changes them.
 
         Argument and errors are those of :meth:`make`.
         """
         points, count = self.make(depth)
-        seen = wp.to_torch(points)
         if not count.numpy()[0]:  # the false point of an empty cloud counts for nothing
-            seen.fill_(math.nan)
-        return seen
+            points.fill_(math.nan)
+        return points

@@ -9,12 +9,12 @@ quaternions xyzw.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 import warp as wp
 
+from vd.arrays import Array, as_warp, library_of, of_warp
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.clouds import HandCloud
@@ -27,8 +27,10 @@ from vd.tracking.fingertips import Fingertips
 from vd.tracking.object_points import object_points
 from vd.tracking.registration import Registration
 from vd.tracking.symmetry import nearest_goal, symmetries_of_worlds
-from vd.vision.alignment import AlignmentNetwork
-from vd.vision.finder import GoalFinder
+
+if TYPE_CHECKING:
+    from vd.vision.alignment import AlignmentNetwork
+    from vd.vision.finder import GoalFinder
 
 UNSEEN = ("object_orientation", "goal_orientation")
 """Orientations in the axes of the object's file, which no camera shows: zeros stand for them."""
@@ -43,13 +45,13 @@ LEAP_RAD = 0.5
 class Found:
     """The object as it is found."""
 
-    orientation: torch.Tensor
+    orientation: Array
     """[N, 4]."""
-    position: torch.Tensor
+    position: Array
     """[m] [N, 3]."""
-    velocity: torch.Tensor
+    velocity: Array
     """[m/s] [N, 3]; zero where it is not known."""
-    spin: torch.Tensor
+    spin: Array
     """Angular velocity [rad/s] [N, 3]; zero where it is not known."""
 
 
@@ -66,6 +68,7 @@ class CameraObserver:
         control_hz: Control steps a second.
         alignment: Finds objects by their goals' clouds; None: they are found by their shapes.
         device: Warp device.
+        library: Of its arrays, torch or on a CPU numpy; those of ``alignment`` are torch's.
     """
 
     def __init__(
@@ -78,32 +81,38 @@ class CameraObserver:
         world_scale: np.ndarray,
         camera: CameraModel,
         control_hz: float,
-        alignment: AlignmentNetwork | None = None,
+        alignment: "AlignmentNetwork | None" = None,
         device: str,
+        library: Any,
     ):
         self._hand, self._rate, self._device = hand, control_hz, device
-        place, links = wp.device_to_torch(device), np.arange(len(hand.link_names))
+        xp, place, links = library, wp.device_to_torch(device), np.arange(len(hand.link_names))
 
         def array(values: Any, dtype: Any) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        def own(values: Any) -> Array:
+            return xp.asarray(values, dtype=xp.float32, device=place, copy=True)
 
         envs: dict[str, Any] = {"world_object": world_object, "world_scale": world_scale, "device": device}
         self._hand_cloud = HandCloud(hand, link_body=links, device=device)
         self._ages = (0.0,) if alignment is None else AGES_S
         self.finder: Registration | GoalFinder
+        symmetry = np.tile([0.0, 0.0, 0.0, 1.0], (len(world_object), 1, 1))
         if alignment is None:
-            self.finder = Registration(objects, camera=camera, **envs)
-            self._symmetry = symmetries_of_worlds(objects, world_object, device)
+            self.finder = Registration(objects, camera=camera, library=xp, **envs)
+            symmetry = symmetries_of_worlds(objects, world_object, device)
         else:
-            self.finder = GoalFinder(alignment, objects, world_object=world_object, world_scale=world_scale)
-            self._symmetry = torch.tensor([0.0, 0.0, 0.0, 1.0], device=place).expand(len(world_object), 1, 4)
-        self._before = self.finder.pose[:, 0].clone()
-        self._fingertips = Fingertips(hand, place)
+            from vd.vision import finder
+
+            self.finder = finder.GoalFinder(
+                alignment, objects, world_object=world_object, world_scale=world_scale
+            )
+        self._symmetry, self._before = own(symmetry), own(self.finder.pose[:, 0])
+        self._fingertips = Fingertips(hand, own)
         self._links = wp.empty((len(world_object), len(links)), dtype=wp.transform, device=device)
         self._past_links = wp.empty_like(self._links)
-        self._base = torch.tensor(hand.mount, dtype=torch.float32, device=place)
-        limits = np.stack([hand.lower, hand.upper])
-        self._lower, self._upper = torch.tensor(limits, dtype=torch.float32, device=place)
+        self._base, self._lower, self._upper = own(hand.mount[None]), own(hand.lower), own(hand.upper)
         self._columns = teacher_observation_slices(hand.num_fingers, hand.num_joints)
         self._size, state = num_observations, teacher_observation_size(hand.num_fingers, hand.num_joints)
         self._columns["shape"] = slice(state, num_observations)
@@ -114,7 +123,7 @@ class CameraObserver:
             array(hand.tip_link, wp.int32),
             array(hand.tip_frame, wp.transform),
         )
-        known = torch.ones(num_observations, device=place)
+        known = own(np.ones(num_observations))
         for name in UNSEEN:
             known[self._columns[name]] = 0.0
         self.found: Found | None = None
@@ -122,7 +131,7 @@ class CameraObserver:
         self.known = known
         """1 for the values that are observed, 0 for those of :data:`UNSEEN` [O]."""
 
-    def __call__(self, senses: Senses) -> tuple[torch.Tensor, torch.Tensor]:
+    def __call__(self, senses: Senses) -> tuple[Array, Array]:
         """Look once.
 
         Returns:
@@ -130,7 +139,7 @@ class CameraObserver:
             its goal [rad] [N]. Of the orientations in which a known shape looks like the wanted one
             (:mod:`.symmetry`) the nearest is the goal: which of them it is, nobody can see.
         """
-        self._hand_cloud.pose(wp.from_torch(senses.joint_q.contiguous()), self._links)
+        self._hand_cloud.pose(as_warp(senses.joint_q), self._links)
         found = self.found = self._find(senses)
         goal = nearest_goal(found.orientation, senses.goal_quat, self._symmetry)
         angle = rotation_distance(found.orientation, goal)
@@ -144,44 +153,44 @@ class CameraObserver:
             "fingertips": self._fingertips(senses.joint_q, senses.joint_qd),
             "previous_action": senses.action,
         }
-        observation = torch.zeros((len(angle), self._size), device=angle.device)
+        xp = library_of(angle)
+        observation = xp.zeros((len(angle), self._size), dtype=xp.float32, device=angle.device)
         if (first := self._columns["shape"].start) < self._size:
-            pose = wp.from_torch(torch.cat([found.position, found.orientation], dim=1))
-            wanted = wp.from_torch(goal.contiguous(), dtype=wp.quat)
-            self._shapes.observe(pose, 0, self._links, wanted, wp.from_torch(observation), first)
+            pose = as_warp(xp.concatenate([found.position, found.orientation], axis=1))
+            self._shapes.observe(pose, 0, self._links, as_warp(goal, wp.quat), as_warp(observation), first)
         for name, values in parts.items():
             observation[:, self._columns[name]] = values
         return observation, angle
 
-    def _hand_points(self, age: float, senses: Senses) -> torch.Tensor:
+    def _hand_points(self, age: float, senses: Senses) -> Array:
         """The hand's own points as they were so long ago [s], base frame [N, H, 3]."""
         links = self._links
         if age > 0.0:
             links = self._past_links
             joints = senses.joint_q - age * senses.joint_qd
-            self._hand_cloud.pose(wp.from_torch(joints.contiguous()), links)
-        return self._hand_cloud(links)
+            self._hand_cloud.pose(as_warp(joints), links)
+        return of_warp(self._hand_cloud(links), library_of(senses.joint_q))
 
     def _find(self, senses: Senses) -> Found:
         """Find the objects among the camera's points, or follow them; links are posed."""
-        followed, before = self.finder, self._before
-        cloud = torch.cat([*(self._hand_points(age, senses) for age in self._ages), senses.points], dim=1)
+        followed, before, xp = self.finder, self._before, library_of(senses.points)
+        cloud = [*(self._hand_points(age, senses) for age in self._ages), senses.points]
         hand = len(self._ages) * self._hand_cloud.count
-        seen, count = object_points(cloud, hand, PAPER.cloud.voxel_m, followed.most)
-        pose, base, turn = followed.pose[:, 0], self._base, self._base[3:].expand(len(seen), 4)
+        seen, count = object_points(xp.concatenate(cloud, axis=1), hand, PAPER.cloud.voxel_m, followed.most)
+        pose, base, turn = followed.pose[:, 0], self._base[:, :3], self._base[:, 3:]
         if isinstance(followed, Registration):
             followed.look(seen, count, fresh=senses.fresh, points=senses.points)
         else:
             followed.look(seen, count, fresh=senses.fresh)
         # A first look knows no motion.
         known = (followed.looks > 1) & (rotation_distance(pose[:, 3:], before[:, 3:]) < LEAP_RAD)
-        moves = self._rate * known[:, None].float()
+        moves = self._rate * xp.asarray(known[:, None], dtype=xp.float32)
         step = relative_rotation(pose[:, 3:], before[:, 3:])
         found = Found(
             orientation=product(turn, pose[:, 3:]),
-            position=base[:3] + rotated(turn, pose[:, :3]),
+            position=base + rotated(turn, pose[:, :3]),
             velocity=moves * rotated(turn, pose[:, :3] - before[:, :3]),
-            spin=moves * 2.0 * rotated(turn, step[:, :3] * step[:, 3:].sign()),  # of a small angle
+            spin=moves * 2.0 * rotated(turn, step[:, :3] * xp.sign(step[:, 3:])),  # of a small angle
         )
-        before.copy_(pose)
+        before[:] = pose
         return found

@@ -3,24 +3,29 @@
 G fingers, D joints, as many of each finger. World frame: z up; quaternions xyzw.
 """
 
-import numpy as np
-import torch
+from collections.abc import Callable
+from typing import Any
 
+import numpy as np
+
+from vd.arrays import Array, library_of
 from vd.assets_usd.hand_data import HandModel, compose, invert
 from vd.kernels.task.observations import FINGERTIP_VALUES
 from vd.quaternions import product, rotated
 
 
 class Fingertips:
-    """Poses and velocities of a hand's fingertips, as a teacher observes them, in this precision.
+    """Poses and velocities of a hand's fingertips, as a teacher observes them.
+
+    Args:
+        hand: The hand.
+        array: Makes arrays of the library, device and precision in which joints are given.
 
     Raises:
         ValueError: Its fingers differ, or its joints are no chains from the base to each fingertip.
     """
 
-    def __init__(
-        self, hand: HandModel, device: str | torch.device = "cpu", *, dtype: torch.dtype = torch.float32
-    ) -> None:
+    def __init__(self, hand: HandModel, array: Callable[[Any], Array]) -> None:
         order = np.arange(hand.num_joints).reshape(-1, hand.joints_per_finger)
         frames = np.empty((len(order), hand.joints_per_finger + 1, 7))
         for finger, joints in enumerate(order):
@@ -32,28 +37,27 @@ class Fingertips:
                 before = invert(hand.joint_child_frame[joint])
             frames[finger, -1] = compose(before, hand.tip_frame[finger])
         # From each joint's frame, turned, to the next one's: of the first from the world, at the end the tip.
-        self._frame = torch.tensor(frames, dtype=dtype, device=device)
-        self._axis = torch.tensor(hand.joint_axis[order], dtype=dtype, device=device)
+        self._frame, self._axis = array(frames), array(hand.joint_axis[order])
 
-    def __call__(self, position: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
+    def __call__(self, position: Array, velocity: Array) -> Array:
         """Position [m], quaternion, velocity [m/s] and angular velocity [rad/s] of each fingertip in turn.
 
         Joint positions [rad] and velocities [rad/s] are [N, D]; columns [N, 13 G] as of
         :func:`vd.kernels.task.observations.teacher_observation_slices`.
         """
-        shape = (len(position), *self._axis.shape[:2], 1)
+        xp, shape = library_of(position), (len(position), *self._axis.shape[:2], 1)
         half, rate = 0.5 * position.reshape(shape), velocity.reshape(shape)
-        turn = torch.cat([self._axis * half.sin(), half.cos()], dim=-1)
-        pose = self._frame[:, 0].expand(len(position), -1, -1)
-        spin, moment = torch.zeros_like(pose[..., :3]), torch.zeros_like(pose[..., :3])
+        turn = xp.concatenate([self._axis * xp.sin(half), xp.cos(half)], axis=-1)
+        pose = xp.broadcast_to(self._frame[:, 0], (len(position), *self._frame[:, 0].shape))
+        spin, moment = xp.zeros_like(pose[..., :3]), xp.zeros_like(pose[..., :3])
         for joint in range(self._axis.shape[1]):
             place, orientation = pose[..., :3], product(pose[..., 3:], turn[..., joint, :])
-            axis = rate[..., joint, :] * rotated(orientation, self._axis[:, joint].expand_as(place))
-            spin, moment = spin + axis, moment + torch.linalg.cross(axis, place)
-            following = self._frame[:, joint + 1].expand_as(pose)
+            axis = rate[..., joint, :] * rotated(orientation, self._axis[None, :, joint])
+            spin, moment = spin + axis, moment + xp.linalg.cross(axis, place)
+            following = self._frame[None, :, joint + 1]
             place = place + rotated(orientation, following[..., :3])
-            pose = torch.cat([place, product(orientation, following[..., 3:])], dim=-1)
+            pose = xp.concatenate([place, product(orientation, following[..., 3:])], axis=-1)
         # Each joint moves the tip by its axis x (tip - joint).
-        linear = torch.linalg.cross(spin, pose[..., :3]) - moment
-        values = torch.cat([pose, linear, spin], dim=-1)
+        linear = xp.linalg.cross(spin, pose[..., :3]) - moment
+        values = xp.concatenate([pose, linear, spin], axis=-1)
         return values.reshape(len(position), FINGERTIP_VALUES * len(self._axis))

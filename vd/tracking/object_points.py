@@ -1,15 +1,13 @@
 """Which of a camera's points are the object's: those of voxels that neither are the hand's nor touch one."""
 
-import torch
 import warp as wp
 
+from vd.arrays import Array, as_warp, library_of
 from vd.kernels.launch import launch
 from vd.kernels.sensor.voxels import CLOUD_SHIFT, beside_kernel, coordinates_kernel, voxel_key_kernel
 
 
-def object_points(
-    points: torch.Tensor, hand: int, voxel_m: float, most: int
-) -> tuple[torch.Tensor, torch.Tensor]:
+def object_points(points: Array, hand: int, voxel_m: float, most: int) -> tuple[Array, Array]:
     """Centres of the object's voxels.
 
     The hand's own samples leave gaps, so a voxel that touches one of them, by a corner at least, is taken for
@@ -25,28 +23,26 @@ def object_points(
         Centres [m], zeros where a cloud has fewer, shape [N, M', 3] with M' <= M, neighbours beside each
         other, and how many there are, int32 [N]. Waits for the device.
     """
-    device, envs = points.device, len(points)
-    keys = torch.empty(points.shape[:2], dtype=torch.int64, device=device)
-    cloud = wp.from_torch(points.contiguous(), dtype=wp.vec3)
-    launch(voxel_key_kernel, keys.shape, [cloud, voxel_m], [wp.from_torch(keys)])
-    voxels, place = torch.unique(keys, return_inverse=True)
-    of_hand = torch.zeros(len(voxels), dtype=torch.bool, device=device)
+    xp, device, envs = library_of(points), points.device, len(points)
+    keys = xp.empty(points.shape[:2], dtype=xp.int64, device=device)
+    launch(voxel_key_kernel, keys.shape, [as_warp(points, wp.vec3), voxel_m], [as_warp(keys)])
+    voxels, place = xp.unique(keys, return_inverse=True)
+    of_hand = xp.zeros(len(voxels), dtype=xp.bool, device=device)
     of_hand[place[:, :hand]] = True
-    touches = torch.empty_like(of_hand)
-    inputs = [wp.from_torch(voxels), wp.from_torch(of_hand)]
-    launch(beside_kernel, len(voxels), inputs, [wp.from_torch(touches)])
+    touches = xp.empty_like(of_hand)
+    launch(beside_kernel, len(voxels), [as_warp(voxels), as_warp(of_hand)], [as_warp(touches)])
     free = voxels[~touches & (voxels < envs << CLOUD_SHIFT)]
-    rows = torch.empty((len(free), 4), dtype=torch.int32, device=device)
-    launch(coordinates_kernel, len(free), [wp.from_torch(free)], [wp.from_torch(rows)])
-    cloud = rows[:, 0].long()
-    first = torch.searchsorted(cloud, torch.arange(envs + 1, device=device))
-    counts, rank = first.diff(), torch.arange(len(cloud), device=device) - first[cloud]
+    rows = xp.empty((len(free), 4), dtype=xp.int32, device=device)
+    launch(coordinates_kernel, len(free), [as_warp(free)], [as_warp(rows)])
+    cloud = xp.asarray(rows[:, 0], dtype=xp.int64)
+    first = xp.searchsorted(cloud, xp.arange(envs + 1, device=device))
+    counts, rank = xp.diff(first), xp.arange(len(cloud), device=device) - first[cloud]
     # Of more than ``most`` every so many-th is taken, in the order of the rows, in which neighbours follow
     # each other: those left out would share a place with the one before them.
-    share = counts.clamp(min=most)[cloud]
+    share = counts.clip(min=most)[cloud]
     place = rank * most // share
     taken = (rank == 0) | ((rank - 1) * most // share < place)
     size = min(most, max(1, int(counts.max())))
-    centres = torch.zeros((envs, size, 3), device=device)
+    centres = xp.zeros((envs, size, 3), dtype=xp.float32, device=device)
     centres[cloud[taken], place[taken]] = rows[taken, 1:] + 0.5
-    return voxel_m * centres, counts.clamp(max=most).int()
+    return voxel_m * centres, xp.asarray(counts.clip(max=most), dtype=xp.int32)

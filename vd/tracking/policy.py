@@ -5,15 +5,16 @@ Tracking policies find the object by its known shape, vision policies by a netwo
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from vd.config import Dropped, from_dict, to_dict
-from vd.policy import REMEDY, TrainedPolicy, policy_of, read_state, teacher_in
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
-from vd.vision.alignment import AlignmentNetwork
 from vd.vision.cfg import AlignmentCfg
-from vd.vision.saved import alignment_network
+
+if TYPE_CHECKING:
+    from vd.policy import TrainedPolicy
+    from vd.vision.alignment import AlignmentNetwork
 
 TRACKING_FORMAT = "visual-dexterity tracking 1"
 
@@ -43,9 +44,9 @@ class TrackingPolicy:
         alignment: Finds the object by the cloud of its goal; None: it is found by its known shape.
     """
 
-    teacher: TrainedPolicy
+    teacher: "TrainedPolicy"
     spec: TrackingSpec
-    alignment: AlignmentNetwork | None = None
+    alignment: "AlignmentNetwork | None" = None
 
     @property
     def kind(self) -> Literal["tracking", "vision"]:
@@ -87,13 +88,16 @@ def tracking_export(policy: TrackingPolicy) -> dict[str, Any]:
     }
 
 
-def read_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy | TrackingPolicy:
+def read_policy(path: str | Path, device: str = "cpu") -> "TrainedPolicy | TrackingPolicy":
     """The policy in a file: by camera, of vd-train tracker, or a teacher (:func:`vd.policy.load_policy`).
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: It is damaged, no policy, or of another version.
     """
+    from vd.policy import REMEDY, policy_of, read_state, teacher_in
+    from vd.vision.saved import alignment_network
+
     state = read_state(path, device, remedy=REMEDY)
     if "tracking" not in state:
         return teacher_in(state, path, device)

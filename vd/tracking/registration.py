@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 
+from vd.arrays import Array, as_warp, of_warp, take_along
 from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.kernels.launch import launch
@@ -108,6 +108,7 @@ class Registration:
         world_scale: np.ndarray,
         camera: CameraModel | None,
         device: str,
+        library: Any,
     ):
         """Measure the shapes.
 
@@ -117,9 +118,10 @@ class Registration:
             world_scale: Size factor of each environment's object, shape [N].
             camera: What sees it, posed in the base frame; None where points are of all sides.
             device: Warp device.
+            library: Of its arrays, torch or on a CPU numpy.
         """
-        self.device, envs = device, len(world_object)
-        place = torch.device(wp.device_to_torch(device))
+        self.device, envs, xp = device, len(world_object), library
+        self._xp, place = xp, wp.device_to_torch(device)
 
         def array(values: Any, dtype: Any) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
@@ -156,24 +158,24 @@ class Registration:
             cells = (math.ceil(camera.height / CELL_PX), math.ceil(camera.width / CELL_PX))
         self._placing = [shapes, self._eye, int(camera is not None), EVERY_SAMPLE]
         self._nearness = wp.zeros((envs, *cells), dtype=float, device=device)
-        self._rotations = torch.tensor(even_rotations(ROTATIONS), dtype=torch.float32, device=place)
-        self.pose = torch.zeros((envs, KEPT, 7), device=place)
+        self._rotations = xp.asarray(even_rotations(ROTATIONS), dtype=xp.float32, device=place)
+        self.pose = xp.zeros((envs, KEPT, 7), dtype=xp.float32, device=place)
         self.pose[..., 6] = 1.0
-        self.misfit = torch.zeros((envs, KEPT), device=place)
-        self.looks = torch.zeros(envs, dtype=torch.int32, device=place)
-        self._kept = [wp.from_torch(self.pose, dtype=wp.transform), wp.from_torch(self.misfit)]
-        self._worlds = torch.arange(envs, dtype=torch.int32, device=place)
+        self.misfit = xp.zeros((envs, KEPT), dtype=xp.float32, device=place)
+        self.looks = xp.zeros(envs, dtype=xp.int32, device=place)
+        self._kept = [as_warp(self.pose, wp.transform), as_warp(self.misfit)]
+        self._worlds = xp.arange(envs, dtype=xp.int32, device=place)
         # What a later look fits: poses kept before, the same where points are now, and others.
         self._found = wp.empty((envs, 2 * KEPT + OTHERS), dtype=wp.transform, device=device)
         self._cost = wp.zeros(self._found.shape, dtype=float, device=device)
 
     def look(
         self,
-        seen: torch.Tensor,
-        count: torch.Tensor,
+        seen: Array,
+        count: Array,
         *,
-        fresh: torch.Tensor,
-        points: torch.Tensor | None = None,
+        fresh: Array,
+        points: Array | None = None,
     ) -> None:
         """Look once in every environment; where nothing is seen of the object all stays as it is.
 
@@ -183,22 +185,20 @@ class Registration:
             fresh: Where nothing is known from before, bool [N].
             points: All that the camera saw [m], NaN for none, [N, K, 3]; None without a camera.
         """
-        inputs = [wp.from_torch(seen.contiguous(), dtype=wp.vec3), wp.from_torch(count)]
+        inputs = [as_warp(seen, wp.vec3), as_warp(count)]
         if points is not None:
             self._nearness.zero_()
-            cloud = wp.from_torch(points.contiguous(), dtype=wp.vec3)
+            cloud = as_warp(points, wp.vec3)
             launch(nearness_kernel, cloud.shape, [self._eye, cloud], [self._nearness])
-        self.looks.masked_fill_(fresh, 0)
+        self.looks[fresh] = 0
         seen_now, known = count > 0, self.looks > 0
-        self._follow(wp.from_torch(torch.where(known & seen_now, self._worlds, -1)), inputs)
-        first = (~known & seen_now).nonzero().flatten()  # waits for the device
+        self._follow(as_warp(self._xp.where(known & seen_now, self._worlds, -1)), inputs)
+        first = self._xp.where(~known & seen_now)[0]  # waits for the device
         if len(first):
-            self._find(wp.from_torch(self._worlds[first]), inputs)
-        self.looks += seen_now.int()
+            self._find(as_warp(self._worlds[first]), inputs)
+        self.looks += seen_now
 
-    def tried(
-        self, seen: torch.Tensor, count: torch.Tensor, *, steps: int, every: int
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def tried(self, seen: Array, count: Array, *, steps: int, every: int) -> tuple[wp.array, wp.array]:
         """All rotations that a first look tries, improved, where there is no camera; nothing is kept.
 
         Args:
@@ -208,11 +208,9 @@ class Registration:
             every: Look at every so many-th point.
 
         Returns:
-            Poses [N, H, 7] and their misfits [m^2], [N, H].
+            Poses [N, H] and their misfits [m^2], [N, H].
         """
-        inputs = [wp.from_torch(seen.contiguous(), dtype=wp.vec3), wp.from_torch(count)]
-        poses, cost = self._tried(wp.from_torch(self._worlds), steps, every, inputs)
-        return wp.to_torch(poses), wp.to_torch(cost)
+        return self._tried(as_warp(self._worlds), steps, every, [as_warp(seen, wp.vec3), as_warp(count)])
 
     def _tried(
         self, envs: wp.array, steps: int, every: int, inputs: list[wp.array]
@@ -220,18 +218,16 @@ class Registration:
         """Poses in all rotations [M, H], improved, and their misfits."""
         poses = wp.empty((len(envs), ROTATIONS), dtype=wp.transform, device=self.device)
         cost = wp.zeros(poses.shape, dtype=float, device=self.device)
-        self._place(poses, cost, envs, self._rotations.expand(len(envs), -1, -1), inputs)
+        turns = self._xp.broadcast_to(self._rotations, (len(envs), ROTATIONS, 4))
+        self._place(poses, cost, envs, turns, inputs)
         self._fit(poses, cost, envs, steps, every, inputs)
         return poses, cost
 
     def _find(self, envs: wp.array, inputs: list[wp.array]) -> None:
         """Find the objects of some environments, of which nothing is known."""
         tried, cost = self._tried(envs, FIRST_STEPS, FIRST_EVERY, inputs)
-        best = wp.to_torch(cost).topk(CHOSEN, dim=1, largest=False).indices
-        poses = wp.to_torch(tried)
-        chosen = wp.from_torch(
-            poses.gather(1, best[..., None].expand(-1, -1, poses.shape[-1])), dtype=wp.transform
-        )
+        best = self._xp.argsort(of_warp(cost, self._xp), axis=1)[:, :CHOSEN, None]
+        chosen = as_warp(take_along(of_warp(tried, self._xp), best, axis=1), wp.transform)
         cost = wp.zeros(chosen.shape, dtype=float, device=self.device)
         self._fit(chosen, cost, envs, CHOSEN_STEPS, 1, inputs)
         self._keep(0, envs, chosen, cost)
@@ -244,23 +240,24 @@ class Registration:
         self._fit(self._found[:, known], self._cost[:, known], envs, STEPS, 1, inputs)
         # What falls is 4 cm farther at the next look, and steps look FAR_M far: poses that do not fit as they
         # did are put where points are now, turned as they were.
-        pose, cost = wp.to_torch(self._found), wp.to_torch(self._cost)
-        cost[:, again].masked_fill_(cost[:, known] <= WORSE * self.misfit, float(NEVER))
-        tried = (self.looks[:, None] * STRIDE + torch.arange(OTHERS, device=cost.device)) % ROTATIONS
+        xp = self._xp
+        pose, cost = of_warp(self._found, xp), of_warp(self._cost, xp)
+        cost[:, again][cost[:, known] <= WORSE * self.misfit] = float(NEVER)
+        tried = (self.looks[:, None] * STRIDE + xp.arange(OTHERS, device=cost.device)) % ROTATIONS
         for columns, turns in ((again, self.pose[..., 3:]), (others, self._rotations[tried])):
             self._place(self._found[:, columns], self._cost[:, columns], envs, turns, inputs)
             self._fit(self._found[:, columns], self._cost[:, columns], envs, STEPS, 1, inputs)
         better = cost[:, again] < cost[:, known]  # of two attempts at one pose
-        pose[:, known] = torch.where(better[..., None], pose[:, again], pose[:, known])
-        cost[:, known] = torch.where(better, cost[:, again], cost[:, known])
+        pose[:, known] = xp.where(better[..., None], pose[:, again], pose[:, known])
+        cost[:, known] = xp.where(better, cost[:, again], cost[:, known])
         cost[:, again] = float(NEVER)
         self._keep(KEPT, envs, self._found, self._cost)
 
     def _place(
-        self, pose: wp.array, cost: wp.array, envs: wp.array, turns: torch.Tensor, inputs: list[wp.array]
+        self, pose: wp.array, cost: wp.array, envs: wp.array, turns: Array, inputs: list[wp.array]
     ) -> None:
         """Write poses [M, C] in rotations [M, C, 4], but where the misfit is NEVER."""
-        given = [*self._placing, envs, wp.from_torch(turns.contiguous(), dtype=wp.quat), cost]
+        given = [*self._placing, envs, as_warp(turns, wp.quat), cost]
         launch(place_poses_kernel, pose.shape, [*given, *inputs], [pose])
 
     def _fit(

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 import warp as wp
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from vd.arrays import Array, library_of, library_on
 from vd.assets_usd.objects.geometry import random_surface_points
 from vd.assets_usd.objects.model import ObjectModel
 from vd.kernels.sensor.shape_grids import off_mesh_kernel
@@ -65,24 +65,21 @@ def with_symmetries(objects: Sequence[ObjectModel], device: str) -> list[ObjectM
     return [replace(item, symmetry=turns) for item, turns in zip(objects, found, strict=True)]
 
 
-def symmetries_of_worlds(
-    objects: Sequence[ObjectModel], world_object: np.ndarray, device: str
-) -> torch.Tensor:
+def symmetries_of_worlds(objects: Sequence[ObjectModel], world_object: np.ndarray, device: str) -> np.ndarray:
     """Symmetries of the object of each environment [N, S, 4], the identity where there are fewer."""
     found = symmetries(objects, device)
     turns = np.zeros((len(found), max(map(len, found)), 4), dtype=np.float32)
     turns[..., 3] = 1.0
     for row, own in zip(turns, found, strict=True):
         row[: len(own)] = own
-    return torch.tensor(turns[np.asarray(world_object)], device=wp.device_to_torch(device))
+    return turns[np.asarray(world_object)]
 
 
-def nearest_goal(orientation: torch.Tensor, goal: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
+def nearest_goal(orientation: Array, goal: Array, turns: Array) -> Array:
     """Of the orientations that look like the wanted one the nearest [N, 4]; arguments [N, 4], [N, S, 4]."""
-    goals = product(goal[:, None].expand_as(turns), turns)
-    angle = rotation_distance(orientation[:, None].expand_as(goals), goals)
-    best = angle.argmin(dim=1)
-    return goals[torch.arange(len(goals), device=goals.device), best]
+    goals = product(goal[:, None], turns)
+    best = rotation_distance(orientation[:, None], goals).argmin(axis=1)
+    return goals[library_of(goals).arange(len(goals), device=goals.device), best]
 
 
 def _key(item: ObjectModel) -> bytes:
@@ -93,20 +90,22 @@ def _key(item: ObjectModel) -> bytes:
 
 def _search(items: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
     """Symmetries of shapes: what registration of each with itself finds, measured on the whole surface."""
+    library = library_on(device)
     itself = Registration(
         items,
         world_object=np.arange(len(items)),
         world_scale=np.ones(len(items)),
         camera=None,
         device=device,
+        library=library,
     )
     # Samples are in an order in which any leading part of them is evenly spread.
-    place = wp.device_to_torch(device)
-    seen = torch.tensor(np.stack([item.surface_points[:POINTS] for item in items]), device=place)
-    count = torch.full((len(items),), seen.shape[1], dtype=torch.int32, device=place)
+    place, samples = wp.device_to_torch(device), np.stack([item.surface_points[:POINTS] for item in items])
+    seen = library.asarray(samples, dtype=library.float32, device=place)
+    count = library.full((len(items),), seen.shape[1], dtype=library.int32, device=place)
     poses, misfits = itself.tried(seen, count, steps=STEPS, every=EVERY)
     found = []
-    for item, turns, misfit in zip(items, poses[..., 3:].cpu().numpy(), misfits.cpu().numpy(), strict=True):
+    for item, turns, misfit in zip(items, poses.numpy()[..., 3:], misfits.numpy(), strict=True):
         surface = _Surface(item, device)
         # Where no more than a hundredth is off by more, the mean square is less, but for a few outliers.
         likely = _apart(turns[misfit.argsort()[: int((misfit < OFF_M**2).sum())]])
@@ -171,8 +170,7 @@ def _closed(turns: np.ndarray, surface: _Surface) -> np.ndarray:
     """
     growing = True
     while True:
-        each = torch.tensor(turns).expand(len(turns), -1, -1)
-        products = product(each.transpose(0, 1), each).numpy()
+        products = product(turns[:, None], turns[None])
         missed = _angles(products[:, :, None], turns).min(axis=2) > CLOSED_RAD
         if not missed.any() or len(turns) == MOST:
             return turns

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 
+from vd.arrays import Array, library_of
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
@@ -20,9 +21,9 @@ from vd.tracking.policy import TrackingPolicy
 class Decision:
     """What a tracking policy says of N hands."""
 
-    action: torch.Tensor
+    action: Array
     """Mean actions [N, D]."""
-    angle: torch.Tensor
+    angle: Array
     """How far the object is expected to be from what looks like its goal [rad] [N]: it is stopped by this."""
 
 
@@ -50,6 +51,9 @@ class Tracker:
         teacher = policy.teacher
         task = ReorientCfg.of(policy)
         objects_of = np.zeros(1, dtype=int) if world_object is None else world_object
+        place = wp.device_to_torch(device)
+        self._teacher: Any = teacher.network.to(place)
+        self._xp = xp = library_of(self._teacher.offset)
         self.observer = CameraObserver(
             hand,
             objects,
@@ -60,23 +64,26 @@ class Tracker:
             control_hz=task.sim.control_hz,
             alignment=policy.alignment,
             device=device,
+            library=xp,
         )
-        place, seen = wp.device_to_torch(device), task.observation
-        self._teacher = teacher.network.to(place)
+
+        def array(values: Any, dtype: str) -> Array:
+            return xp.asarray(values, dtype=getattr(xp, dtype), device=place, copy=True)
+
+        seen = task.observation
         self._maps: FrameMaps | None = None
         if seen.view != "world":
-            self._maps = FrameMaps(hand, seen, place)
+            self._maps = FrameMaps(hand, seen, array)
 
     def step(self, senses: Senses) -> Decision:
         """One control step: see, find, observe, choose a symmetry frame, act."""
-        with torch.no_grad():
-            observation, angle = self.observer(senses)
-            if self._maps is None:
-                return Decision(self._teacher(self._guessed(observation)), angle)
-            frame = self._maps.choose(observation)  # in whose sector the goal is believed to lie
-            action = self._teacher(self._guessed(self._maps.take(observation, frame)))
-            return Decision(self._maps.world_action(action, frame), angle)
+        observation, angle = self.observer(senses)
+        if self._maps is None:
+            return Decision(self._teacher(self._guessed(observation)), angle)
+        frame = self._maps.choose(observation)  # in whose sector the goal is believed to lie
+        action = self._teacher(self._guessed(self._maps.take(observation, frame)))
+        return Decision(self._maps.world_action(action, frame), angle)
 
-    def _guessed(self, seen: torch.Tensor) -> torch.Tensor:
+    def _guessed(self, seen: Array) -> Array:
         """Observations as a frame shows them [N, O], with the teacher's mean for what no camera shows."""
-        return torch.where(self.observer.known > 0.0, seen, self._teacher.offset)
+        return self._xp.where(self.observer.known > 0.0, seen, self._teacher.offset)

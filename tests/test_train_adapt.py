@@ -1,0 +1,57 @@
+"""vd-train adapt: what it takes over of a policy, what it refuses, and what its page compares."""
+
+import re
+from dataclasses import replace
+
+import pytest
+from test_evaluate_trace import FakeObject, judged, traced
+
+from vd.assets_usd.hand_layer import write_layer
+from vd.assets_usd.hands import load_hand
+from vd.envs.cfg import ReorientCfg
+from vd.evaluate.result import Result
+from vd.policy import load_policy
+from vd.train import adapt
+from vd.train.adapt import AdaptCfg, teacher_cfg
+from vd.train.flags import write_config
+
+
+@pytest.fixture
+def cfg(tmp_path) -> AdaptCfg:
+    hand, layer = load_hand("dclaw4"), tmp_path / "late.usda"
+    effects = {name: {"command_delay": {"delay_s": (0.08, 0.07, 0.09)}} for name in hand.joint_names}
+    write_layer(layer, hand, baseline={}, effects=effects, tool="a test", recording="none")
+    return AdaptCfg(policy="dclaw4", hand_layer=layer, out=tmp_path / "run", objects=("cube",))
+
+
+def test_it_goes_on_as_the_policy_was_trained_with_the_servos_of_the_layer_alone(cfg):
+    policy, run = load_policy(adapt.find_start("dclaw4")), teacher_cfg(cfg)
+    before = ReorientCfg.of(policy)
+    asked = {"hand_layer": str(cfg.hand_layer), "objects": ("cube",), "seed": 0}
+    assert run.env == replace(before, randomisation=replace(before.randomisation, effects={}), **asked)
+    assert run.run.max_steps == policy.env_steps + cfg.steps
+    write_config(run)
+    assert teacher_cfg(cfg) == run, "the same command goes on"
+    with pytest.raises(FileExistsError, match="holds a run of other settings"):
+        teacher_cfg(replace(cfg, seed=1))
+    for name, remedy in (
+        ("dclaw4-vision", "adapt its teacher, dclaw4, .*vd-train tracker .* --alignment"),
+        ("dclaw4-cube", "vd-train teacher --init dclaw4-cube --hand-layer"),
+    ):
+        with pytest.raises(ValueError, match=remedy):
+            teacher_cfg(replace(cfg, policy=name, out=cfg.out.with_name("other")))
+
+
+def test_both_policies_are_compared_in_both_models(cfg, monkeypatch):
+    def compare(asked, model):
+        rows, nominal = [], asked.hand_layer == "none"
+        for name in asked.policies:
+            trace = traced(policy={} if nominal or name == str(cfg.out) else {"until": 0})
+            rows += [replace(row, condition=model) for row in judged(trace, (FakeObject("a"),), policy=name)]
+        return Result(tuple(rows))
+
+    monkeypatch.setattr("vd.evaluate.compare.compare", compare)
+    said: list[str] = []
+    adapt.compare_models(cfg, teacher_cfg(cfg), said.append)
+    assert re.findall(r"(\S+) %", said[-1]) == ["100.0", "0.0", "100.0"], "before, there, and adapted"
+    assert "training, identified" in (cfg.out / adapt.PAGE).read_text()

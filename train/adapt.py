@@ -1,0 +1,165 @@
+"""``vd-train adapt``: train a teacher further in an identified model of its hand, and what that is worth."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from vd.command_line import parse
+from vd.config import require
+from vd.evaluate.agents import NO_LAYER, check_names
+from vd.evaluate.cfg import EvalCfg
+from vd.evaluate.conditions import EXACT
+from vd.train.begin import find_start, settings_of
+from vd.train.flags import saved_config
+from vd.train.presets import PRESETS, TeacherCfg
+from vd.train.teacher import say_of_main, train
+
+PAGE = "adapted.html"
+"""Page of the comparison, in the run's folder."""
+NOMINAL, IDENTIFIED = "nominal", "identified"
+"""Models of the hand in which the policies are compared."""
+
+
+@dataclass(kw_only=True)
+class AdaptCfg:
+    """Train a teacher further in the identified model of a hand, until it works there as it did before.
+
+    Task and learner stay those of the policy's own training. The servos are the layer's: each number with an
+    interval is drawn from it in every episode. Effects of the policy's training that the layer lacks go.
+
+    At the end the policy before and after turns the same objects in the nominal and in the identified model:
+    adapted.html in --out. The same command goes on where it was interrupted. For other settings take
+    vd-train teacher --init POLICY --hand-layer LAYER.
+    """
+
+    policy: Annotated[str, tyro.conf.Positional]
+    """The teacher: an installed policy, a policy.pt, a checkpoint, or a run's folder."""
+    hand_layer: Path = field()
+    """The identified model: identified.usda, or identified-all-fingers.usda, of vd-gap."""
+    out: Path = Path("runs/adapted")
+    """Folder of the run, as of vd-train teacher, and of the comparison."""
+    objects: tuple[str, ...] = ()
+    """Object sets to train and compare on; by default those of the policy's training."""
+    num_envs: int | None = None
+    """Environments simulated side by side; by default as many as in the policy's training."""
+    steps: int = 100_000_000
+    """Control steps to train for, all environments together."""
+    max_minutes: float | None = None
+    """End the training after this much time, and compare."""
+    episodes: int = 20
+    """Starts and goals of every object in the comparison."""
+    seed: int = 0
+    """Of the training and the comparison."""
+    device: str = "auto"
+    """auto, cpu or cuda:N."""
+
+
+def adapt_command(arguments: list[str], started: float) -> int:
+    """``vd-train adapt``; the exit status.
+
+    Raises:
+        ValueError: The policy is no teacher, or does not say how it was trained; names the remedy.
+        vd.assets_usd.hand_data.HandError: The layer is not one of the policy's hand.
+        FileExistsError: The folder holds another run.
+    """
+    cfg: AdaptCfg = parse(AdaptCfg, arguments, prog="vd-train adapt")
+    require(cfg, "--", "positive", "num_envs steps episodes")
+    run, say = teacher_cfg(cfg), say_of_main()
+    status = train(run, say, started)
+    if status == 0 and os.environ.get("RANK", "0") == "0":
+        compare_models(cfg, run, say)
+    return status
+
+
+def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
+    """The training of a teacher that an adaptation is.
+
+    Raises:
+        As :func:`adapt_command`.
+    """
+    check_names([cfg.policy], cfg.objects)
+    _check_teacher(cfg.policy)
+    try:
+        base = settings_of(cfg.policy, PRESETS["gpu"]())
+    except ValueError as error:
+        raise ValueError(
+            f"{cfg.policy} cannot go on by itself ({error}): vd-train teacher --init {cfg.policy} "
+            f"--hand-layer {cfg.hand_layer} --preset ..."
+        ) from error
+    from vd.assets_usd.hands import load_hand
+    from vd.train.checkpoint import load_checkpoint
+
+    load_hand(base.env.hand, base.env.fingertip, cfg.hand_layer)
+    before = base.env.randomisation
+    env = replace(
+        base.env,
+        hand_layer=str(cfg.hand_layer),
+        objects=cfg.objects or base.env.objects,
+        num_envs=cfg.num_envs or base.env.num_envs,
+        seed=cfg.seed,
+        randomisation=replace(before, effects={}) if before.enabled else EXACT,
+    )
+    check_names([], env.objects)
+    done = load_checkpoint(find_start(cfg.policy))["env_steps"]
+    how = replace(base.run, out=cfg.out, device=cfg.device, max_minutes=cfg.max_minutes)
+    run = replace(base, init=cfg.policy, resume="auto", run=replace(how, max_steps=done + cfg.steps), env=env)
+    there = saved_config(["--resume", "auto"], run)
+    if there is not None and (there.init, there.env) != (run.init, run.env):
+        raise FileExistsError(f"{cfg.out} holds a run of other settings; choose another --out")
+    return run
+
+
+def _check_teacher(name: str) -> None:
+    """Refuse what sees by camera: its teacher learns, and sees again afterwards."""
+    from vd.evaluate.agents import open_policy
+    from vd.tracking.policy import TrackingPolicy
+
+    policy = open_policy(name, "cpu")
+    if policy is None:
+        raise ValueError(f"{name} has learned nothing; name a trained teacher")
+    if isinstance(policy, TrackingPolicy):
+        network = "" if policy.alignment is None else f" --alignment {name}"
+        raise ValueError(
+            f"{name} sees by camera; adapt its teacher, {policy.spec.teacher}, and let that see again: "
+            f"vd-train tracker runs/adapted --objects SET{network}"
+        )
+
+
+def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object]) -> None:
+    """Compare the policy before and after, in the nominal and in the identified model, and write the page."""
+    from vd.evaluate.compare import compare
+    from vd.evaluate.page import asked, percent, shown_name, write_page
+    from vd.evaluate.result import SUCCESS, Result
+
+    say("comparing the policy before and after, in the nominal and in the identified model ...")
+    before, after = cfg.policy, str(cfg.out)
+    evaluation = EvalCfg(
+        policies=(before, after),
+        objects=run.env.objects,
+        episodes=cfg.episodes,
+        seed=cfg.seed,
+        device=cfg.device,
+    )
+    found = []
+    for model, layer in ((NOMINAL, NO_LAYER), (IDENTIFIED, str(cfg.hand_layer))):
+        found.append(compare(replace(evaluation, hand_layer=layer, out=cfg.out / model), model))
+    rows = tuple(row for one in found for row in one.rows if row.stopped_by != SUCCESS)
+    result, page = Result(rows, found[0].software), cfg.out / PAGE
+    rate = {
+        (model, policy): percent(row.overall.outcomes["success"])
+        for (model, _), headlines in result.headlines().items()
+        for policy, row in headlines.items()
+    }
+    layer = shown_name(str(cfg.hand_layer))
+    told = (
+        f"{before} succeeds in {rate[NOMINAL, before]} of the episodes in the nominal model of "
+        f"{run.env.hand}, in {rate[IDENTIFIED, before]} in the identified one ({layer}), and "
+        f"adapted to that in {rate[IDENTIFIED, after]}."
+    )
+    title, how = f"{before}, adapted to an identified hand", asked([rows[0].protocol])
+    write_page(result, page, title=title, lead=told, notes=(f"{how}.",))
+    say(f"{told}\n{page}")

@@ -1,0 +1,49 @@
+"""Arrays of torch or of NumPy, for code that serves both: a robot's computer then needs no torch.
+
+NumPy 2 and torch name most functions alike, with ``axis`` and ``keepdims``. What differs is here.
+"""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+import warp as wp
+
+Array: TypeAlias = Any
+"""A tensor of torch, or on a CPU an array of NumPy."""
+
+
+def library_of(array: Array) -> Any:
+    """The module whose functions take an array: numpy or torch."""
+    if isinstance(array, np.ndarray):
+        return np
+    import torch
+
+    return torch
+
+
+def library_on(device: str) -> Any:
+    """The module for work that needs neither by itself: numpy on a CPU, torch on a GPU."""
+    if wp.get_device(device).is_cpu:
+        return np
+    import torch
+
+    return torch
+
+
+def as_warp(array: Array, dtype: Any = None) -> wp.array:
+    """The memory of an array for Warp, of ``dtype``, such as ``wp.vec3``; where it has gaps, a copy's."""
+    if isinstance(array, np.ndarray):
+        return wp.array(np.ascontiguousarray(array), dtype=dtype or Any, copy=False, device="cpu")
+    return wp.from_torch(array.contiguous(), dtype=dtype)
+
+
+def of_warp(array: wp.array, library: Any) -> Array:
+    """The memory of a Warp array for a library; vectors and the like are the last axis."""
+    return array.numpy() if library is np else wp.to_torch(array)
+
+
+def take_along(values: Array, index: Array, axis: int) -> Array:
+    """Values at indices along an axis; the other axes are broadcast."""
+    if isinstance(values, np.ndarray):
+        return np.take_along_axis(values, index, axis)
+    return values.take_along_dim(index, dim=axis)
