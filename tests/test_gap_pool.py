@@ -25,7 +25,7 @@ def fits(pool: WorkerPool, spec: JointSpec) -> list[Any]:
     for column, value in TRUE.items():
         base[0, column] = 1.1 * value
     scales = pool.run(spec, [("scales", {"row": base[0], "residual": 0.02})])[0]
-    given = {"base": base, "starts": [{}], "scales": scales, "iterations": 3, "refits": 2}
+    given = {"base": base, "starts": [{}], "scales": scales, "iterations": 3}
     calls: list[Call] = [("fit", {**given, "effects": (effect,)}) for effect in EFFECTS]
     return pool.run(spec, calls)
 

@@ -21,8 +21,6 @@ SCREEN_ITERATIONS = 6
 FULL_ITERATIONS = 12
 ASTRAY = 2.0
 """Factor from the nominal model beyond which a fit starts from that as well."""
-BETTER = 0.98
-"""Share of the error from which a fit of the same model is a better one."""
 
 Call = tuple[str, dict[str, Any]]
 Run = Callable[[list[Call]], list[Any]]
@@ -40,7 +38,6 @@ class CandidateFits:
         others: Slots of the other joints of the chain.
         candidates: Effects to consider.
         scales: Sizes of the joint's motion.
-        refits: Steps of each refit without a fold (:meth:`vd.gap.fit.JointProblem.fit`).
         vetoes: Effects that telemetry contradicts, with the reason.
         nominal: Nominal values of the baseline's parameters, by key.
         promised: Share of the squared error that each candidate of the last round could remove at best.
@@ -54,7 +51,6 @@ class CandidateFits:
     others: Sequence[int]
     candidates: Sequence[str]
     scales: Scales
-    refits: int = 0
     vetoes: Mapping[str, str] = field(default_factory=dict)
     nominal: Mapping[str, float] = field(default_factory=dict)
     promised: dict[str, float] = field(default_factory=dict)
@@ -108,7 +104,7 @@ class CandidateFits:
     def plain(self, baseline: JointFit) -> Call:
         """The call that fits the plain model anew."""
         call = {"base": baseline.rows, "effects": (), "starts": [{}, self.nominal], "scales": self.scales}
-        return "fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits}
+        return "fit", {**call, "iterations": FULL_ITERATIONS}
 
     def refined(self, fit: JointFit) -> JointFit:
         """A fit at finer time steps."""
@@ -145,7 +141,6 @@ class CandidateFits:
                 "starts": list(starts),
                 "scales": self.scales,
                 "iterations": iterations,
-                "refits": self.refits if iterations == FULL_ITERATIONS else 0,
             },
         )
 
@@ -155,8 +150,7 @@ class CandidateFits:
         What was fitted beside that one is known.
         """
         fit = self.refit(present, [effect for effect in present.effects if effect != name])
-        seen = self.seen.get(frozenset(fit.effects), fit)
-        return seen if BETTER * seen.rmse <= fit.rmse else fit
+        return min(fit, self.seen.get(frozenset(fit.effects), fit), key=lambda each: each.rmse)
 
     def refit(self, present: JointFit, effects: Sequence[str]) -> JointFit:
         """The fit with only some of a model's effects."""
@@ -166,7 +160,7 @@ class CandidateFits:
                 rows[self.joint, parameter.column] = parameter.neutral
         values = {k: v for k, v in present.values.items() if k.rpartition(".")[0] in ("", *effects)}
         call = {"base": rows, "effects": tuple(effects), "starts": [values], "scales": self.scales}
-        return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0]
+        return self.run([("fit", {**call, "iterations": FULL_ITERATIONS})])[0]
 
 
 def alike(names: Sequence[str], model: str) -> dict[str, tuple[str, ...]]:

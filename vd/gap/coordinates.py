@@ -17,6 +17,8 @@ LOG_STEP = 0.01
 """Finite-difference step of a logarithmic coordinate: above the noise of single precision."""
 LINEAR_STEP = 0.05
 """Finite-difference step of a linear coordinate, in its scale or in its value if that is larger."""
+LOG_TRUST, LINEAR_TRUST = 1.5, 5.0
+"""First trust region of a fit, of a logarithmic coordinate and of a linear one, besides its size."""
 SECONDS_SCALE = 0.02
 """Scale of delays [s]: with ``LINEAR_STEP`` a step of 2 ms, above the time step of the rollouts."""
 SLOWING = ("torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag", "acceleration_limit")
@@ -65,12 +67,14 @@ class Coordinate:
         x = math.log(max(value, 1e-12)) if self.log else value / self.scale
         return min(max(x, self.lower), self.upper)
 
-    def step(self, x: np.ndarray, widened: np.ndarray) -> np.ndarray:
-        """Finite-difference step at x, times ``widened``: the other way where it would leave the bounds."""
-        size = np.full_like(x, LOG_STEP) if self.log else LINEAR_STEP * np.maximum(1.0, np.abs(x))
-        size = size * widened
-        outside = (x + size > self.upper) | (x + size < self.lower)
-        return np.where(outside, -size, size)
+    def step(self, x: float) -> float:
+        """Finite-difference step at x: back where it would leave the bounds."""
+        size = LOG_STEP if self.log else LINEAR_STEP * max(1.0, abs(x))
+        return -size if x + size > self.upper else size
+
+    def trust(self, x: float) -> float:
+        """Change from x that a fit dares at first."""
+        return LOG_TRUST if self.log else LINEAR_TRUST + abs(x)
 
     def bound(self, x: float) -> bool:
         """Whether x is at the far end of its range; 0 of an effect and half a turn are values like others."""

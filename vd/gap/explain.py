@@ -97,8 +97,6 @@ def _with_notes(search: Search, explanation: Explanation) -> Explanation:
 
 POLISH_ITERATIONS = 5
 """Steps of a fit that has to follow small changes of the other joints."""
-REFITS = 3
-"""Steps of Levenberg-Marquardt of each refit without a fold."""
 
 Progress = Callable[[str], None]
 
@@ -176,7 +174,6 @@ class Explainer:
             floor=spec.floor,
             scales=joint.scales,
             weights=resamples(len(spec.trajectories), rng),
-            refits=REFITS,
             vetoes={**stood_for(same), **told},
             report=lambda line: self.progress(f"explain: {joint.name}: {line}"),
             rest=rest(recording, column, spec.trajectories),
@@ -190,7 +187,7 @@ class Explainer:
         if np.array_equal(rows, joint.fit.rows):
             return joint.fit
         call = {"base": rows, "effects": (), "starts": [{}], "scales": joint.scales}
-        call |= {"iterations": POLISH_ITERATIONS, "refits": REFITS}
+        call |= {"iterations": POLISH_ITERATIONS}
         return self.pool.run(joint.spec, [("fit", call)])[0]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import others_in
 from vd.gap.coordinates import Coordinate, Scales, coordinate, keys
-from vd.gap.descent import FIRST_DAMPING, LOG_TRUST, Descent, LeastSquares
+from vd.gap.descent import LeastSquares
 from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
@@ -70,10 +70,8 @@ CMA_SIGMA = 0.7
 CMA_TRAJECTORIES = 4
 CMA_POPULATION = 16
 
-NEAR = 2.0
-"""Error, in noise floors, up to which refits without a fold keep the slopes of the whole fit: they end close
-to it, where the model is all but linear."""
-
+REFITS = 4
+"""Trials of a refit without a fold, with the slopes of the whole fit."""
 FINER = (2, 4)
 """Divisors of the time step at which an estimate is finished: what the last one changes is its error."""
 FINER_ITERATIONS = 4
@@ -158,12 +156,15 @@ class JointProblem:
     ) -> LeastSquares:
         """The squared error of the model whose other parameters are those of ``base``."""
 
+        def every(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray | None:
+            return None if keep is None else np.repeat(keep[None], len(x), axis=0)
+
         def residuals(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
-            return self.residuals(self.rows(base, coordinates, x), trajectories, keep)
+            return self.residuals(self.rows(base, coordinates, x), trajectories, every(x, keep))
 
         def coarse(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
             rows = self.rows(base, coordinates, x)
-            return self.residuals(rows, trajectories, keep, rollouts=self.coarse)
+            return self.residuals(rows, trajectories, every(x, keep), rollouts=self.coarse)
 
         slopes = None if self.coarse is None else coarse
         return LeastSquares(coordinates, residuals, RIDGE * self.floor**2, slopes)
@@ -226,7 +227,6 @@ class JointProblem:
         *,
         iterations: int = 12,
         trajectories: Trajectories = None,
-        refits: int = 0,
     ) -> JointFit:
         """Fit a model from several starts at once, by Levenberg-Marquardt.
 
@@ -237,7 +237,6 @@ class JointProblem:
             scales: Sizes of the joint's motion.
             iterations: Steps at most.
             trajectories: Subset to fit to, without held-out errors; all of the problem's if None.
-            refits: Steps of Levenberg-Marquardt of each refit without a fold; 0: one Gauss-Newton step.
 
         Returns:
             The best.
@@ -251,16 +250,12 @@ class JointProblem:
         )
         chosen = self.trajectories if trajectories is None else np.asarray(trajectories)
         model = self.squares(base, coordinates, chosen)
-        found = model.descend(x0, iterations, race=True)
-        squares = np.einsum("bn,bn->b", found.residual, found.residual)
-        found = found.at(int(np.argmin(squares)), 1)
-        found = replace(found, jacobian=model.jacobian(found.x, found.residual))
-        fit = self._result(
-            base, effects, coordinates, found.x[0], found.residual[0], found.jacobian[0], chosen
-        )
+        x = model.best(x0, iterations)
+        jacobian = model.jacobian(x)
+        fit = self._result(base, effects, coordinates, x, model.residuals(x[None], None)[0], jacobian, chosen)
         if trajectories is not None:
             return fit
-        held_out, absolute = self.cross_validate(fit, found, refits)
+        held_out, absolute = self.cross_validate(fit, jacobian)
         return replace(fit, held_out=held_out, held_out_abs=absolute)
 
     def fitted(self, effects: Sequence[str]) -> list[str]:
@@ -271,8 +266,7 @@ class JointProblem:
 
     def jacobian(self, fit: JointFit) -> np.ndarray:
         """d(predicted)/dx at a fit, shape [P, N]."""
-        residual = self.residuals(fit.rows[None])
-        return self.squares(fit.rows, fit.coordinates).jacobian(fit.x[None], residual)[0]
+        return self.squares(fit.rows, fit.coordinates).jacobian(fit.x)
 
     def _result(
         self,
@@ -298,49 +292,22 @@ class JointProblem:
             gradient=np.stack([j @ e for j, e in zip(parts, errors, strict=True)]),
         )
 
-    def cross_validate(
-        self, fit: JointFit, found: Descent, iterations: int = 0
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def cross_validate(self, fit: JointFit, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Squared and absolute errors of each trajectory, predicted by a fit without its fold, [S] each.
 
         Args:
             fit: The fit to all folds.
-            found: Its residual and Jacobian.
-            iterations: Steps of Levenberg-Marquardt of each refit; 0: one Gauss-Newton step.
+            jacobian: Its d(predicted)/dx [P, N], which the refits keep.
         """
         out = np.unique(self.folds)[:, None] == self.folds
         model = self.squares(fit.rows, fit.coordinates)
-        if iterations:
-            inside = np.repeat(~out, self.count.astype(int), axis=1)
-            start = found.at(0, len(out))
-            start = replace(
-                start, residual=start.residual * inside, jacobian=start.jacobian * inside[:, None]
-            )
-            near = fit.rmse < NEAR * self.floor
-            x = model.descend(start.x, iterations, keep=~out, known=start, chord=near).x
-            # A refit that found no way down is still the fit that has seen the fold.
-            for stuck in np.flatnonzero((x == start.x).all(axis=1)):
-                x[stuck] = self._without(fit, out[stuck])
-        else:
-            x = np.stack([self._without(fit, fold) for fold in out])
-        residual = self.residuals(self.rows(fit.rows, fit.coordinates, x), keep=out)
+        x = [
+            model.descend(fit.x, REFITS, ~fold, jacobian * np.repeat(~fold, self.count.astype(int)))
+            for fold in out
+        ]
+        residual = self.residuals(self.rows(fit.rows, fit.coordinates, np.array(x)), keep=out)
         parts = self.split(residual.sum(0))
         return np.array([part @ part for part in parts]), np.array([np.abs(part).sum() for part in parts])
-
-    def _without(self, fit: JointFit, out: np.ndarray) -> np.ndarray:
-        """Coordinates one Gauss-Newton step from a fit, towards the one without some trajectories [S]."""
-        lower = np.array([c.lower for c in fit.coordinates])
-        upper = np.array([c.upper for c in fit.coordinates])
-        logarithmic = np.array([c.log for c in fit.coordinates])
-        trust = np.where(logarithmic, 0.3 * LOG_TRUST, 1.0 + 0.5 * np.abs(fit.x))
-        gram = fit.gram[~out].sum(0) + RIDGE * self.floor**2 * np.eye(len(fit.x))
-        gradient = fit.gradient[~out].sum(0)
-        free = ~(((fit.x <= lower) & (gradient < 0.0)) | ((fit.x >= upper) & (gradient > 0.0)))
-        step = np.zeros(len(fit.x))
-        damped = gram[np.ix_(free, free)]
-        damped = damped + np.diag(FIRST_DAMPING * np.diag(damped))
-        step[free] = np.linalg.solve(damped, gradient[free])
-        return np.clip(fit.x + np.clip(step, -trust, trust), lower, upper)
 
     def refine(self, fit: JointFit, scales: Scales) -> JointFit:
         """The same model fitted on with finer time steps, for values that do not depend on the step.

@@ -22,11 +22,8 @@ MAX_ROUNDS = 6
 UNEARNED = float(np.hypot(1.0, MIN_GAIN_FLOORS))
 """Error, in noise floors, from which down to the floor no further effect can close what it has to."""
 SEARCH_TAIL = 0.4
-"""Share of the resamples that may see no gain from an effect while the search goes on: one of two causes
+"""Share of the resamples that may see no gain from an effect that the search adds or keeps: one of two causes
 alone can make some motions worse."""
-KEEP_TAIL = 0.1
-"""Share of the resamples that may see no gain from an effect that is in the model already: what was
-earned is not lost to the luck of another local fit."""
 PLAIN_FRICTION = "coulomb_friction"
 GROWN = 1.5
 """Spread of the samples of a motion, in that of the noise alone, from which they are weighted. Motions that
@@ -126,7 +123,7 @@ class Search(CandidateFits, Evidence):
         """The model without an effect that it does not need, or with a better one in its place, or None."""
         for name in present.effects if len(present.effects) > 1 else ():
             without = self.without(present, name)
-            if not self.better(without, present, KEEP_TAIL)[0]:
+            if not self.better(without, present, SEARCH_TAIL)[0]:
                 self.report(f"- {name}: not needed beside the others")
                 return without
             fits = self.rivals(present, name, without)

@@ -21,7 +21,7 @@ from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.chain import Chain, chains, relative_torques
 from vd.gap.coordinates import BASELINE_PARAMETERS, FREE_SPEED, Scales
 from vd.gap.design import design, pieces
-from vd.gap.explain import POLISH_ITERATIONS, REFITS, Explainer, Joint, Progress
+from vd.gap.explain import POLISH_ITERATIONS, Explainer, Joint, Progress
 from vd.gap.find import findings
 from vd.gap.joints import explain_joints
 from vd.gap.recording import Recording, read_recording
@@ -233,7 +233,7 @@ def _resume(pool: WorkerPool, specs: Sequence[JointSpec], known: dict[str, Any])
         found = known[pool.problems.chains[spec.chain].joints[spec.joint]]
         rows = np.array(found["rows"])
         scales = _scales(pool, spec, rows, found["rmse_rad"])
-        joint = _fitted(pool, spec, rows, scales, iterations=1, refits=REFITS)
+        joint = _fitted(pool, spec, rows, scales, iterations=1)
         return replace(joint, scales=scales)
 
     return parallel(one, specs)
