@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.candidates import alike, stood_for
 from vd.gap.chain import candidates, others_in
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.evidence import EXPLAINED, JITTER, cancelled, middles
+from vd.gap.evidence import JITTER, NO_GAP, cancelled, middles
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.jitter_search import FIXED, try_jitter
 from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.recording import Recording
-from vd.gap.search import MAX_ROUNDS, UNEARNED, Search
+from vd.gap.search import MAX_ROUNDS, Search, alike, stood_for
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import BEHIND_SENSOR, vetoes
 from vd.gap.worker_pool import JointSpec, WorkerPool
@@ -48,7 +47,7 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
             search.report(f"taken back: {why}")
             present = baseline
     known: tuple[Accepted, ...] = ()
-    if not search.no_gap(present) and present.rmse > UNEARNED * search.floor:
+    if not search.no_gap(present) and not search.white(present):
         found, known, rows = try_jitter(search, explain, baseline, present)
         present = found if found is present or JITTER in found.effects else search.revise(found)
         trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
@@ -74,8 +73,8 @@ def _nothing_to_explain(search: Search, baseline: JointFit, loose: str) -> Expla
 def _explain_weighted(search: Search, baseline: JointFit, weighting: SampleWeighting) -> Explanation:
     """What a search finds with samples weighted by how surely they are known, which says so."""
     search.report("errors of the clock grow: samples are weighted by how surely they are known")
-    inner = search.weighted(weighting)
-    found = explain(inner, inner.run([inner.plain(baseline)])[0])
+    inner = search.weighted(weighting, clocked=True)
+    found = explain(inner, inner.plain(baseline))
     return replace(found, weighting=weighting, reason=f"{found.reason}; {WEIGHTED}")
 
 
@@ -94,9 +93,6 @@ def _with_notes(search: Search, explanation: Explanation) -> Explanation:
     ]
     return replace(explanation, reason="; ".join([explanation.reason, *notes]))
 
-
-POLISH_ITERATIONS = 5
-"""Steps of a fit that has to follow small changes of the other joints."""
 
 Progress = Callable[[str], None]
 
@@ -187,7 +183,6 @@ class Explainer:
         if np.array_equal(rows, joint.fit.rows):
             return joint.fit
         call = {"base": rows, "effects": (), "starts": [{}], "scales": joint.scales}
-        call |= {"iterations": POLISH_ITERATIONS}
         return self.pool.run(joint.spec, [("fit", call)])[0]
 
 
@@ -210,7 +205,7 @@ def steady(joint: Joint, explanation: Explanation) -> bool:
     return (
         explanation.verdict == "effects"
         and not {JITTER, FIXED} & {*final.effects}
-        and final.rmse < EXPLAINED * joint.spec.floor
+        and final.rmse < NO_GAP * joint.spec.floor
     )
 
 

@@ -70,11 +70,12 @@ CMA_SIGMA = 0.7
 CMA_TRAJECTORIES = 4
 CMA_POPULATION = 16
 
+ITERATIONS = 12
+"""Trials of a fit at most."""
 REFITS = 4
 """Trials of a refit without a fold, with the slopes of the whole fit."""
 FINER = (2, 4)
 """Divisors of the time step at which an estimate is finished: what the last one changes is its error."""
-FINER_ITERATIONS = 4
 
 Trajectories = Sequence[int] | np.ndarray | None
 """Indices of trajectories; None: all."""
@@ -225,7 +226,7 @@ class JointProblem:
         starts: Sequence[Mapping[str, float]],
         scales: Scales,
         *,
-        iterations: int = 12,
+        iterations: int = ITERATIONS,
         trajectories: Trajectories = None,
     ) -> JointFit:
         """Fit a model from several starts at once, by Levenberg-Marquardt.
@@ -326,7 +327,6 @@ class JointProblem:
                     fit.effects,
                     [result.values],
                     scales,
-                    iterations=FINER_ITERATIONS,
                     trajectories=self.trajectories,
                 )
                 x, error = result.x, np.abs(result.x - x)

@@ -7,14 +7,12 @@ in turn.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from vd.gap.candidates import Call
 from vd.gap.evidence import JITTER, REPEATABLE
 from vd.gap.explanation import Accepted, Explanation, Trial
-from vd.gap.joint_fit import JointFit, SampleWeighting
+from vd.gap.joint_fit import JointFit
 from vd.gap.search import Search
 
 Explain = Callable[[Search, JointFit], Explanation]
@@ -94,8 +92,13 @@ def with_jitter(
     """
     jitter, weighting = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
     for _ in range(PASSES):
-        inner = behind(search, weighting)
-        plain = inner.run([inner.plain(baseline)])[0]
+        inner = search.weighted(
+            weighting,
+            candidates=[name for name in search.candidates if name != JITTER],
+            behind_jitter=True,
+            report=lambda line: search.report(f"beside {JITTER}: {line}"),
+        )
+        plain = inner.plain(baseline)
         found = explain(inner, plain)
         clear = found.verdict in ("effects", "ambiguous")
         rest, beside = (found.final, found.accepted) if clear else (plain, ())
@@ -116,20 +119,3 @@ def with_jitter(
 def equivalent(fit: JointFit) -> float:
     """RMSE of a fit as a likelihood has it that knows a width of each motion: their geometric mean [rad]."""
     return float(np.exp(0.5 * np.sum(fit.count * np.log(fit.sse / fit.count)) / fit.count.sum()))
-
-
-def behind(search: Search, weighting: SampleWeighting) -> Search:
-    """The same search, samples weighted by what random delays do to them."""
-
-    def run(calls: list[Call]) -> list[Any]:
-        return search.run([(name, {**options, "weighting": weighting}) for name, options in calls])
-
-    return replace(
-        search,
-        run=run,
-        candidates=[name for name in search.candidates if name != JITTER],
-        behind_jitter=True,
-        report=lambda line: search.report(f"beside {JITTER}: {line}"),
-        promised={},
-        seen={},
-    )

@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 
-from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.evidence import CANCELLING, JITTER, LEVELS, MIN_GAIN, explains
 from vd.gap.explain import Explained, Explainer, Joint, beside, weighting_of
 from vd.gap.explanation import NAMED, Explanation, estimates, intervals, polished
@@ -148,7 +147,7 @@ def explain_joints(explainer: Explainer) -> list[Explanation]:
 def _finished(pool: WorkerPool, known: Explained, joint: Joint, fit: JointFit) -> JointFit:
     """A model fitted to the end from where it is, beside the joints as they are known."""
     call = {"base": beside(joint, known), "effects": fit.effects, "starts": [fit.values]}
-    call |= {"scales": joint.scales, "iterations": FULL_ITERATIONS}
+    call |= {"scales": joint.scales}
     weighting = weighting_of(next(found for other, found in known if other is joint))
     whole = pool.run(joint.spec, [("fit", {**call, **weighting})])[0]
     return pool.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales, **weighting})])[0]

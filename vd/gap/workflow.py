@@ -17,11 +17,10 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
-from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.chain import Chain, chains, relative_torques
 from vd.gap.coordinates import BASELINE_PARAMETERS, FREE_SPEED, Scales
 from vd.gap.design import design, pieces
-from vd.gap.explain import POLISH_ITERATIONS, Explainer, Joint, Progress
+from vd.gap.explain import Explainer, Joint, Progress
 from vd.gap.find import findings
 from vd.gap.joints import explain_joints
 from vd.gap.recording import Recording, read_recording
@@ -209,7 +208,7 @@ def _identify(pool: WorkerPool, specs: Sequence[JointSpec], options: Options) ->
         # A short search can end where the inertia is too small to show, from where no descent comes back.
         nominal = {key: float(rows[spec.joint, BASELINE_PARAMETERS[key].column]) for key in spec.baseline}
         starts += [nominal, {**nominal, "velocity_limit": SPEED_STARTS[0] * scales.speed}]
-        joint = _fitted(pool, spec, searched, scales, starts=starts, iterations=FULL_ITERATIONS)
+        joint = _fitted(pool, spec, searched, scales, starts=starts)
         error, floor = 1e3 * joint.fit.rmse, 1e3 * spec.floor
         options.progress(f"find: {joint.name}: baseline {error:.2f} mrad, noise floor {floor:.2f}")
         return joint
@@ -219,7 +218,7 @@ def _identify(pool: WorkerPool, specs: Sequence[JointSpec], options: Options) ->
         for other in joints:
             if other.spec.chain == joint.spec.chain:
                 rows[other.spec.joint] = other.fit.rows[other.spec.joint]
-        return _fitted(pool, joint.spec, rows, joint.scales, iterations=POLISH_ITERATIONS)
+        return _fitted(pool, joint.spec, rows, joint.scales)
 
     joints = parallel(first, specs)
     single = all(len(chain.joints) == 1 for chain in pool.problems.chains)
