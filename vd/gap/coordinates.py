@@ -249,9 +249,3 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
     if effect in SMOOTHING:
         starts += [{**start, "inertia": LIGHT * scales.inertia} for start in starts]
     return starts
-
-
-def best_two(starts: Sequence[dict[str, float]]) -> list[dict[str, float]]:
-    """The best of starts in order of promise, and the best that changes other parameters, if any does."""
-    other = next((start for start in starts[1:] if start.keys() != starts[0].keys()), None)
-    return [starts[0], *([other] if other is not None else starts[1:2])]

@@ -20,10 +20,6 @@ SLOW = 0.1
 """Share of it below which motion is slow."""
 HEAVY = 0.7
 """Share of the largest pull (command minus position) above which the servo works hard."""
-LATE = 2.0 / 3.0
-"""Share of a trajectory after which it is late in it; before one minus it, early."""
-LONG_S = 6.0
-"""Length of trajectories of which early and late are compared [s]."""
 NOTABLE = 2.0
 """A phase is reported if its RMS is this many noise floors."""
 TYPICAL = 1.15
@@ -33,8 +29,6 @@ MAX_FINDINGS = 4
 """Findings of a joint."""
 SYSTEMATIC = 0.5
 """Share of the RMS that the mean must have for a sign to be reported."""
-LAG_SHARE = 0.3
-"""Share of the squared residual that a pure lag must explain to be reported."""
 
 PHASES: dict[str, tuple[str, str]] = {
     "onset": ("when the command starts to move", f"for {1e3 * ONSET_S:.0f} ms"),
@@ -43,8 +37,6 @@ PHASES: dict[str, tuple[str, str]] = {
     "fast": ("in fast motion", ""),
     "slow": ("in slow motion", ""),
     "load": ("when the servo pulls hard", ""),
-    "early": ("early in long motions", ""),
-    "late": ("late in long motions", ""),
 }
 """Phase -> when, and for how long."""
 
@@ -88,7 +80,6 @@ def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) ->
     before = np.concatenate([[0], count[:-1]])
     onset = changed & (before - count[first] == 0) & (time > 0.0)
     pull = np.abs(command - position)
-    long = time[-1] >= LONG_S
     return {
         "onset": _after(onset, time, ONSET_S),
         "reversal": _after(reversed_, time, REVERSAL_S),
@@ -96,8 +87,6 @@ def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) ->
         "fast": np.abs(speed) > FAST * top,
         "slow": moving & (np.abs(speed) < SLOW * top) & ~rest,
         "load": pull > HEAVY * max(float(pull.max()), 1e-12),
-        "early": np.full(len(time), long) & (time < (1.0 - LATE) * time[-1]),
-        "late": np.full(len(time), long) & (time > LATE * time[-1]),
     }
 
 
@@ -139,13 +128,7 @@ def _joint(recording: Recording, parts: list[np.ndarray], column: int, floor: fl
     chosen = [row for row in rows if row[0] > NOTABLE * floor and row[0] > TYPICAL * overall][:MAX_FINDINGS]
     if not chosen and rows and overall > NOTABLE * floor:
         chosen = rows[:1]
-    result = [_finding(name, row, overall, floor) for row in chosen]
-    lag = _lag(residual, speed)
-    if chosen and lag is not None:
-        verb = "lags" if lag > 0.0 else "leads"
-        text = f"{name}: the joint {verb} the model by about {1e3 * abs(lag):.0f} ms throughout"
-        result.append(Finding(name, text, {"lag_s": lag, "rms_rad": overall, "noise_floor_rad": floor}))
-    return result
+    return [_finding(name, row, overall, floor) for row in chosen]
 
 
 def _finding(
@@ -171,13 +154,3 @@ def _finding(
         "noise_floor_rad": floor,
     }
     return Finding(name, text, signature)
-
-
-def _lag(residual: np.ndarray, speed: np.ndarray) -> float | None:
-    """Lag behind the model [s] if the residual is mostly in proportion to the speed."""
-    power = float(speed @ speed)
-    if power <= 0.0:
-        return None
-    slope = float(residual @ speed) / power
-    explained = slope**2 * power / max(float(residual @ residual), 1e-300)
-    return -slope if explained > LAG_SHARE else None

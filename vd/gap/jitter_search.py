@@ -8,8 +8,6 @@ in turn.
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-
 from vd.gap.evidence import JITTER, REPEATABLE
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.joint_fit import JointFit
@@ -23,12 +21,6 @@ FIXED = "command_delay"
 """What is the mean of random delays, too."""
 PASSES = 2
 """Searches for what there is beside random delays, each with these as they are beside what the last found."""
-NOT_NEAR = 1.5
-"""Error after the first of them, in that of the model without them, from which the next is not made."""
-HOPELESS = 3.0
-"""The same of what is left through it, in what may be left in the end: the first weighting is too narrow."""
-SAME_SPREAD = 0.1
-"""Relative change of their standard deviation up to which they are the same."""
 SPREAD = "its spread is what is measured"
 """Why they are named."""
 
@@ -104,18 +96,11 @@ def with_jitter(
         rest, beside = (found.final, found.accepted) if clear else (plain, ())
         call = {"fit": rest, "scales": search.scales, "start": jitter}
         random, weighting = search.run([("fit_jitter", call)])[0]
-        before, jitter = jitter, (random.values[SIGMA], random.values[DROP])
-        same = abs(np.log(jitter[0] / before[0])) < SAME_SPREAD
-        hopeless = rest.rmse > HOPELESS * REPEATABLE * search.floor
-        if same or hopeless or equivalent(random) > NOT_NEAR * equivalent(present):
+        jitter = random.values[SIGMA], random.values[DROP]
+        if not search.likelier(present, random)[0]:
             break
     rows = [
         replace(row, round=row.round + 1, fit=replace(row.fit, effects=(JITTER, *row.fit.effects)))
         for row in found.trials
     ]
     return random, beside, rows, rest.rmse
-
-
-def equivalent(fit: JointFit) -> float:
-    """RMSE of a fit as a likelihood has it that knows a width of each motion: their geometric mean [rad]."""
-    return float(np.exp(0.5 * np.sum(fit.count * np.log(fit.sse / fit.count)) / fit.count.sum()))

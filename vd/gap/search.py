@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.coordinates import Scales, best_two, sizes, torque_power
+from vd.gap.coordinates import Scales, sizes, torque_power
 from vd.gap.evidence import JITTER, NESTED, Evidence
 from vd.gap.explanation import Trial
 from vd.gap.jitter import CALLS
@@ -123,37 +123,26 @@ class Search(Evidence):
             return {}, {}
         call = {"fit": present, "starts": [start for _, start in flat], "scales": self.scales}
         promise = self.run([("promise", call)])[0]
-        best_first: dict[str, list[dict[str, float]]] = {}
+        best: dict[str, dict[str, float]] = {}
         promised: dict[str, float] = {}
         for i in np.argsort(-promise):
             name, start = flat[i]
-            best_first.setdefault(name, []).append(start)
+            best.setdefault(name, start)
             promised.setdefault(name, float(promise[i]))
-        tried = list(best_first)[:SHORT_LIST]
-        fits = self.run(
-            [
-                self.fit(
-                    present.rows,
-                    (*present.effects, name),
-                    self.starts(present, best_two(best_first[name])),
-                )
-                for name in tried
-            ]
-        )
-        return dict(zip(tried, fits, strict=True)), promised
+        tried = list(best)[:SHORT_LIST]
+        calls = [self.fit(present.rows, (*present.effects, n), self.starts(present, best[n])) for n in tried]
+        return dict(zip(tried, self.run(calls), strict=True)), promised
 
-    def starts(self, present: JointFit, added: Sequence[dict[str, float]]) -> list[dict[str, float]]:
+    def starts(self, present: JointFit, added: Mapping[str, float]) -> list[dict[str, float]]:
         """Where a fit with a further effect starts: at the present model, and at the nominal one.
 
         Without the effect, the baseline may have gone far to imitate it (an unmodelled delay is best met
         by a servo twenty times as stiff), and from there no descent comes back.
         """
-        nominal = self.nominal.get("kp", 0.0)
+        start, nominal = {**present.values, **added}, self.nominal.get("kp", 0.0)
         torque = nominal / present.values["kp"] if nominal else 1.0
-        start = {
-            key: value * torque ** torque_power(key) for key, value in (present.values | added[0]).items()
-        }
-        return [*({**present.values, **one} for one in added), {**start, **self.nominal}]
+        scaled = {key: value * torque ** torque_power(key) for key, value in start.items()}
+        return [start, {**scaled, **self.nominal}]
 
     def clock_sensitivity(self, fit: JointFit) -> SampleWeighting | None:
         """What errors of the clock do under a model that leaves more than noise; None where they do not grow.
