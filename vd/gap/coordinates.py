@@ -67,10 +67,10 @@ class Coordinate:
         x = math.log(max(value, 1e-12)) if self.log else value / self.scale
         return min(max(x, self.lower), self.upper)
 
-    def step(self, x: float) -> float:
-        """Finite-difference step at x: back where it would leave the bounds."""
-        size = LOG_STEP if self.log else LINEAR_STEP * max(1.0, abs(x))
-        return -size if x + size > self.upper else size
+    def step(self, x: float, widen: float = 1.0) -> float:
+        """Finite-difference step at x, times a factor: the other way where it would leave the bounds."""
+        size = widen * (LOG_STEP if self.log else LINEAR_STEP * max(1.0, abs(x)))
+        return size if self.lower <= x + size <= self.upper else -size
 
     def trust(self, x: float) -> float:
         """Change from x that a fit dares at first."""

@@ -10,6 +10,9 @@ from vd.gap.coordinates import Coordinate
 
 RACE_ITERATIONS = 4
 """Iterations after which only the better half of several starts goes on."""
+WIDEN = -3.0
+"""Factor on the finite-difference steps of a second descent: dry friction and limits make the squared error
+rugged at the scale of the first one's."""
 TOLERANCE = 1e-4
 """Relative improvement of the squared error at which a fit has converged."""
 
@@ -33,9 +36,9 @@ class LeastSquares:
     ridge: float
     slopes: Residuals | None = None
 
-    def jacobian(self, x: np.ndarray, keep: np.ndarray | None = None) -> np.ndarray:
-        """d(predicted)/dx [P, N] at coordinates [P] by one-sided differences."""
-        steps = np.array([c.step(v) for c, v in zip(self.coordinates, x, strict=True)])
+    def jacobian(self, x: np.ndarray, keep: np.ndarray | None = None, widen: float = 1.0) -> np.ndarray:
+        """d(predicted)/dx [P, N] at coordinates [P] by one-sided differences, their steps times a factor."""
+        steps = np.array([c.step(v, widen) for c, v in zip(self.coordinates, x, strict=True)])
         moved = np.vstack([x, x + np.diag(steps)])
         answers = (self.residuals if self.slopes is None else self.slopes)(moved, keep)
         return (answers[0] - answers[1:]) / steps[:, None]
@@ -46,6 +49,7 @@ class LeastSquares:
         iterations: int,
         keep: np.ndarray | None = None,
         slopes: np.ndarray | None = None,
+        widen: float = 1.0,
     ) -> np.ndarray:
         """Coordinates [P] of a local minimum.
 
@@ -54,6 +58,7 @@ class LeastSquares:
             iterations: Trials at most.
             keep: Trajectories that count [S]; all by default.
             slopes: A Jacobian [P, N] to keep.
+            widen: Factor on finite-difference steps.
         """
         pull = np.sqrt(self.ridge)
 
@@ -61,7 +66,7 @@ class LeastSquares:
             return np.concatenate([self.residuals((start + moved)[None], keep)[0], pull * moved])
 
         def jacobian(moved: np.ndarray) -> np.ndarray:
-            own = self.jacobian(start + moved, keep) if slopes is None else slopes
+            own = self.jacobian(start + moved, keep, widen) if slopes is None else slopes
             return np.vstack([-own.T, pull * np.eye(len(start))])
 
         lower = np.array([c.lower for c in self.coordinates]) - start
@@ -89,4 +94,4 @@ class LeastSquares:
             costs = [float(np.sum(self.residuals(one[None], None) ** 2)) for one in x]
             x = [x[i] for i in np.argsort(costs)[: (len(x) + 1) // 2]]
             iterations = max(iterations - RACE_ITERATIONS, RACE_ITERATIONS)
-        return self.descend(x[0], iterations)
+        return self.descend(self.descend(x[0], iterations), iterations, widen=WIDEN)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from vd.gap.evidence import JITTER, NO_GAP, cancelled, middles
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.jitter_search import FIXED, try_jitter
 from vd.gap.joint_fit import JointFit, SampleWeighting
-from vd.gap.recording import Recording
 from vd.gap.search import MAX_ROUNDS, Search, alike, stood_for
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import BEHIND_SENSOR, vetoes
@@ -129,11 +127,6 @@ class Explainer:
     seed: int
     progress: Progress
 
-    @cached_property
-    def when(self) -> np.ndarray:
-        """When each trajectory was recorded (:func:`vd.gap.evidence.middles`)."""
-        return middles(self.pool.problems.recording)
-
     def explain(self, joint: Joint, explained: Explained) -> Explanation:
         """What a joint lacks.
 
@@ -150,6 +143,7 @@ class Explainer:
         chain, spec = self.pool.problems.chains[joint.spec.chain], joint.spec
         recording = self.pool.problems.recording
         column = int(chain.columns[spec.joint])
+        own = [recording.trajectories[i] for i in spec.trajectories]
         names = candidates(chain, self.effects)
         if _no_jitter(explained):
             names = [name for name in names if name != JITTER]
@@ -172,9 +166,9 @@ class Explainer:
             weights=resamples(len(spec.trajectories), rng),
             vetoes={**stood_for(same), **told},
             report=lambda line: self.progress(f"explain: {joint.name}: {line}"),
-            rest=rest(recording, column, spec.trajectories),
-            moves=moves(recording, column, spec.trajectories),
-            when=self.when[list(spec.trajectories)],
+            rest=float(np.median([t.position[0, column] for t in own])),
+            moves=np.array([bool(np.ptp(t.command[:, column])) for t in own]),
+            when=middles(recording)[list(spec.trajectories)],
         )
 
     def plain(self, joint: Joint, explained: Explained) -> JointFit:
@@ -190,22 +184,18 @@ def _no_jitter(explained: Explained) -> bool:
     """Whether random delays are none on a joint, by what is known of the others of its finger.
 
     They are none where they were tried on one and refused, not where too little was left there to try them;
-    and where another is explained without, as commands go out together.
+    and where another is explained without them or a fixed one, their mean, as commands go out together.
     """
-    unknown = any(found.verdict == "unknown" for _, found in explained)
-    random = any(JITTER in found.final.effects for _, found in explained)
-    tried = any(row.name == JITTER for _, found in explained for row in found.trials)
-    refused = unknown and tried and not random
-    return refused or any(steady(other, found) for other, found in explained)
-
-
-def steady(joint: Joint, explanation: Explanation) -> bool:
-    """Whether a joint is explained down to noise with neither random delays nor a fixed one, their mean."""
-    final = explanation.final
-    return (
-        explanation.verdict == "effects"
-        and not {JITTER, FIXED} & {*final.effects}
-        and final.rmse < NO_GAP * joint.spec.floor
+    found = [one for _, one in explained]
+    random = any(JITTER in one.final.effects for one in found)
+    tried = any(row.name == JITTER for one in found for row in one.trials)
+    if tried and not random and any(one.verdict == "unknown" for one in found):
+        return True
+    return any(
+        one.verdict == "effects"
+        and not {JITTER, FIXED} & {*one.final.effects}
+        and one.final.rmse < NO_GAP * joint.spec.floor
+        for joint, one in explained
     )
 
 
@@ -223,13 +213,3 @@ def beside(joint: Joint, explained: Explained) -> np.ndarray:
 def weighting_of(found: Explanation) -> dict[str, Any]:
     """How the samples of an explained joint are weighted, as an argument of a call."""
     return {} if found.weighting is None else {"weighting": found.weighting}
-
-
-def rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:
-    """Where a joint begins most of its motions [rad]."""
-    return float(np.median([recording.trajectories[i].position[0, column] for i in trajectories]))
-
-
-def moves(recording: Recording, column: int, trajectories: Sequence[int]) -> np.ndarray:
-    """Whether a joint's command changes in each trajectory [S]."""
-    return np.array([bool(np.ptp(recording.trajectories[i].command[:, column])) for i in trajectories])

@@ -39,7 +39,7 @@ def try_jitter(
     Returns:
         The better model; what it has besides random delays, if it has these; and the evidence.
     """
-    if not _tried(search):
+    if search.behind_jitter or JITTER not in search.candidates or JITTER in search.vetoes:
         return present, (), []
     random, beside, rows, left = with_jitter(search, explain, baseline, present)
     others = [name for name in random.effects if name != JITTER]
@@ -57,21 +57,11 @@ def try_jitter(
     row = Trial(1, JITTER, random, gain, ci, decision, SPREAD if accepted else why)
     if not accepted:
         return present, (), [row]
-    random = bounded(search, random)
+    random = search.run([("bound_jitter", {"fit": random, "scales": search.scales})])[0]
     names, before, after = " and ".join(random.effects), present.held_out_rmse, random.held_out_rmse
     text = f"as likely as {1e3 * after:.2f} mrad of constant width, before {1e3 * before:.2f}"
     search.report(f"+ {names}: {text}")
     return random, beside, [row, *rows]
-
-
-def _tried(search: Search) -> bool:
-    """Whether random delays are among what a search may find."""
-    return not search.behind_jitter and JITTER in search.candidates and JITTER not in search.vetoes
-
-
-def bounded(search: Search, random: JointFit) -> JointFit:
-    """A model with the intervals of its random delays."""
-    return search.run([("bound_jitter", {"fit": random, "scales": search.scales})])[0]
 
 
 def with_jitter(

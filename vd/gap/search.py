@@ -55,7 +55,7 @@ class Search(Evidence):
         report: Called with a line of progress.
         rest: Where the joint rests before it moves [rad].
         clocked: Whether samples are weighted by what errors of the clock do.
-        seen: Models to which an effect was added, by their effects.
+        known: Values of the models that steps led to, by their effects: fits of these start there, too.
     """
 
     run: Run
@@ -67,12 +67,13 @@ class Search(Evidence):
     report: Callable[[str], None] = lambda line: None
     rest: float = 0.0
     clocked: bool = False
-    seen: dict[frozenset[str], JointFit] = field(default_factory=dict)
+    known: dict[frozenset[str], Mapping[str, float]] = field(default_factory=dict)
 
     def fit(self, base: np.ndarray, effects: Sequence[str], starts: Sequence[Mapping[str, float]]) -> Call:
         """The call that fits a model from the rows of a chain."""
-        given = {"base": base, "effects": tuple(effects), "starts": list(starts)}
-        return "fit", {**given, "scales": self.scales}
+        known = self.known.get(frozenset(effects))
+        starts = [*starts, *([] if known is None else [known])]
+        return "fit", {"base": base, "effects": tuple(effects), "starts": starts, "scales": self.scales}
 
     def plain(self, baseline: JointFit) -> JointFit:
         """The plain model, fitted anew."""
@@ -92,9 +93,8 @@ class Search(Evidence):
         return self.run([self.fit(rows, effects, [values])])[0]
 
     def without(self, present: JointFit, name: str) -> JointFit:
-        """The better fit without one of a model's effects: a new one, or that to which it was added."""
-        fit = self.refit(present, [effect for effect in present.effects if effect != name])
-        return min(fit, self.seen.get(frozenset(fit.effects), fit), key=lambda each: each.rmse)
+        """The fit without one of a model's effects."""
+        return self.refit(present, [effect for effect in present.effects if effect != name])
 
     def fit_candidates(
         self, present: JointFit, skip: Sequence[str] = (), vetoed: Sequence[str] = ()
@@ -171,7 +171,7 @@ class Search(Evidence):
                 ]
             )
 
-        return replace(self, run=run, seen={}, **changes)
+        return replace(self, run=run, known=dict(self.known), **changes)
 
     def search(self, baseline: JointFit) -> tuple[JointFit, list[Trial]]:
         """Forward steps from the plain model, each checked backward; what they add is tentative.
@@ -194,8 +194,9 @@ class Search(Evidence):
                 break
             name, before, after = best.effects[-1], present.held_out_rmse, best.held_out_rmse
             self.report(f"+ {name}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
-            self.seen[frozenset(present.effects)] = present
+            self.known[frozenset(best.effects)] = best.values
             present = self.revise(best)
+            self.known[frozenset(present.effects)] = present.values
             if frozenset(present.effects) in visited:
                 break  # back where it was before
             visited.add(frozenset(present.effects))
