@@ -85,12 +85,12 @@ def test_the_pendulum_is_predicted_at_gains_left_out(pendulum):
 @pytest.mark.parametrize(
     ("gains", "left_rad"), [((100, 400, 800), MAE_RAD), ((100,), 0.018), ((400,), 0.034)]
 )
-def test_all_candidates_leave_no_more_of_the_pendulum(shared_dir, tmp_path, gains, left_rad):
+def test_all_candidates_leave_no_more_of_the_pendulum(shared_dir, tmp_path, gains, left):
     """Fits that end in the valley of a smaller model leave 42, 41 and 42 mrad."""
     recording = measured(shared_dir, "xl330_pendulum")
     own = tuple(t for t in recording.trajectories if t.conditions["p_gain"] in gains)
     report = explain(replace(recording, trajectories=own), None, tmp_path, workers=1)
-    assert report.held_out.identified_mae_rad < left_rad
+    assert report.held_out.identified_mae_rad < left
 
 
 @pytest.fixture(scope="module")
