@@ -15,51 +15,10 @@ from vd.gap.chain import others_in
 from vd.gap.coordinates import Coordinate, Scales, coordinate, keys
 from vd.gap.descent import LeastSquares
 from vd.gap.joint_fit import JointFit, SampleWeighting
-from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
 
 STILL_COUNTS = 0.05
 """Encoder counts within which a prediction stands still."""
-
-
-class Holding:
-    """The trajectories in which a joint's command never changes.
-
-    A rollout starts at the first reading. Where dry friction holds the joint, the prediction stays there,
-    with the reading's error of up to a count, although the model is right; and so does the middle of what
-    play or a dead zone leave free, however the joint is shaken within.
-
-    Args:
-        recording: The recording.
-        column: The joint's column in it.
-        trajectories: Indices of the trajectories that are used.
-    """
-
-    def __init__(self, recording: Recording, column: int, trajectories: Sequence[int] | np.ndarray):
-        parts = {int(t): recording.trajectories[int(t)] for t in trajectories}
-        self._holds = {t: not np.ptp(part.command[:, column]) for t, part in parts.items()}
-        self._length = {t: len(part.time) for t, part in parts.items()}
-        self._least = STILL_COUNTS * recording.encoder_resolution_rad
-
-    def forgive(
-        self, residual: np.ndarray, predicted: np.ndarray, chosen: Sequence[int], free: np.ndarray
-    ) -> None:
-        """Take the mean from the residuals [C, N] of held motions, as far as the start can be its cause.
-
-        Args:
-            residual: Measured minus predicted, trajectory by trajectory; changed in place.
-            predicted: Predicted positions [C, N] [rad].
-            chosen: Indices of the trajectories.
-            free: Width in which nothing holds the joint [C] [rad]; all of a mean can be the start's where the
-                prediction stands still.
-        """
-        ends = np.cumsum([self._length[t] for t in chosen])[:-1]
-        parts = zip(chosen, np.split(residual, ends, axis=1), np.split(predicted, ends, axis=1), strict=True)
-        for trajectory, part, path in parts:
-            if self._holds[trajectory]:
-                still = np.ptp(path, axis=1) < self._least
-                most, mean = np.where(still, np.inf, free), part.mean(axis=1)
-                part -= np.clip(mean, -most, most)[:, None]
 
 
 RIDGE = 0.01
@@ -113,7 +72,9 @@ class JointProblem:
         self._measured = {
             int(t): rollouts.measured[rollouts.sample_trajectory == t, joint] for t in self.trajectories
         }
-        self._holding = Holding(rollouts.recording, int(rollouts.chain.columns[joint]), trajectories)
+        column = int(rollouts.chain.columns[joint])
+        recorded = {int(t): rollouts.recording.trajectories[int(t)] for t in self.trajectories}
+        self._holds = {t: not np.ptp(part.command[:, column]) for t, part in recorded.items()}
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
         self._growth: dict[int, np.ndarray] = {}
 
@@ -145,12 +106,26 @@ class JointProblem:
         self.simulated += len(rows) * len(chosen) if keep is None else int(keep.sum())
         residual = measured - predicted
         free = rows[:, self.joint, [servo.BACKLASH_WIDTH, servo.DEAD_ZONE_WIDTH]].max(axis=1)
-        self._holding.forgive(residual, predicted, chosen, free)
+        parts = zip(chosen, self.split(residual, chosen), self.split(predicted, chosen), strict=True)
+        for trajectory, part, path in parts:
+            if self._holds[trajectory]:
+                self._forgive(part, path, free)
         if self._growth:
             residual /= np.concatenate([self._growth[t] for t in chosen])
         if keep is not None:
             residual *= np.repeat(keep, [len(self._measured[t]) for t in chosen], axis=1)
         return residual
+
+    def _forgive(self, residual: np.ndarray, predicted: np.ndarray, free: np.ndarray) -> None:
+        """Take the mean from the residuals [C, T] of a motion whose command never changes, in place.
+
+        A rollout starts at the first reading. Where dry friction holds the joint, the prediction stays there,
+        with the reading's error of up to a count, although the model is right; and so does the middle of what
+        play or a dead zone leave ``free`` [C] [rad], however the joint is shaken within.
+        """
+        least = STILL_COUNTS * self.rollouts.recording.encoder_resolution_rad
+        most, mean = np.where(np.ptp(predicted, axis=1) < least, np.inf, free), residual.mean(axis=1)
+        residual -= np.clip(mean, -most, most)[:, None]
 
     def squares(
         self, base: np.ndarray, coordinates: Sequence[Coordinate], trajectories: Trajectories = None
@@ -182,11 +157,6 @@ class JointProblem:
         chosen = self.trajectories if trajectories is None else trajectories
         ends = np.cumsum([len(self._measured[int(t)]) for t in chosen])[:-1]
         return np.split(samples, ends, axis=-1)
-
-    def sums(self, residuals: np.ndarray, trajectories: Trajectories = None) -> np.ndarray:
-        """Squared errors of each trajectory, shape [C, S]."""
-        parts = self.split(residuals, trajectories)
-        return np.stack([np.einsum("cn,cn->c", part, part) for part in parts], axis=1)
 
     def scales(self, row: np.ndarray, residual: float) -> Scales:
         """Sizes of the joint's motion with a baseline row [PARAMETER_COLUMNS]."""
@@ -253,7 +223,19 @@ class JointProblem:
         model = self.squares(base, coordinates, chosen)
         x = model.best(x0, iterations)
         jacobian = model.jacobian(x)
-        fit = self._result(base, effects, coordinates, x, model.residuals(x[None], None)[0], jacobian, chosen)
+        errors = self.split(model.residuals(x[None], None)[0], chosen)
+        parts = self.split(jacobian, chosen)
+        fit = JointFit(
+            effects=tuple(effects),
+            coordinates=tuple(coordinates),
+            x=x,
+            rows=self.rows(base, coordinates, x[None])[0],
+            sse=np.array([e @ e for e in errors]),
+            held_out=np.full(len(chosen), np.nan),
+            count=np.array([len(e) for e in errors], float),
+            gram=np.stack([j @ j.T for j in parts]),
+            gradient=np.stack([j @ e for j, e in zip(parts, errors, strict=True)]),
+        )
         if trajectories is not None:
             return fit
         held_out, absolute = self.cross_validate(fit, jacobian)
@@ -268,30 +250,6 @@ class JointProblem:
     def jacobian(self, fit: JointFit) -> np.ndarray:
         """d(predicted)/dx at a fit, shape [P, N]."""
         return self.squares(fit.rows, fit.coordinates).jacobian(fit.x)
-
-    def _result(
-        self,
-        base: np.ndarray,
-        effects: Sequence[str],
-        coordinates: Sequence[Coordinate],
-        x: np.ndarray,
-        residual: np.ndarray,
-        jacobian: np.ndarray,
-        chosen: np.ndarray,
-    ) -> JointFit:
-        parts = self.split(jacobian, chosen)
-        errors = self.split(residual, chosen)
-        return JointFit(
-            effects=tuple(effects),
-            coordinates=tuple(coordinates),
-            x=x,
-            rows=self.rows(base, coordinates, x[None])[0],
-            sse=self.sums(residual[None], chosen)[0],
-            held_out=np.full(len(chosen), np.nan),
-            count=np.array([len(e) for e in errors], float),
-            gram=np.stack([j @ j.T for j in parts]),
-            gradient=np.stack([j @ e for j, e in zip(parts, errors, strict=True)]),
-        )
 
     def cross_validate(self, fit: JointFit, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Squared and absolute errors of each trajectory, predicted by a fit without its fold, [S] each.
@@ -317,27 +275,15 @@ class JointProblem:
         problem's own time step: they need not be finer. Held-out errors are those of
         ``fit``, to be compared with other models'.
         """
-        x, error, result = fit.x, np.zeros(len(fit.x)), fit
-        self.coarse = given = self.rollouts
-        try:
-            for divisor in FINER:
-                self.rollouts = self.coarse.at(self.coarse.dt / divisor)
-                result = self.fit(
-                    fit.rows,
-                    fit.effects,
-                    [result.values],
-                    scales,
-                    trajectories=self.trajectories,
-                )
-                x, error = result.x, np.abs(result.x - x)
-        finally:
-            self.rollouts, self.coarse = given, None
-        return replace(
-            result,
-            held_out=fit.held_out,
-            held_out_abs=fit.held_out_abs,
-            step_error=error,
-        )
+        result, error, fine = fit, np.zeros(len(fit.x)), copy.copy(self)
+        fine.coarse = self.rollouts
+        for divisor in FINER:
+            fine.rollouts = self.rollouts.at(self.rollouts.dt / divisor)
+            before, given = result.x, [result.values]
+            result = fine.fit(fit.rows, fit.effects, given, scales, trajectories=self.trajectories)
+            error = np.abs(result.x - before)
+        self.simulated = fine.simulated
+        return replace(result, held_out=fit.held_out, held_out_abs=fit.held_out_abs, step_error=error)
 
     def promise(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> np.ndarray:
         """Share of the squared error that each start could remove, the present parameters readjusted.
@@ -351,7 +297,6 @@ class JointProblem:
             scales: Sizes of the joint's motion.
         """
         residual = self.residuals(fit.rows[None])
-        plain = residual if self.coarse is None else self.residuals(fit.rows[None], rollouts=self.coarse)
         jacobian = self.jacobian(fit)
         basis = np.linalg.svd(jacobian, full_matrices=False)[2]
         left = residual[0] - basis.T @ (basis @ residual[0])
@@ -361,7 +306,7 @@ class JointProblem:
                 if "." not in key and key not in self.baseline:
                     continue  # not free in this chain
                 rows[i, self.joint, coordinate(key, scales).column] = value
-        change = plain - self.residuals(rows, rollouts=self.coarse)
+        change = residual - self.residuals(rows)
         change -= (change @ basis.T) @ basis
         along = change @ left
         power = np.einsum("cn,cn->c", change, change)

@@ -4,7 +4,6 @@ Chains: :mod:`vd.gap.chain`. Physics: :mod:`vd.kernels.servo.chains`.
 """
 
 import itertools
-import threading
 import zlib
 from collections.abc import Sequence
 from functools import cached_property
@@ -23,12 +22,8 @@ STEP_S = 1.0 / 480.0
 """Time step [s]: four of the simulator's, a fifth of a servo's fastest time constant (inertia / kd)."""
 STREAM_BITS = 28
 """Bits of the number of a trajectory's random stream."""
-CUDA_BLOCK = 32
-"""Threads of a block: few, so that the few thousand rollouts of a launch are spread over all processors."""
-CPU_BLOCK = 256
 RECALLED = 10_000
 """Rollouts that are kept: searches ask for the same again, where one fit ends and the next begins."""
-_MAKING = threading.Lock()
 
 
 def links_of(
@@ -100,7 +95,6 @@ class Rollouts:
         trajectories = recording.trajectories
         counts = [len(t.time) for t in trajectories]
         self._count = np.array(counts, np.int32)
-        self._steps = np.array([(t.time[-1] - t.time[0]) / dt for t in trajectories])
         self._first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int32)
         self._stream = np.array(
             [zlib.crc32(t.file.encode()) & ((1 << STREAM_BITS) - 1) for t in trajectories], np.int32
@@ -113,10 +107,9 @@ class Rollouts:
 
     def at(self, dt: float) -> "Rollouts":
         """The same with another time step [s]; kept, so that who asks again simulates with the same."""
-        with _MAKING:
-            if dt not in self._finer:
-                self._finer[dt] = Rollouts(self.chain, self.recording, dt=dt, device=self.device)
-            return self._finer[dt]
+        if dt not in self._finer:
+            self._finer[dt] = Rollouts(self.chain, self.recording, dt=dt, device=self.device)
+        return self._finer[dt]
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the device's arrays behind: another process makes its own."""
@@ -242,14 +235,7 @@ class Rollouts:
         predicted: wp.array,
     ) -> None:
         """Simulate R rollouts: parameters [R, n, PARAMETER_COLUMNS], and the rest [R]."""
-        device, block = self.device, CPU_BLOCK
-        if wp.get_device(device).is_cuda:
-            # Threads of a warp wait for the slowest: the same trajectory for all of them, the longest first.
-            order = np.lexsort((trajectory, -self._steps[trajectory]))
-            parameters, trajectory, output, wanted = (
-                each[order] for each in (parameters, trajectory, output, wanted)
-            )
-            block = CUDA_BLOCK
+        device = self.device
         shape = (len(trajectory), self.num_joints, servo.STATE_COLUMNS)
         state = wp.empty(shape, dtype=float, device=device)
         links, slot, lower, upper, effort = self._links
@@ -280,7 +266,6 @@ class Rollouts:
             ],
             outputs=[state, predicted],
             device=device,
-            block_dim=block,
         )
 
     def _scale_loads(self, parameters: np.ndarray, trajectory: np.ndarray) -> None:
