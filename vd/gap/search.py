@@ -123,26 +123,26 @@ class Search(Evidence):
             return {}, {}
         call = {"fit": present, "starts": [start for _, start in flat], "scales": self.scales}
         promise = self.run([("promise", call)])[0]
-        best: dict[str, dict[str, float]] = {}
+        best: dict[str, list[dict[str, float]]] = {}
         promised: dict[str, float] = {}
         for i in np.argsort(-promise):
             name, start = flat[i]
-            best.setdefault(name, start)
+            best.setdefault(name, []).append(start)
             promised.setdefault(name, float(promise[i]))
         tried = list(best)[:SHORT_LIST]
         calls = [self.fit(present.rows, (*present.effects, n), self.starts(present, best[n])) for n in tried]
         return dict(zip(tried, self.run(calls), strict=True)), promised
 
-    def starts(self, present: JointFit, added: Mapping[str, float]) -> list[dict[str, float]]:
-        """Where a fit with a further effect starts: at the present model, and at the nominal one.
+    def starts(self, present: JointFit, added: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
+        """Where a fit with a further effect starts: at the present model with two sizes, and the nominal one.
 
         Without the effect, the baseline may have gone far to imitate it (an unmodelled delay is best met
         by a servo twenty times as stiff), and from there no descent comes back.
         """
-        start, nominal = {**present.values, **added}, self.nominal.get("kp", 0.0)
+        starts, nominal = [{**present.values, **one} for one in added[:2]], self.nominal.get("kp", 0.0)
         torque = nominal / present.values["kp"] if nominal else 1.0
-        scaled = {key: value * torque ** torque_power(key) for key, value in start.items()}
-        return [start, {**scaled, **self.nominal}]
+        scaled = {key: value * torque ** torque_power(key) for key, value in starts[0].items()}
+        return [*starts, {**scaled, **self.nominal}]
 
     def clock_sensitivity(self, fit: JointFit) -> SampleWeighting | None:
         """What errors of the clock do under a model that leaves more than noise; None where they do not grow.
