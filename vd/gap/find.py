@@ -10,10 +10,8 @@ from vd.gap.statistics import HOLD_S, held
 
 SMOOTH_S = 0.05
 """Window over which speeds are taken [s]: longer than an encoder count at low speed."""
-ONSET_S = 0.15
-"""Time after a command starts to move from rest [s]."""
-REVERSAL_S = 0.12
-"""Time after a change of direction [s]."""
+AFTER_S = 0.15
+"""Time after a command starts to move from rest, or a joint turns [s]."""
 FAST = 0.6
 """Share of the joint's largest speed above which motion is fast."""
 SLOW = 0.1
@@ -22,17 +20,14 @@ HEAVY = 0.7
 """Share of the largest pull (command minus position) above which the servo works hard."""
 NOTABLE = 2.0
 """A phase is reported if its RMS is this many noise floors."""
-TYPICAL = 1.15
-"""And this many times the joint's overall RMS; the worst is reported anyway."""
-MIN_SAMPLES = 20
-MAX_FINDINGS = 4
+MAX_FINDINGS = 2
 """Findings of a joint."""
 SYSTEMATIC = 0.5
 """Share of the RMS that the mean must have for a sign to be reported."""
 
 PHASES: dict[str, tuple[str, str]] = {
-    "onset": ("when the command starts to move", f"for {1e3 * ONSET_S:.0f} ms"),
-    "reversal": ("after each reversal", f"for {1e3 * REVERSAL_S:.0f} ms"),
+    "onset": ("when the command starts to move", f"for {1e3 * AFTER_S:.0f} ms"),
+    "reversal": ("after each reversal", f"for {1e3 * AFTER_S:.0f} ms"),
     "hold": ("while holding still", ""),
     "fast": ("in fast motion", ""),
     "slow": ("in slow motion", ""),
@@ -49,10 +44,10 @@ def speed_of(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     return (ahead - behind) / SMOOTH_S
 
 
-def _after(events: np.ndarray, time: np.ndarray, span: float) -> np.ndarray:
-    """Samples within ``span`` after an event."""
+def _after(events: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Samples soon after an event."""
     when = np.where(events, time, -np.inf)
-    return time - np.maximum.accumulate(when) <= span
+    return time - np.maximum.accumulate(when) <= AFTER_S
 
 
 def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) -> dict[str, np.ndarray]:
@@ -81,8 +76,8 @@ def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) ->
     onset = changed & (before - count[first] == 0) & (time > 0.0)
     pull = np.abs(command - position)
     return {
-        "onset": _after(onset, time, ONSET_S),
-        "reversal": _after(reversed_, time, REVERSAL_S),
+        "onset": _after(onset, time),
+        "reversal": _after(reversed_, time),
         "hold": rest,
         "fast": np.abs(speed) > FAST * top,
         "slow": moving & (np.abs(speed) < SLOW * top) & ~rest,
@@ -119,15 +114,13 @@ def _joint(recording: Recording, parts: list[np.ndarray], column: int, floor: fl
     rows = []
     for phase in PHASES:
         mask = np.concatenate([m[phase] for m in masks])
-        if mask.sum() < MIN_SAMPLES:
+        if not mask.any():
             continue
         part, direction = residual[mask], np.sign(speed[mask])
         rms = float(np.sqrt(np.mean(part**2)))
         rows.append((rms, phase, part, direction, float(mask.mean())))
     rows.sort(key=lambda row: -row[0])
-    chosen = [row for row in rows if row[0] > NOTABLE * floor and row[0] > TYPICAL * overall][:MAX_FINDINGS]
-    if not chosen and rows and overall > NOTABLE * floor:
-        chosen = rows[:1]
+    chosen = [row for row in rows if row[0] > NOTABLE * floor][:MAX_FINDINGS]
     return [_finding(name, row, overall, floor) for row in chosen]
 
 
