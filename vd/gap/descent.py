@@ -93,5 +93,4 @@ class LeastSquares:
             x = [self.descend(one, RACE_ITERATIONS) for one in x]
             costs = [float(np.sum(self.residuals(one[None], None) ** 2)) for one in x]
             x = [x[i] for i in np.argsort(costs)[: (len(x) + 1) // 2]]
-            iterations = max(iterations - RACE_ITERATIONS, RACE_ITERATIONS)
         return self.descend(self.descend(x[0], iterations), iterations, widen=WIDEN)

@@ -1,4 +1,4 @@
-"""Fit the servo model of one joint to its trajectories: CMA-ES for the start, Levenberg-Marquardt to finish.
+"""Fit the servo model of one joint to its trajectories: CMA-ES for the start, least squares to finish.
 
 Every simulation is a rollout of the whole trajectory; all perturbed parameter sets of a step go through
 one call of :class:`vd.gap.rollout.Rollouts`.
@@ -199,7 +199,7 @@ class JointProblem:
         iterations: int = ITERATIONS,
         trajectories: Trajectories = None,
     ) -> JointFit:
-        """Fit a model from several starts at once, by Levenberg-Marquardt.
+        """Fit a model from several starts by least squares.
 
         Args:
             base: Rows of the chain's joints [n, PARAMETER_COLUMNS]; this joint's parameters start there.
