@@ -82,9 +82,7 @@ def test_the_pendulum_is_predicted_at_gains_left_out(pendulum):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("gains", "left_rad"), [((100, 400, 800), MAE_RAD), ((100,), 0.018), ((400,), 0.034)]
-)
+@pytest.mark.parametrize(("gains", "left"), [((100, 400, 800), 0.038), ((100,), 0.02), ((400,), 0.034)])
 def test_all_candidates_leave_no_more_of_the_pendulum(shared_dir, tmp_path, gains, left):
     """Fits that end in the valley of a smaller model leave 42, 41 and 42 mrad."""
     recording = measured(shared_dir, "xl330_pendulum")
