@@ -103,9 +103,6 @@ EXCESS_FLOORS = 0.07
 thousands of samples carry that difference."""
 CONTAINED_FLOORS = 0.15
 """The same for one that the winner contains: with more parameters it imitates what the integrator misses."""
-FULLER_FLOORS = 0.04
-"""What the line of a motor must leave less, in noise floors, than its ceiling alone to stay beside that: luck
-gives that much in one of two hundred recordings."""
 RECOVERED = 0.5
 """Share of the squared gap that the named effects must recover; less is an unknown cause."""
 REPEATABLE = 2.0
@@ -373,15 +370,8 @@ class Evidence:
             alternatives.append((other, fit.held_out_rmse, ci))
             if same:
                 tied.append(other)
-        # In a tie the simpler one is meant: none beside an effect that it contains, but for a limit that is
-        # better by too little to be the name.
-        fuller = {
-            fit.effects[-1]
-            for fit in others
-            if fit.effects[-1] == "torque_speed_limit"
-            and mine.rmse**2 - fit.rmse**2 > (FULLER_FLOORS * self.floor) ** 2
-        }
-        tied = [o for o in tied if o in fuller or not {name, *tied} & set(NESTED.get(o, ()))]
+        # In a tie the simpler one is meant: none beside an effect that it contains.
+        tied = [o for o in tied if not {name, *tied} & set(NESTED.get(o, ()))]
         if share < NAMED and not tied:
             rival = int(np.argmax(np.bincount(choice, minlength=len(others) + 1)[1:]))
             tied.append(others[rival].effects[-1])
