@@ -11,8 +11,7 @@ from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hands import load_hand
 from vd.bench.gap_sizes import effect_at
 from vd.bench.hidden_finger import body_of
-from vd.bench.hidden_physics import Physics
-from vd.bench.hidden_plant import Plant, Run, simulate
+from vd.bench.hidden_plant import Physics, Plant, Run, simulate
 from vd.bench.hide import COUPLING, NOISE_RAD, Hiding, _Session, simulate_hidden
 from vd.gap.chain import chains
 from vd.gap.rollout import Rollouts

@@ -122,6 +122,7 @@ def test_a_sample_of_each_format_is_read_as_it_was_made(make, tmp_path, capsys):
         (csv, ["--rename", "clock=t", "--out", "."], "a.csv, which would be lost"),
         (csv, ["--rename", "clock=t", "command.wrist [deg]=command.elbow [deg]"], "two columns are"),
         (csv, ["--format", "bam"], "no log of BAM"),
+        (csv, ["--rename", "clock=t", "--command-topic", "/goal"], "read as csv, which has no topics"),
         (lerobot, [], "give --unit deg or rad"),
         (ros, ["--state-topic", "/nosuch"], "/nosuch is none; give --state-topic"),
     ],

@@ -11,7 +11,6 @@ import vd.kernels.servo.actuators as servo
 from vd.bench.hidden_plant import COGGING, OUTSIDE
 from vd.bench.hide import Hiding, simulate_hidden
 from vd.gap.chain import chains
-from vd.gap.fit_cache import FOLDER
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
 from vd.gap.words import verdict_sentence
@@ -169,22 +168,3 @@ def test_delays_that_vary_are_named_and_what_is_beside_them(tmp_path: Path) -> N
     for effect in report.effects:
         for key, found in effect.parameters.items():
             assert found.ci95[0] <= true[effect.name][key] <= found.ci95[1], key
-
-
-def test_an_interrupted_search_goes_on_where_it_was(tmp_path: Path) -> None:
-    recording = recorded({servo.COULOMB_TORQUE: 0.06})
-    options = {"effects": ("coulomb_friction", "backlash", "command_delay"), "key": "one"}
-    whole = analysed(recording, tmp_path / "whole", **options)
-
-    def interrupt(line: str) -> None:
-        if "+ coulomb_friction" in line:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        analysed(recording, tmp_path / "again", progress=interrupt, **options)
-    assert any((tmp_path / "again" / FOLDER).iterdir())
-    resumed = analysed(recording, tmp_path / "again", **options)
-    assert resumed.rollouts < 0.8 * whole.rollouts
-    assert not (tmp_path / "again" / FOLDER).exists()
-    same = {"seconds": 0.0, "rollouts": 0}
-    assert replace(resumed, **same).to_dict() == replace(whole, **same).to_dict()

@@ -84,6 +84,16 @@ def test_the_pendulum_is_predicted_at_gains_left_out(pendulum):
     assert 0.005 < parameters["kd_off"] < 0.5 * parameters["kd"]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("gains", "left"), [((100, 400, 800), 0.038), ((100,), 0.02), ((400,), 0.034)])
+def test_all_candidates_leave_no_more_of_the_pendulum(shared_dir, tmp_path, gains, left):
+    """Fits that end in the valley of a smaller model leave 42, 41 and 42 mrad."""
+    recording = measured(shared_dir, "xl330_pendulum")
+    own = tuple(t for t in recording.trajectories if t.conditions["p_gain"] in gains)
+    report = explain(replace(recording, trajectories=own), None, tmp_path, workers=1)
+    assert report.held_out.identified_mae_rad < left
+
+
 @pytest.fixture(scope="module")
 def arm(shared_dir) -> Recording:
     return measured(shared_dir, "so101")

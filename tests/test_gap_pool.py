@@ -1,21 +1,17 @@
-"""Fits one by one, in processes, in threads that simulate together, and from what was kept of them."""
+"""Fits one by one and in processes."""
 
 import multiprocessing
-import pickle
 import threading
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from gap_recordings import TRUE, made_up, recorded
+from gap_recordings import TRUE, recorded
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.assemble import curves
 from vd.gap.chain import chains
 from vd.gap.design import design
-from vd.gap.fit_cache import FitCache
-from vd.gap.launch_batch import LaunchBatch
 from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.statistics import noise_floor
 from vd.gap.worker_pool import Call, JointSpec, Problems, WorkerPool, parallel
@@ -29,34 +25,29 @@ def fits(pool: WorkerPool, spec: JointSpec) -> list[Any]:
     for column, value in TRUE.items():
         base[0, column] = 1.1 * value
     scales = pool.run(spec, [("scales", {"row": base[0], "residual": 0.02})])[0]
-    given = {"base": base, "starts": [{}], "scales": scales, "iterations": 3, "refits": 2}
+    given = {"base": base, "starts": [{}], "scales": scales, "iterations": 3}
     calls: list[Call] = [("fit", {**given, "effects": (effect,)}) for effect in EFFECTS]
     return pool.run(spec, calls)
 
 
-def problem(extra: dict[int, float], batch: LaunchBatch | None = None) -> tuple[Problems, JointSpec]:
+def problem(extra: dict[int, float]) -> tuple[Problems, JointSpec]:
     """A made-up recording of a servo, and what makes the problem of its joint."""
     recording = recorded(extra)
     (chain,) = chains(recording)
     trajectories, folds = design(recording, chain, 0)
     spec = JointSpec(0, 0, trajectories, folds, noise_floor(recording, 0), baseline_of(chain))
-    return Problems(recording, [chain], STEP_S, "cpu", batch), spec
+    return Problems(recording, [chain], STEP_S, "cpu"), spec
 
 
-def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
-    extra = {servo.COULOMB_TORQUE: 0.06}
-    problems, spec = problem(extra)
+def test_processes_find_what_one_alone_finds() -> None:
+    problems, spec = problem({servo.COULOMB_TORQUE: 0.06})
     with WorkerPool(problems, workers=1) as pool:
         alone, simulated = fits(pool, spec), pool.simulated
-        again = fits(pool, spec)
-        assert pool.simulated == simulated, "a call that was made before is not made again"
-        assert all(one is other for one, other in zip(alone, again, strict=True))
-    with WorkerPool(problem(extra, LaunchBatch())[0], workers=1) as pool:
-        together = fits(pool, spec)
-    for one, other in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(one.x, other.x)
-        np.testing.assert_array_equal(one.held_out, other.held_out)
-    assert pool.simulated == simulated, "every call counts its own"
+    with WorkerPool(problems, workers=2) as pool:
+        for one, other in zip(alone, fits(pool, spec), strict=True):
+            np.testing.assert_array_equal(one.x, other.x)
+            np.testing.assert_array_equal(one.held_out, other.held_out)
+        assert pool.simulated == simulated, "every call counts its own"
 
 
 def test_a_worker_that_is_killed_ends_the_run_with_what_to_change() -> None:
@@ -95,17 +86,3 @@ def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
     drawn = curves(recording, problems, [("j", spec, rows)])
     searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
     assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)
-
-
-def test_fits_that_are_kept_are_of_one_recording_and_those_that_are_damaged_none(tmp_path: Path) -> None:
-    FitCache(tmp_path / "a", "one").add("q", [made_up((), 1.0), 0.5])
-    again = FitCache(tmp_path / "a", "one")
-    assert "q" in again and again["q"][0].coordinates == made_up((), 1.0).coordinates
-    assert "q" not in FitCache(tmp_path / "a", "another")
-    (file,) = (tmp_path / "a").iterdir()
-    whole = file.read_bytes()
-    for content in (whole[: len(whole) // 2], b"", pickle.dumps(print)):
-        file.write_bytes(content)
-        assert "q" not in FitCache(tmp_path / "a", "one"), "nor is anything run that a file asks for"
-    again.forget()
-    assert not (tmp_path / "a").exists()

@@ -129,7 +129,6 @@ def test_a_header_that_cannot_be_used_is_refused(folder, changes, words):
     [
         (lambda t: [row[:-1] for row in t], ("row 1", "no column 'position.f0_j2'")),
         (lambda t: t[0].__setitem__(1, "command.f0_j9"), ("row 1", "unknown joint 'f0_j9'")),
-        (lambda t: [[";".join(row)] for row in t], ("no column 't'", "commas")),
         (lambda t: [t[0], ["s", *["rad"] * (len(t[0]) - 1)], *t[1:]], ("row 2", "'t'", "s is not a finite")),
         (set_cells("t", lambda t: f"{1e3 * t:.3f}"), ("'t'", "10 s between samples", "milliseconds")),
         (lambda t: t[:4], ("3 samples", "at least")),
@@ -174,12 +173,15 @@ def test_an_encoder_that_only_flickers_is_dead(tmp_path):
 
 def test_files_of_a_spreadsheet_are_read(folder):
     plain = read_recording(folder).trajectories[0]
-    for file in ("a.csv", "recording.json"):  # a byte order mark, and lines that end in CR LF
+    for file in ("recording.json", "a.csv"):  # a byte order mark, and lines that end in CR LF
         text = (folder / file).read_text()
         (folder / file).write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
     marked = read_recording(folder).trajectories[0]
     np.testing.assert_array_equal(marked.position, plain.position)
     assert marked.conditions == plain.conditions
+    german = text.replace(".", "#").replace(",", ";").replace("#", ",").replace(",f0", ".f0")
+    (folder / "a.csv").write_text(german)
+    np.testing.assert_array_equal(read_recording(folder).trajectories[0].position, plain.position)
 
 
 def test_small_motions_in_degrees_show_in_the_encoder_counts(tmp_path):
@@ -231,7 +233,6 @@ SPEED = np.gradient(SOUND.position, AT_100_HZ, axis=0)
         ({"command_time": 1e3 * AT_100_HZ}, ("t_command", "1e+03 times as fast", "milliseconds")),
         ({"command_time": AT_100_HZ + 3.0}, ("t_command", "3 s off", "another clock")),
         ({"time": AT_100_HZ + 5.0 * (AT_100_HZ > 4.0)}, ("row 403", "'t'", "5.01 s without", "cut the file")),
-        ({"velocity": SPEED * 30.0 / np.pi}, ("velocity.joint", "9.55 times", "rpm")),
     ],
 )
 def test_a_recording_of_other_clocks_units_or_columns_is_refused_by_its_cause(tmp_path, change, words):

@@ -91,11 +91,11 @@ def run_tasks(
 def _worker() -> ProcessPoolExecutor:
     """One process, which starts with its first task."""
     context = get_context("spawn")  # Warp and a CUDA context do not survive a fork
-    return ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(os.getpid(),))
+    return ProcessPoolExecutor(1, mp_context=context, initializer=begin_worker, initargs=(os.getpid(),))
 
 
-def _begin(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and end with it."""
+def begin_worker(parent: int) -> None:
+    """Have a process leave Ctrl-C to its parent, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent(parent)
 

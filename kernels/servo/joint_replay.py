@@ -1,9 +1,8 @@
 """Replay recorded commands in the simulator, and sample its positions where the recording has them.
 
 Order in a physics step: :func:`replay_command_kernel`, the servo and the solver's step, then
-:func:`sample_position_kernel`, and the step is counted. Every finger of every world follows its own
-trajectory: a track. W worlds, F fingers, D joints; S samples of all trajectories one
-after the other, J recorded joints. Times, delays and lost commands are those of
+:func:`sample_position_kernel`, and the step is counted. Every world follows a trajectory: a track. W worlds,
+D joints; samples of all trajectories one after the other. Times, delays and lost commands are those of
 :mod:`vd.kernels.servo.chains`.
 """
 
@@ -18,13 +17,12 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Tracks:
-    """What each finger of each world follows."""
+    """What each world follows."""
 
     column: wp.array[int]  # [D] recorded column of every hand joint, or -1
-    finger: wp.array[int]  # [D] finger of every hand joint
-    first: wp.array2d[int]  # [W, F] first sample of the track
-    last: wp.array2d[int]  # [W, F] sample after the last
-    stream: wp.array2d[int]  # [W, F] random stream of the track's trajectory
+    first: wp.array[int]  # [W] first sample of the track
+    last: wp.array[int]  # [W] sample after the last
+    stream: wp.array[int]  # [W] random stream of the track's trajectory
 
 
 @wp.kernel
@@ -55,7 +53,7 @@ def replay_command_kernel(
     # Model:
     parameters: wp.array2d[float],  # [W D, PARAMETER_COLUMNS] parameter rows
     samples: Samples,  # the recording; columns are the recorded joints
-    tracks: Tracks,  # what each finger follows
+    tracks: Tracks,  # what each world follows
     # In:
     dt: float,  # physics time step [s]
     step_in: wp.array[wp.int32],  # [1] number of the physics step
@@ -76,11 +74,10 @@ def replay_command_kernel(
     """
     world, joint = wp.tid()
     column = tracks.column[joint]
-    finger = tracks.finger[joint]
     row = world * write.shape[1] + joint
     now = step_in[0]
     upcoming = write[world, joint]
-    last = tracks.last[world, finger]
+    last = tracks.last[world]
     if column < 0:
         last = upcoming  # nothing recorded: the first command holds
     value = held[world, joint]
@@ -90,7 +87,7 @@ def replay_command_kernel(
     done = wp.float32(0.0)
     waiting = wp.bool(True)
     while waiting and upcoming < last:
-        step, fraction, kept = arrival(samples, upcoming, tracks.stream[world, finger], parameters, row, dt)
+        step, fraction, kept = arrival(samples, upcoming, tracks.stream[world], parameters, row, dt)
         late_step = due_step[world, joint]
         late_fraction = due_fraction[world, joint]
         if step < late_step or (step == late_step and fraction < late_fraction):
@@ -124,18 +121,16 @@ def sample_position_kernel(
     # Model:
     parameters: wp.array2d[float],  # [W D, PARAMETER_COLUMNS] parameter rows
     samples: Samples,  # the recording; columns are the recorded joints
-    tracks: Tracks,  # what each finger follows
+    tracks: Tracks,  # what each world follows
     # In:
-    position_in: wp.array2d[float],  # [S, J] recorded positions [rad]
     dt: float,  # physics time step [s]
     step_in: wp.array[wp.int32],  # [1] number of the physics step
     joint_q_prev_in: wp.array2d[float],  # [W, *] joint positions at the start of the step [rad]
     joint_q_in: wp.array2d[float],  # [W, *] joint positions at its end [rad]
     # In/Out:
     read: wp.array2d[wp.int32],  # [W, D] the next sample to take
-    squared_error: wp.array2d[float],  # [W, D] sum of squared differences to the recording [rad^2]
     # Out:
-    position_out: wp.array3d[float],  # [W, T, D] predicted positions [rad]; T = 0: not kept
+    position_out: wp.array3d[float],  # [W, T, D] predicted positions [rad]
 ):
     """Positions as the recording would have them: linear in time, old by the read delay, biased.
 
@@ -145,14 +140,12 @@ def sample_position_kernel(
     column = tracks.column[joint]
     if column < 0:
         return
-    finger = tracks.finger[joint]
     row = world * read.shape[1] + joint
     now = step_in[0]
     before = joint_q_prev_in[world, joint]
     change = joint_q_in[world, joint] - before
     upcoming = read[world, joint]
-    last = tracks.last[world, finger]
-    error = squared_error[world, joint]
+    last = tracks.last[world]
     waiting = wp.bool(True)
     while waiting and upcoming < last:
         shift = -parameters[row, READ_DELAY] / dt
@@ -161,13 +154,8 @@ def sample_position_kernel(
             if step < now:  # before the start of the recording
                 fraction = 0.0
             position = before + fraction * change + parameters[row, ENCODER_BIAS]
-            difference = position - position_in[upcoming, column]
-            error += difference * difference
-            index = upcoming - tracks.first[world, finger]
-            if index < position_out.shape[1]:
-                position_out[world, index, joint] = position
+            position_out[world, upcoming - tracks.first[world], joint] = position
             upcoming += 1
         else:
             waiting = wp.bool(False)
     read[world, joint] = upcoming
-    squared_error[world, joint] = error

@@ -26,7 +26,6 @@ from vd.bench.hidden_plant import OUTSIDE
 from vd.bench.hide import hide
 from vd.files import make_folder, write_json
 from vd.gap import workflow
-from vd.gap.torque_unit import in_known_unit
 from vd.kernels.servo import chains
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
@@ -97,7 +96,7 @@ def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
             report = workflow.explain(
                 recording, hand, Path(work) / "analysis", seed=case.seed, device=device, workers=1
             )
-        result = score(case, in_known_unit(report, hidden.recording).to_dict(), hidden.truth)
+        result = score(case, report.to_dict(), hidden.truth)
     except Exception:  # one case that fails is a figure of the battery, not its end
         result = {"case": asdict(case), "error": traceback.format_exc(limit=6)}
     result["cpu_s"] = time.process_time() - begin

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from vd.bench.gap_sizes import sized_effect
-from vd.bench.hidden_physics import TUNED, Physics
-from vd.bench.hidden_plant import CABLE, COGGING, WARMING
+from vd.bench.hidden_plant import CABLE, COGGING, TUNED, WARMING, Physics
 from vd.bench.hide import Hiding
 from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 
@@ -218,26 +217,18 @@ class Figure:
         """Share of hits, in [0, 1], or the median; NaN without cases."""
         if not self.values:
             return math.nan
-        return float(np.mean(self.values) if self._is_share else np.median(self.values))
+        return float(np.mean(self.values) if isinstance(self.values[0], bool) else np.median(self.values))
 
     @property
     def reached(self) -> bool:
         """Whether the value is within its bounds."""
         return self.least <= self.value <= self.most
 
-    @property
-    def _is_share(self) -> bool:
-        return any(isinstance(value, bool) for value in self.values)
-
     def row(self) -> str:
         """A row of a table."""
-
-        def text(value: float) -> str:
-            return f"{100 * value:.1f} %" if self._is_share else f"{value:.3g}"
-
         bounds = {">=": self.least, "<=": self.most}
-        goal = ", ".join(f"{sign} {text(bound)}" for sign, bound in bounds.items() if math.isfinite(bound))
-        answer = ("-", "") if not self.values else (text(self.value), "yes" if self.reached else "no")
+        goal = ", ".join(f"{sign} {bound:.3g}" for sign, bound in bounds.items() if math.isfinite(bound))
+        answer = (f"{self.value:.3f}", "yes" if self.reached else "no") if self.values else ("-", "")
         return f"| {self.what} | {goal} | {answer[0]} | {len(self.values)} | {answer[1]} |"
 
 

@@ -16,8 +16,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from vd.bench.hidden_finger import Finger, FingerBody, slip
-from vd.bench.hidden_physics import TUNED, Physics
 
+STEP_S = 4.0e-4
+"""Time step [s]: five times finer than the fitted model's, second order where the motion is smooth."""
 FULL_DUTY_RAD = 1.2
 """Error at full P gain that asks for all of the supply [rad], as of a soft X-series servo."""
 PARTS = 8
@@ -36,6 +37,29 @@ OUTSIDE: dict[str, dict[str, float]] = {
 }
 """Effects that are not in the table, with typical sizes: torque ripple amplitude sin(n q); a cable that
 pulls back once its slack is used up; friction that falls as the joint warms over the session."""
+
+
+@dataclass(frozen=True)
+class Physics:
+    """How a plant obeys the same laws otherwise than the one that the analysis was tuned on (the default).
+
+    Attributes:
+        step_s: Time step [s].
+        presliding_rad: Travel over which dry friction builds up, as the teeth of a gear bend [rad]; 0: none.
+        noise_s: Correlation time of the reading's noise [s]; 0: white.
+        ripple_nm: Amplitude of a torque that the gears of every joint add [N m].
+        ripple_per_turn: Its periods in a radian of travel.
+    """
+
+    step_s: float = STEP_S
+    presliding_rad: float = 0.0
+    noise_s: float = 0.0
+    ripple_nm: float = 0.0
+    ripple_per_turn: float = 0.0
+
+
+TUNED = Physics()
+"""The plant that the rules of the search were tuned on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,10 +239,8 @@ class _Batch:
             output = np.minimum(np.maximum(output, target - gap), target + gap)
             reference[k][on] = output
 
-    def _switch(self) -> np.ndarray | None:
-        """Whether each servo is on in each step [K, B, J] float, or None if all always are."""
-        if all(run.enabled.all() for run in self.runs):
-            return None
+    def _switch(self) -> np.ndarray:
+        """Whether each servo is on in each step [K, B, J] float."""
         grid = np.arange(self.steps) * self.dt
         on = np.empty((self.steps, len(self.runs), self.count))
         for b, run in enumerate(self.runs):
@@ -231,43 +253,26 @@ class _Batch:
         Also what the controllers ask for in each step, as an error at full gain [K, B, J] [rad].
         """
         dt, half = self.dt, 0.5 * self.dt
-        switch = self._switch()
-        first = np.ones_like(self.kp) if switch is None else switch[0]
-        loads = _Loads(self, dt)
-        motor = _Motor(self)
+        loads, motor, switch = _Loads(self, dt), _Motor(self), self._switch()
         dead = 0.5 * self.of("dead_zone", "width_rad")
         integral_gain = self.of("integral_action", "k_i")
         coupling = np.stack([self.of("joint_coupling", f"from_{i + 1}") for i in range(self.count)], axis=2)
-        for j in range(self.count):
-            coupling[:, j, j] = 0.0
-        coupled, zoned, creeping = coupling.any(), dead.any(), integral_gain.any()
-
-        q = self._equilibrium(reference[0, 0], first, coupling)
+        coupling *= 1.0 - np.eye(self.count)
+        q = self._equilibrium(reference[0, 0], switch[0], coupling)
         v, wound = np.zeros_like(q), np.zeros_like(q)
-        path = np.empty((self.steps + 1, *q.shape))
+        path, asked = np.empty((self.steps + 1, *q.shape)), np.empty((self.steps, *q.shape))
         path[0] = q
-        asked = np.empty((self.steps, *q.shape))
         loads.start(q)
-        # Open terminals carry no current: the damping of a servo that is off, mostly back-EMF, is gone.
-        on, stiffness, damping = first, self.kp * self.gain * first, self.kd * (first > 0.0)
-        means = reference.mean(axis=1)
-        for k in range(self.steps):
+        for k, on in enumerate(switch):
+            gain = self.gain * on
+            # Open terminals carry no current: the damping of a servo that is off, mostly back-EMF, is gone.
+            damping = self.kd * (on > 0.0)
             middle = q + half * v
-            # A motor without limits is linear: the mean of the parts is enough.
-            error = (reference[k] if motor.bends or zoned else means[k]) - middle
-            if coupled:
-                error = error + np.einsum("bij,bj->bi", coupling, middle)
-            if zoned:
-                error = error - np.minimum(np.maximum(error, -dead), dead)
-                error = error if motor.bends else error.mean(axis=0)
-            if switch is not None:
-                on = switch[k]
-                stiffness, damping = self.kp * self.gain * on, self.kd * (on > 0.0)
-            wanted = stiffness * error
-            if creeping:
-                wound = wound + dt * (error.mean(axis=0) if motor.bends else error) * (on > 0.0)
-                wanted = wanted + self.gain * on * integral_gain * wound
-            asked[k] = (wanted.mean(axis=0) if motor.bends else wanted) / self.kp
+            error = reference[k] - middle + np.einsum("bij,bj->bi", coupling, middle)
+            error = error - np.clip(error, -dead, dead)
+            wound = wound + dt * _mean(error) * (on > 0.0)
+            wanted = gain * (self.kp * error + integral_gain * wound)
+            asked[k] = _mean(wanted) / self.kp
             torque, slope, carried = motor(wanted - damping * v, v, k * dt)
             load = loads(middle, v)
             new = self._speed(middle, v, torque + load, 0.5 * slope * damping, loads, carried, v, k * dt)
@@ -276,8 +281,7 @@ class _Batch:
                 mean = 0.5 * (v + new)
                 torque, _, carried = motor(wanted - damping * mean, mean, k * dt)
                 new = self._speed(middle, v, torque + load, 0.0, loads, carried, mean, k * dt)
-            v = new
-            v = np.minimum(np.maximum(v, -self.limit), self.limit)
+            v = np.clip(new, -self.limit, self.limit)
             q = middle + half * v
             loads.bend(v)
             path[k + 1] = q
@@ -296,10 +300,9 @@ class _Batch:
     ) -> np.ndarray:
         """Speeds after a step [B, J] from ``v``, friction as of a torque carried and a sliding speed."""
         minus, plus = loads.friction(carried, sliding, time)
-        if loads.bends:
-            elastic = loads.presliding > 0.0
-            push = push - np.where(elastic, loads.bent(v, minus, plus), 0.0)
-            minus, plus = np.where(elastic, 0.0, minus), np.where(elastic, 0.0, plus)
+        elastic = loads.presliding > 0.0
+        push = push - np.where(elastic, loads.bent(v, minus, plus), 0.0)
+        minus, plus = np.where(elastic, 0.0, minus), np.where(elastic, 0.0, plus)
         if self.body is not None:
             zero = np.zeros_like(v)
             return self.body.velocity(middle, v, push, resisting + zero, minus, plus, self.inertia, self.dt)
@@ -346,7 +349,7 @@ class _Motor:
     def __init__(self, batch: _Batch):
         self.sag = batch.of("supply_sag", "relative")
         self.rate = batch.of("thermal_drift", "rate_per_s")
-        self.soft = _where_on(batch.of("torque_saturation", "tau_s_nm"))
+        self.soft = np.minimum(_where_on(batch.of("torque_saturation", "tau_s_nm")), 1e9)
         efforts = [np.inf if p.effort is None else p.effort for p in batch.plants]
         self.hard = np.minimum(
             _where_on(batch.of("torque_limit", "tau_max_nm")),
@@ -354,41 +357,29 @@ class _Motor:
         )
         self.stall = _where_on(batch.of("torque_speed_limit", "tau_stall_nm"))
         self.idle = _where_on(batch.of("torque_speed_limit", "omega_0_rad_s"))
-        self.sags, self.warms = self.sag.any(), self.rate.any()
-        self.softens = np.isfinite(self.soft).any()
-        self.clips, self.stalls = np.isfinite(self.hard).any(), np.isfinite(self.stall).any()
-        self.soft = np.minimum(self.soft, 1e9)  # tanh(x / inf) inf is not x
-        self.bends = self.sags or self.softens or self.clips or self.stalls
+        self.stalls = np.isfinite(self.stall).any()
 
     def __call__(self, wanted: np.ndarray, speed: np.ndarray, time: float) -> tuple[Any, Any, Any]:
-        """Mean torque, its slope by the torque wanted, and its mean size; of parts of a step if it bends.
+        """Mean torque, its mean slope by the torque wanted, and its mean size.
 
         Args:
-            wanted: Torque wanted, in parts of the step [PARTS, B, J] if the motor bends, or [B, J] [N m].
+            wanted: Torque wanted, in parts of the step [PARTS, B, J] [N m].
             speed: Speed of the joints [B, J] [rad/s].
             time: Time since the start [s].
         """
-        torque, slope = wanted, np.ones_like(wanted)
-        if self.sags:
-            share = 1.0 / (1.0 + self.sag * np.abs(torque))
-            torque, slope = torque * share, slope * share * share
-        if self.warms:
-            cool = np.exp(-self.rate * time)
-            torque, slope = torque * cool, slope * cool
-        if self.softens:
-            bent = np.tanh(torque / self.soft)
-            torque, slope = self.soft * bent, slope * (1.0 - bent * bent)
-        if self.clips:
-            slope = slope * (np.abs(torque) < self.hard)
-            torque = np.minimum(np.maximum(torque, -self.hard), self.hard)
+        share = 1.0 / (1.0 + self.sag * np.abs(wanted))
+        cool = np.exp(-self.rate * time)
+        torque, slope = cool * share * wanted, cool * share * share
+        bent = np.tanh(torque / self.soft)
+        torque, slope = self.soft * bent, slope * (1.0 - bent * bent)
+        slope = slope * (np.abs(torque) < self.hard)
+        torque = np.clip(torque, -self.hard, self.hard)
         if self.stalls:
             available = self.stall * np.maximum(0.0, 1.0 - np.abs(speed) / self.idle)
             bound = np.where(torque * speed > 0.0, available, self.stall)
             slope = slope * (np.abs(torque) < bound)
-            torque = np.minimum(np.maximum(torque, -bound), bound)
-        if self.bends:
-            return _mean(torque), _mean(slope), _mean(np.abs(torque))
-        return torque, slope, np.abs(torque)
+            torque = np.clip(torque, -bound, bound)
+        return _mean(torque), _mean(slope), _mean(np.abs(torque))
 
 
 def _mean(parts: np.ndarray) -> np.ndarray:
@@ -406,46 +397,32 @@ class _Loads:
 
     def __init__(self, batch: _Batch, dt: float):
         of = batch.of
-        self.dt = dt
-        self.pendulum = batch.pendulum
+        self.dt, self.pendulum = dt, batch.pendulum
         self.weight, self.phase = of("gravity_load", "tau_g_nm"), of("gravity_load", "phase_rad")
         self.ripple, self.turns = of(COGGING, "amplitude_nm"), of(COGGING, "per_turn")
         self.cable, self.slack = of(CABLE, "k_nm_rad"), of(CABLE, "slack_rad")
-        self.spring, self.loss = (
-            of("elastic_transmission", "k_nm_rad"),
-            of("elastic_transmission", "c_nms_rad"),
-        )
-        self.mass = np.where(self.spring > 0.0, of("elastic_transmission", "j_kgm2"), 1.0)
+        spring = "elastic_transmission"
+        self.spring, self.loss = of(spring, "k_nm_rad"), of(spring, "c_nms_rad")
+        self.mass = np.where(self.spring > 0.0, of(spring, "j_kgm2"), 1.0)
         if (self.spring * dt * dt + self.loss * dt >= self.mass).any():
-            raise ValueError(
-                f"elastic_transmission is too stiff for a step of {dt:g} s: raise j_kgm2, or lower k_nm_rad"
-            )
-        self.constant = of("coulomb_friction", "tau_c_nm")
-        self.load = of("load_friction", "k_load")
-        self.static, self.sliding = of("stribeck_friction", "tau_s_nm"), of("stribeck_friction", "tau_c_nm")
-        self.scale = _where_on(of("stribeck_friction", "v_s_rad_s"))
-        self.plus, self.minus = (
-            of("asymmetric_friction", "tau_plus_nm"),
-            of("asymmetric_friction", "tau_minus_nm"),
-        )
+            raise ValueError(f"{spring} is too stiff for a step of {dt:g} s: raise j_kgm2, or lower k_nm_rad")
+        self.load, self.static = of("load_friction", "k_load"), of("stribeck_friction", "tau_s_nm")
+        self.sliding, self.scale = (of("stribeck_friction", name) for name in ("tau_c_nm", "v_s_rad_s"))
+        self.sides = [of("asymmetric_friction", name) for name in ("tau_minus_nm", "tau_plus_nm")]
+        self.constant = of("coulomb_friction", "tau_c_nm") + self.sliding
         self.cold, self.warm = of(WARMING, "cold_nm"), of(WARMING, "warm_nm")
-        self.warming = _where_on(of(WARMING, "time_s"))
+        self.warming, self.scale = _where_on(of(WARMING, "time_s")), _where_on(self.scale)
         self.session = np.array([[run.session_s] for run in batch.runs])
-        self.hangs, self.swings = self.weight.any(), self.pendulum.any()
-        self.springs, self.cogs, self.pulls = self.spring.any(), self.ripple.any(), self.cable.any()
-        self.stribecks = self.static.any() or self.sliding.any()
-        self.warms, self.loads = self.cold.any() or self.warm.any(), self.load.any()
+        self.loads = self.load.any()
         self.turn = self.rate = self.strain = np.zeros_like(self.weight)
         self.presliding, self.gear, self.teeth = (
             np.array([[getattr(p.physics, name)] for p in batch.plants]) + self.strain
             for name in ("presliding_rad", "ripple_nm", "ripple_per_turn")
         )
-        self.bends, self.geared = self.presliding.any(), self.gear.any()
 
     def bend(self, v: np.ndarray) -> None:
         """Bend what carries dry friction by a step at speeds [B, J]."""
-        if self.bends:
-            self.strain = self._bent(v)
+        self.strain = self._bent(v)
 
     def bent(self, v: np.ndarray, minus: np.ndarray, plus: np.ndarray) -> np.ndarray:
         """Friction torque [B, J] [N m] as far as a step at speeds ``v`` has it build up to its bounds."""
@@ -459,27 +436,17 @@ class _Loads:
         """Put the second masses at rest on the joints."""
         self.turn, self.rate = q.copy(), np.zeros_like(q)
 
-    def __call__(self, q: np.ndarray, v: np.ndarray) -> Any:
-        torque: Any = 0.0
-        if self.swings:
-            torque = torque - self.pendulum * np.sin(q)
-        if self.hangs:
-            torque = torque - self.weight * np.sin(q + self.phase)
-        if self.cogs:
-            torque = torque + self.ripple * np.sin(self.turns * q)
-        if self.geared:
-            torque = torque + self.gear * np.sin(self.teeth * q)
-        if self.pulls:
-            torque = torque - self.cable * np.maximum(q - self.slack, 0.0)
-        if self.springs:
-            middle = self.turn + 0.5 * self.dt * self.rate
-            drag = self.spring * (middle - q) + self.loss * (self.rate - v)
-            self.rate = self.rate - self.dt * drag / self.mass
-            self.turn = middle + 0.5 * self.dt * self.rate
-            torque = torque + drag
-        return torque
+    def __call__(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Torques [B, J] [N m] at positions and speeds; the second masses move on."""
+        middle = self.turn + 0.5 * self.dt * self.rate
+        drag = self.spring * (middle - q) + self.loss * (self.rate - v)
+        self.rate = self.rate - self.dt * drag / self.mass
+        self.turn = middle + 0.5 * self.dt * self.rate
+        weight = self.pendulum * np.sin(q) + self.weight * np.sin(q + self.phase)
+        ripple = self.ripple * np.sin(self.turns * q) + self.gear * np.sin(self.teeth * q)
+        return drag - weight + ripple - self.cable * np.maximum(q - self.slack, 0.0)
 
-    def friction(self, motor: np.ndarray, v: np.ndarray, time: float) -> tuple[Any, Any]:
+    def friction(self, motor: np.ndarray, v: np.ndarray, time: float) -> list[np.ndarray]:
         """Bounds of the friction torque against negative and positive motion [B, J] [N m].
 
         Args:
@@ -487,13 +454,7 @@ class _Loads:
             v: Speed [B, J] [rad/s].
             time: Time since the start [s].
         """
-        bound = self.constant
-        if self.loads:
-            bound = bound + self.load * motor
-        if self.stribecks:
-            fading = np.exp(-np.square(v / self.scale))
-            bound = bound + self.sliding + (self.static - self.sliding) * fading
-        if self.warms:
-            cooling = np.exp(-(self.session + time) / self.warming)
-            bound = bound + self.warm + (self.cold - self.warm) * cooling
-        return bound + self.minus, bound + self.plus
+        fading = (self.static - self.sliding) * np.exp(-np.square(v / self.scale))
+        cooling = (self.cold - self.warm) * np.exp(-(self.session + time) / self.warming)
+        bound = self.constant + self.load * motor + fading + self.warm + cooling
+        return [bound + side for side in self.sides]

@@ -15,8 +15,7 @@ from scipy.signal import lfilter
 
 from vd.assets_usd.hands import load_hand
 from vd.bench.hidden_finger import body_of
-from vd.bench.hidden_physics import TUNED, Physics
-from vd.bench.hidden_plant import OUTSIDE, Motion, Plant, Run, simulate
+from vd.bench.hidden_plant import OUTSIDE, TUNED, Motion, Physics, Plant, Run, simulate
 from vd.files import write_json
 from vd.gap.excitations import Excitation, JointRange, excitation_set
 from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording, Trajectory, write_recording
@@ -42,11 +41,12 @@ FULL_P_GAIN = 400.0
 CHUNK = 48
 """Trajectories simulated together: enough to amortise Python, few enough for memory."""
 
-SERVO = {"kp": 3.0, "kd": 0.3, "velocity_limit": 7.0, "inertia": 2.0e-3, "gravity": 0.0}
-"""A hobby servo that turns a small load about a vertical axis."""
-PENDULUM = {"kp": 3.0, "kd": 0.2, "velocity_limit": 8.0, "inertia": 6.0e-3, "gravity": 0.4}
-"""The rig of the XL330 recordings: some 0.4 kg on an arm of 0.1 m."""
-BARE = {"servo": SERVO, "pendulum": PENDULUM}
+BARE = {
+    "servo": {"kp": 3.0, "kd": 0.3, "velocity_limit": 7.0, "inertia": 2.0e-3, "gravity_torque": 0.0},
+    "pendulum": {"kp": 3.0, "kd": 0.2, "velocity_limit": 8.0, "inertia": 6.0e-3, "gravity_torque": 0.4},
+}
+"""A hobby servo that turns a small load about a vertical axis; the rig of the XL330 recordings, some 0.4 kg
+on an arm of 0.1 m."""
 BARE_REACH_RAD = 1.5
 """Range of a bare servo about its centre [rad]."""
 INERTIA_SPREAD = math.log(2.0)
@@ -57,8 +57,6 @@ COUPLING = "joint_coupling"
 
 BASE = ("kp", "kd", "velocity_limit", "inertia", "gravity_torque")
 """Base parameters of a plant that the truth tells."""
-
-Effects = Mapping[str, Mapping[str, float]]
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ class Hiding:
     """
 
     model: str
-    effects: Effects = field(default_factory=dict)
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     seed: int = 0
     joints: tuple[str, ...] = ()
     effect_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -275,12 +273,13 @@ def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
     effects = {}
     for name, given in hiding.effects.items():
         typical = effect_parameters(name)
+        signed = {p.name for p in (EFFECTS[name].parameters if name in EFFECTS else ()) if p.signed}
         for key, value in given.items():
             if key not in typical:
                 raise ValueError(f"{name} has no parameter {key!r}; it has {', '.join(typical)}")
             if not math.isfinite(value):
                 raise ValueError(f"{name}: {key} is {value}; give a finite number")
-            if value < 0.0 and key not in _signed(name):
+            if value < 0.0 and key not in signed:
                 raise ValueError(f"{name}: {key} is {value}; it cannot be negative")
         having = _effect_joints(hiding, name, plant.joints)
         if name == COUPLING and len(plant.joints) == 1:
@@ -288,12 +287,6 @@ def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
         on = np.array([joint in having for joint in plant.joints], dtype=float)
         effects[name] = {key: on * given.get(key, value) for key, value in typical.items()}
     return reach, replace(plant, effects=effects, physics=hiding.physics)
-
-
-def _signed(name: str) -> set[str]:
-    """Parameters of an effect that can be negative."""
-    known = EFFECTS[name].parameters if name in EFFECTS else ()
-    return {parameter.name for parameter in known if parameter.signed}
 
 
 def _effect_joints(hiding: Hiding, name: str, joints: tuple[str, ...]) -> tuple[str, ...]:
@@ -311,15 +304,8 @@ def _bare(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
     near = _spread(rng, hiding.base_spread, (3, count))
     far = np.exp(_spread(rng, INERTIA_SPREAD if hiding.base_spread else 0.0, (2, count)) - 1.0)
     reach = JointRange(joints, np.full(count, -BARE_REACH_RAD), np.full(count, BARE_REACH_RAD), FULL_P_GAIN)
-    return reach, Plant(
-        joints=joints,
-        kp=nominal["kp"] * near[0],
-        kd=nominal["kd"] * near[1],
-        velocity_limit=nominal["velocity_limit"] * near[2],
-        inertia=nominal["inertia"] * far[0],
-        gravity_torque=nominal["gravity"] * far[1],
-        full_gain=FULL_P_GAIN,
-    )
+    base = {name: nominal[name] * factor for name, factor in zip(BASE, [*near, *far], strict=True)}
+    return reach, Plant(joints=joints, **base, full_gain=FULL_P_GAIN)
 
 
 def _spread(rng: np.random.Generator, width: float, shape: tuple[int, ...]) -> np.ndarray:

@@ -4,14 +4,16 @@ A bare servo and a pendulum are one joint with its own inertia; a finger is a ch
 down as in the simulator.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel
-from vd.gap.recording import Recording
+from vd.gap.coordinates import of_torque
+from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
 
@@ -58,6 +60,8 @@ class Chain:
         baseline_free: Names of the parameters that the baseline fits.
         start_row: Nominal parameter rows, every effect off [n, PARAMETER_COLUMNS].
         slot: Place of each joint in its finger, which is its column of the coupling [n].
+        reference_p_gain: Largest ``p_gain`` of the recording, at which kp is identified; None without.
+        reference_load: A pendulum's load, at which inertia and gravity torque are identified, or None.
         bodies: Whether the links have mass; if not, each joint is its own inertia.
         axis: Unit joint axes in the base frame, all joints at zero, as all that follows [n, 3].
         offset: From the joint before (the base) to the joint [n, 3] [m].
@@ -68,8 +72,6 @@ class Chain:
         lower: Lower stops [n] [rad].
         upper: Upper stops [n] [rad].
         effort: Largest torques of the drives [n] [N m].
-        reference_p_gain: Largest ``p_gain`` of the recording, at which kp is identified; None without.
-        reference_load: A pendulum's load, at which inertia and gravity torque are identified, or None.
     """
 
     name: str
@@ -78,18 +80,18 @@ class Chain:
     baseline_free: tuple[str, ...]
     start_row: np.ndarray
     slot: np.ndarray
-    bodies: bool
-    axis: np.ndarray
-    offset: np.ndarray
-    mass: np.ndarray
-    com: np.ndarray
-    inertia: np.ndarray
-    gravity: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    effort: np.ndarray
     reference_p_gain: float | None
-    reference_load: Load | None
+    reference_load: Load | None = None
+    bodies: bool = False
+    axis: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    offset: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    mass: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    com: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    inertia: np.ndarray = field(default_factory=lambda: np.zeros((1, 3, 3)))
+    gravity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    lower: np.ndarray = field(default_factory=lambda: np.array([-FREE]))
+    upper: np.ndarray = field(default_factory=lambda: np.array([FREE]))
+    effort: np.ndarray = field(default_factory=lambda: np.array([FREE]))
 
     def inertia_scale(self, joint: int) -> float:
         """Inertia of the links about a joint with all joints at zero, without the drive's own [kg m^2]."""
@@ -116,7 +118,7 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
     """
     gains = [t.conditions["p_gain"] for t in recording.trajectories if "p_gain" in t.conditions]
     p_gain = max((float(gain) for gain in gains), default=None)
-    if recording.model in ("servo", "pendulum"):
+    if recording.model in BARE_MODELS:
         return [_bare(recording, column, p_gain) for column in range(len(recording.joints))]
     if hand is None:
         raise ValueError(f"{recording.path}: a recording of {recording.model!r} needs its hand; pass it")
@@ -144,10 +146,12 @@ def load_of(conditions: dict[str, float | str]) -> Load | None:
 
 
 def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
-    """One joint that is its own inertia."""
+    """One joint that is its own inertia, its torques in the unit in which its stiffness is told."""
     row = np.array(neutral_row())
+    told = known_stiffness(recording, recording.joints[column])
+    unit = 1.0 if told is None else told / BASELINE[0].typical
     for parameter in BASELINE:
-        row[parameter.column] = parameter.typical
+        row[parameter.column] = parameter.typical * (unit if of_torque(parameter.unit) else 1.0)
     free = [parameter.name for parameter in BASELINE]
     if all(t.enabled[:, column].all() for t in recording.trajectories):
         free.remove("kd_off")  # nothing shows it
@@ -166,16 +170,6 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
         baseline_free=tuple(free),
         start_row=row[None],
         slot=np.zeros(1, int),
-        bodies=False,
-        axis=np.zeros((1, 3)),
-        offset=np.zeros((1, 3)),
-        mass=np.zeros(1),
-        com=np.zeros((1, 3)),
-        inertia=np.zeros((1, 3, 3)),
-        gravity=np.zeros(3),
-        lower=np.array([-FREE]),
-        upper=np.array([FREE]),
-        effort=np.array([FREE]),
         reference_p_gain=p_gain,
         reference_load=load,
     )
@@ -185,51 +179,38 @@ def _finger(
     recording: Recording, hand: HandModel, finger: slice, names: tuple[str, ...], p_gain: float | None
 ) -> Chain:
     """A finger's bodies with all joints at zero; what an unrecorded joint carries is fixed to its parent."""
-    length = finger.stop - finger.start
     slots = [i for i, name in enumerate(hand.joint_names[finger]) if name in names]
-    joints = finger.start + np.array(slots)
+    joints, n = finger.start + np.array(slots), len(slots)
     poses = hand.forward_kinematics(np.zeros(hand.num_joints))
-    origins, axes = [], []
-    for joint in joints:
-        parent, frame = poses[hand.joint_parent[joint]], hand.joint_parent_frame[joint]
-        turn = Rotation.from_quat(parent[3:])
-        origins.append(parent[:3] + turn.apply(frame[:3]))
-        axes.append((turn * Rotation.from_quat(frame[3:])).apply(hand.joint_axis[joint]))
-    n = len(joints)
+    parents, frames = poses[hand.joint_parent[joints]], hand.joint_parent_frame[joints]
+    turns, own = Rotation.from_quat(parents[:, 3:]), Rotation.from_quat(poses[:, 3:])
+    origins = parents[:, :3] + turns.apply(frames[:, :3])
+    centres, matrices = poses[:, :3] + own.apply(hand.link_com), own.as_matrix()
+    turned = matrices @ hand.link_inertia @ matrices.transpose(0, 2, 1)
     mass, com, inertia = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
-    for i, slot in enumerate(slots):
-        last = slots[i + 1] if i + 1 < n else length
-        carried = hand.joint_child[finger.start + np.arange(slot, last)]
-        masses = hand.link_mass[carried]
-        turns = [Rotation.from_quat(pose[3:]) for pose in poses[carried]]
-        centres = np.array(
-            [
-                pose[:3] + t.apply(hand.link_com[link])
-                for t, pose, link in zip(turns, poses[carried], carried, strict=True)
-            ]
-        )
+    for i, (first, end) in enumerate(pairwise([*joints, finger.stop])):
+        links = hand.joint_child[first:end]
+        masses = hand.link_mass[links]
         mass[i] = masses.sum()
-        centre = masses @ centres / mass[i]
+        centre = masses @ centres[links] / mass[i]
         com[i] = centre - origins[i]
-        for link, turn, m, arm in zip(carried, turns, masses, centres - centre, strict=True):
-            rotation = turn.as_matrix()
-            inertia[i] += rotation @ hand.link_inertia[link] @ rotation.T
-            inertia[i] += m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        for m, arm, about in zip(masses, centres[links] - centre, turned[links], strict=True):
+            inertia[i] += about + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     rows = np.tile(neutral_row(), (n, 1))
     rows[:, servo.KP] = hand.kp[joints]
     rows[:, servo.KD] = hand.kd[joints]
     rows[:, servo.VELOCITY_LIMIT] = hand.velocity_limit[joints]
     rows[:, servo.INERTIA] = hand.armature[joints]
     return Chain(
-        name=f"f{finger}",
+        name=names[0].partition("_")[0],
         joints=names,
         columns=np.array([recording.joints.index(name) for name in names]),
         baseline_free=("kp", "kd", "velocity_limit"),
         start_row=rows,
         slot=np.array(slots),
         bodies=True,
-        axis=np.array(axes),
-        offset=np.diff(np.array(origins), axis=0, prepend=np.zeros((1, 3))),
+        axis=(turns * Rotation.from_quat(frames[:, 3:])).apply(hand.joint_axis[joints]),
+        offset=np.diff(origins, axis=0, prepend=np.zeros((1, 3))),
         mass=mass,
         com=com,
         inertia=inertia,
@@ -238,8 +219,25 @@ def _finger(
         upper=hand.upper[joints],
         effort=hand.effort[joints],
         reference_p_gain=p_gain,
-        reference_load=None,
     )
+
+
+def known_stiffness(recording: Recording, joint: str) -> float | None:
+    """Stiffness of a joint's drive at the largest P gain recorded [N m/rad], if the recording tells it.
+
+    Commands and positions of a bare servo, or of a pendulum whose load is not known, show torques up to one
+    common factor. The fit holds the stiffness, at a nominal value unless it is told.
+    """
+    told = recording.servo.get(STIFFNESS)
+    value = told.get(joint) if isinstance(told, Mapping) else told
+    return None if value is None else float(value)
+
+
+def relative_torques(recording: Recording) -> bool:
+    """Whether nothing tells how large the torques of a recording are: they have a unit of their own."""
+    loads = any(load_of(trajectory.conditions) for trajectory in recording.trajectories)
+    free = recording.model == "servo" or (recording.model in BARE_MODELS and not loads)
+    return free and any(known_stiffness(recording, joint) is None for joint in recording.joints)
 
 
 def others_in(chain: Chain, joint: int) -> list[int]:
@@ -249,11 +247,8 @@ def others_in(chain: Chain, joint: int) -> list[int]:
 
 def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
     """Effects that a joint of a chain can have besides its baseline."""
-    excluded = set()
-    if "tau_g_nm" in chain.baseline_free:
-        excluded.add("gravity_load")
-    if "inertia" in chain.baseline_free:
-        excluded.add("payload_inertia")
+    own = {"tau_g_nm": "gravity_load", "inertia": "payload_inertia"}
+    excluded = {effect for name, effect in own.items() if name in chain.baseline_free}
     if len(chain.joints) == 1:
         excluded.add("joint_coupling")
     return [name for name in EFFECTS if name in effects and name not in excluded]

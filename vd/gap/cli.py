@@ -2,9 +2,8 @@
 
 import json
 import sys
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -20,10 +19,8 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
 
-SILENT_S = 10.0
-"""Longest time without a line while something is simulated [s]."""
-OK, UNUSABLE = 0, 2
-"""Exit statuses: a verdict was reached, something else is wrong, the recording cannot be used."""
+UNUSABLE = 2
+"""Exit status where the recording cannot be used."""
 
 RecordingPath = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
 
@@ -84,7 +81,7 @@ class Run(_Step):
     """Find, explain, close and report: the whole analysis of a recording.
 
     Writes DIR/report.html (one page for people), report.json, identified.usda (the identified model, for
-    --hand-layer) and the figures. An interrupted run goes on where it stopped. The exit status is 0 for
+    --hand-layer) and the figures. An interrupted run goes on with its step. The exit status is 0 for
     every verdict and 2 for a recording that cannot be used.
     """
 
@@ -102,10 +99,12 @@ class _OneStep(_Step):
     def run(self) -> int:
         """Run the step."""
         analysis = self.analysis()
-        analysis.run(self.name, first=self.name, fresh=self.fresh)
+        analysis.run(self.name, first=self.name, fresh=self.fresh or self.name == "report")
         path = analysis.out / f"{self.name}.json"
+        if self.name == "report":
+            return _print_report(analysis, self.json)
         print(path.read_text() if self.json else path)
-        return OK
+        return 0
 
 
 class Find(_OneStep):
@@ -126,15 +125,10 @@ class Close(_OneStep):
     name = "close"
 
 
-@dataclass(frozen=True)
-class Report(_Step):
+class Report(_OneStep):
     """Write report.json, report.html and the figures from what the steps before have found."""
 
-    def run(self) -> int:
-        """Run the step."""
-        analysis = self.analysis()
-        analysis.run("report", first="report", fresh=True)
-        return _print_report(analysis, self.json)
+    name = "report"
 
 
 @dataclass(frozen=True)
@@ -160,7 +154,7 @@ class Plan(_Step):
             print(path.read_text())
         else:
             print(f"{result.sentence}\n{path}")
-        return OK
+        return 0
 
 
 @dataclass(frozen=True)
@@ -209,15 +203,15 @@ class Hide:
             print(json.dumps(hidden.truth, indent=1))
         else:
             print(f"{self.out}: {len(hidden.recording.trajectories)} motions\n{truth_path(self.out)}")
-        return OK
+        return 0
 
 
 @dataclass(frozen=True)
 class Identify:
-    """The paper's identification alone: the drives of a hand, searched for in Newton, without any effect.
+    """The paper's identification alone: CMA-ES over the drives of each finger of a hand, without any effect.
 
-    CMA-ES over stiffness, damping and velocity limit, a search for each finger and every motion of every
-    candidate simulated at once. vd-gap run needs none of it: it finds the same drives, and what they lack.
+    Every motion of every candidate is simulated at once. vd-gap run needs none of it: it finds the same
+    drives, and what they lack.
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
@@ -231,7 +225,7 @@ class Identify:
     generations: int = 100
     """Generations of the search."""
     population: int = 64
-    """Candidates of a generation; times the motions of a finger: the worlds."""
+    """Candidates of a generation."""
     rate: float = 480.0
     """Physics steps a second; training has 120, a quarter of the work."""
     seed: int = 0
@@ -243,8 +237,6 @@ class Identify:
 
     def run(self) -> int:
         """Search, and write the layer."""
-        import dataclasses
-
         from vd.gap.recording import read_recording
 
         recording = read_recording(self.recording)
@@ -257,24 +249,9 @@ class Identify:
         if hand is None:
             raise ValueError(f"{self.recording}: a bare {recording.model} is no hand; use vd-gap run")
 
-        print(
-            f"identify: {self.generations} generations of {self.population} candidates, every motion of each "
-            "in Newton; the first also compiles",
-            file=sys.stderr,
-            flush=True,
-        )
-
-        told = time.monotonic()
-
-        def working(share: float) -> None:
-            nonlocal told
-            if time.monotonic() - told > SILENT_S:
-                told = time.monotonic()
-                print(f"  {100.0 * share:.0f} % of a generation", file=sys.stderr, flush=True)
-
-        def show(generation: int, best: dict[str, float]) -> None:
-            errors = ", ".join(f"{finger} {1e3 * error:.2f} mrad" for finger, error in best.items())
-            print(f"generation {generation}/{self.generations}: {errors}", file=sys.stderr, flush=True)
+        def show(generation: int, finger: str, best: float) -> None:
+            line = f"{finger}: generation {generation}/{self.generations}: {1e3 * best:.2f} mrad"
+            print(line, file=sys.stderr, flush=True)
 
         found = identify(
             recording,
@@ -285,20 +262,17 @@ class Identify:
             device=resolve_device(self.device),
             seed=self.seed,
             progress=show,
-            working=working,
         )
         write_drives(found, self.out, hand, recording, every_finger=self.every_finger)
         if self.json:
-            values = {name: getattr(found, name).tolist() for name in ("kp", "kd", "velocity_limit")}
-            print(json.dumps({**dataclasses.asdict(found), **values}, indent=1))
-            return OK
-        for i, joint in enumerate(found.joints):
-            print(
-                f"{joint}: {found.kp[i]:.3g} N m/rad, {found.kd[i]:.3g} N m s/rad, at most "
-                f"{found.velocity_limit[i]:.3g} rad/s"
-            )
-        print(f"{found.rollouts} motions simulated, {found.rollouts_per_second:.0f} a second\n{self.out}")
-        return OK
+            print(json.dumps(asdict(found), indent=1))
+            return 0
+        for joint, kp, kd, limit in zip(*list(asdict(found).values())[:4], strict=True):
+            print(f"{joint}: {kp:.3g} N m/rad, {kd:.3g} N m s/rad, at most {limit:.3g} rad/s")
+        print(
+            f"{found.rollouts} motions simulated, {found.rollouts / found.seconds:.0f} a second\n{self.out}"
+        )
+        return 0
 
 
 Command = (
@@ -340,7 +314,7 @@ def _print_report(analysis: "Analysis", as_json: bool) -> int:
     path = analysis.out / "report.json"
     if as_json:
         print(path.read_text())
-        return OK
+        return 0
     report = Contents.read(path)
     print(verdict_sentence(report))
     for finding in report.findings:
@@ -351,7 +325,7 @@ def _print_report(analysis: "Analysis", as_json: bool) -> int:
     for line in report.warnings:
         print(f"  note: {line}")
     print(f"\n{analysis.out / 'report.html'}\n{path}")
-    return OK
+    return 0
 
 
 def _effects(text: str) -> tuple[str, ...]:

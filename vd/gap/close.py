@@ -7,7 +7,7 @@ or pendulum has no articulation: there the layer is read back into the joint's o
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 WHOLE_HAND_LAYER = "identified-all-fingers.usda"
 """The same on every finger, as the paper applies what it identified on one."""
-GRAVITY_EFFECT = "gravity_load"
-_DRIVE = tuple(parameter.name for parameter in BASELINE)
-_COLUMN = {p.name: p.column for p in (*BASELINE, GRAVITY)}
 
 
 def write_identified(
@@ -56,7 +53,7 @@ def write_identified(
         path,
         hand if hand is not None else recording.model,
         baseline={
-            joint: {name: fitted[known][name] for name in _DRIVE if name in fitted[known]}
+            joint: {p.name: fitted[known][p.name] for p in BASELINE if p.name in fitted[known]}
             for joint, known in source.items()
         },
         effects={joint: _effects(held, known, fitted[known], start) for joint, known in source.items()},
@@ -90,26 +87,22 @@ def counterparts(hand: "HandModel", known: tuple[str, ...]) -> dict[str, str]:
 
 
 def _effects(
-    held: tuple[NamedEffect, ...],
-    joint: str,
-    fitted: Mapping[str, float],
-    start: Mapping[str, np.ndarray],
-) -> dict[str, dict[str, float | tuple[float, float, float]]]:
+    held: tuple[NamedEffect, ...], joint: str, fitted: Mapping[str, float], start: Mapping[str, np.ndarray]
+) -> dict[str, dict[str, Any]]:
     """Effects of a joint: those it started with, a pendulum's gravity, and the identified ones."""
-    values: dict[str, dict[str, float | tuple[float, float, float]]] = {}
+    values: dict[str, dict[str, Any]] = {}
     if joint in start:
         for effect in EFFECTS.values():
             row = {p.name: float(start[joint][p.column]) for p in effect.parameters}
             if any(row[p.name] != p.neutral for p in effect.parameters):
-                values[effect.name] = dict(row)
+                values[effect.name] = row
     if GRAVITY.name in fitted:
-        values.setdefault(GRAVITY_EFFECT, {})[GRAVITY.name] = fitted[GRAVITY.name]
+        values.setdefault("gravity_load", {})[GRAVITY.name] = fitted[GRAVITY.name]
     for name, parameters in effect_values(held, joint).items():
-        known: dict[str, float | tuple[float, float, float]] = {}
+        known = values.setdefault(name, {})
         for key, (value, low, high) in parameters.items():
             certain = np.isfinite([low, high]).all() and low <= value <= high
             known[key] = (value, low, high) if certain else value
-        values[name] = {**values.get(name, {}), **known}
     return values
 
 
@@ -138,99 +131,73 @@ def simulate_again(
         What it showed, and the new curves.
     """
     if hand_name is None:
-        again = _bare(layer, recording, curves, device)
+        before, after = curves.baseline, _bare(layer, recording, curves, device)
     else:
-        again = _newton(report, layer, recording, hand_name, start_layer, curves, device)
-    squares = {joint: _squares(again, joint, rows) for joint, rows in _scored(report, again).items()}
-    before, after = np.sqrt(np.concatenate(list(squares.values())).mean(axis=0))
+        before, after = _newton(report, layer, recording, hand_name, start_layer, device)
+    unseen = np.isnan(curves.baseline)
+    before, after = (np.where(unseen, np.nan, each) for each in (before, after))
+    squares = {}
+    for joint, rows in _scored(report, curves).items():
+        column = curves.joints.index(joint)
+        models = np.stack([before[rows, column], after[rows, column]], axis=1)
+        squares[joint] = (models - curves.measured[rows, column, None]) ** 2
     note = ""
     if len(report.held_out.trajectories) == len(recording.trajectories):
         note = (
             "The layer's numbers were fitted to all motions, after the held-out errors above were measured."
         )
+    plain, identified = _rms(np.concatenate(list(squares.values())))
     closing = Closing(
         simulator="rollout" if hand_name is None else "newton",
         layer=layer.name,
-        baseline_rmse_rad=float(before),
-        identified_rmse_rad=float(after),
-        per_joint={joint: _pair(np.sqrt(values.mean(axis=0))) for joint, values in squares.items()},
+        baseline_rmse_rad=plain,
+        identified_rmse_rad=identified,
+        per_joint={joint: _rms(values) for joint, values in squares.items()},
         note=note,
     )
-    return closing, again
+    return closing, replace(curves, baseline=before, identified=after)
 
 
-def _pair(values: np.ndarray) -> tuple[float, float]:
-    return float(values[0]), float(values[1])
+def _rms(squares: np.ndarray) -> tuple[float, float]:
+    """Of baseline and identified model."""
+    before, after = np.sqrt(squares.mean(axis=0))
+    return float(before), float(after)
 
 
 def _scored(report: Report, curves: Predictions) -> dict[str, np.ndarray]:
     """Samples of each joint that count, as masks [S]: held-out motions, or all where none was held out."""
-    rows = [row for row in report.trajectories if row.held_out] or list(report.trajectories)
-    chosen: dict[str, set[int]] = {}
+    rows = [row for row in report.trajectories if row.held_out] or report.trajectories
+    chosen: dict[str, list[int]] = {}
     for row in rows:
-        chosen.setdefault(row.joint, set()).add(curves.files.index(row.file))
-    return {joint: np.isin(curves.trajectory, list(indices)) for joint, indices in chosen.items()}
-
-
-def _squares(curves: Predictions, joint: str, rows: np.ndarray) -> np.ndarray:
-    """Squared errors of baseline and identified model, shape [samples, 2]."""
-    column = curves.joints.index(joint)
-    models = np.stack([curves.baseline[rows, column], curves.identified[rows, column]], axis=1)
-    return (models - curves.measured[rows, column, None]) ** 2
+        chosen.setdefault(row.joint, []).append(curves.files.index(row.file))
+    return {joint: np.isin(curves.trajectory, indices) for joint, indices in chosen.items()}
 
 
 def _newton(
-    report: Report,
-    layer: Path,
-    recording: Recording,
-    hand_name: str,
-    start_layer: Path | None,
-    curves: Predictions,
-    device: str,
-) -> Predictions:
-    """Both models in Newton; the identified one as any user of the layer reads it."""
+    report: Report, layer: Path, recording: Recording, hand_name: str, start_layer: Path | None, device: str
+) -> np.ndarray:
+    """Both models in Newton [2, S, J]; the identified one as any user of the layer reads it."""
     from vd.assets_usd.hands import load_hand
     from vd.gap.newton import simulate_hand
 
     before, after = load_hand(hand_name, layer=start_layer), load_hand(hand_name, layer=layer)
-    rows = np.array(before.servo, dtype=float)
+    rows = np.array([before.servo, after.servo], dtype=float)
     for joint, values in report.baseline.parameters.items():
-        for name, value in values.items():
-            rows[before.joint_names.index(joint), _COLUMN[name]] = value
-    both = np.stack([rows, np.array(after.servo, dtype=float)])
-    return _with(curves, recording, *simulate_hand(recording, after, both, device=device))
+        for parameter in (*BASELINE, GRAVITY):
+            if parameter.name in values:
+                rows[0, before.joint_names.index(joint), parameter.column] = values[parameter.name]
+    return simulate_hand(recording, after, rows, device=device)
 
 
-def _bare(layer: Path, recording: Recording, curves: Predictions, device: str) -> Predictions:
-    """The identified model of each joint as it comes back from the layer; the baseline as it was fitted."""
+def _bare(layer: Path, recording: Recording, curves: Predictions, device: str) -> np.ndarray:
+    """The identified model of each joint as it comes back from the layer [S, J]."""
     from vd.assets_usd.hand_layer import read_bare_layer
     from vd.gap.chain import chains
     from vd.gap.rollout import Rollouts
 
     after = curves.identified.copy()
     for chain in chains(recording, None):
-        if not np.isfinite(curves.identified[:, chain.columns]).any():
-            continue
-        rows, _ = read_bare_layer(layer, chain.joints)
-        rollouts = Rollouts(chain, recording, device=device)
-        after[:, chain.columns] = rollouts.predict(rows[None])[0]
-    return _with(curves, recording, curves.baseline, after)
-
-
-def _with(
-    curves: Predictions, recording: Recording, baseline: np.ndarray, identified: np.ndarray
-) -> Predictions:
-    """The curves with other models, at every sample of the recording; NaN where a joint was not simulated."""
-    trajectories = recording.trajectories
-    unseen = np.isnan(curves.baseline)
-    return replace(
-        curves,
-        time=np.concatenate([t.time for t in trajectories]),
-        trajectory=np.repeat(np.arange(len(trajectories)), [len(t.time) for t in trajectories]),
-        command=np.concatenate([t.command for t in trajectories]),
-        measured=np.concatenate([t.position for t in trajectories]),
-        baseline=np.where(unseen, np.nan, baseline),
-        identified=np.where(unseen, np.nan, identified),
-        joints=recording.joints,
-        files=tuple(t.file for t in trajectories),
-    )
+        if np.isfinite(curves.identified[:, chain.columns]).any():
+            rows, _ = read_bare_layer(layer, chain.joints)
+            after[:, chain.columns] = Rollouts(chain, recording, device=device).predict(rows[None])[0]
+    return after

@@ -73,6 +73,10 @@ def convert(asked: Convert) -> Recording:
         raise ValueError(f"--rename {bad[0]!r} is no OLD=NEW")
     rename = {old: new for old, _, new in (pair.partition("=") for pair in asked.rename)}
     format = asked.format or format_of(asked.source)
+    if format != "ros" and (topic := asked.state_topic or asked.command_topic):
+        raise ValueError(
+            f"topic {topic}: {asked.source} is read as {format}, which has no topics; leave it out"
+        )
     told = Told(asked.unit, rename, asked.state_topic, asked.command_topic, asked.joints)
     motions = list(FORMATS[format](asked.source, told))
     if unused := sorted(rename.keys() - told.used):

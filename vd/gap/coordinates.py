@@ -17,6 +17,8 @@ LOG_STEP = 0.01
 """Finite-difference step of a logarithmic coordinate: above the noise of single precision."""
 LINEAR_STEP = 0.05
 """Finite-difference step of a linear coordinate, in its scale or in its value if that is larger."""
+LOG_TRUST, LINEAR_TRUST = 1.5, 5.0
+"""First trust region of a fit, of a logarithmic coordinate and of a linear one, besides its size."""
 SECONDS_SCALE = 0.02
 """Scale of delays [s]: with ``LINEAR_STEP`` a step of 2 ms, above the time step of the rollouts."""
 SLOWING = ("torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag", "acceleration_limit")
@@ -65,12 +67,14 @@ class Coordinate:
         x = math.log(max(value, 1e-12)) if self.log else value / self.scale
         return min(max(x, self.lower), self.upper)
 
-    def step(self, x: np.ndarray, widened: np.ndarray) -> np.ndarray:
-        """Finite-difference step at x, times ``widened``: the other way where it would leave the bounds."""
-        size = np.full_like(x, LOG_STEP) if self.log else LINEAR_STEP * np.maximum(1.0, np.abs(x))
-        size = size * widened
-        outside = (x + size > self.upper) | (x + size < self.lower)
-        return np.where(outside, -size, size)
+    def step(self, x: float, widen: float = 1.0) -> float:
+        """Finite-difference step at x, times a factor: the other way where it would leave the bounds."""
+        size = widen * (LOG_STEP if self.log else LINEAR_STEP * max(1.0, abs(x)))
+        return size if self.lower <= x + size <= self.upper else -size
+
+    def trust(self, x: float) -> float:
+        """Change from x that a fit dares at first."""
+        return LOG_TRUST if self.log else LINEAR_TRUST + abs(x)
 
     def bound(self, x: float) -> bool:
         """Whether x is at the far end of its range; 0 of an effect and half a turn are values like others."""
@@ -125,7 +129,12 @@ def torque_power(key: str) -> int:
     unit = next((p.unit for p in EFFECTS[effect].parameters if p.name == name), "") if effect else ""
     if unit == "1/(N m)":
         return -1
-    return int("N m" in unit or "kg" in unit)
+    return int(of_torque(unit))
+
+
+def of_torque(unit: str) -> bool:
+    """Whether a unit is of torque, or of what torques are divided by: a stiffness, an inertia."""
+    return "N m" in unit or "kg" in unit
 
 
 def keys(effects: Sequence[str], baseline: Sequence[str]) -> list[str]:
@@ -240,9 +249,3 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
     if effect in SMOOTHING:
         starts += [{**start, "inertia": LIGHT * scales.inertia} for start in starts]
     return starts
-
-
-def best_two(starts: Sequence[dict[str, float]]) -> list[dict[str, float]]:
-    """The best of starts in order of promise, and the best that changes other parameters, if any does."""
-    other = next((start for start in starts[1:] if start.keys() != starts[0].keys()), None)
-    return [starts[0], *([other] if other is not None else starts[1:2])]

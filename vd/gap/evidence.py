@@ -84,7 +84,7 @@ NESTED = {
 """Effects that contain a simpler one; in a tie the simpler one is meant."""
 
 NO_GAP = 1.15
-"""A baseline within this factor of the noise floor leaves nothing to explain."""
+"""A model within this factor of the noise floor leaves white residuals, and nothing to explain."""
 MIN_GAIN = 0.05
 """Share of the held-out RMSE that an effect must remove."""
 MIN_GAIN_FLOORS = 0.7
@@ -98,19 +98,11 @@ MIN_SHARE = 0.02
 second effect came with a share of 0.015 that was not there."""
 PENALTY = 0.01
 """Relative RMSE that a further parameter must earn to be preferred."""
-TIE_TAIL = 0.05
-"""Share of the resamples in which the other of two candidates is better that makes them a tie: half of
-what a name may lose."""
-EXPLAINED = 1.1
-"""A winner within this factor of the noise floor leaves white residuals ..."""
 EXCESS_FLOORS = 0.07
-"""... so that an alternative that leaves this much more, in noise floors, is worse: thousands of samples
-carry that difference."""
+"""What an alternative to a winner that leaves white residuals must leave more, in noise floors, to be worse:
+thousands of samples carry that difference."""
 CONTAINED_FLOORS = 0.15
 """The same for one that the winner contains: with more parameters it imitates what the integrator misses."""
-FULLER_FLOORS = 0.04
-"""What the line of a motor must leave less, in noise floors, than its ceiling alone to stay beside that: luck
-gives that much in one of two hundred recordings."""
 RECOVERED = 0.5
 """Share of the squared gap that the named effects must recover; less is an unknown cause."""
 REPEATABLE = 2.0
@@ -159,7 +151,7 @@ class Evidence:
 
     def white(self, fit: JointFit) -> bool:
         """Whether samples tell how good a fit is: it leaves no more than noise, or jitter, on all of them."""
-        return self.behind_jitter or fit.rmse < EXPLAINED * self.floor
+        return self.behind_jitter or fit.rmse < NO_GAP * self.floor
 
     def no_gap(self, fit: JointFit) -> bool:
         """Whether a fit predicts as well as noise lets it; beside jitter that is not known as exactly."""
@@ -274,7 +266,7 @@ class Evidence:
                 excess += 2.0 * PENALTY * more * (winner.rmse / self.floor) ** 2
             excess /= MEMORY if self.behind_jitter else 1.0
             return excess < (CONTAINED_FLOORS if loose else EXCESS_FLOORS) ** 2, (low, high)
-        return float(np.quantile(error - best, TIE_TAIL)) <= 0.0, (low, high)
+        return low <= 0.0, (low, high)
 
     def undetermined(self, fit: JointFit) -> str:
         """Which parameter of the baseline the motions leave open, in words; empty if none."""
@@ -378,15 +370,8 @@ class Evidence:
             alternatives.append((other, fit.held_out_rmse, ci))
             if same:
                 tied.append(other)
-        # In a tie the simpler one is meant: none beside an effect that it contains, but for a limit that is
-        # better by too little to be the name.
-        fuller = {
-            fit.effects[-1]
-            for fit in others
-            if fit.effects[-1] == "torque_speed_limit"
-            and mine.rmse**2 - fit.rmse**2 > (FULLER_FLOORS * self.floor) ** 2
-        }
-        tied = [o for o in tied if o in fuller or not {name, *tied} & set(NESTED.get(o, ()))]
+        # In a tie the simpler one is meant: none beside an effect that it contains.
+        tied = [o for o in tied if not {name, *tied} & set(NESTED.get(o, ()))]
         if share < NAMED and not tied:
             rival = int(np.argmax(np.bincount(choice, minlength=len(others) + 1)[1:]))
             tied.append(others[rival].effects[-1])

@@ -2,20 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from vd.gap.candidates import alike, stood_for
 from vd.gap.chain import candidates, others_in
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.evidence import EXPLAINED, JITTER, cancelled, middles
+from vd.gap.evidence import JITTER, NO_GAP, cancelled, middles
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.jitter_search import FIXED, try_jitter
 from vd.gap.joint_fit import JointFit, SampleWeighting
-from vd.gap.recording import Recording
-from vd.gap.search import MAX_ROUNDS, UNEARNED, Search
+from vd.gap.search import MAX_ROUNDS, Search, alike, stood_for
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import BEHIND_SENSOR, vetoes
 from vd.gap.worker_pool import JointSpec, WorkerPool
@@ -48,7 +45,7 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
             search.report(f"taken back: {why}")
             present = baseline
     known: tuple[Accepted, ...] = ()
-    if not search.no_gap(present) and present.rmse > UNEARNED * search.floor:
+    if not search.no_gap(present) and not search.white(present):
         found, known, rows = try_jitter(search, explain, baseline, present)
         present = found if found is present or JITTER in found.effects else search.revise(found)
         trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
@@ -74,8 +71,8 @@ def _nothing_to_explain(search: Search, baseline: JointFit, loose: str) -> Expla
 def _explain_weighted(search: Search, baseline: JointFit, weighting: SampleWeighting) -> Explanation:
     """What a search finds with samples weighted by how surely they are known, which says so."""
     search.report("errors of the clock grow: samples are weighted by how surely they are known")
-    inner = search.weighted(weighting)
-    found = explain(inner, inner.run([inner.plain(baseline)])[0])
+    inner = search.weighted(weighting, clocked=True)
+    found = explain(inner, inner.plain(baseline))
     return replace(found, weighting=weighting, reason=f"{found.reason}; {WEIGHTED}")
 
 
@@ -94,11 +91,6 @@ def _with_notes(search: Search, explanation: Explanation) -> Explanation:
     ]
     return replace(explanation, reason="; ".join([explanation.reason, *notes]))
 
-
-POLISH_ITERATIONS = 5
-"""Steps of a fit that has to follow small changes of the other joints."""
-REFITS = 3
-"""Steps of Levenberg-Marquardt of each refit without a fold."""
 
 Progress = Callable[[str], None]
 
@@ -135,11 +127,6 @@ class Explainer:
     seed: int
     progress: Progress
 
-    @cached_property
-    def when(self) -> np.ndarray:
-        """When each trajectory was recorded (:func:`vd.gap.evidence.middles`)."""
-        return middles(self.pool.problems.recording)
-
     def explain(self, joint: Joint, explained: Explained) -> Explanation:
         """What a joint lacks.
 
@@ -156,6 +143,7 @@ class Explainer:
         chain, spec = self.pool.problems.chains[joint.spec.chain], joint.spec
         recording = self.pool.problems.recording
         column = int(chain.columns[spec.joint])
+        own = [recording.trajectories[i] for i in spec.trajectories]
         names = candidates(chain, self.effects)
         if _no_jitter(explained):
             names = [name for name in names if name != JITTER]
@@ -176,12 +164,11 @@ class Explainer:
             floor=spec.floor,
             scales=joint.scales,
             weights=resamples(len(spec.trajectories), rng),
-            refits=REFITS,
             vetoes={**stood_for(same), **told},
             report=lambda line: self.progress(f"explain: {joint.name}: {line}"),
-            rest=rest(recording, column, spec.trajectories),
-            moves=moves(recording, column, spec.trajectories),
-            when=self.when[list(spec.trajectories)],
+            rest=float(np.median([t.position[0, column] for t in own])),
+            moves=np.array([bool(np.ptp(t.command[:, column])) for t in own]),
+            when=middles(recording)[list(spec.trajectories)],
         )
 
     def plain(self, joint: Joint, explained: Explained) -> JointFit:
@@ -190,7 +177,6 @@ class Explainer:
         if np.array_equal(rows, joint.fit.rows):
             return joint.fit
         call = {"base": rows, "effects": (), "starts": [{}], "scales": joint.scales}
-        call |= {"iterations": POLISH_ITERATIONS, "refits": REFITS}
         return self.pool.run(joint.spec, [("fit", call)])[0]
 
 
@@ -198,22 +184,18 @@ def _no_jitter(explained: Explained) -> bool:
     """Whether random delays are none on a joint, by what is known of the others of its finger.
 
     They are none where they were tried on one and refused, not where too little was left there to try them;
-    and where another is explained without, as commands go out together.
+    and where another is explained without them or a fixed one, their mean, as commands go out together.
     """
-    unknown = any(found.verdict == "unknown" for _, found in explained)
-    random = any(JITTER in found.final.effects for _, found in explained)
-    tried = any(row.name == JITTER for _, found in explained for row in found.trials)
-    refused = unknown and tried and not random
-    return refused or any(steady(other, found) for other, found in explained)
-
-
-def steady(joint: Joint, explanation: Explanation) -> bool:
-    """Whether a joint is explained down to noise with neither random delays nor a fixed one, their mean."""
-    final = explanation.final
-    return (
-        explanation.verdict == "effects"
-        and not {JITTER, FIXED} & {*final.effects}
-        and final.rmse < EXPLAINED * joint.spec.floor
+    found = [one for _, one in explained]
+    random = any(JITTER in one.final.effects for one in found)
+    tried = any(row.name == JITTER for one in found for row in one.trials)
+    if tried and not random and any(one.verdict == "unknown" for one in found):
+        return True
+    return any(
+        one.verdict == "effects"
+        and not {JITTER, FIXED} & {*one.final.effects}
+        and one.final.rmse < NO_GAP * joint.spec.floor
+        for joint, one in explained
     )
 
 
@@ -231,13 +213,3 @@ def beside(joint: Joint, explained: Explained) -> np.ndarray:
 def weighting_of(found: Explanation) -> dict[str, Any]:
     """How the samples of an explained joint are weighted, as an argument of a call."""
     return {} if found.weighting is None else {"weighting": found.weighting}
-
-
-def rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:
-    """Where a joint begins most of its motions [rad]."""
-    return float(np.median([recording.trajectories[i].position[0, column] for i in trajectories]))
-
-
-def moves(recording: Recording, column: int, trajectories: Sequence[int]) -> np.ndarray:
-    """Whether a joint's command changes in each trajectory [S]."""
-    return np.array([bool(np.ptp(recording.trajectories[i].command[:, column])) for i in trajectories])

@@ -108,13 +108,3 @@ def polished(explanation: Explanation, fit: JointFit, floor: float) -> Explanati
     spread = intervals(fit, floor)
     accepted = tuple(replace(a, estimates=estimates(fit, a.name, spread)) for a in explanation.accepted)
     return replace(explanation, final=fit, accepted=accepted)
-
-
-def added(fit: JointFit) -> tuple[tuple[str, ...], dict[str, float]]:
-    """The effects of a model, and their values by key."""
-    return fit.effects, {key: value for key, value in fit.values.items() if "." in key}
-
-
-def certain(explanation: Explanation) -> bool:
-    """Whether every effect of the final model is the answer rather than one of a set."""
-    return explanation.verdict == "effects" and all(one.named for one in explanation.accepted)

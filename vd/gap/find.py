@@ -10,41 +10,28 @@ from vd.gap.statistics import HOLD_S, held
 
 SMOOTH_S = 0.05
 """Window over which speeds are taken [s]: longer than an encoder count at low speed."""
-ONSET_S = 0.15
-"""Time after a command starts to move from rest [s]."""
-REVERSAL_S = 0.12
-"""Time after a change of direction [s]."""
+AFTER_S = 0.15
+"""Time after a command starts to move from rest, or a joint turns [s]."""
 FAST = 0.6
 """Share of the joint's largest speed above which motion is fast."""
 SLOW = 0.1
 """Share of it below which motion is slow."""
 HEAVY = 0.7
 """Share of the largest pull (command minus position) above which the servo works hard."""
-LATE = 2.0 / 3.0
-"""Share of a trajectory after which it is late in it; before one minus it, early."""
-LONG_S = 6.0
-"""Length of trajectories of which early and late are compared [s]."""
 NOTABLE = 2.0
 """A phase is reported if its RMS is this many noise floors."""
-TYPICAL = 1.15
-"""And this many times the joint's overall RMS; the worst is reported anyway."""
-MIN_SAMPLES = 20
-MAX_FINDINGS = 4
+MAX_FINDINGS = 2
 """Findings of a joint."""
 SYSTEMATIC = 0.5
 """Share of the RMS that the mean must have for a sign to be reported."""
-LAG_SHARE = 0.3
-"""Share of the squared residual that a pure lag must explain to be reported."""
 
 PHASES: dict[str, tuple[str, str]] = {
-    "onset": ("when the command starts to move", f"for {1e3 * ONSET_S:.0f} ms"),
-    "reversal": ("after each reversal", f"for {1e3 * REVERSAL_S:.0f} ms"),
+    "onset": ("when the command starts to move", f"for {1e3 * AFTER_S:.0f} ms"),
+    "reversal": ("after each reversal", f"for {1e3 * AFTER_S:.0f} ms"),
     "hold": ("while holding still", ""),
     "fast": ("in fast motion", ""),
     "slow": ("in slow motion", ""),
     "load": ("when the servo pulls hard", ""),
-    "early": ("early in long motions", ""),
-    "late": ("late in long motions", ""),
 }
 """Phase -> when, and for how long."""
 
@@ -57,10 +44,10 @@ def speed_of(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     return (ahead - behind) / SMOOTH_S
 
 
-def _after(events: np.ndarray, time: np.ndarray, span: float) -> np.ndarray:
-    """Samples within ``span`` after an event."""
+def _after(events: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Samples soon after an event."""
     when = np.where(events, time, -np.inf)
-    return time - np.maximum.accumulate(when) <= span
+    return time - np.maximum.accumulate(when) <= AFTER_S
 
 
 def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) -> dict[str, np.ndarray]:
@@ -88,16 +75,13 @@ def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) ->
     before = np.concatenate([[0], count[:-1]])
     onset = changed & (before - count[first] == 0) & (time > 0.0)
     pull = np.abs(command - position)
-    long = time[-1] >= LONG_S
     return {
-        "onset": _after(onset, time, ONSET_S),
-        "reversal": _after(reversed_, time, REVERSAL_S),
+        "onset": _after(onset, time),
+        "reversal": _after(reversed_, time),
         "hold": rest,
         "fast": np.abs(speed) > FAST * top,
         "slow": moving & (np.abs(speed) < SLOW * top) & ~rest,
         "load": pull > HEAVY * max(float(pull.max()), 1e-12),
-        "early": np.full(len(time), long) & (time < (1.0 - LATE) * time[-1]),
-        "late": np.full(len(time), long) & (time > LATE * time[-1]),
     }
 
 
@@ -130,22 +114,14 @@ def _joint(recording: Recording, parts: list[np.ndarray], column: int, floor: fl
     rows = []
     for phase in PHASES:
         mask = np.concatenate([m[phase] for m in masks])
-        if mask.sum() < MIN_SAMPLES:
+        if not mask.any():
             continue
         part, direction = residual[mask], np.sign(speed[mask])
         rms = float(np.sqrt(np.mean(part**2)))
         rows.append((rms, phase, part, direction, float(mask.mean())))
     rows.sort(key=lambda row: -row[0])
-    chosen = [row for row in rows if row[0] > NOTABLE * floor and row[0] > TYPICAL * overall][:MAX_FINDINGS]
-    if not chosen and rows and overall > NOTABLE * floor:
-        chosen = rows[:1]
-    result = [_finding(name, row, overall, floor) for row in chosen]
-    lag = _lag(residual, speed)
-    if chosen and lag is not None:
-        verb = "lags" if lag > 0.0 else "leads"
-        text = f"{name}: the joint {verb} the model by about {1e3 * abs(lag):.0f} ms throughout"
-        result.append(Finding(name, text, {"lag_s": lag, "rms_rad": overall, "noise_floor_rad": floor}))
-    return result
+    chosen = [row for row in rows if row[0] > NOTABLE * floor][:MAX_FINDINGS]
+    return [_finding(name, row, overall, floor) for row in chosen]
 
 
 def _finding(
@@ -171,13 +147,3 @@ def _finding(
         "noise_floor_rad": floor,
     }
     return Finding(name, text, signature)
-
-
-def _lag(residual: np.ndarray, speed: np.ndarray) -> float | None:
-    """Lag behind the model [s] if the residual is mostly in proportion to the speed."""
-    power = float(speed @ speed)
-    if power <= 0.0:
-        return None
-    slope = float(residual @ speed) / power
-    explained = slope**2 * power / max(float(residual @ residual), 1e-300)
-    return -slope if explained > LAG_SHARE else None

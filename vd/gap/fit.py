@@ -1,4 +1,4 @@
-"""Fit the servo model of one joint to its trajectories: CMA-ES for the start, Levenberg-Marquardt to finish.
+"""Fit the servo model of one joint to its trajectories: CMA-ES for the start, least squares to finish.
 
 Every simulation is a rollout of the whole trajectory; all perturbed parameter sets of a step go through
 one call of :class:`vd.gap.rollout.Rollouts`.
@@ -13,53 +13,12 @@ import numpy as np
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import others_in
 from vd.gap.coordinates import Coordinate, Scales, coordinate, keys
-from vd.gap.descent import FIRST_DAMPING, LOG_TRUST, Descent, LeastSquares
+from vd.gap.descent import LeastSquares
 from vd.gap.joint_fit import JointFit, SampleWeighting
-from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
 
 STILL_COUNTS = 0.05
 """Encoder counts within which a prediction stands still."""
-
-
-class Holding:
-    """The trajectories in which a joint's command never changes.
-
-    A rollout starts at the first reading. Where dry friction holds the joint, the prediction stays there,
-    with the reading's error of up to a count, although the model is right; and so does the middle of what
-    play or a dead zone leave free, however the joint is shaken within.
-
-    Args:
-        recording: The recording.
-        column: The joint's column in it.
-        trajectories: Indices of the trajectories that are used.
-    """
-
-    def __init__(self, recording: Recording, column: int, trajectories: Sequence[int] | np.ndarray):
-        parts = {int(t): recording.trajectories[int(t)] for t in trajectories}
-        self._holds = {t: not np.ptp(part.command[:, column]) for t, part in parts.items()}
-        self._length = {t: len(part.time) for t, part in parts.items()}
-        self._least = STILL_COUNTS * recording.encoder_resolution_rad
-
-    def forgive(
-        self, residual: np.ndarray, predicted: np.ndarray, chosen: Sequence[int], free: np.ndarray
-    ) -> None:
-        """Take the mean from the residuals [C, N] of held motions, as far as the start can be its cause.
-
-        Args:
-            residual: Measured minus predicted, trajectory by trajectory; changed in place.
-            predicted: Predicted positions [C, N] [rad].
-            chosen: Indices of the trajectories.
-            free: Width in which nothing holds the joint [C] [rad]; all of a mean can be the start's where the
-                prediction stands still.
-        """
-        ends = np.cumsum([self._length[t] for t in chosen])[:-1]
-        parts = zip(chosen, np.split(residual, ends, axis=1), np.split(predicted, ends, axis=1), strict=True)
-        for trajectory, part, path in parts:
-            if self._holds[trajectory]:
-                still = np.ptp(path, axis=1) < self._least
-                most, mean = np.where(still, np.inf, free), part.mean(axis=1)
-                part -= np.clip(mean, -most, most)[:, None]
 
 
 RIDGE = 0.01
@@ -70,13 +29,12 @@ CMA_SIGMA = 0.7
 CMA_TRAJECTORIES = 4
 CMA_POPULATION = 16
 
-NEAR = 2.0
-"""Error, in noise floors, up to which refits without a fold keep the slopes of the whole fit: they end close
-to it, where the model is all but linear."""
-
+ITERATIONS = 12
+"""Trials of a fit at most."""
+REFITS = 4
+"""Trials of a refit without a fold, with the slopes of the whole fit."""
 FINER = (2, 4)
 """Divisors of the time step at which an estimate is finished: what the last one changes is its error."""
-FINER_ITERATIONS = 4
 
 Trajectories = Sequence[int] | np.ndarray | None
 """Indices of trajectories; None: all."""
@@ -114,15 +72,11 @@ class JointProblem:
         self._measured = {
             int(t): rollouts.measured[rollouts.sample_trajectory == t, joint] for t in self.trajectories
         }
-        self._holding = Holding(rollouts.recording, int(rollouts.chain.columns[joint]), trajectories)
+        column = int(rollouts.chain.columns[joint])
+        recorded = {int(t): rollouts.recording.trajectories[int(t)] for t in self.trajectories}
+        self._holds = {t: not np.ptp(part.command[:, column]) for t, part in recorded.items()}
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
         self._growth: dict[int, np.ndarray] = {}
-
-    def finer(self) -> "JointProblem":
-        """The same data simulated with the step at which estimates are finished; slopes as before."""
-        fine = copy.copy(self)
-        fine.coarse, fine.rollouts = self.rollouts, self.rollouts.at(self.rollouts.dt / FINER[-1])
-        return fine
 
     def weighted(self, weighting: SampleWeighting) -> "JointProblem":
         """The same data, samples weighted by how surely they are known."""
@@ -152,24 +106,41 @@ class JointProblem:
         self.simulated += len(rows) * len(chosen) if keep is None else int(keep.sum())
         residual = measured - predicted
         free = rows[:, self.joint, [servo.BACKLASH_WIDTH, servo.DEAD_ZONE_WIDTH]].max(axis=1)
-        self._holding.forgive(residual, predicted, chosen, free)
+        parts = zip(chosen, self.split(residual, chosen), self.split(predicted, chosen), strict=True)
+        for trajectory, part, path in parts:
+            if self._holds[trajectory]:
+                self._forgive(part, path, free)
         if self._growth:
             residual /= np.concatenate([self._growth[t] for t in chosen])
         if keep is not None:
             residual *= np.repeat(keep, [len(self._measured[t]) for t in chosen], axis=1)
         return residual
 
+    def _forgive(self, residual: np.ndarray, predicted: np.ndarray, free: np.ndarray) -> None:
+        """Take the mean from the residuals [C, T] of a motion whose command never changes, in place.
+
+        A rollout starts at the first reading. Where dry friction holds the joint, the prediction stays there,
+        with the reading's error of up to a count, although the model is right; and so does the middle of what
+        play or a dead zone leave ``free`` [C] [rad], however the joint is shaken within.
+        """
+        least = STILL_COUNTS * self.rollouts.recording.encoder_resolution_rad
+        most, mean = np.where(np.ptp(predicted, axis=1) < least, np.inf, free), residual.mean(axis=1)
+        residual -= np.clip(mean, -most, most)[:, None]
+
     def squares(
         self, base: np.ndarray, coordinates: Sequence[Coordinate], trajectories: Trajectories = None
     ) -> LeastSquares:
         """The squared error of the model whose other parameters are those of ``base``."""
 
+        def every(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray | None:
+            return None if keep is None else np.repeat(keep[None], len(x), axis=0)
+
         def residuals(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
-            return self.residuals(self.rows(base, coordinates, x), trajectories, keep)
+            return self.residuals(self.rows(base, coordinates, x), trajectories, every(x, keep))
 
         def coarse(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
             rows = self.rows(base, coordinates, x)
-            return self.residuals(rows, trajectories, keep, rollouts=self.coarse)
+            return self.residuals(rows, trajectories, every(x, keep), rollouts=self.coarse)
 
         slopes = None if self.coarse is None else coarse
         return LeastSquares(coordinates, residuals, RIDGE * self.floor**2, slopes)
@@ -186,11 +157,6 @@ class JointProblem:
         chosen = self.trajectories if trajectories is None else trajectories
         ends = np.cumsum([len(self._measured[int(t)]) for t in chosen])[:-1]
         return np.split(samples, ends, axis=-1)
-
-    def sums(self, residuals: np.ndarray, trajectories: Trajectories = None) -> np.ndarray:
-        """Squared errors of each trajectory, shape [C, S]."""
-        parts = self.split(residuals, trajectories)
-        return np.stack([np.einsum("cn,cn->c", part, part) for part in parts], axis=1)
 
     def scales(self, row: np.ndarray, residual: float) -> Scales:
         """Sizes of the joint's motion with a baseline row [PARAMETER_COLUMNS]."""
@@ -230,11 +196,10 @@ class JointProblem:
         starts: Sequence[Mapping[str, float]],
         scales: Scales,
         *,
-        iterations: int = 12,
+        iterations: int = ITERATIONS,
         trajectories: Trajectories = None,
-        refits: int = 0,
     ) -> JointFit:
-        """Fit a model from several starts at once, by Levenberg-Marquardt.
+        """Fit a model from several starts by least squares.
 
         Args:
             base: Rows of the chain's joints [n, PARAMETER_COLUMNS]; this joint's parameters start there.
@@ -243,7 +208,6 @@ class JointProblem:
             scales: Sizes of the joint's motion.
             iterations: Steps at most.
             trajectories: Subset to fit to, without held-out errors; all of the problem's if None.
-            refits: Steps of Levenberg-Marquardt of each refit without a fold; 0: one Gauss-Newton step.
 
         Returns:
             The best.
@@ -257,16 +221,24 @@ class JointProblem:
         )
         chosen = self.trajectories if trajectories is None else np.asarray(trajectories)
         model = self.squares(base, coordinates, chosen)
-        found = model.descend(x0, iterations, race=True)
-        squares = np.einsum("bn,bn->b", found.residual, found.residual)
-        found = found.at(int(np.argmin(squares)), 1)
-        found = replace(found, jacobian=model.jacobian(found.x, found.residual))
-        fit = self._result(
-            base, effects, coordinates, found.x[0], found.residual[0], found.jacobian[0], chosen
+        x = model.best(x0, iterations)
+        jacobian = model.jacobian(x)
+        errors = self.split(model.residuals(x[None], None)[0], chosen)
+        parts = self.split(jacobian, chosen)
+        fit = JointFit(
+            effects=tuple(effects),
+            coordinates=tuple(coordinates),
+            x=x,
+            rows=self.rows(base, coordinates, x[None])[0],
+            sse=np.array([e @ e for e in errors]),
+            held_out=np.full(len(chosen), np.nan),
+            count=np.array([len(e) for e in errors], float),
+            gram=np.stack([j @ j.T for j in parts]),
+            gradient=np.stack([j @ e for j, e in zip(parts, errors, strict=True)]),
         )
         if trajectories is not None:
             return fit
-        held_out, absolute = self.cross_validate(fit, found, refits)
+        held_out, absolute = self.cross_validate(fit, jacobian)
         return replace(fit, held_out=held_out, held_out_abs=absolute)
 
     def fitted(self, effects: Sequence[str]) -> list[str]:
@@ -277,76 +249,24 @@ class JointProblem:
 
     def jacobian(self, fit: JointFit) -> np.ndarray:
         """d(predicted)/dx at a fit, shape [P, N]."""
-        residual = self.residuals(fit.rows[None])
-        return self.squares(fit.rows, fit.coordinates).jacobian(fit.x[None], residual)[0]
+        return self.squares(fit.rows, fit.coordinates).jacobian(fit.x)
 
-    def _result(
-        self,
-        base: np.ndarray,
-        effects: Sequence[str],
-        coordinates: Sequence[Coordinate],
-        x: np.ndarray,
-        residual: np.ndarray,
-        jacobian: np.ndarray,
-        chosen: np.ndarray,
-    ) -> JointFit:
-        parts = self.split(jacobian, chosen)
-        errors = self.split(residual, chosen)
-        return JointFit(
-            effects=tuple(effects),
-            coordinates=tuple(coordinates),
-            x=x,
-            rows=self.rows(base, coordinates, x[None])[0],
-            sse=self.sums(residual[None], chosen)[0],
-            held_out=np.full(len(chosen), np.nan),
-            count=np.array([len(e) for e in errors], float),
-            gram=np.stack([j @ j.T for j in parts]),
-            gradient=np.stack([j @ e for j, e in zip(parts, errors, strict=True)]),
-        )
-
-    def cross_validate(
-        self, fit: JointFit, found: Descent, iterations: int = 0
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def cross_validate(self, fit: JointFit, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Squared and absolute errors of each trajectory, predicted by a fit without its fold, [S] each.
 
         Args:
             fit: The fit to all folds.
-            found: Its residual and Jacobian.
-            iterations: Steps of Levenberg-Marquardt of each refit; 0: one Gauss-Newton step.
+            jacobian: Its d(predicted)/dx [P, N], which the refits keep.
         """
         out = np.unique(self.folds)[:, None] == self.folds
         model = self.squares(fit.rows, fit.coordinates)
-        if iterations:
-            inside = np.repeat(~out, self.count.astype(int), axis=1)
-            start = found.at(0, len(out))
-            start = replace(
-                start, residual=start.residual * inside, jacobian=start.jacobian * inside[:, None]
-            )
-            near = fit.rmse < NEAR * self.floor
-            x = model.descend(start.x, iterations, keep=~out, known=start, chord=near).x
-            # A refit that found no way down is still the fit that has seen the fold.
-            for stuck in np.flatnonzero((x == start.x).all(axis=1)):
-                x[stuck] = self._without(fit, out[stuck])
-        else:
-            x = np.stack([self._without(fit, fold) for fold in out])
-        residual = self.residuals(self.rows(fit.rows, fit.coordinates, x), keep=out)
+        x = [
+            model.descend(fit.x, REFITS, ~fold, jacobian * np.repeat(~fold, self.count.astype(int)))
+            for fold in out
+        ]
+        residual = self.residuals(self.rows(fit.rows, fit.coordinates, np.array(x)), keep=out)
         parts = self.split(residual.sum(0))
         return np.array([part @ part for part in parts]), np.array([np.abs(part).sum() for part in parts])
-
-    def _without(self, fit: JointFit, out: np.ndarray) -> np.ndarray:
-        """Coordinates one Gauss-Newton step from a fit, towards the one without some trajectories [S]."""
-        lower = np.array([c.lower for c in fit.coordinates])
-        upper = np.array([c.upper for c in fit.coordinates])
-        logarithmic = np.array([c.log for c in fit.coordinates])
-        trust = np.where(logarithmic, 0.3 * LOG_TRUST, 1.0 + 0.5 * np.abs(fit.x))
-        gram = fit.gram[~out].sum(0) + RIDGE * self.floor**2 * np.eye(len(fit.x))
-        gradient = fit.gradient[~out].sum(0)
-        free = ~(((fit.x <= lower) & (gradient < 0.0)) | ((fit.x >= upper) & (gradient > 0.0)))
-        step = np.zeros(len(fit.x))
-        damped = gram[np.ix_(free, free)]
-        damped = damped + np.diag(FIRST_DAMPING * np.diag(damped))
-        step[free] = np.linalg.solve(damped, gradient[free])
-        return np.clip(fit.x + np.clip(step, -trust, trust), lower, upper)
 
     def refine(self, fit: JointFit, scales: Scales) -> JointFit:
         """The same model fitted on with finer time steps, for values that do not depend on the step.
@@ -355,28 +275,15 @@ class JointProblem:
         problem's own time step: they need not be finer. Held-out errors are those of
         ``fit``, to be compared with other models'.
         """
-        x, error, result = fit.x, np.zeros(len(fit.x)), fit
-        self.coarse = given = self.rollouts
-        try:
-            for divisor in FINER:
-                self.rollouts = self.coarse.at(self.coarse.dt / divisor)
-                result = self.fit(
-                    fit.rows,
-                    fit.effects,
-                    [result.values],
-                    scales,
-                    iterations=FINER_ITERATIONS,
-                    trajectories=self.trajectories,
-                )
-                x, error = result.x, np.abs(result.x - x)
-        finally:
-            self.rollouts, self.coarse = given, None
-        return replace(
-            result,
-            held_out=fit.held_out,
-            held_out_abs=fit.held_out_abs,
-            step_error=error,
-        )
+        result, error, fine = fit, np.zeros(len(fit.x)), copy.copy(self)
+        fine.coarse = self.rollouts
+        for divisor in FINER:
+            fine.rollouts = self.rollouts.at(self.rollouts.dt / divisor)
+            before, given = result.x, [result.values]
+            result = fine.fit(fit.rows, fit.effects, given, scales, trajectories=self.trajectories)
+            error = np.abs(result.x - before)
+        self.simulated = fine.simulated
+        return replace(result, held_out=fit.held_out, held_out_abs=fit.held_out_abs, step_error=error)
 
     def promise(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> np.ndarray:
         """Share of the squared error that each start could remove, the present parameters readjusted.
@@ -390,7 +297,6 @@ class JointProblem:
             scales: Sizes of the joint's motion.
         """
         residual = self.residuals(fit.rows[None])
-        plain = residual if self.coarse is None else self.residuals(fit.rows[None], rollouts=self.coarse)
         jacobian = self.jacobian(fit)
         basis = np.linalg.svd(jacobian, full_matrices=False)[2]
         left = residual[0] - basis.T @ (basis @ residual[0])
@@ -400,7 +306,7 @@ class JointProblem:
                 if "." not in key and key not in self.baseline:
                     continue  # not free in this chain
                 rows[i, self.joint, coordinate(key, scales).column] = value
-        change = plain - self.residuals(rows, rollouts=self.coarse)
+        change = residual - self.residuals(rows)
         change -= (change @ basis.T) @ basis
         along = change @ left
         power = np.einsum("cn,cn->c", change, change)

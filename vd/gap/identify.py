@@ -1,12 +1,12 @@
-"""The paper's identification of a hand's drives (Methods, identification of robot dynamics), in Newton.
+"""The paper's identification of a hand's drives (Methods, identification of robot dynamics): CMA-ES alone.
 
-CMA-ES over stiffness, damping and velocity limit by the squared error of trajectories, all candidates and
-trajectories simulated at once in parallel worlds, a search for every finger.
+Stiffness, damping and velocity limit of a finger's joints by the squared error of its trajectories, all of
+them with every candidate at once (:mod:`vd.gap.rollout`).
 """
 
-import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,184 +14,111 @@ import numpy as np
 
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hand_model import HandModel
+from vd.gap.chain import chains
 from vd.gap.close import counterparts
-from vd.gap.newton import DEFAULT_DT, HandReplay
 from vd.gap.recording import Recording
-from vd.kernels.servo.actuators import KD, KP, VELOCITY_LIMIT
+from vd.gap.rollout import STEP_S, Rollouts
 from vd.kernels.servo.effects import BASELINE
 
-SEARCHED = (KP, KD, VELOCITY_LIMIT)
-"""What the paper identifies, by column of a parameter row."""
+SEARCHED = BASELINE[:3]
+"""What the paper identifies: stiffness, damping, velocity limit."""
 SEARCH_SPREAD = 0.3
 """First standard deviation of the search, in logarithms of the parameters."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Identified:
     """What the search found, for K identified joints."""
 
     joints: tuple[str, ...]
     """Names of the joints."""
-    kp: np.ndarray
-    """Stiffness [N m/rad], shape [K]."""
-    kd: np.ndarray
-    """Damping [N m s/rad], shape [K]."""
-    velocity_limit: np.ndarray
-    """Velocity limit [rad/s], shape [K]."""
+    kp: list[float]
+    """Stiffness [N m/rad] [K]."""
+    kd: list[float]
+    """Damping [N m s/rad] [K]."""
+    velocity_limit: list[float]
+    """Velocity limit [rad/s] [K]."""
     rmse: dict[str, float]
     """Root mean squared error over the trajectories that excite a finger, by finger [rad]."""
     start_rmse: dict[str, float]
     """The same of the values that the search started from [rad]."""
     rollouts: int
-    """Trajectories simulated, of one finger each."""
+    """Trajectories simulated."""
     seconds: float
-    """Time that took, without building the worlds and compiling kernels."""
-
-    @property
-    def rollouts_per_second(self) -> float:
-        """Trajectories of one finger simulated in a second."""
-        return self.rollouts / self.seconds
-
-
-def pack_tracks(recording: Recording, hand: HandModel, fingers: Sequence[int]) -> np.ndarray:
-    """Spread the trajectories that excite each finger over worlds, long ones together, shape [W, F].
-
-    Fingers not in ``fingers`` and slots that are left over get -1.
-
-    Raises:
-        ValueError: A finger that is to be identified was never excited.
-    """
-    queues: list[list[int]] = []
-    for finger in range(hand.num_fingers):
-        names = set(finger_joints(hand, finger))
-        excited = [i for i, t in enumerate(recording.trajectories) if names & set(t.joints)]
-        if finger in fingers and not excited:
-            raise ValueError(
-                f"{recording.path}: no trajectory excites finger {finger} ({', '.join(sorted(names))}); "
-                "record one, or leave its joints out"
-            )
-        order = sorted(excited, key=lambda i: -recording.trajectories[i].time[-1])
-        queues.append(order if finger in fingers else [])
-    tracks = np.full((max(map(len, queues)), hand.num_fingers), -1)
-    for finger, queue in enumerate(queues):
-        tracks[: len(queue), finger] = queue
-    return tracks
-
-
-def finger_joints(hand: HandModel, finger: int) -> tuple[str, ...]:
-    """Names of the joints of a finger."""
-    return hand.joint_names[hand.fingers[finger]]
+    """Time that took."""
 
 
 def identify(
     recording: Recording,
     hand: HandModel,
-    joints: Sequence[str] | None = None,
     *,
     generations: int = 100,
     population: int = 64,
-    dt: float = DEFAULT_DT,
+    dt: float = STEP_S,
     device: str = "cpu",
     seed: int = 0,
-    progress: Callable[[int, dict[str, float]], None] = lambda generation, best: None,
-    working: Callable[[float], None] = lambda share: None,
+    progress: Callable[[int, str, float], None] = lambda generation, finger, best: None,
 ) -> Identified:
-    """Identify stiffness, damping and velocity limits as the paper does: CMA-ES on parallel simulations.
-
-    Every finger has a search of its own; they advance together, in the same worlds. The score is the
-    squared error of the finger's joints over the trajectories that excite one of them.
+    """Identify stiffness, damping and velocity limits of all joints that some motion excites.
 
     Args:
         recording: A recording of the hand.
         hand: The hand.
-        joints: Joints to identify; all that some motion excites by default.
-        generations: Generations of the search.
-        population: Candidates of a generation; times the trajectories of a finger: the worlds.
+        generations: Generations of each finger's search.
+        population: Candidates of a generation.
         dt: Physics step [s].
         device: Warp device.
         seed: Seed of the search.
-        progress: Called after each generation with its number and the best error of each finger [rad].
-        working: Called in each generation with the share that is done.
+        progress: Called after each generation with its number, the finger and its best error [rad].
 
     Raises:
-        ValueError: A joint is not recorded or its finger was never excited.
+        ValueError: The recording is not of this hand.
     """
-    excited = {joint for trajectory in recording.trajectories for joint in trajectory.joints}
-    names = tuple(name for name in recording.joints if name in excited) if joints is None else tuple(joints)
-    missing = [name for name in names if name not in recording.joints]
-    if missing:
-        raise ValueError(f"{recording.path}: joints {', '.join(missing)} are not recorded; leave them out")
-    base = np.array(hand.servo, dtype=float)
-    chosen = [hand.joint_names.index(name) for name in names]
-    fingers = sorted({int(hand.joint_finger[joint]) for joint in chosen})
-    tracks = pack_tracks(recording, hand, fingers)
-    slots = len(tracks)
-    replay = HandReplay(recording, hand, np.tile(tracks, (population, 1)), dt=dt, device=device)
+    began, count = time.perf_counter(), 0
+    columns: dict[str, list[float]] = {}
+    rmse: dict[str, float] = {}
+    start_rmse: dict[str, float] = {}
+    for chain in chains(recording, hand):
+        parts = [i for i, t in enumerate(recording.trajectories) if {*chain.joints} & {*t.joints}]
+        moved = [j for j, n in enumerate(chain.joints) if any(n in t.joints for t in recording.trajectories)]
+        if not parts:
+            continue
+        finger = chain.name
+        rollouts = Rollouts(chain, recording, dt=dt, device=device)
+        measured = rollouts.measured[np.isin(rollouts.sample_trajectory, parts)]
+        places = np.ix_(range(population), moved, [p.column for p in SEARCHED])
+        rows = np.repeat(chain.start_row[None], population, axis=0)
+        best = rows[places][0]
+        error = start_rmse[finger] = _errors(rollouts, rows[:1], parts, measured)[0]
+        search = _search(best, population, seed + len(rmse) + 1)
+        for generation in range(generations):
+            asked = search.ask()
+            rows[places] = np.exp(np.array(asked)).reshape(population, *best.shape)
+            errors = _errors(rollouts, rows, parts, measured)
+            search.tell(asked, (errors**2).tolist())
+            if errors.min() < error:
+                error, best = float(errors.min()), rows[places][np.argmin(errors)]
+            progress(generation + 1, finger, error)
+        count += generations * population * len(parts)
+        rmse[finger] = error
+        columns |= {chain.joints[j]: values for j, values in zip(moved, best.tolist(), strict=True)}
+    kp, kd, limit = (list(values) for values in zip(*columns.values(), strict=True))
+    return Identified(tuple(columns), kp, kd, limit, rmse, start_rmse, count, time.perf_counter() - began)
 
-    members = {f: [j for j in chosen if hand.joint_finger[j] == f] for f in fingers}
-    searches = {f: _search(base[members[f]], population, seed + f + 1) for f in fingers}
-    samples = {
-        f: sum(len(recording.trajectories[i].time) for i in tracks[:, f] if i >= 0) * len(scored)
-        for f in fingers
-        if (scored := [n for n in finger_joints(hand, f) if n in recording.joints])
-    }
 
-    def evaluate(rows: np.ndarray) -> dict[int, np.ndarray]:
-        """Mean squared error of each finger for rows [population, D, P]."""
-        replay.run(np.repeat(rows, slots, axis=0), working)
-        error = replay.squared_error.numpy().reshape(population, slots, -1)
-        error = np.nan_to_num(error.astype(float), nan=np.inf)
-        return {f: error[:, :, hand.fingers[f]].sum(axis=(1, 2)) / samples[f] for f in fingers}
-
-    first = evaluate(np.tile(base, (population, 1, 1)))  # also compiles every kernel
-    start_rmse = {f"f{f}": float(np.sqrt(first[f][0])) for f in fingers}
-    best = {f: (first[f][0], base[np.ix_(members[f], SEARCHED)]) for f in fingers}
-    began, rollouts = time.perf_counter(), 0
-    for generation in range(generations):
-        rows = np.tile(base, (population, 1, 1))
-        asked = {f: searches[f].ask() for f in fingers}
-        for f in fingers:
-            values = np.exp(np.array(asked[f])).reshape(population, len(members[f]), len(SEARCHED))
-            rows[np.ix_(range(population), members[f], SEARCHED)] = values
-        scores = evaluate(rows)
-        rollouts += population * int(np.count_nonzero(tracks >= 0))
-        for f in fingers:
-            searches[f].tell(asked[f], scores[f].tolist())
-            winner = int(np.argmin(scores[f]))
-            if scores[f][winner] < best[f][0]:
-                best[f] = (scores[f][winner], rows[winner][np.ix_(members[f], SEARCHED)])
-        progress(generation + 1, {f"f{f}": float(np.sqrt(best[f][0])) for f in fingers})
-    found = base.copy()
-    for f in fingers:
-        found[np.ix_(members[f], SEARCHED)] = best[f][1]
-    return Identified(
-        joints=names,
-        kp=found[chosen, KP],
-        kd=found[chosen, KD],
-        velocity_limit=found[chosen, VELOCITY_LIMIT],
-        rmse={f"f{f}": float(np.sqrt(best[f][0])) for f in fingers},
-        start_rmse=start_rmse,
-        rollouts=rollouts,
-        seconds=time.perf_counter() - began,
-    )
+def _errors(rollouts: Rollouts, rows: np.ndarray, parts: list[int], measured: np.ndarray) -> np.ndarray:
+    """RMSE [C] [rad] of chains with rows [C, n, P] on trajectories whose positions are ``measured``."""
+    error = rollouts.predict(rows, parts) - measured
+    return np.sqrt(np.einsum("csj,csj->c", error, error) / measured.size)
 
 
 def _search(start: np.ndarray, population: int, seed: int) -> Any:
-    """CMA-ES on the logarithms of the searched parameters of a finger's joints.
-
-    Args:
-        start: Servo parameters of its joints, shape [J, P].
-        population: Candidates of a generation.
-        seed: Seed of the search.
-    """
+    """CMA-ES on the logarithms of the searched parameters [J, 3] of a finger's joints."""
     import cma
 
-    bounds = {p.column: (p.lower, p.upper) for p in BASELINE}
-    centre = np.log(start[:, SEARCHED]).flatten()
-    low = np.log([bounds[c][0] for _ in start for c in SEARCHED])
-    high = np.log([bounds[c][1] for _ in start for c in SEARCHED])
+    low, high = ([np.log(getattr(p, end)) for _ in start for p in SEARCHED] for end in ("lower", "upper"))
     options = {"popsize": population, "seed": seed, "bounds": [low, high], "verbose": -9}
-    return cma.CMAEvolutionStrategy(np.clip(centre, low, high), SEARCH_SPREAD, options)
+    return cma.CMAEvolutionStrategy(np.clip(np.log(start.ravel()), low, high), SEARCH_SPREAD, options)
 
 
 def write_drives(
@@ -212,11 +139,11 @@ def write_drives(
     source = {joint: joint for joint in found.joints}
     if every_finger:
         source |= counterparts(hand, found.joints)
-    columns = {"kp": found.kp, "kd": found.kd, "velocity_limit": found.velocity_limit}
-    baseline = {
-        joint: {name: float(values[found.joints.index(known)]) for name, values in columns.items()}
-        for joint, known in source.items()
+    own = {
+        joint: {p.name: float(getattr(found, p.name)[i]) for p in SEARCHED}
+        for i, joint in enumerate(found.joints)
     }
+    baseline = {joint: own[known] for joint, known in source.items()}
     write_layer(
         path, hand, baseline=baseline, effects={}, tool="vd-gap identify", recording=str(recording.path)
     )

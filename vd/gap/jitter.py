@@ -80,7 +80,6 @@ class JitterFit:
             replace(recording, trajectories=copies),
             dt=problem.rollouts.dt,
             device=problem.rollouts.device,
-            batch=problem.rollouts.batch,
         )
         self.measured = np.concatenate([t.position[:, self._column] for t in chosen])
         self.ends = np.cumsum([len(t.time) for t in chosen])[:-1]

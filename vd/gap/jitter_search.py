@@ -7,14 +7,10 @@ in turn.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
-
-from vd.gap.candidates import Call
 from vd.gap.evidence import JITTER, REPEATABLE
 from vd.gap.explanation import Accepted, Explanation, Trial
-from vd.gap.joint_fit import JointFit, SampleWeighting
+from vd.gap.joint_fit import JointFit
 from vd.gap.search import Search
 
 Explain = Callable[[Search, JointFit], Explanation]
@@ -25,12 +21,6 @@ FIXED = "command_delay"
 """What is the mean of random delays, too."""
 PASSES = 2
 """Searches for what there is beside random delays, each with these as they are beside what the last found."""
-NOT_NEAR = 1.5
-"""Error after the first of them, in that of the model without them, from which the next is not made."""
-HOPELESS = 3.0
-"""The same of what is left through it, in what may be left in the end: the first weighting is too narrow."""
-SAME_SPREAD = 0.1
-"""Relative change of their standard deviation up to which they are the same."""
 SPREAD = "its spread is what is measured"
 """Why they are named."""
 
@@ -49,7 +39,7 @@ def try_jitter(
     Returns:
         The better model; what it has besides random delays, if it has these; and the evidence.
     """
-    if not _tried(search):
+    if search.behind_jitter or JITTER not in search.candidates or JITTER in search.vetoes:
         return present, (), []
     random, beside, rows, left = with_jitter(search, explain, baseline, present)
     others = [name for name in random.effects if name != JITTER]
@@ -67,21 +57,11 @@ def try_jitter(
     row = Trial(1, JITTER, random, gain, ci, decision, SPREAD if accepted else why)
     if not accepted:
         return present, (), [row]
-    random = bounded(search, random)
+    random = search.run([("bound_jitter", {"fit": random, "scales": search.scales})])[0]
     names, before, after = " and ".join(random.effects), present.held_out_rmse, random.held_out_rmse
     text = f"as likely as {1e3 * after:.2f} mrad of constant width, before {1e3 * before:.2f}"
     search.report(f"+ {names}: {text}")
     return random, beside, [row, *rows]
-
-
-def _tried(search: Search) -> bool:
-    """Whether random delays are among what a search may find."""
-    return not search.behind_jitter and JITTER in search.candidates and JITTER not in search.vetoes
-
-
-def bounded(search: Search, random: JointFit) -> JointFit:
-    """A model with the intervals of its random delays."""
-    return search.run([("bound_jitter", {"fit": random, "scales": search.scales})])[0]
 
 
 def with_jitter(
@@ -94,42 +74,23 @@ def with_jitter(
     """
     jitter, weighting = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
     for _ in range(PASSES):
-        inner = behind(search, weighting)
-        plain = inner.run([inner.plain(baseline)])[0]
+        inner = search.weighted(
+            weighting,
+            candidates=[name for name in search.candidates if name != JITTER],
+            behind_jitter=True,
+            report=lambda line: search.report(f"beside {JITTER}: {line}"),
+        )
+        plain = inner.plain(baseline)
         found = explain(inner, plain)
         clear = found.verdict in ("effects", "ambiguous")
         rest, beside = (found.final, found.accepted) if clear else (plain, ())
         call = {"fit": rest, "scales": search.scales, "start": jitter}
         random, weighting = search.run([("fit_jitter", call)])[0]
-        before, jitter = jitter, (random.values[SIGMA], random.values[DROP])
-        same = abs(np.log(jitter[0] / before[0])) < SAME_SPREAD
-        hopeless = rest.rmse > HOPELESS * REPEATABLE * search.floor
-        if same or hopeless or equivalent(random) > NOT_NEAR * equivalent(present):
+        jitter = random.values[SIGMA], random.values[DROP]
+        if not search.likelier(present, random)[0]:
             break
     rows = [
         replace(row, round=row.round + 1, fit=replace(row.fit, effects=(JITTER, *row.fit.effects)))
         for row in found.trials
     ]
     return random, beside, rows, rest.rmse
-
-
-def equivalent(fit: JointFit) -> float:
-    """RMSE of a fit as a likelihood has it that knows a width of each motion: their geometric mean [rad]."""
-    return float(np.exp(0.5 * np.sum(fit.count * np.log(fit.sse / fit.count)) / fit.count.sum()))
-
-
-def behind(search: Search, weighting: SampleWeighting) -> Search:
-    """The same search, samples weighted by what random delays do to them."""
-
-    def run(calls: list[Call]) -> list[Any]:
-        return search.run([(name, {**options, "weighting": weighting}) for name, options in calls])
-
-    return replace(
-        search,
-        run=run,
-        candidates=[name for name in search.candidates if name != JITTER],
-        behind_jitter=True,
-        report=lambda line: search.report(f"beside {JITTER}: {line}"),
-        promised={},
-        seen={},
-    )

@@ -6,12 +6,10 @@ from functools import partial
 
 import numpy as np
 
-from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.evidence import CANCELLING, JITTER, LEVELS, MIN_GAIN, explains
-from vd.gap.explain import REFITS, Explained, Explainer, Joint, beside, weighting_of
+from vd.gap.explain import Explained, Explainer, Joint, beside, weighting_of
 from vd.gap.explanation import NAMED, Explanation, estimates, intervals, polished
 from vd.gap.joint_fit import JointFit
-from vd.gap.masses import masses_alone, masses_beside, widened
 from vd.gap.worker_pool import WorkerPool, parallel
 
 OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}
@@ -139,26 +137,17 @@ def explain_joints(explainer: Explainer) -> list[Explanation]:
         explainer: Explains one.
     """
     pool, joints = explainer.pool, explainer.joints
-    masses = masses_alone(pool, joints)
-
-    def one(joint: Joint, explained: Explained) -> Explanation:
-        if joint.spec.chain not in masses:
-            return explainer.explain(joint, explained)
-        text = f"the plain model is within the noise floor {masses[joint.spec.chain].text}"
-        explainer.progress(f"explain: {joint.name}: no_gap: {text}")
-        return Explanation(joint.fit, joint.fit, "no_gap", text)
-
     floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))
-    alone = _in_turn(joints, one)
+    alone = _in_turn(joints, explainer.explain)
     ends = [partial(_finished, pool, list(zip(joints, alone, strict=True)), joint) for joint in joints]
     shared = share(alone, floors, fingers, ends)
-    return doubted(_consistent(pool, joints, masses_beside(pool, joints, shared)), fingers)
+    return doubted(_consistent(pool, joints, shared), fingers)
 
 
 def _finished(pool: WorkerPool, known: Explained, joint: Joint, fit: JointFit) -> JointFit:
     """A model fitted to the end from where it is, beside the joints as they are known."""
     call = {"base": beside(joint, known), "effects": fit.effects, "starts": [fit.values]}
-    call |= {"scales": joint.scales, "iterations": FULL_ITERATIONS, "refits": REFITS}
+    call |= {"scales": joint.scales}
     weighting = weighting_of(next(found for other, found in known if other is joint))
     whole = pool.run(joint.spec, [("fit", {**call, **weighting})])[0]
     return pool.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales, **weighting})])[0]
@@ -203,9 +192,6 @@ def _consistent(
             return own
         rows[joint.spec.joint] = own.final.rows[joint.spec.joint]
         call = {"fit": replace(own.final, rows=rows), "scales": joint.scales, **weighting_of(own)}
-        fit = pool.run(joint.spec, [("refine", call)])[0]
-        if own.final.extents:
-            fit = widened(fit, joint.spec.floor, own.final.extents)
-        return polished(own, fit, joint.spec.floor)
+        return polished(own, pool.run(joint.spec, [("refine", call)])[0], joint.spec.floor)
 
     return parallel(again, range(len(joints)))

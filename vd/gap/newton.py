@@ -1,25 +1,21 @@
 """Recordings of a hand replayed in Newton as policies are trained: same solver, same servo kernels.
 
-The fingers of a hand do not move each other, so one world can replay a different trajectory with every
-finger. Contacts are off; SI units, radians.
+Every world replays one trajectory with one set of parameters. Contacts are off; SI units, radians.
 """
 
 import dataclasses
 import math
 import zlib
-from collections.abc import Callable
 from typing import Any
 
 import mujoco
 import newton
 import numpy as np
 import warp as wp
-from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_model import HandModel
-from vd.gap.chain import GRAVITY_M_S2
 from vd.gap.recording import Recording, Trajectory
-from vd.gap.rollout import STREAM_BITS
+from vd.gap.rollout import STEP_S, STREAM_BITS
 from vd.kernels.launch import count_kernel, launch
 from vd.kernels.servo.actuators import BACKLASH_WIDTH, ENCODER_BIAS
 from vd.kernels.servo.chains import Samples
@@ -34,143 +30,120 @@ from vd.sim.engine import make_solver
 from vd.sim.joint_servo import JointServo
 from vd.sim.scene import build_hand, new_builder
 
-DEFAULT_DT = 1.0 / 480.0
-"""Physics step [s]: a quarter of training's, at which the integrator's error is under a milliradian."""
-CONSTRAINT_ROWS = 3
-"""Rows of a joint without contacts: its limit, its friction, and that it follows another."""
-CONTACTS = 4
-"""The solver wants room for some contacts even if there are none."""
-GRADIENT_STEP = 1.0e-5
-"""Step of central differences [rad]: rounding and curvature are both far below a servo's torques."""
 GRAPH_STEPS = 16
 """Physics steps per graph; even, since states are swapped every step."""
 
 
-class HandReplay:
-    """Worlds with a hand each, every finger of which follows a trajectory of a recording.
+def simulate_hand(
+    recording: Recording, hand: HandModel, rows: np.ndarray, *, dt: float = STEP_S, device: str = "cpu"
+) -> np.ndarray:
+    """What Newton makes of a recording's commands, sampled where the recording has positions.
 
-    W worlds, F fingers, D joints, P = PARAMETER_COLUMNS.
+    Args:
+        recording: A recording of the hand.
+        hand: The hand.
+        rows: Servo parameters, shape [D, P], or of M models that are simulated side by side [M, D, P].
+        dt: Physics step [s].
+        device: Warp device.
+
+    Returns:
+        Predicted recorded positions [rad] in the recording's columns, the samples of the trajectories one
+        after the other, shape [S, J] or [M, S, J].
+    """
+    rows = np.asarray(rows, dtype=float)
+    models = rows[None] if rows.ndim == 2 else rows
+    lengths = [len(trajectory.time) for trajectory in recording.trajectories]
+    replay = _Replay(recording, hand, len(models), dt, device)
+    positions = replay.run(np.repeat(models, len(lengths), axis=0))
+    positions = positions.reshape(len(models), len(lengths), -1, hand.num_joints)
+    answers = np.concatenate([positions[:, k, :length] for k, length in enumerate(lengths)], axis=1)
+    answers = answers[..., [hand.joint_names.index(name) for name in recording.joints]]
+    return answers[0] if rows.ndim == 2 else answers
+
+
+def random_stream(trajectory: Trajectory) -> int:
+    """The stream of a trajectory's random delays, the same as in the rollouts."""
+    return zlib.crc32(trajectory.file.encode()) & ((1 << STREAM_BITS) - 1)
+
+
+class _Replay:
+    """Worlds with a hand each, one for every trajectory of each of M models.
+
+    W worlds, D joints, P = PARAMETER_COLUMNS.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        hand: HandModel,
-        tracks: np.ndarray,
-        *,
-        dt: float = DEFAULT_DT,
-        device: str = "cpu",
-        keep_positions: bool = False,
-    ):
-        """Build the worlds.
-
-        Args:
-            recording: The recording; its joints are joints of the hand.
-            hand: The hand.
-            tracks: Trajectory that each finger follows, or -1 for none, shape [W, F].
-            dt: Physics step [s].
-            device: Warp device.
-            keep_positions: Keep the predicted positions, not just their squared errors.
-
-        Raises:
-            ValueError: The recording has joints that the hand has not.
-        """
-        unknown = [name for name in recording.joints if name not in hand.joint_names]
-        if unknown:
-            raise ValueError(
-                f"{recording.path}: joints {', '.join(unknown)} are not joints of {hand.name} "
-                f"({', '.join(hand.joint_names)}); name the hand that was recorded"
-            )
+    def __init__(self, recording: Recording, hand: HandModel, models: int, dt: float, device: str):
         self.hand, self.dt, self.device = hand, dt, device
-        tracks = np.asarray(tracks)
-        self.num_worlds = w = len(tracks)
-        self.num_joints = d = hand.num_joints
-        self._load(recording, tracks)
-        self._build()
+        self.shape = w, d = models * len(recording.trajectories), hand.num_joints
 
         def zeros(*shape: int, dtype: Any = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self.squared_error = zeros(w, d)
-        """Sum over samples of the squared error of every joint [rad^2], shape [W, D]."""
-        kept = max(self._length[i] for i in tracks.flat if i >= 0) if keep_positions else 0
-        self.positions = zeros(w, int(kept), d)
-        """Predicted positions [rad] by sample of the world's tracks, shape [W, T, D]."""
+        self._load(recording, models)
+        self._build()
+        self.positions = zeros(w, max(len(t.time) for t in recording.trajectories), d)
         self._step = zeros(1, dtype=wp.int32)
         self._write, self._read = zeros(w, d, dtype=wp.int32), zeros(w, d, dtype=wp.int32)
         self._due_step, self._due_fraction = zeros(w, d, dtype=wp.int32), zeros(w, d)
         self._held, self._held_power = zeros(w, d), zeros(w, d)
-        self._graph: Any = None
-        self._loaded = False
 
-    def _load(self, recording: Recording, tracks: np.ndarray) -> None:
+    def _load(self, recording: Recording, models: int) -> None:
         """Put the trajectories on the device, one after the other."""
-        trajectories = recording.trajectories
-        self._length = np.array([len(t.time) for t in trajectories])
-        start = np.concatenate([[0], np.cumsum(self._length)])
-        first = np.where(tracks >= 0, start[tracks], 0)
-        last = np.where(tracks >= 0, start[tracks + 1], 0)
-        streams = np.array([random_stream(t) for t in trajectories])
+        trajectories, names = recording.trajectories, list(recording.joints)
+        lengths = [len(t.time) for t in trajectories]
+        first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
         gains = [float(t.conditions.get("p_gain", 0.0)) for t in trajectories]
-        reference = max(gains)
-        power = np.concatenate(
-            [
-                t.enabled * (gain / reference if gain > 0.0 else 1.0)
-                for t, gain in zip(trajectories, gains, strict=True)
-            ]
-        )
-        stamps = np.concatenate([t.time for t in trajectories]) / self.dt
-        sent = np.concatenate([t.sent for t in trajectories]) / self.dt
+        shares = [gain / max(gains) if gain > 0.0 else 1.0 for gain in gains]
+        power = np.concatenate([t.enabled * share for t, share in zip(trajectories, shares, strict=True)])
         command = np.concatenate([t.command for t in trajectories])
-        position = np.concatenate([t.position for t in trajectories])
-        names = list(recording.joints)
         column = np.array([names.index(n) if n in names else -1 for n in self.hand.joint_names])
-        self.duration = float(max(trajectories[i].time[-1] for i in tracks.flat if i >= 0))
-
-        # Where every joint starts, and the command it has had: rest where nothing is recorded.
-        finger = self.hand.joint_finger
-        by_joint = first[:, finger]
-        recorded = (tracks[:, finger] >= 0) & (column >= 0)
-        idle = np.clip(0.0, self.hand.lower, self.hand.upper)
-        self._start = np.where(recorded, position[by_joint, column], idle)
-        self._start_command = np.where(recorded, command[by_joint, column], idle)
-        self._start_power = np.where(recorded, power[by_joint, column], 1.0)
-        self._recorded, self._first_sample = recorded, by_joint.astype(np.int32)
+        self.duration = float(max(t.time[-1] for t in trajectories))
 
         def array(values: np.ndarray, dtype: Any = float) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
-        self._position = array(position)
-        self._samples = Samples()
-        self._samples.step = array(np.floor(stamps), int)
-        self._samples.fraction = array(stamps - np.floor(stamps))
-        self._samples.sent_step = array(np.floor(sent), int)
-        self._samples.sent_fraction = array(sent - np.floor(sent))
+        def start(values: np.ndarray, idle: np.ndarray | float) -> np.ndarray:
+            """Of every joint at the first samples [W, D]; rest where nothing is recorded."""
+            return np.tile(np.where(column >= 0, values[first][:, column], idle), (models, 1))
+
+        centre = np.clip(0.0, self.hand.lower, self.hand.upper)
+        self._start = start(np.concatenate([t.position for t in trajectories]), centre)
+        self._start_command, self._start_power = start(command, centre), start(power, 1.0)
+        self._recorded = column >= 0
+        self._samples, self._tracks = Samples(), Tracks()
+        for prefix, times in (
+            ("", [t.time for t in trajectories]),
+            ("sent_", [t.sent for t in trajectories]),
+        ):
+            steps = np.concatenate(times) / self.dt
+            setattr(self._samples, f"{prefix}step", array(np.floor(steps), int))
+            setattr(self._samples, f"{prefix}fraction", array(steps - np.floor(steps)))
         self._samples.command, self._samples.power = array(command), array(power)
-        self._tracks = Tracks()
-        self._tracks.column, self._tracks.finger = array(column, int), array(finger, int)
-        self._tracks.first, self._tracks.last = array(first, int), array(last, int)
-        self._tracks.stream = array(streams[tracks], int)
+        self._tracks.column = array(column, int)
+        self._tracks.first = array(np.tile(first, models), int)
+        self._tracks.last = array(np.tile(first + lengths, models), int)
+        self._tracks.stream = array(np.tile([random_stream(t) for t in trajectories], models), int)
 
     def _build(self) -> None:
+        """The worlds; without contacts a joint has three rows: its limit, friction, and whom it follows."""
+        w, d = self.shape
         cfg = dataclasses.replace(
             SimCfg(),
             physics_hz=1.0 / self.dt,
             control_hz=0.5 / self.dt,
             contact_time_constant_s=max(SimCfg().contact_time_constant_s, 2.0 * self.dt),
-            njmax=CONSTRAINT_ROWS * self.num_joints,
-            nconmax=CONTACTS,
+            njmax=3 * d,
+            nconmax=4,  # the solver wants room for some even if there are none
         )
-        world = build_hand(self.hand, cfg, visuals=False)
         scene = new_builder()
-        scene.replicate(world, self.num_worlds)
+        scene.replicate(build_hand(self.hand, cfg, visuals=False), w)
         self.model = scene.finalize(device=self.device)
         self.solver = make_solver(self.model, cfg)
         self.solver.mjw_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self.control = self.model.control()
         self._states = self.model.state(), self.model.state()
-        self._q = [s.joint_q.reshape((self.num_worlds, -1)) for s in self._states]
-        self._qd = [s.joint_qd.reshape((self.num_worlds, -1)) for s in self._states]
+        self._q = [s.joint_q.reshape((w, -1)) for s in self._states]
+        self._qd = [s.joint_qd.reshape((w, -1)) for s in self._states]
         self.servo = JointServo(
             self.solver,
             self.control,
@@ -181,139 +154,58 @@ class HandReplay:
             control_dt=self.duration,  # commands come from the recording, none is in transit
         )
 
-    def run(self, rows: np.ndarray, progress: Callable[[float], None] = lambda share: None) -> None:
-        """Simulate all trajectories from rest at the first recorded positions.
+    def run(self, rows: np.ndarray) -> np.ndarray:
+        """Simulate from rest at the first recorded positions.
 
         Args:
-            rows: Servo parameters, shape [D, P] or [W, D, P].
-            progress: Called with the share that is done.
+            rows: Servo parameters, shape [W, D, P].
+
+        Returns:
+            Predicted positions [rad] by sample of the world's trajectory, shape [W, T, D].
         """
-        rows = np.asarray(rows, dtype=float)
         self.servo.set_rows(rows)
         start = np.where(self._recorded, self._start - rows[..., ENCODER_BIAS], self._start)
         self._q[0].assign(start.astype(np.float32))
-        self._qd[0].zero_()
         self.solver.reset(self._states[0], flags=newton.StateFlags(0))
         self._held.assign(self._start_command.astype(np.float32))
         self._held_power.assign(self._start_power.astype(np.float32))
         wp.copy(self.servo.power, self._held_power)
-        self.servo.reset(wp.ones(self.num_worlds, dtype=wp.int32, device=self.device), command=self._held)
+        self.servo.reset(wp.ones(self.shape[0], dtype=wp.int32, device=self.device), command=self._held)
         if rows[..., BACKLASH_WIDTH].any():
-            load = wp.array(gravity_load(self.hand, start), dtype=float, device=self.device)
+            load = wp.array(self._gravity(start), dtype=float, device=self.device)
             servo = [self.servo.parameters, self.servo.first]
             inputs = [*servo, self._held, self._held_power, load, self._q[0]]
-            shape = (self.num_worlds, self.num_joints)
-            wp.launch(
-                rest_play_kernel, dim=shape, inputs=inputs, outputs=[self.servo.state], device=self.device
-            )
-        for array in (self._step, self.squared_error, self._due_step, self._due_fraction):
-            array.zero_()
-        self._write.assign(self._first_sample)
-        self._read.assign(self._first_sample)
-        steps = math.ceil(self.duration / self.dt) + 1
-        graphs = math.ceil(steps / GRAPH_STEPS)
-        for number in range(graphs):
-            self._advance()
-            progress((number + 1) / graphs)
-
-    def _advance(self) -> None:
-        """Some physics steps as one graph, once every kernel is loaded: a tenth of the time, on a CPU too."""
-        if not self._loaded:
+            launch(rest_play_kernel, self.shape, inputs, [self.servo.state])
+        first = np.repeat(self._tracks.first.numpy()[:, None], self.shape[1], axis=1)
+        self._write.assign(first)
+        self._read.assign(first)
+        self._launch_steps()  # loads every kernel, which a capture cannot
+        with wp.ScopedCapture(device=self.device) as capture:  # a tenth of the time, on a CPU too
             self._launch_steps()
-            self._loaded = True
-            return
-        if self._graph is None:
-            with wp.ScopedCapture(device=self.device) as capture:
-                self._launch_steps()
-            self._graph = capture.graph
-        wp.capture_launch(self._graph)
+        for _ in range(math.ceil((math.ceil(self.duration / self.dt) + 1) / GRAPH_STEPS) - 1):
+            wp.capture_launch(capture.graph)
+        return self.positions.numpy().astype(float)
+
+    def _gravity(self, q: np.ndarray) -> np.ndarray:
+        """Torques of gravity on the joints [N m], shape [W, D], at positions [W, D] [rad]."""
+        data, load = mujoco.MjData(self.solver.mj_model), np.empty_like(q)
+        for i, place in enumerate(q):
+            data.qpos[: q.shape[1]] = place
+            mujoco.mj_forward(self.solver.mj_model, data)
+            load[i] = -data.qfrc_bias[: q.shape[1]]
+        return load
 
     def _launch_steps(self) -> None:
-        dim, servo = (self.num_worlds, self.num_joints), self.servo
-        given = [servo.parameters, self._samples, self._tracks]
+        servo = self.servo
+        given = [servo.parameters, self._samples, self._tracks, self.dt, self._step]
         commands = [self._write, self._due_step, self._due_fraction, self._held, self._held_power]
         for k in range(GRAPH_STEPS):
             here, there = k % 2, 1 - k % 2
-            wp.launch(
-                replay_command_kernel,
-                dim=dim,
-                inputs=[*given, self.dt, self._step, *commands, servo.state],
-                outputs=[servo.reference, servo.power],
-                device=self.device,
-            )
+            inputs = [*given, *commands, servo.state]
+            launch(replay_command_kernel, self.shape, inputs, [servo.reference, servo.power])
             servo.drive(self._q[here], self._qd[here])
             self.solver.step(self._states[here], self._states[there], self.control, None, self.dt)
             servo.finish(self._q[here], self._q[there], self._qd[there])
-            wp.launch(
-                sample_position_kernel,
-                dim=dim,
-                inputs=[
-                    *given,
-                    self._position,
-                    self.dt,
-                    self._step,
-                    self._q[here],
-                    self._q[there],
-                    self._read,
-                    self.squared_error,
-                ],
-                outputs=[self.positions],
-                device=self.device,
-            )
+            inputs = [*given, self._q[here], self._q[there], self._read]
+            launch(sample_position_kernel, self.shape, inputs, [self.positions])
             launch(count_kernel, 1, [], [self._step])
-
-
-def gravity_load(hand: HandModel, q: np.ndarray) -> np.ndarray:
-    """Torques of gravity on the joints [N m], shape [W, D], at positions [W, D] [rad].
-
-    The gradient of the potential energy by central differences.
-    """
-    q = np.asarray(q, dtype=float)[..., : hand.num_joints]
-    moved = q[:, None] + GRADIENT_STEP * np.concatenate([np.eye(hand.num_joints), -np.eye(hand.num_joints)])
-    poses = hand.forward_kinematics(moved)
-    turns = Rotation.from_quat(poses[..., 3:].reshape(-1, 4))
-    arms = turns.apply(np.broadcast_to(hand.link_com, (*poses.shape[:-1], 3)).reshape(-1, 3))
-    fallen = (poses[..., :3] + arms.reshape(poses[..., :3].shape)) @ hand.down
-    work = GRAVITY_M_S2 * fallen @ hand.link_mass
-    plus, minus = np.split(work, 2, axis=1)
-    return (plus - minus) / (2.0 * GRADIENT_STEP)
-
-
-def random_stream(trajectory: Trajectory) -> int:
-    """The stream of a trajectory's random delays, the same as in the rollouts."""
-    return zlib.crc32(trajectory.file.encode()) & ((1 << STREAM_BITS) - 1)
-
-
-def simulate_hand(
-    recording: Recording,
-    hand: HandModel,
-    rows: np.ndarray,
-    *,
-    dt: float = DEFAULT_DT,
-    device: str = "cpu",
-) -> np.ndarray:
-    """What Newton makes of a recording's commands, sampled where the recording has positions.
-
-    Args:
-        recording: A recording of a hand.
-        hand: The hand.
-        rows: Servo parameters, shape [D, P], or of M models that are simulated side by side [M, D, P].
-        dt: Physics step [s].
-        device: Warp device.
-
-    Returns:
-        Predicted recorded positions [rad] in the recording's columns, the samples of the trajectories one
-        after the other, shape [S, J] or [M, S, J].
-    """
-    count = len(recording.trajectories)
-    rows = np.asarray(rows, dtype=float)
-    models = rows[None] if rows.ndim == 2 else rows
-    tracks = np.repeat(np.tile(np.arange(count), len(models))[:, None], hand.num_fingers, axis=1)
-    replay = HandReplay(recording, hand, tracks, dt=dt, device=device, keep_positions=True)
-    replay.run(np.repeat(models, count, axis=0))
-    columns = [hand.joint_names.index(name) for name in recording.joints]
-    positions = replay.positions.numpy()[..., columns].astype(float)
-    positions = positions.reshape(len(models), count, -1, len(columns))
-    lengths = [len(trajectory.time) for trajectory in recording.trajectories]
-    answers = np.concatenate([positions[:, k, :length] for k, length in enumerate(lengths)], axis=1)
-    return answers[0] if rows.ndim == 2 else answers

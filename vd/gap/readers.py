@@ -3,7 +3,6 @@
 Every reader yields a :class:`Motion` for each episode, bag or file. ``FORMATS`` has them by name.
 """
 
-import csv
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.motions import CHANNELS
+from vd.gap.recording import by_channel, numbers, read_table
 from vd.gap.recording_checks import RecordingError
 from vd.interrupt import need
 
@@ -89,31 +88,18 @@ class Told:
 def read_csv(path: Path, told: Told) -> Iterator[Motion]:
     """A CSV whose header names ``t [ms]``, ``position.JOINT [deg]``, ...; a folder: every CSV in it."""
     for file in _files(path, ".csv"):
-        try:
-            with file.open(newline="", encoding="utf-8-sig") as stream:
-                lines = [row for row in csv.reader(stream) if any(cell.strip() for cell in row)]
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise RecordingError(f"{file}: no CSV in UTF-8 ({error}); save it as that") from error
-        header, *rows = lines or [[]]
+        header, rows = read_table(file)
         columns: dict[str, np.ndarray] = {}
         for i, text in enumerate(header):
-            name, scale = _column(file, text.strip(), told)
+            name, scale = _column(file, text, told)
             if scale is not None:
                 if name in columns:
                     raise RecordingError(f"{file}: two columns are {name!r}; --rename one to 'unused'")
-                columns[name] = scale * _numbers(file, text, [row[i : i + 1] for row in rows])
+                columns[name] = scale * numbers(file, text, [row[i] for row in rows])
         if "t" not in columns:
             raise RecordingError(f"{file}: no column 't'; give --rename 'ITS TIME=t' with its unit: 't [ms]'")
-        if not rows:
-            raise RecordingError(f"{file} has no rows; drop it")
         joints = tuple(dict.fromkeys(name.partition(".")[2] for name in columns if "." in name))
-        channels = {}
-        for channel in CHANNELS:
-            found = [columns.get(f"{channel}.{joint}") for joint in joints]
-            if any(values is not None for values in found):
-                blank = np.full(len(rows), np.nan)
-                channels[channel] = np.stack([blank if v is None else v for v in found], axis=1)
-        yield Motion(file.stem, joints, columns["t"], channels)
+        yield Motion(file.stem, joints, columns["t"], by_channel(columns, joints, len(rows)))
 
 
 def _column(file: Path, text: str, told: Told) -> tuple[str, float | None]:
@@ -136,16 +122,6 @@ def _name_and_unit(text: str) -> tuple[str, str]:
     """``elbow [deg]`` as ``elbow`` and ``deg``; the unit may be empty."""
     name, _, unit = text.replace("(", "[").replace(")", "]").partition("[")
     return name.strip(), unit.rstrip("]").strip()
-
-
-def _numbers(file: Path, column: str, cells: list[list[str]]) -> np.ndarray:
-    values = np.empty(len(cells))
-    for i, cell in enumerate(cells):
-        try:
-            values[i] = float(cell[0])
-        except (IndexError, ValueError):
-            raise RecordingError(f"{file}: row {i + 2}, column {column!r}: no number; drop the row") from None
-    return values
 
 
 def read_bam(path: Path, told: Told) -> Iterator[Motion]:

@@ -3,12 +3,9 @@
 Chains: :mod:`vd.gap.chain`. Physics: :mod:`vd.kernels.servo.chains`.
 """
 
-import copy
 import itertools
-import threading
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -16,7 +13,6 @@ import numpy as np
 import warp as wp
 
 from vd.gap.chain import Chain, load_of
-from vd.gap.launch_batch import LaunchBatch
 from vd.gap.recording import Recording
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.chain_bodies import links_of_size, room_for
@@ -26,12 +22,8 @@ STEP_S = 1.0 / 480.0
 """Time step [s]: four of the simulator's, a fifth of a servo's fastest time constant (inertia / kd)."""
 STREAM_BITS = 28
 """Bits of the number of a trajectory's random stream."""
-CUDA_BLOCK = 32
-"""Threads of a block: few, so that the few thousand rollouts of a launch are spread over all processors."""
-CPU_BLOCK = 256
 RECALLED = 10_000
 """Rollouts that are kept: searches ask for the same again, where one fit ends and the next begins."""
-_MAKING = threading.Lock()
 
 
 def links_of(
@@ -59,23 +51,6 @@ def links_of(
     return links
 
 
-@dataclass(frozen=True, eq=False)
-class Call:
-    """One call of :meth:`Rollouts.predict`.
-
-    Attributes:
-        rows: Parameter rows [C, n, PARAMETER_COLUMNS], float32.
-        chosen: Indices of trajectories.
-        joint: The only joint wanted, or None for all.
-        keep: Which trajectories each set is simulated on [C, trajectories]; None for all.
-    """
-
-    rows: np.ndarray
-    chosen: np.ndarray
-    joint: int | None
-    keep: np.ndarray | None
-
-
 class Rollouts:
     """Predictions of a recording's trajectories for one chain. S samples in all, n joints.
 
@@ -99,7 +74,6 @@ class Rollouts:
         *,
         dt: float = STEP_S,
         device: str = "cpu",
-        batch: LaunchBatch | None = None,
     ):
         """Prepare the trajectories.
 
@@ -108,7 +82,6 @@ class Rollouts:
             recording: The recording.
             dt: Time step [s].
             device: Warp device.
-            batch: Threads whose calls are simulated together; None simulates each at once.
 
         Raises:
             ValueError: ``dt`` is not positive.
@@ -116,14 +89,12 @@ class Rollouts:
         if not dt > 0.0:
             raise ValueError(f"dt is {dt}; give a positive time step in seconds")
         self.chain, self.recording, self.dt, self.device = chain, recording, dt, device
-        self.batch = batch
         self._finer: dict[float, Rollouts] = {}
         self._recent: dict[bytes, np.ndarray] = {}
         self.num_joints = len(chain.joints)
         trajectories = recording.trajectories
         counts = [len(t.time) for t in trajectories]
         self._count = np.array(counts, np.int32)
-        self._steps = np.array([(t.time[-1] - t.time[0]) / dt for t in trajectories])
         self._first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int32)
         self._stream = np.array(
             [zlib.crc32(t.file.encode()) & ((1 << STREAM_BITS) - 1) for t in trajectories], np.int32
@@ -136,24 +107,14 @@ class Rollouts:
 
     def at(self, dt: float) -> "Rollouts":
         """The same with another time step [s]; kept, so that who asks again simulates with the same."""
-        with _MAKING:
-            if dt not in self._finer:
-                self._finer[dt] = Rollouts(
-                    self.chain, self.recording, dt=dt, device=self.device, batch=self.batch
-                )
-            return self._finer[dt]
-
-    def with_chain(self, chain: Chain) -> "Rollouts":
-        """The same motions of a chain with other links; joints and columns are the same."""
-        other = copy.copy(self)
-        other.chain, other.batch, other._finer, other._recent = chain, None, {}, {}
-        other.__dict__.pop("_links", None)
-        return other
+        if dt not in self._finer:
+            self._finer[dt] = Rollouts(self.chain, self.recording, dt=dt, device=self.device)
+        return self._finer[dt]
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the device's arrays behind: another process makes its own."""
         kept = {key: value for key, value in self.__dict__.items() if key not in ("_samples", "_links")}
-        return {**kept, "batch": None, "_finer": {}, "_recent": {}}
+        return {**kept, "_finer": {}, "_recent": {}}
 
     @cached_property
     def _samples(self) -> Samples:
@@ -224,45 +185,20 @@ class Rollouts:
         if rows.ndim != 3 or rows.shape[1:] != (n, servo.PARAMETER_COLUMNS):
             raise ValueError(f"rows has shape {rows.shape}; it must be (C, {n}, {servo.PARAMETER_COLUMNS})")
         chosen = np.arange(len(self._count)) if trajectories is None else np.asarray(trajectories, int)
-        call = Call(rows, chosen, joint, keep)
-        return self.simulate([call])[0] if self.batch is None else self.batch.simulate(self, call)
-
-    def simulate(self, calls: Sequence["Call"]) -> list[np.ndarray]:
-        """The answers to calls of :meth:`predict`, in one launch if all want one joint, or all want all."""
-        wide = [call.joint is None for call in calls]
-        if any(wide) and not all(wide):
-            return [self.simulate([call])[0] for call in calls]
-        width = self.num_joints if any(wide) else 1
-        lengths = [int(self._count[call.chosen].sum()) for call in calls]
-        ends = np.cumsum([len(call.rows) * length for call, length in zip(calls, lengths, strict=True)])
-        parts = [
-            self._rolls(call, int(end) - len(call.rows) * length)
-            for call, length, end in zip(calls, lengths, ends, strict=True)
-        ]
-        parameters, trajectory, output, wanted = (np.concatenate(each) for each in zip(*parts, strict=True))
-        empty = wp.empty if all(call.keep is None for call in calls) else wp.zeros
-        predicted = empty((int(ends[-1]), width), dtype=float, device=self.device)
-        if len(trajectory) and wp.get_device(self.device).is_cuda:
-            self._launch(parameters, trajectory, output, wanted, predicted)
-        elif len(trajectory):
-            self._recall(parameters, trajectory, output, wanted, predicted)
-        answers = np.split(predicted.numpy(), ends[:-1])
-        shapes = [
-            (len(call.rows), length) if call.joint is not None else (len(call.rows), length, width)
-            for call, length in zip(calls, lengths, strict=True)
-        ]
-        return [answer.reshape(shape) for answer, shape in zip(answers, shapes, strict=True)]
-
-    def _rolls(self, call: "Call", first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Parameters, trajectory, row of the output (after ``first``), and joint of a call's rollouts."""
-        counts = self._count[call.chosen]
-        keep = np.ones((len(call.rows), len(counts)), bool) if call.keep is None else call.keep
-        index, place = np.nonzero(keep)
-        trajectory = call.chosen[place]
-        parameters = call.rows[index]
+        counts = self._count[chosen]
+        length, width = int(counts.sum()), n if joint is None else 1
+        kept = np.ones((len(rows), len(counts)), bool) if keep is None else keep
+        index, place = np.nonzero(kept)
+        trajectory, parameters = chosen[place], rows[index]
         self._scale_loads(parameters, trajectory)
-        output = first + index * int(counts.sum()) + (np.cumsum(counts) - counts)[place]
-        return parameters, trajectory, output, np.full(len(index), -1 if call.joint is None else call.joint)
+        output = index * length + (np.cumsum(counts) - counts)[place]
+        wanted = np.full(len(index), -1 if joint is None else joint)
+        predicted = wp.zeros((len(rows) * length, width), dtype=float, device=self.device)
+        if len(trajectory):
+            simulate = self._launch if wp.get_device(self.device).is_cuda else self._recall
+            simulate(parameters, trajectory, output, wanted, predicted)
+        shape = (len(rows), length, width)
+        return predicted.numpy().reshape(shape if joint is None else shape[:2])
 
     def _recall(
         self,
@@ -299,14 +235,7 @@ class Rollouts:
         predicted: wp.array,
     ) -> None:
         """Simulate R rollouts: parameters [R, n, PARAMETER_COLUMNS], and the rest [R]."""
-        device, block = self.device, CPU_BLOCK
-        if wp.get_device(device).is_cuda:
-            # Threads of a warp wait for the slowest: the same trajectory for all of them, the longest first.
-            order = np.lexsort((trajectory, -self._steps[trajectory]))
-            parameters, trajectory, output, wanted = (
-                each[order] for each in (parameters, trajectory, output, wanted)
-            )
-            block = CUDA_BLOCK
+        device = self.device
         shape = (len(trajectory), self.num_joints, servo.STATE_COLUMNS)
         state = wp.empty(shape, dtype=float, device=device)
         links, slot, lower, upper, effort = self._links
@@ -337,7 +266,6 @@ class Rollouts:
             ],
             outputs=[state, predicted],
             device=device,
-            block_dim=block,
         )
 
     def _scale_loads(self, parameters: np.ndarray, trajectory: np.ndarray) -> None:

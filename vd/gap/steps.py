@@ -1,12 +1,11 @@
 """The steps of ``vd-gap run``, each from files to files, skipped where they have run on the same input.
 
 ``DIR/run.json`` keeps the settings, so that a later step needs only ``DIR``, and a digest of what each step
-was made from, so that an interrupted run goes on where it stopped.
+was made from, so that an interrupted run goes on with the step it was in.
 """
 
 import hashlib
 import json
-import shutil
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -19,8 +18,7 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import make_folder, write_json
-from vd.gap.fit_cache import FOLDER
-from vd.gap.recording import BARE_MODELS, Recording, read_recording
+from vd.gap.recording import BARE_MODELS, Recording, model_path, read_recording
 from vd.gap.result import LAYER, Closing, Predictions, Report
 from vd.versions import installed_versions
 
@@ -29,18 +27,23 @@ if TYPE_CHECKING:
 
 RUN = "run.json"
 FIND, EXPLAIN, CLOSE, CLOSING_CURVES = "find.json", "explain.json", "close.json", "closing.npz"
-CURVES, PAGE = "predictions.npz", "report.html"
+CURVES = "predictions.npz"
 OUTPUTS = {
     "find": (FIND,),
     "explain": (EXPLAIN, CURVES),
     "close": (LAYER, CLOSE, CLOSING_CURVES),
-    "report": ("report.json", PAGE),
+    "report": ("report.json", "report.html"),
 }
 """What each step writes, in the order of the steps."""
-METHOD = 11
+_DOES = {
+    "find": "fitting the plain servo model and looking for what it misses",
+    "explain": "trying every effect on motions that the fit has not seen",
+    "close": "writing the identified model and simulating the commands again",
+    "report": "drawing the page",
+}
+METHOD = 12
 """Of the analysis; what another one made is made again."""
 STEPS = tuple(OUTPUTS)
-USD_SUFFIXES = (".usd", ".usda", ".usdc")
 _PACKAGES = ("visual-dexterity", "warp-lang", "newton", "cma", "numpy")
 
 
@@ -118,7 +121,7 @@ class Analysis:
             return named
         if model in BARE_MODELS:
             return None
-        return str(self.recording.path / model) if model.endswith(USD_SUFFIXES) else model
+        return model_path(self.recording.path, model)
 
     @cached_property
     def hand(self) -> "HandModel | None":
@@ -128,15 +131,10 @@ class Analysis:
         from vd.assets_usd.hands import load_hand, root_name
 
         hand, model = load_hand(self.hand_name, layer=self.settings.hand_layer), self.recording.model
-        model = root_name(str(self.recording.path / model) if model.endswith(USD_SUFFIXES) else model)
+        model = root_name(model_path(self.recording.path, model))
         if model != hand.name:
             raise ValueError(
                 f"{self.recording.path} is of {model}, not of {hand.name}; name the hand that was recorded"
-            )
-        if stray := [joint for joint in self.recording.joints if joint not in hand.joint_names]:
-            raise ValueError(
-                f"{self.recording.path}: {hand.name} has no joint {', '.join(stray)}, only "
-                f"{', '.join(hand.joint_names)}; name the hand that was recorded"
             )
         return hand
 
@@ -172,12 +170,9 @@ class Analysis:
             self._step(name, fresh=fresh)
 
     def _step(self, name: str, *, fresh: bool) -> None:
-        for needed in OUTPUTS[STEPS[STEPS.index(name) - 1]] if name != STEPS[0] else ():
-            if not (self.out / needed).is_file():
-                before = STEPS[STEPS.index(name) - 1]
-                raise ValueError(
-                    f"{self.out / needed} is missing; run vd-gap {before} --out {self.out} first"
-                )
+        before = STEPS[STEPS.index(name) - 1] if name != STEPS[0] else None
+        for needed in OUTPUTS.get(before or "", ()):
+            self._need(needed, str(before))
         made_from = self._digest(name)
         record = self._record()
         done = record["steps"].get(name, {})
@@ -187,16 +182,24 @@ class Analysis:
             return
         for file in files:  # a step that is interrupted must not look finished
             file.unlink(missing_ok=True)
-        if fresh:
-            shutil.rmtree(self.out / FOLDER, ignore_errors=True)
         make_folder(self.out)
         record["settings"] = to_dict(self.settings)
         write_json(self.out / RUN, record)
         print(f"{name}: {_DOES[name]}", file=sys.stderr)
         began = time.perf_counter()
-        _RUN[name](self, made_from)
+        _RUN[name](self)
         record["steps"][name] = {"made_from": made_from, "seconds": time.perf_counter() - began}
         write_json(self.out / RUN, record)
+
+    def _need(self, file: str, step: str) -> Path:
+        """A file that a step writes.
+
+        Raises:
+            ValueError: It has not run.
+        """
+        if not (self.out / file).is_file():
+            raise ValueError(f"{self.out / file} is missing; run vd-gap {step} --out {self.out} first")
+        return self.out / file
 
     def _record(self) -> dict[str, Any]:
         path = self.out / RUN
@@ -240,9 +243,7 @@ class Analysis:
         Raises:
             ValueError: It has not run.
         """
-        if not (self.out / EXPLAIN).is_file():
-            raise ValueError(f"{self.out / EXPLAIN} is missing; run vd-gap explain --out {self.out} first")
-        return Report.read(self.out / EXPLAIN)
+        return Report.read(self._need(EXPLAIN, "explain"))
 
     def command(self) -> str:
         """The command that repeats the analysis."""
@@ -260,21 +261,19 @@ def _show(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _find(analysis: Analysis, key: str) -> None:
+def _find(analysis: Analysis) -> None:
     from vd.gap import workflow
 
-    workflow.find(analysis.recording, analysis.hand, analysis.out, key=key, **analysis.options())
+    workflow.find(analysis.recording, analysis.hand, analysis.out, **analysis.options())
 
 
-def _explain(analysis: Analysis, key: str) -> None:
+def _explain(analysis: Analysis) -> None:
     from vd.gap import workflow
-    from vd.gap.torque_unit import in_known_unit
 
-    workflow.explain(analysis.recording, analysis.hand, analysis.out, key=key, **analysis.options())
-    in_known_unit(analysis.explained(), analysis.recording).write(analysis.out / EXPLAIN)
+    workflow.explain(analysis.recording, analysis.hand, analysis.out, **analysis.options())
 
 
-def _close(analysis: Analysis, _: str) -> None:
+def _close(analysis: Analysis) -> None:
     from vd.gap.close import WHOLE_HAND_LAYER, one_finger, simulate_again, write_identified
     from vd.gap.plan import discard_plan, plan, write_plan
 
@@ -305,7 +304,7 @@ def _close(analysis: Analysis, _: str) -> None:
     write_json(analysis.out / CLOSE, to_dict(closing))
 
 
-def _report(analysis: Analysis, _: str) -> None:
+def _report(analysis: Analysis) -> None:
     from vd.gap.plan import PLAN_JSON
     from vd.gap.recording_checks import cautions
     from vd.gap.report import write_report
@@ -330,15 +329,9 @@ def _report(analysis: Analysis, _: str) -> None:
     write_report(report, Predictions.read(analysis.out / CLOSING_CURVES), analysis.out)
 
 
-_RUN: dict[str, Callable[[Analysis, str], None]] = {
+_RUN: dict[str, Callable[[Analysis], None]] = {
     "find": _find,
     "explain": _explain,
     "close": _close,
     "report": _report,
-}
-_DOES = {
-    "find": "fitting the plain servo model and looking for what it misses",
-    "explain": "trying every effect on motions that the fit has not seen",
-    "close": "writing the identified model and simulating the commands again",
-    "report": "drawing the page",
 }

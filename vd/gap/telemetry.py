@@ -10,13 +10,11 @@ import numpy as np
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain
 from vd.gap.recording import Recording, Trajectory
+from vd.gap.recording_checks import MIN_SAMPLES
 from vd.gap.worker_pool import JointSpec
 
 LINEAR = 0.995
 """Share of the duty cycle's variance that plain error and speed must explain for it to be linear."""
-MIN_SAMPLES = 100
-SATURATED = 0.95
-"""Duty cycles above this are limited."""
 SAG_NEEDED = 0.1
 """Share of the supply by which the voltage must fall for sag to matter: it takes that much torque."""
 UPSTREAM = (
@@ -27,8 +25,10 @@ UPSTREAM = (
     "acceleration_limit",
     "dead_zone",
     "integral_action",
+    "backlash",
 )
-"""Effects between command and controller output; the duty cycle shows each of them."""
+"""Effects between command and controller output, each of which the duty cycle shows. Backlash is that of the
+reference, as the servo model has it, not play behind the motor."""
 BEHIND_SENSOR = {
     "supply_sag": "only as a resistance behind the voltage sensor, which loses torque like a sagging supply"
 }
@@ -37,8 +37,6 @@ LAGS_S = np.arange(0.0, 0.3, 2.5e-3)
 """Lags that are tried [s]: up to the longest delay searched, as fine as the duty cycle tells."""
 CLEARER = 4.0
 """How many times more of the duty cycle the wrong delay must leave than the right one."""
-REFERENCE_SIDE = "backlash"
-"""Play of the reference, as the servo model has it; play behind the motor does not show."""
 
 
 def vetoes(recording: Recording, chain: Chain, spec: JointSpec, rows: np.ndarray) -> dict[str, str]:
@@ -50,17 +48,12 @@ def vetoes(recording: Recording, chain: Chain, spec: JointSpec, rows: np.ndarray
         spec: The joint's problem.
         rows: Baseline rows of the chain [n, PARAMETER_COLUMNS].
     """
-    column = int(chain.columns[spec.joint])
-    trajectories = [recording.trajectories[i] for i in spec.trajectories]
-    trajectories = [t for t in trajectories if chain.joints[spec.joint] in t.joints]
     result = {}
-    reason = _steady_voltage(trajectories, column)
-    if reason:
+    if reason := _steady_voltage(_excited(recording, chain, spec), int(chain.columns[spec.joint])):
         result["supply_sag"] = reason
-    reason, late = _plain_duty(recording, chain, spec, trajectories, rows[spec.joint])
+    reason, late = _plain_duty(recording, chain, spec) if rows[spec.joint, servo.KP] > 0.0 else ("", "")
     if reason:
-        others = (name for name in (*UPSTREAM, REFERENCE_SIDE) if name != late)
-        result.update(dict.fromkeys(others, reason))
+        result |= {name: reason for name in UPSTREAM if name != late}
     return result
 
 
@@ -73,59 +66,72 @@ def late_side(recording: Recording, chain: Chain, spec: JointSpec) -> str:
     Returns:
         ``command_delay``, ``read_delay``, or nothing where neither fits, both do, or no duty is recorded.
     """
-    column = int(chain.columns[spec.joint])
-    trajectories = [recording.trajectories[i] for i in spec.trajectories]
-    left, side, lag = min(
-        (1.0 - _follows(trajectories, column, chain.reference_p_gain, **{side: lag}), side, lag)
+    parts = [recording.trajectories[i] for i in spec.trajectories]
+    left = {
+        side: [1.0 - _follows(parts, chain, spec.joint, **{side: lag}) for lag in LAGS_S]
         for side in ("command_delay", "read_delay")
-        for lag in LAGS_S
-    )
-    other = "read_delay" if side == "command_delay" else "command_delay"
-    rest = 1.0 - max(_follows(trajectories, column, chain.reference_p_gain, **{other: lag}) for lag in LAGS_S)
+    }
+    side, other = sorted(left, key=lambda each: min(left[each]))
+    lag = LAGS_S[np.argmin(left[side])]
     # Registers read one after the other are less than a sample apart: that is nobody's delay.
-    sample = float(np.median(np.concatenate([np.diff(t.time) for t in trajectories])))
-    return side if lag >= sample and left < 1.0 - LINEAR and CLEARER * left < rest else ""
+    sample = float(np.median(np.concatenate([np.diff(t.time) for t in parts])))
+    clear = min(left[side]) < 1.0 - LINEAR and CLEARER * min(left[side]) < min(left[other])
+    return side if lag >= sample and clear else ""
+
+
+def _excited(recording: Recording, chain: Chain, spec: JointSpec) -> list[Trajectory]:
+    """The joint's trajectories in which it is driven."""
+    parts = [recording.trajectories[i] for i in spec.trajectories]
+    return [t for t in parts if chain.joints[spec.joint] in t.joints]
+
+
+def _told(values: np.ndarray | None, column: int) -> bool:
+    """Whether a channel is recorded for a joint."""
+    return values is not None and bool(np.isfinite(values[:, column]).all())
 
 
 def _follows(
     trajectories: list[Trajectory],
-    column: int,
-    reference_gain: float | None,
+    chain: Chain,
+    joint: int,
     command_delay: float = 0.0,
     read_delay: float = 0.0,
 ) -> float:
-    """Share of the duty cycle that follows the error if command or reading is that late [s]."""
-    errors, duties = [], []
+    """Share of a joint's duty cycle that follows the error if command or reading is that late [s]."""
+    errors, duties, column, reference = (
+        [np.zeros(0)],
+        [np.zeros(0)],
+        chain.columns[joint],
+        chain.reference_p_gain,
+    )
     for t in trajectories:
-        if t.pwm is None or not np.isfinite(t.pwm[:, column]).all():
+        if t.pwm is None or not _told(t.pwm, column):
             continue
         sent = np.maximum(np.searchsorted(t.sent, t.time - command_delay, side="right") - 1, 0)
         position = np.interp(t.time + read_delay, t.time, t.position[:, column])
-        gain = float(t.conditions.get("p_gain", reference_gain)) / reference_gain if reference_gain else 1.0
-        used = t.enabled[:, column] & (np.abs(t.pwm[:, column]) < SATURATED)
+        gain = float(t.conditions.get("p_gain", reference)) / reference if reference else 1.0
+        used = t.enabled[:, column] & (np.abs(t.pwm[:, column]) < 1.0)
         errors.append(gain * (t.command[sent, column] - position)[used])
         duties.append(t.pwm[used, column])
-    if sum(map(len, errors)) < MIN_SAMPLES:
-        return 0.0
     error, duty = np.concatenate(errors), np.concatenate(duties)
+    if len(error) < MIN_SAMPLES:
+        return 0.0
     slope = float(error @ duty) / max(float(error @ error), 1e-300)
     return 1.0 - float(np.sum((duty - slope * error) ** 2)) / max(float(duty @ duty), 1e-300)
 
 
 def _steady_voltage(trajectories: list[Trajectory], column: int) -> str:
     """Why the voltage speaks against a sagging supply, or nothing."""
-    volts, pulls = [], []
+    volts, pulls = [np.zeros(0)], [np.zeros(0)]
     for t in trajectories:
-        if t.voltage is None or not np.isfinite(t.voltage[:, column]).all():
-            continue
-        on = t.enabled[:, column]
-        duty = t.pwm is not None and np.isfinite(t.pwm[:, column]).all()
-        pull = t.pwm if duty and t.pwm is not None else t.command - t.position
-        volts.append(t.voltage[on, column])
-        pulls.append(np.abs(pull[on, column]))
-    if not volts or sum(map(len, volts)) < MIN_SAMPLES:
-        return ""
+        if t.voltage is not None and _told(t.voltage, column):
+            on, pull = t.enabled[:, column], t.command - t.position
+            pull = t.pwm if t.pwm is not None and _told(t.pwm, column) else pull
+            volts.append(t.voltage[on, column])
+            pulls.append(np.abs(pull[on, column]))
     volt, pull = np.concatenate(volts), np.concatenate(pulls)
+    if len(volt) < MIN_SAMPLES:
+        return ""
     slope, idle = np.polyfit(pull, volt, 1)
     fall = max(-slope * float(np.percentile(pull, 99.0)), 0.0)
     if fall >= SAG_NEEDED * idle:
@@ -133,17 +139,12 @@ def _steady_voltage(trajectories: list[Trajectory], column: int) -> str:
     return f"the recorded voltage falls by {fall:.2f} V of {idle:.1f} V at full pull, too little for sag"
 
 
-def _plain_duty(
-    recording: Recording, chain: Chain, spec: JointSpec, trajectories: list[Trajectory], row: np.ndarray
-) -> tuple[str, str]:
+def _plain_duty(recording: Recording, chain: Chain, spec: JointSpec) -> tuple[str, str]:
     """Why the duty cycle speaks against anything between command and controller, and but for which delay."""
-    if row[servo.KP] <= 0.0:
-        return "", ""
-    late = late_side(recording, chain, spec)
-    if late:
+    if late := late_side(recording, chain, spec):
         return f"the recorded duty cycle follows the error with a {late.replace('_', ' ')} alone", late
-    share = _follows(trajectories, int(chain.columns[spec.joint]), chain.reference_p_gain)
-    if share < LINEAR:
-        return "", ""
-    text = f"the recorded duty cycle follows the plain error ({100.0 * share:.1f} % of it)"
-    return f"{text}: it acts downstream", ""
+    share = _follows(_excited(recording, chain, spec), chain, spec.joint)
+    text = (
+        f"the recorded duty cycle follows the plain error ({100.0 * share:.1f} % of it): it acts downstream"
+    )
+    return (text, "") if share >= LINEAR else ("", "")

@@ -1,8 +1,7 @@
 """Find and explain a gap: from a recording to a :class:`vd.gap.result.Report` without a closing.
 
 ``find`` identifies the baseline and says where it fails (``DIR/find.json``); ``explain`` selects the
-effects (``DIR/explain.json``, ``DIR/predictions.npz``). With a key, a step that was interrupted goes on from
-the fits that it had made under that key.
+effects (``DIR/explain.json``, ``DIR/predictions.npz``).
 """
 
 import json
@@ -18,15 +17,12 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
-from vd.gap.chain import Chain, chains
-from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
+from vd.gap.chain import Chain, chains, relative_torques
+from vd.gap.coordinates import BASELINE_PARAMETERS, FREE_SPEED, Scales
 from vd.gap.design import design, pieces
-from vd.gap.explain import POLISH_ITERATIONS, REFITS, Explainer, Joint, Progress
+from vd.gap.explain import Explainer, Joint, Progress
 from vd.gap.find import findings
-from vd.gap.fit_cache import FOLDER, FitCache
-from vd.gap.joint_fit import JointFit
 from vd.gap.joints import explain_joints
-from vd.gap.launch_batch import LaunchBatch
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S
@@ -36,17 +32,8 @@ from vd.kernels.servo.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"
 CMA_GENERATIONS = 20
-BASELINE_ITERATIONS = 15
-LONG_STEP_S = 1.0 / 240.0
-"""Time step [s] for recordings so long that the usual step would take minutes a joint."""
-LONG_S = 600.0
-"""Total motion [s] above which a recording counts as long."""
-SPEED_STARTS = (1.05, 3.0)
+SPEED_STARTS = (1.05, FREE_SPEED)
 """Starts of the velocity limit, in largest speeds seen: one that binds, one that does not."""
-
-
-def _silent(_: str) -> None:
-    pass
 
 
 @dataclass(frozen=True)
@@ -60,6 +47,7 @@ class Options:
         workers: Processes; the machine's cores by default, one on a GPU.
         start: Parameter rows [PARAMETER_COLUMNS] of joints by name, of an identified model to start from:
             its effects are part of the baseline, and what is named comes on top.
+        progress: Called with lines of progress.
     """
 
     effects: tuple[str, ...] = tuple(EFFECTS)
@@ -67,37 +55,21 @@ class Options:
     device: str = "cpu"
     workers: int | None = None
     start: Mapping[str, np.ndarray] = field(default_factory=dict)
+    progress: Progress = lambda line: None
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.effects) - set(EFFECTS))
         if unknown:
             raise ValueError(f"no effects are called {', '.join(unknown)}; choose from {', '.join(EFFECTS)}")
 
-    @property
-    def processes(self) -> int:
-        """Worker processes."""
-        if self.workers is not None:
-            return self.workers
-        return len(os.sched_getaffinity(0)) if self.device == "cpu" else 1
 
-
-def find(
-    recording: Recording | Path,
-    hand: HandModel | None,
-    out: Path,
-    *,
-    key: str = "",
-    progress: Progress = _silent,
-    **options: Any,
-) -> list[Finding]:
+def find(recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any) -> list[Finding]:
     """Identify the baseline of every excited joint, and say where it and the measurement disagree.
 
     Args:
         recording: The recording or its folder.
         hand: The hand, for a recording of one.
         out: Folder for ``find.json``.
-        key: Of all that the fits depend on, under which they are kept while this runs; without, they are not.
-        progress: Called with lines of progress.
         options: Fields of :class:`Options`.
 
     Returns:
@@ -107,16 +79,13 @@ def find(
         RecordingError: The recording cannot be used.
         ValueError: An unknown effect, or a recording that is not of this hand.
     """
-    chosen = Options(**options)
-    recording = read_recording(recording) if isinstance(recording, Path | str) else recording
-    out = Path(out)
-    begin = time.perf_counter()
-    cache = FitCache(out / FOLDER if key else None, key)
-    with _workers(recording, hand, chosen, cache) as pool:
-        joints = _identify(pool, _specs(recording, pool.problems.chains), chosen, progress)
+    chosen, begin = Options(**options), time.perf_counter()
+    pool, specs = _workers(recording, hand, chosen)
+    with pool:
+        recording = pool.problems.recording
+        joints = _identify(pool, specs, chosen)
         predicted = curves(recording, pool.problems, [(j.name, j.spec, j.fit.rows) for j in joints])
-        floors = {j.name: j.spec.floor for j in joints}
-        found = findings(recording, predicted, floors)
+        found = findings(recording, predicted, {j.name: j.spec.floor for j in joints})
         value = {
             "format": FIND_FORMAT,
             "findings": [asdict(f) for f in found],
@@ -124,31 +93,20 @@ def find(
             "simulated": pool.simulated,
             "seconds": time.perf_counter() - begin,
         }
-        progress(f"find: {pool.summary}")
-    write_json(out / "find.json", value)
-    cache.forget()
+        write_json(Path(out) / "find.json", value)
+    chosen.progress(f"find: {pool.simulated} motions simulated")
     for finding in found:
-        progress(f"  {finding.where}")
+        chosen.progress(f"  {finding.where}")
     return found
 
 
-def explain(
-    recording: Recording | Path,
-    hand: HandModel | None,
-    out: Path,
-    *,
-    key: str = "",
-    progress: Progress = _silent,
-    **options: Any,
-) -> Report:
+def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any) -> Report:
     """Name what the baseline lacks; runs :func:`find` first where the folder has no ``find.json``.
 
     Args:
         recording: The recording or its folder.
         hand: The hand, for a recording of one.
         out: Folder for ``explain.json`` and ``predictions.npz``.
-        key: As of :func:`find`.
-        progress: Called with lines of progress.
         options: Fields of :class:`Options`.
 
     Returns:
@@ -158,23 +116,21 @@ def explain(
         RecordingError: The recording cannot be used.
         ValueError: An unknown effect, or a recording that is not of this hand.
     """
-    chosen = Options(**options)
-    recording = read_recording(recording) if isinstance(recording, Path | str) else recording
-    out = Path(out)
+    chosen, out = Options(**options), Path(out)
     if not (out / "find.json").is_file():
-        find(recording, hand, out, key=key, progress=progress, **options)
+        find(recording, hand, out, **options)
     known = json.loads((out / "find.json").read_text())
     begin = time.perf_counter()
-    cache = FitCache(out / FOLDER if key else None, key)
-    with _workers(recording, hand, chosen, cache) as pool:
-        joints = _resume(pool, _specs(recording, pool.problems.chains), known["joints"])
-        explained = explain_joints(Explainer(pool, joints, chosen.effects, chosen.seed, progress))
+    pool, specs = _workers(recording, hand, chosen)
+    with pool:
+        recording = pool.problems.recording
+        joints = _resume(pool, specs, known["joints"])
+        explained = explain_joints(Explainer(pool, joints, chosen.effects, chosen.seed, chosen.progress))
         analysed = [
             Analysed(j.name, j.spec, replace(e, baseline=j.fit))
             for j, e in zip(joints, explained, strict=True)
         ]
         seconds = known["seconds"] + time.perf_counter() - begin
-        simulated = known["simulated"] + pool.simulated
         report, predictions = assemble(
             recording,
             pool.problems,
@@ -182,22 +138,27 @@ def explain(
             [Finding(**f) for f in known["findings"]],
             seed=chosen.seed,
             seconds=seconds,
-            simulated=simulated,
+            simulated=known["simulated"] + pool.simulated,
         )
-        progress(f"explain: {pool.summary}")
-    predictions.write(out / "predictions.npz")
-    report.write(out / "explain.json")
-    cache.forget()
-    progress(f"explain: {report.verdict} after {seconds:.0f} s")
+        source = replace(report.recording, relative_torques=relative_torques(recording))
+        report = replace(report, recording=source)
+        predictions.write(out / "predictions.npz")
+        report.write(out / "explain.json")
+    chosen.progress(f"explain: {report.verdict} after {seconds:.0f} s, {pool.simulated} motions simulated")
     return report
 
 
-def _workers(recording: Recording, hand: HandModel | None, options: Options, cache: FitCache) -> WorkerPool:
-    length = sum(float(t.time[-1]) for t in recording.trajectories)
-    dt = LONG_STEP_S if length > LONG_S else STEP_S
+def _workers(
+    recording: Recording | Path, hand: HandModel | None, options: Options
+) -> tuple[WorkerPool, list[JointSpec]]:
+    """Who fits, and the problems of all excited joints."""
+    recording = recording if isinstance(recording, Recording) else read_recording(recording)
     parts = [_started(chain, options.start) for chain in chains(recording, hand)]
-    batch = None if options.device == "cpu" else LaunchBatch()
-    return WorkerPool(Problems(recording, parts, dt, options.device, batch), options.processes, cache)
+    specs = _specs(recording, parts)
+    # A recording so long that pieces of it are analysed would take minutes a joint with the usual step.
+    dt = STEP_S * (2.0 if any(spec.pieces for spec in specs) else 1.0)
+    cores = len(os.sched_getaffinity(0)) if options.device == "cpu" else 1
+    return WorkerPool(Problems(recording, parts, dt, options.device), options.workers or cores), specs
 
 
 def _started(chain: Chain, start: Mapping[str, np.ndarray]) -> Chain:
@@ -233,63 +194,64 @@ def baseline_of(chain: Chain) -> tuple[str, ...]:
     return tuple(name for name in chain.baseline_free if name != anchor)
 
 
-def _identify(
-    pool: WorkerPool, specs: Sequence[JointSpec], options: Options, progress: Progress
-) -> list[Joint]:
+def _identify(pool: WorkerPool, specs: Sequence[JointSpec], options: Options) -> list[Joint]:
     """Baselines of all joints; the joints of a chain once more with the others' baselines."""
 
     def first(spec: JointSpec) -> Joint:
         chain = pool.problems.chains[spec.chain]
         rows = chain.start_row.copy()
-        scales = pool.run(spec, [("scales", {"row": rows[spec.joint], "residual": spec.floor})])[0]
+        scales = _scales(pool, spec, rows, spec.floor)
         start = {"base": rows, "scales": scales, "seed": options.seed, "generations": CMA_GENERATIONS}
         searched = pool.run(spec, [("start_baseline", start)])[0]
         starts = [{}, *({"velocity_limit": f * scales.speed} for f in SPEED_STARTS)]
         # A short search can end where the inertia is too small to show, from where no descent comes back.
         nominal = {key: float(rows[spec.joint, BASELINE_PARAMETERS[key].column]) for key in spec.baseline}
         starts += [nominal, {**nominal, "velocity_limit": SPEED_STARTS[0] * scales.speed}]
-        call = {"base": searched, "effects": (), "starts": starts, "scales": scales}
-        fit = pool.run(spec, [("fit", {**call, "iterations": BASELINE_ITERATIONS})])[0]
-        name = chain.joints[spec.joint]
-        progress(f"find: {name}: baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}")
-        return Joint(name, spec, _scales(pool, spec, fit), fit)
-
-    joints = parallel(first, specs)
-    if all(len(chain.joints) == 1 for chain in pool.problems.chains):
-        return joints
-    return _together(pool, joints)
-
-
-def _together(pool: WorkerPool, joints: Sequence[Joint]) -> list[Joint]:
-    """Refit each joint with the other joints of its chain as they were found."""
+        joint = _fitted(pool, spec, searched, scales, starts=starts)
+        error, floor = 1e3 * joint.fit.rmse, 1e3 * spec.floor
+        options.progress(f"find: {joint.name}: baseline {error:.2f} mrad, noise floor {floor:.2f}")
+        return joint
 
     def again(joint: Joint) -> Joint:
         rows = joint.fit.rows.copy()
         for other in joints:
             if other.spec.chain == joint.spec.chain:
                 rows[other.spec.joint] = other.fit.rows[other.spec.joint]
-        call = {"base": rows, "effects": joint.fit.effects, "starts": [{}], "scales": joint.scales}
-        fit = pool.run(joint.spec, [("fit", {**call, "iterations": POLISH_ITERATIONS})])[0]
-        return replace(joint, fit=fit, scales=_scales(pool, joint.spec, fit))
+        return _fitted(pool, joint.spec, rows, joint.scales)
 
-    return parallel(again, joints)
-
-
-def _scales(pool: WorkerPool, spec: JointSpec, fit: JointFit) -> Scales:
-    call = {"row": fit.rows[spec.joint], "residual": fit.rmse}
-    return pool.run(spec, [("scales", call)])[0]
+    joints = parallel(first, specs)
+    single = all(len(chain.joints) == 1 for chain in pool.problems.chains)
+    return joints if single else parallel(again, joints)
 
 
 def _resume(pool: WorkerPool, specs: Sequence[JointSpec], known: dict[str, Any]) -> list[Joint]:
     """The joints of an earlier ``find``, their fits recomputed from its rows."""
 
     def one(spec: JointSpec) -> Joint:
-        name = pool.problems.chains[spec.chain].joints[spec.joint]
-        rows = np.array(known[name]["rows"])
-        scales = pool.run(spec, [("scales", {"row": rows[spec.joint], "residual": known[name]["rmse_rad"]})])[
-            0
-        ]
-        call = {"base": rows, "effects": (), "starts": [{}], "scales": scales, "iterations": 1}
-        return Joint(name, spec, scales, pool.run(spec, [("fit", {**call, "refits": REFITS})])[0])
+        found = known[pool.problems.chains[spec.chain].joints[spec.joint]]
+        rows = np.array(found["rows"])
+        scales = _scales(pool, spec, rows, found["rmse_rad"])
+        joint = _fitted(pool, spec, rows, scales, iterations=1)
+        return replace(joint, scales=scales)
 
     return parallel(one, specs)
+
+
+def _scales(pool: WorkerPool, spec: JointSpec, rows: np.ndarray, residual: float) -> Scales:
+    return pool.run(spec, [("scales", {"row": rows[spec.joint], "residual": residual})])[0]
+
+
+def _fitted(
+    pool: WorkerPool,
+    spec: JointSpec,
+    base: np.ndarray,
+    scales: Scales,
+    *,
+    starts: Sequence[Mapping[str, float]] = ({},),
+    **options: Any,
+) -> Joint:
+    """A joint's plain model, fitted from rows of its chain, and the sizes of its motion with that."""
+    call = {"base": base, "effects": (), "starts": starts, "scales": scales, **options}
+    fit = pool.run(spec, [("fit", call)])[0]
+    name = pool.problems.chains[spec.chain].joints[spec.joint]
+    return Joint(name, spec, _scales(pool, spec, fit.rows, fit.rmse), fit)
