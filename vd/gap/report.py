@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 
 from vd.files import atomic_path
 from vd.gap import figures, words
-from vd.gap.result import UNITS, Candidate, JointGap, NamedEffect, Predictions, Report, parameters_of
+from vd.gap.coordinates import BASELINE_PARAMETERS
+from vd.gap.result import Candidate, JointGap, NamedEffect, Predictions, Report, parameters_of
 from vd.gap.words import amount, mrad, percent, plain
 from vd.kernels.servo.effects import EFFECTS
 from vd.page import FIGURE_DPI, write_html
@@ -157,7 +158,7 @@ def _model(report: Report) -> list[Row]:
     return [
         (
             joint,
-            f"{name} [{words.unit_text(UNITS[name])}]",
+            f"{name} [{words.unit_text(BASELINE_PARAMETERS[name].unit)}]",
             f"{before[name]:.3g}" if name in before else "",
             f"{after[name]:.3g}",
         )

@@ -17,8 +17,9 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import atomic_path, write_json
+from vd.gap.coordinates import BASELINE_PARAMETERS
 from vd.gap.motions import Recording
-from vd.kernels.servo.effects import BASELINE, EFFECTS, Parameter
+from vd.kernels.servo.effects import EFFECTS, Parameter
 
 FORMAT = "vd-gap-report/1"
 LAYER = "identified.usda"
@@ -30,11 +31,6 @@ Verdict = Literal["effects", "ambiguous", "unknown", "under_excited", "no_gap"]
 """That of a recording is the first of these that some joint has."""
 Decision = Literal["named", "tied", "rejected"]
 Interval = tuple[float, float]
-
-# The baseline's gravity load of a pendulum is the effect's parameter, fitted without being named.
-GRAVITY = EFFECTS["gravity_load"].parameters[0]
-UNITS: dict[str, str] = {p.name: p.unit for p in (*BASELINE, GRAVITY)}
-"""Units of what a baseline can fit."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +85,7 @@ class Fit:
     """RMSE of each joint [rad]."""
     mae_rad: float = math.nan
     parameters: dict[str, dict[str, float]] = field(default_factory=dict)
-    """The baseline's parameters of each joint (:data:`UNITS` has their units)."""
+    """The baseline's parameters of each joint, SI."""
 
 
 @dataclass(frozen=True)
@@ -151,12 +147,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class TrajectoryError:
-    """Errors of one joint in one trajectory, by models that were fitted without it where ``held_out``."""
+    """Errors of one joint in one trajectory, by models that were fitted without it."""
 
     file: str
     excitation: str
     joint: str
-    held_out: bool
     baseline_rmse_rad: float
     identified_rmse_rad: float
     baseline_mae_rad: float = math.nan
@@ -174,12 +169,11 @@ class Closing:
     layer: str
     """File beside the report."""
     baseline_rmse_rad: float
-    """Held-out trajectories, before, by the same simulator."""
+    """Before, by the same simulator."""
     identified_rmse_rad: float
     """The same with the layer."""
     per_joint: dict[str, Interval]
     """(baseline, identified) RMSE [rad] of each joint."""
-    note: str = ""
     whole_hand_layer: str = ""
     """The layer with the same on every finger, where not all were recorded: the one to train with."""
 
@@ -349,8 +343,8 @@ def parameters_of(effect: str) -> dict[str, Parameter]:
 
 def parameter_columns(report: Report, joint: str) -> dict[int, float]:
     """Columns of the joint's parameter row (:mod:`vd.kernels.servo.actuators`) that the report identified."""
-    known = {p.name: p.column for p in (*BASELINE, GRAVITY)}
-    columns = {known[name]: value for name, value in report.identified.parameters.get(joint, {}).items()}
+    baseline = report.identified.parameters.get(joint, {})
+    columns = {BASELINE_PARAMETERS[name].column: value for name, value in baseline.items()}
     for effect, values in effect_values((*report.effects, *report.provisional), joint).items():
         columns |= {parameters_of(effect)[name].column: value for name, (value, *_) in values.items()}
     return columns
