@@ -1,0 +1,175 @@
+"""Identified contact of an object as a layer over its USD file: ``identified.usda``.
+
+The layer has the object's file as sublayer, so that it is the object: commands take it wherever they take the
+file. USD's own attributes are where USD has some (``physics:mass``, ``physics:centerOfMass``); everything that was
+identified is on the root prim besides: ``vd:contact:<parameter>``, with ``vd:contact:<parameter>:ci95`` (low, high;
+SI units) for its 95 % interval.
+"""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vd.paper import PAPER
+
+NAMESPACE = "vd:contact"
+LAYER_FORMAT = "vd-contact-layer/1"
+"""What ``customLayerData`` of a layer says it is."""
+STIFF_RESTITUTION = 0.135
+"""Restitution of the simulator's contacts, which are critically damped springs: exp(-2)."""
+
+
+class ContactParameter(NamedTuple):
+    """What a motion tells of an object's contact.
+
+    Attributes:
+        meaning: In words.
+        unit: SI unit.
+        nominal: Where the object's file has nothing; its length is the number of numbers.
+        resolution: Difference that matters to a policy, [unit] or a share of the nominal value.
+        relative: Whether the resolution is a share.
+        record: What tells it.
+        trend: What speaks against a constant.
+    """
+
+    meaning: str
+    unit: str
+    nominal: tuple[float, ...]
+    resolution: float
+    relative: bool
+    record: str
+    trend: str = ""
+
+
+_MATERIALS = PAPER.materials
+CONTACT: dict[str, ContactParameter] = {
+    "table_friction": ContactParameter(
+        "coefficient of friction between this object and the table",
+        "",
+        (0.5 * (_MATERIALS.friction + _MATERIALS.table_friction),),
+        0.05,
+        False,
+        "record slides: the object let go at 1 m/s or more on one of its faces, in several directions",
+        "the object slows down differently at another speed",
+    ),
+    "restitution": ContactParameter(
+        "share of the speed of the touching point that an impact on the table leaves",
+        "",
+        (STIFF_RESTITUTION,),
+        0.08,
+        False,
+        "record drops from 0.1 m or more that bounce",
+        "fast impacts keep another share of the speed than slow ones",
+    ),
+    "mass": ContactParameter(
+        "mass",
+        "kg",
+        (_MATERIALS.object_mass_kg,),
+        0.1,
+        True,
+        "record slides, and pushes with the force of the pusher: free motion does not depend on the mass",
+    ),
+    "centre_of_mass": ContactParameter(
+        "centre of mass in the frame of the object's file",
+        "m",
+        (0.0, 0.0, 0.0),
+        0.003,
+        False,
+        "record drops in which the object turns by half a radian or more about different axes",
+    ),
+    "tip_compliance": ContactParameter(
+        "way that the fingertip gives under a force",
+        "m/N",
+        (0.0,),
+        2.0e-4,
+        False,
+        "record presses: a finger whose force is measured on the object, on the table, up to some N",
+        "the tip stiffens or softens as the force grows",
+    ),
+}
+"""Parameters by name; names are a contract: USD attributes and keys of reports."""
+
+Identified = Mapping[str, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]]
+"""By parameter: value, low and high end of the 95 % interval, as many numbers each as the parameter has."""
+
+
+def write_contact_layer(path: Path, item_file: Path, found: Identified, recording: str) -> None:
+    """Write what was identified as a layer over an object's file, atomically.
+
+    Args:
+        path: File to write, ``.usda``.
+        item_file: The object's file, which becomes a sublayer.
+        found: What was identified.
+        recording: From which recording, for people.
+
+    Raises:
+        ObjectError: The file is no object.
+    """
+    from pxr import Gf, Sdf
+
+    from vd.assets_usd.hand_layer import save_layer
+    from vd.assets_usd.objects.model import read_object
+
+    item = read_object(item_file)
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.defaultPrim = item.name
+    layer.subLayerPaths.append(os.path.relpath(item_file.resolve(), path.resolve().parent))
+    layer.documentation = f"Contact of {item.name}, identified by vd-gap contact from {recording}: pass it as --objects."
+    layer.customLayerData = {"format": LAYER_FORMAT, "recording": recording}
+    prim = Sdf.PrimSpec(layer, item.name, Sdf.SpecifierOver)
+
+    author_contact(prim, found)
+    if "mass" in found:
+        mass = found["mass"][0][0]
+        moments = Gf.Vec3f(*map(float, item.inertia * mass / item.mass_kg))
+        _author(prim, "physics:mass", Sdf.ValueTypeNames.Float, mass)
+        _author(prim, "physics:diagonalInertia", Sdf.ValueTypeNames.Float3, moments)
+    if "centre_of_mass" in found:
+        centre = Gf.Vec3f(*found["centre_of_mass"][0])
+        _author(prim, "physics:centerOfMass", Sdf.ValueTypeNames.Point3f, centre)
+    save_layer(layer, path)
+
+
+def author_contact(prim: Any, found: Identified) -> None:
+    """Author what was identified on the spec of an object's root prim, USD's own attributes apart."""
+    from pxr import Sdf
+
+    for name, (value, low, high) in found.items():
+        _author(prim, f"{NAMESPACE}:{name}", Sdf.ValueTypeNames.DoubleArray, list(value))
+        _author(prim, f"{NAMESPACE}:{name}:ci95", Sdf.ValueTypeNames.DoubleArray, [*low, *high])
+
+
+def _author(prim: Any, name: str, kind: Any, value: Any) -> None:
+    from pxr import Sdf
+
+    custom = name.startswith(NAMESPACE)
+    Sdf.AttributeSpec(prim, name, kind, Sdf.VariabilityVarying, declaresCustom=custom).default = value
+
+
+def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ...]]:
+    """What was identified of an object; the type is :data:`Identified`.
+
+    Args:
+        prim: The object's root prim.
+        where: The file to name in errors.
+
+    Raises:
+        ValueError: An attribute is no parameter, or not as many ordered, finite numbers as it should be.
+    """
+    found = {}
+    for attribute in prim.GetAuthoredPropertiesInNamespace(NAMESPACE):
+        full = attribute.GetName()
+        name = full.removeprefix(f"{NAMESPACE}:").removesuffix(":ci95")
+        if name not in CONTACT:
+            raise ValueError(f"{where}: {full!r} is no parameter of contact; choose from {', '.join(CONTACT)}")
+        size = len(CONTACT[name].nominal)
+        parts = [prim.GetAttribute(f"{NAMESPACE}:{name}{end}").Get() for end in ("", ":ci95")]
+        numbers = np.concatenate([np.atleast_1d([] if part is None else part) for part in parts]).astype(float)
+        value, low, high = (numbers[i * size : (i + 1) * size] for i in range(3))
+        if len(numbers) != 3 * size or not (np.isfinite(numbers).all() and np.all((low <= value) & (value <= high))):
+            raise ValueError(f"{where}: {full!r}: give {size} numbers, and for its ci95 {size} low and {size} high")
+        found[name] = tuple(tuple(float(v) for v in part) for part in (value, low, high))
+    return found
