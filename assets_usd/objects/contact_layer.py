@@ -1,9 +1,8 @@
 """Identified contact of an object as a layer over its USD file: ``identified.usda``.
 
-The layer has the object's file as sublayer, so that it is the object: commands take it wherever they take the
-file. USD's own attributes are where USD has some (``physics:mass``, ``physics:centerOfMass``); everything that was
-identified is on the root prim besides: ``vd:contact:<parameter>``, with ``vd:contact:<parameter>:ci95`` (low, high;
-SI units) for its 95 % interval.
+The layer has the object's file as sublayer, so commands take it wherever they take the file. What was identified
+is on the root prim: ``vd:contact:<parameter>``, with ``vd:contact:<parameter>:ci95`` (low ends, high ends; SI
+units) for the 95 % interval; mass and centre of mass in USD's own attributes besides.
 """
 
 import os
@@ -18,8 +17,8 @@ from vd.paper import PAPER
 NAMESPACE = "vd:contact"
 LAYER_FORMAT = "vd-contact-layer/1"
 """What ``customLayerData`` of a layer says it is."""
-STIFF_RESTITUTION = 0.135
-"""Restitution of the simulator's contacts, which are critically damped springs: exp(-2)."""
+LEAST_RESTITUTION = 0.135
+"""Of the simulator's contacts, which are critically damped springs: exp(-2)."""
 
 
 class ContactParameter(NamedTuple):
@@ -28,66 +27,63 @@ class ContactParameter(NamedTuple):
     Attributes:
         meaning: In words.
         unit: SI unit.
-        nominal: Where the object's file has nothing; its length is the number of numbers.
-        resolution: Difference that matters to a policy, [unit] or a share of the nominal value.
-        relative: Whether the resolution is a share.
+        nominal: Where the object's file has nothing; as many numbers as the parameter has.
+        resolution: Difference that matters to a policy (ours), in the unit or as a share of the nominal value.
         record: What tells it.
-        trend: What speaks against a constant.
+        relative: Whether the resolution is a share.
     """
 
     meaning: str
     unit: str
     nominal: tuple[float, ...]
     resolution: float
-    relative: bool
     record: str
-    trend: str = ""
+    relative: bool = False
+
+    def of(self, item: Any) -> np.ndarray:
+        """As an object (:class:`vd.assets_usd.objects.model.ObjectModel`) has it: identified, or nominal."""
+        name = next(key for key, parameter in CONTACT.items() if parameter is self)
+        told = {"mass": (item.mass_kg,), "centre_of_mass": item.centre_of_mass}
+        return np.array(told.get(name, item.contact.get(name, (self.nominal,))[0]), dtype=float)
 
 
 _MATERIALS = PAPER.materials
 CONTACT: dict[str, ContactParameter] = {
     "table_friction": ContactParameter(
         "coefficient of friction between this object and the table",
-        "",
+        "1",
         (0.5 * (_MATERIALS.friction + _MATERIALS.table_friction),),
         0.05,
-        False,
-        "record slides: the object let go at 1 m/s or more on one of its faces, in several directions",
-        "the object slows down differently at another speed",
+        "record slides of 1 m/s or more on one of its faces, in several directions",
     ),
     "restitution": ContactParameter(
-        "share of the speed of the touching point that an impact on the table leaves",
-        "",
-        (STIFF_RESTITUTION,),
+        "share of its speed with which the object leaves the table",
+        "1",
+        (LEAST_RESTITUTION,),
         0.08,
-        False,
-        "record drops from 0.1 m or more that bounce",
-        "fast impacts keep another share of the speed than slow ones",
+        "record drops from 0.15 m or more onto one of its faces",
     ),
     "mass": ContactParameter(
         "mass",
         "kg",
         (_MATERIALS.object_mass_kg,),
         0.1,
-        True,
         "record slides, and pushes with the force of the pusher: free motion does not depend on the mass",
+        relative=True,
     ),
     "centre_of_mass": ContactParameter(
         "centre of mass in the frame of the object's file",
         "m",
         (0.0, 0.0, 0.0),
         0.003,
-        False,
-        "record drops in which the object turns by half a radian or more about different axes",
+        "record tosses in which the object turns by a radian or more, about several axes",
     ),
     "tip_compliance": ContactParameter(
         "way that the fingertip gives under a force",
         "m/N",
         (0.0,),
         2.0e-4,
-        False,
-        "record presses: a finger whose force is measured on the object, on the table, up to some N",
-        "the tip stiffens or softens as the force grows",
+        "record presses of a finger whose force is measured on the object, up to some N",
     ),
 }
 """Parameters by name; names are a contract: USD attributes and keys of reports."""
@@ -117,7 +113,9 @@ def write_contact_layer(path: Path, item_file: Path, found: Identified, recordin
     layer = Sdf.Layer.CreateAnonymous(".usda")
     layer.defaultPrim = item.name
     layer.subLayerPaths.append(os.path.relpath(item_file.resolve(), path.resolve().parent))
-    layer.documentation = f"Contact of {item.name}, identified by vd-gap contact from {recording}: pass it as --objects."
+    layer.documentation = (
+        f"Contact of {item.name}, identified by vd-gap contact from {recording}: pass it as --objects."
+    )
     layer.customLayerData = {"format": LAYER_FORMAT, "recording": recording}
     prim = Sdf.PrimSpec(layer, item.name, Sdf.SpecifierOver)
 
@@ -164,12 +162,20 @@ def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ..
         full = attribute.GetName()
         name = full.removeprefix(f"{NAMESPACE}:").removesuffix(":ci95")
         if name not in CONTACT:
-            raise ValueError(f"{where}: {full!r} is no parameter of contact; choose from {', '.join(CONTACT)}")
+            raise ValueError(
+                f"{where}: {full!r} is no parameter of contact; choose from {', '.join(CONTACT)}"
+            )
         size = len(CONTACT[name].nominal)
         parts = [prim.GetAttribute(f"{NAMESPACE}:{name}{end}").Get() for end in ("", ":ci95")]
-        numbers = np.concatenate([np.atleast_1d([] if part is None else part) for part in parts]).astype(float)
+        numbers = np.concatenate([np.atleast_1d([] if part is None else part) for part in parts]).astype(
+            float
+        )
         value, low, high = (numbers[i * size : (i + 1) * size] for i in range(3))
-        if len(numbers) != 3 * size or not (np.isfinite(numbers).all() and np.all((low <= value) & (value <= high))):
-            raise ValueError(f"{where}: {full!r}: give {size} numbers, and for its ci95 {size} low and {size} high")
+        if len(numbers) != 3 * size or not (
+            np.isfinite(numbers).all() and np.all((low <= value) & (value <= high))
+        ):
+            raise ValueError(
+                f"{where}: {full!r}: give {size} numbers, and for its ci95 {size} low and {size} high"
+            )
         found[name] = tuple(tuple(float(v) for v in part) for part in (value, low, high))
     return found

@@ -122,6 +122,7 @@ class ObjectModel:
             hulls=tuple(hull._replace(vertices=hull.vertices * np.float32(factor)) for hull in self.hulls),
             inertia=self.inertia * factor**2,
             surface_points=self.surface_points * np.float32(factor),
+            centre_of_mass=tuple(factor * c for c in self.centre_of_mass),
             scale=self.scale * factor,
         )
 
@@ -261,12 +262,14 @@ def _layer(path: Path) -> Any:
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
     except Tf.ErrorException:
         return None
-    if not layer.subLayerPaths:
+    if layer is None or not layer.subLayerPaths:
         return layer
     below = [(path.parent / name, _layer(path.parent / name)) for name in layer.subLayerPaths]
     for file, sublayer in below:
         if sublayer is None:
-            raise ObjectError(f"{path}: its sublayer {file} is missing or no USD; put the object's file there")
+            raise ObjectError(
+                f"{path}: its sublayer {file} is missing or no USD; put the object's file there"
+            )
     layer.subLayerPaths = [sublayer.identifier for _, sublayer in below]
     return Usd.Stage.Open(layer).Flatten()
 

@@ -100,7 +100,9 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
         "named": [each.name for each in by_weight(found)],
         "unknown": [each.name for each in found if each.verdict == "unknown"],
         "covered": covered,
-        "estimates": {each.name: [each.value.tolist(), each.low.tolist(), each.high.tolist()] for each in found},
+        "estimates": {
+            each.name: [each.value.tolist(), each.low.tolist(), each.high.tolist()] for each in found
+        },
         "truth": truth["parameters"],
     }
     write_json(folder / f"{case.name}.json", result)
@@ -110,7 +112,11 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
 def run_battery(cases: Sequence[Case], folder: Path, jobs: int) -> list[dict[str, Any]]:
     """Run the cases that have no result yet, and write ``summary.md``; returns the results of all."""
     make_folder(folder)
-    done = {case: json.loads(path.read_text()) for case in cases if (path := folder / f"{case.name}.json").is_file()}
+    done = {
+        case: json.loads(path.read_text())
+        for case in cases
+        if (path := folder / f"{case.name}.json").is_file()
+    }
     waiting = [case for case in cases if case not in done]
 
     def finished(case: Case, result: dict[str, Any] | None, why: str) -> None:
@@ -147,12 +153,18 @@ def summary(results: Sequence[Mapping[str, Any]]) -> str:
         Figure("nothing hidden: no false name", [not false(r) for r in none], least=0.98),
         Figure("two hidden: both named, nothing else", [both(r) for r in pair], least=0.8),
         Figure("outside the table: no false name", [not false(r) for r in outside], least=0.9),
-        Figure("95 % intervals that cover", [c for r in known for v in r["covered"].values() for c in v], least=0.9),
+        Figure(
+            "95 % intervals that cover",
+            [c for r in known for v in r["covered"].values() for c in v],
+            least=0.9,
+        ),
         Figure("parameters told, of all", [n not in r["unknown"] for r in known for n in CONTACT]),
     ]
     head = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
-    wrong = [f"- {Case(**{**r['case'], 'hidden': tuple(r['case']['hidden'])}).name}: "
-             f"{', '.join(r.get('named', ['failed'])) or 'nothing'}"
-             for r in results if ("error" in r or set(r["named"]) != set(r["case"]["hidden"]))
-             and r["case"]["kind"] != "outside"]
+    wrong = [
+        f"- {Case(**{**r['case'], 'hidden': tuple(r['case']['hidden'])}).name}: "
+        f"{', '.join(r.get('named', ['failed'])) or 'nothing'}"
+        for r in results
+        if ("error" in r or set(r["named"]) != set(r["case"]["hidden"])) and r["case"]["kind"] != "outside"
+    ]
     return "\n".join([*head, *(figure.row() for figure in figures), "", "Not as hidden:", "", *wrong]) + "\n"

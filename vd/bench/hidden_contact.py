@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.contact_layer import CONTACT
 from vd.assets_usd.objects.model import ObjectModel
+from vd.bench.hide import truth_path
 from vd.files import write_json
 from vd.gap.contact_recording import ContactMotion, Kind, write_contact_recording
 from vd.sim.scene import damping_ratio
@@ -57,6 +58,11 @@ class ContactPlant:
         nominal = CONTACT[name].nominal
         return self.values.get(name, nominal if len(nominal) > 1 else nominal[0])
 
+    @property
+    def compliance(self) -> float:
+        """Of the pusher [m/N]: no real one is rigid."""
+        return float(self.value("tip_compliance")) + 1.0 / RIGID_N_M
+
 
 class World:
     """The compiled scene of one motion, and what happens in it step by step."""
@@ -64,7 +70,9 @@ class World:
     def __init__(self, plant: ContactPlant, rng: np.random.Generator, *, finger: bool):
         item, spec = plant.item, mujoco.MjSpec()
         spec.option.timestep = rng.choice([4.0e-4, 5.0e-4])
-        spec.option.integrator = rng.choice([mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_EULER])
+        spec.option.integrator = rng.choice(
+            [mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_EULER]
+        )
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         tilt = plant.outside.get("tilted_table", 0.0)
         spec.option.gravity = [9.81 * math.sin(tilt), 0.0, -9.81 * math.cos(tilt)]
@@ -87,21 +95,37 @@ class World:
         self.corners = np.unique(np.concatenate([vertices for vertices, _ in item.hulls]), axis=0)
         for i, corner in enumerate(self.corners):
             name, size = f"corner_{i}", [CORNER_M, 0.0, 0.0]
-            body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=corner, contype=0, conaffinity=0)
+            body.add_geom(
+                name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=corner, contype=0, conaffinity=0
+            )
             solref = [1.0 / (ratio * CONTACT_RATE), ratio]
-            spec.add_pair(geomname1="table", geomname2=name, condim=1, solref=solref, solimp=[0.999, 0.999, 0.001, 0.5, 2.0])
+            spec.add_pair(
+                geomname1="table",
+                geomname2=name,
+                condim=1,
+                solref=solref,
+                solimp=[0.999, 0.999, 0.001, 0.5, 2.0],
+            )
         if finger:
             tip = spec.worldbody.add_body(name="tip")
             for axis in np.eye(3):
                 tip.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-            tip.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[TIP_RADIUS_M, 0, 0], mass=TIP_KG, contype=0,
-                         conaffinity=1, priority=2, friction=[0.9, 0.0, 0.0], solref=[0.002, 1.0], gap=0.0)
+            tip.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[TIP_RADIUS_M, 0, 0],
+                mass=TIP_KG,
+                contype=0,
+                conaffinity=1,
+                priority=2,
+                friction=[0.9, 0.0, 0.0],
+                solref=[0.002, 1.0],
+                solimp=[0.99, 0.999, 1e-3, 0.5, 2.0],
+            )
             tip.gravcomp = 1.0
         self.model = spec.compile()
         self._first_corner = int(self.model.geom("corner_0").id)
         self.data = mujoco.MjData(self.model)
-        compliance = plant.value("tip_compliance") + 1.0 / RIGID_N_M
-        self.stiffness, self.step = 1.0 / compliance, self.model.opt.timestep
+        self.stiffness, self.step = 1.0 / plant.compliance, self.model.opt.timestep
         self.damping = 2.0 * TIP_DAMPING * math.sqrt(self.stiffness * TIP_KG)
         self.carriage = np.zeros(3)
 
@@ -144,16 +168,16 @@ class World:
             return
         normal = data.efc_force[data.contact.efc_address[touching]]
         turn = data.xmat[1].reshape(3, 3)
-        arms = self.corners[data.contact.geom2[touching] - self._first_corner] @ turn.T
-        slip = data.qvel[:3] + np.cross(turn @ data.qvel[3:6], arms)
-        slip[:, 2] = 0.0
-        speed = np.linalg.norm(slip, axis=1)
+        x, y, z = turn @ self.corners[data.contact.geom2[touching] - self._first_corner].T
+        (vx, vy, _), (wx, wy, wz) = data.qvel[:3], turn @ data.qvel[3:6]
+        slip = np.array([vx + wy * z - wz * y, vy + wz * x - wx * z])
+        speed = np.sqrt((slip**2).sum(0)) + 1e-9
         size = self.friction * (1.0 + self.speed_friction * speed) * normal
         # What stops a quarter of the object within four steps is enough, and stable.
         size = np.minimum(size, 0.25 * self.model.body_mass[1] * speed / (4.0 * self.step))
-        pull = -slip * (size / np.maximum(speed, 1e-9))[:, None]
-        data.qfrc_applied[:3] += pull.sum(0)
-        data.qfrc_applied[3:6] += np.cross(arms, pull).sum(0) @ turn
+        px, py = -slip * size / speed
+        data.qfrc_applied[:2] += px.sum(), py.sum()
+        data.qfrc_applied[3:6] += np.array([-(z @ py), z @ px, x @ py - y @ px]) @ turn
 
 
 Path3 = Callable[[float], np.ndarray]
@@ -192,14 +216,21 @@ def _motion(plant: ContactPlant, kind: Kind, rng: np.random.Generator) -> tuple[
         speed = rng.uniform(0.8, 1.6)
         force = world.model.body_mass[1] * (speed / PUSH_OFF_S + world.friction * 9.81) * ahead
         spin = rng.normal(0.0, 0.5)
-        return _run(world, 0.9, None, hand=np.array([*force, 0.0, 0.0, world.model.body_inertia[1, 2] * spin / PUSH_OFF_S]))
+        return _run(
+            world,
+            0.9,
+            None,
+            hand=np.array([*force, 0.0, 0.0, world.model.body_inertia[1, 2] * spin / PUSH_OFF_S]),
+        )
     world.place(rest, upright, none, none)
     if kind == "press":
         start, depth = np.array([0.0, 0.0, highest - lowest + TIP_RADIUS_M + 0.004]), rng.uniform(3.0, 8.0)
-        travel = 0.004 + depth * (plant.value("tip_compliance") + 1.0 / RIGID_N_M)
+        travel = 0.004 + depth * plant.compliance
         world.put_tip(start)
         return _run(world, 1.0, lambda t: start - np.array([0, 0, travel * math.sin(math.pi * t) ** 2]))
-    reach = max(float(np.linalg.norm(v[:, :2], axis=1).max()) for v, _ in plant.item.hulls) + TIP_RADIUS_M + 0.01
+    reach = (
+        max(float(np.linalg.norm(v[:, :2], axis=1).max()) for v, _ in plant.item.hulls) + TIP_RADIUS_M + 0.01
+    )
     face = upright.apply([1.0, 0.0, 0.0])
     start = np.array([0.0, 0.0, 0.4 * (highest - lowest)]) - face * reach
     start += upright.apply([0.0, rng.normal(0.0, 0.002), 0.0])
@@ -208,7 +239,9 @@ def _motion(plant: ContactPlant, kind: Kind, rng: np.random.Generator) -> tuple[
     return _run(world, 1.0, lambda t: start + face * (speed * t + 0.5 * acceleration * t**2))
 
 
-def _drop(world: World, item: ObjectModel, upright: Rotation, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def _drop(
+    world: World, item: ObjectModel, upright: Rotation, rng: np.random.Generator
+) -> tuple[np.ndarray, ...]:
     """Let go flat, or tossed with a spin; before that a hand holds it, or brings it to its speed."""
     flat = rng.uniform() < 0.5
     tilt = Rotation.from_rotvec(rng.normal(0.0, 0.02 if flat else 1.0, 3)) * upright
@@ -252,11 +285,16 @@ class Tracker:
     def draw(rng: np.random.Generator) -> "Tracker":
         """One of those that there are, from motion capture to a camera with markers."""
         return Tracker(
-            rng.uniform(100.0, 240.0), rng.uniform(1e-4, 6e-4), rng.uniform(1e-3, 8e-3),
-            rng.uniform(0.0, 1e-3), rng.uniform(0.005, 0.02),
+            rng.uniform(100.0, 240.0),
+            rng.uniform(1e-4, 6e-4),
+            rng.uniform(1e-3, 8e-3),
+            rng.uniform(0.0, 1e-3),
+            rng.uniform(0.005, 0.02),
         )
 
-    def see(self, truth: tuple[np.ndarray, ...], kind: Kind, file: str, rng: np.random.Generator) -> ContactMotion:
+    def see(
+        self, truth: tuple[np.ndarray, ...], kind: Kind, file: str, rng: np.random.Generator
+    ) -> ContactMotion:
         """A motion as it is recorded: a state is taken late, and stamped with the time it was asked for."""
         time, pose, pusher, force = truth
         asked = np.arange(0.0, time[-1], 1.0 / self.rate)
@@ -267,11 +305,17 @@ class Tracker:
         measured = kind in ("push", "press")
         bias = rng.normal(0.0, self.force_n / 3.0, 3)
         return ContactMotion(
-            file, kind, asked,
+            file,
+            kind,
+            asked,
             pose[index, :3] + rng.normal(0.0, self.position_m, (len(index), 3)),
             noise * Rotation.from_quat(pose[index, 3:]),
-            pusher[index] + rng.normal(0.0, self.position_m, (len(index), 3)) if measured else np.empty((0, 3)),
-            force[index] + bias + rng.normal(0.0, self.force_n, (len(index), 3)) if measured else np.empty((0, 3)),
+            pusher[index] + rng.normal(0.0, self.position_m, (len(index), 3))
+            if measured
+            else np.empty((0, 3)),
+            force[index] + bias + rng.normal(0.0, self.force_n, (len(index), 3))
+            if measured
+            else np.empty((0, 3)),
         )
 
 
@@ -294,9 +338,10 @@ def hide_contact(plant: ContactPlant, out: Path, counts: Mapping[Kind, int] = CO
     truth = {
         "object": plant.item.name,
         "hidden": [*plant.values, *plant.outside],
-        "parameters": {name: np.array(plant.value(name)).tolist() for name in CONTACT},
+        "parameters": {name: np.array(plant.value(name)).tolist() for name in CONTACT}
+        | {"tip_compliance": plant.compliance},
         "outside": dict(plant.outside),
         "seed": plant.seed,
     }
-    write_json(out.with_name(f"{out.name}.truth.json"), truth)
+    write_json(truth_path(out), truth)
     return truth

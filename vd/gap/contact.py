@@ -1,15 +1,13 @@
-"""What the recorded motions of an object tell of its contact: friction, restitution, mass, its centre, soft tips.
+"""What the recorded motions of an object tell of its contact.
 
-Nothing is simulated. Each parameter is the slope of a law that is exact for a rigid object, fitted by linear least
-squares to every motion that obeys it:
+Nothing is simulated. Each parameter is the slope of a law that is exact for a rigid object, fitted by linear
+least squares to every motion that obeys it:
 
-====================  ==========================================================================================
-table_friction        a sliding object slows down by mu g: the path along its direction is s0 + v t - mu g t^2 / 2
-centre_of_mass        in flight the centre, o(t) + R(t) d, is on a parabola: o = c + v t - g t^2 / 2 - R(t) d
-restitution           the point that hits the table leaves it with e times the speed it came with
-mass                  while a pushed object slides: impulse of the push = m (change of velocity + mu g time)
-tip_compliance        the pusher's rigid part comes nearer by c times the force
-====================  ==========================================================================================
+- ``table_friction`` mu: a sliding object slows down by mu g, its path is s0 + v t - mu g t^2 / 2.
+- ``centre_of_mass`` d: in flight o(t) + R(t) d is on a parabola, o the object's origin.
+- ``restitution`` e: what hits the table under the centre of mass leaves with e times the speed it came with.
+- ``mass`` m: while a pushed object slides, the impulse of the push is m (change of velocity + mu g time).
+- ``tip_compliance`` c: the rigid part of a pressing finger comes nearer by c times the force.
 
 The unit of all intervals is the motion, since residuals within one are correlated.
 """
@@ -28,7 +26,6 @@ from vd.assets_usd.objects.contact_layer import CONTACT
 from vd.assets_usd.objects.model import ObjectModel
 from vd.gap.contact_recording import ContactMotion, ContactRecording, Kind
 from vd.gap.recording_checks import RecordingError
-from vd.gap.result import Verdict
 
 GRAVITY = 9.81
 FALSE_NAMES = 0.02
@@ -36,42 +33,32 @@ FALSE_NAMES = 0.02
 OUTLIER = 3.5
 """Residuals beyond this many standard deviations, by the median, are samples that came late."""
 FEWEST = 5
-"""Samples below which a stretch of a motion is no evidence."""
+"""Samples below which a stretch of a motion is no evidence; motions: three."""
 SMOOTH_S = 0.05
 """Window of the parabola that gives velocities [s]."""
 CLEAR_M = 0.003
-"""An object is in flight if its lowest point is this far above the table: tracking errors and soft contacts are less."""
+"""An object flies if its lowest point is this far above the table: more than a tracker errs by [m]."""
 SURE_S = 0.1
 """Before an impact a hand has let go for as long: a fall of 5 cm [s]."""
-SLIDING = 0.1
-"""A slide ends at this share of its top speed, before rest and noise decide the direction; a push begins at it."""
+SLIDING, MOVING = 0.1, 0.3
+"""Shares of the top speed down to which a slide, and a push, count: slower, noise decides the direction."""
 UPRIGHT_RAD = 0.05
 """Tilt within which a sliding object stays: more is tumbling or rolling."""
 TURNING = 0.3
-"""Speed of an object's rim by turning over its own speed, below which friction acts against its motion: within 2 %."""
+"""Speed of the rim by turning over that of the object below which friction is against the motion, to 2 %."""
 FLAT_M = 0.003
-"""Points this close to the lowest one hit the table with it."""
+"""Points this close to the lowest one hit the table with it [m]."""
+CENTRAL = 0.25
+"""Share of the object's reach within which an impact is under the centre of mass: others hit in several places."""
 FAST_M_S = 1.0
 """Impacts from this speed on tell the restitution: the flight after slower ones is too short."""
-CENTRAL = 0.25
-"""Share of the object's reach that the middle of what hits the table may be beside the centre of mass."""
 IMPACT_S = 0.01
-"""Longest impact: a rubber ball on wood takes half."""
+"""Longest impact: a rubber ball on wood takes half [s]."""
 PRESSED_N = 0.2
 """Force above which a finger touches: ten times the noise of a cheap load cell."""
 
-
-@dataclass(frozen=True)
-class Rows:
-    """Linear equations of one motion for a parameter of P numbers, and for one trend that should not be there.
-
-    Attributes:
-        gram: X^T X, shape [P + 1, P + 1].
-        gradient: X^T y, shape [P + 1].
-    """
-
-    gram: np.ndarray
-    gradient: np.ndarray
+Equations = tuple[np.ndarray, np.ndarray]
+"""Linear equations of one motion for a parameter of P numbers: X^T X [P, P] and X^T y [P]."""
 
 
 @dataclass(frozen=True)
@@ -80,13 +67,12 @@ class Found:
 
     Attributes:
         name: Key of :data:`vd.assets_usd.objects.contact_layer.CONTACT`.
-        verdict: ``effect``: it differs from the object's file; ``no_gap``: it does not; ``unknown``: not told.
+        verdict: ``effect``: other than the object's file says; ``no_gap``: as it says; ``unknown``: not told.
         value, low, high: Estimate, and its 95 % interval [P].
         nominal: As the object's file has it [P].
         confidence: That it differs.
-        weight: Difference over the half-width from which it is named; at least 1 of an effect.
+        weight: Difference over the half-width from which it is named; more than 1 for an effect.
         motions: Motions that tell it.
-        bent: The motions contradict a constant.
         reason: One sentence.
     """
 
@@ -99,18 +85,21 @@ class Found:
     confidence: float
     weight: float
     motions: int
-    bent: bool
     reason: str
 
 
 @dataclass
 class _State:
-    """What later parameters take from earlier ones."""
+    """Corners of the object [N, 3], height of the table, and what later parameters take from earlier ones."""
 
     points: np.ndarray
     table_m: float
     centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    friction: float = np.nan
+    friction: float = math.nan
+
+    @property
+    def reach(self) -> float:
+        return float(np.linalg.norm(self.points, axis=1).max())
 
 
 def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Found]:
@@ -128,9 +117,11 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Fou
     state = _State(points, float(np.median([np.percentile(height, 5) for height in heights])))
     _check_gravity(recording, state)
 
-    def equations(kind: Kind, rows: Callable[[ContactMotion, _State], Iterator[Rows]]) -> list[Rows]:
-        summed = [_sum(rows(motion, state)) for motion in recording.of(kind)]
-        return [each for each in summed if each is not None]
+    def equations(
+        kind: Kind, rows: Callable[[ContactMotion, _State], Iterator[Equations]]
+    ) -> list[Equations]:
+        each = [list(rows(motion, state)) for motion in recording.motions if motion.kind == kind]
+        return [(sum(g for g, _ in own), sum(s for _, s in own)) for own in each if own]  # type: ignore[misc]
 
     found = {}
     found["centre_of_mass"] = centre = _judge("centre_of_mass", equations("drop", _flights), item)
@@ -141,22 +132,18 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Fou
     # Pushes need the friction; what its error does to the mass widens the mass's interval.
     masses = []
     for value in (0.25 * (friction.high + 3.0 * friction.low), friction.value):
-        state.friction = math.nan if friction.bent else float(value[0])
+        state.friction = float(value[0])
         pushes = equations("push", _pushes)
-        masses.append(_estimate(pushes, slice(0, 1))[0])
+        masses.append(_estimate(pushes, 1)[0])
     found["mass"] = _judge("mass", pushes, item, np.abs(masses[0] - masses[1]))
     found["tip_compliance"] = _judge("tip_compliance", equations("press", _presses), item)
     return [found[name] for name in CONTACT]
 
 
-def verdict(found: Sequence[Found]) -> Verdict:
+def verdict(found: Sequence[Found]) -> Literal["effects", "no_gap", "under_excited"]:
     """What the recording says as a whole, in the words of ``vd-gap run``."""
     told = {each.verdict for each in found}
-    if "effect" in told:
-        return "effects"
-    if any(each.bent for each in found):
-        return "unknown"
-    return "no_gap" if "no_gap" in told else "under_excited"
+    return "effects" if "effect" in told else "no_gap" if "no_gap" in told else "under_excited"
 
 
 def by_weight(found: Sequence[Found]) -> list[Found]:
@@ -164,102 +151,75 @@ def by_weight(found: Sequence[Found]) -> list[Found]:
     return sorted((each for each in found if each.verdict == "effect"), key=lambda each: -each.weight)
 
 
-def _nominal(item: ObjectModel, name: str) -> np.ndarray:
-    """A parameter as the object's file has it [P]: what it was identified as before, or what the task assumes."""
-    told = {"mass": (item.mass_kg,), "centre_of_mass": item.centre_of_mass}
-    identified = item.contact.get(name, (CONTACT[name].nominal,))[0]
-    return np.array(told.get(name, identified), dtype=float)
-
-
-def _judge(name: str, motions: list[Rows], item: ObjectModel, besides: np.ndarray | float = 0.0) -> Found:
-    """A parameter's estimate and verdict from the equations of its motions.
-
-    Args:
-        name: The parameter.
-        motions: Its equations.
-        item: The object as its file has it.
-        besides: Standard deviation that comes from parameters taken as known.
-    """
-    parameter, nominal = CONTACT[name], _nominal(item, name)
-    size = len(nominal)
-    resolution = parameter.resolution * (nominal if parameter.relative else np.ones(size))
-    value, deviation = _estimate(motions, slice(0, size))
-    deviation = np.hypot(deviation, besides)
-    freedom = max(len(motions) - 1, 1)
-    # All numbers of all parameters together may give a false name in this share of recordings.
+def _judge(
+    name: str, motions: list[Equations], item: ObjectModel, besides: np.ndarray | float = 0.0
+) -> Found:
+    """A parameter's estimate and verdict; ``besides``: deviation from parameters taken as known [P]."""
+    parameter = CONTACT[name]
+    nominal = parameter.of(item)
+    resolution = parameter.resolution * (nominal if parameter.relative else np.ones(len(nominal)))
+    value, deviation = _estimate(motions, len(nominal))
+    deviation, freedom = np.hypot(deviation, besides), max(len(motions) - 1, 1)
+    # All numbers of all parameters together may give a false name in FALSE_NAMES of recordings.
     numbers = sum(len(p.nominal) for p in CONTACT.values())
-    level = student.ppf(1.0 - 0.5 * FALSE_NAMES / numbers, freedom)
-    gap, least = np.abs(value - nominal), np.maximum(level * deviation, resolution)
-    trend, spread = _estimate(motions, slice(0, size + 1))
-    bent = bool(abs(trend[-1]) > max(level * spread[-1], resolution.max()))
+    half = student.ppf(1.0 - 0.5 * FALSE_NAMES / numbers, freedom) * deviation
+    gap, least = np.abs(value - nominal), np.maximum(half, resolution)
     told = bool(np.isfinite(deviation).all())
     weight = float((gap / least).max()) if told else 0.0
+    says: Literal["effect", "no_gap", "unknown"] = "unknown"
     if not told:
-        verdict, reason = "unknown", f"no motion tells it; {parameter.record}"
-    elif bent:
-        verdict, reason = "unknown", f"it is no constant: {parameter.trend}"
+        reason = f"no motion tells it; {parameter.record}"
     elif weight > 1.0:
-        verdict, reason = "effect", "the interval excludes what the object's file says"
-    elif (least > resolution).any():
-        verdict, reason = "unknown", f"the interval is too wide to say; {parameter.record}"
+        says, reason = "effect", "the interval excludes what the object's file says"
+    elif (half > resolution).any():
+        reason = f"the interval is too wide to say; {parameter.record}"
     else:
-        verdict, reason = "no_gap", "as the object's file says, as far as can be told"
+        says, reason = "no_gap", "as the object's file says, as far as can be told"
     confidence = float(1.0 - 2.0 * student.sf((gap / deviation).max(), freedom)) if told else 0.0
-    half = student.ppf(0.975, freedom) * deviation
-    ends = value - half, value + half
-    return Found(name, verdict, value, *ends, nominal, confidence, weight, len(motions), bent, reason)
+    usual = student.ppf(0.975, freedom) * deviation
+    ends = value - usual, value + usual
+    return Found(name, says, value, *ends, nominal, confidence, weight, len(motions), reason)
 
 
-def _estimate(motions: list[Rows], part: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares over all motions, and the jackknife's standard deviation over them; NaN if not determined."""
-    size = part.stop
-    blank = np.full(size, np.nan)
-    if len(motions) < 3:
+def _estimate(motions: list[Equations], size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares over all motions, and the jackknife's deviation over them [P]; NaN if not determined."""
+    count, blank = len(motions), np.full(size, np.nan)
+    if count < 3:
         return blank, blank
-    gram = np.array([rows.gram[part, part] for rows in motions])
-    gradient = np.array([rows.gradient[part] for rows in motions])
+    gram, slope = (np.array(arrays) for arrays in zip(*motions, strict=True))
     try:
-        value = np.linalg.solve(gram.sum(0), gradient.sum(0))
-        others = np.linalg.solve(gram.sum(0) - gram, (gradient.sum(0) - gradient)[..., None])[..., 0]
+        value = np.linalg.solve(gram.sum(0), slope.sum(0))
+        others = np.linalg.solve(gram.sum(0) - gram, (slope.sum(0) - slope)[..., None])[..., 0]
     except np.linalg.LinAlgError:
         return blank, blank
-    count = len(motions)
     return value, np.sqrt((count - 1) / count * ((others - value) ** 2).sum(0))
 
 
-def _sum(rows: Iterator[Rows]) -> Rows | None:
-    """All equations of a motion."""
-    every = list(rows)
-    return Rows(sum(r.gram for r in every), sum(r.gradient for r in every)) if every else None
-
-
-def _equations(nuisance: np.ndarray, slopes: np.ndarray, values: np.ndarray) -> Rows:
-    """Equations values [T] = nuisance [T, K] a + slopes [T, P + 1] theta, with a taken out and late samples dropped."""
+def _equations(nuisance: np.ndarray, slopes: np.ndarray, values: np.ndarray) -> Equations:
+    """Of values [T] = nuisance [T, K] a + slopes [T, P] theta; a is taken out, late samples are dropped."""
     full = np.hstack([nuisance, slopes])
-    left = values - full @ np.linalg.lstsq(full, values, rcond=None)[0]
-    kept = np.abs(left) <= OUTLIER * 1.4826 * np.median(np.abs(left)) + 1e-12
+    left = np.abs(values - full @ np.linalg.lstsq(full, values, rcond=None)[0])
+    kept = left <= OUTLIER * 1.4826 * np.median(left) + 1e-12
     basis = np.linalg.qr(nuisance[kept])[0]
-    inner, outer = slopes[kept], values[kept]
-    inner = inner - basis @ (basis.T @ inner)
-    return Rows(inner.T @ inner, inner.T @ outer)
+    inner = slopes[kept] - basis @ (basis.T @ slopes[kept])
+    return inner.T @ inner, inner.T @ values[kept]
 
 
 def _lowest(motion: ContactMotion, points: np.ndarray) -> np.ndarray:
     """Height of the lowest point of the object [T]."""
-    down = motion.rotation.inv().apply([0.0, 0.0, 1.0])
-    return motion.position[:, 2] + (down @ points.T).min(1)
+    return motion.position[:, 2] + (motion.rotation.as_matrix()[:, 2] @ points.T).min(1)
 
 
-def _velocity(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Derivative of [T, K] by parabolas through :data:`SMOOTH_S`; samples are resampled evenly before."""
+def _velocity(motion: ContactMotion) -> np.ndarray:
+    """Horizontal velocity [T, 2] by parabolas through :data:`SMOOTH_S` of evenly spaced samples."""
+    time = motion.time
     step = float(np.median(np.diff(time)))
     even = np.arange(time[0], time[-1] + step, step)
-    window = max(2 * round(0.5 * SMOOTH_S / step) + 1, 5)
-    columns = [
-        np.interp(time, even, savgol_filter(np.interp(even, time, v), window, 2, deriv=1, delta=step))
-        for v in values.T
-    ]
-    return np.stack(columns, axis=1)
+    window = min(max(2 * round(0.5 * SMOOTH_S / step) + 1, 5), 2 * ((len(even) - 1) // 2) + 1)
+    smooth = (
+        savgol_filter(np.interp(even, time, v), window, 2, deriv=1, delta=step) for v in motion.position.T[:2]
+    )
+    return np.stack([np.interp(time, even, v) for v in smooth], axis=1)
 
 
 def _stretches(mask: np.ndarray) -> Iterator[slice]:
@@ -272,22 +232,19 @@ def _stretches(mask: np.ndarray) -> Iterator[slice]:
 
 def _in_flight(motion: ContactMotion, state: _State) -> list[slice]:
     """Stretches in which nothing touches the object."""
-    clear = _lowest(motion, state.points) > state.table_m + CLEAR_M
-    found = list(_stretches(clear))
-    if found:
-        found[0] = _released(motion, found[0])
-    return found
+    found = list(_stretches(_lowest(motion, state.points) > state.table_m + CLEAR_M))
+    return [_released(motion, part) if i == 0 else part for i, part in enumerate(found)]
 
 
 def _released(motion: ContactMotion, part: slice) -> slice:
-    """The end of a stretch that a hand begins: as long before the impact as the motion is that of free flight."""
+    """The end of a stretch that a hand begins: as long before the impact as the motion is free flight."""
     time, end = motion.time, part.stop
     first = min(max(int(np.searchsorted(time, time[end - 1] - SURE_S)), part.start), end - FEWEST)
     usual = float(np.median(_flight_errors(motion, slice(first, end))))
     while first > part.start:
         longer = max(first - FEWEST, part.start)
         if np.median(_flight_errors(motion, slice(longer, end))[:FEWEST]) > OUTLIER * usual:
-            # What the hand did to the last samples is still below noise there.
+            # What the hand did to the first samples is still below noise there.
             return slice(int(np.searchsorted(time, time[first] + 0.5 * SMOOTH_S)), end)
         first = longer
     return slice(first, end)
@@ -309,144 +266,120 @@ def _flight_errors(motion: ContactMotion, part: slice) -> np.ndarray:
 def _check_gravity(recording: ContactRecording, state: _State) -> None:
     """Refuse drops that do not fall as things do."""
     falls = []
-    for motion in recording.of("drop"):
-        for part in _in_flight(motion, state):
-            time = motion.time[part]
-            if time[-1] - time[0] > 3.0 * SMOOTH_S:
-                falls.append(-2.0 * np.polyfit(time - time[0], motion.position[part, 2], 2)[0])
+    for motion in recording.motions:
+        for part in _in_flight(motion, state) if motion.kind == "drop" else ():
+            time = motion.time[part] - motion.time[part].mean()
+            if np.ptp(time) > SURE_S:
+                falls.append(-2.0 * np.polyfit(time, motion.position[part, 2], 2)[0])
     if falls and not 0.8 < np.median(falls) / GRAVITY < 1.25:
         raise RecordingError(
-            f"{recording.path}: dropped objects fall with {np.median(falls):.3g} m/s^2, not {GRAVITY}; z of the "
-            "table's frame points up, positions are in m, t is in s: correct table_pose or the columns"
+            f"{recording.path}: dropped objects fall with {np.median(falls):.3g} m/s^2, not {GRAVITY}: z of the "
+            "table's frame points up, positions are in m, t is in s; correct table_pose or the columns"
         )
 
 
-def _flights(motion: ContactMotion, state: _State) -> Iterator[Rows]:
-    """o - g-term = c + v t - R d, for x, y and z of every flight."""
+def _flights(motion: ContactMotion, state: _State) -> Iterator[Equations]:
+    """Of the origin: o + g t^2 / 2 = c + v t - R d, for x, y and z of every flight."""
     for part in _in_flight(motion, state):
         time = motion.time[part] - motion.time[part].mean()
-        turn = motion.rotation[part].as_matrix()
-        fall = -0.5 * GRAVITY * time**2
-        for axis in range(3):
-            values = motion.position[part, axis] - (fall if axis == 2 else 0.0)
-            slopes = np.hstack([-turn[:, axis, :], np.zeros((len(time), 1))])
-            yield _equations(np.vander(time, 2), slopes, values)
+        for axis, fall in enumerate((0.0, 0.0, GRAVITY)):
+            slopes = -motion.rotation[part].as_matrix()[:, axis, :]
+            yield _equations(np.vander(time, 2), slopes, motion.position[part, axis] + 0.5 * fall * time**2)
 
 
-def _slides(motion: ContactMotion, state: _State) -> Iterator[Rows]:
-    """Path along the direction of a slide = s0 + v t - mu g t^2 / 2; the trend is t^3: friction that changes."""
-    velocity = _velocity(motion.time, motion.position[:, :2])
+def _slides(motion: ContactMotion, state: _State) -> Iterator[Equations]:
+    """Path along the direction of a slide = s0 + v t - mu g t^2 / 2."""
+    time, velocity = motion.time, _velocity(motion)
     speed = np.linalg.norm(velocity, axis=1)
-    top = int(np.argmax(speed))
-    after = np.arange(len(speed)) > top
-    fast = after & (motion.time > motion.time[top] + SMOOTH_S) & (speed > SLIDING * speed[top])
-    for part in _stretches(fast & _flat_on_table(motion, state)):
-        time = motion.time[part] - motion.time[part].mean()
-        ahead = velocity[part].mean(0) / np.linalg.norm(velocity[part].mean(0))
-        if _turning(motion, part, state) > TURNING * speed[part].mean():
-            continue
-        duration = time[-1] - time[0]
-        slopes = np.stack([-0.5 * GRAVITY * time**2, -0.5 * GRAVITY * time**3 / duration], axis=1)
-        yield _equations(np.vander(time, 2), slopes, motion.position[part, :2] @ ahead)
-        break  # what moves again was touched
+    free = (time > time[speed.argmax()] + SMOOTH_S) & (speed > SLIDING * speed.max())
+    for part in _stretches(free & _flat_on_table(motion, state)):
+        since = time[part] - time[part].mean()
+        turned = (motion.rotation[part][0].inv() * motion.rotation[part][-1]).magnitude()
+        if state.reach * turned / np.ptp(since) < TURNING * speed[part].mean():
+            ahead = velocity[part].mean(0) / np.linalg.norm(velocity[part].mean(0))
+            slopes = -0.5 * GRAVITY * since[:, None] ** 2
+            yield _equations(np.vander(since, 2), slopes, motion.position[part, :2] @ ahead)
+        return  # what moves again was touched
 
 
 def _flat_on_table(motion: ContactMotion, state: _State) -> np.ndarray:
     """Samples at which the object is on the table and as upright as at the end, [T] bool."""
-    final = motion.rotation[-1].inv().apply([0.0, 0.0, 1.0])
-    tilt = np.arccos(np.clip(motion.rotation.inv().apply([0.0, 0.0, 1.0]) @ final, -1.0, 1.0))
+    upward = motion.rotation.as_matrix()[:, 2]
+    tilt = np.arccos(np.clip(upward @ upward[-1], -1.0, 1.0))
     return (tilt < UPRIGHT_RAD) & (_lowest(motion, state.points) < state.table_m + CLEAR_M)
 
 
-def _turning(motion: ContactMotion, part: slice, state: _State) -> float:
-    """Mean speed of the object's rim by its turning about the vertical [m/s]."""
-    between = (motion.rotation[part][0].inv() * motion.rotation[part][-1]).magnitude()
-    reach = float(np.linalg.norm(state.points, axis=1).max())
-    return reach * between / (motion.time[part][-1] - motion.time[part][0])
-
-
-def _impacts(motion: ContactMotion, state: _State) -> Iterator[Rows]:
+def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Speed of the touching points after an impact = e times before."""
     flights = _in_flight(motion, state)
     step = float(np.median(np.diff(motion.time)))
     # Of the fastest bounce with too few samples above CLEAR_M; one that is not seen had half that speed.
     unseen = math.sqrt(2.0 * GRAVITY * (CLEAR_M + GRAVITY * (0.5 * FEWEST * step) ** 2 / 2.0))
-    for before, after in zip(flights, [*flights[1:], None], strict=True):
+    for before, after in zip(flights, [*flights[1:], None], strict=False):
         if before.stop == len(motion.time):
-            continue
+            return
         come, falling, touching = _touch(motion, before, state, None)
-        if -falling < FAST_M_S or not _central(motion, before, state, touching):
+        arms = motion.rotation[before][-1].apply(state.points - state.centre)[touching]
+        if -falling < FAST_M_S or np.linalg.norm(arms[:, :2].mean(0)) > CENTRAL * state.reach:
             continue
         rising = 0.5 * unseen
         if after is not None:
             leave, rising, _ = _touch(motion, after, state, touching)
             if not -0.2 * IMPACT_S < leave - come < IMPACT_S:
                 continue  # another point hit the table in between
-        row = -falling * np.array([[1.0, 0.0]])
-        yield Rows(row.T @ row, row[0] * rising)
-
-
-def _central(motion: ContactMotion, part: slice, state: _State, touching: np.ndarray) -> bool:
-    """Whether the points that touch first lie under the centre of mass: else several hit one after another."""
-    arms = motion.rotation[part][-1].apply(state.points - state.centre)
-    reach = float(np.linalg.norm(state.points, axis=1).max())
-    return bool(np.linalg.norm(arms[touching, :2].mean(0)) < CENTRAL * reach)
+        yield np.array([[falling**2]]), np.array([-falling * rising])
 
 
 def _touch(
     motion: ContactMotion, part: slice, state: _State, touching: np.ndarray | None
 ) -> tuple[float, float, np.ndarray]:
-    """Where a flight, longer than it is, meets the table: at its end, or at its begin for given points.
+    """Where a flight meets the table: at its end, or at its begin for given points [N] bool.
 
     Returns:
         When [s]; how fast the points that touch it rise then [m/s]; which points they are, [N] bool.
     """
-    ends = touching is None
-    time, rotation = motion.time[part], motion.rotation[part]
-    edge = time[-1] if ends else time[0]
-    centre = motion.position[part] + rotation.apply(state.centre)
-    heights = centre[:, 2] + 0.5 * GRAVITY * (time - edge) ** 2
-    line = np.polynomial.polynomial.polyfit(time - edge, heights, 1)
-    near = np.abs(time - edge) < SMOOTH_S
-    base = rotation[-1] if ends else rotation[0]
-    turned = (rotation[near] * base.inv()).as_rotvec()
-    turn, spin = np.polynomial.polynomial.polyfit(time[near] - edge, turned, 1)
-    # The edge is at most as far from the table as an object goes between clear and touched.
+    time, edge = motion.time[part], -1 if touching is None else 0
+    since = time - time[edge]
+    centre = motion.position[part] + motion.rotation[part].apply(state.centre)
+    height, rise = np.polynomial.polynomial.polyfit(since, centre[:, 2] + 0.5 * GRAVITY * since**2, 1)
+    near = np.abs(since) < SMOOTH_S
+    base = motion.rotation[part][edge]
+    turned = (motion.rotation[part][near] * base.inv()).as_rotvec()
+    turn, spin = np.polynomial.polynomial.polyfit(since[near], turned, 1)
     times = np.linspace(-0.5 * SMOOTH_S, 0.5 * SMOOTH_S, 501)
-    arms = (Rotation.from_rotvec(turn + times[:, None] * spin) * base).as_matrix() @ (state.points - state.centre).T
-    falling = line[0] + line[1] * times - 0.5 * GRAVITY * times**2 - state.table_m
+    turns = (Rotation.from_rotvec(turn + times[:, None] * spin) * base).as_matrix()
+    arms = turns @ (state.points - state.centre).T  # [501, 3, N]
+    above = height + rise * times - 0.5 * GRAVITY * times**2 - state.table_m
     if touching is None:
-        first = int(np.abs(falling + arms[:, 2].min(1)).argmin())
+        first = int(np.abs(above + arms[:, 2].min(1)).argmin())
         touching = arms[first, 2] < arms[first, 2].min() + FLAT_M
-    at = int(np.abs(falling + arms[:, 2, touching].mean(1)).argmin())
+    at = int(np.abs(above + arms[:, 2, touching].mean(1)).argmin())
     arm = arms[at][:, touching].mean(1)
-    return edge + times[at], line[1] - GRAVITY * times[at] + np.cross(spin, arm)[2], touching
+    return time[edge] + times[at], rise - GRAVITY * times[at] + np.cross(spin, arm)[2], touching
 
 
-def _pushes(motion: ContactMotion, state: _State) -> Iterator[Rows]:
+def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Impulse of a push along the path = m (change of velocity + mu g time) while the object slides."""
-    velocity = _velocity(motion.time, motion.position[:, :2])
+    velocity = _velocity(motion)
     speed, pressing = np.linalg.norm(velocity, axis=1), np.linalg.norm(motion.force, axis=1) > PRESSED_N
-    sliding = pressing & (speed > 3.0 * SLIDING * speed.max()) & _flat_on_table(motion, state)
-    for part in _stretches(sliding):
-        time = motion.time[part]
-        if time[-1] - time[0] < 2.0 * SMOOTH_S:
-            continue
-        ahead = velocity[part] / speed[part, None]
-        along = (motion.force[part, :2] * ahead).sum(1) + state.friction * motion.force[part, 2]
-        push = np.trapezoid(along, time)
-        gain = speed[part][-1] - speed[part][0] + state.friction * GRAVITY * (time[-1] - time[0])
-        row = np.array([[gain, 0.0]])
-        yield Rows(row.T @ row, row[0] * push)
+    sliding = pressing & (speed > MOVING * speed.max()) & _flat_on_table(motion, state)
+    margin = round(SMOOTH_S / float(np.median(np.diff(motion.time))))
+    for whole in _stretches(sliding):
+        part = slice(
+            whole.start + margin, whole.stop - margin
+        )  # velocities at the ends are of other motions too
+        time, ahead = motion.time[part], velocity[part] / speed[part, None]
+        if len(time) >= FEWEST:
+            along = (motion.force[part, :2] * ahead).sum(1) + state.friction * motion.force[part, 2]
+            gain = speed[part][-1] - speed[part][0] + state.friction * GRAVITY * np.ptp(time)
+            yield np.array([[gain**2]]), np.array([gain * np.trapezoid(along, time)])
 
 
-def _presses(motion: ContactMotion, state: _State) -> Iterator[Rows]:
-    """Way of the pusher into the object = c times the force; the trend is its square: a tip that stiffens."""
+def _presses(motion: ContactMotion, state: _State) -> Iterator[Equations]:
+    """Way of the pusher into the object = c times the force."""
     size = np.linalg.norm(motion.force, axis=1)
     ahead = motion.force[size.argmax()] / size.max()
     force, way = motion.force @ ahead, (motion.pusher - motion.position) @ ahead
     touching = force > PRESSED_N
     if touching.sum() >= FEWEST:
-        force, way = force[touching], way[touching]
-        slopes = np.stack([force, force * (force / force.max() - 1.0)], axis=1)
-        yield _equations(np.ones((len(force), 1)), slopes, way)
+        yield _equations(np.ones((touching.sum(), 1)), force[touching, None], way[touching])

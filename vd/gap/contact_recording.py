@@ -113,7 +113,13 @@ def read_contact_recording(path: str | Path) -> ContactRecording:
 def write_contact_recording(folder: Path, motions: Sequence[ContactMotion]) -> None:
     """Write motions into a folder: each file atomically, ``recording.json`` last."""
     for motion in motions:
-        columns = [motion.time[:, None], motion.position, motion.rotation.as_quat(), motion.pusher, motion.force]
+        columns = [
+            motion.time[:, None],
+            motion.position,
+            motion.rotation.as_quat(),
+            motion.pusher,
+            motion.force,
+        ]
         names = [*TIME, *POSE, *(PUSHER if motion.pusher.size else ()), *(FORCE if motion.force.size else ())]
         table = np.hstack([column for column in columns if column.size])
         with atomic_path(folder / motion.file) as temporary:
@@ -129,7 +135,9 @@ def _frame(where: Path, name: str, values: Any) -> tuple[np.ndarray, Rotation]:
     except (TypeError, ValueError):
         pose = np.empty(0)
     if pose.shape != (7,) or not abs(np.linalg.norm(pose[3:]) - 1.0) < UNIT_ERROR:
-        raise RecordingError(f"{where}: {name!r} is {values!r}; give x y z in m and a quaternion xyzw of length 1")
+        raise RecordingError(
+            f"{where}: {name!r} is {values!r}; give x y z in m and a quaternion xyzw of length 1"
+        )
     return pose[:3], Rotation.from_quat(pose[3:])
 
 
@@ -167,7 +175,9 @@ def _columns(file: Path, kind: Kind) -> dict[str, np.ndarray]:
         if names.count(name) != 1:
             raise RecordingError(f"{file}: row 1 has no one column {name!r}, which a {kind} needs; add it")
     if len(rows) < MIN_SAMPLES:
-        raise RecordingError(f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, record it again")
+        raise RecordingError(
+            f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, record it again"
+        )
     used = [i for i, name in enumerate(names) if name in (*TIME, *POSE, *PUSHER, *FORCE)]
     table = np.full((len(rows), len(used)), np.nan)
     for i, row in enumerate(rows):
