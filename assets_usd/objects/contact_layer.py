@@ -1,8 +1,8 @@
 """Identified contact of an object as a layer over its USD file: ``identified.usda``.
 
-The layer has the object's file as sublayer, so commands take it wherever they take the file. What was identified
-is on the root prim: ``vd:contact:<parameter>``, with ``vd:contact:<parameter>:ci95`` (low ends, high ends; SI
-units) for the 95 % interval; mass and centre of mass in USD's own attributes besides.
+The layer has the object's file as sublayer, so commands take it wherever they take the file. The root prim
+has what was identified, ``vd:contact:<parameter>``, with ``vd:contact:<parameter>:ci95`` (low ends, high
+ends; SI units) for the 95 % interval, and mass and centre of mass in USD's own attributes besides.
 """
 
 import os
@@ -28,7 +28,7 @@ class ContactParameter(NamedTuple):
         meaning: In words.
         unit: SI unit.
         nominal: Where the object's file has nothing; as many numbers as the parameter has.
-        resolution: Difference that matters to a policy (ours), in the unit or as a share of the nominal value.
+        resolution: Difference that matters to a policy (ours), in the unit or as a share of nominal.
         record: What tells it.
         relative: Whether the resolution is a share.
     """

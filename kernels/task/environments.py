@@ -49,8 +49,9 @@ def write_friction_kernel(
     """Write each shape's friction so that the solver's pair value is the average of the two bodies'.
 
     The solver takes the friction of the geom with the higher priority: table over hand over object.
-    So the table carries the average of table and object, unless the pair's was measured, a hand shape that of hand and object; a
-    fingertip whose material differs from the nominal hand's keeps its ratio to it. Launch [S].
+    So the table carries the average of table and object, unless the pair's was measured, a hand shape that
+    of hand and object; a fingertip whose material differs from the nominal hand's keeps its ratio to it.
+    Launch [S].
     """
     shape = wp.tid()
     world = shape_world[shape]

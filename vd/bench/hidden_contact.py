@@ -1,6 +1,6 @@
-"""An object on a table in MuJoCo's own engine, pushed, pressed, dropped and seen by an imperfect tracker.
+"""An object on a table in MuJoCo's own engine: slid, pushed, pressed, dropped, seen by an imperfect tracker.
 
-It shares no code with the analysis (:mod:`vd.gap.contact`), which integrates nothing. World frame: z up, the
+It shares nothing with the analysis (:mod:`vd.gap.contact`), which simulates nothing. World frame: z up, the
 table's top at z = 0; SI units, quaternions xyzw.
 """
 
@@ -21,29 +21,35 @@ from vd.files import write_json
 from vd.gap.contact_recording import ContactMotion, Kind, write_contact_recording
 from vd.sim.scene import damping_ratio
 
-OUTSIDE = {"speed_friction": "coefficient", "stiffening_tip": "coefficient", "tilted_table": "angle"}
-"""Causes that no parameter describes: friction that grows with speed, a tip that stiffens, a table not level."""
+OUTSIDE = {"speed_friction": "table_friction", "stiffening_tip": "tip_compliance", "tilted_table": "table_friction"}
+"""Causes that no parameter describes, and the parameter that is nearest: friction that grows with the speed,
+a tip that stiffens, a table that is not level."""
 CONTACT_RATE = 800.0
-"""Natural frequency of the table's contact [rad/s]: an impact lasts some milliseconds."""
+"""Natural frequency of the table's contact [rad/s]: an impact lasts 4 ms."""
 TIP_KG, TIP_RADIUS_M, TIP_DAMPING = 0.01, 0.008, 0.3
 """Pusher: its mass, radius, and damping ratio on its spring."""
-PUSH_OFF_S = 0.15
-"""Time in which a hand brings a sliding object to its speed [s]."""
+RIGID_N_M = 2.0e4
+"""Stiffness of a pusher without compliance [N/m]: no real one is rigid."""
 CORNER_M = 2.0e-4
 """Radius of an object's corners [m]."""
-RIGID_N_M = 2.0e4
-"""Stiffness of a pusher without compliance [N/m]."""
-COUNTS: Mapping[Kind, int] = {"drop": 12, "slide": 8, "push": 6, "press": 6}
+PUSH_OFF_S = 0.15
+"""Time in which a hand brings an object to its speed [s]."""
+COUNTS: Mapping[Kind, int] = {"drop": 12, "slide": 8, "push": 8, "press": 6}
 """Motions of a recording."""
+
+Truth = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""A motion as it is: time [T], pose [T, 7], pusher [T, 3], its force [T, 3]."""
+Way = Callable[[float], np.ndarray]
+"""Position of the pusher's rigid part over time [3]."""
 
 
 @dataclass(frozen=True)
 class ContactPlant:
-    """What the table, the object and the finger are, and how they are seen.
+    """What the table, the object and the finger are.
 
     Attributes:
         item: The object as its file has it.
-        values: Parameters of :data:`vd.assets_usd.objects.contact_layer.CONTACT` that differ from the nominal.
+        values: What differs, by names of :data:`vd.assets_usd.objects.contact_layer.CONTACT`.
         outside: Causes of :data:`OUTSIDE` by name, with their size.
         seed: Of motions, solver and tracker.
     """
@@ -54,80 +60,68 @@ class ContactPlant:
     seed: int = 0
 
     def value(self, name: str) -> Any:
-        """A parameter, nominal where it is not hidden."""
-        nominal = CONTACT[name].nominal
-        return self.values.get(name, nominal if len(nominal) > 1 else nominal[0])
-
-    @property
-    def compliance(self) -> float:
-        """Of the pusher [m/N]: no real one is rigid."""
-        return float(self.value("tip_compliance")) + 1.0 / RIGID_N_M
+        """A parameter, a number or three of them."""
+        nominal = CONTACT[name].of(self.item).tolist()
+        value = self.values.get(name, nominal if len(nominal) > 1 else nominal[0])
+        return value + 1.0 / RIGID_N_M if name == "tip_compliance" else value
 
 
 class World:
     """The compiled scene of one motion, and what happens in it step by step."""
 
     def __init__(self, plant: ContactPlant, rng: np.random.Generator, *, finger: bool):
-        item, spec = plant.item, mujoco.MjSpec()
-        spec.option.timestep = rng.choice([4.0e-4, 5.0e-4])
-        spec.option.integrator = rng.choice(
-            [mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_EULER]
-        )
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        tilt = plant.outside.get("tilted_table", 0.0)
+        self.friction, outside = plant.value("table_friction"), plant.outside
+        self.speed_friction = outside.get("speed_friction", 0.0)
+        self.stiffening = outside.get("stiffening_tip", 0.0)
+        self.stiffness = 1.0 / plant.value("tip_compliance")
+        self.damping = 2.0 * TIP_DAMPING * math.sqrt(self.stiffness * TIP_KG)
+        self.corners = np.unique(np.concatenate([vertices for vertices, _ in plant.item.hulls]), axis=0)
+        spec, tilt = mujoco.MjSpec(), outside.get("tilted_table", 0.0)
         spec.option.gravity = [9.81 * math.sin(tilt), 0.0, -9.81 * math.cos(tilt)]
-        ratio = damping_ratio(plant.value("restitution"))
-        self.friction = plant.value("table_friction")
-        self.speed_friction = plant.outside.get("speed_friction", 0.0)
-        self.stiffening = plant.outside.get("stiffening_tip", 0.0)
-        plane = mujoco.mjtGeom.mjGEOM_PLANE
-        spec.worldbody.add_geom(name="table", type=plane, size=[2.0, 2.0, 0.1], contype=0, conaffinity=0)
-        body = spec.worldbody.add_body(name="object")
+        spec.option.timestep = self.step = rng.choice([4.0e-4, 5.0e-4])
+        spec.option.integrator = rng.choice([int(mujoco.mjtIntegrator.mjINT_EULER), 3])  # or implicitfast
+        self._add_object(spec, plant)
+        if finger:
+            tip = spec.worldbody.add_body(name="tip", gravcomp=1.0)
+            for axis in np.eye(3):
+                tip.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+            size, stiff = (
+                [TIP_RADIUS_M, 0.0, 0.0],
+                {"solref": [0.002, 1.0], "solimp": [0.99, 0.999, 1e-3, 0.5, 2.0]},
+            )
+            tip.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, mass=TIP_KG, contype=0, priority=2, **stiff
+            )
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self._first_corner = int(self.model.geom("corner_0").id)
+        self.carriage = np.zeros(3)
+
+    def _add_object(self, spec: Any, plant: ContactPlant) -> None:
+        """The object on the table: hulls for the finger, a small sphere at each corner for the table.
+
+        Between a mesh and a plane MuJoCo finds three contacts, on which a cube rocks.
+        """
+        item, mass, kinds = plant.item, plant.value("mass"), mujoco.mjtGeom
+        spec.worldbody.add_geom(
+            name="table", type=kinds.mjGEOM_PLANE, size=[2, 2, 0.1], contype=0, conaffinity=0
+        )
+        body = spec.worldbody.add_body(name="object", explicitinertial=True)
         body.add_freejoint()
-        body.explicitinertial = True
-        body.mass, body.ipos = plant.value("mass"), plant.value("centre_of_mass")
         x, y, z, w = item.inertia_quat
-        body.inertia, body.iquat = item.inertia * plant.value("mass") / item.mass_kg, [w, x, y, z]
+        body.mass, body.ipos = mass, plant.value("centre_of_mass")
+        body.inertia, body.iquat = item.inertia * mass / item.mass_kg, [w, x, y, z]
         for i, (vertices, faces) in enumerate(item.hulls):
             spec.add_mesh(name=f"hull_{i}", uservert=vertices.flatten(), userface=faces.flatten())
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"hull_{i}", contype=1, conaffinity=0)
-        # Between a mesh and a plane MuJoCo finds three contacts, on which a cube rocks: every corner gets its own.
-        self.corners = np.unique(np.concatenate([vertices for vertices, _ in item.hulls]), axis=0)
+            body.add_geom(type=kinds.mjGEOM_MESH, meshname=f"hull_{i}", contype=1, conaffinity=0)
+        ratio = damping_ratio(plant.value("restitution"))
+        bounce = {"solref": [1.0 / (ratio * CONTACT_RATE), ratio], "solimp": [0.999, 0.999, 1e-3, 0.5, 2.0]}
         for i, corner in enumerate(self.corners):
             name, size = f"corner_{i}", [CORNER_M, 0.0, 0.0]
             body.add_geom(
-                name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=corner, contype=0, conaffinity=0
+                name=name, type=kinds.mjGEOM_SPHERE, size=size, pos=corner, contype=0, conaffinity=0
             )
-            solref = [1.0 / (ratio * CONTACT_RATE), ratio]
-            spec.add_pair(
-                geomname1="table",
-                geomname2=name,
-                condim=1,
-                solref=solref,
-                solimp=[0.999, 0.999, 0.001, 0.5, 2.0],
-            )
-        if finger:
-            tip = spec.worldbody.add_body(name="tip")
-            for axis in np.eye(3):
-                tip.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-            tip.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                size=[TIP_RADIUS_M, 0, 0],
-                mass=TIP_KG,
-                contype=0,
-                conaffinity=1,
-                priority=2,
-                friction=[0.9, 0.0, 0.0],
-                solref=[0.002, 1.0],
-                solimp=[0.99, 0.999, 1e-3, 0.5, 2.0],
-            )
-            tip.gravcomp = 1.0
-        self.model = spec.compile()
-        self._first_corner = int(self.model.geom("corner_0").id)
-        self.data = mujoco.MjData(self.model)
-        self.stiffness, self.step = 1.0 / plant.compliance, self.model.opt.timestep
-        self.damping = 2.0 * TIP_DAMPING * math.sqrt(self.stiffness * TIP_KG)
-        self.carriage = np.zeros(3)
+            spec.add_pair(geomname1="table", geomname2=name, condim=1, **bounce)
 
     def place(self, position: np.ndarray, rotation: Rotation, velocity: np.ndarray, spin: np.ndarray) -> None:
         """Put the object; velocity of its frame and spin in the world frame."""
@@ -136,25 +130,31 @@ class World:
         self.data.qvel[:6] = [*velocity, *rotation.inv().apply(spin)]
         mujoco.mj_forward(self.model, self.data)
 
-    def put_tip(self, position: np.ndarray) -> None:
-        """Put the pusher, at rest on its spring."""
-        self.carriage = np.array(position, dtype=float)
-        self.data.qpos[7:10] = position
-        self.data.qvel[6:9] = 0.0
+    def run(self, seconds: float, way: Way | None = None, hand: np.ndarray | None = None) -> Truth:
+        """Steps with the pusher's rigid part on its way, or a hand's wrench [6] during PUSH_OFF_S."""
+        rows, data = [], self.data
+        if way is not None:
+            self.carriage = data.qpos[7:10] = way(0.0)
+        for i in range(round(seconds / self.step)):
+            if hand is not None:
+                data.xfrc_applied[1] = hand * (i * self.step < PUSH_OFF_S)
+            data.qfrc_applied[:] = 0.0
+            self._slip()
+            force = np.zeros(3) if way is None else self._pull(way(i * self.step))
+            rows.append(
+                [i * self.step, *data.qpos[:3], *data.qpos[4:7], data.qpos[3], *self.carriage, *force]
+            )
+            mujoco.mj_step(self.model, data)
+        table = np.array(rows)
+        return table[:, 0], table[:, 1:8], table[:, 8:11], table[:, 11:14]
 
-    def advance(self, carriage: np.ndarray | None) -> np.ndarray:
-        """One step with the pusher's rigid part at a place; returns the spring's force on the tip [N]."""
-        force = np.zeros(3)
-        self.data.qfrc_applied[:] = 0.0
-        self._slip()
-        if carriage is not None:
-            speed = (carriage - self.carriage) / self.step
-            stretch = carriage - self.data.qpos[7:10]
-            stiffness = self.stiffness * (1.0 + self.stiffening * float(np.linalg.norm(stretch)))
-            force = stiffness * stretch + self.damping * (speed - self.data.qvel[6:9])
-            self.data.qfrc_applied[6:9] += force
-            self.carriage = carriage.copy()
-        mujoco.mj_step(self.model, self.data)
+    def _pull(self, carriage: np.ndarray) -> np.ndarray:
+        """Move the rigid part of the pusher, whose spring pulls its tip; returns that force [N]."""
+        stretch = carriage - self.data.qpos[7:10]
+        stiffness = self.stiffness * (1.0 + self.stiffening * float(np.linalg.norm(stretch)))
+        speed = (carriage - self.carriage) / self.step - self.data.qvel[6:9]
+        self.data.qfrc_applied[6:9] += (force := stiffness * stretch + self.damping * speed)
+        self.carriage = carriage
         return force
 
     def _slip(self) -> None:
@@ -180,142 +180,75 @@ class World:
         data.qfrc_applied[3:6] += np.array([-(z @ py), z @ px, x @ py - y @ px]) @ turn
 
 
-Path3 = Callable[[float], np.ndarray]
-
-
-def _run(
-    world: World, seconds: float, carriage: Path3 | None, hand: np.ndarray | None = None
-) -> tuple[np.ndarray, ...]:
-    """True time, pose [T, 7] xyzw, pusher and force of every step; a hand's wrench [6] ends after PUSH_OFF_S."""
-    rows = []
-    for i in range(round(seconds / world.step)):
-        if hand is not None:
-            world.data.xfrc_applied[1] = hand * (i * world.step < PUSH_OFF_S)
-        at = None if carriage is None else carriage(i * world.step)
-        pose = world.data.qpos[:7].copy()
-        force = world.advance(at)
-        rows.append(np.concatenate([[i * world.step], pose[:3], pose[[4, 5, 6, 3]], world.carriage, force]))
-    table = np.array(rows)
-    return table[:, 0], table[:, 1:8], table[:, 8:11], table[:, 11:14]
-
-
-def _motion(plant: ContactPlant, kind: Kind, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def _motion(plant: ContactPlant, kind: Kind, rng: np.random.Generator) -> Truth:
     """One motion of a kind as it truly is."""
-    lowest = min(float(vertices[:, 2].min()) for vertices, _ in plant.item.hulls)
-    highest = max(float(vertices[:, 2].max()) for vertices, _ in plant.item.hulls)
-    upright = Rotation.from_euler("z", rng.uniform(-math.pi, math.pi))
-    heading = rng.uniform(-math.pi, math.pi)
-    ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
-    rest, none = np.array([0.0, 0.0, -lowest + 2e-4]), np.zeros(3)
     world = World(plant, rng, finger=kind in ("push", "press"))
+    low, high = world.corners[:, 2].min() - CORNER_M, world.corners[:, 2].max()
+    upright = Rotation.from_euler("z", rng.uniform(-math.pi, math.pi))
     if kind == "drop":
-        return _drop(world, plant.item, upright, rng)
+        return _drop(world, upright, rng)
+    none = np.zeros(3)
+    world.place(np.array([0.0, 0.0, -low]), upright, none, none)
+    ahead = upright.apply([1.0, 0.0, 0.0])
     if kind == "slide":
-        world.place(rest, upright, none, none)
-        # A hand brings it to its speed: MuJoCo lets what is thrown onto the table hop.
-        speed = rng.uniform(0.8, 1.6)
-        force = world.model.body_mass[1] * (speed / PUSH_OFF_S + world.friction * 9.81) * ahead
-        spin = rng.normal(0.0, 0.5)
-        return _run(
-            world,
-            0.9,
-            None,
-            hand=np.array([*force, 0.0, 0.0, world.model.body_inertia[1, 2] * spin / PUSH_OFF_S]),
-        )
-    world.place(rest, upright, none, none)
+        speed, mass, inertia = rng.uniform(0.8, 1.6), world.model.body_mass[1], world.model.body_inertia[1, 2]
+        ahead = Rotation.from_euler("z", rng.uniform(-math.pi, math.pi)).apply(ahead)
+        push = mass * (speed / PUSH_OFF_S + world.friction * 9.81) * ahead
+        return world.run(0.6, hand=np.array([*push, 0.0, 0.0, inertia * rng.normal(0.0, 0.5) / PUSH_OFF_S]))
     if kind == "press":
-        start, depth = np.array([0.0, 0.0, highest - lowest + TIP_RADIUS_M + 0.004]), rng.uniform(3.0, 8.0)
-        travel = 0.004 + depth * plant.compliance
-        world.put_tip(start)
-        return _run(world, 1.0, lambda t: start - np.array([0, 0, travel * math.sin(math.pi * t) ** 2]))
-    reach = (
-        max(float(np.linalg.norm(v[:, :2], axis=1).max()) for v, _ in plant.item.hulls) + TIP_RADIUS_M + 0.01
-    )
-    face = upright.apply([1.0, 0.0, 0.0])
-    start = np.array([0.0, 0.0, 0.4 * (highest - lowest)]) - face * reach
-    start += upright.apply([0.0, rng.normal(0.0, 0.002), 0.0])
-    world.put_tip(start)
+        above, force = np.array([0.0, 0.0, high - low + TIP_RADIUS_M + 0.004]), rng.uniform(3.0, 8.0)
+        down = np.array([0.0, 0.0, 0.004 + force * plant.value("tip_compliance")])
+        return world.run(0.6, lambda t: above - down * math.sin(math.pi * t / 0.6) ** 2)
+    reach = float(np.linalg.norm(world.corners[:, :2], axis=1).max()) + TIP_RADIUS_M + 0.01
+    behind = upright.apply([-reach, rng.normal(0.0, 0.002), 0.4 * (high - low)])
     speed, acceleration = rng.uniform(0.08, 0.15), rng.uniform(0.0, 0.3)
-    return _run(world, 1.0, lambda t: start + face * (speed * t + 0.5 * acceleration * t**2))
+    return world.run(0.9, lambda t: behind + ahead * (speed * t + 0.5 * acceleration * t**2))
 
 
-def _drop(
-    world: World, item: ObjectModel, upright: Rotation, rng: np.random.Generator
-) -> tuple[np.ndarray, ...]:
+def _drop(world: World, upright: Rotation, rng: np.random.Generator) -> Truth:
     """Let go flat, or tossed with a spin; before that a hand holds it, or brings it to its speed."""
     flat = rng.uniform() < 0.5
     tilt = Rotation.from_rotvec(rng.normal(0.0, 0.02 if flat else 1.0, 3)) * upright
-    under = tilt.apply(np.concatenate([vertices for vertices, _ in item.hulls]))[:, 2].min()
-    place = np.array([0.0, 0.0, rng.uniform(0.15, 0.3) - under])
+    place = np.array([0.0, 0.0, rng.uniform(0.15, 0.3) - tilt.apply(world.corners)[:, 2].min()])
     velocity = np.array([*rng.normal(0.0, 0.1, 2), 0.0 if flat else rng.uniform(0.8, 1.6)])
     spin = rng.normal(0.0, 0.1 if flat else 5.0, 3)
     world.place(place, tilt, velocity, spin)
-    time, pose, pusher, force = _run(world, 1.0, None)
+    time, pose, pusher, force = world.run(0.8)
     before = np.arange(0.0, PUSH_OFF_S, world.step)
     way = 0.5 * before**2 / PUSH_OFF_S - 0.5 * PUSH_OFF_S
-    turns = (Rotation.from_rotvec(np.outer(way, spin)) * tilt).as_quat()
-    held = np.hstack([place + np.outer(way, velocity), turns])
-    nothing = np.zeros((len(before), 3))
-    return (
-        np.concatenate([before, time + PUSH_OFF_S]),
-        np.concatenate([held, pose]),
-        np.concatenate([nothing, pusher]),
-        np.concatenate([nothing, force]),
-    )
+    turned = Rotation.from_rotvec(np.outer(way, spin)) * tilt
+    held, nothing = np.hstack([place + np.outer(way, velocity), turned.as_quat()]), np.zeros((len(before), 3))
+    parts = (held, pose), (nothing, pusher), (nothing, force)
+    pose, pusher, force = (np.concatenate(part) for part in parts)
+    return np.concatenate([before, time + PUSH_OFF_S]), pose, pusher, force
 
 
-@dataclass(frozen=True)
 class Tracker:
-    """Errors of what is recorded, drawn for a recording.
+    """What is recorded of a motion, by one of the trackers that there are: motion capture or a camera."""
 
-    Attributes:
-        rate: Samples a second [Hz].
-        position_m, rotation_rad: Standard deviations of the pose.
-        late_s: Mean lateness of a sample, exponential [s]; every 30th is a frame late.
-        force_n: Standard deviation of the force; its bias is a third of that.
-    """
+    def __init__(self, rng: np.random.Generator):
+        self._rng, self.rate = rng, rng.uniform(100.0, 240.0)
+        self.position_m, self.rotation_rad = rng.uniform(1e-4, 6e-4), rng.uniform(1e-3, 8e-3)
+        self.late_s, self.force_n = rng.uniform(0.0, 1e-3), rng.uniform(0.005, 0.02)
 
-    rate: float
-    position_m: float
-    rotation_rad: float
-    late_s: float
-    force_n: float
-
-    @staticmethod
-    def draw(rng: np.random.Generator) -> "Tracker":
-        """One of those that there are, from motion capture to a camera with markers."""
-        return Tracker(
-            rng.uniform(100.0, 240.0),
-            rng.uniform(1e-4, 6e-4),
-            rng.uniform(1e-3, 8e-3),
-            rng.uniform(0.0, 1e-3),
-            rng.uniform(0.005, 0.02),
-        )
-
-    def see(
-        self, truth: tuple[np.ndarray, ...], kind: Kind, file: str, rng: np.random.Generator
-    ) -> ContactMotion:
-        """A motion as it is recorded: a state is taken late, and stamped with the time it was asked for."""
-        time, pose, pusher, force = truth
+    def see(self, truth: Truth, kind: Kind, file: str) -> ContactMotion:
+        """A state is taken late, some by a frame, and stamped with when it was asked for; some are missing."""
+        rng, (time, pose, pusher, force) = self._rng, truth
         asked = np.arange(0.0, time[-1], 1.0 / self.rate)
         asked = asked[rng.uniform(size=len(asked)) > 0.02]
         late = rng.exponential(self.late_s, len(asked)) + (rng.uniform(size=len(asked)) < 1 / 30) / self.rate
-        index = np.searchsorted(time, asked - late).clip(0, len(time) - 1)
-        noise = Rotation.from_rotvec(rng.normal(0.0, self.rotation_rad, (len(index), 3)))
-        measured = kind in ("push", "press")
+        at = np.searchsorted(time, asked - late).clip(0, len(time) - 1)
+
+        def noisy(values: np.ndarray, deviation: float) -> np.ndarray:
+            return values[at, :3] + rng.normal(0.0, deviation, (len(at), 3))
+
+        turned = Rotation.from_rotvec(rng.normal(0.0, self.rotation_rad, (len(at), 3)))
+        position, rotation = noisy(pose, self.position_m), turned * Rotation.from_quat(pose[at, 3:])
+        pushes = kind in ("push", "press")
         bias = rng.normal(0.0, self.force_n / 3.0, 3)
+        measured = (noisy(pusher, self.position_m), noisy(force, self.force_n) + bias)
         return ContactMotion(
-            file,
-            kind,
-            asked,
-            pose[index, :3] + rng.normal(0.0, self.position_m, (len(index), 3)),
-            noise * Rotation.from_quat(pose[index, 3:]),
-            pusher[index] + rng.normal(0.0, self.position_m, (len(index), 3))
-            if measured
-            else np.empty((0, 3)),
-            force[index] + bias + rng.normal(0.0, self.force_n, (len(index), 3))
-            if measured
-            else np.empty((0, 3)),
+            file, kind, asked, position, rotation, *(measured if pushes else [np.empty((0, 3))] * 2)
         )
 
 
@@ -328,9 +261,9 @@ def hide_contact(plant: ContactPlant, out: Path, counts: Mapping[Kind, int] = CO
         counts: Motions of each kind.
     """
     rng = np.random.default_rng(plant.seed)
-    tracker = Tracker.draw(rng)
+    tracker = Tracker(rng)
     motions = [
-        tracker.see(_motion(plant, kind, rng), kind, f"{kind}_{i}.csv", rng)
+        tracker.see(_motion(plant, kind, rng), kind, f"{kind}_{i}.csv")
         for kind, count in counts.items()
         for i in range(count)
     ]
@@ -338,8 +271,7 @@ def hide_contact(plant: ContactPlant, out: Path, counts: Mapping[Kind, int] = CO
     truth = {
         "object": plant.item.name,
         "hidden": [*plant.values, *plant.outside],
-        "parameters": {name: np.array(plant.value(name)).tolist() for name in CONTACT}
-        | {"tip_compliance": plant.compliance},
+        "parameters": {name: np.atleast_1d(plant.value(name)).tolist() for name in CONTACT},
         "outside": dict(plant.outside),
         "seed": plant.seed,
     }

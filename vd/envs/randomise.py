@@ -97,7 +97,7 @@ class Randomiser:
         return np.array(values)[self._state.scene.world_object]
 
     def _ranges(self, name: str, usual: tuple[float, float]) -> wp.array:
-        """Range of a contact parameter in each environment [N]: an identified one varies within its interval."""
+        """Range of a parameter in each environment [N]: an identified one varies within its interval."""
 
         def of(item: ObjectModel) -> tuple[float, float]:
             if name not in item.contact:

@@ -49,7 +49,7 @@ TURNING = 0.3
 FLAT_M = 0.003
 """Points this close to the lowest one hit the table with it [m]."""
 CENTRAL = 0.25
-"""Share of the object's reach within which an impact is under the centre of mass: others hit in several places."""
+"""Share of the object's reach within which an impact is under the centre of mass: others are several."""
 FAST_M_S = 1.0
 """Impacts from this speed on tell the restitution: the flight after slower ones is too short."""
 IMPACT_S = 0.01
@@ -90,12 +90,16 @@ class Found:
 
 @dataclass
 class _State:
-    """Corners of the object [N, 3], height of the table, and what later parameters take from earlier ones."""
+    """What laws need besides a motion: corners of the object [N, 3], height of the table, earlier parameters.
+
+    A bounce too low to be seen has the share ``unseen`` of the highest such.
+    """
 
     points: np.ndarray
     table_m: float
     centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
     friction: float = math.nan
+    unseen: float = 0.5
 
     @property
     def reach(self) -> float:
@@ -127,15 +131,18 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Fou
     found["centre_of_mass"] = centre = _judge("centre_of_mass", equations("drop", _flights), item)
     if centre.verdict == "effect":  # impacts need it
         state.centre = centre.value
-    found["restitution"] = _judge("restitution", equations("drop", _impacts), item)
+    # What is known within bounds only widens an interval by what it does to the estimate.
+    bounces = []
+    for state.unseen in (0.0, 1.0, 0.5):
+        bounces.append(equations("drop", _impacts))
+    spread = np.abs(_estimate(bounces[1], 1)[0] - _estimate(bounces[0], 1)[0]) / math.sqrt(12.0)
+    found["restitution"] = _judge("restitution", bounces[2], item, spread)
     found["table_friction"] = friction = _judge("table_friction", equations("slide", _slides), item)
-    # Pushes need the friction; what its error does to the mass widens the mass's interval.
-    masses = []
-    for value in (0.25 * (friction.high + 3.0 * friction.low), friction.value):
-        state.friction = float(value[0])
-        pushes = equations("push", _pushes)
-        masses.append(_estimate(pushes, 1)[0])
-    found["mass"] = _judge("mass", pushes, item, np.abs(masses[0] - masses[1]))
+    pushes = []
+    for (state.friction,) in (friction.low, friction.high, friction.value):
+        pushes.append(equations("push", _pushes))
+    spread = np.abs(_estimate(pushes[1], 1)[0] - _estimate(pushes[0], 1)[0]) / 4.0
+    found["mass"] = _judge("mass", pushes[2], item, spread)
     found["tip_compliance"] = _judge("tip_compliance", equations("press", _presses), item)
     return [found[name] for name in CONTACT]
 
@@ -273,8 +280,8 @@ def _check_gravity(recording: ContactRecording, state: _State) -> None:
                 falls.append(-2.0 * np.polyfit(time, motion.position[part, 2], 2)[0])
     if falls and not 0.8 < np.median(falls) / GRAVITY < 1.25:
         raise RecordingError(
-            f"{recording.path}: dropped objects fall with {np.median(falls):.3g} m/s^2, not {GRAVITY}: z of the "
-            "table's frame points up, positions are in m, t is in s; correct table_pose or the columns"
+            f"{recording.path}: dropped objects fall with {np.median(falls):.3g} m/s^2, not {GRAVITY}: z of "
+            "the table's frame points up, positions are in m, t is in s; correct table_pose or the columns"
         )
 
 
@@ -313,7 +320,7 @@ def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Speed of the touching points after an impact = e times before."""
     flights = _in_flight(motion, state)
     step = float(np.median(np.diff(motion.time)))
-    # Of the fastest bounce with too few samples above CLEAR_M; one that is not seen had half that speed.
+    # Of the fastest bounce with too few samples above CLEAR_M.
     unseen = math.sqrt(2.0 * GRAVITY * (CLEAR_M + GRAVITY * (0.5 * FEWEST * step) ** 2 / 2.0))
     for before, after in zip(flights, [*flights[1:], None], strict=False):
         if before.stop == len(motion.time):
@@ -322,7 +329,7 @@ def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
         arms = motion.rotation[before][-1].apply(state.points - state.centre)[touching]
         if -falling < FAST_M_S or np.linalg.norm(arms[:, :2].mean(0)) > CENTRAL * state.reach:
             continue
-        rising = 0.5 * unseen
+        rising = state.unseen * unseen
         if after is not None:
             leave, rising, _ = _touch(motion, after, state, touching)
             if not -0.2 * IMPACT_S < leave - come < IMPACT_S:

@@ -3,6 +3,7 @@
 SI units, quaternions xyzw. What is read is in the table's frame: z up, the origin on its top.
 """
 
+import contextlib
 import csv
 import json
 from collections.abc import Mapping, Sequence
@@ -42,8 +43,8 @@ class ContactMotion:
 
     Attributes:
         file: Name of the CSV file.
-        kind: ``drop``: falls and bounces; ``slide``: slides freely until it rests; ``push``: is pushed along by
-            one finger whose force is measured; ``press``: is pressed onto the table by it and stays there.
+        kind: ``drop``: falls and bounces; ``slide``: slides freely until it rests; ``push``: is pushed along
+            by a finger whose force is measured; ``press``: is pressed onto the table by it, and stays.
         time: Time stamps [T] [s].
         position: Origin of the object's USD frame [T, 3] [m].
         rotation: Orientation of the object's USD frame, [T].
@@ -67,10 +68,6 @@ class ContactRecording:
     path: Path
     motions: tuple[ContactMotion, ...]
 
-    def of(self, *kinds: Kind) -> list[ContactMotion]:
-        """Motions of some kinds."""
-        return [motion for motion in self.motions if motion.kind in kinds]
-
 
 def read_contact_recording(path: str | Path) -> ContactRecording:
     """Read and check a recording of an object's motions.
@@ -91,7 +88,7 @@ def read_contact_recording(path: str | Path) -> ContactRecording:
         raise RecordingError(f"{file}: not JSON ({error}); correct it at that place") from error
     if not isinstance(header, dict) or (header.get("format"), header.get("model")) != (FORMAT, MODEL):
         raise RecordingError(
-            f"{file}: format and model must be {FORMAT!r} and {MODEL!r}; recordings of joints are for vd-gap run"
+            f"{file}: format and model must be {FORMAT!r}, {MODEL!r}; recordings of joints are for vd-gap run"
         )
     frames = [_frame(file, name, header.get(name, IDENTITY)) for name in ("table_pose", "object_pose")]
     entries = header.get("trajectories")
@@ -182,13 +179,11 @@ def _columns(file: Path, kind: Kind) -> dict[str, np.ndarray]:
     table = np.full((len(rows), len(used)), np.nan)
     for i, row in enumerate(rows):
         for j, index in enumerate(used):
-            try:
+            with contextlib.suppress(ValueError, IndexError):
                 table[i, j] = float(row[index])
-            except (ValueError, IndexError):
-                pass
             if not np.isfinite(table[i, j]):
                 raise RecordingError(
-                    f"{file}: row {i + 2}, column {names[index]!r}: no finite number; drop rows without a pose"
+                    f"{file}: row {i + 2}, column {names[index]!r}: no number; drop rows without a pose"
                 )
     return {names[index]: table[:, j] for j, index in enumerate(used)}
 
