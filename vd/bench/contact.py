@@ -34,8 +34,8 @@ SIZES: Mapping[str, tuple[tuple[float, float], ...]] = {
     "stiffening_tip": ((200.0, 500.0),),
     "tilted_table": ((0.03, 0.08),),
 }
-"""Ranges of what is hidden (ours): differences from nominal of twice what matters to a policy and more; outside
-the table growth with the speed [s/m] and with the depth [1/m], and an angle [rad]."""
+"""Ranges of what is hidden (ours): from twice what matters to a policy on, beside the nominal value. Outside
+the table: growth with the speed [s/m], growth with the depth [1/m], angle [rad]."""
 
 
 class Case(NamedTuple):

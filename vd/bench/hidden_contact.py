@@ -21,7 +21,11 @@ from vd.files import write_json
 from vd.gap.contact_recording import ContactMotion, Kind, write_contact_recording
 from vd.sim.scene import damping_ratio
 
-OUTSIDE = {"speed_friction": "table_friction", "stiffening_tip": "tip_compliance", "tilted_table": "table_friction"}
+OUTSIDE = {
+    "speed_friction": "table_friction",
+    "stiffening_tip": "tip_compliance",
+    "tilted_table": "table_friction",
+}
 """Causes that no parameter describes, and the parameter that is nearest: friction that grows with the speed,
 a tip that stiffens, a table that is not level."""
 CONTACT_RATE = 800.0
@@ -180,13 +184,13 @@ class World:
         data.qfrc_applied[3:6] += np.array([-(z @ py), z @ px, x @ py - y @ px]) @ turn
 
 
-def _motion(plant: ContactPlant, kind: Kind, rng: np.random.Generator) -> Truth:
-    """One motion of a kind as it truly is."""
+def _motion(plant: ContactPlant, kind: Kind, number: int, rng: np.random.Generator) -> Truth:
+    """One motion of a kind as it truly is; every other drop is a toss."""
     world = World(plant, rng, finger=kind in ("push", "press"))
     low, high = world.corners[:, 2].min() - CORNER_M, world.corners[:, 2].max()
     upright = Rotation.from_euler("z", rng.uniform(-math.pi, math.pi))
     if kind == "drop":
-        return _drop(world, upright, rng)
+        return _drop(world, upright, rng, flat=number % 2 == 0)
     none = np.zeros(3)
     world.place(np.array([0.0, 0.0, -low]), upright, none, none)
     ahead = upright.apply([1.0, 0.0, 0.0])
@@ -205,9 +209,8 @@ def _motion(plant: ContactPlant, kind: Kind, rng: np.random.Generator) -> Truth:
     return world.run(0.9, lambda t: behind + ahead * (speed * t + 0.5 * acceleration * t**2))
 
 
-def _drop(world: World, upright: Rotation, rng: np.random.Generator) -> Truth:
+def _drop(world: World, upright: Rotation, rng: np.random.Generator, *, flat: bool) -> Truth:
     """Let go flat, or tossed with a spin; before that a hand holds it, or brings it to its speed."""
-    flat = rng.uniform() < 0.5
     tilt = Rotation.from_rotvec(rng.normal(0.0, 0.02 if flat else 1.0, 3)) * upright
     place = np.array([0.0, 0.0, rng.uniform(0.15, 0.3) - tilt.apply(world.corners)[:, 2].min()])
     velocity = np.array([*rng.normal(0.0, 0.1, 2), 0.0 if flat else rng.uniform(0.8, 1.6)])
@@ -232,7 +235,7 @@ class Tracker:
         self.late_s, self.force_n = rng.uniform(0.0, 1e-3), rng.uniform(0.005, 0.02)
 
     def see(self, truth: Truth, kind: Kind, file: str) -> ContactMotion:
-        """A state is taken late, some by a frame, and stamped with when it was asked for; some are missing."""
+        """States are late, some by a frame, and stamped with when they were asked for; some are missing."""
         rng, (time, pose, pusher, force) = self._rng, truth
         asked = np.arange(0.0, time[-1], 1.0 / self.rate)
         asked = asked[rng.uniform(size=len(asked)) > 0.02]
@@ -263,7 +266,7 @@ def hide_contact(plant: ContactPlant, out: Path, counts: Mapping[Kind, int] = CO
     rng = np.random.default_rng(plant.seed)
     tracker = Tracker(rng)
     motions = [
-        tracker.see(_motion(plant, kind, rng), kind, f"{kind}_{i}.csv")
+        tracker.see(_motion(plant, kind, i, rng), kind, f"{kind}_{i}.csv")
         for kind, count in counts.items()
         for i in range(count)
     ]

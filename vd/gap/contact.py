@@ -38,8 +38,8 @@ SMOOTH_S = 0.05
 """Window of the parabola that gives velocities [s]."""
 CLEAR_M = 0.003
 """An object flies if its lowest point is this far above the table: more than a tracker errs by [m]."""
-SURE_S = 0.1
-"""Before an impact a hand has let go for as long: a fall of 5 cm [s]."""
+SURE_S = 0.15
+"""Before an impact a hand has let go for as long: a fall of 11 cm [s]."""
 SLIDING, MOVING = 0.1, 0.3
 """Shares of the top speed down to which a slide, and a push, count: slower, noise decides the direction."""
 UPRIGHT_RAD = 0.05
@@ -252,7 +252,7 @@ def _released(motion: ContactMotion, part: slice) -> slice:
         longer = max(first - FEWEST, part.start)
         if np.median(_flight_errors(motion, slice(longer, end))[:FEWEST]) > OUTLIER * usual:
             # What the hand did to the first samples is still below noise there.
-            return slice(int(np.searchsorted(time, time[first] + 0.5 * SMOOTH_S)), end)
+            return slice(int(np.searchsorted(time, time[first] + SMOOTH_S)), end)
         first = longer
     return slice(first, end)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import tyro
 
 if TYPE_CHECKING:
@@ -67,7 +68,14 @@ class Contact:
 def identified(found: "Sequence[Found]") -> dict[str, tuple[tuple[float, ...], ...]]:
     """What is told, as :func:`vd.assets_usd.objects.contact_layer.write_contact_layer` takes it."""
     return {
-        each.name: tuple(tuple(map(float, ends)) for ends in (each.value, each.low, each.high))
+        each.name: (
+            tuple(each.value.tolist()),
+            # A coarse interval may reach below zero, which cannot be simulated.
+            tuple(
+                each.low.tolist() if len(each.low) > 1 else np.maximum(each.low, 0.1 * each.value).tolist()
+            ),
+            tuple(each.high.tolist()),
+        )
         for each in found
         if each.verdict != "unknown"
     }
