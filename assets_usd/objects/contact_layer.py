@@ -88,8 +88,8 @@ CONTACT: dict[str, ContactParameter] = {
 }
 """Parameters by name; names are a contract: USD attributes and keys of reports."""
 
-Identified = Mapping[str, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]]
-"""By parameter: value, low and high end of the 95 % interval, as many numbers each as the parameter has."""
+Identified = Mapping[str, tuple[tuple[float, ...], ...]]
+"""By parameter three tuples of as many numbers as it has: value, low and high end of the 95 % interval."""
 
 
 def write_contact_layer(path: Path, item_file: Path, found: Identified, recording: str) -> None:

@@ -99,7 +99,7 @@ class ObjectModel:
     content_hash: str = ""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    centre_of_mass: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    centre_of_mass: tuple[float, ...] = (0.0, 0.0, 0.0)
     contact: Identified = field(default_factory=dict)
 
     @property

@@ -74,8 +74,9 @@ def battery(which: str, seeds: int) -> list[Case]:
         which: ``development`` or ``closed``.
         seeds: Recordings of each parameter and cause; a quarter of each pair.
     """
-    kinds = [("single", (name,)) for name in CONTACT] + [("none", ())] * 10
-    cases = [*kinds, *(("outside", (name,)) for name in OUTSIDE)] * seeds
+    cases: list[tuple[str, tuple[str, ...]]] = [("single", (name,)) for name in CONTACT]
+    cases += [("none", ())] * 10 + [("outside", (name,)) for name in OUTSIDE]
+    cases *= seeds
     cases += [("pair", pair) for pair in itertools.combinations(CONTACT, 2)] * math.ceil(seeds / 4)
     return [Case(kind, hidden, FIRST_SEED[which] + i) for i, (kind, hidden) in enumerate(cases)]
 
@@ -93,7 +94,7 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
         "parameters": {
             each.name: {
                 "true": true[each.name],
-                "value": each.value.tolist(),
+                "value": [v if math.isfinite(v) else None for v in each.value.tolist()],
                 "verdict": each.verdict,
                 "covered": ((each.low <= true[each.name]) & (true[each.name] <= each.high)).tolist(),
             }

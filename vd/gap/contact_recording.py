@@ -94,14 +94,13 @@ def read_contact_recording(path: str | Path) -> ContactRecording:
     entries = header.get("trajectories")
     if not isinstance(entries, list) or not entries:
         raise RecordingError(f"{file}: 'trajectories' is empty; list at least one {{file, excitation}}")
-    names = [entry.get("file") if isinstance(entry, dict) else None for entry in entries]
-    for i, name in enumerate(names):
-        kind = entries[i].get("excitation") if name else None
-        if kind not in get_args(Kind):
+    for i, entry in enumerate(entries):
+        name, kind = (entry.get(key) if isinstance(entry, dict) else None for key in ("file", "excitation"))
+        if not isinstance(name, str) or kind not in get_args(Kind):
             raise RecordingError(
                 f"{file}: trajectories[{i}]: give 'file', and 'excitation' out of {', '.join(get_args(Kind))}"
             )
-        if name in names[:i] or Path(name).is_absolute() or ".." in Path(name).parts:
+        if any(name == other["file"] for other in entries[:i]) or Path(name).name != name:
             raise RecordingError(f"{file}: trajectories[{i}]: list {name!r} once, a file of this folder")
     motions = [_motion(file.parent / entry["file"], entry["excitation"], frames) for entry in entries]
     return ContactRecording(file.parent, tuple(motions))
