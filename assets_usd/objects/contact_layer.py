@@ -5,9 +5,7 @@ has what was identified, ``vd:contact:<parameter>``, with ``vd:contact:<paramete
 ends; SI units) for the 95 % interval, and mass and centre of mass in USD's own attributes besides.
 """
 
-import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -92,55 +90,17 @@ Identified = Mapping[str, tuple[tuple[float, ...], ...]]
 """By parameter three tuples of as many numbers as it has: value, low and high end of the 95 % interval."""
 
 
-def write_contact_layer(path: Path, item_file: Path, found: Identified, recording: str) -> None:
-    """Write what was identified as a layer over an object's file, atomically.
-
-    Args:
-        path: File to write, ``.usda``.
-        item_file: The object's file, which becomes a sublayer.
-        found: What was identified.
-        recording: From which recording, for people.
-
-    Raises:
-        ObjectError: The file is no object.
-    """
-    from pxr import Gf, Sdf
-
-    from vd.assets_usd.hand_layer import save_layer
-    from vd.assets_usd.objects.model import read_object
-
-    item = read_object(item_file)
-    layer = Sdf.Layer.CreateAnonymous(".usda")
-    layer.defaultPrim = item.name
-    layer.subLayerPaths.append(os.path.relpath(item_file.resolve(), path.resolve().parent))
-    layer.documentation = (
-        f"Contact of {item.name}, identified by vd-gap contact from {recording}: pass it as --objects."
-    )
-    layer.customLayerData = {"format": LAYER_FORMAT, "recording": recording}
-    prim = Sdf.PrimSpec(layer, item.name, Sdf.SpecifierOver)
-
-    author_contact(prim, found)
-    if "mass" in found:
-        mass = found["mass"][0][0]
-        moments = Gf.Vec3f(*map(float, item.inertia * mass / item.mass_kg))
-        _author(prim, "physics:mass", Sdf.ValueTypeNames.Float, mass)
-        _author(prim, "physics:diagonalInertia", Sdf.ValueTypeNames.Float3, moments)
-    if "centre_of_mass" in found:
-        centre = Gf.Vec3f(*found["centre_of_mass"][0])
-        _author(prim, "physics:centerOfMass", Sdf.ValueTypeNames.Point3f, centre)
-    save_layer(layer, path)
-
-
 def author_contact(prim: Any, found: Identified) -> None:
     """Author what was identified on the spec of an object's root prim, USD's own attributes apart."""
     from pxr import Sdf
 
     for name, (value, low, high) in found.items():
-        _author(prim, f"{NAMESPACE}:{name}", Sdf.ValueTypeNames.DoubleArray, list(value))
-        _author(prim, f"{NAMESPACE}:{name}:ci95", Sdf.ValueTypeNames.DoubleArray, [*low, *high])
+        author(prim, f"{NAMESPACE}:{name}", Sdf.ValueTypeNames.DoubleArray, list(value))
+        author(prim, f"{NAMESPACE}:{name}:ci95", Sdf.ValueTypeNames.DoubleArray, [*low, *high])
 
 
-def _author(prim: Any, name: str, kind: Any, value: Any) -> None:
+def author(prim: Any, name: str, kind: Any, value: Any) -> None:
+    """Author an attribute of a type of ``Sdf.ValueTypeNames`` on a prim's spec."""
     from pxr import Sdf
 
     custom = name.startswith(NAMESPACE)

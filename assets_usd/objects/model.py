@@ -12,6 +12,7 @@ Everything that is not geometry or physics (licence, source, errors, symmetries)
 the root prim under ``visualDexterity``. Files are binary crates (``.usd``): 150 objects are a few MB.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +21,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.objects.contact_layer import Identified, author_contact, read_contact
+from vd.assets_usd.objects.contact_layer import (
+    LAYER_FORMAT,
+    Identified,
+    author,
+    author_contact,
+    read_contact,
+)
 from vd.assets_usd.objects.geometry import Hull, Solid, principal_axes
 from vd.files import atomic_path
 from vd.paper import PAPER
@@ -360,6 +367,44 @@ def read_object(path: Path) -> ObjectModel:
         notes=tuple(str(data["notes"]).splitlines()),
         warnings=tuple(str(data.get("warnings", "")).splitlines()),
     )
+
+
+def write_contact_layer(path: Path, item_file: Path, found: Identified, recording: str) -> None:
+    """Write what was identified as a layer over an object's file, atomically.
+
+    Args:
+        path: File to write, ``.usda``.
+        item_file: The object's file, which becomes a sublayer.
+        found: What was identified.
+        recording: From which recording, for people.
+
+    Raises:
+        ObjectError: The file is no object.
+    """
+    from pxr import Gf, Sdf
+
+    from vd.assets_usd.hand_layer import save_layer
+
+    item = read_object(item_file)
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.defaultPrim = item.name
+    layer.subLayerPaths.append(os.path.relpath(item_file.resolve(), path.resolve().parent))
+    layer.documentation = (
+        f"Contact of {item.name}, identified by vd-gap contact from {recording}: pass it as --objects."
+    )
+    layer.customLayerData = {"format": LAYER_FORMAT, "recording": recording}
+    prim = Sdf.PrimSpec(layer, item.name, Sdf.SpecifierOver)
+
+    author_contact(prim, found)
+    if "mass" in found:
+        mass = found["mass"][0][0]
+        moments = Gf.Vec3f(*map(float, item.inertia * mass / item.mass_kg))
+        author(prim, "physics:mass", Sdf.ValueTypeNames.Float, mass)
+        author(prim, "physics:diagonalInertia", Sdf.ValueTypeNames.Float3, moments)
+    if "centre_of_mass" in found:
+        centre = Gf.Vec3f(*found["centre_of_mass"][0])
+        author(prim, "physics:centerOfMass", Sdf.ValueTypeNames.Point3f, centre)
+    save_layer(layer, path)
 
 
 def object_files(folder: Path) -> list[Path]:

@@ -38,8 +38,7 @@ class Contact:
         from vd.gap.contact_recording import read_contact_recording
 
         recording, began = read_contact_recording(self.recording), time.perf_counter()
-        from vd.assets_usd.objects.contact_layer import write_contact_layer
-        from vd.assets_usd.objects.model import read_object
+        from vd.assets_usd.objects.model import read_object, write_contact_layer
         from vd.files import make_folder, write_json
         from vd.gap.contact import identify_contact
 
