@@ -12,6 +12,7 @@ Everything that is not geometry or physics (licence, source, errors, symmetries)
 the root prim under ``visualDexterity``. Files are binary crates (``.usd``): 150 objects are a few MB.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +21,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vd.assets_usd.objects.contact_layer import (
+    LAYER_FORMAT,
+    Identified,
+    author,
+    author_contact,
+    read_contact,
+)
 from vd.assets_usd.objects.geometry import Hull, Solid, principal_axes
 from vd.files import atomic_path
 from vd.paper import PAPER
@@ -51,7 +59,7 @@ class ObjectError(ValueError):
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """A rigid object with its origin at the centre of mass (object frame, SI).
+    """A rigid object with its origin at the centre of its volume (object frame, SI).
 
     Attributes:
         name: Prim and file name.
@@ -74,6 +82,8 @@ class ObjectModel:
         content_hash: Hash of what the file was made from; equal hashes need no new work.
         notes: What was repaired or assumed.
         warnings: What may be wrong with the object: reports on it repeat them.
+        centre_of_mass: In the object frame, [3]; the origin unless it was identified.
+        contact: What was identified of its contact (:mod:`vd.assets_usd.objects.contact_layer`).
     """
 
     name: str
@@ -96,6 +106,8 @@ class ObjectModel:
     content_hash: str = ""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    centre_of_mass: tuple[float, ...] = (0.0, 0.0, 0.0)
+    contact: Identified = field(default_factory=dict)
 
     @property
     def inertia_matrix(self) -> np.ndarray:
@@ -117,6 +129,7 @@ class ObjectModel:
             hulls=tuple(hull._replace(vertices=hull.vertices * np.float32(factor)) for hull in self.hulls),
             inertia=self.inertia * factor**2,
             surface_points=self.surface_points * np.float32(factor),
+            centre_of_mass=tuple(factor * c for c in self.centre_of_mass),
             scale=self.scale * factor,
         )
 
@@ -200,7 +213,7 @@ def write_object(path: Path, model: ObjectModel) -> Path:
     UsdPhysics.RigidBodyAPI.Apply(prim)
     mass = UsdPhysics.MassAPI.Apply(prim)
     mass.CreateMassAttr(model.mass_kg)
-    mass.CreateCenterOfMassAttr(Gf.Vec3f(0.0))
+    mass.CreateCenterOfMassAttr(Gf.Vec3f(*model.centre_of_mass))
     mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, model.inertia)))
     x, y, z, w = map(float, model.inertia_quat)
     mass.CreatePrincipalAxesAttr(Gf.Quatf(w, x, y, z))
@@ -234,6 +247,7 @@ def write_object(path: Path, model: ObjectModel) -> Path:
             ),
         },
     )
+    author_contact(stage.GetRootLayer().GetPrimAtPath(root), model.contact)
     with atomic_path(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise OSError(f"{path}: USD could not write the object; is the disk full?")
@@ -247,14 +261,24 @@ def _key(name: str) -> str:
 
 
 def _layer(path: Path) -> Any:
-    """The layer of a USD file as it is now; None if it is none."""
-    from pxr import Sdf, Tf
+    """The layer of a USD file as it is now, with its sublayers in it; None if it is none."""
+    from pxr import Sdf, Tf, Usd
 
     try:
         # Anonymous: a layer cached by path would hide that the file was written anew.
-        return Sdf.Layer.OpenAsAnonymous(str(path))
+        layer = Sdf.Layer.OpenAsAnonymous(str(path))
     except Tf.ErrorException:
         return None
+    if layer is None or not layer.subLayerPaths:
+        return layer
+    below = [(path.parent / name, _layer(path.parent / name)) for name in layer.subLayerPaths]
+    for file, sublayer in below:
+        if sublayer is None:
+            raise ObjectError(
+                f"{path}: its sublayer {file} is missing or no USD; put the object's file there"
+            )
+    layer.subLayerPaths = [sublayer.identifier for _, sublayer in below]
+    return Usd.Stage.Open(layer).Flatten()
 
 
 def _custom(layer: Any) -> dict[str, Any]:
@@ -310,6 +334,10 @@ def read_object(path: Path) -> ObjectModel:
             raise ObjectError(f"{path}: {relative}.{attribute} is missing; import the object again")
         return np.array(value, dtype=dtype).reshape(-1, columns)
 
+    try:
+        contact = read_contact(prim, str(path))
+    except ValueError as error:
+        raise ObjectError(str(error)) from error
     hulls = []
     collision = stage.GetPrimAtPath(root.AppendPath("collision"))
     for child in collision.GetChildren() if collision else ():
@@ -329,6 +357,8 @@ def read_object(path: Path) -> ObjectModel:
         faces=array("visual", "faceVertexIndices", 3, np.int32),
         hulls=tuple(hulls),
         mass_kg=float(mass.GetMassAttr().Get()),
+        centre_of_mass=tuple(map(float, mass.GetCenterOfMassAttr().Get() or (0.0, 0.0, 0.0))),
+        contact=contact,
         inertia=np.array(mass.GetDiagonalInertiaAttr().Get(), dtype=np.float64),
         inertia_quat=quat / np.linalg.norm(quat),
         surface_points=array("surface_points", "points", 3, np.float32),
@@ -337,6 +367,44 @@ def read_object(path: Path) -> ObjectModel:
         notes=tuple(str(data["notes"]).splitlines()),
         warnings=tuple(str(data.get("warnings", "")).splitlines()),
     )
+
+
+def write_contact_layer(path: Path, item_file: Path, found: Identified, recording: str) -> None:
+    """Write what was identified as a layer over an object's file, atomically.
+
+    Args:
+        path: File to write, ``.usda``.
+        item_file: The object's file, which becomes a sublayer.
+        found: What was identified.
+        recording: From which recording, for people.
+
+    Raises:
+        ObjectError: The file is no object.
+    """
+    from pxr import Gf, Sdf
+
+    from vd.assets_usd.hand_layer import save_layer
+
+    item = read_object(item_file)
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.defaultPrim = item.name
+    layer.subLayerPaths.append(os.path.relpath(item_file.resolve(), path.resolve().parent))
+    layer.documentation = (
+        f"Contact of {item.name}, identified by vd-gap contact from {recording}: pass it as --objects."
+    )
+    layer.customLayerData = {"format": LAYER_FORMAT, "recording": recording}
+    prim = Sdf.PrimSpec(layer, item.name, Sdf.SpecifierOver)
+
+    author_contact(prim, found)
+    if "mass" in found:
+        mass = found["mass"][0][0]
+        moments = Gf.Vec3f(*map(float, item.inertia * mass / item.mass_kg))
+        author(prim, "physics:mass", Sdf.ValueTypeNames.Float, mass)
+        author(prim, "physics:diagonalInertia", Sdf.ValueTypeNames.Float3, moments)
+    if "centre_of_mass" in found:
+        centre = Gf.Vec3f(*found["centre_of_mass"][0])
+        author(prim, "physics:centerOfMass", Sdf.ValueTypeNames.Point3f, centre)
+    save_layer(layer, path)
 
 
 def object_files(folder: Path) -> list[Path]:

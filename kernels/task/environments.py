@@ -32,6 +32,9 @@ def write_friction_kernel(
     shape_world: wp.array[wp.int32],  # [S] world of each shape
     shape_kind: wp.array[wp.int32],  # [S] kind of each shape
     nominal: wp.array[float],  # [S] friction of each shape before randomisation
+    table_share: wp.array[
+        float
+    ],  # [N] share of the table's friction in that of the pair; 1: it is the pair's
     nominal_hand: float,  # friction of the hand that ``hand_friction`` replaces
     kind_table: int,  # kind of the table
     kind_object: int,  # kind of the object's parts
@@ -46,8 +49,9 @@ def write_friction_kernel(
     """Write each shape's friction so that the solver's pair value is the average of the two bodies'.
 
     The solver takes the friction of the geom with the higher priority: table over hand over object.
-    So the table carries the average of table and object, a hand shape that of hand and object; a
-    fingertip whose material differs from the nominal hand's keeps its ratio to it. Launch [S].
+    So the table carries the average of table and object, unless the pair's was measured, a hand shape that
+    of hand and object; a fingertip whose material differs from the nominal hand's keeps its ratio to it.
+    Launch [S].
     """
     shape = wp.tid()
     world = shape_world[shape]
@@ -57,7 +61,8 @@ def write_friction_kernel(
     if kind == kind_object:
         friction_out[shape] = object_friction[world]
     elif kind == kind_table:
-        friction_out[shape] = 0.5 * (table_friction[world] + object_friction[world])
+        share = table_share[world]
+        friction_out[shape] = share * table_friction[world] + (1.0 - share) * object_friction[world]
     elif kind == kind_hand:
         hand = hand_friction[world] * nominal[shape] / nominal_hand
         friction_out[shape] = 0.5 * (hand + object_friction[world])

@@ -16,9 +16,7 @@ class RandomisationParams:
     """Ranges of the draws; an array of length 1 in device memory."""
 
     friction: wp.vec2  # friction coefficient of the hand, and of the object
-    table_friction: wp.vec2  # friction coefficient of the table
     link_mass_scale: wp.vec2  # factor on each link's mass
-    object_mass: wp.vec2  # mass of the object [kg]
     action_offset_std: float  # standard deviation of the constant action error, in action units
     observation_offset_std: float  # standard deviation of the constant error of each observed value
 
@@ -39,6 +37,7 @@ def draw_dynamics_kernel(
     nominal_kd: wp.array[float],  # [D] damping before randomisation [N m s/rad]
     kp_scale: wp.array[wp.vec2],  # [D] range of the factor on the stiffness
     kd_scale: wp.array[wp.vec2],  # [D] range of the factor on the damping
+    table_friction: wp.array[wp.vec2],  # [N] range of the friction coefficient of the table
     params: wp.array[RandomisationParams],  # [1] ranges
     # In:
     mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
@@ -68,10 +67,10 @@ def draw_dynamics_kernel(
         action_offset_out[world, joint] = settings.action_offset_std * wp.randn(state)
     state, hand_friction = uniform(state, settings.friction)
     state, object_friction = uniform(state, settings.friction)
-    state, table_friction = uniform(state, settings.table_friction)
+    state, drawn_table_friction = uniform(state, table_friction[world])
     hand_friction_out[world] = hand_friction
     object_friction_out[world] = object_friction
-    table_friction_out[world] = table_friction
+    table_friction_out[world] = drawn_table_friction
     for i in range(observation_offset_out.shape[1]):
         observation_offset_out[world, i] = settings.observation_offset_std * wp.randn(state)
     rng[world] = next_stream(state, world)
@@ -123,6 +122,7 @@ def draw_servo_kernel(
 @wp.kernel
 def draw_masses_kernel(
     # Model:
+    object_mass: wp.array[wp.vec2],  # [N] range of the mass of the object [kg]
     params: wp.array[RandomisationParams],  # [1] ranges
     # In:
     mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
@@ -141,7 +141,7 @@ def draw_masses_kernel(
     for link in range(link_mass_scale_out.shape[1]):
         state, scale = uniform(state, settings.link_mass_scale)
         link_mass_scale_out[world, link] = scale
-    state, mass = uniform(state, settings.object_mass)
+    state, mass = uniform(state, object_mass[world])
     object_mass_out[world] = mass
     rng[world] = next_stream(state, world)
 

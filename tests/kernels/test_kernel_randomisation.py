@@ -19,9 +19,7 @@ from vd.paper import PAPER
 DR = PAPER.randomisation
 RANGES = {
     "friction": wp.vec2(*DR.friction),
-    "table_friction": wp.vec2(*DR.table_friction),
     "link_mass_scale": wp.vec2(*DR.link_mass_scale),
-    "object_mass": wp.vec2(*DR.object_mass_kg),
     "action_offset_std": DR.action_offset_std_code,
     "observation_offset_std": PAPER.observation.noise_offset_std_code,
 }
@@ -43,7 +41,12 @@ def draw_dynamics(device, mask, fingers=3, seed=0, observation_size=87):
     shapes = [(worlds, joints)] * 2 + [worlds] * 3 + [(worlds, joints), (worlds, observation_size)]
     inputs = [np.tile(KP, fingers), np.tile(KD, fingers)]
     inputs += [np.broadcast_to(scale, (joints, 2)) for scale in (DR.stiffness_scale, DR.damping_scale)]
-    inputs += [RANGES, mask, rng := streams(worlds, seed, device)]
+    inputs += [
+        np.broadcast_to(DR.table_friction, (worlds, 2)),
+        RANGES,
+        mask,
+        rng := streams(worlds, seed, device),
+    ]
     drawn = launch(draw_dynamics_kernel, worlds, inputs, device, *shapes)
     return {**dict(zip(OUTPUTS, drawn, strict=True)), "rng": rng.numpy()}
 
@@ -51,7 +54,8 @@ def draw_dynamics(device, mask, fingers=3, seed=0, observation_size=87):
 def draw_masses(device, mask, links=9, seed=0):
     """Launch; returns link scales, object masses and streams."""
     worlds = len(mask)
-    inputs = [RANGES, mask, rng := streams(worlds, seed, device)]
+    masses = np.broadcast_to(DR.object_mass_kg, (worlds, 2))
+    inputs = [masses, RANGES, mask, rng := streams(worlds, seed, device)]
     return *launch(draw_masses_kernel, worlds, inputs, device, (worlds, links), worlds), rng.numpy()
 
 

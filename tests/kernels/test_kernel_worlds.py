@@ -92,6 +92,7 @@ def test_friction_of_a_pair_is_the_average(device, seed, worlds):
     world, kind = random.integers(-1, worlds, shapes), random.integers(0, 4, shapes)
     nominal = random.uniform(0.5, 1.5, shapes).astype(np.float32)
     hand, item, table = random.uniform(0.05, 1.6, (3, worlds)).astype(np.float32)
+    share = random.choice([0.5, 1.0], worlds).astype(np.float32)
     before = random.uniform(size=shapes).astype(np.float32)
     expected = before.copy()
     for s in range(shapes):
@@ -101,11 +102,11 @@ def test_friction_of_a_pair_is_the_average(device, seed, worlds):
         if kind[s] == 2:
             expected[s] = item[w]
         elif kind[s] == 1:
-            expected[s] = 0.5 * (table[w] + item[w])
+            expected[s] = share[w] * table[w] + (1.0 - share[w]) * item[w]
         elif kind[s] == 3:
             expected[s] = 0.5 * (hand[w] * nominal[s] / FRICTION + item[w])
     out = device_array(before, float, device)
-    inputs = [world, kind, nominal, FRICTION, 1, 2, 3, hand, item, table, out]
+    inputs = [world, kind, nominal, share, FRICTION, 1, 2, 3, hand, item, table, out]
     launch(write_friction_kernel, shapes, inputs, device)
     np.testing.assert_allclose(out.numpy(), expected, rtol=1e-5)
 

@@ -188,11 +188,33 @@ class GapCommand:
         return 0
 
 
+@dataclass(frozen=True)
+class ContactCommand:
+    """The battery of vd-gap contact: parameters hidden in MuJoCo, named or not. Run it again to go on."""
+
+    out: Path = Path("runs/contact-battery")
+    """Folder of the results and their tables (summary.md)."""
+    seeds: int = 10
+    """Recordings of each parameter; ten times as many with nothing hidden."""
+    battery: Literal["development", "closed"] = "development"
+    """Seeds to develop on, or those that judge a finished method once."""
+    jobs: int = 1
+    """Cases at a time, one process and one thread each."""
+
+    def run(self) -> int:
+        """Run the cases, then write and print the tables."""
+        from vd.bench.contact import battery, run_battery, summary
+
+        print(summary(run_battery(battery(self.battery, self.seeds), self.out, self.jobs)))
+        return 0
+
+
 Command = (
     Annotated[SimCommand, tyro.conf.subcommand("sim")]
     | Annotated[PhysicsCommand, tyro.conf.subcommand("physics")]
     | Annotated[DepthCommand, tyro.conf.subcommand("depth")]
     | Annotated[GapCommand, tyro.conf.subcommand("gap")]
+    | Annotated[ContactCommand, tyro.conf.subcommand("contact")]
 )
 
 
@@ -204,7 +226,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"vd-bench: {given[0]!r} is no more: {GONE[given[0]]}", file=sys.stderr)
         return interrupt.USAGE_ERROR
     command = parse(Command, arguments, prog="vd-bench", description=__doc__)
-    if isinstance(command, GapCommand):
+    if isinstance(command, GapCommand | ContactCommand):
         check_folder(command.out)
     elif isinstance(command, Measurement) and command.json is not None:
         check_file(command.json)

@@ -79,9 +79,7 @@ class TaskParameters:
         self.randomisation = array(
             RandomisationParams,
             friction=span(random.friction, materials.friction),
-            table_friction=span(random.table_friction, cfg.table_friction),
             link_mass_scale=span(random.link_mass_scale, 1.0),
-            object_mass=span(random.object_mass_kg, materials.object_mass_kg),
             action_offset_std=on * random.action_offset_std,
             observation_offset_std=on * random.observation_offset_std,
         )

@@ -1,9 +1,13 @@
 """Domain randomisation (Table S3): draws on the device, written into the simulator's model."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import newton
 import numpy as np
 import warp as wp
 
+from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.servo import gain_scales
 from vd.envs.task_state import TaskState
 from vd.kernels.servo.actuators import INERTIA, PAYLOAD_INERTIA
@@ -73,12 +77,36 @@ class Randomiser:
         )
         inertia = state.servo_ranges[:, [INERTIA, PAYLOAD_INERTIA]]
         self._inertia_varies = bool(np.any(inertia[..., 0] != inertia[..., 1]))
+        random = cfg.randomisation
+        nominal = (cfg.table_friction,) * 2, (PAPER.materials.object_mass_kg,) * 2
+        usual = (random.table_friction, random.object_mass_kg) if self.enabled else nominal
+        self._table_friction = self._ranges("table_friction", usual[0])
+        self._object_mass = self._ranges("mass", usual[1])
+        measured = self._of_objects(["table_friction" in item.contact for item in state.objects])
+        # The average of table and object, as the paper's engine has it; what was measured is of the pair.
+        self._table_share = wp.array(np.where(measured, 1.0, 0.5), dtype=float, device=device)
         self._shape_kind = wp.array(scene.shape_kind, dtype=wp.int32, device=device)
         self._nominal_friction = wp.clone(model.shape_material_mu)
         self._places = wp.clone(state.sim.solver.mjw_data.geom_xpos)
         self._model_kp = model.joint_target_ke.reshape((n, -1))
         self._model_kd = model.joint_target_kd.reshape((n, -1))
         self._draw_masses()
+
+    def _of_objects(self, values: Sequence[Any]) -> np.ndarray:
+        """A value of each object as one of each environment, shape [N, ...]."""
+        return np.array(values)[self._state.scene.world_object]
+
+    def _ranges(self, name: str, usual: tuple[float, float]) -> wp.array:
+        """Range of a parameter in each environment [N]: an identified one varies within its interval."""
+
+        def of(item: ObjectModel) -> tuple[float, float]:
+            if name not in item.contact:
+                return usual
+            (value,), (low,), (high,) = item.contact[name]
+            return (low, high) if usual[0] < usual[1] else (value, value)
+
+        ranges = self._of_objects([of(item) for item in self._state.objects])
+        return wp.array(ranges, dtype=wp.vec2, device=self._state.device)
 
     def _draw_masses(self) -> None:
         """Draw link and object masses, with which inertias scale, and where the objects' centres are."""
@@ -88,7 +116,7 @@ class Randomiser:
         everywhere = wp.ones(n, dtype=wp.int32, device=state.device)
         state.launch(
             draw_masses_kernel,
-            [state.parameters.randomisation, everywhere, state.rng],
+            [self._object_mass, state.parameters.randomisation, everywhere, state.rng],
             [link_scale, self.object_mass],
         )
         factor = np.ones((n, state.scene.bodies_per_world))
@@ -131,7 +159,7 @@ class Randomiser:
     def _draw_dynamics(self, mask: wp.array) -> None:
         """Draw gains, frictions and constant errors."""
         state = self._state
-        ranges = self._kp_scale, self._kd_scale, state.parameters.randomisation
+        ranges = self._kp_scale, self._kd_scale, self._table_friction, state.parameters.randomisation
         state.launch(
             draw_dynamics_kernel,
             [self._nominal_kp, self._nominal_kd, *ranges, mask, state.rng],
@@ -221,6 +249,7 @@ class Randomiser:
                 model.shape_world,
                 self._shape_kind,
                 self._nominal_friction,
+                self._table_share,
                 PAPER.materials.friction,
                 SHAPE_TABLE,
                 SHAPE_OBJECT,

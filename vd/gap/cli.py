@@ -13,6 +13,7 @@ from vd import interrupt
 from vd.command_line import parse
 from vd.device import resolve_device
 from vd.files import check_file, check_folder
+from vd.gap.contact_cli import Contact, HideContact
 from vd.gap.convert import Convert
 from vd.warp_quiet import quiet_warp
 
@@ -285,15 +286,17 @@ Command = (
     | Annotated[Identify, tyro.conf.subcommand("identify")]
     | Annotated[Hide, tyro.conf.subcommand("hide")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[Contact, tyro.conf.subcommand("contact")]
+    | Annotated[HideContact, tyro.conf.subcommand("hide-contact")]
 )
 
 
 @interrupt.command("vd-gap")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
-    command: Run | Find | Explain | Close | Report | Plan | Identify | Hide | Convert = parse(
-        Command, arguments, prog="vd-gap", description=__doc__
-    )
+    command: (
+        Run | Find | Explain | Close | Report | Plan | Identify | Hide | Convert | Contact | HideContact
+    ) = parse(Command, arguments, prog="vd-gap", description=__doc__)
     from vd.gap.recording import RecordingError
 
     try:

@@ -3,6 +3,7 @@
 World frame: z up, table top at z = 0, all worlds at one origin. SI units, quaternions xyzw.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -11,6 +12,7 @@ import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
+from scipy.optimize import brentq
 
 from vd.assets_usd.hand_model import HandModel, open_stage
 from vd.assets_usd.objects.model import ObjectModel
@@ -103,6 +105,20 @@ def contact_attributes(priority: int, condim: int = CONDIM_SLIDING) -> dict[str,
     }
 
 
+def damping_ratio(restitution: float) -> float:
+    """Of a spring and a damper that push but never pull, whose impacts have this restitution.
+
+    Critically damped it is exp(-2), the least there is here.
+    """
+
+    def kept(ratio: float) -> float:
+        root = math.sqrt(1.0 - ratio**2)
+        return math.exp(-ratio / root * math.atan2(2.0 * ratio * root, 2.0 * ratio**2 - 1.0)) - restitution
+
+    low, high = 1e-6, 1.0 - 1e-6
+    return float(brentq(kept, low, high)) if kept(low) > 0.0 > kept(high) else high
+
+
 def shape_cfg(cfg: SimCfg, friction: float, *, visual: bool = False) -> newton.ModelBuilder.ShapeConfig:
     """Newton's shape settings for a colliding (or visual-only) shape."""
     # kd and ke such that MuJoCo's solref becomes (time constant, damping ratio 1).
@@ -175,19 +191,26 @@ def _group_fingers(builder: newton.ModelBuilder, hand: HandModel) -> None:
                 builder.shape_collision_group[shape] = OBJECT_GROUP - 1 - finger
 
 
-def add_table(builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool) -> None:
+def add_table(
+    builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool, item: ObjectModel | None = None
+) -> None:
     """Add the table of this world: a plane to the physics, a box to the eye.
+
+    Objects bounce on it as their files say, where they were identified (``item``), and hardly otherwise.
 
     The paper's table reaches 0.3 m to each side and an object counts as lost at half of that, so
     nothing can tell a plane from it, except that contacts with a plane are exact: against a box, a
     quarter of the imported objects never come to rest.
     """
+    surface = shape_cfg(cfg, PAPER.materials.table_friction)
+    if item is not None and "restitution" in item.contact:
+        surface.kd *= damping_ratio(item.contact["restitution"][0][0])
     builder.add_shape_plane(
         plane=(0.0, 0.0, 1.0, -PAPER.scene.table_top_m),
         width=0.0,
         length=0.0,
         body=-1,
-        cfg=shape_cfg(cfg, PAPER.materials.table_friction),
+        cfg=surface,
         label=TABLE_LABEL,
         custom_attributes=contact_attributes(PRIORITY_TABLE),
     )
@@ -228,7 +251,7 @@ def add_object(
 
     Args:
         builder: The world's builder.
-        item: The object; its frame's origin is its centre of mass.
+        item: The object.
         cfg: Contact settings.
         at: Where it is [m].
         scale: Uniform factor on its size. The mass stays; the inertia follows the size.
@@ -236,6 +259,7 @@ def add_object(
     """
     body = builder.add_body(
         xform=wp.transform(wp.vec3(*at), wp.quat_identity()),
+        com=wp.vec3(*(scale * c for c in item.centre_of_mass)),
         mass=item.mass_kg,
         inertia=wp.mat33(*(item.inertia_matrix * scale**2).flatten()),
         label=OBJECT_LABEL,
@@ -309,7 +333,7 @@ def build_scene(
             world = new_builder()
             world.add_builder(hand_builder)
             if not hand.palm_up:  # what rests in a hand needs no table, and what falls from it is lost
-                add_table(world, cfg, visible=visuals)
+                add_table(world, cfg, visible=visuals, item=item)
             add_object(world, item, cfg, at=hand.workspace.drop_m, scale=float(scale), visuals=visuals)
             scene.replicate(world, int(copies))
             worlds.append((world, int(copies)))

@@ -1,0 +1,154 @@
+"""The battery of ``vd-gap contact``: does it name what is hidden in a plant of MuJoCo, and nothing else?"""
+
+import itertools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vd.assets_usd.objects.contact_layer import CONTACT
+from vd.assets_usd.objects.sets import load_set
+from vd.bench.gap_score import Figure
+from vd.bench.hidden_contact import OUTSIDE, ContactPlant, hide_contact
+from vd.files import make_folder, write_json, write_text
+from vd.gap.contact import by_weight, identify_contact, verdict
+from vd.gap.contact_recording import read_contact_recording
+from vd.workers import run_tasks
+
+FIRST_SEED = {"development": 0, "closed": 100_000}
+OBJECTS = ("cube", "cuboid")
+CASE_LIMIT_S = 900.0
+"""Longest time of a case [s]; one that takes longer has failed."""
+SIZES: Mapping[str, tuple[tuple[float, float], ...]] = {
+    "table_friction": ((-0.4, -0.12), (0.12, 0.3)),
+    "restitution": ((0.15, 0.6),),
+    "mass": ((-0.06, -0.03), (0.03, 0.15)),
+    "centre_of_mass": ((0.006, 0.015),),
+    "tip_compliance": ((0.5e-3, 3.0e-3),),
+    "speed_friction": ((0.2, 0.5),),
+    "stiffening_tip": ((200.0, 500.0),),
+    "tilted_table": ((0.03, 0.08),),
+}
+"""Ranges of what is hidden (ours): from twice what matters to a policy on, beside the nominal value. Outside
+the table: growth with the speed [s/m], growth with the depth [1/m], angle [rad]."""
+
+
+class Case(NamedTuple):
+    """One recording: its kind, what is hidden, and its seed."""
+
+    kind: str
+    hidden: tuple[str, ...]
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its result file."""
+        return "-".join([self.kind, *self.hidden, str(self.seed)])
+
+    def plant(self) -> ContactPlant:
+        """The plant with random sizes."""
+        rng = np.random.default_rng(self.seed)
+        item = load_set(OBJECTS[self.seed % len(OBJECTS)])[0]
+        values, outside = {}, {}
+        for name in self.hidden:
+            size = rng.uniform(*SIZES[name][rng.integers(len(SIZES[name]))])
+            if name in OUTSIDE:
+                outside[name] = size
+                continue
+            nominal = CONTACT[name].of(item)
+            direction = rng.normal(size=3)
+            vector = size * direction / np.linalg.norm(direction)
+            values[name] = nominal[0] + size if len(nominal) == 1 else tuple(vector.tolist())
+        return ContactPlant(item, values, outside, self.seed)
+
+
+def battery(which: str, seeds: int) -> list[Case]:
+    """The cases: every parameter and cause outside the table, ten times as often nothing, pairs.
+
+    Args:
+        which: ``development`` or ``closed``.
+        seeds: Recordings of each parameter and cause; a quarter of each pair.
+    """
+    cases: list[tuple[str, tuple[str, ...]]] = [("single", (name,)) for name in CONTACT]
+    cases += [("none", ())] * 10 + [("outside", (name,)) for name in OUTSIDE]
+    cases *= seeds
+    cases += [("pair", pair) for pair in itertools.combinations(CONTACT, 2)] * math.ceil(seeds / 4)
+    return [Case(kind, hidden, FIRST_SEED[which] + i) for i, (kind, hidden) in enumerate(cases)]
+
+
+def run_case(case: Case, folder: Path) -> dict[str, Any]:
+    """Make the recording, analyse it, compare; writes ``folder/CASE.json``."""
+    plant = case.plant()
+    with TemporaryDirectory() as work:
+        true = hide_contact(plant, Path(work) / "recording")["parameters"]
+        found = identify_contact(read_contact_recording(Path(work) / "recording"), plant.item)
+    result = {
+        "case": case._asdict(),
+        "verdict": verdict(found),
+        "named": [each.name for each in by_weight(found)],
+        "parameters": {
+            each.name: {
+                "true": true[each.name],
+                "value": [v if math.isfinite(v) else None for v in each.value.tolist()],
+                "verdict": each.verdict,
+                "covered": ((each.low <= true[each.name]) & (true[each.name] <= each.high)).tolist(),
+            }
+            for each in found
+        },
+    }
+    write_json(folder / f"{case.name}.json", result)
+    return result
+
+
+def run_battery(cases: Sequence[Case], folder: Path, jobs: int) -> list[dict[str, Any]]:
+    """Run the cases that have no result yet, with a line for each; returns the results of all."""
+    make_folder(folder)
+    files = {case: folder / f"{case.name}.json" for case in cases}
+    done = {case: json.loads(file.read_text()) for case, file in files.items() if file.is_file()}
+
+    def finished(case: Case, result: dict[str, Any] | None, why: str) -> None:
+        done[case] = result or {"case": case._asdict(), "error": why}
+        said = why if result is None else ", ".join(result["named"]) or "nothing"
+        print(f"[{len(done)}/{len(cases)}] {case.name}: {said}", flush=True)
+
+    waiting = [case for case in cases if case not in done]
+    run_tasks(partial(run_case, folder=folder), waiting, finished, jobs=jobs, limit_s=CASE_LIMIT_S)
+    write_text(folder / "summary.md", summary([done[case] for case in cases]))
+    return [done[case] for case in cases]
+
+
+def summary(results: Sequence[Mapping[str, Any]]) -> str:
+    """The goals' figures as a table, failed cases counted against them; then what was not named as hidden."""
+
+    def of(kind: str) -> list[Mapping[str, Any]]:
+        return [result for result in results if result["case"]["kind"] == kind]
+
+    def named(result: Mapping[str, Any]) -> list[str]:
+        return list(result.get("named", ["failed"]))
+
+    def hidden(result: Mapping[str, Any]) -> list[str]:
+        return [OUTSIDE.get(name, name) for name in result["case"]["hidden"]]
+
+    def clean(among: Sequence[Mapping[str, Any]]) -> list[bool]:
+        return [set(named(r)) <= set(hidden(r)) for r in among]
+
+    told = [p for r in results if r["case"]["kind"] != "outside" for p in r.get("parameters", {}).values()]
+    covers = [c for p in told if p["verdict"] != "unknown" for c in p["covered"]]
+    figures = [
+        Figure("first name right", [named(r)[:1] == hidden(r) for r in of("single")], least=0.9),
+        Figure("one hidden: no false name", clean(of("single")), least=0.98),
+        Figure("nothing hidden: no false name", clean(of("none")), least=0.98),
+        Figure("two hidden: both named, nothing else", [set(named(r)) == set(hidden(r)) for r in of("pair")]),
+        Figure("outside the table: nothing or the nearest", clean(of("outside"))),
+        Figure("95 % intervals that cover", covers),
+        Figure("parameters told", [p["verdict"] != "unknown" for p in told]),
+    ]
+    wrong = [r for r in results if set(named(r)) != set(hidden(r)) and r["case"]["kind"] != "outside"]
+    lines = [f"- {Case(**r['case']).name}: {', '.join(named(r)) or 'nothing'}" for r in wrong]
+    head = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
+    return "\n".join([*head, *(figure.row() for figure in figures), "", "Not as hidden:", "", *lines]) + "\n"

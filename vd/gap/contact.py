@@ -1,0 +1,392 @@
+"""What the recorded motions of an object tell of its contact.
+
+Nothing is simulated. Each parameter is the slope of a law that is exact for a rigid object, fitted by linear
+least squares to every motion that obeys it:
+
+- ``table_friction`` mu: a sliding object slows down by mu g, its path is s0 + v t - mu g t^2 / 2.
+- ``centre_of_mass`` d: in flight o(t) + R(t) d is on a parabola, o the object's origin.
+- ``restitution`` e: what hits the table under the centre of mass leaves with e times the speed it came with.
+- ``mass`` m: while a pushed object slides, the impulse of the push is m (change of velocity + mu g time).
+- ``tip_compliance`` c: the rigid part of a pressing finger comes nearer by c times the force.
+
+The unit of all intervals is the motion, since residuals within one are correlated.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
+from scipy.stats import t as student
+
+from vd.assets_usd.objects.contact_layer import CONTACT
+from vd.assets_usd.objects.model import ObjectModel
+from vd.gap.contact_recording import ContactMotion, ContactRecording, Kind
+from vd.gap.recording_checks import RecordingError
+
+GRAVITY = 9.81
+FALSE_NAMES = 0.02
+"""Share of recordings without a gap in which any name may be given; split evenly over all numbers."""
+OUTLIER = 3.5
+"""Residuals beyond this many standard deviations, by the median, are samples that came late."""
+FEWEST = 5
+"""Samples below which a stretch of a motion is no evidence; motions: three."""
+SMOOTH_S = 0.05
+"""Window of the parabola that gives velocities [s]."""
+CLEAR_M = 0.003
+"""An object flies if its lowest point is this far above the table: more than a tracker errs by [m]."""
+SURE_S = 0.15
+"""Before an impact a hand has let go for as long: a fall of 11 cm [s]."""
+SLIDING, MOVING = 0.1, 0.3
+"""Shares of the top speed down to which a slide, and a push, count: slower, noise decides the direction."""
+UPRIGHT_RAD = 0.05
+"""Tilt within which a sliding object stays: more is tumbling or rolling."""
+TURNING = 0.3
+"""Speed of the rim by turning over that of the object below which friction is against the motion, to 2 %."""
+FLAT_M = 0.003
+"""Points this close to the lowest one hit the table with it [m]."""
+CENTRAL = 0.25
+"""Share of the object's reach within which an impact is under the centre of mass: others are several."""
+FAST_M_S = 1.0
+"""Impacts from this speed on tell the restitution: the flight after slower ones is too short."""
+IMPACT_S = 0.01
+"""Longest impact: a rubber ball on wood takes half [s]."""
+PRESSED_N = 0.2
+"""Force above which a finger touches: ten times the noise of a cheap load cell."""
+
+Equations = tuple[np.ndarray, np.ndarray]
+"""Linear equations of one motion for a parameter of P numbers: X^T X [P, P] and X^T y [P]."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A parameter as the motions tell it; P numbers each, NaN where they do not.
+
+    Attributes:
+        name: Key of :data:`vd.assets_usd.objects.contact_layer.CONTACT`.
+        verdict: ``effect``: other than the object's file says; ``no_gap``: as it says; ``unknown``: not told.
+        value, low, high: Estimate, and its 95 % interval [P].
+        nominal: As the object's file has it [P].
+        confidence: That it differs.
+        weight: Difference over the half-width from which it is named; more than 1 for an effect.
+        motions: Motions that tell it.
+        reason: One sentence.
+    """
+
+    name: str
+    verdict: Literal["effect", "no_gap", "unknown"]
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    nominal: np.ndarray
+    confidence: float
+    weight: float
+    motions: int
+    reason: str
+
+
+@dataclass
+class _State:
+    """What laws need besides a motion: corners of the object [N, 3], height of the table, earlier parameters.
+
+    A bounce too low to be seen has the share ``unseen`` of the highest such.
+    """
+
+    points: np.ndarray
+    table_m: float
+    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    friction: float = math.nan
+    unseen: float = 0.5
+
+    @property
+    def reach(self) -> float:
+        return float(np.linalg.norm(self.points, axis=1).max())
+
+
+def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Found]:
+    """Every parameter of the contact, in the order of :data:`CONTACT`.
+
+    Args:
+        recording: The motions.
+        item: The object as its file has it.
+
+    Raises:
+        RecordingError: Objects do not fall by g along -z: another frame, unit or clock.
+    """
+    points = np.unique(np.concatenate([vertices for vertices, _ in item.hulls]), axis=0)
+    heights = [_lowest(motion, points) for motion in recording.motions]
+    state = _State(points, float(np.median([np.percentile(height, 5) for height in heights])))
+    _check_gravity(recording, state)
+
+    def equations(
+        kind: Kind, rows: Callable[[ContactMotion, _State], Iterator[Equations]]
+    ) -> list[Equations]:
+        each = [list(rows(motion, state)) for motion in recording.motions if motion.kind == kind]
+        return [(sum(g for g, _ in own), sum(s for _, s in own)) for own in each if own]  # type: ignore[misc]
+
+    found = {}
+    found["centre_of_mass"] = centre = _judge("centre_of_mass", equations("drop", _flights), item)
+    if centre.verdict == "effect":  # impacts need it
+        state.centre = centre.value
+    # What is known within bounds only widens an interval by what it does to the estimate.
+    bounces = []
+    for state.unseen in (0.0, 1.0, 0.5):
+        bounces.append(equations("drop", _impacts))
+    spread = np.abs(_estimate(bounces[1], 1)[0] - _estimate(bounces[0], 1)[0]) / math.sqrt(12.0)
+    found["restitution"] = _judge("restitution", bounces[2], item, spread)
+    found["table_friction"] = friction = _judge("table_friction", equations("slide", _slides), item)
+    pushes = []
+    for (state.friction,) in (friction.low, friction.high, friction.value):
+        pushes.append(equations("push", _pushes))
+    spread = np.abs(_estimate(pushes[1], 1)[0] - _estimate(pushes[0], 1)[0]) / 4.0
+    found["mass"] = _judge("mass", pushes[2], item, spread)
+    found["tip_compliance"] = _judge("tip_compliance", equations("press", _presses), item)
+    return [found[name] for name in CONTACT]
+
+
+def verdict(found: Sequence[Found]) -> Literal["effects", "no_gap", "under_excited"]:
+    """What the recording says as a whole, in the words of ``vd-gap run``."""
+    told = {each.verdict for each in found}
+    return "effects" if "effect" in told else "no_gap" if "no_gap" in told else "under_excited"
+
+
+def by_weight(found: Sequence[Found]) -> list[Found]:
+    """The effects, those that stand out most from their intervals first."""
+    return sorted((each for each in found if each.verdict == "effect"), key=lambda each: -each.weight)
+
+
+def _judge(
+    name: str, motions: list[Equations], item: ObjectModel, besides: np.ndarray | float = 0.0
+) -> Found:
+    """A parameter's estimate and verdict; ``besides``: deviation from parameters taken as known [P]."""
+    parameter = CONTACT[name]
+    nominal = parameter.of(item)
+    resolution = parameter.resolution * (nominal if parameter.relative else np.ones(len(nominal)))
+    value, deviation = _estimate(motions, len(nominal))
+    deviation, freedom = np.hypot(deviation, besides), max(len(motions) - 1, 1)
+    # All numbers of all parameters together may give a false name in FALSE_NAMES of recordings.
+    numbers = sum(len(p.nominal) for p in CONTACT.values())
+    half = student.ppf(1.0 - 0.5 * FALSE_NAMES / numbers, freedom) * deviation
+    gap, least = np.abs(value - nominal), np.maximum(half, resolution)
+    told = bool(np.isfinite(deviation).all())
+    weight = float((gap / least).max()) if told else 0.0
+    says: Literal["effect", "no_gap", "unknown"] = "unknown"
+    if not told:
+        reason = f"no motion tells it; {parameter.record}"
+    elif weight > 1.0:
+        says, reason = "effect", "the interval excludes what the object's file says"
+    elif (half > resolution).any():
+        reason = f"the interval is too wide to say; {parameter.record}"
+    else:
+        says, reason = "no_gap", "as the object's file says, as far as can be told"
+    confidence = float(1.0 - 2.0 * student.sf((gap / deviation).max(), freedom)) if told else 0.0
+    usual = student.ppf(0.975, freedom) * deviation
+    ends = value - usual, value + usual
+    return Found(name, says, value, *ends, nominal, confidence, weight, len(motions), reason)
+
+
+def _estimate(motions: list[Equations], size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares over all motions, and the jackknife's deviation over them [P]; NaN if not determined."""
+    count, blank = len(motions), np.full(size, np.nan)
+    if count < 3:
+        return blank, blank
+    gram, slope = (np.array(arrays) for arrays in zip(*motions, strict=True))
+    try:
+        value = np.linalg.solve(gram.sum(0), slope.sum(0))
+        others = np.linalg.solve(gram.sum(0) - gram, (slope.sum(0) - slope)[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        return blank, blank
+    return value, np.sqrt((count - 1) / count * ((others - value) ** 2).sum(0))
+
+
+def _equations(nuisance: np.ndarray, slopes: np.ndarray, values: np.ndarray) -> Equations:
+    """Of values [T] = nuisance [T, K] a + slopes [T, P] theta; a is taken out, late samples are dropped."""
+    full = np.hstack([nuisance, slopes])
+    left = np.abs(values - full @ np.linalg.lstsq(full, values, rcond=None)[0])
+    kept = left <= OUTLIER * 1.4826 * np.median(left) + 1e-12
+    basis = np.linalg.qr(nuisance[kept])[0]
+    inner = slopes[kept] - basis @ (basis.T @ slopes[kept])
+    return inner.T @ inner, inner.T @ values[kept]
+
+
+def _lowest(motion: ContactMotion, points: np.ndarray) -> np.ndarray:
+    """Height of the lowest point of the object [T]."""
+    return motion.position[:, 2] + (motion.rotation.as_matrix()[:, 2] @ points.T).min(1)
+
+
+def _velocity(motion: ContactMotion) -> np.ndarray:
+    """Horizontal velocity [T, 2] by parabolas through :data:`SMOOTH_S` of evenly spaced samples."""
+    time = motion.time
+    step = float(np.median(np.diff(time)))
+    even = np.arange(time[0], time[-1] + step, step)
+    window = min(max(2 * round(0.5 * SMOOTH_S / step) + 1, 5), 2 * ((len(even) - 1) // 2) + 1)
+    smooth = (
+        savgol_filter(np.interp(even, time, v), window, 2, deriv=1, delta=step) for v in motion.position.T[:2]
+    )
+    return np.stack([np.interp(time, even, v) for v in smooth], axis=1)
+
+
+def _stretches(mask: np.ndarray) -> Iterator[slice]:
+    """Runs of true samples, long enough to be evidence."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        if end - first >= FEWEST:
+            yield slice(int(first), int(end))
+
+
+def _in_flight(motion: ContactMotion, state: _State) -> list[slice]:
+    """Stretches in which nothing touches the object."""
+    found = list(_stretches(_lowest(motion, state.points) > state.table_m + CLEAR_M))
+    return [_released(motion, part) if i == 0 else part for i, part in enumerate(found)]
+
+
+def _released(motion: ContactMotion, part: slice) -> slice:
+    """The end of a stretch that a hand begins: as long before the impact as the motion is free flight."""
+    time, end = motion.time, part.stop
+    first = min(max(int(np.searchsorted(time, time[end - 1] - SURE_S)), part.start), end - FEWEST)
+    usual = float(np.median(_flight_errors(motion, slice(first, end))))
+    while first > part.start:
+        longer = max(first - FEWEST, part.start)
+        if np.median(_flight_errors(motion, slice(longer, end))[:FEWEST]) > OUTLIER * usual:
+            # What the hand did to the first samples is still below noise there.
+            return slice(int(np.searchsorted(time, time[first] + SMOOTH_S)), end)
+        first = longer
+    return slice(first, end)
+
+
+def _flight_errors(motion: ContactMotion, part: slice) -> np.ndarray:
+    """Distances of a stretch from the best parabola of any centre of mass, [T] [m]."""
+    time, turn = motion.time[part] - motion.time[part].mean(), motion.rotation[part].as_matrix()
+    design = np.zeros((3, len(time), 9))
+    for axis in range(3):
+        design[axis, :, 2 * axis : 2 * axis + 2] = np.vander(time, 2)
+        design[axis, :, 6:] = -turn[:, axis, :]
+    values = motion.position[part].T.copy()
+    values[2] += 0.5 * GRAVITY * time**2
+    found = np.linalg.lstsq(design.reshape(-1, 9), values.reshape(-1), rcond=1e-3)[0]
+    return np.linalg.norm(values - design @ found, axis=0)
+
+
+def _check_gravity(recording: ContactRecording, state: _State) -> None:
+    """Refuse drops that do not fall as things do."""
+    falls = []
+    for motion in recording.motions:
+        for part in _in_flight(motion, state) if motion.kind == "drop" else ():
+            time = motion.time[part] - motion.time[part].mean()
+            if np.ptp(time) > SURE_S:
+                falls.append(-2.0 * np.polyfit(time, motion.position[part, 2], 2)[0])
+    if falls and not 0.8 < np.median(falls) / GRAVITY < 1.25:
+        raise RecordingError(
+            f"{recording.path}: dropped objects fall with {np.median(falls):.3g} m/s^2, not {GRAVITY}: z of "
+            "the table's frame points up, positions are in m, t is in s; correct table_pose or the columns"
+        )
+
+
+def _flights(motion: ContactMotion, state: _State) -> Iterator[Equations]:
+    """Of the origin: o + g t^2 / 2 = c + v t - R d, for x, y and z of every flight."""
+    for part in _in_flight(motion, state):
+        time = motion.time[part] - motion.time[part].mean()
+        for axis, fall in enumerate((0.0, 0.0, GRAVITY)):
+            slopes = -motion.rotation[part].as_matrix()[:, axis, :]
+            yield _equations(np.vander(time, 2), slopes, motion.position[part, axis] + 0.5 * fall * time**2)
+
+
+def _slides(motion: ContactMotion, state: _State) -> Iterator[Equations]:
+    """Path along the direction of a slide = s0 + v t - mu g t^2 / 2."""
+    time, velocity = motion.time, _velocity(motion)
+    speed = np.linalg.norm(velocity, axis=1)
+    free = (time > time[speed.argmax()] + SMOOTH_S) & (speed > SLIDING * speed.max())
+    for part in _stretches(free & _flat_on_table(motion, state)):
+        since = time[part] - time[part].mean()
+        turned = (motion.rotation[part][0].inv() * motion.rotation[part][-1]).magnitude()
+        if state.reach * turned / np.ptp(since) < TURNING * speed[part].mean():
+            ahead = velocity[part].mean(0) / np.linalg.norm(velocity[part].mean(0))
+            slopes = -0.5 * GRAVITY * since[:, None] ** 2
+            yield _equations(np.vander(since, 2), slopes, motion.position[part, :2] @ ahead)
+        return  # what moves again was touched
+
+
+def _flat_on_table(motion: ContactMotion, state: _State) -> np.ndarray:
+    """Samples at which the object is on the table and as upright as at the end, [T] bool."""
+    upward = motion.rotation.as_matrix()[:, 2]
+    tilt = np.arccos(np.clip(upward @ upward[-1], -1.0, 1.0))
+    return (tilt < UPRIGHT_RAD) & (_lowest(motion, state.points) < state.table_m + CLEAR_M)
+
+
+def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
+    """Speed of the touching points after an impact = e times before."""
+    flights = _in_flight(motion, state)
+    step = float(np.median(np.diff(motion.time)))
+    # Of the fastest bounce with too few samples above CLEAR_M.
+    unseen = math.sqrt(2.0 * GRAVITY * (CLEAR_M + GRAVITY * (0.5 * FEWEST * step) ** 2 / 2.0))
+    for before, after in zip(flights, [*flights[1:], None], strict=False):
+        if before.stop == len(motion.time):
+            return
+        come, falling, touching = _touch(motion, before, state, None)
+        arms = motion.rotation[before][-1].apply(state.points - state.centre)[touching]
+        if -falling < FAST_M_S or np.linalg.norm(arms[:, :2].mean(0)) > CENTRAL * state.reach:
+            continue
+        rising = state.unseen * unseen
+        if after is not None:
+            leave, rising, _ = _touch(motion, after, state, touching)
+            if not -0.2 * IMPACT_S < leave - come < IMPACT_S:
+                continue  # another point hit the table in between
+        yield np.array([[falling**2]]), np.array([-falling * rising])
+
+
+def _touch(
+    motion: ContactMotion, part: slice, state: _State, touching: np.ndarray | None
+) -> tuple[float, float, np.ndarray]:
+    """Where a flight meets the table: at its end, or at its begin for given points [N] bool.
+
+    Returns:
+        When [s]; how fast the points that touch it rise then [m/s]; which points they are, [N] bool.
+    """
+    time, edge = motion.time[part], -1 if touching is None else 0
+    since = time - time[edge]
+    centre = motion.position[part] + motion.rotation[part].apply(state.centre)
+    height, rise = np.polynomial.polynomial.polyfit(since, centre[:, 2] + 0.5 * GRAVITY * since**2, 1)
+    near = np.abs(since) < SMOOTH_S
+    base = motion.rotation[part][edge]
+    turned = (motion.rotation[part][near] * base.inv()).as_rotvec()
+    turn, spin = np.polynomial.polynomial.polyfit(since[near], turned, 1)
+    times = np.linspace(-0.5 * SMOOTH_S, 0.5 * SMOOTH_S, 501)
+    turns = (Rotation.from_rotvec(turn + times[:, None] * spin) * base).as_matrix()
+    arms = turns @ (state.points - state.centre).T  # [501, 3, N]
+    above = height + rise * times - 0.5 * GRAVITY * times**2 - state.table_m
+    if touching is None:
+        first = int(np.abs(above + arms[:, 2].min(1)).argmin())
+        touching = arms[first, 2] < arms[first, 2].min() + FLAT_M
+    at = int(np.abs(above + arms[:, 2, touching].mean(1)).argmin())
+    arm = arms[at][:, touching].mean(1)
+    return time[edge] + times[at], rise - GRAVITY * times[at] + np.cross(spin, arm)[2], touching
+
+
+def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:
+    """Impulse of a push along the path = m (change of velocity + mu g time) while the object slides."""
+    velocity = _velocity(motion)
+    speed, pressing = np.linalg.norm(velocity, axis=1), np.linalg.norm(motion.force, axis=1) > PRESSED_N
+    sliding = pressing & (speed > MOVING * speed.max()) & _flat_on_table(motion, state)
+    margin = round(SMOOTH_S / float(np.median(np.diff(motion.time))))
+    for whole in _stretches(sliding):
+        part = slice(
+            whole.start + margin, whole.stop - margin
+        )  # velocities at the ends are of other motions too
+        time, ahead = motion.time[part], velocity[part] / speed[part, None]
+        if len(time) >= FEWEST:
+            along = (motion.force[part, :2] * ahead).sum(1) + state.friction * motion.force[part, 2]
+            gain = speed[part][-1] - speed[part][0] + state.friction * GRAVITY * np.ptp(time)
+            yield np.array([[gain**2]]), np.array([gain * np.trapezoid(along, time)])
+
+
+def _presses(motion: ContactMotion, state: _State) -> Iterator[Equations]:
+    """Way of the pusher into the object = c times the force."""
+    size = np.linalg.norm(motion.force, axis=1)
+    ahead = motion.force[size.argmax()] / size.max()
+    force, way = motion.force @ ahead, (motion.pusher - motion.position) @ ahead
+    touching = force > PRESSED_N
+    if touching.sum() >= FEWEST:
+        yield _equations(np.ones((touching.sum(), 1)), force[touching, None], way[touching])

@@ -1,0 +1,163 @@
+"""``vd-gap contact`` and ``vd-gap hide-contact``: what an object's recorded motions tell of its contact."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+
+if TYPE_CHECKING:
+    from vd.gap.contact import Found
+
+FORMAT = "vd-contact-report/1"
+REPORT, LAYER = "report.json", "identified.usda"
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Friction, restitution, mass, its centre and soft fingertips from the recorded motions of an object.
+
+    Writes DIR/report.json and DIR/identified.usda, a layer over the object's file that --objects takes.
+    """
+
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
+    """Folder with recording.json (model contact) and its CSV files."""
+    object: Path
+    """The object's file, as vd-assets writes it, or an identified layer over it."""
+    out: Path = Path("contact")
+    """DIR: folder of the report and of the layer."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the report as JSON."""
+
+    def run(self) -> int:
+        """Identify, write, and print the verdict."""
+        from vd.gap.contact_recording import read_contact_recording
+
+        recording, began = read_contact_recording(self.recording), time.perf_counter()
+        from vd.assets_usd.objects.model import read_object, write_contact_layer
+        from vd.files import make_folder, write_json
+        from vd.gap.contact import identify_contact
+
+        item, layer = read_object(self.object), self.out / LAYER
+        if layer.exists() and layer.samefile(self.object):
+            raise ValueError(f"--out {self.out} holds --object itself; name another folder")
+        found = identify_contact(recording, item)
+        report = contact_report(found, str(self.recording), str(self.object), time.perf_counter() - began)
+        make_folder(self.out)
+        write_contact_layer(layer, self.object, identified(found), str(self.recording))
+        write_json(self.out / REPORT, report)
+        if self.json:
+            print(json.dumps(report, indent=1))
+            return 0
+        print(f"{report['verdict']}: {', '.join(e['name'] for e in report['effects']) or 'nothing named'}")
+        for each in found:
+            value = " ".join(
+                f"{v:.4g} ({a:.4g} to {b:.4g})"
+                for v, a, b in zip(each.value, each.low, each.high, strict=True)
+            )
+            print(f"  {each.name}: {each.verdict}: {value}; {each.reason}")
+        print(f"{self.out / REPORT}\n{layer}")
+        return 0
+
+
+def identified(found: "Sequence[Found]") -> dict[str, tuple[tuple[float, ...], ...]]:
+    """What is told, as :func:`vd.assets_usd.objects.contact_layer.write_contact_layer` takes it."""
+    return {
+        each.name: (
+            tuple(each.value.tolist()),
+            # A coarse interval may reach below zero, which cannot be simulated.
+            tuple(
+                each.low.tolist() if len(each.low) > 1 else np.maximum(each.low, 0.1 * each.value).tolist()
+            ),
+            tuple(each.high.tolist()),
+        )
+        for each in found
+        if each.verdict != "unknown"
+    }
+
+
+def contact_report(found: "Sequence[Found]", recording: str, item: str, seconds: float) -> Mapping[str, Any]:
+    """``report.json``; a number that is not known is None."""
+    from vd.assets_usd.objects.contact_layer import CONTACT
+    from vd.gap.contact import by_weight, verdict
+
+    def numbers(values: Any) -> list[float | None]:
+        return [float(value) if value == value else None for value in values]
+
+    def estimate(each: "Found") -> dict[str, Any]:
+        interval = [numbers(each.low), numbers(each.high)]
+        return {"value": numbers(each.value), "ci95": interval, "unit": CONTACT[each.name].unit}
+
+    return {
+        "format": FORMAT,
+        "verdict": verdict(found),
+        "effects": [
+            {"name": each.name, "confidence": each.confidence, "parameters": {each.name: estimate(each)}}
+            for each in by_weight(found)
+        ],
+        "parameters": {
+            each.name: {
+                **estimate(each),
+                "verdict": each.verdict,
+                "nominal": numbers(each.nominal),
+                "motions": each.motions,
+                "reason": each.reason,
+            }
+            for each in found
+        },
+        "recording": recording,
+        "object": item,
+        "seconds": seconds,
+    }
+
+
+@dataclass(frozen=True)
+class HideContact:
+    """Make a recording of an object in MuJoCo, with contact parameters hidden, to see whether they are found.
+
+    The plant shares nothing with the analysis; a tracker adds noise, late and missing samples. The truth is
+    written beside the folder.
+    """
+
+    out: Path
+    """Folder of the recording to write."""
+    object: str = "cube"
+    """Object set, or an object's file, whose first object it is."""
+    hide: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=VALUE such as table_friction=0.4, or centre_of_mass=X,Y,Z; give it again for a second one."""
+    seed: int = 0
+    """Seed of motions, solver and tracker."""
+
+    def run(self) -> int:
+        """Write the recording."""
+        from vd.assets_usd.objects.sets import load_set
+        from vd.bench.hidden_contact import ContactPlant, hide_contact, truth_path
+
+        if (self.out / "recording.json").exists() and not truth_path(self.out).exists():
+            raise ValueError(
+                f"--out {self.out} holds a recording in which nothing was hidden; name another folder"
+            )
+        values = dict(_parse(text) for text in self.hide)
+        hide_contact(ContactPlant(load_set(self.object)[0], values, seed=self.seed), self.out)
+        print(f"{self.out}\n{truth_path(self.out)}")
+        return 0
+
+
+def _parse(text: str) -> tuple[str, Any]:
+    """NAME=VALUE or NAME=X,Y,Z."""
+    from vd.assets_usd.objects.contact_layer import CONTACT
+
+    name, _, value = text.partition("=")
+    if name not in CONTACT:
+        raise ValueError(f"--hide {text}: there is no {name!r}; choose from {', '.join(CONTACT)}")
+    try:
+        numbers = tuple(float(part) for part in value.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != len(CONTACT[name].nominal):
+        raise ValueError(f"--hide {text}: give {len(CONTACT[name].nominal)} numbers, separated by commas")
+    return name, numbers[0] if len(numbers) == 1 else numbers
