@@ -327,7 +327,7 @@ class AlignTrainer(TrainingLoop):
 
     @torch.no_grad()
     def measure(self) -> dict[str, torch.Tensor]:
-        """Figures of first looks at shapes not learned from, at goals whole and as scans; processes share them.
+        """Figures of first looks at shapes not learned from, whole goals and scans; processes share the views.
 
         Medians are means of the processes' medians.
         """
