@@ -327,7 +327,7 @@ class AlignTrainer(TrainingLoop):
 
     @torch.no_grad()
     def measure(self) -> dict[str, torch.Tensor]:
-        """Figures of first looks at shapes not learned from, whole goals and scans; processes share the views.
+        """Figures of first looks at shapes not learned from, whole goals and scans; processes share them.
 
         Medians are means of the processes' medians.
         """
