@@ -6,10 +6,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
+from vd.evaluate.scanned import MISSING
 from vd.train.student.shapes import made_shapes
 from vd.train.student.views import (
     CELL_M,
-    SCAN_MISSING,
     TOUCH_M,
     Hands,
     draw_pairs,
@@ -142,4 +142,4 @@ def test_goals_from_scans_lack_a_side_and_are_noisy():
     scans = goal_points(ball, 500, 1.0)
     assert (scans.norm(dim=-1) - 0.05).std() == pytest.approx(0.004, rel=0.1)
     # The mean of a ball without its cap lies on the other side.
-    assert scans.mean(dim=1).norm(dim=-1).mean() > 0.5 * SCAN_MISSING * 0.05
+    assert scans.mean(dim=1).norm(dim=-1).mean() > 0.5 * MISSING * 0.05

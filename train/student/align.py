@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -326,14 +327,15 @@ class AlignTrainer(TrainingLoop):
 
     @torch.no_grad()
     def measure(self) -> dict[str, torch.Tensor]:
-        """Figures of first looks at whole goals of shapes not learned from; processes share the views.
+        """Figures of first looks at shapes not learned from, whole goals and scans; processes share them.
 
         Medians are means of the processes' medians.
         """
         figures = {}
-        for name, shapes in self.scenes.held_out.items():
+        for (name, shapes), kind in product(self.scenes.held_out.items(), ("", "_scans")):
             views = max(1, self.cfg.views // (self.world_size * (4 if name == "made" else 1)))
-            error, offset, surface = self._errors(shapes.repeat(views, 1, 1))
+            error, offset, surface = self._errors(shapes.repeat(views, 1, 1), scans=float(kind != ""))
+            name += kind
             figures[f"{name}/rotation_error"] = error.median()
             for bound in WITHIN_RAD:
                 figures[f"{name}/within_{bound:g}"] = (error < bound).float().mean()
@@ -341,11 +343,13 @@ class AlignTrainer(TrainingLoop):
             figures[f"{name}/offset_error"] = offset.median()
         return figures
 
-    def _errors(self, shapes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _errors(
+        self, shapes: torch.Tensor, *, scans: float
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Errors of a first look: rotation [rad], place [m], distance of the surfaces [m], [B] each."""
         parts = []
         for some in shapes.split(max(1, self.cfg.batch // 8)):
-            pairs = draw_pairs(self.scenes.hands, some, self.cfg.points)
+            pairs = draw_pairs(self.scenes.hands, some, self.cfg.points, scans=scans)
             found = Aligner(self.network, pairs.goal, self.cfg.search).look(pairs.seen)
             wrong = found.rotation.transpose(-1, -2) @ pairs.rotation
             apart = torch.cdist(pairs.goal @ wrong, pairs.surface).amin(dim=-1).mean(dim=-1)

@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 
 from vd.assets_usd.hand_data import HandModel, compose, invert
 from vd.clouds import HandCloud
+from vd.evaluate.scanned import MISSING, NOISE_M
 from vd.train.student.shapes import drawn, random_matrices, uniform
 from vd.vision.rotations import matrices, rotations_about, two_columns
 
@@ -40,8 +41,6 @@ DEPTH_STD_M, POINT_STD_M = 0.003, 0.001
 """Noise along the ray, of each view up to this much, and of points: stereo depth at half a metre."""
 LOST_PATCHES, LOST_RADIUS_M = 2, 0.025
 """Patches in which stereo finds no depth, and up to how large they are."""
-SCAN_STD_M, SCAN_MISSING = 0.004, 0.2
-"""Noise of goals from scans, and the share of the surface that they lack on one side."""
 NEAR_RAD = 0.9
 """Near starts are up to this far off: nearer than the rotations of a cube leave gaps, as later passes are."""
 TRIED_HANDS, TRIED_POINTS = 8, 64
@@ -201,19 +200,18 @@ def camera_points(hands: Hands, rows: torch.Tensor, shapes: torch.Tensor, count:
 
 
 def goal_points(points: torch.Tensor, count: int, scans: float) -> torch.Tensor:
-    """Clouds of goals [m] [B, count, 3] from points of whole shapes [m] [B, P, 3], in no order.
+    """Clouds of goals [m] [B, count, 3], the first points of whole shapes [m] [B, P, 3], in no order.
 
-    A share ``scans`` is as from scans: a side is missing, others stand for it, and points are noisy.
+    A share ``scans`` is as :func:`vd.evaluate.scanned.scan` has them: a side is missing, others stand for it,
+    and points are noisy.
     """
-    batch, device = len(points), points.device
-    scan = torch.rand((batch, 1), device=device) < scans
-    height = (points @ normalize(torch.randn((batch, 3, 1), device=device), dim=1)).squeeze(-1)
-    whole = int((1.0 - SCAN_MISSING) * points.shape[1])
-    there = height <= height.kthvalue(whole, dim=1, keepdim=True).values
-    first = torch.arange(count, device=device).expand(batch, -1)
-    index = torch.where(scan & ~there[:, :count], drawn(there.float(), count), first)
-    goal = points.take_along_dim(index[..., None], dim=1)
-    return goal + SCAN_STD_M * scan[..., None] * torch.randn_like(goal)
+    goal, device = points[:, :count], points.device
+    scan = torch.rand((len(goal), 1), device=device) < scans
+    height = (goal @ torch.randn((len(goal), 3, 1), device=device)).squeeze(-1)
+    there = height <= height.kthvalue(round((1.0 - MISSING) * count), dim=1, keepdim=True).values
+    index = torch.arange(count, device=device).expand(len(goal), -1)
+    index = torch.where(scan & ~there, drawn(there.float(), count), index)
+    return goal.take_along_dim(index[..., None], dim=1) + NOISE_M * scan[..., None] * torch.randn_like(goal)
 
 
 def draw_pairs(

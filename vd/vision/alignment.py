@@ -157,7 +157,8 @@ class Aligner:
     """Finds the rotation from goals to objects, and follows it from look to look.
 
     A first look begins from the 24 rotations of a cube: none is farther than 1.1 rad from one of them. Later
-    looks improve the best that it came to. All are then laid onto what is seen; what fits best is believed.
+    looks improve those that are kept by turns, one each. All are then laid onto what is seen; what fits best
+    is believed.
 
     Args:
         network: The trained network.
@@ -170,12 +171,14 @@ class Aligner:
         self._starts = cube_rotations(goal.device)
         self._goal = goal - goal.mean(dim=1, keepdim=True)
         self._near, self._normals = network.neighbours(self._goal), normals(self._goal)
-        self._kept = torch.eye(3, device=goal.device).repeat(len(goal), self._cfg.kept, 1, 1)  # best first
-        self._known = torch.zeros(len(goal), dtype=torch.bool, device=goal.device)
+        kept = len(goal), self._cfg.kept
+        self._kept = torch.eye(3, device=goal.device).repeat(*kept, 1, 1)  # best first
+        self._places = torch.zeros((*kept, 3), device=goal.device)  # of the goals' means
+        self._looks = torch.zeros(len(goal), dtype=torch.long, device=goal.device)  # 0: nothing is known
 
     def reset(self, rows: torch.Tensor) -> None:
         """Forget what is known of objects, a mask or indices."""
-        self._known[rows] = False
+        self._looks[rows] = 0
 
     @torch.no_grad()
     def look(self, seen: torch.Tensor, rows: torch.Tensor | None = None) -> Alignment:
@@ -189,39 +192,46 @@ class Aligner:
         mean = seen.mean(dim=1)
         seen = seen - mean[:, None]
         tokens = self.network.encode(seen, SEEN, self.network.neighbours(seen))
-        new = ~self._known[rows]
+        looks = self._looks[rows]
+        new = looks == 0
         if bool(new.any()):
-            self._begin(rows[new], tokens[new], seen[new])
-        found, offset, misfit = self._fitted(rows, tokens, seen, self._kept[rows])
+            self._begin(rows[new], tokens[new], seen[new], mean[new])
+        found, offset = self._kept[rows], self._places[rows] - mean[:, None]
+        row, turn = torch.arange(len(rows), device=rows.device), looks % self._cfg.kept
+        better, where = self._improve(rows, tokens, found[row, turn][:, None])
+        found[row, turn], offset[row, turn] = better[:, 0], where[:, 0]
+        found, offset, misfit = self._laid(rows, seen, found, offset)
         misfit[:, 0] *= torch.where(new, 1.0, STAY)
         order = misfit.argsort(dim=1)
         self._kept[rows] = found = found.take_along_dim(order[:, :, None, None], dim=1)
-        self._known[rows] = True
-        offset = offset.take_along_dim(order[:, :1, None], dim=1)[:, 0]
-        return Alignment(found[:, 0], mean + offset)
+        self._places[rows] = places = mean[:, None] + offset.take_along_dim(order[:, :, None], dim=1)
+        self._looks[rows] += 1
+        return Alignment(found[:, 0], places[:, 0])
 
-    def _begin(self, rows: torch.Tensor, tokens: torch.Tensor, seen: torch.Tensor) -> None:
+    def _begin(
+        self, rows: torch.Tensor, tokens: torch.Tensor, seen: torch.Tensor, mean: torch.Tensor
+    ) -> None:
         """Keep the best that starts come to."""
         found = self._starts.expand(len(rows), -1, -1, -1)
-        for _ in range(self._cfg.passes - 1):
-            found, _ = self._improve(rows, tokens, found)
-        found, _, misfit = self._fitted(rows, tokens, seen, found)
+        for _ in range(self._cfg.passes):
+            found, offset = self._improve(rows, tokens, found)
+        found, offset, misfit = self._laid(rows, seen, found, offset)
         best = misfit.topk(self._cfg.kept, dim=1, largest=False).indices
         self._kept[rows] = found.take_along_dim(best[:, :, None, None], dim=1)
+        self._places[rows] = mean[:, None] + offset.take_along_dim(best[:, :, None], dim=1)
 
-    def _fitted(
-        self, rows: torch.Tensor, tokens: torch.Tensor, seen: torch.Tensor, rotations: torch.Tensor
+    def _laid(
+        self, rows: torch.Tensor, seen: torch.Tensor, rotations: torch.Tensor, offsets: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Hypotheses [R, H, 3, 3] improved and laid onto what is seen, their offsets and misfits [m]."""
-        better, offset = self._improve(rows, tokens, rotations)
-        shape, pair = better.shape[:2], torch.arange(len(rows), device=rows.device)
+        """Hypotheses [R, H, 3, 3] and offsets [R, H, 3] laid onto what is seen, and their misfits [m]."""
+        shape, pair = rotations.shape[:2], torch.arange(len(rows), device=rows.device)
         pair, parts = pair.repeat_interleave(shape[1]), []
         for some in torch.arange(len(pair), device=rows.device).split(PAIRS_AT_ONCE):
             goal = rows[pair[some]]
             clouds = self._goal[goal], self._normals[goal], seen[pair[some]]
-            parts.append(refine(*clouds, better.flatten(0, 1)[some], offset.flatten(0, 1)[some], STEPS))
-        better, offset, misfit = (torch.cat(v).unflatten(0, shape) for v in zip(*parts, strict=True))
-        return better, offset, misfit
+            parts.append(refine(*clouds, rotations.flatten(0, 1)[some], offsets.flatten(0, 1)[some], STEPS))
+        found, offset, misfit = (torch.cat(v).unflatten(0, shape) for v in zip(*parts, strict=True))
+        return found, offset, misfit
 
     def _improve(
         self, rows: torch.Tensor, seen: torch.Tensor, rotations: torch.Tensor

@@ -52,33 +52,25 @@ def refine(
     Returns:
         Rotations, offsets, and root mean square distances from the planes [m] [B].
     """
-    for _ in range(steps):
-        near, facing, apart = _matched(goal, normal, seen, rotation, offset)
-        away = (facing * (seen - near)).sum(dim=-1)
-        weight = (apart <= apart.kthvalue(int(NEAREST * seen.shape[1]), dim=1, keepdim=True).values).float()
-        slope = torch.cat([torch.linalg.cross(near / CLOUD_M, facing), facing], dim=-1)
-        pulled = slope * weight[..., None]
-        square = pulled.transpose(-1, -2) @ slope
-        square = square + DAMPING * seen.shape[1] * torch.eye(6, device=seen.device)
-        step = torch.linalg.solve(square, (pulled * away[..., None]).sum(dim=1))
+    square, planes = goal.square().sum(dim=-1), torch.cat([goal, normal], dim=-1)
+    damping = DAMPING * seen.shape[1] * torch.eye(6, device=seen.device)
+    moved = (seen - offset[:, None]) @ rotation  # in the goals' frames, which stay
+    for left in range(steps, -1, -1):
+        # Squared distances but for those of the moved points from the origins.
+        apart, index = torch.baddbmm(square[:, None], moved, goal.transpose(-1, -2), alpha=-2.0).min(dim=-1)
+        near, facing = planes.take_along_dim(index[..., None], dim=1).split(3, dim=-1)
+        away = (facing * (near - moved)).sum(dim=-1)
+        if not left:
+            break
+        apart = apart + moved.square().sum(dim=-1)
+        inside = apart <= apart.kthvalue(int(NEAREST * seen.shape[1]), dim=1, keepdim=True).values
+        middle = moved.mean(dim=1, keepdim=True)
+        slope = torch.cat([torch.linalg.cross((near - middle) / CLOUD_M, facing), facing], dim=-1)
+        pulled = (slope * inside[..., None]).transpose(-1, -2)
+        step = torch.linalg.solve(pulled @ slope + damping, (pulled @ away[..., None]).squeeze(-1))
         turn = step[:, :3] / CLOUD_M
-        turn = matrices(two_columns(rotations_about(turn, turn.norm(dim=-1).clamp(max=STEP_RAD))))
-        rotation = turn @ rotation
-        offset = (turn @ offset[..., None]).squeeze(-1) + step[:, 3:]
-    near, facing, _ = _matched(goal, normal, seen, rotation, offset)
-    return rotation, offset, (facing * (seen - near)).sum(dim=-1).square().mean(dim=-1).sqrt()
-
-
-def _matched(
-    goal: torch.Tensor,
-    normal: torch.Tensor,
-    seen: torch.Tensor,
-    rotation: torch.Tensor,
-    offset: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Of each point that is seen the goal's nearest, its normal, and how far it is; [B, S, 3], [B, S]."""
-    back = rotation.transpose(-1, -2)
-    placed = goal @ back + offset[:, None]
-    apart, index = torch.cdist(seen, placed).min(dim=-1)
-    near = placed.take_along_dim(index[..., None], dim=1)
-    return near, normal.take_along_dim(index[..., None], dim=1) @ back, apart
+        back = matrices(two_columns(rotations_about(-turn, turn.norm(dim=-1).clamp(max=STEP_RAD))))
+        moved = (moved - middle) @ back + middle + step[:, None, 3:]
+        rotation = rotation @ back
+    offset = seen.mean(dim=1) - (rotation @ moved.mean(dim=1)[..., None]).squeeze(-1)
+    return rotation, offset, away.square().mean(dim=-1).sqrt()
