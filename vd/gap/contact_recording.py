@@ -3,9 +3,6 @@
 SI units, quaternions xyzw. What is read is in the table's frame: z up, the origin on its top.
 """
 
-import contextlib
-import csv
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.files import atomic_path, write_json
-from vd.gap.recording import FORMAT, MIN_SAMPLES, TEXT
+from vd.gap.recording import FORMAT, MIN_SAMPLES, numbers, read_header, read_table
 from vd.gap.recording_checks import RecordingError
 
 MODEL = "contact"
@@ -80,16 +77,9 @@ def read_contact_recording(path: str | Path) -> ContactRecording:
     """
     path = Path(path)
     file = path if path.suffix == ".json" else path / "recording.json"
-    try:
-        header = json.loads(file.read_text(encoding=TEXT))
-    except OSError as error:
-        raise RecordingError(f"{file}: no such file; give a folder with recording.json") from error
-    except ValueError as error:
-        raise RecordingError(f"{file}: not JSON ({error}); correct it at that place") from error
-    if not isinstance(header, dict) or (header.get("format"), header.get("model")) != (FORMAT, MODEL):
-        raise RecordingError(
-            f"{file}: format and model must be {FORMAT!r}, {MODEL!r}; recordings of joints are for vd-gap run"
-        )
+    header = read_header(file)
+    if header.get("model") != MODEL:
+        raise RecordingError(f"{file}: model must be {MODEL!r}; recordings of joints are for vd-gap run")
     frames = [_frame(file, name, header.get(name, IDENTITY)) for name in ("table_pose", "object_pose")]
     entries = header.get("trajectories")
     if not isinstance(entries, list) or not entries:
@@ -162,11 +152,7 @@ def _motion(file: Path, kind: Kind, frames: Sequence[tuple[np.ndarray, Rotation]
 
 def _columns(file: Path, kind: Kind) -> dict[str, np.ndarray]:
     """The columns of a CSV file by name, all of them finite numbers."""
-    try:
-        with file.open(newline="", encoding=TEXT) as stream:
-            names, *rows = [[cell.strip() for cell in row] for row in csv.reader(stream) if any(row)]
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{file}: no CSV file in UTF-8 ({error}); export it again") from error
+    names, rows = read_table(file)
     for name in (name for group in NEEDED[kind] for name in group):
         if names.count(name) != 1:
             raise RecordingError(f"{file}: row 1 has no one column {name!r}, which a {kind} needs; add it")
@@ -175,16 +161,7 @@ def _columns(file: Path, kind: Kind) -> dict[str, np.ndarray]:
             f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, record it again"
         )
     used = [i for i, name in enumerate(names) if name in (*TIME, *POSE, *PUSHER, *FORCE)]
-    table = np.full((len(rows), len(used)), np.nan)
-    for i, row in enumerate(rows):
-        for j, index in enumerate(used):
-            with contextlib.suppress(ValueError, IndexError):
-                table[i, j] = float(row[index])
-            if not np.isfinite(table[i, j]):
-                raise RecordingError(
-                    f"{file}: row {i + 2}, column {names[index]!r}: no number; drop rows without a pose"
-                )
-    return {names[index]: table[:, j] for j, index in enumerate(used)}
+    return {names[i]: numbers(file, names[i], [row[i] for row in rows]) for i in used}
 
 
 def _check_values(file: Path, time: np.ndarray, pose: np.ndarray) -> None:

@@ -53,7 +53,7 @@ def read_recording(path: str | Path) -> Recording:
     """
     path = Path(path)
     file = path if path.suffix == ".json" else path / "recording.json"
-    header = _read_header(file)
+    header = read_header(file)
     joints = _names(file, "joints", header.get("joints"))
     _check_model(file, header.get("model"), joints)
     resolution: Any = header.get("encoder_resolution_rad")
@@ -132,7 +132,12 @@ def _read_text(file: Path) -> str:
         raise RecordingError(f"{file}: not a text file ({error}); export it in UTF-8") from error
 
 
-def _read_header(file: Path) -> dict[str, Any]:
+def read_header(file: Path) -> dict[str, Any]:
+    """What ``recording.json`` says.
+
+    Raises:
+        RecordingError: It is missing, no JSON, or of another format.
+    """
     try:
         header = json.loads(_read_text(file))
     except json.JSONDecodeError as error:
