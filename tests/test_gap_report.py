@@ -174,7 +174,7 @@ def test_of_one_recorded_finger_the_layer_of_all_is_to_be_trained_with(report, c
     assert "pass identified-all-fingers.usda with --hand-layer" in words.next_step(one)
     write_report(one, curves, tmp_path)
     page = (tmp_path / "report.html").read_text()
-    assert "vd-train teacher --hand dclaw3 --hand-layer identified-all-fingers.usda" in page
+    assert "vd-train adapt POLICY --hand-layer identified-all-fingers.usda" in page
     assert "--hand-layer identified.usda --out DIR" in page, (
         "what was recorded is compared with the recording"
     )

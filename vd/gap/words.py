@@ -91,8 +91,8 @@ def verdict_sentence(report: Report) -> str:
     if report.verdict == "no_gap":
         model = "plain servo model" if report.hand_layer is None else f"model in {report.hand_layer}"
         return (
-            f"No gap: the {model} explains this recording. It leaves {sizes}: no more than noise, a small "
-            "error of the links' masses, or what no candidate explains."
+            f"No gap: the {model} explains this recording. It leaves {sizes}: no more than noise, or "
+            "what no candidate explains."
         )
     if report.verdict == "under_excited":
         return (
