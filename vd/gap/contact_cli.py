@@ -26,8 +26,8 @@ class Contact:
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """Folder with recording.json (model contact) and its CSV files."""
-    object: Path
-    """The object's file, as vd-assets writes it, or an identified layer over it."""
+    object: str
+    """The object: a set of one, such as cube, its file, as vd-assets writes it, or a layer over that."""
     out: Path = Path("contact")
     """DIR: folder of the report and of the layer."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -39,16 +39,20 @@ class Contact:
 
         recording, began = read_contact_recording(self.recording), time.perf_counter()
         from vd.assets_usd.objects.model import read_object, write_contact_layer
+        from vd.assets_usd.objects.sets import set_files
         from vd.files import make_folder, write_json
         from vd.gap.contact import identify_contact
 
-        item, layer = read_object(self.object), self.out / LAYER
-        if layer.exists() and layer.samefile(self.object):
+        file, *others = set_files([self.object])
+        if others:
+            raise ValueError(f"--object {self.object} has {1 + len(others)} objects; name the one that moved")
+        item, layer = read_object(file), self.out / LAYER
+        if layer.exists() and layer.samefile(file):
             raise ValueError(f"--out {self.out} holds --object itself; name another folder")
         found = identify_contact(recording, item)
-        report = contact_report(found, str(self.recording), str(self.object), time.perf_counter() - began)
+        report = contact_report(found, str(self.recording), self.object, time.perf_counter() - began)
         make_folder(self.out)
-        write_contact_layer(layer, self.object, identified(found), str(self.recording))
+        write_contact_layer(layer, file, identified(found), str(self.recording))
         write_json(self.out / REPORT, report)
         if self.json:
             print(json.dumps(report, indent=1))
