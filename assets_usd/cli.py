@@ -1,5 +1,6 @@
 """vd-assets: name and import hands, author objects, import meshes, draw contact sheets."""
 
+import statistics
 import sys
 import time
 from collections import Counter
@@ -214,7 +215,7 @@ def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
         named = ", ".join(f"{model.name} {model.volume_error:.1%}" for model in worst[:WORST_SHOWN])
         hulls = sum(len(model.hulls) for model in worst) / len(worst)
         lines.append(f"{hulls:.1f} convex parts on average, {size / 1e6:.1f} MB")
-        median = worst[len(worst) // 2].volume_error
+        median = statistics.median(model.volume_error for model in worst)
         lines.append(f"volume error of the parts: median {median:.1%}, worst {named}")
         scaled = sum("scaled by" in note for model in worst for note in model.notes)
         lines.append(

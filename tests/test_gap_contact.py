@@ -41,6 +41,12 @@ def test_what_is_hidden_is_named_and_what_was_not_recorded_is_unknown(analysis: 
     assert found["tip_compliance"]["value"] == [None]
 
 
+def test_commands_for_joints_send_a_recording_of_an_object_to_its_own(analysis: Path, capsys):
+    for command in ("run", "plan"):
+        assert main([command, str(analysis / "rec"), "--out", str(analysis / "joints")]) == 2
+        assert "they are for vd-gap contact" in capsys.readouterr().err
+
+
 def test_the_layer_is_the_object_with_what_was_identified(analysis: Path):
     path = analysis / "out" / "identified.usda"
     item, plain = read_object(path), load_set("cube")[0]

@@ -174,6 +174,9 @@ def test_export_commands(tmp_path, capsys):
     assert main(["export", str(whole), str(tmp_path / "out.pt")]) == 0
     assert load_policy(tmp_path / "out.pt").iteration == 1
     assert (tmp_path / "out.pt").stat().st_size < whole.stat().st_size
+    (tmp_path / "policy.pt").write_bytes((tmp_path / "out.pt").read_bytes())
+    assert main(["export", str(tmp_path), str(tmp_path / "of_folder.pt")]) == 0, "a run's folder"
+    assert load_policy(tmp_path / "of_folder.pt").iteration == 1
     small = tmp_path / "small.pt"
     assert main(["export", "--resumable", str(whole), str(small)]) == 0
     resumed = make_runner(tmp_path)

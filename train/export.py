@@ -43,7 +43,8 @@ class ExportCfg:
     """
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
-    """Checkpoint of vd-train teacher, or its policy.pt; for ONNX any policy, by camera too, also by name."""
+    """Checkpoint of vd-train teacher, its policy.pt, its run's folder, or a policy's name; for ONNX by camera
+    too."""
     output: Annotated[Path, tyro.conf.Positional] = Path("policy.pt")
     """File to write. A name that ends in .onnx gets the layers from observation to mean action, and
     NAME-alignment.onnx beside it the network of a vision policy. They are checked against onnxruntime where
@@ -88,10 +89,12 @@ def export_command(arguments: list[str], _started: float) -> int:
 
 def _exported(cfg: ExportCfg) -> dict[str, Any]:
     """What the file gets."""
+    from vd.evaluate.agents import find_policy
     from vd.policy import policy_export
     from vd.train.checkpoint import load_checkpoint, without_worlds
 
-    state = load_checkpoint(cfg.checkpoint, flag="vd-train export")
+    path = cfg.checkpoint if cfg.resumable else find_policy(cfg.checkpoint)
+    state = load_checkpoint(path, flag="vd-train export")
     if cfg.resumable and "optimizer_state_dict" not in state:
         raise ValueError(f"{cfg.checkpoint} is a policy, not a checkpoint; nothing can go on from it")
     return without_worlds(state) if cfg.resumable else policy_export(state)

@@ -145,4 +145,4 @@ def _beginning(cfg: TeacherCfg, runner: "TeacherRunner") -> Iterator[str]:
         actor = "stays as it is" if runner.imitation is None else "imitates what it began from"
         yield f"the critic learns alone for {runner.critic_warmup} iterations, the actor {actor}"
     for difference in runner.unlike:
-        yield f"the policy was trained with other observations or actions: {difference}"
+        yield f"other than in the training of that policy: {difference}"

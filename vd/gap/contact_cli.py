@@ -163,5 +163,6 @@ def _parse(text: str) -> tuple[str, Any]:
     except ValueError:
         numbers = ()
     if len(numbers) != len(CONTACT[name].nominal):
-        raise ValueError(f"--hide {text}: give {len(CONTACT[name].nominal)} numbers, separated by commas")
+        form = "=X,Y,Z" if len(CONTACT[name].nominal) > 1 else "=NUMBER"
+        raise ValueError(f"--hide {text}: give {name}{form}")
     return name, numbers[0] if len(numbers) == 1 else numbers

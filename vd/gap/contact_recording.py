@@ -12,10 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.files import atomic_path, write_json
-from vd.gap.recording import FORMAT, MIN_SAMPLES, numbers, read_header, read_table
+from vd.gap.recording import CONTACT_MODEL, FORMAT, MIN_SAMPLES, numbers, read_header, read_table
 from vd.gap.recording_checks import RecordingError
 
-MODEL = "contact"
 Kind = Literal["drop", "slide", "push", "press"]
 TIME, POSE = ("t",), ("x", "y", "z", "qx", "qy", "qz", "qw")
 PUSHER = ("pusher_x", "pusher_y", "pusher_z")
@@ -78,8 +77,10 @@ def read_contact_recording(path: str | Path) -> ContactRecording:
     path = Path(path)
     file = path if path.suffix == ".json" else path / "recording.json"
     header = read_header(file)
-    if header.get("model") != MODEL:
-        raise RecordingError(f"{file}: model must be {MODEL!r}; recordings of joints are for vd-gap run")
+    if header.get("model") != CONTACT_MODEL:
+        raise RecordingError(
+            f"{file}: model must be {CONTACT_MODEL!r}; recordings of joints are for vd-gap run"
+        )
     frames = [_frame(file, name, header.get(name, IDENTITY)) for name in ("table_pose", "object_pose")]
     entries = header.get("trajectories")
     if not isinstance(entries, list) or not entries:
@@ -111,7 +112,7 @@ def write_contact_recording(folder: Path, motions: Sequence[ContactMotion]) -> N
         with atomic_path(folder / motion.file) as temporary:
             np.savetxt(temporary, table, "%.6f", ",", header=",".join(names), comments="")
     entries = [{"file": motion.file, "excitation": motion.kind} for motion in motions]
-    write_json(folder / "recording.json", {"format": FORMAT, "model": MODEL, "trajectories": entries})
+    write_json(folder / "recording.json", {"format": FORMAT, "model": CONTACT_MODEL, "trajectories": entries})
 
 
 def _frame(where: Path, name: str, values: Any) -> tuple[np.ndarray, Rotation]:

@@ -30,6 +30,8 @@ from vd.gap.recording_checks import (
 )
 
 FORMAT = "vd-recording/1"
+CONTACT_MODEL = "contact"
+"""Model of a recording of an object's motions, not of joints."""
 BARE_MODELS = ("servo", "pendulum")
 """Models that need no articulation: an unknown inertia and gravity load, a point mass on an arm."""
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
@@ -54,6 +56,7 @@ def read_recording(path: str | Path) -> Recording:
     path = Path(path)
     file = path if path.suffix == ".json" else path / "recording.json"
     header = read_header(file)
+    require(header.get("model") != CONTACT_MODEL, f"{file}: an object's motions; they are for vd-gap contact")
     joints = _names(file, "joints", header.get("joints"))
     _check_model(file, header.get("model"), joints)
     resolution: Any = header.get("encoder_resolution_rad")
