@@ -306,7 +306,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"vd-gap: this recording cannot be used: {error}", file=sys.stderr)
         return UNUSABLE
     except KeyboardInterrupt:
-        print("vd-gap: stopped; the same command goes on with the step it was in", file=sys.stderr)
+        again = "goes on with the step it was in" if isinstance(command, _Step) else "begins anew"
+        print(f"vd-gap: stopped; the same command {again}", file=sys.stderr)
         return interrupt.INTERRUPTED
 
 

@@ -25,6 +25,7 @@ from vd.gap.design import design, pieces
 from vd.gap.excitations import MENU, Excitation, JointRange, excitation_set
 from vd.gap.fit import FINER
 from vd.gap.recording import BARE_MODELS, Recording, Trajectory
+from vd.gap.recording_checks import MIN_KINDS
 from vd.gap.result import Report, parameter_columns, parameters_of
 from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.words import causes, joints_text
@@ -131,7 +132,9 @@ def plan(
         competing=competing,
         ranking=(best, *others),
         motions=tuple(motions[best.name]),
-        sentence=_sentence(best, report, tuple(competing)),
+        sentence=_sentence(
+            best, report, tuple(competing), len({t.excitation for t in recording.trajectories})
+        ),
     )
 
 
@@ -364,10 +367,15 @@ def disagreement(one: Rival, other: Rival, new: np.ndarray) -> float:
     return float(np.sqrt(max(apart @ apart / len(apart) - pull @ np.linalg.solve(stiffness, pull), 0.0)))
 
 
-def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
+def _sentence(best: Score, report: Report, joints: tuple[str, ...], kinds: int) -> str:
     """What to record, and what it would show."""
     sets = report.open_sets
     between = f" between {causes(sets[0], 'and')}" if len(sets) == 1 else ""
+    if best.disagreement < VISIBLE and kinds < MIN_KINDS:
+        return (
+            f"Record {MIN_KINDS} kinds of motion at least, here are {kinds}: with so few no motion of the "
+            f"menu decides alone. The best of the menu is in {PLAN_FOLDER}/."
+        )
     if best.disagreement < VISIBLE:
         return (
             f"No motion of the menu would decide{between}: on all of them the models in question differ by "
