@@ -32,9 +32,7 @@ def write_friction_kernel(
     shape_world: wp.array[wp.int32],  # [S] world of each shape
     shape_kind: wp.array[wp.int32],  # [S] kind of each shape
     nominal: wp.array[float],  # [S] friction of each shape before randomisation
-    table_share: wp.array[
-        float
-    ],  # [N] share of the table's friction in that of the pair; 1: it is the pair's
+    table_share: wp.array[float],  # [N] share of the table's friction in the pair's; 1: it is the pair's
     nominal_hand: float,  # friction of the hand that ``hand_friction`` replaces
     kind_table: int,  # kind of the table
     kind_object: int,  # kind of the object's parts
