@@ -61,7 +61,9 @@ def read_mocap(path: Path, body: str | None = None) -> Mocap:
         length = np.linalg.norm(mocap.pose[mocap.tracked, 3:], axis=1)
         if (np.abs(length - 1.0) > UNIT_TOLERANCE).any():
             raise ValueError("a quaternion's length is not 1; export rotations as quaternions")
-    except (OSError, ValueError, csv.Error) as error:  # of text and numbers too
+    except OSError as error:
+        raise MocapError(f"{path}: {error.strerror}; name the export of the motion capture") from error
+    except (ValueError, csv.Error) as error:  # of text and numbers too
         raise MocapError(f"{path}: {error}") from error
     return mocap
 
