@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.contact_layer import CONTACT
 from vd.assets_usd.objects.model import ObjectModel
+from vd.bench.hidden_finger import GRAVITY_M_S2
 from vd.bench.hide import truth_path
 from vd.files import write_json
 from vd.gap.contact_recording import ContactMotion, Kind, write_contact_recording
@@ -81,7 +82,7 @@ class World:
         self.damping = 2.0 * TIP_DAMPING * math.sqrt(self.stiffness * TIP_KG)
         self.corners = np.unique(np.concatenate([vertices for vertices, _ in plant.item.hulls]), axis=0)
         spec, tilt = mujoco.MjSpec(), outside.get("tilted_table", 0.0)
-        spec.option.gravity = [9.81 * math.sin(tilt), 0.0, -9.81 * math.cos(tilt)]
+        spec.option.gravity = [GRAVITY_M_S2 * math.sin(tilt), 0.0, -GRAVITY_M_S2 * math.cos(tilt)]
         spec.option.timestep = self.step = rng.choice([4.0e-4, 5.0e-4])
         spec.option.integrator = rng.choice([int(mujoco.mjtIntegrator.mjINT_EULER), 3])  # or implicitfast
         self._add_object(spec, plant)
@@ -197,7 +198,7 @@ def _motion(plant: ContactPlant, kind: Kind, number: int, rng: np.random.Generat
     if kind == "slide":
         speed, mass, inertia = rng.uniform(0.8, 1.6), world.model.body_mass[1], world.model.body_inertia[1, 2]
         ahead = Rotation.from_euler("z", rng.uniform(-math.pi, math.pi)).apply(ahead)
-        push = mass * (speed / PUSH_OFF_S + world.friction * 9.81) * ahead
+        push = mass * (speed / PUSH_OFF_S + world.friction * GRAVITY_M_S2) * ahead
         return world.run(0.6, hand=np.array([*push, 0.0, 0.0, inertia * rng.normal(0.0, 0.5) / PUSH_OFF_S]))
     if kind == "press":
         above, force = np.array([0.0, 0.0, high - low + TIP_RADIUS_M + 0.004]), rng.uniform(3.0, 8.0)

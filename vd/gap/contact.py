@@ -24,10 +24,10 @@ from scipy.stats import t as student
 
 from vd.assets_usd.objects.contact_layer import CONTACT
 from vd.assets_usd.objects.model import ObjectModel
+from vd.gap.chain import GRAVITY_M_S2
 from vd.gap.contact_recording import ContactMotion, ContactRecording, Kind
 from vd.gap.recording_checks import RecordingError
 
-GRAVITY = 9.81
 FALSE_NAMES = 0.02
 """Share of recordings without a gap in which any name may be given; split evenly over all numbers."""
 OUTLIER = 3.5
@@ -265,7 +265,7 @@ def _flight_errors(motion: ContactMotion, part: slice) -> np.ndarray:
         design[axis, :, 2 * axis : 2 * axis + 2] = np.vander(time, 2)
         design[axis, :, 6:] = -turn[:, axis, :]
     values = motion.position[part].T.copy()
-    values[2] += 0.5 * GRAVITY * time**2
+    values[2] += 0.5 * GRAVITY_M_S2 * time**2
     found = np.linalg.lstsq(design.reshape(-1, 9), values.reshape(-1), rcond=1e-3)[0]
     return np.linalg.norm(values - design @ found, axis=0)
 
@@ -278,10 +278,10 @@ def _check_gravity(recording: ContactRecording, state: _State) -> None:
             time = motion.time[part] - motion.time[part].mean()
             if np.ptp(time) > SURE_S:
                 falls.append(-2.0 * np.polyfit(time, motion.position[part, 2], 2)[0])
-    if falls and not 0.8 < np.median(falls) / GRAVITY < 1.25:
+    if falls and not 0.8 < np.median(falls) / GRAVITY_M_S2 < 1.25:
         raise RecordingError(
-            f"{recording.path}: dropped objects fall with {np.median(falls):.3g} m/s^2, not {GRAVITY}: z of "
-            "the table's frame points up, positions are in m, t is in s; correct table_pose or the columns"
+            f"{recording.path}: dropped objects fall with {np.median(falls):.3g} m/s^2, not {GRAVITY_M_S2}: "
+            "z of the table's frame points up, positions are in m, t is in s; correct table_pose or the columns"
         )
 
 
@@ -289,7 +289,7 @@ def _flights(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Of the origin: o + g t^2 / 2 = c + v t - R d, for x, y and z of every flight."""
     for part in _in_flight(motion, state):
         time = motion.time[part] - motion.time[part].mean()
-        for axis, fall in enumerate((0.0, 0.0, GRAVITY)):
+        for axis, fall in enumerate((0.0, 0.0, GRAVITY_M_S2)):
             slopes = -motion.rotation[part].as_matrix()[:, axis, :]
             yield _equations(np.vander(time, 2), slopes, motion.position[part, axis] + 0.5 * fall * time**2)
 
@@ -304,7 +304,7 @@ def _slides(motion: ContactMotion, state: _State) -> Iterator[Equations]:
         turned = (motion.rotation[part][0].inv() * motion.rotation[part][-1]).magnitude()
         if state.reach * turned / np.ptp(since) < TURNING * speed[part].mean():
             ahead = velocity[part].mean(0) / np.linalg.norm(velocity[part].mean(0))
-            slopes = -0.5 * GRAVITY * since[:, None] ** 2
+            slopes = -0.5 * GRAVITY_M_S2 * since[:, None] ** 2
             yield _equations(np.vander(since, 2), slopes, motion.position[part, :2] @ ahead)
         return  # what moves again was touched
 
@@ -321,7 +321,7 @@ def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     flights = _in_flight(motion, state)
     step = float(np.median(np.diff(motion.time)))
     # Of the fastest bounce with too few samples above CLEAR_M.
-    unseen = math.sqrt(2.0 * GRAVITY * (CLEAR_M + GRAVITY * (0.5 * FEWEST * step) ** 2 / 2.0))
+    unseen = math.sqrt(2.0 * GRAVITY_M_S2 * (CLEAR_M + GRAVITY_M_S2 * (0.5 * FEWEST * step) ** 2 / 2.0))
     for before, after in zip(flights, [*flights[1:], None], strict=False):
         if before.stop == len(motion.time):
             return
@@ -348,7 +348,7 @@ def _touch(
     time, edge = motion.time[part], -1 if touching is None else 0
     since = time - time[edge]
     centre = motion.position[part] + motion.rotation[part].apply(state.centre)
-    height, rise = np.polynomial.polynomial.polyfit(since, centre[:, 2] + 0.5 * GRAVITY * since**2, 1)
+    height, rise = np.polynomial.polynomial.polyfit(since, centre[:, 2] + 0.5 * GRAVITY_M_S2 * since**2, 1)
     near = np.abs(since) < SMOOTH_S
     base = motion.rotation[part][edge]
     turned = (motion.rotation[part][near] * base.inv()).as_rotvec()
@@ -356,13 +356,13 @@ def _touch(
     times = np.linspace(-0.5 * SMOOTH_S, 0.5 * SMOOTH_S, 501)
     turns = (Rotation.from_rotvec(turn + times[:, None] * spin) * base).as_matrix()
     arms = turns @ (state.points - state.centre).T  # [501, 3, N]
-    above = height + rise * times - 0.5 * GRAVITY * times**2 - state.table_m
+    above = height + rise * times - 0.5 * GRAVITY_M_S2 * times**2 - state.table_m
     if touching is None:
         first = int(np.abs(above + arms[:, 2].min(1)).argmin())
         touching = arms[first, 2] < arms[first, 2].min() + FLAT_M
     at = int(np.abs(above + arms[:, 2, touching].mean(1)).argmin())
     arm = arms[at][:, touching].mean(1)
-    return time[edge] + times[at], rise - GRAVITY * times[at] + np.cross(spin, arm)[2], touching
+    return time[edge] + times[at], rise - GRAVITY_M_S2 * times[at] + np.cross(spin, arm)[2], touching
 
 
 def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:
@@ -378,7 +378,7 @@ def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:
         time, ahead = motion.time[part], velocity[part] / speed[part, None]
         if len(time) >= FEWEST:
             along = (motion.force[part, :2] * ahead).sum(1) + state.friction * motion.force[part, 2]
-            gain = speed[part][-1] - speed[part][0] + state.friction * GRAVITY * np.ptp(time)
+            gain = speed[part][-1] - speed[part][0] + state.friction * GRAVITY_M_S2 * np.ptp(time)
             yield np.array([[gain**2]]), np.array([gain * np.trapezoid(along, time)])
 
 

@@ -12,7 +12,7 @@ RACE_ITERATIONS = 4
 """Iterations after which only the better half of several starts goes on."""
 WIDEN = -3.0
 """Factor on the finite-difference steps of a second descent: dry friction and limits make the squared error
-rugged at the scale of the first one's."""
+rugged at the scale of the first one's. Less than 0: to the other side."""
 TOLERANCE = 1e-4
 """Relative improvement of the squared error at which a fit has converged."""
 
