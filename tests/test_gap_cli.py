@@ -28,8 +28,7 @@ def recording(tmp_path_factory):
     return rubbing_servo(tmp_path_factory.mktemp("recordings") / "servo")
 
 
-@pytest.mark.parametrize("command", ["run", "identify"])
-def test_a_recording_that_cannot_be_used_is_refused_before_warp_is_imported(recording, tmp_path, command):
+def test_a_recording_that_cannot_be_used_is_refused_before_warp_is_imported(recording, tmp_path):
     folder = shutil.copytree(recording, tmp_path / "r")
     table = sorted(folder.glob("*.csv"))[0]
     lines = table.read_text().splitlines()
@@ -38,7 +37,7 @@ def test_a_recording_that_cannot_be_used_is_refused_before_warp_is_imported(reco
         "import sys; from vd.gap.cli import main; status = main(sys.argv[1:]); "
         "print(status, 'warp' in sys.modules, file=sys.stderr)"
     )
-    arguments = [sys.executable, "-c", script, command, str(folder), "--out", str(tmp_path / "out")]
+    arguments = [sys.executable, "-c", script, "run", str(folder), "--out", str(tmp_path / "out")]
     said = subprocess.run(arguments, capture_output=True, text=True, timeout=120).stderr
     assert "cut the file there" in said and table.name in said
     assert said.endswith("2 False\n") and not (tmp_path / "out").exists()
@@ -156,7 +155,7 @@ def test_layer_of_a_bare_servo_reads_back_as_it_was_identified(recording, tmp_pa
     report, curves = servo_report(recording)
     layer = tmp_path / "identified.usda"
     found = read_recording(recording)
-    write_identified(report, layer, found, None, {})
+    write_identified(report, tmp_path, found, None, {})
     rows, intervals = read_bare_layer(layer, (JOINT,))
     for column, value in {**base_columns(), actuators.COULOMB_TORQUE: FRICTION}.items():
         assert rows[0, column] == pytest.approx(value, rel=1e-6)
@@ -166,7 +165,7 @@ def test_layer_of_a_bare_servo_reads_back_as_it_was_identified(recording, tmp_pa
     assert closing.identified_rmse_rad == pytest.approx(report.held_out.identified_rmse_rad, rel=1e-3)
     start = chains(found, None)[0].start_row[0].copy()
     start[actuators.COMMAND_DELAY] = 0.02
-    write_identified(report, layer, found, None, {JOINT: start})  # what was started from stays
+    write_identified(report, tmp_path, found, None, {JOINT: start})  # what was started from stays
     rows, _ = read_bare_layer(layer, (JOINT,))
     assert rows[0, actuators.COMMAND_DELAY] == pytest.approx(0.02)
     assert rows[0, actuators.COULOMB_TORQUE] == pytest.approx(FRICTION)

@@ -6,6 +6,7 @@ from typing import get_args
 
 import numpy as np
 
+from vd.gap.chain import relative_torques
 from vd.gap.coordinates import BASELINE_PARAMETERS, GRAVITY
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.fit import FINER
@@ -30,9 +31,6 @@ from vd.gap.rollout import Rollouts
 from vd.gap.statistics import interval, resamples, rmse
 from vd.gap.worker_pool import JointSpec, Problems
 from vd.kernels.servo.effects import EFFECTS
-
-CLOSE = 0.1
-"""Values of one effect on two joints within this share of each other are one value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +111,7 @@ def assemble(
             samples=len(predictions.time),
             seconds=float(sum(t.time[-1] for t in recording.trajectories)),
             servo=str(recording.servo.get("model", "")),
+            relative_torques=relative_torques(recording),
         ),
         provisional=_pool(joints, named=False),
         joints=tuple(_gap(j, rows[j.name], rng) for j in joints),
@@ -217,7 +216,7 @@ def _gap(joint: Analysed, rows: Sequence[TrajectoryError], rng: np.random.Genera
         identified_ci95=interval(rmse(new, count, weights)),
         verdict=joint.explanation.verdict,
         reason=joint.explanation.reason,
-        open_sets=tuple((one.name, *one.tied) for one in joint.found if one.tied and not one.named),
+        open_sets=tuple(_unique(one.name, *one.tied) for one in joint.found if one.tied and not one.named),
     )
 
 
@@ -238,15 +237,11 @@ def _pool(joints: Sequence[Analysed], *, named: bool) -> tuple[NamedEffect, ...]
 
 
 def _agree(one: Accepted, other: Accepted) -> bool:
-    """Whether the values of an effect on two joints can be the same."""
+    """Whether the values of an effect on two joints can be the same: their intervals overlap."""
     if one.estimates.keys() != other.estimates.keys():
         return False
-    for key, (value, low, high) in one.estimates.items():
-        theirs, their_low, their_high = other.estimates[key]
-        near = abs(value - theirs) <= CLOSE * max(abs(value), abs(theirs))
-        if not near and not (low <= their_high and their_low <= high):
-            return False
-    return True
+    pairs = [(one.estimates[key], other.estimates[key]) for key in one.estimates]
+    return all(a[1] <= b[2] and b[1] <= a[2] for a, b in pairs)
 
 
 def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
@@ -279,9 +274,13 @@ def _sets(joints: Sequence[Analysed]) -> tuple[tuple[str, ...], ...]:
     sets: dict[frozenset[str], tuple[str, ...]] = {}
     for accepted in (one for joint in joints for one in joint.found):
         if (accepted.tied and not accepted.named) or accepted.equivalent:
-            members = (accepted.name, *accepted.equivalent, *accepted.tied)
+            members = _unique(accepted.name, *accepted.equivalent, *accepted.tied)
             sets.setdefault(frozenset(members), members)
     return tuple(sets.values())
+
+
+def _unique(*names: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(names))
 
 
 def _evidence(joint: Analysed) -> list[Candidate]:

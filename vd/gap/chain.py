@@ -7,6 +7,7 @@ down as in the simulator.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,14 +24,8 @@ FREE = 1.0e6
 """A position [rad] that no joint and a torque [N m] that no drive reaches: the bound of one that has none."""
 
 
-@dataclass(frozen=True, eq=False)
-class Load:
-    """The point mass on a pendulum's arm.
-
-    Attributes:
-        mass_kg: Mass [kg].
-        arm_m: Length of the arm [m].
-    """
+class Load(NamedTuple):
+    """The point mass on a pendulum's arm, in kg and m."""
 
     mass_kg: float
     arm_m: float
@@ -95,16 +90,10 @@ class Chain:
 
     def inertia_scale(self, joint: int) -> float:
         """Inertia of the links about a joint with all joints at zero, without the drive's own [kg m^2]."""
-        if not self.bodies:
-            return 0.0
-        total, origin = 0.0, np.zeros(3)
-        for link in range(joint, len(self.joints)):
-            origin = origin + (self.offset[link] if link > joint else 0.0)
-            lever = np.cross(self.axis[joint], origin + self.com[link])
-            total += (
-                self.mass[link] * lever @ lever + self.axis[joint] @ self.inertia[link] @ self.axis[joint]
-            )
-        return float(total)
+        axis, places = self.axis[joint], np.cumsum(self.offset, axis=0) + self.com
+        levers = np.cross(axis, places - np.cumsum(self.offset, axis=0)[joint])[joint:]
+        own = np.einsum("i,kij,j->k", axis, self.inertia[joint:], axis)
+        return float(np.sum(self.mass[joint:] * (levers**2).sum(axis=1) + own))
 
 
 def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:

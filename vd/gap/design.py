@@ -11,14 +11,10 @@ from vd.gap.statistics import held
 MAX_FOLDS = 6
 BYSTANDERS = 2
 """Trajectories of each other joint of the chain in which a joint's own rest is fitted too."""
-CONDITION_VALUES = 3
-"""Values of a condition from which on its values, not the motions, are held out."""
 MAX_MOTION_S = 150.0
 """Motion of a joint that is fitted [s]: twice what the paper records; the rest is held out for good."""
 MAX_MOTIONS = 30
 """Trajectories of a joint that are fitted, spread over the recording: each is worth 5 s then."""
-NEARLY = 0.95
-"""Share of the widest range that a piece must cover to be taken for being the earliest."""
 
 
 def design(recording: Recording, chain: Chain, joint: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -75,7 +71,7 @@ def pieces(recording: Recording, chain: Chain, trajectories: Sequence[int]) -> t
 
 
 def _widest(recording: Recording, chain: Chain, trajectory: Trajectory, share: float) -> tuple[int, int]:
-    """The first piece of ``share`` seconds from rest in which the joints cover about the most they do."""
+    """The piece of ``share`` seconds from rest in which the joints cover most."""
     time = trajectory.time
     if time[-1] <= share:
         return 0, len(time)
@@ -86,16 +82,17 @@ def _widest(recording: Recording, chain: Chain, trajectory: Trajectory, share: f
     ends = np.searchsorted(time, time[starts] + share)
     position = trajectory.position[:, columns]
     parts = zip(starts, ends, strict=True)
-    covered = np.array([np.ptp(position[first:end], axis=0).sum() for first, end in parts])
-    best = int(np.argmax(covered >= NEARLY * covered.max()))
+    best = int(np.argmax([np.ptp(position[first:end], axis=0).sum() for first, end in parts]))
     return int(starts[best]), int(ends[best])
 
 
 def varied(trajectories: list[Trajectory]) -> str | None:
-    """The condition whose values are held out: the one with the most values, if they are enough."""
-    names = sorted({name for t in trajectories for name in t.conditions})
-    counts = {
-        name: len({str(t.conditions[name]) for t in trajectories if name in t.conditions}) for name in names
+    """The condition whose values are held out: that with the most, if two are left when one is held out."""
+    values: dict[str, set[str]] = {
+        name: set() for name in sorted({n for t in trajectories for n in t.conditions})
     }
-    best = max(names, key=lambda name: counts[name], default=None)
-    return best if best is not None and counts[best] >= CONDITION_VALUES else None
+    for trajectory in trajectories:
+        for name, value in trajectory.conditions.items():
+            values[name].add(str(value))
+    best = max(values, key=lambda name: len(values[name]), default=None)
+    return best if best is not None and len(values[best]) > 2 else None

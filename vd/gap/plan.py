@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vd.config import to_dict
-from vd.files import write_json, write_text
-from vd.gap.chain import Chain, chains
+from vd.files import write_json
+from vd.gap.chain import Chain, candidates, chains
 from vd.gap.coordinates import BASELINE_PARAMETERS
 from vd.gap.design import design, pieces
-from vd.gap.excitations import MENU, Excitation, JointRange, excitation_set
+from vd.gap.excitations import MENU, JointRange, excitation_set, numbered
 from vd.gap.fit import FINER
-from vd.gap.recording import BARE_MODELS, Recording, Trajectory
+from vd.gap.recording import BARE_MODELS, Recording, Trajectory, write_table
 from vd.gap.recording_checks import MIN_KINDS
 from vd.gap.result import Report, parameter_columns, parameters_of
 from vd.gap.rollout import STEP_S, Rollouts
@@ -74,7 +74,7 @@ class Plan:
     """Sets of models in question, by joint."""
     ranking: tuple[Score, ...]
     """Best first."""
-    motions: tuple[Excitation, ...]
+    motions: tuple[Trajectory, ...]
     """Of the best set."""
     sentence: str
 
@@ -149,13 +149,13 @@ def write_plan(result: Plan, folder: Path) -> Path:
     """
     discard_plan(folder)
     path, entries = Path(folder) / PLAN_JSON, []
-    for index, motion in enumerate(result.motions):
-        name = f"{PLAN_FOLDER}/{index:03d}_{motion.joints[0]}_{motion.name}.csv"
-        write_text(Path(folder) / name, _csv(motion, result.joints))
+    for motion in numbered(result.motions):
+        file = f"{PLAN_FOLDER}/{motion.file}"
+        write_table(Path(folder) / file, motion, result.joints, ("command", "enabled"))
         entries.append(
             {
-                "file": name,
-                "excitation": motion.name,
+                "file": file,
+                "excitation": motion.excitation,
                 "joints": list(motion.joints),
                 "conditions": motion.conditions,
                 "duration_s": motion.duration,
@@ -190,7 +190,7 @@ def _targets(report: Report) -> dict[str, tuple[tuple[str, ...], ...]]:
     return {joint: groups for joint, groups in targets.items() if joint in report.identified.parameters}
 
 
-def _menu(recording: Recording, hand: "HandModel | None") -> dict[str, list[Excitation]]:
+def _menu(recording: Recording, hand: "HandModel | None") -> dict[str, list[Trajectory]]:
     """The menu for this machine, under the conditions that its recording has throughout.
 
     Joints move in the hand's range, or in that of the commands before. Only a pendulum's load is modelled.
@@ -220,11 +220,11 @@ def _menu(recording: Recording, hand: "HandModel | None") -> dict[str, list[Exci
 
 def _base(chain: Chain, report: Report, start: Mapping[str, np.ndarray]) -> np.ndarray:
     """Parameter rows of the chain as identified so far, shape [n, P]."""
-    rows = np.array(chain.start_row, dtype=float)
-    for index, joint in enumerate(chain.joints):
-        rows[index] = start.get(joint, rows[index])
+    rows = [start.get(name, row) for name, row in zip(chain.joints, chain.start_row, strict=True)]
+    rows = np.array(rows, dtype=float)
+    for row, joint in zip(rows, chain.joints, strict=True):
         for column, value in parameter_columns(report, joint).items():
-            rows[index, column] = value
+            row[column] = value
     return rows
 
 
@@ -241,9 +241,7 @@ def _models(
         return rows
 
     if len(group) < 2:  # nothing in particular competes: which motion would show the most of everything?
-        alone = len(chain.joints) == 1
-        effects = [name for name in EFFECTS if not (alone and name == "joint_coupling")]
-        return {PLAIN: base, **{name: having(name, {}) for name in effects}}
+        return {PLAIN: base, **{name: having(name, {}) for name in candidates(chain, tuple(EFFECTS))}}
     for parameter in (p for name in group for p in EFFECTS[name].parameters):
         base[index, parameter.column] = parameter.neutral  # one of them stands in the model for all
     held = {e.name for e in (*report.effects, *report.provisional) if joint in e.joints} - {*group}
@@ -261,7 +259,7 @@ def _fitted(report: Report, joint: str, name: str, given: set[str]) -> dict[str,
 def _compare(
     chain: Chain,
     recording: Recording,
-    menu: Mapping[str, Sequence[Excitation]],
+    menu: Mapping[str, Sequence[Trajectory]],
     joint: str,
     models: Mapping[str, np.ndarray],
     noise: float,
@@ -271,20 +269,7 @@ def _compare(
     index = chain.joints.index(joint)
     known = _analysed(recording, chain, index)
     owner = [""] * len(known) + [name for name, new in menu.items() for _ in new]
-    imagined = [
-        Trajectory(
-            file=str(number),
-            excitation=motion.name,
-            joints=motion.joints,
-            conditions=motion.conditions,
-            time=motion.time,
-            command=motion.command,
-            position=motion.command,
-            enabled=motion.enabled,
-        )
-        for number, motion in enumerate(itertools.chain(*menu.values()))
-    ]
-    everything = replace(recording, trajectories=(*known, *imagined))
+    everything = replace(recording, trajectories=(*known, *itertools.chain(*menu.values())))
     # Rivals of a set differ by less than a delay of the fit's own step.
     step = STEP_S if PLAIN in models else STEP_S / FINER[-1]
     rollouts = Rollouts(chain, everything, dt=step, device=device)
@@ -371,17 +356,13 @@ def _sentence(best: Score, report: Report, joints: tuple[str, ...], kinds: int) 
     """What to record, and what it would show."""
     sets = report.open_sets
     between = f" between {causes(sets[0], 'and')}" if len(sets) == 1 else ""
-    if best.disagreement < VISIBLE and kinds < MIN_KINDS:
-        return (
-            f"Record {MIN_KINDS} kinds of motion at least, here are {kinds}: with so few no motion of the "
-            f"menu decides alone. The best of the menu is in {PLAN_FOLDER}/."
-        )
     if best.disagreement < VISIBLE:
+        decide = "so either serves in simulation; another quantity may decide, current or an external sensor"
+        if kinds < MIN_KINDS:
+            decide = f"but here are {kinds} kinds of motion: record {MIN_KINDS} at least"
         return (
             f"No motion of the menu would decide{between}: on all of them the models in question differ by "
-            f"less than {VISIBLE:g} times the noise, so either serves in simulation. To decide, record "
-            "another quantity, such as current or an external sensor. The best of the menu is in "
-            f"{PLAN_FOLDER}/."
+            f"less than {VISIBLE:g} times the noise, {decide}. The best of the menu is in {PLAN_FOLDER}/."
         )
     goal = f"to decide{between}" if sets else "to see what these motions do not show"
     shows = f"the models in question differ by {best.disagreement:.1f} times the noise"
@@ -392,16 +373,3 @@ def _sentence(best: Score, report: Report, joints: tuple[str, ...], kinds: int) 
         f"there {shows}. The commands are in {PLAN_FOLDER}/; add what was measured to the recording and run "
         "vd-gap again."
     )
-
-
-def _csv(motion: Excitation, joints: Sequence[str]) -> str:
-    """The commands of a motion, and where its torque is on if it is not always."""
-    columns = {
-        "t": motion.time,
-        **{f"command.{joint}": motion.command[:, i] for i, joint in enumerate(joints)},
-    }
-    cells = [[f"{value:.6f}" for value in column] for column in columns.values()]
-    if not motion.enabled.all():
-        columns |= {f"enabled.{joint}": motion.enabled[:, i] for i, joint in enumerate(joints)}
-        cells += motion.enabled.astype(int).astype(str).T.tolist()
-    return "\n".join(map(",".join, [list(columns), *zip(*cells, strict=True)])) + "\n"

@@ -8,16 +8,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import correlate, correlation_lags
 
 from vd.gap.motions import Recording, Trajectory
 
 COMMAND_TIME = "t_command"
 """Optional column: when the commands of a row were sent [s], if not at the row's time stamp."""
-TURN = 2.0 * math.pi
 RADIANS = "more than a turn, so these look like degrees or counts; write radians"
 RANGES = {
-    "command": (-1.1 * TURN, 1.1 * TURN, RADIANS),
-    "position": (-1.1 * TURN, 1.1 * TURN, RADIANS),
+    "command": (-1.1 * math.tau, 1.1 * math.tau, RADIANS),
+    "position": (-1.1 * math.tau, 1.1 * math.tau, RADIANS),
     "velocity": (-100.0, 100.0, "no servo is that fast, so these look like rpm or deg/s; write rad/s"),
     "current": (-50.0, 50.0, "no servo draws that much, so these look like mA or counts; write A"),
     "pwm": (-1.0, 1.0, "a duty cycle lies in [-1, 1]; divide by the full scale"),
@@ -90,6 +90,12 @@ def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
             wrong = ~np.isin(values, (low, high))
         i = int(np.argmax(np.where(wrong, np.abs(values), -1.0)))
         require(not wrong.any(), f"{file}: row {i + 2}, column {name!r}: {values[i]:g}: {why}")
+        i = int(np.argmax(np.abs(np.diff(values))))
+        require(
+            not name.startswith("position.") or abs(values[i + 1] - values[i]) <= math.pi,
+            f"{file}: row {i + 3}, column {name!r} jumps by a turn, as angles wrapped at pi do; unwrap it "
+            "and its command (numpy.unwrap)",
+        )
 
 
 def _check_sent(file: Path, time: np.ndarray, sent: np.ndarray) -> None:
@@ -108,42 +114,6 @@ def _check_sent(file: Path, time: np.ndarray, sent: np.ndarray) -> None:
         f"{file}: column {COMMAND_TIME!r} {why}: {unit}; write seconds on the clock of 't', or drop "
         "the column",
     )
-
-
-def unwrapped(
-    where: str, command: np.ndarray, position: np.ndarray, on: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Command and position without jumps by a whole turn, the position beside its command.
-
-    Args:
-        where: File and joint, for the error.
-        command: Commands of the joint [T] [rad].
-        position: Its positions [T] [rad].
-        on: Where its torque is on [T] bool.
-
-    Returns:
-        Both [T], or None where nothing jumps.
-
-    Raises:
-        RecordingError: The commands are wrapped, but their steps are too large to tell the turn.
-    """
-    if not on.any() or np.abs(command - position)[on].max() <= math.pi >= np.abs(np.diff(position)).max():
-        return None
-    whole = np.unwrap(position)
-    whole += TURN * np.round(np.median((command - whole)[on]) / TURN)
-    apart = command - whole
-    near = apart - TURN * np.round(apart / TURN)
-    far = on & (np.abs(apart) > math.pi)
-    # A large step is far from its position for a moment, a wrapped command where it has arrived, too.
-    if far.any() and np.median(np.abs(near[far])) < TURN / 8.0:
-        require(
-            np.abs(near[on]).max() <= math.pi - TURN / 8.0,
-            f"{where}: the command is wrapped at a turn, and its steps are too large to tell which; "
-            "unwrap it beside the position (numpy.unwrap)",
-        )
-        apart = near
-    moved = whole - position, apart + whole - command
-    return (whole + apart, whole) if max(np.abs(shift).max() for shift in moved) > math.pi else None
 
 
 def check_motion(recording: Recording) -> None:
@@ -192,53 +162,31 @@ def _answer_fault(told: list[Trajectory], j: int, count: float) -> str:
 
 def _lead(t: Trajectory, j: int) -> float:
     """By how much the positions of a joint come before its commands [s]; 0 if they do not, clearly."""
-    step = max(float(np.median(np.diff(t.time))), SLOWEST_S / 100.0)
-    reach = int(SLOWEST_S / step)
+    step = float(np.median(np.diff(t.time)))
     when = np.arange(0.0, t.time[-1], step)
-    if len(when) < 4 * reach:
-        return 0.0
-    c = np.interp(when, t.sent, t.command[:, j])[reach:-reach]
-    p = np.lib.stride_tricks.sliding_window_view(np.interp(when, t.time, t.position[:, j]), len(c))
-    c, p = c - c.mean(), p - p.mean(axis=1, keepdims=True)
-    size = np.linalg.norm(c) * np.linalg.norm(p, axis=1)
-    if not size.all():
-        return 0.0
-    miss = 1.0 - p @ c / size
-    best = int(np.argmin(miss))
-    lead = reach - best
-    return lead * step if lead >= FEW and miss[best] < CLEARLY * miss[reach:].min() else 0.0
+    command, position = np.interp(when, t.sent, t.command[:, j]), np.interp(when, t.time, t.position[:, j])
+    command, position = command - command.mean(), position - position.mean()
+    miss = 1.0 - correlate(command, position) / (np.linalg.norm(command) * np.linalg.norm(position))
+    lead, best = int(correlation_lags(len(when), len(when))[np.argmin(miss)]), miss.min()
+    return lead * step if lead >= FEW and best < CLEARLY * miss[: len(when)].min() else 0.0
 
 
 def check_units(recording: Recording) -> None:
-    """Small motions in degrees show in the size of a count."""
-    for joint, step in _steps(recording).items():
-        require(
-            step <= MOVING_COUNTS * recording.encoder_resolution_rad,
-            f"{recording.path}: column 'position.{joint}' moves in steps of {step:.3g}, but "
-            f"'encoder_resolution_rad' is {recording.encoder_resolution_rad:g}: these look like degrees or "
-            "counts; write radians",
-        )
-
-
-def _steps(recording: Recording) -> dict[str, float]:
-    """Smallest step between two readings of each joint [rad]; of those that have enough to tell."""
-    found = {}
+    """Small motions in degrees show in the size of a count: the least step between two readings of a joint."""
+    count = recording.encoder_resolution_rad
     for column, joint in enumerate(recording.joints):
         levels = np.unique(np.concatenate([t.position[:, column] for t in recording.trajectories]).round(6))
-        if len(levels) >= MIN_SAMPLES:
-            found[joint] = float(np.diff(levels).min())
-    return found
+        step = float(np.diff(levels).min()) if len(levels) >= MIN_SAMPLES else 0.0
+        require(
+            step <= MOVING_COUNTS * count,
+            f"{recording.path}: column 'position.{joint}' moves in steps of {step:.3g}, but "
+            f"'encoder_resolution_rad' is {count:g}: these look like degrees or counts; write radians",
+        )
 
 
 def cautions(recording: Recording) -> tuple[str, ...]:
     """Plain sentences about what the recording cannot show well, joints together where they share one."""
     found: list[str] = []
-    jumped = {joint: None for t in recording.trajectories for joint in t.unwrapped}
-    if jumped:
-        found.append(
-            f"Command or position of {', '.join(jumped)} jumped by whole turns, as angles wrapped at pi do: "
-            "they are analysed unwrapped."
-        )
     kinds = {j: {t.excitation for t in recording.trajectories if j in t.joints} for j in recording.joints}
     idle = [joint for joint, names in kinds.items() if not names]
     few = [joint for joint, names in kinds.items() if 0 < len(names) < MIN_KINDS]
@@ -255,11 +203,4 @@ def cautions(recording: Recording) -> tuple[str, ...]:
             f"Samples are {1e3 * between:.0f} ms apart: what a servo does at the beginning of a step is not "
             "resolved; record at 50 Hz or more."
         )
-    for joint, step in _steps(recording).items():
-        if step > 1.5 * recording.encoder_resolution_rad:
-            found.append(
-                f"Positions of {joint} come in steps of {1e3 * step:.3g} mrad, where recording.json says "
-                f"{1e3 * recording.encoder_resolution_rad:.3g}: correct the size of a count, or the noise "
-                "floor may be too low."
-            )
     return tuple(found)

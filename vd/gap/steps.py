@@ -1,14 +1,14 @@
 """The steps of ``vd-gap run``, each from files to files, skipped where they have run on the same input.
 
-``DIR/run.json`` keeps the settings, so that a later step needs only ``DIR``, and a digest of what each step
-was made from, so that an interrupted run goes on with the step it was in.
+``DIR/run.json`` keeps the settings, so that a later step needs only ``DIR``, a digest of recording, model and
+settings, and which steps have run on them, so that an interrupted run goes on with the step it was in.
 """
 
 import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -43,6 +43,8 @@ _DOES = {
 }
 METHOD = 12
 """Of the analysis; what another one made is made again."""
+NO_EFFECTS = "none"
+"""In place of candidates: identify the drives alone, as the paper does."""
 STEPS = tuple(OUTPUTS)
 _PACKAGES = ("visual-dexterity", "warp-lang", "newton", "cma", "numpy")
 
@@ -58,7 +60,7 @@ class Settings:
     hand_layer: Path | None = None
     """Identified model to start from."""
     effects: tuple[str, ...] = ()
-    """Candidates; empty means all."""
+    """Candidates, or :data:`NO_EFFECTS`; empty means all."""
     seed: int = 0
     device: str = "cpu"
 
@@ -153,78 +155,65 @@ class Analysis:
         rows, _ = read_bare_layer(self.settings.hand_layer, joints)
         return dict(zip(joints, rows, strict=True))
 
-    def run(self, last: str, *, first: str | None = None, fresh: bool = False) -> None:
+    def run(self, last: str, *, first: str = STEPS[0], fresh: bool = False) -> None:
         """Run steps up to ``last``; those that have run on the same input are skipped.
 
         Args:
             last: Name of the last step.
-            first: First step; only what it needs may be there already. None is the very first.
+            first: First step; only what it needs may be there already.
             fresh: Repeat the steps even if nothing has changed.
 
         Raises:
             RecordingError: The recording cannot be used.
-            ValueError: A setting cannot be used, or what an earlier step writes is missing.
+            ValueError: A setting cannot be used, or a step before ``first`` has not run.
         """
-        begin = STEPS.index(first or STEPS[0])
-        for name in STEPS[begin : STEPS.index(last) + 1]:
-            self._step(name, fresh=fresh)
+        for index in range(STEPS.index(first), STEPS.index(last) + 1):
+            name, done = STEPS[index], self._done(STEPS[:index])
+            if name in self._seconds() and not fresh:
+                print(f"{name}: nothing has changed, kept", file=sys.stderr)
+                continue
+            for file in OUTPUTS[name]:  # what was found before is not what an interrupted step finds
+                (self.out / file).unlink(missing_ok=True)
+            self._note(done)
+            print(f"{name}: {_DOES[name]}", file=sys.stderr)
+            began = time.perf_counter()
+            _RUN[name](self)
+            self._note({**done, name: time.perf_counter() - began})
 
-    def _step(self, name: str, *, fresh: bool) -> None:
-        before = STEPS[STEPS.index(name) - 1] if name != STEPS[0] else None
-        for needed in OUTPUTS.get(before or "", ()):
-            self._need(needed, str(before))
-        made_from = self._digest(name)
-        record = self._record()
-        done = record["steps"].get(name, {})
-        files = [self.out / file for file in OUTPUTS[name]]
-        if not fresh and done.get("made_from") == made_from and all(file.is_file() for file in files):
-            print(f"{name}: nothing has changed, kept", file=sys.stderr)
-            return
-        for file in files:  # a step that is interrupted must not look finished
-            file.unlink(missing_ok=True)
-        make_folder(self.out)
-        record["settings"] = to_dict(self.settings)
-        write_json(self.out / RUN, record)
-        print(f"{name}: {_DOES[name]}", file=sys.stderr)
-        began = time.perf_counter()
-        _RUN[name](self)
-        record["steps"][name] = {"made_from": made_from, "seconds": time.perf_counter() - began}
-        write_json(self.out / RUN, record)
-
-    def _need(self, file: str, step: str) -> Path:
-        """A file that a step writes.
+    def _done(self, steps: Sequence[str]) -> dict[str, float]:
+        """Seconds that steps have taken.
 
         Raises:
-            ValueError: It has not run.
+            ValueError: One of them has not run on this input.
         """
-        if not (self.out / file).is_file():
-            raise ValueError(f"{self.out / file} is missing; run vd-gap {step} --out {self.out} first")
-        return self.out / file
+        seconds = self._seconds()
+        if missing := [name for name in steps if name not in seconds]:
+            raise ValueError(f"{self.out} lacks a step; run vd-gap {missing[0]} --out {self.out} first")
+        return {name: seconds[name] for name in steps}
 
-    def _record(self) -> dict[str, Any]:
-        path = self.out / RUN
-        if path.is_file():
-            try:
-                record = json.loads(path.read_text())
-                return {"settings": record["settings"], "steps": dict(record["steps"])}
-            except (ValueError, KeyError, TypeError):
-                pass  # written by something else, or by hand: start afresh
-        return {"settings": {}, "steps": {}}
+    def _seconds(self) -> dict[str, float]:
+        """Seconds of every step that has run on this input, and whose files are there."""
+        try:
+            record = json.loads((self.out / RUN).read_text())
+            ran = record["steps"].items() if record["made_from"] == self._made_from else ()
+            return {name: s for name, s in ran if all((self.out / f).is_file() for f in OUTPUTS[name])}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return {}  # none, or written by something else: start afresh
 
-    def _digest(self, name: str) -> str:
-        """Of everything a step is made from."""
-        digest = hashlib.sha256(f"{name} {METHOD}".encode())
-        digest.update(json.dumps(to_dict(replace(self.settings, recording=Path()))).encode())
-        recording = self.recording
-        digest.update((recording.path / "recording.json").read_bytes())
-        for trajectory in recording.trajectories:
-            digest.update((recording.path / trajectory.file).read_bytes())
-        for model in (self.hand_name, self.settings.hand_layer):  # the files, where they are some
-            if model is not None and Path(model).is_file():
-                digest.update(Path(model).read_bytes())
-        if name != STEPS[0]:
-            for file in OUTPUTS[STEPS[STEPS.index(name) - 1]]:
-                digest.update((self.out / file).read_bytes())
+    def _note(self, steps: Mapping[str, float]) -> None:
+        make_folder(self.out)
+        record = {"settings": to_dict(self.settings), "made_from": self._made_from, "steps": steps}
+        write_json(self.out / RUN, record)
+
+    @cached_property
+    def _made_from(self) -> str:
+        """Digest of everything that the steps are made from."""
+        settings = to_dict(replace(self.settings, recording=Path()))
+        digest, folder = hashlib.sha256(json.dumps([METHOD, settings]).encode()), self.recording.path
+        files = ["recording.json", *(trajectory.file for trajectory in self.recording.trajectories)]
+        models = [Path(model) for model in (self.hand_name, self.settings.hand_layer) if model is not None]
+        for file in (*(folder / name for name in files), *(model for model in models if model.is_file())):
+            digest.update(file.read_bytes())
         return digest.hexdigest()
 
     def options(self) -> dict[str, Any]:
@@ -232,7 +221,7 @@ class Analysis:
         settings = self.settings
         options: dict[str, Any] = {"seed": settings.seed, "device": settings.device, "progress": _show}
         if settings.effects:
-            options["effects"] = settings.effects
+            options["effects"] = tuple(name for name in settings.effects if name != NO_EFFECTS)
         if self.start:
             options["start"] = self.start
         return options
@@ -243,7 +232,8 @@ class Analysis:
         Raises:
             ValueError: It has not run.
         """
-        return Report.read(self._need(EXPLAIN, "explain"))
+        self._done(STEPS[:2])
+        return Report.read(self.out / EXPLAIN)
 
     def command(self) -> str:
         """The command that repeats the analysis."""
@@ -274,26 +264,21 @@ def _explain(analysis: Analysis) -> None:
 
 
 def _close(analysis: Analysis) -> None:
-    from vd.gap.close import WHOLE_HAND_LAYER, one_finger, simulate_again, write_identified
+    from vd.gap.close import simulate_again, write_identified
     from vd.gap.plan import discard_plan, plan, write_plan
 
-    report, layer = analysis.explained(), analysis.out / LAYER
-    whole = layer.with_name(WHOLE_HAND_LAYER)
-    whole.unlink(missing_ok=True)
-    write_identified(report, layer, analysis.recording, analysis.hand, analysis.start)
-    partly = one_finger(analysis.recording, analysis.hand)
-    if partly:
-        write_identified(report, whole, analysis.recording, analysis.hand, analysis.start, every_finger=True)
+    report = analysis.explained()
+    whole = write_identified(report, analysis.out, analysis.recording, analysis.hand, analysis.start)
     closing, curves = simulate_again(
         report,
-        layer,
+        analysis.out / LAYER,
         analysis.recording,
         analysis.hand_name,
         analysis.settings.hand_layer,
         Predictions.read(analysis.out / CURVES),
         device=analysis.settings.device,
     )
-    closing = replace(closing, whole_hand_layer=whole.name if partly else "")
+    closing = replace(closing, whole_hand_layer=whole)
     curves.write(analysis.out / CLOSING_CURVES)
     discard_plan(analysis.out)
     if report.verdict == "under_excited" or report.open_sets:
@@ -310,7 +295,6 @@ def _report(analysis: Analysis) -> None:
     from vd.gap.report import write_report
 
     closing = from_dict(Closing, json.loads((analysis.out / CLOSE).read_text()))
-    steps = analysis._record()["steps"]
     report = analysis.explained()
     planned = analysis.out / PLAN_JSON
     report = replace(
@@ -319,7 +303,7 @@ def _report(analysis: Analysis) -> None:
         next_experiment=(
             json.loads(planned.read_text())["sentence"] if planned.is_file() else report.next_experiment
         ),
-        seconds=sum(step["seconds"] for step in steps.values()),
+        seconds=sum(analysis._seconds().values()),
         hand=analysis.hand_name,
         hand_layer=None if analysis.settings.hand_layer is None else str(analysis.settings.hand_layer),
         warnings=cautions(analysis.recording),

@@ -69,10 +69,13 @@ def estimate(one: Estimate) -> str:
     return f"{value} {shown}".strip() + f" (95 %: {low} to {high})"
 
 
-def effect_sentence(effect: NamedEffect) -> str:
-    """``command delay on f0_j1 (40.2 ms)``."""
-    sizes = ", ".join(amount(p.value, p.unit) for p in effect.parameters.values())
-    return f"{plain(effect.name)} on {joints_text(effect.joints)}" + (f" ({sizes})" if sizes else "")
+def effects_sentence(effects: Iterable[NamedEffect]) -> str:
+    """``backlash on f0_j1 (40 mrad), f0_j2 (12 mrad) and dead zone on f0_j3 (8 mrad)``: each name once."""
+    places: dict[str, list[str]] = {}
+    for effect in effects:
+        sizes = ", ".join(amount(p.value, p.unit) for p in effect.parameters.values())
+        places.setdefault(effect.name, []).append(f"{joints_text(effect.joints)} ({sizes})")
+    return listing(f"{plain(name)} on {', '.join(where)}" for name, where in places.items())
 
 
 def verdict_sentence(report: Report) -> str:
@@ -81,12 +84,13 @@ def verdict_sentence(report: Report) -> str:
     sizes = f"{before} on motions that the fit has not seen, against a noise floor of "
     sizes += mrad(report.noise_floor_rad)
     if report.verdict == "effects":
-        missing = listing(map(effect_sentence, report.effects))
-        return f"The simulation lacks {missing}. {_shrinks(report)}{_besides(report)}"
+        return (
+            f"The simulation lacks {effects_sentence(report.effects)}. {_shrinks(report)}{_besides(report)}"
+        )
     if report.verdict == "ambiguous":
         text = f"There is a gap: {sizes}. {_leaves(report)}"
         if report.provisional:
-            text += f" With {listing(map(effect_sentence, report.provisional))} it falls to {after}."
+            text += f" With {effects_sentence(report.provisional)} it falls to {after}."
         return text
     if report.verdict == "no_gap":
         model = "plain servo model" if report.hand_layer is None else f"model in {report.hand_layer}"
@@ -149,7 +153,7 @@ def next_step(report: Report) -> str:
     layer = training_layer(report)
     use = "identified.usda has the servo's model, with every effect by name."
     if report.hand is not None:
-        use = f"Use the identified model: pass {layer} with --hand-layer to vd-train, vd-eval and vd-play."
+        use = f"vd-train adapt POLICY --hand-layer {layer} goes on in it; vd-eval and vd-play take it too."
     return (
         f"Nothing is open. {use} To confirm that the gap is closed, run vd-gap on a new recording with "
         f"--hand-layer {LAYER}."

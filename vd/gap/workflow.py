@@ -17,7 +17,7 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
-from vd.gap.chain import Chain, chains, relative_torques
+from vd.gap.chain import Chain, chains
 from vd.gap.coordinates import BASELINE_PARAMETERS, FREE_SPEED, Scales
 from vd.gap.design import design, pieces
 from vd.gap.explain import Explainer, Joint, Progress
@@ -140,8 +140,6 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
             seconds=seconds,
             simulated=known["simulated"] + pool.simulated,
         )
-        source = replace(report.recording, relative_torques=relative_torques(recording))
-        report = replace(report, recording=source)
         predictions.write(out / "predictions.npz")
         report.write(out / "explain.json")
     chosen.progress(f"explain: {report.verdict} after {seconds:.0f} s, {pool.simulated} motions simulated")
@@ -153,33 +151,20 @@ def _workers(
 ) -> tuple[WorkerPool, list[JointSpec]]:
     """Who fits, and the problems of all excited joints."""
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
-    parts = [_started(chain, options.start) for chain in chains(recording, hand)]
-    specs = _specs(recording, parts)
+    parts, specs = [], []
+    for index, chain in enumerate(chains(recording, hand)):
+        rows = [options.start.get(name, row) for name, row in zip(chain.joints, chain.start_row, strict=True)]
+        parts.append(replace(chain, start_row=np.array(rows, dtype=float)))
+        for joint, column in enumerate(chain.columns):
+            trajectories, folds = design(recording, chain, joint)
+            if trajectories:
+                floor, analysed = noise_floor(recording, int(column)), pieces(recording, chain, trajectories)
+                free = baseline_of(chain)
+                specs.append(JointSpec(index, joint, trajectories, folds, floor, free, analysed))
     # A recording so long that pieces of it are analysed would take minutes a joint with the usual step.
     dt = STEP_S * (2.0 if any(spec.pieces for spec in specs) else 1.0)
     cores = len(os.sched_getaffinity(0)) if options.device == "cpu" else 1
     return WorkerPool(Problems(recording, parts, dt, options.device), options.workers or cores), specs
-
-
-def _started(chain: Chain, start: Mapping[str, np.ndarray]) -> Chain:
-    """The chain with the joints of an identified model as they were identified."""
-    rows = [start.get(joint, row) for joint, row in zip(chain.joints, chain.start_row, strict=True)]
-    return replace(chain, start_row=np.array(rows, dtype=float))
-
-
-def _specs(recording: Recording, parts: Sequence[Chain]) -> list[JointSpec]:
-    """The problems of all excited joints."""
-    specs = []
-    for index, chain in enumerate(parts):
-        for joint in range(len(chain.joints)):
-            trajectories, folds = design(recording, chain, joint)
-            if trajectories:
-                floor = noise_floor(recording, int(chain.columns[joint]))
-                analysed = pieces(recording, chain, trajectories)
-                specs.append(
-                    JointSpec(index, joint, trajectories, folds, floor, baseline_of(chain), analysed)
-                )
-    return specs
 
 
 def baseline_of(chain: Chain) -> tuple[str, ...]:
@@ -231,8 +216,7 @@ def _resume(pool: WorkerPool, specs: Sequence[JointSpec], known: dict[str, Any])
         found = known[pool.problems.chains[spec.chain].joints[spec.joint]]
         rows = np.array(found["rows"])
         scales = _scales(pool, spec, rows, found["rmse_rad"])
-        joint = _fitted(pool, spec, rows, scales, iterations=1)
-        return replace(joint, scales=scales)
+        return replace(_fitted(pool, spec, rows, scales, iterations=1), scales=scales)
 
     return parallel(one, specs)
 
