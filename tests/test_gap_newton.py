@@ -42,11 +42,9 @@ def motions(kind: str, joints: tuple[str, ...], seconds: float, hand: HandModel 
     reach = JointRange(hand.joint_names, hand.lower, hand.upper)
     trajectories = []
     for motion in excitation_set(reach):
-        if motion.name == kind and motion.joints[0] in joints:
-            keep = motion.time <= seconds
-            command = motion.command[keep]
-            start = np.tile(command[0], (len(command), 1))
-            short = replace(motion, time=motion.time[keep], command=command, enabled=motion.enabled[keep])
+        if motion.excitation == kind and motion.joints[0] in joints:
+            short = motion.piece(0, int(np.searchsorted(motion.time, seconds, side="right")))
+            start = np.broadcast_to(short.command[0], short.command.shape)
             trajectories.append(replace(short, file=f"{motion.joints[0]}.csv", position=start))
     return Recording(Path("unsaved"), hand.name, hand.joint_names, {}, 1e-4, tuple(trajectories))
 

@@ -20,8 +20,6 @@ from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
 
 GRAVITY_M_S2 = 9.81
 """Acceleration of gravity, the simulator's."""
-FREE = 1.0e6
-"""A position [rad] that no joint and a torque [N m] that no drive reaches: the bound of one that has none."""
 
 
 class Load(NamedTuple):
@@ -84,9 +82,9 @@ class Chain:
     com: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
     inertia: np.ndarray = field(default_factory=lambda: np.zeros((1, 3, 3)))
     gravity: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    lower: np.ndarray = field(default_factory=lambda: np.array([-FREE]))
-    upper: np.ndarray = field(default_factory=lambda: np.array([FREE]))
-    effort: np.ndarray = field(default_factory=lambda: np.array([FREE]))
+    lower: np.ndarray = field(default_factory=lambda: np.array([-np.inf]))
+    upper: np.ndarray = field(default_factory=lambda: np.array([np.inf]))
+    effort: np.ndarray = field(default_factory=lambda: np.array([np.inf]))
 
     def inertia_scale(self, joint: int) -> float:
         """Inertia of the links about a joint with all joints at zero, without the drive's own [kg m^2]."""

@@ -11,7 +11,7 @@ import tyro
 
 from vd import interrupt
 from vd.command_line import parse
-from vd.device import resolve_device
+from vd.device import warp_device
 from vd.files import check_folder
 from vd.gap.contact_cli import Contact, HideContact
 from vd.gap.convert import Convert
@@ -20,32 +20,28 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
 
-RecordingPath = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-
 
 @dataclass(frozen=True)
 class _Step:
-    """What all steps take; what is left out is as it was in the step before."""
+    """What all steps take; the same words for every step of an analysis."""
 
     first: ClassVar[str] = "find"
     last: ClassVar[str] = "report"
 
-    recording: RecordingPath = None
-    """Folder with recording.json and its CSV files; later steps know it from DIR."""
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
+    """Folder with recording.json and its CSV files."""
     out: Path = Path("gap")
     """DIR: folder of the analysis."""
-    hand: str | None = None
-    """Hand, dclaw3 or dclaw4; by default the recording's model."""
-    model: Path | None = None
-    """The hand's own USD file, in place of --hand."""
+    hand: Annotated[str | None, tyro.conf.arg(aliases=("--model",))] = None
+    """Hand, dclaw3 or dclaw4, or its USD file; by default the recording's model."""
     hand_layer: Path | None = None
     """Start from an identified model (identified.usda): is there a gap left?"""
-    effects: str | None = None
+    effects: str = ""
     """Candidates, separated by commas; all effects by default, none: the plain drives alone."""
-    seed: int | None = None
+    seed: int = 0
     """Seed of the search and of the resampling."""
-    device: str | None = None
-    """cpu (the default), cuda, or auto."""
+    device: str = "cpu"
+    """cpu, cuda, or auto."""
     fresh: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Repeat finished steps even if nothing has changed."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -55,25 +51,14 @@ class _Step:
         """The analysis in DIR with these settings; a recording is checked before anything slow begins."""
         from vd.gap.recording import read_recording
 
-        recording = None if self.recording is None else read_recording(self.recording)
-        from vd.gap.steps import Analysis
+        recording = read_recording(self.recording)
+        from vd.gap.steps import Analysis, Settings
 
         quiet_warp()
-        if self.hand is not None and self.model is not None:
-            raise ValueError("--hand and --model both name the hand; give one of them")
-        analysis = Analysis.open(
-            self.out,
-            {
-                "recording": self.recording,
-                "hand": self.hand or (str(self.model) if self.model else None),
-                "hand_layer": self.hand_layer,
-                "effects": None if self.effects is None else _effects(self.effects),
-                "seed": self.seed,
-                "device": None if self.device is None else resolve_device(self.device),
-            },
-        )
-        if recording is not None:
-            analysis.recording = recording
+        effects, device = _effects(self.effects), warp_device(self.device)
+        settings = Settings(self.recording, self.hand, self.hand_layer, effects, self.seed, device)
+        analysis = Analysis(settings, self.out)
+        analysis.recording = recording
         return analysis
 
     def run(self) -> int:
@@ -136,10 +121,8 @@ class Plan(_Step):
         from vd.gap.plan import plan, write_plan
 
         analysis = self.analysis()
-        if self.recording is not None:
-            analysis.run("explain", fresh=self.fresh)
-        device = analysis.settings.device
-        report = analysis.explained()
+        analysis.run("explain", fresh=self.fresh)
+        device, report = analysis.settings.device, analysis.explained()
         result = plan(report, analysis.recording, analysis.hand, analysis.start, device=device)
         path = write_plan(result, self.out)
         if self.json:

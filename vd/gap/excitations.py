@@ -102,7 +102,6 @@ def _time(duration_s: float) -> np.ndarray:
     return np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ
 
 
-_SMALL = 0.04 * np.array([1, 2, 3, 2, 1, 2, 1, 0, -1, 0, -2, -1, -2, 0])
 MENU: dict[str, tuple[Motion, ...]] = {
     "steps_and_sines": (
         _levels("step_small", 1.75, 0.12, -0.12),
@@ -129,7 +128,9 @@ MENU: dict[str, tuple[Motion, ...]] = {
     # Levels held for seconds: creep, warming, and where the joint comes to rest.
     "long_holds": (_levels("long_holds", 4.0, 0.5, 0.9, -0.3, -0.8),),
     # Small steps with more and more reversals: play, dead zone, stiction.
-    "reversal_staircase": (_levels("reversal_staircase", 0.8, *_SMALL),),
+    "reversal_staircase": (
+        _levels("reversal_staircase", 0.8, *0.04 * np.array([1, 2, 3, 2, 1, 2, 1, 0, -1, 0, -2, -1, -2, 0])),
+    ),
     # A small sine of rising frequency: delay against filter against inertia.
     "chirp": (_chirp("chirp", 0.25, 0.2, 6.0, 10.0),),
 }

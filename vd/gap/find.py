@@ -10,16 +10,14 @@ from vd.gap.statistics import HOLD_S, held
 
 SMOOTH_S = 0.05
 """Window over which speeds are taken [s]: longer than an encoder count at low speed."""
-AFTER_S = 0.15
-"""Time after a command starts to move from rest, or a joint turns [s]."""
 EXTREME = 0.3
 """Share of the largest speed below which motion is slow, and within which of the largest speed or pull it is
 fast or the servo pulls hard."""
 NOTABLE = 2.0
 """A phase is reported if its RMS is this many noise floors."""
 PHASES = {
-    "onset": f"for {1e3 * AFTER_S:.0f} ms after the command starts to move",
-    "reversal": f"for {1e3 * AFTER_S:.0f} ms after each reversal",
+    "onset": f"for {1e3 * HOLD_S:.0f} ms after the command starts to move",
+    "reversal": f"for {1e3 * HOLD_S:.0f} ms after each reversal",
     "hold": "while holding still",
     "fast": "in fast motion",
     "slow": "in slow motion",
@@ -54,7 +52,7 @@ def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) ->
     pull = np.abs(command - position)
 
     def after(events: np.ndarray) -> np.ndarray:
-        return time - np.maximum.accumulate(np.where(events, time, -np.inf)) <= AFTER_S
+        return time - np.maximum.accumulate(np.where(events, time, -np.inf)) <= HOLD_S
 
     return {
         "onset": after(onset),

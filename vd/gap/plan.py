@@ -9,7 +9,6 @@ disagree most is proposed.
 
 import contextlib
 import itertools
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -169,14 +168,8 @@ def write_plan(result: Plan, folder: Path) -> Path:
 
 def discard_plan(folder: Path) -> None:
     """Remove a plan that :func:`write_plan` wrote, and no other file."""
-    path = Path(folder) / PLAN_JSON
-    try:
-        files = [entry["file"] for entry in json.loads(path.read_text())["trajectories"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        files = []  # none, or not of this program
-    for file in files:
-        (Path(folder) / PLAN_FOLDER / Path(file).name).unlink(missing_ok=True)
-    path.unlink(missing_ok=True)
+    for file in (Path(folder) / PLAN_JSON, *(Path(folder) / PLAN_FOLDER).glob("[0-9][0-9][0-9]_*.csv")):
+        file.unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # something else is in it, or it is not there
         (Path(folder) / PLAN_FOLDER).rmdir()
 

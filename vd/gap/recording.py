@@ -40,7 +40,6 @@ POSITIVE = ("p_gain", "payload_kg", "arm_length_m")
 """Conditions that the model computes with: numbers, not negative."""
 STIFFNESS = "kp_nm_rad"
 """Key of ``servo``: the drive's stiffness at the largest P gain recorded [N m/rad], one or by joint."""
-CSV_DIGITS = 6
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -113,7 +112,7 @@ def write_recording(recording: Recording, folder: str | Path, *, only: Collectio
                 "file": trajectory.file,
                 "excitation": trajectory.excitation,
                 "joints": list(trajectory.joints),
-                "duration_s": round(trajectory.duration, CSV_DIGITS),
+                "duration_s": round(trajectory.duration, 6),
                 "conditions": trajectory.conditions,
             }
             for trajectory in recording.trajectories
@@ -340,7 +339,7 @@ def write_table(
             continue
         each = zip(joints, np.asarray(values, dtype=float).T, strict=True)
         columns |= {f"{channel}.{joint}": column for joint, column in each if not np.isnan(column).all()}
-    formats = ["%d" if name.startswith("enabled") else f"%.{CSV_DIGITS}f" for name in columns]
+    formats = ["%d" if name.startswith("enabled") else "%.6f" for name in columns]
     table, header = np.stack([*columns.values()], axis=1), ",".join(columns)
     with atomic_path(file) as temporary:
         np.savetxt(temporary, table, formats, ",", header=header, comments="")

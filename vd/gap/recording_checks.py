@@ -28,10 +28,9 @@ RANGES = {
 """Least and largest value that a channel can have, and what one outside looks like. A servo in position mode
 turns once, and a tenth for offsets."""
 MIN_SAMPLES = 20
-"""Samples of a trajectory, and distinct positions, below which no motion or unit can be told from noise."""
-MOVING_COUNTS = 20.0
-"""Encoder counts by which a command must move before the position has to answer, and a step of a position
-that is another unit (degrees are 57 times radians)."""
+"""Samples of a trajectory, and distinct positions, below which no motion or unit can be told from noise.
+Counts by which a command must move before the position has to answer, and of a step that is another unit
+(degrees are 57 times radians)."""
 FEW = 3
 """Encoder counts within which a reading at rest flickers, rows within which an echo of the command comes
 back, samples by which stamps alone may let a position lead."""
@@ -128,7 +127,7 @@ def check_motion(recording: Recording) -> None:
         told = [
             t
             for t in recording.trajectories
-            if np.ptp(t.command[:, j]) > MOVING_COUNTS * count and t.enabled[:, j].all()
+            if np.ptp(t.command[:, j]) > MIN_SAMPLES * count and t.enabled[:, j].all()
         ]
         if not told:
             continue
@@ -172,13 +171,13 @@ def _lead(t: Trajectory, j: int) -> float:
 
 
 def check_units(recording: Recording) -> None:
-    """Small motions in degrees show in the size of a count: the least step between two readings of a joint."""
+    """Small motions in degrees show in the size of a count, the least step between two readings."""
     count = recording.encoder_resolution_rad
     for column, joint in enumerate(recording.joints):
         levels = np.unique(np.concatenate([t.position[:, column] for t in recording.trajectories]).round(6))
         step = float(np.diff(levels).min()) if len(levels) >= MIN_SAMPLES else 0.0
         require(
-            step <= MOVING_COUNTS * count,
+            step <= MIN_SAMPLES * count,
             f"{recording.path}: column 'position.{joint}' moves in steps of {step:.3g}, but "
             f"'encoder_resolution_rad' is {count:g}: these look like degrees or counts; write radians",
         )

@@ -1,7 +1,7 @@
 """The steps of ``vd-gap run``, each from files to files, skipped where they have run on the same input.
 
-``DIR/run.json`` keeps the settings, so that a later step needs only ``DIR``, a digest of recording, model and
-settings, and which steps have run on them, so that an interrupted run goes on with the step it was in.
+``DIR/run.json`` keeps a digest of recording, model and settings, and which steps have run on them, so that an
+interrupted run goes on with the step it was in.
 """
 
 import hashlib
@@ -10,9 +10,9 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from vd.config import from_dict, to_dict
 from vd.files import make_folder, write_json
 from vd.gap.recording import BARE_MODELS, Recording, model_path, read_recording
 from vd.gap.result import LAYER, Closing, Predictions, Report
+from vd.kernels.servo.effects import EFFECTS
 from vd.versions import installed_versions
 
 if TYPE_CHECKING:
@@ -75,31 +76,6 @@ class Analysis:
 
     def __init__(self, settings: Settings, out: Path):
         self.settings, self.out = settings, Path(out)
-
-    @staticmethod
-    def open(out: Path, changes: Mapping[str, Any]) -> "Analysis":
-        """An analysis of a recording, or the one that has begun in ``out`` where none is named.
-
-        Args:
-            out: Folder of the analysis.
-            changes: Settings by name; None leaves one as it was, or at its default.
-
-        Raises:
-            ValueError: No recording is named, and none is known from before.
-        """
-        path = Path(out) / RUN
-        changes = {name: value for name, value in changes.items() if value is not None}
-        if path.is_file() and "recording" not in changes:
-            try:
-                settings = from_dict(Settings, json.loads(path.read_text())["settings"])
-            except (ValueError, KeyError, TypeError) as error:
-                raise ValueError(f"{path}: not of vd-gap ({error}); delete it and start again") from error
-            return Analysis(replace(settings, **changes), out)
-        if "recording" not in changes:
-            raise ValueError(
-                f"{out}: no analysis has begun here; name the recording: vd-gap run RECORDING --out {out}"
-            )
-        return Analysis(Settings(**changes), out)
 
     @cached_property
     def recording(self) -> Recording:
@@ -202,8 +178,7 @@ class Analysis:
 
     def _note(self, steps: Mapping[str, float]) -> None:
         make_folder(self.out)
-        record = {"settings": to_dict(self.settings), "made_from": self._made_from, "steps": steps}
-        write_json(self.out / RUN, record)
+        write_json(self.out / RUN, {"made_from": self._made_from, "steps": steps})
 
     @cached_property
     def _made_from(self) -> str:
@@ -216,23 +191,8 @@ class Analysis:
             digest.update(file.read_bytes())
         return digest.hexdigest()
 
-    def options(self) -> dict[str, Any]:
-        """Keyword arguments of the steps of :mod:`vd.gap.workflow`."""
-        settings = self.settings
-        options: dict[str, Any] = {"seed": settings.seed, "device": settings.device, "progress": _show}
-        if settings.effects:
-            options["effects"] = tuple(name for name in settings.effects if name != NO_EFFECTS)
-        if self.start:
-            options["start"] = self.start
-        return options
-
     def explained(self) -> Report:
-        """What ``explain`` wrote.
-
-        Raises:
-            ValueError: It has not run.
-        """
-        self._done(STEPS[:2])
+        """What ``explain`` wrote."""
         return Report.read(self.out / EXPLAIN)
 
     def command(self) -> str:
@@ -251,16 +211,20 @@ def _show(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _find(analysis: Analysis) -> None:
+def _fit(analysis: Analysis, step: str) -> None:
     from vd.gap import workflow
 
-    workflow.find(analysis.recording, analysis.hand, analysis.out, **analysis.options())
-
-
-def _explain(analysis: Analysis) -> None:
-    from vd.gap import workflow
-
-    workflow.explain(analysis.recording, analysis.hand, analysis.out, **analysis.options())
+    settings = analysis.settings
+    getattr(workflow, step)(
+        analysis.recording,
+        analysis.hand,
+        analysis.out,
+        effects=tuple(name for name in settings.effects or EFFECTS if name != NO_EFFECTS),
+        seed=settings.seed,
+        device=settings.device,
+        start=analysis.start,
+        progress=_show,
+    )
 
 
 def _close(analysis: Analysis) -> None:
@@ -314,8 +278,8 @@ def _report(analysis: Analysis) -> None:
 
 
 _RUN: dict[str, Callable[[Analysis], None]] = {
-    "find": _find,
-    "explain": _explain,
+    "find": partial(_fit, step="find"),
+    "explain": partial(_fit, step="explain"),
     "close": _close,
     "report": _report,
 }
