@@ -225,19 +225,6 @@ def test_plan_does_not_explain_two_rivals_away_together(tmp_path):
     assert "to decide between coulomb friction and dead zone" in result.sentence
 
 
-def test_plan_counts_the_pairs_of_every_set_that_a_motion_tells_apart(recording):
-    sets = (("coulomb_friction", "backlash"), ("torque_limit", "torque_saturation"))
-    report, _ = servo_report(recording, verdict="ambiguous", ambiguous=sets)
-    weak = Candidate((JOINT,), 2, "torque_limit", 0.01, 0.2, (0.1, 0.3), "tied", "", {"tau_max_nm": 50.0})
-    report = dataclasses.replace(report, evidence=(*report.evidence, weak))  # a limit that is never met
-    result = plan(report, read_recording(recording), None)
-    assert result.competing == {JOINT: sets}
-    assert all(score.pairs == 2 for score in result.ranking)
-    told = [score.told for score in result.ranking]
-    assert told[0] > 0
-    assert f"{told[0]} of 2 pairs" in result.sentence
-
-
 def test_disagreement_is_what_no_change_of_the_parameters_takes_away():
     """Against one least-squares problem of both models' parameters, bounded by prior and recording."""
     rng = np.random.default_rng(0)

@@ -54,10 +54,6 @@ class Score:
     disagreement: float
     """Of two models, RMS in units of the noise; of several pairs the one at which as much is learnt, which is
     log(1 + disagreement^2) in the mean."""
-    told: int
-    """Pairs of models that disagree by more than :data:`VISIBLE`."""
-    pairs: int
-    """Pairs in question."""
     seconds: float
     """Length of all its motions."""
 
@@ -118,8 +114,6 @@ def plan(
         Score(
             name,
             disagreement=float(np.sqrt(np.expm1(np.mean(np.log1p(np.square(values)))))),
-            told=sum(value > VISIBLE for value in values),
-            pairs=len(values),
             seconds=sum(motion.duration for motion in motions[name]),
         )
         for name, values in found.items()
@@ -358,11 +352,8 @@ def _sentence(best: Score, report: Report, joints: tuple[str, ...], kinds: int) 
             f"less than {VISIBLE:g} times the noise, {decide}. The best of the menu is in {PLAN_FOLDER}/."
         )
     goal = f"to decide{between}" if sets else "to see what these motions do not show"
-    shows = f"the models in question differ by {best.disagreement:.1f} times the noise"
-    if best.pairs > 1:
-        shows = f"{best.told} of {best.pairs} pairs of possible models differ by more than the noise"
     return (
-        f"Record the motions {best.name} on {joints_text(joints)}, {best.seconds:.0f} s, {goal}: "
-        f"there {shows}. The commands are in {PLAN_FOLDER}/; add what was measured to the recording and run "
-        "vd-gap again."
+        f"Record the motions {best.name} on {joints_text(joints)}, {best.seconds:.0f} s, {goal}: there the "
+        f"models in question differ by {best.disagreement:.1f} times the noise. The commands are in "
+        f"{PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
     )
