@@ -207,8 +207,8 @@ def _menu(recording: Recording, hand: "HandModel | None") -> dict[str, list[Traj
 
 def _base(chain: Chain, report: Report, start: Mapping[str, np.ndarray]) -> np.ndarray:
     """Parameter rows of the chain as identified so far, shape [n, P]."""
-    rows = [start.get(name, row) for name, row in zip(chain.joints, chain.start_row, strict=True)]
-    rows = np.array(rows, dtype=float)
+    given = [start.get(name, row) for name, row in zip(chain.joints, chain.start_row, strict=True)]
+    rows = np.array(given, dtype=float)
     for row, joint in zip(rows, chain.joints, strict=True):
         for column, value in parameter_columns(report, joint).items():
             row[column] = value

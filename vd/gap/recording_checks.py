@@ -71,17 +71,18 @@ def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
         f"({time[i]:g} s, then {time[i + 1]:g} s); sort the rows and keep one per stamp",
     )
     typical, longest = float(np.median(between)), int(np.argmax(between))
-    require(
-        typical <= SLOWEST_S,
-        f"{file}: column 't': {typical:g} s between samples: these look like milliseconds, and as seconds "
-        "would show nothing of a servo; write seconds",
-    )
+    cut = "in which the motion is not known; cut the file there into two trajectories"
     require(
         between[longest] <= SLOWEST_S,
-        f"{file}: row {longest + 3}, column 't': {between[longest]:.3g} s without a sample, in which the "
-        "motion is not known; cut the file there into two trajectories",
+        f"{file}: row {longest + 3}, column 't': {between[longest]:.3g} s without a sample, "
+        + (cut if typical <= SLOWEST_S else "as everywhere: these look like milliseconds; write seconds"),
     )
-    _check_sent(file, time, columns.get(COMMAND_TIME, time))
+    sent = columns.get(COMMAND_TIME, time)
+    require(
+        float(np.diff(sent).min()) >= 0.0 and abs(float(np.median(sent - time))) <= SLOWEST_S,
+        f"{file}: {COMMAND_TIME!r} runs backward, or is of another unit or clock than 't'; write seconds "
+        "on that clock, in the order of the rows, or drop it",
+    )
     for name, values in columns.items():
         low, high, why = RANGES.get(name.partition(".")[0], (-np.inf, np.inf, ""))
         wrong = (values < low) | (values > high)
@@ -95,24 +96,6 @@ def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
             f"{file}: row {i + 3}, column {name!r} jumps by a turn, as angles wrapped at pi do; unwrap it "
             "and its command (numpy.unwrap)",
         )
-
-
-def _check_sent(file: Path, time: np.ndarray, sent: np.ndarray) -> None:
-    """Commands went out in the order of the rows, on the clock of the rows."""
-    i = int(np.argmin(np.diff(sent)))
-    require(
-        sent[i + 1] >= sent[i],
-        f"{file}: row {i + 3}, column {COMMAND_TIME!r}: sent before the commands of the row before; commands "
-        "go out in the order of the rows: correct it",
-    )
-    apart, rate = float(np.median(sent - time)), np.ptp(sent) / np.ptp(time)
-    why = f"runs {rate:.3g} times as fast as 't'" if rate > 2.0 else f"is {apart:.3g} s off from 't'"
-    unit = "these look like milliseconds" if rate > 2.0 else "it is of another clock"
-    require(
-        abs(apart) <= SLOWEST_S,
-        f"{file}: column {COMMAND_TIME!r} {why}: {unit}; write seconds on the clock of 't', or drop "
-        "the column",
-    )
 
 
 def check_motion(recording: Recording) -> None:
