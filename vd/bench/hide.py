@@ -7,6 +7,7 @@ counts and jittered stamps. What is hidden is written beside the folder, never i
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from vd.assets_usd.hands import load_hand
-from vd.bench.hidden_finger import body_of
+from vd.bench.hidden_finger import finger_of
 from vd.bench.hidden_plant import OUTSIDE, TUNED, Motion, Physics, Plant, Run, simulate
 from vd.files import write_json
 from vd.gap.excitations import JointRange, excitation_set, numbered
@@ -332,7 +333,7 @@ def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
         velocity_limit=hand.velocity_limit[index] * near[2],
         inertia=hand.armature[index],
         gravity_torque=np.zeros(n),
-        body=body_of(hand, finger, heavy),
+        body=partial(finger_of, hand, finger, heavy),
         full_gain=FULL_P_GAIN,
         effort=hand.effort[index],
     )

@@ -65,6 +65,11 @@ class Settings:
     seed: int = 0
     device: str = "cpu"
 
+    def __post_init__(self) -> None:
+        known = (*EFFECTS, NO_EFFECTS)
+        if unknown := [name for name in self.effects if name not in known]:
+            raise ValueError(f"effects: there is no {unknown[0]}; choose from {', '.join(known)}")
+
 
 class Analysis:
     """One analysis in its folder.

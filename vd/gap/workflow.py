@@ -57,11 +57,6 @@ class Options:
     start: Mapping[str, np.ndarray] = field(default_factory=dict)
     progress: Progress = lambda line: None
 
-    def __post_init__(self) -> None:
-        unknown = sorted(set(self.effects) - set(EFFECTS))
-        if unknown:
-            raise ValueError(f"no effects are called {', '.join(unknown)}; choose from {', '.join(EFFECTS)}")
-
 
 def find(recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any) -> list[Finding]:
     """Identify the baseline of every excited joint, and say where it and the measurement disagree.
@@ -77,7 +72,7 @@ def find(recording: Recording | Path, hand: HandModel | None, out: Path, **optio
 
     Raises:
         RecordingError: The recording cannot be used.
-        ValueError: An unknown effect, or a recording that is not of this hand.
+        ValueError: A recording that is not of this hand.
     """
     chosen, begin = Options(**options), time.perf_counter()
     pool, specs = _workers(recording, hand, chosen)
@@ -114,7 +109,7 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
 
     Raises:
         RecordingError: The recording cannot be used.
-        ValueError: An unknown effect, or a recording that is not of this hand.
+        ValueError: A recording that is not of this hand.
     """
     chosen, out = Options(**options), Path(out)
     if not (out / "find.json").is_file():
