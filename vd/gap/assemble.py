@@ -6,7 +6,6 @@ from typing import get_args
 
 import numpy as np
 
-from vd.gap.chain import relative_torques
 from vd.gap.coordinates import BASELINE_PARAMETERS, GRAVITY
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.fit import FINER
@@ -111,7 +110,6 @@ def assemble(
             samples=len(predictions.time),
             seconds=float(sum(t.time[-1] for t in recording.trajectories)),
             servo=str(recording.servo.get("model", "")),
-            relative_torques=relative_torques(recording),
         ),
         provisional=_pool(joints, named=False),
         joints=tuple(_gap(j, rows[j.name], rng) for j in joints),

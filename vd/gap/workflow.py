@@ -17,7 +17,7 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
-from vd.gap.chain import Chain, chains
+from vd.gap.chain import Chain, chains, relative_torques
 from vd.gap.coordinates import BASELINE_PARAMETERS, FREE_SPEED, Scales
 from vd.gap.design import design, pieces
 from vd.gap.explain import Explainer, Joint, Progress
@@ -135,6 +135,8 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
             seconds=seconds,
             simulated=known["simulated"] + pool.simulated,
         )
+        source = replace(report.recording, relative_torques=relative_torques(recording))
+        report = replace(report, recording=source)
         predictions.write(out / "predictions.npz")
         report.write(out / "explain.json")
     chosen.progress(f"explain: {report.verdict} after {seconds:.0f} s, {pool.simulated} motions simulated")
