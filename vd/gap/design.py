@@ -15,6 +15,8 @@ MAX_MOTION_S = 150.0
 """Motion of a joint that is fitted [s]: twice what the paper records; the rest is held out for good."""
 MAX_MOTIONS = 30
 """Trajectories of a joint that are fitted, spread over the recording: each is worth 5 s then."""
+NEARLY = 0.95
+"""Share of the widest range that a piece must cover to be taken for being the earliest."""
 
 
 def design(recording: Recording, chain: Chain, joint: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -71,7 +73,7 @@ def pieces(recording: Recording, chain: Chain, trajectories: Sequence[int]) -> t
 
 
 def _widest(recording: Recording, chain: Chain, trajectory: Trajectory, share: float) -> tuple[int, int]:
-    """The piece of ``share`` seconds from rest in which the joints cover most."""
+    """The first piece of ``share`` seconds from rest in which the joints cover about the most they do."""
     time = trajectory.time
     if time[-1] <= share:
         return 0, len(time)
@@ -82,7 +84,8 @@ def _widest(recording: Recording, chain: Chain, trajectory: Trajectory, share: f
     ends = np.searchsorted(time, time[starts] + share)
     position = trajectory.position[:, columns]
     parts = zip(starts, ends, strict=True)
-    best = int(np.argmax([np.ptp(position[first:end], axis=0).sum() for first, end in parts]))
+    covered = np.array([np.ptp(position[first:end], axis=0).sum() for first, end in parts])
+    best = int(np.argmax(covered >= NEARLY * covered.max()))
     return int(starts[best]), int(ends[best])
 
 

@@ -74,12 +74,11 @@ def read_recording(path: str | Path) -> Recording:
     )
     trajectories = tuple(_read_trajectory(file, i, entry, joints) for i, entry in enumerate(entries))
     names = [trajectory.file for trajectory in trajectories]
-    for i, name in enumerate(names):
-        require(
-            name not in names[:i],
-            f"{file}: trajectories[{i}]: {name!r} is listed before as trajectories[{names.index(name)}]; "
-            "list each file once, or it counts twice as evidence",
-        )
+    twice = sorted({name for name in names if names.count(name) > 1})
+    require(
+        not twice,
+        f"{file}: 'trajectories' lists {twice} twice; list each once, or it counts as evidence twice",
+    )
     recording = Recording(file.parent, header["model"], joints, servo, float(resolution), trajectories)
     check_motion(recording)
     check_units(recording)

@@ -203,13 +203,16 @@ class Analysis:
     def command(self) -> str:
         """The command that repeats the analysis."""
         settings = self.settings
-        words = ["vd-gap run", str(settings.recording), "--out", str(self.out)]
-        for flag, value in (("--hand", settings.hand), ("--hand-layer", settings.hand_layer)):
-            words += [flag, str(value)] if value is not None else []
-        words += ["--effects", ",".join(settings.effects)] if settings.effects else []
-        words += ["--seed", str(settings.seed)] if settings.seed else []
-        words += ["--device", settings.device] if settings.device != "cpu" else []
-        return " ".join(words)
+        device = settings.device if settings.device != "cpu" else ""
+        flags = {
+            "--hand": settings.hand,
+            "--hand-layer": settings.hand_layer,
+            "--effects": ",".join(settings.effects),
+            "--seed": settings.seed,
+            "--device": device,
+        }
+        said = [word for flag, value in flags.items() if value for word in (flag, str(value))]
+        return " ".join(["vd-gap run", str(settings.recording), "--out", str(self.out), *said])
 
 
 def _show(line: str) -> None:
@@ -263,15 +266,11 @@ def _report(analysis: Analysis) -> None:
     from vd.gap.recording_checks import cautions
     from vd.gap.report import write_report
 
-    closing = from_dict(Closing, json.loads((analysis.out / CLOSE).read_text()))
-    report = analysis.explained()
     planned = analysis.out / PLAN_JSON
     report = replace(
-        report,
-        closing=closing,
-        next_experiment=(
-            json.loads(planned.read_text())["sentence"] if planned.is_file() else report.next_experiment
-        ),
+        analysis.explained(),
+        closing=from_dict(Closing, json.loads((analysis.out / CLOSE).read_text())),
+        next_experiment=json.loads(planned.read_text())["sentence"] if planned.is_file() else "",
         seconds=sum(analysis._seconds().values()),
         hand=analysis.hand_name,
         hand_layer=None if analysis.settings.hand_layer is None else str(analysis.settings.hand_layer),
