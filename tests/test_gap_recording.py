@@ -113,7 +113,7 @@ def test_commands_may_be_sent_at_other_times_than_the_stamps(tmp_path):
         ),
         (
             {"trajectories": [{"file": "a.csv", "joints": ["f0_j1"]}] * 2},
-            ("trajectories[1]", "'a.csv'", "trajectories[0]", "once"),
+            ("'a.csv'", "twice", "once"),
         ),
     ],
 )
