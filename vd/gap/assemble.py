@@ -48,7 +48,7 @@ class Analysed:
 
 
 def curves(
-    recording: Recording, problems: Problems, models: Sequence[tuple[str, JointSpec, np.ndarray]]
+    recording: Recording, problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]
 ) -> np.ndarray:
     """Positions of all trajectories one after the other [S, J] [rad]; NaN where no joint was fitted.
 
@@ -57,16 +57,14 @@ def curves(
     Args:
         recording: The recording.
         problems: Its chains.
-        models: Name, problem and parameter rows of each fitted joint.
+        models: Problem and parameter rows of each fitted joint.
     """
     total = sum(len(t.time) for t in recording.trajectories)
     result = np.full((total, len(recording.joints)), np.nan)
     for index, chain in enumerate(problems.chains):
-        rows, fitted = chain.start_row.copy(), False
-        for _, spec, own in models:
-            if spec.chain == index:
-                rows[spec.joint], fitted = own[spec.joint], True
-        if fitted:
+        own = {spec.joint: rows[spec.joint] for spec, rows in models if spec.chain == index}
+        if own:
+            rows = np.array([own.get(joint, row) for joint, row in enumerate(chain.start_row)])
             rollouts = Rollouts(chain, recording, dt=problems.dt / FINER[-1], device=problems.device)
             result[:, chain.columns] = rollouts.predict(rows[None])[0]
     return result
@@ -83,8 +81,8 @@ def assemble(
     simulated: int,
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
-    before = curves(recording, problems, [(j.name, j.spec, j.explanation.baseline.rows) for j in joints])
-    after = curves(recording, problems, [(j.name, j.spec, j.explanation.final.rows) for j in joints])
+    before = curves(recording, problems, [(j.spec, j.explanation.baseline.rows) for j in joints])
+    after = curves(recording, problems, [(j.spec, j.explanation.final.rows) for j in joints])
     predictions = Predictions.of(recording, before, after)
     rng = np.random.default_rng(seed)
     residuals = {j.name: _residuals(j, predictions) for j in joints}

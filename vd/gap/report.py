@@ -16,7 +16,7 @@ from vd.kernels.servo.effects import EFFECTS
 from vd.page import FIGURE_DPI, write_html
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
-FIGURES = ("gap.png", "overlay_*.png", "residual_*.png", "evidence_*.png")
+FIGURES = ("gap.png", "overlay_*.png", "residual_*.png")
 """Those of an earlier analysis go; other motions were drawn."""
 
 _VERDICTS = {

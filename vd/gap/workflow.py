@@ -79,7 +79,7 @@ def find(recording: Recording | Path, hand: HandModel | None, out: Path, **optio
     with pool:
         recording = pool.problems.recording
         joints = _identify(pool, specs, chosen)
-        predicted = curves(recording, pool.problems, [(j.name, j.spec, j.fit.rows) for j in joints])
+        predicted = curves(recording, pool.problems, [(j.spec, j.fit.rows) for j in joints])
         found = findings(recording, predicted, {j.name: j.spec.floor for j in joints})
         value = {
             "format": FIND_FORMAT,
