@@ -138,7 +138,9 @@ def _besides(report: Report) -> str:
 def _leaves(report: Report) -> str:
     """Which causes are still possible."""
     if len(report.open_sets) == 1:
-        return f"It is {causes(report.open_sets[0])}; this recording cannot say which."
+        (group,) = report.open_sets
+        where = f" on {_undecided(report, group)}" if len(report.joints) > 1 else ""
+        return f"It is {causes(group)}{where}; this recording cannot say which."
     return f"This recording leaves {len(report.open_sets)} sets of causes, listed under what to do next."
 
 
@@ -168,11 +170,12 @@ def training_layer(report: Report) -> str:
 
 def open_questions(report: Report) -> list[str]:
     """What is left open, joints with the same set together: ``f0_j1: backlash or dead zone``."""
-    return [
-        joints_text([joint.joint for joint in report.joints if {*group} in map(set, joint.open_sets)])
-        + f": {causes(group)}"
-        for group in report.open_sets
-    ]
+    return [f"{_undecided(report, group)}: {causes(group)}" for group in report.open_sets]
+
+
+def _undecided(report: Report, group: tuple[str, ...]) -> str:
+    """The joints that leave a set open."""
+    return joints_text([one.joint for one in report.joints if {*group} in map(set, one.open_sets)])
 
 
 def _size(value: float, unit: str) -> tuple[float, str]:
