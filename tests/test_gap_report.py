@@ -134,7 +134,7 @@ OUTCOMES = {
         "It is coulomb friction or backlash",
     ),
     "under_excited": ({"effects": (), "next_experiment": "Record a chirp."}, "do not determine"),
-    "unknown": ({"effects": ()}, "No effect that is known here explains it"),
+    "unknown": ({"effects": ()}, "No effect that was tried explains it"),
 }
 
 

@@ -103,18 +103,15 @@ def verdict_sentence(report: Report) -> str:
             "No verdict on effects: the motions in this recording do not determine the model. Different "
             "parameters fit equally well."
         )
-    return (
-        f"There is a gap: {sizes}. No effect that is known here explains it; its cause is not in the table."
-    )
+    return f"There is a gap: {sizes}. No effect that was tried explains it."
 
 
 def _shrinks(report: Report) -> str:
-    held = report.held_out
+    held, names = report.held_out, {one.name for one in report.effects}
     return (
-        f"With {'it' if len(report.effects) == 1 else 'them'} the error on motions that the fit has not seen "
-        f"falls from {mrad(held.baseline_rmse_rad)} to {mrad(held.identified_rmse_rad)} "
-        f"({percent(held.reduction)} less, 95 %: {percent_range(held.ci95)}); the noise floor is "
-        f"{mrad(report.noise_floor_rad)}."
+        f"With {'it' if len(names) == 1 else 'them'} the error on motions that the fit has not seen falls "
+        f"from {mrad(held.baseline_rmse_rad)} to {mrad(held.identified_rmse_rad)} ({percent(held.reduction)} "
+        f"less, 95 %: {percent_range(held.ci95)}); the noise floor is {mrad(report.noise_floor_rad)}."
     )
 
 
