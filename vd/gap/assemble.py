@@ -77,7 +77,6 @@ def assemble(
     findings: Sequence[Finding],
     *,
     seed: int,
-    seconds: float,
     simulated: int,
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
@@ -99,7 +98,7 @@ def assemble(
         identified=_fit(joints, residuals, 1),
         held_out=_held_out(predictions.files, every, rng),
         next_experiment="",
-        seconds=seconds,
+        seconds=np.nan,
         recording=Source(
             path=str(recording.path),
             model=recording.model,

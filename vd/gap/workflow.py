@@ -6,7 +6,6 @@ effects (``DIR/explain.json``, ``DIR/predictions.npz``).
 
 import json
 import os
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -74,7 +73,7 @@ def find(recording: Recording | Path, hand: HandModel | None, out: Path, **optio
         RecordingError: The recording cannot be used.
         ValueError: A recording that is not of this hand.
     """
-    chosen, begin = Options(**options), time.perf_counter()
+    chosen = Options(**options)
     pool, specs = _workers(recording, hand, chosen)
     with pool:
         recording = pool.problems.recording
@@ -86,7 +85,6 @@ def find(recording: Recording | Path, hand: HandModel | None, out: Path, **optio
             "findings": [asdict(f) for f in found],
             "joints": {j.name: {"rows": j.fit.rows.tolist(), "rmse_rad": j.fit.rmse} for j in joints},
             "simulated": pool.simulated,
-            "seconds": time.perf_counter() - begin,
         }
         write_json(Path(out) / "find.json", value)
     chosen.progress(f"find: {pool.simulated} motions simulated")
@@ -115,7 +113,6 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
     if not (out / "find.json").is_file():
         find(recording, hand, out, **options)
     known = json.loads((out / "find.json").read_text())
-    begin = time.perf_counter()
     pool, specs = _workers(recording, hand, chosen)
     with pool:
         recording = pool.problems.recording
@@ -125,21 +122,19 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
             Analysed(j.name, j.spec, replace(e, baseline=j.fit))
             for j, e in zip(joints, explained, strict=True)
         ]
-        seconds = known["seconds"] + time.perf_counter() - begin
         report, predictions = assemble(
             recording,
             pool.problems,
             analysed,
             [Finding(**f) for f in known["findings"]],
             seed=chosen.seed,
-            seconds=seconds,
             simulated=known["simulated"] + pool.simulated,
         )
         source = replace(report.recording, relative_torques=relative_torques(recording))
         report = replace(report, recording=source)
         predictions.write(out / "predictions.npz")
         report.write(out / "explain.json")
-    chosen.progress(f"explain: {report.verdict} after {seconds:.0f} s, {pool.simulated} motions simulated")
+    chosen.progress(f"explain: {report.verdict} after {pool.simulated} motions simulated")
     return report
 
 
