@@ -169,7 +169,8 @@ class Analysis:
         """
         seconds = self._seconds()
         if missing := [name for name in steps if name not in seconds]:
-            raise ValueError(f"{self.out} lacks a step; run vd-gap {missing[0]} --out {self.out} first")
+            again = f"vd-gap {missing[0]} {self.settings.recording} --out {self.out}"
+            raise ValueError(f"{self.out} lacks what comes before; run {again} first")
         return {name: seconds[name] for name in steps}
 
     def _seconds(self) -> dict[str, float]:
