@@ -31,6 +31,10 @@ from vd.gap.statistics import interval, resamples, rmse
 from vd.gap.worker_pool import JointSpec, Problems
 from vd.kernels.servo.effects import EFFECTS
 
+CLOSE = 0.1
+"""Values of one effect on two joints within this share of each other are one value: a model that lacks something
+else moves them by more than their intervals tell."""
+
 
 @dataclass(frozen=True, eq=False)
 class Analysed:
@@ -232,11 +236,12 @@ def _pool(joints: Sequence[Analysed], *, named: bool) -> tuple[NamedEffect, ...]
 
 
 def _agree(one: Accepted, other: Accepted) -> bool:
-    """Whether the values of an effect on two joints can be the same: their intervals overlap."""
+    """Whether the values of an effect on two joints can be the same: close, or of intervals that overlap."""
     if one.estimates.keys() != other.estimates.keys():
         return False
     pairs = [(one.estimates[key], other.estimates[key]) for key in one.estimates]
-    return all(a[1] <= b[2] and b[1] <= a[2] for a, b in pairs)
+    near = [abs(a[0] - b[0]) <= CLOSE * max(abs(a[0]), abs(b[0])) for a, b in pairs]
+    return all(close or (a[1] <= b[2] and b[1] <= a[2]) for close, (a, b) in zip(near, pairs, strict=True))
 
 
 def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
