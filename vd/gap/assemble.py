@@ -32,8 +32,8 @@ from vd.gap.worker_pool import JointSpec, Problems
 from vd.kernels.servo.effects import EFFECTS
 
 CLOSE = 0.1
-"""Values of one effect on two joints within this share of each other are one value: a model that lacks something
-else moves them by more than their intervals tell."""
+"""Values of one effect on two joints within this share of each other are one value: a model that lacks
+something else moves them by more than their intervals tell."""
 
 
 @dataclass(frozen=True, eq=False)
