@@ -35,8 +35,7 @@ FEW = 3
 """Encoder counts within which a reading at rest flickers, rows within which an echo of the command comes
 back, samples by which stamps alone may let a position lead."""
 SLOWEST_S = 0.5
-"""Time between samples [s] that shows nothing of a servo (2 ms are 2.0 if written in milliseconds), and the
-longest lead of a position that is looked for: a longer one of a sine may be its next period."""
+"""Time between samples [s] that shows nothing of a servo (2 ms are 2.0 if written in milliseconds)."""
 CLEARLY = 0.5
 """Correlation against its command at which a joint turns the other way: lag alone spares slow motions. What a
 lead must leave of one less the correlation, in that of any lag: luck leaves 0.7."""
