@@ -23,7 +23,7 @@ from vd.gap.coordinates import BASELINE_PARAMETERS
 from vd.gap.design import design, pieces
 from vd.gap.excitations import MENU, JointRange, excitation_set, numbered
 from vd.gap.fit import FINER
-from vd.gap.recording import BARE_MODELS, Recording, Trajectory, write_table
+from vd.gap.recording import BARE_MODELS, Recording, Trajectory, entry_of, write_table
 from vd.gap.recording_checks import MIN_KINDS
 from vd.gap.result import Report, parameter_columns, parameters_of
 from vd.gap.rollout import STEP_S, Rollouts
@@ -100,13 +100,12 @@ def plan(
     competing: dict[str, tuple[tuple[str, ...], ...]] = {}
     for chain in chains(recording, hand):
         base = _base(chain, report, start or {})
-        for joint in (name for name in chain.joints if name in targets):
+        for joint, group in ((name, group) for name in chain.joints for group in targets.get(name, ())):
+            models = _models(report, chain, joint, base, group)
+            competing[joint] = (*competing.get(joint, ()), tuple(models))
             own = {name: [m for m in motions if m.joints == (joint,)] for name, motions in menu.items()}
-            for group in targets[joint]:
-                models = _models(report, chain, joint, base, group)
-                competing[joint] = (*competing.get(joint, ()), tuple(models))
-                values = _compare(chain, recording, own, joint, models, noise[joint], device)
-                found = {name: [*known, *values[name]] for name, known in found.items()}
+            for name, values in _compare(chain, recording, own, joint, models, noise[joint], device).items():
+                found[name] += values
     if not competing:
         raise ValueError(f"{recording.path}: no joint has a fitted model; run vd-gap explain first")
     motions = {name: [m for m in every if m.joints[0] in competing] for name, every in menu.items()}
@@ -118,17 +117,11 @@ def plan(
         )
         for name, values in found.items()
     ]
-    best, *others = sorted(scores, key=lambda score: -score.disagreement)
-    return Plan(
-        model=recording.model,
-        joints=recording.joints,
-        competing=competing,
-        ranking=(best, *others),
-        motions=tuple(motions[best.name]),
-        sentence=_sentence(
-            best, report, tuple(competing), len({t.excitation for t in recording.trajectories})
-        ),
-    )
+    ranking = tuple(sorted(scores, key=lambda score: -score.disagreement))
+    kinds = len({t.excitation for t in recording.trajectories})
+    sentence = _sentence(ranking[0], report, tuple(competing), kinds)
+    chosen = tuple(motions[ranking[0].name])
+    return Plan(recording.model, recording.joints, competing, ranking, chosen, sentence)
 
 
 def write_plan(result: Plan, folder: Path) -> Path:
@@ -143,17 +136,8 @@ def write_plan(result: Plan, folder: Path) -> Path:
     discard_plan(folder)
     path, entries = Path(folder) / PLAN_JSON, []
     for motion in numbered(result.motions):
-        file = f"{PLAN_FOLDER}/{motion.file}"
-        write_table(Path(folder) / file, motion, result.joints, ("command", "enabled"))
-        entries.append(
-            {
-                "file": file,
-                "excitation": motion.excitation,
-                "joints": list(motion.joints),
-                "conditions": motion.conditions,
-                "duration_s": motion.duration,
-            }
-        )
+        entries.append(entry_of(replace(motion, file=f"{PLAN_FOLDER}/{motion.file}")))
+        write_table(Path(folder) / entries[-1]["file"], motion, result.joints, ("command", "enabled"))
     contents = {name: value for name, value in vars(result).items() if name != "motions"}
     contents |= {"format": FORMAT, "excitation": result.ranking[0].name, "trajectories": entries}
     write_json(path, to_dict(contents))

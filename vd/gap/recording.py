@@ -106,19 +106,21 @@ def write_recording(recording: Recording, folder: str | Path, *, only: Collectio
         "joints": list(recording.joints),
         "servo": recording.servo,
         "encoder_resolution_rad": recording.encoder_resolution_rad,
-        "trajectories": [
-            {
-                "file": trajectory.file,
-                "excitation": trajectory.excitation,
-                "joints": list(trajectory.joints),
-                "duration_s": round(trajectory.duration, 6),
-                "conditions": trajectory.conditions,
-            }
-            for trajectory in recording.trajectories
-        ],
+        "trajectories": [entry_of(trajectory) for trajectory in recording.trajectories],
     }
     write_json(folder / "recording.json", header)
     return folder
+
+
+def entry_of(trajectory: Trajectory) -> dict[str, Any]:
+    """What ``recording.json`` says of a trajectory."""
+    return {
+        "file": trajectory.file,
+        "excitation": trajectory.excitation,
+        "joints": list(trajectory.joints),
+        "duration_s": round(trajectory.duration, 6),
+        "conditions": trajectory.conditions,
+    }
 
 
 def _read_text(file: Path) -> str:
