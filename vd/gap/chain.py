@@ -145,9 +145,8 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
     load = None
     if recording.model == "pendulum":
         free.append("tau_g_nm")
-        loads = [load for t in recording.trajectories if (load := load_of(t.conditions)) is not None]
-        load = max(loads, key=lambda each: each.torque, default=None)
-        if load is not None:
+        loads = filter(None, (load_of(t.conditions) for t in recording.trajectories))
+        if load := max(loads, key=lambda each: each.torque, default=None):
             row[servo.GRAVITY_TORQUE] = load.torque
             row[servo.INERTIA] += load.inertia
     return Chain(

@@ -7,7 +7,7 @@ or pendulum has no articulation: there the layer is read back into the joint's o
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -132,8 +132,7 @@ def simulate_again(
         squares[joint] = (models[:, rows, column] - curves.measured[rows, column]) ** 2
     before, after = np.sqrt(np.concatenate([*squares.values()], axis=1).mean(axis=1)).tolist()
     per_joint = {joint: tuple(np.sqrt(each.mean(axis=1)).tolist()) for joint, each in squares.items()}
-    simulator: Literal["rollout", "newton"] = "rollout" if hand_name is None else "newton"
-    closing = Closing(simulator, layer.name, before, after, per_joint)
+    closing = Closing("rollout" if hand_name is None else "newton", layer.name, before, after, per_joint)
     return closing, replace(curves, baseline=models[0], identified=models[1])
 
 

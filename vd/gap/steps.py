@@ -94,17 +94,15 @@ class Analysis:
         Raises:
             ValueError: A hand is named for a recording of a bare servo or pendulum.
         """
-        model, named = self.recording.model, self.settings.hand
-        if named is not None and model in BARE_MODELS:
-            raise ValueError(
-                f"{self.recording.path} is of a bare {model}, not of {named}: leave out --hand and --model, "
-                "or name the hand as 'model' in recording.json"
-            )
+        recording, named = self.recording, self.settings.hand
+        if recording.model not in BARE_MODELS:
+            return named or model_path(recording.path, recording.model)
         if named is not None:
-            return named
-        if model in BARE_MODELS:
-            return None
-        return model_path(self.recording.path, model)
+            raise ValueError(
+                f"{recording.path} is of a bare {recording.model}, not of {named}: leave out --hand, or name "
+                "the hand as 'model' in recording.json"
+            )
+        return None
 
     @cached_property
     def hand(self) -> "HandModel | None":
