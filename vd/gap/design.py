@@ -10,7 +10,8 @@ from vd.gap.statistics import held
 
 MAX_FOLDS = 6
 BYSTANDERS = 2
-"""Trajectories of each other joint of the chain in which a joint's own rest is fitted too."""
+"""Trajectories of each other joint of the chain in which a joint's own rest is fitted too; of one, a coupling
+would have no interval."""
 MAX_MOTION_S = 150.0
 """Motion of a joint that is fitted [s]: twice what the paper records; the rest is held out for good."""
 MAX_MOTIONS = 30
