@@ -45,7 +45,7 @@ _DOES = {
 METHOD = 12
 """Of the analysis; what another one made is made again."""
 NO_EFFECTS = "none"
-"""In place of candidates: identify the drives alone, as the paper does."""
+"""In place of candidates: identify the drives alone."""
 STEPS = tuple(OUTPUTS)
 _PACKAGES = ("visual-dexterity", "warp-lang", "newton", "cma", "numpy")
 
