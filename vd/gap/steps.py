@@ -47,7 +47,7 @@ METHOD = 12
 NO_EFFECTS = "none"
 """In place of candidates: identify the drives alone."""
 STEPS = tuple(OUTPUTS)
-_PACKAGES = ("visual-dexterity", "warp-lang", "newton", "cma", "numpy")
+_PACKAGES = ("visual-dexterity", "warp-lang", "newton", "scipy", "numpy")
 
 
 @dataclass(frozen=True)
