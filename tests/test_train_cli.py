@@ -92,14 +92,10 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
             *("--seed", "7", "--ppo.epochs", "3", "--env.reward.energy=-1.5", "--out", "runs/x"),
             *("--max-minutes", "2.5", "--hand-layer", "bench/identified.usda", "--randomise"),
             *("--env.randomisation.effects", "backlash.width_rad", "0", "0.03"),
-            *("dead_zone.width_rad", "0", "0.1"),
         ]
     )
     assert cfg.env.hand_layer == "bench/identified.usda"
-    assert cfg.env.randomisation.effects == {
-        "backlash.width_rad": (0.0, 0.03),
-        "dead_zone.width_rad": (0, 0.1),
-    }
+    assert cfg.env.randomisation.effects == {"backlash.width_rad": (0.0, 0.03)}
     assert from_dict(TeacherCfg, json.loads(json.dumps(to_dict(cfg)))) == cfg
     assert (cfg.env.hand, cfg.env.objects) == ("dclaw3", ("cube", "cuboid"))
     assert (cfg.env.num_envs, cfg.env.seed) == (128, 7)

@@ -5,7 +5,7 @@ import difflib
 import types
 import typing
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
@@ -141,7 +141,7 @@ def _convert(hint: Any, value: Any, where: str, over: Any = None) -> Any:
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         named = _mapping(value, f"fields of {hint.__name__}", where)
         return from_dict(hint, named, where=where, over=over if isinstance(over, hint) else None)
-    if origin is dict:
+    if origin in (dict, MutableMapping):  # of the second tyro makes one flag, filled or not
         named = _mapping(value, "values by name", where)
         return {key: _convert(args[1], item, f"{where}.{key}") for key, item in named.items()}
     if origin is typing.Literal:

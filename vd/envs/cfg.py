@@ -1,5 +1,6 @@
 """Configuration of the reorientation task; every default is the paper's."""
 
+from collections.abc import MutableMapping
 from dataclasses import dataclass, field, replace
 from math import pi
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -56,7 +57,7 @@ class RewardCfg:
     """Ours: times the height of the object's lowest point above the table (there or not), 1 from 2 cm on."""
     scale: float = 1.0
     """Ours: factor on the sum; changes no optimum, keeps value targets near 1."""
-    terms: dict[str, float] = field(default_factory=dict)
+    terms: MutableMapping[str, float] = field(default_factory=dict)
     """Your own terms: functions (module:function) with their coefficients (docs/tutorials/terms.md)."""
 
 
@@ -109,10 +110,10 @@ class ObservationCfg:
     dynamics: Literal["none", "critic"] = "none"
     """Ours, privileged: whether the critic is told what was drawn (gains, delay, friction and backlash of
     joints, frictions, mass, latency), and the present state and shape, without noise."""
-    terms: dict[str, int] = field(default_factory=dict)
+    terms: MutableMapping[str, int] = field(default_factory=dict)
     """Your own values: functions (module:function), and how many values each gives. Symmetry frames show
     them as they are, without latency and noise."""
-    critic_terms: dict[str, int] = field(default_factory=dict)
+    critic_terms: MutableMapping[str, int] = field(default_factory=dict)
     """The same, for the critic alone."""
 
     @property
@@ -293,7 +294,7 @@ class RandomisationCfg:
     the released code; a whole control step, 1/12, gives five times the impulse (condition ``hard``)."""
     force_decay: float = 0.0
     """What remains of a force in the next control step: 0 in the paper, 0.998 in the released code."""
-    effects: dict[str, tuple[float, float]] = field(default_factory=dict)
+    effects: MutableMapping[str, tuple[float, float]] = field(default_factory=dict)
     """Effects of servos to draw for every joint in each episode, by name and parameter: command_delay.delay_s
     0 0.04 draws a delay of up to 40 ms. They replace what a hand layer says about the same parameter. Delays
     are of the bus: all joints of an environment have the same share of their range."""
