@@ -164,11 +164,13 @@ def add_layer(stage: Usd.Stage, path: Path) -> None:
         path: The layer.
 
     Raises:
-        HandError: The file is missing or no USD, or changes prims that the hand does not have.
+        HandError: The file is missing, no USD or empty, or changes prims that the hand does not have.
     """
     layer = open_layer(path)
     hand = stage.GetRootLayer().realPath
     root = stage.GetDefaultPrim().GetName()
+    if not layer.rootPrims:
+        raise HandError(f"{path}: not an identified servo model, it has no joints; let vd-gap write it again")
     for prim in layer.rootPrims:
         if prim.name != root:
             raise HandError(

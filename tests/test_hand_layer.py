@@ -141,6 +141,7 @@ def test_another_hand_is_refused(hand, tmp_path):
         (overs("f0_j1", "custom double vd:torque_speed_limit:tau_stall_nm = 1"), "omega_0_rad_s'; author it"),
         (overs("f0_j1", "float drive:angular:physics:stiffness = -1"), "stiffness' is -1.0; it must be pos"),
         ("not USD at all", "not a USD layer"),
+        ("#usda 1.0\n", "it has no joints"),
     ],
 )
 def test_wrong_layers_name_file_prim_and_attribute(tmp_path, text, message):

@@ -119,7 +119,7 @@ class ObservationCfg:
     @property
     def own(self) -> dict[str, int]:
         """All own values, those of the actor first."""
-        return self.terms | self.critic_terms
+        return {**self.terms, **self.critic_terms}
 
     def num_frames(self, fingers: int) -> int:
         """Symmetry frames of a hand of so many fingers; 0: it sees the world as it is."""

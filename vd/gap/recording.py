@@ -126,7 +126,7 @@ def entry_of(trajectory: Trajectory) -> dict[str, Any]:
 def _read_text(file: Path) -> str:
     try:
         return file.read_text(encoding="utf-8-sig")  # spreadsheets put a mark in front
-    except (FileNotFoundError, IsADirectoryError):
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise RecordingError(
             f"{file}: no such file; give a folder with recording.json and the CSV files that it lists"
         ) from None
