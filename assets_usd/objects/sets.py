@@ -100,7 +100,7 @@ def _place(entry: str | Path) -> Path:
     there = sorted(each.name for each in root.glob("*/") if _holds_objects(each))
     raise ObjectError(
         f"no object set or path {str(entry)!r}.\n"
-        f"  built in: {', '.join(BUILT_IN)}\n"
+        f"  built in, for --objects: {', '.join(BUILT_IN)}\n"
         f"  in {root}: {', '.join(there) or 'none'}\n"
         f"  import meshes as a set: vd-assets import MESHES --out {named}\n"
         "  author our own: vd-assets objects --procedural 150 --seed 0"

@@ -296,8 +296,9 @@ class RandomisationCfg:
     """What remains of a force in the next control step: 0 in the paper, 0.998 in the released code."""
     effects: MutableMapping[str, tuple[float, float]] = field(default_factory=dict)
     """Effects of servos to draw for every joint in each episode, by name and parameter: command_delay.delay_s
-    0 0.04 draws a delay of up to 40 ms. They replace what a hand layer says about the same parameter. Delays
-    are of the bus: all joints of an environment have the same share of their range."""
+    0 0.04 draws a delay of up to 40 ms. Those given are all: others of --init or a preset go. They replace
+    what a hand layer says about the same parameter. Delays are of the bus: all joints of an environment have
+    the same share of their range."""
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old the object's state is that the policy sees [s], drawn for each episode, to the nearest physics
     step: a camera and its loop. Rewards and success are of the true state."""
