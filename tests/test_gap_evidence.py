@@ -12,11 +12,12 @@ from vd.gap.evidence import Evidence
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.joints import doubted, share
 from vd.gap.statistics import resamples
+from vd.kernels.servo.effects import EFFECTS
 
 
 @pytest.fixture
 def judge() -> Evidence:
-    return Evidence(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
+    return Evidence(noise=FLOOR, weights=resamples(10, np.random.default_rng(0)))
 
 
 def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(judge: Evidence) -> None:
@@ -53,7 +54,8 @@ def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: 
 
 def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:
     def explanation(name: str, *tied: str, verdict: str = "") -> Explanation:
-        accepted = Accepted(name, 0.6 if tied else 1.0, {}, (), tied, False)
+        known = {parameter.name: (1.0, 0.5, 1.5) for parameter in EFFECTS[name].parameters}
+        accepted = Accepted(name, 0.6 if tied else 1.0, known, (), tied, False)
         fits = [made_up((other,), 0.01) for other in (name, *tied)]
         verdict = verdict or ("ambiguous" if tied else "effects")
         return Explanation(made_up((), 0.02), fits[0], verdict, "", (accepted,), (), {name: fits})
@@ -105,9 +107,10 @@ def test_a_friction_that_changes_from_motion_to_motion_is_no_name(falls: float, 
         held_out=count * FLOOR**2,
         gram=np.einsum("sni,snj->sij", slopes, slopes),
         gradient=np.einsum("sni,sn->si", slopes, measured - slopes @ x),
+        refits=np.stack([x, x]),
     )
     gap = count * (10.0 * FLOOR) ** 2
     plain = replace(final, effects=(), held_out=gap, sse=gap)
-    judge = Evidence(floor=FLOOR, weights=resamples(len(when), np.random.default_rng(0)), when=when)
+    judge = Evidence(noise=FLOOR, weights=resamples(len(when), np.random.default_rng(0)), when=when)
     found = judge.conclude(plain, final, {"coulomb_friction": [final]}, [], "")
     assert found.verdict == verdict and ("changes" in found.reason) == bool(falls)

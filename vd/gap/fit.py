@@ -238,8 +238,7 @@ class JointProblem:
         )
         if trajectories is not None:
             return fit
-        held_out, absolute = self.cross_validate(fit, jacobian)
-        return replace(fit, held_out=held_out, held_out_abs=absolute)
+        return self.cross_validate(fit, jacobian)
 
     def fitted(self, effects: Sequence[str]) -> list[str]:
         """Keys of what a model with these effects fits on this joint."""
@@ -251,8 +250,8 @@ class JointProblem:
         """d(predicted)/dx at a fit, shape [P, N]."""
         return self.squares(fit.rows, fit.coordinates).jacobian(fit.x)
 
-    def cross_validate(self, fit: JointFit, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Squared and absolute errors of each trajectory, predicted by a fit without its fold, [S] each.
+    def cross_validate(self, fit: JointFit, jacobian: np.ndarray) -> JointFit:
+        """A fit with the errors of each trajectory as a fit without its fold predicts it.
 
         Args:
             fit: The fit to all folds.
@@ -260,13 +259,16 @@ class JointProblem:
         """
         out = np.unique(self.folds)[:, None] == self.folds
         model = self.squares(fit.rows, fit.coordinates)
-        x = [
-            model.descend(fit.x, REFITS, ~fold, jacobian * np.repeat(~fold, self.count.astype(int)))
-            for fold in out
-        ]
-        residual = self.residuals(self.rows(fit.rows, fit.coordinates, np.array(x)), keep=out)
+        x = np.array(
+            [
+                model.descend(fit.x, REFITS, ~fold, jacobian * np.repeat(~fold, self.count.astype(int)))
+                for fold in out
+            ]
+        )
+        residual = self.residuals(self.rows(fit.rows, fit.coordinates, x), keep=out)
         parts = self.split(residual.sum(0))
-        return np.array([part @ part for part in parts]), np.array([np.abs(part).sum() for part in parts])
+        squared, absolute = (np.array([np.sum(abs(part) ** power) for part in parts]) for power in (2, 1))
+        return replace(fit, held_out=squared, held_out_abs=absolute, refits=x)
 
     def refine(self, fit: JointFit, scales: Scales) -> JointFit:
         """The same model fitted on with finer time steps, for values that do not depend on the step.
@@ -283,7 +285,8 @@ class JointProblem:
             result = fine.fit(fit.rows, fit.effects, given, scales, trajectories=self.trajectories)
             error = np.abs(result.x - before)
         self.simulated = fine.simulated
-        return replace(result, held_out=fit.held_out, held_out_abs=fit.held_out_abs, step_error=error)
+        held_out = {name: getattr(fit, name) for name in ("held_out", "held_out_abs", "refits")}
+        return replace(result, **held_out, step_error=error)
 
     def promise(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> np.ndarray:
         """Share of the squared error that each start could remove, the present parameters readjusted.

@@ -1,6 +1,5 @@
 """A model of one joint as a fit leaves it, and how samples are weighted in one."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,9 +27,9 @@ class JointFit:
         count: Samples of each trajectory [S].
         gram: J^T J of each trajectory, [S, P, P].
         gradient: J^T r of each trajectory, [S, P].
+        refits: Coordinates of the fits without each fold [F, P]; None where not taken.
         held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad]; None where not taken.
         step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
-        extents: 95 % intervals by key, of parameters for which the matrices do not give them.
     """
 
     effects: tuple[str, ...]
@@ -42,9 +41,9 @@ class JointFit:
     count: np.ndarray
     gram: np.ndarray
     gradient: np.ndarray
+    refits: np.ndarray | None = None
     held_out_abs: np.ndarray | None = None
     step_error: np.ndarray | None = None
-    extents: Mapping[str, tuple[float, float]] | None = None
 
     @property
     def values(self) -> dict[str, float]:

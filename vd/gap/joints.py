@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from vd.gap.evidence import CANCELLING, JITTER, LEVELS, MIN_GAIN, explains
-from vd.gap.explain import Explained, Explainer, Joint, beside, weighting_of
+from vd.gap.explain import Explained, Explainer, Joint, beside
 from vd.gap.explanation import NAMED, Explanation, estimates, intervals, polished
 from vd.gap.joint_fit import JointFit
 from vd.gap.worker_pool import WorkerPool, parallel
@@ -148,9 +148,8 @@ def _finished(pool: WorkerPool, known: Explained, joint: Joint, fit: JointFit) -
     """A model fitted to the end from where it is, beside the joints as they are known."""
     call = {"base": beside(joint, known), "effects": fit.effects, "starts": [fit.values]}
     call |= {"scales": joint.scales}
-    weighting = weighting_of(next(found for other, found in known if other is joint))
-    whole = pool.run(joint.spec, [("fit", {**call, **weighting})])[0]
-    return pool.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales, **weighting})])[0]
+    whole = pool.run(joint.spec, [("fit", call)])[0]
+    return pool.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales})])[0]
 
 
 def _in_turn(
@@ -191,7 +190,7 @@ def _consistent(
         if not changed or not own.final.effects or JITTER in own.final.effects:
             return own
         rows[joint.spec.joint] = own.final.rows[joint.spec.joint]
-        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales, **weighting_of(own)}
+        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales}
         return polished(own, pool.run(joint.spec, [("refine", call)])[0], joint.spec.floor)
 
     return parallel(again, range(len(joints)))

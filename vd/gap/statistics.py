@@ -104,35 +104,7 @@ def rmse(sse: np.ndarray, count: np.ndarray, weights: np.ndarray | None = None) 
     return np.sqrt(np.maximum(sse @ weights.T, 0.0) / np.maximum(weights @ count, 1e-30))
 
 
-def covariance(gram: np.ndarray, gradient: np.ndarray, ridge: np.ndarray, floor: float) -> np.ndarray:
-    """Covariance of a least-squares estimate, robust against residuals that are correlated in a trajectory.
-
-    The jackknife over trajectories in one Gauss-Newton step each (the cluster-robust CR3 estimate),
-    but at least the textbook covariance of white noise at the floor.
-
-    Args:
-        gram: J^T J of each trajectory, shape [S, P, P].
-        gradient: J^T r of each trajectory, r = measured - predicted, shape [S, P].
-        ridge: Added to the diagonal of the sum, shape [P].
-        floor: Noise floor [rad].
-    """
-    total = gram.sum(0) + np.diag(ridge)
-    slope = gradient.sum(0)
-    center = np.linalg.solve(total, slope)
-    units = len(gram)
-    white = floor**2 * np.linalg.inv(total)
-    if units < 2:
-        return white
-    steps = np.array(
-        [np.linalg.lstsq(total - gram[s], slope - gradient[s], rcond=None)[0] - center for s in range(units)]
-    )
-    robust = (units - 1) / units * steps.T @ steps
-    larger = np.maximum(np.diag(robust), np.diag(white)) / np.maximum(np.diag(robust), 1e-300)
-    scale = np.sqrt(larger)
-    return robust * np.outer(scale, scale)
-
-
 def half_width(variance: np.ndarray, units: int) -> np.ndarray:
-    """Half the 95 % interval of estimates whose variance was estimated from ``units`` trajectories."""
+    """Half the 95 % interval of estimates whose variance was estimated from ``units`` parts of the data."""
     freedom = max(units - 1, 1)
     return float(student.ppf(0.5 + 0.5 * CONFIDENCE, freedom)) * np.sqrt(np.maximum(variance, 0.0))
