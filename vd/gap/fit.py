@@ -7,6 +7,7 @@ one call of :class:`vd.gap.rollout.Rollouts`.
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -132,17 +133,12 @@ class JointProblem:
     ) -> LeastSquares:
         """The squared error of the model whose other parameters are those of ``base``."""
 
-        def every(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray | None:
-            return None if keep is None else np.repeat(keep[None], len(x), axis=0)
-
-        def residuals(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
-            return self.residuals(self.rows(base, coordinates, x), trajectories, every(x, keep))
-
-        def coarse(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
+        def residuals(x: np.ndarray, keep: np.ndarray | None, rollouts: Rollouts | None = None) -> np.ndarray:
             rows = self.rows(base, coordinates, x)
-            return self.residuals(rows, trajectories, every(x, keep), rollouts=self.coarse)
+            mask = None if keep is None else np.repeat(keep[None], len(x), axis=0)
+            return self.residuals(rows, trajectories, mask, rollouts=rollouts)
 
-        slopes = None if self.coarse is None else coarse
+        slopes = partial(residuals, rollouts=self.coarse)
         return LeastSquares(coordinates, residuals, RIDGE * self.floor**2, slopes)
 
     def rows(self, base: np.ndarray, coordinates: Sequence[Coordinate], x: np.ndarray) -> np.ndarray:
