@@ -41,7 +41,7 @@ _DOES = {
     "close": "writing the identified model and simulating the commands again",
     "report": "drawing the page",
 }
-METHOD = 12
+METHOD = 13
 """Of the analysis; what another one made is made again."""
 STEPS = tuple(OUTPUTS)
 _PACKAGES = ("visual-dexterity", "warp-lang", "newton", "cma", "numpy")
