@@ -53,15 +53,16 @@ class Accepted:
 
     @property
     def shown(self) -> bool:
-        """Whether the interval of one of its sizes leaves out its absence.
+        """Whether the interval of its size leaves out its absence; several sizes stand in for each other.
 
-        That is 0, but infinity of a limit or a stiffness. Its inverse is known to be more than 0 where half
+        Absence is 0, but infinity of a limit or a stiffness: its inverse is more than 0 for sure if half
         the interval of its logarithm is less than 1, to first order.
         """
         known = {p.name: p for p in EFFECTS[self.name].parameters if p.column != servo.GRAVITY_PHASE}
         told = [(known[key], *estimate) for key, estimate in self.estimates.items() if key in known]
         limits = [high < np.e * value for p, value, _, high in told if p.lower > 0.0 == p.neutral]
-        return any(limits or [not low <= 0.0 <= high for p, _, low, high in told if p.lower == 0.0])
+        sizes = limits or [not low <= 0.0 <= high for p, _, low, high in told if p.lower == 0.0]
+        return len(sizes) != 1 or sizes[0]
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
     for c, x, w in zip(fit.coordinates, fit.x, width, strict=True):
         low, high = max(x - w, c.lower), min(x + w, c.upper)
         result[c.key] = float(c.value(low)), float(c.value(high))
-    return result
+    return {**result, **(fit.extents or {})}
 
 
 def estimates(

@@ -20,6 +20,7 @@ from vd.gap.evidence import JITTER
 from vd.gap.fit import RIDGE, JointProblem
 from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
+from vd.gap.statistics import half_width
 
 DRAWS = 16
 """Realisations of the delays."""
@@ -32,6 +33,10 @@ NOISES = (1.0, 3.0, 10.0)
 NARROW = 0.5
 """Share of the first guess that is believed: behind more jitter than there is an effect would not show."""
 EVALUATIONS = 60
+FACTORS = (0.0, 0.5, 0.71, 0.85, 1.0, 1.18, 1.41, 2.0)
+"""Multiples of the best standard deviation at which the likelihood is looked at for the intervals ..."""
+DROPS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)
+"""... and shares of commands dropped."""
 
 
 class JitterFit:
@@ -151,30 +156,30 @@ class JitterFit:
         return self._values(x)
 
     def _values(self, x: np.ndarray) -> tuple[float, float]:
-        most = [float(c.value(c.upper)) for c in self.coordinates]
-        return min(float(np.exp(x[0])), most[0]), min(float(np.exp(x[1])), most[1])
+        sigma, drop = (float(v) for v in np.exp(x))
+        return self._limited(sigma, drop)
 
-    def scores(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Fisher information and score of the model at coordinates of the pair [2], as matrices of a fit.
+    def extents(self, sigma: float, drop: float) -> dict[str, tuple[float, float]]:
+        """Intervals of both parameters: the values of the pairs that the trajectories do not reject.
 
-        Of a normal distribution with mean m and variance v the information is m'm'/v + v'v'/(2 v^2), and the
-        score e m'/v + (e^2/v - 1) v'/(2 v), with the error e: those of least squares with two residuals.
+        Delays and losses stand in for each other in part, so that the pairs are what is judged: by the sum of
+        their losses of likelihood over the trajectories, and its interval, since the model is not quite right
+        (Vuong 1989). Each end is half way to the first value that is rejected with every other.
         """
-        steps = np.array([c.step(v) for c, v in zip(self.coordinates, x, strict=True)])
-        moved = [x, *(x + np.diag(steps))]
-        values = [[float(c.value(v)) for c, v in zip(self.coordinates, one, strict=True)] for one in moved]
-        means, spreads = (np.array(part) for part in zip(*(self.draws(*v) for v in values), strict=True))
-        floor, error = self.problem.floor, self.measured - means[0]
-        variance = spreads[0] + floor**2
-        mean = np.vstack([self.jacobian, (means[1:] - means[0]) / steps[:, None]]) / np.sqrt(variance)
-        spread = np.zeros_like(mean)
-        spread[-2:] = (spreads[1:] - spreads[0]) / steps[:, None] / variance / np.sqrt(2.0)
-        left = np.stack([error / np.sqrt(variance), (error**2 / variance - 1.0) / np.sqrt(2.0)])
-        slopes = np.stack([mean, spread], axis=1)
-        parts = zip(np.split(slopes, self.ends, axis=-1), np.split(left, self.ends, axis=-1), strict=True)
-        pairs = [(np.einsum("akn,bkn->ab", j, j), np.einsum("akn,kn->a", j, e)) for j, e in parts]
-        gram, gradient = (floor**2 * np.array(each) for each in zip(*pairs, strict=True))
-        return gram, gradient
+        here, sigmas, drops = self.losses(sigma, drop), [sigma * f for f in FACTORS], sorted({drop, *DROPS})
+        worse = np.array([[self.losses(*self._limited(s, d)) - here for d in drops] for s in sigmas])
+        kept = worse.sum(axis=-1) < half_width(self.size * worse.var(axis=-1, ddof=1), self.size)
+        kept[sigmas.index(sigma), drops.index(drop)] = True
+        ranges = {}
+        for name, values, inside in (("sigma_s", sigmas, kept.any(1)), ("p_drop", drops, kept.any(0))):
+            first, last = np.flatnonzero(inside)[[0, -1]]
+            ends = np.interp([first - 0.5, last + 0.5], range(len(values) + 1), [*values, 2.0 * values[-1]])
+            ranges[f"command_jitter.{name}"] = float(ends[0]), float(ends[1])
+        return ranges
+
+    def _limited(self, sigma: float, drop: float) -> tuple[float, float]:
+        limits = [float(c.value(c.upper)) for c in self.coordinates]
+        return min(sigma, limits[0]), min(drop, limits[1])
 
     def result(self, sigma: float, drop: float) -> JointFit:
         """A pair of values as any other fit, with the errors that a constant width has at its likelihood."""
@@ -182,21 +187,18 @@ class JitterFit:
         count = self.problem.count
         # A motion that is far from its prediction has an error of a radian: as good as none.
         errors = count * np.exp(np.minimum(2.0 * self.losses(sigma, drop) / count - 1.0, 0.0))
-        gram, gradient = self.scores(x)
-        every, ridge = np.concatenate([self.base.x, x]), RIDGE * self.problem.floor**2 * np.eye(gram.shape[1])
-        kept = self.problem.folds != np.unique(self.problem.folds)[:, None]
-        steps = [np.linalg.solve(gram[fold].sum(0) + ridge, gradient[fold].sum(0)) for fold in kept]
+        gram, gradient, refits = self.base.gram, self.base.gradient, self.base.refits
         return JointFit(
             effects=(*self.base.effects, JITTER),
             coordinates=(*self.base.coordinates, *self.coordinates),
-            x=every,
+            x=np.concatenate([self.base.x, x]),
             rows=self.row(sigma, drop),
             sse=errors,
             held_out=errors,
             count=count,
-            gram=gram,
-            gradient=gradient,
-            refits=every + np.array(steps),
+            gram=np.pad(gram, ((0, 0), (0, 2), (0, 2))),
+            gradient=np.pad(gradient, ((0, 0), (0, 2))),
+            refits=np.hstack([refits, np.tile(x, (len(refits), 1))]),
         )
 
 
@@ -216,8 +218,19 @@ def fit_jitter(
     return jitter.result(*values), jitter.weighting(*values)
 
 
+def bound_jitter(problem: JointProblem, fit: JointFit, scales: Scales) -> JointFit:
+    """A fitted model with the intervals of its jitter, which take longer than the fit."""
+    rows, values = fit.rows.copy(), fit.values
+    for c in fit.coordinates[-2:]:
+        rows[problem.joint, c.column] = 0.0
+    rest = replace(fit, effects=fit.effects[:-1], coordinates=fit.coordinates[:-2], x=fit.x[:-2], rows=rows)
+    sigma, drop = (values[c.key] for c in fit.coordinates[-2:])
+    return replace(fit, extents=JitterFit(problem, rest, scales).extents(sigma, drop))
+
+
 CALLS: dict[str, Callable[..., Any]] = {
     "look": look,
     "fit_jitter": fit_jitter,
+    "bound_jitter": bound_jitter,
 }
 """What is asked of a joint's problem by name, besides its methods."""

@@ -57,6 +57,7 @@ def try_jitter(
     row = Trial(1, JITTER, random, gain, ci, decision, SPREAD if accepted else why)
     if not accepted:
         return present, (), [row]
+    random = search.run([("bound_jitter", {"fit": random, "scales": search.scales})])[0]
     names, before, after = " and ".join(random.effects), present.held_out_rmse, random.held_out_rmse
     text = f"as likely as {1e3 * after:.2f} mrad of constant width, before {1e3 * before:.2f}"
     search.report(f"+ {names}: {text}")

@@ -1,5 +1,6 @@
 """A model of one joint as a fit leaves it, and how samples are weighted in one."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,7 @@ class JointFit:
         gradient: J^T r of each trajectory, [S, P].
         refits: Coordinates of the fits without each fold [F, P]; None where not taken.
         held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad]; None where not taken.
+        extents: 95 % intervals by key, of parameters for which the refits do not give them.
         step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
     """
 
@@ -44,6 +46,7 @@ class JointFit:
     refits: np.ndarray | None = None
     held_out_abs: np.ndarray | None = None
     step_error: np.ndarray | None = None
+    extents: Mapping[str, tuple[float, float]] | None = None
 
     @property
     def values(self) -> dict[str, float]:
