@@ -149,7 +149,7 @@ def test_the_evidence_has_every_effect_also_what_was_not_fitted(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_an_acceleration_limit_that_cannot_follow_is_named(tmp_path: Path) -> None:
-    """It lets small errors grow, so that the right model leaves more than noise, and that is no other effect."""
+    """It lets small errors grow, so that the right model leaves more than noise."""
     recording = hidden(acceleration_limit={"a_max_rad_s2": 10.0})
     tried = ("acceleration_limit", "command_delay", "coulomb_friction", "torque_saturation")
     report = analysed(recording, tmp_path / "gap", effects=tried)
