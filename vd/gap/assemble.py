@@ -259,8 +259,9 @@ def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
         weight /= weight.sum()
         value = float(weight @ values)
         # No narrower than the joints' own values lie apart from the pooled one.
-        apart = half_width(weight @ (values - value) ** 2 / max(len(every) - 1, 1), len(every))
-        below, above = (max(np.linalg.norm(weight * d), apart) for d in (values - lows, highs - values))
+        spread = weight @ (values - value) ** 2 / max(len(every) - 1, 1)
+        apart = float(half_width(spread, len(every)))
+        below, above = (max(float(np.linalg.norm(weight * d)), apart) for d in (values - lows, highs - values))
         low = max(value - below, -np.inf if known[key].signed else 0.0)
         parameters[key] = Estimate(value, (float(low), float(value + above)), known[key].unit)
     return NamedEffect(

@@ -87,7 +87,6 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
     Residuals are no white noise where the model is not quite right; but an interval is no narrower than white
     noise at the floor makes it.
     """
-    assert fit.refits is not None
     folds, ridge = len(fit.refits), RIDGE * floor**2 * np.eye(len(fit.x))
     white = floor**2 * np.diag(np.linalg.inv(fit.gram.sum(0) + ridge))
     width = half_width(np.maximum((folds - 1) * fit.refits.var(axis=0), white), folds)

@@ -231,6 +231,7 @@ class JointProblem:
             count=np.array([len(e) for e in errors], float),
             gram=np.stack([j @ j.T for j in parts]),
             gradient=np.stack([j @ e for j, e in zip(parts, errors, strict=True)]),
+            refits=x[None],
         )
         if trajectories is not None:
             return fit

@@ -28,7 +28,7 @@ class JointFit:
         count: Samples of each trajectory [S].
         gram: J^T J of each trajectory, [S, P, P].
         gradient: J^T r of each trajectory, [S, P].
-        refits: Coordinates of the fits without each fold [F, P]; None where not taken.
+        refits: Coordinates of the fits without each fold [F, P].
         held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad]; None where not taken.
         extents: 95 % intervals by key, of parameters for which the refits do not give them.
         step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
@@ -43,7 +43,7 @@ class JointFit:
     count: np.ndarray
     gram: np.ndarray
     gradient: np.ndarray
-    refits: np.ndarray | None = None
+    refits: np.ndarray
     held_out_abs: np.ndarray | None = None
     step_error: np.ndarray | None = None
     extents: Mapping[str, tuple[float, float]] | None = None
