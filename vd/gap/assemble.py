@@ -260,8 +260,10 @@ def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
         value = float(weight @ values)
         # No narrower than the joints' own values lie apart from the pooled one.
         spread = weight @ (values - value) ** 2 / max(len(every) - 1, 1)
-        apart = float(half_width(spread, len(every)))
-        below, above = (max(float(np.linalg.norm(weight * d)), apart) for d in (values - lows, highs - values))
+        apart = half_width(spread, len(every))
+        below, above = (
+            float(np.maximum(np.linalg.norm(weight * d), apart)) for d in (values - lows, highs - values)
+        )
         low = max(value - below, -np.inf if known[key].signed else 0.0)
         parameters[key] = Estimate(value, (float(low), float(value + above)), known[key].unit)
     return NamedEffect(
