@@ -258,12 +258,9 @@ def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
         weight = np.maximum(0.5 * (highs - lows), 1e-12) ** -2
         weight /= weight.sum()
         value = float(weight @ values)
-        # No narrower than the joints' own values lie apart from the pooled one.
-        spread = weight @ (values - value) ** 2 / max(len(every) - 1, 1)
-        apart = half_width(spread, len(every))
-        below, above = (
-            float(np.maximum(np.linalg.norm(weight * d), apart)) for d in (values - lows, highs - values)
-        )
+        # No narrower than the joints' own, whose errors are one model's, nor than their values lie apart.
+        apart = half_width(weight @ (values - value) ** 2 / max(len(every) - 1, 1), len(every))
+        below, above = (float(np.maximum(weight @ d, apart)) for d in (values - lows, highs - values))
         low = max(value - below, -np.inf if known[key].signed else 0.0)
         parameters[key] = Estimate(value, (float(low), float(value + above)), known[key].unit)
     return NamedEffect(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 import vd.kernels.servo.actuators as servo
-from vd.gap.explanation import NAMED, Accepted, Explanation, Trial, estimates, intervals
+from vd.gap.explanation import NAMED, OWN_ERROR, Accepted, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import DRY, ONE_SIDED, JointFit
 from vd.gap.recording import Recording
 from vd.gap.statistics import half_width, interval, rmse
@@ -85,9 +85,6 @@ JITTER_GAIN_FLOORS = 0.3
 """The same beside random delays: an effect of six floors leaves half of one there."""
 MEMORY = 8.0
 """Samples in a row that say the same beside them: what a late command does lasts that long."""
-OWN_ERROR = 0.02
-"""A model's own error, as a share of the whole gap: no fit of a large effect is better than that. Beside a
-friction of 97 noise floors a second effect came with a share of 0.015 that was not there."""
 PENALTY = 0.01
 """Relative RMSE that a further parameter must earn to be preferred."""
 EXCESS_FLOORS = 0.07

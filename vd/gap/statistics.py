@@ -104,7 +104,7 @@ def rmse(sse: np.ndarray, count: np.ndarray, weights: np.ndarray | None = None) 
     return np.sqrt(np.maximum(sse @ weights.T, 0.0) / np.maximum(weights @ count, 1e-30))
 
 
-def half_width(variance: np.ndarray, units: int) -> np.ndarray:
+def half_width(variance: np.ndarray, units: float) -> np.ndarray:
     """Half the 95 % interval of estimates whose variance was estimated from ``units`` parts of the data."""
     freedom = max(units - 1, 1)
     return float(student.ppf(0.5 + 0.5 * CONFIDENCE, freedom)) * np.sqrt(np.maximum(variance, 0.0))
