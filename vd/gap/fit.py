@@ -18,10 +18,6 @@ from vd.gap.descent import LeastSquares
 from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
 
-STILL_COUNTS = 0.05
-"""Encoder counts within which a prediction stands still."""
-
-
 RIDGE = 0.01
 """Pull towards the start, as information in units of the noise floor: holds directions that the data
 leave free (the torque scale of a bare servo), moves no others."""
@@ -68,9 +64,6 @@ class JointProblem:
         self._measured = {
             int(t): rollouts.measured[rollouts.sample_trajectory == t, joint] for t in self.trajectories
         }
-        column = int(rollouts.chain.columns[joint])
-        recorded = {int(t): rollouts.recording.trajectories[int(t)] for t in self.trajectories}
-        self._holds = {t: not np.ptp(part.command[:, column]) for t, part in recorded.items()}
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
         self._growth: dict[int, np.ndarray] = {}
 
@@ -101,27 +94,11 @@ class JointProblem:
         predicted = simulation.predict(rows, chosen, joint=self.joint, keep=keep)
         self.simulated += len(rows) * len(chosen) if keep is None else int(keep.sum())
         residual = measured - predicted
-        free = rows[:, self.joint, [servo.BACKLASH_WIDTH, servo.DEAD_ZONE_WIDTH]].max(axis=1)
-        parts = zip(chosen, self.split(residual, chosen), self.split(predicted, chosen), strict=True)
-        for trajectory, part, path in parts:
-            if self._holds[trajectory]:
-                self._forgive(part, path, free)
         if self._growth:
             residual /= np.concatenate([self._growth[t] for t in chosen])
         if keep is not None:
             residual *= np.repeat(keep, [len(self._measured[t]) for t in chosen], axis=1)
         return residual
-
-    def _forgive(self, residual: np.ndarray, predicted: np.ndarray, free: np.ndarray) -> None:
-        """Take the mean from the residuals [C, T] of a motion whose command never changes, in place.
-
-        A rollout starts at the first reading. Where dry friction holds the joint, the prediction stays there,
-        with the reading's error of up to a count, although the model is right; and so does the middle of what
-        play or a dead zone leave ``free`` [C] [rad], however the joint is shaken within.
-        """
-        least = STILL_COUNTS * self.rollouts.recording.encoder_resolution_rad
-        most, mean = np.where(np.ptp(predicted, axis=1) < least, np.inf, free), residual.mean(axis=1)
-        residual -= np.clip(mean, -most, most)[:, None]
 
     def squares(
         self, base: np.ndarray, coordinates: Sequence[Coordinate], trajectories: Trajectories = None
