@@ -24,17 +24,10 @@ SHORT_LIST = 10
 SEARCH_TAIL = 0.4
 """Share of the resamples that may see no gain from an effect that the search adds or keeps: one of two causes
 alone can make some motions worse."""
-PLAIN_FRICTION = "coulomb_friction"
 
 Call = tuple[str, dict[str, Any]]
 Run = Callable[[list[Call]], list[Any]]
 """Runs methods of the joint's :class:`vd.gap.fit.JointProblem` by name, in parallel."""
-
-
-def doubled(effects: Sequence[str]) -> list[str]:
-    """Frictions that one of a model is with other numbers, and that are none beside it."""
-    fuller = [name for name, simpler in NESTED.items() if PLAIN_FRICTION in simpler]
-    return fuller if PLAIN_FRICTION in effects else [PLAIN_FRICTION] if {*fuller} & {*effects} else []
 
 
 @dataclass(kw_only=True)
@@ -156,7 +149,7 @@ class Search(Evidence):
         for number in range(1, MAX_ROUNDS + 1):
             if self.is_last(present):
                 break
-            fits, promised = self.fit_candidates(present, doubled(present.effects))
+            fits, promised = self.fit_candidates(present)
             if not fits:
                 break
             best = self.winner(list(fits.values()))
