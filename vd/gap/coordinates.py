@@ -9,7 +9,7 @@ import numpy as np
 import vd.kernels.servo.actuators as servo
 from vd.kernels.servo.effects import BASELINE, EFFECTS, Parameter
 
-GRAVITY = EFFECTS["gravity_load"].parameters[0]
+GRAVITY, _ = EFFECTS["gravity_load"].parameters
 BASELINE_PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAVITY)}
 """Everything that a baseline can fit, by name."""
 
@@ -29,8 +29,6 @@ LIGHT = 0.1
 """An inertia that does none of it, in fitted ones."""
 FREE_SPEED = 3.0
 """A speed limit that does not bind, in largest speeds."""
-FLATTEST = 1e-3
-"""Scale of angles at least [rad], if the residual is smaller."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,7 @@ def _scale(parameter: Parameter, scales: Scales) -> float:
     if parameter.unit == "N m":
         return max(0.3 * scales.torque, 1e-4)
     if parameter.column in (servo.BACKLASH_WIDTH, servo.DEAD_ZONE_WIDTH, servo.ENCODER_BIAS):
-        return max(scales.residual, FLATTEST)
+        return scales.residual
     if parameter.column == servo.OFF_DAMPING:
         return 0.1 * max(scales.torque, 1e-4) / scales.speed
     if parameter.column == servo.SUPPLY_SAG:
@@ -168,7 +166,7 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         scales: Sizes of the joint's motion.
     """
     torque, peak, speed = scales.torque, scales.peak, scales.speed
-    small = max(scales.residual, FLATTEST)
+    small = scales.residual
     period = SECONDS_SCALE
     table: dict[str, list[dict[str, float]]] = {
         "command_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],

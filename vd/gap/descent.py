@@ -80,7 +80,6 @@ class LeastSquares:
             bounds=(lower, upper),
             x_scale=scale,
             ftol=TOLERANCE,
-            xtol=1e-6,
             gtol=None,
             max_nfev=iterations,
         )

@@ -101,8 +101,6 @@ JITTER = "command_jitter"
 """The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
 
 
-UNEXPLAINED = 1.5
-"""A baseline beyond this factor of the noise floor has a gap, whether or not an effect explains it."""
 CANCELLING = ("gravity_load", "encoder_bias")
 """Effects that hold a joint off its command at rest. Where they cancel there, they are no two causes but one
 that pulls with the travel from there, a spring, which the table has not."""
@@ -110,8 +108,6 @@ CANCELLED = 0.1
 """Share of either that is left where they cancel; by luck they do so in a few of a hundred machines."""
 DETERMINED = ("kp", "kd", "inertia")
 """Baseline parameters that every useful excitation determines."""
-WIDE = 10.0
-"""Ratio of the ends of an interval from which a parameter counts as open."""
 
 
 @dataclass(kw_only=True)
@@ -263,7 +259,7 @@ class Evidence:
     def undetermined(self, fit: JointFit) -> str:
         """Which parameter of the baseline the motions leave open, in words; empty if none."""
         for key, (low, high) in intervals(fit, self.floor).items():
-            if key in DETERMINED and high > WIDE * low:
+            if key in DETERMINED and high > np.e**2 * low:  # as of a limit that is not shown
                 return f"{key} can lie anywhere between {low:.2g} and {high:.2g}: the motions do not show it"
         return ""
 
@@ -325,7 +321,7 @@ class Evidence:
         """The verdict where no effect earned its place."""
         tried = [t for t in explanation.trials if not t.placebo and np.isfinite(t.gain)]
         why = tried[0].reason if tried else "there is no candidate"
-        if explanation.baseline.held_out_rmse > UNEXPLAINED * self.floor:
+        if explanation.baseline.held_out_rmse > REPEATABLE * self.floor:
             return replace(explanation, reason=f"a gap that no candidate explains: the best {why}")
         if loose:
             return replace(explanation, verdict="under_excited", reason=loose)

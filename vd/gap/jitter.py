@@ -32,7 +32,6 @@ NOISES = (1.0, 3.0, 10.0)
 """Noise floors that the first guess allows: what the model lacks besides must not look like jitter."""
 NARROW = 0.5
 """Share of the first guess that is believed: behind more jitter than there is an effect would not show."""
-EVALUATIONS = 60
 FACTORS = (0.0, 0.5, 0.71, 0.85, 1.0, 1.18, 1.41, 2.0)
 """Multiples of the best standard deviation at which the likelihood is looked at for the intervals ..."""
 DROPS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)
@@ -145,7 +144,7 @@ class JitterFit:
 
         x = np.log(np.array(start))
         simplex = x + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0]])
-        options = {"maxfev": EVALUATIONS, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
+        options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
         x = minimize(total, x, method="Nelder-Mead", options=options).x
         total(x)
         bounds = np.array([(c.lower, c.upper) for c in self.base.coordinates]).T

@@ -17,7 +17,7 @@ from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.servo.effects import EFFECTS, equivalent
 
 MAX_EFFECTS = 3
-MAX_ROUNDS = 6
+MAX_ROUNDS = 2 * MAX_EFFECTS
 """Forward steps, some of which a backward step takes back."""
 SHORT_LIST = 10
 """Candidates of a round that are fitted, after the linear screening of all."""
