@@ -12,60 +12,8 @@ import numpy as np
 import vd.kernels.servo.actuators as servo
 from vd.gap.explanation import NAMED, OWN_ERROR, Accepted, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import DRY, ONE_SIDED, JointFit
-from vd.gap.recording import Recording
-from vd.gap.statistics import half_width, interval, rmse
+from vd.gap.statistics import interval, rmse
 from vd.kernels.servo.effects import BESIDE, TOGETHER
-
-LEVELS = {
-    "coulomb_friction": ("tau_c_nm",),
-    "stribeck_friction": ("tau_s_nm", "tau_c_nm"),
-    "asymmetric_friction": ("tau_plus_nm", "tau_minus_nm"),
-    "load_friction": ("k_load",),
-}
-"""Parameters of each friction that change together."""
-LEAST = 0.2
-"""Change over a recording, as a share of the friction, that is more than a model may miss."""
-SURE = 2.0
-"""Half widths of its 95 % interval that it is from 0 at least: all frictions of all joints are looked at."""
-
-
-def middles(recording: Recording) -> np.ndarray:
-    """When each trajectory was half way, if they followed each other as they are listed [T] [s]."""
-    lengths = np.array([float(trajectory.time[-1]) for trajectory in recording.trajectories])
-    return np.cumsum(lengths) - 0.5 * lengths
-
-
-def change(fit: JointFit, friction: str, when: np.ndarray) -> tuple[float, float]:
-    """Change of a friction from the first motion to the last, as a share of it, and half its 95 % interval.
-
-    A line through the friction that each motion asks for, to first order, weighted by how much it says.
-
-    Args:
-        fit: The model.
-        friction: One of its effects.
-        when: Time of each trajectory [S] [s].
-    """
-    keys = {f"{friction}.{name}" for name in LEVELS[friction]}
-    slope = [
-        (1.0 if c.log else float(x)) if c.key in keys else 0.0
-        for c, x in zip(fit.coordinates, fit.x, strict=True)
-    ]
-    said = np.maximum(np.einsum("p,spq,q->s", slope, fit.gram, slope), 1e-30)
-    line, spread = np.polyfit(
-        (when - when.mean()) / np.ptp(when), fit.gradient @ slope / said, 1, w=np.sqrt(said), cov=True
-    )
-    return float(line[0]), float(half_width(spread[0, 0], len(when) - 1))
-
-
-def warming(fit: JointFit, when: np.ndarray) -> str:
-    """Which friction of a model is sure to change over the recording, in words; empty if none is."""
-    for name in (effect for effect in fit.effects if effect in LEVELS):
-        share, width = change(fit, name, when)
-        if abs(share) - width > LEAST and abs(share) > SURE * width:
-            way = "falls" if share < 0.0 else "rises"
-            return f"{name} {way} over the recording by {100.0 * abs(share):.0f} % of its mean"
-    return ""
-
 
 NESTED = {
     "stribeck_friction": ("coulomb_friction",),
@@ -122,7 +70,6 @@ class Evidence:
         behind_jitter: Whether samples are weighted by what random delays do (:mod:`vd.gap.joint_fit`).
         equivalent: Effects that one stands for, since the recording cannot tell them apart.
         joint: Index of the joint in its chain.
-        when: Time of each trajectory [S] [s]; None where it is not known.
     """
 
     noise: float
@@ -132,7 +79,6 @@ class Evidence:
     behind_jitter: bool = False
     equivalent: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     joint: int = 0
-    when: np.ndarray | None = None
 
     @property
     def floor(self) -> float:
@@ -311,10 +257,6 @@ class Evidence:
         if share < RECOVERED and JITTER not in final.effects:
             text = f"the best candidate recovers {100.0 * share:.0f} % of the squared gap, less than half"
             return replace(explanation, reason=text)
-        warms = self.warms(told)
-        if warms:
-            text = f"{warms}: the cause is a friction that changes, as with temperature"
-            return replace(explanation, warms=True, reason=text)
         return _by_names(explanation)
 
     def nothing_earned(self, explanation: Explanation, loose: str) -> Explanation:
@@ -326,12 +268,6 @@ class Evidence:
         if loose:
             return replace(explanation, verdict="under_excited", reason=loose)
         return replace(explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}")
-
-    def warms(self, fit: JointFit) -> str:
-        """Which friction of a model near the floor changes over the recording, in words, or nothing."""
-        if self.when is None or self.behind_jitter or fit.rmse > REPEATABLE * self.floor:
-            return ""
-        return warming(fit, self.when)
 
     def accept(
         self,

@@ -7,7 +7,7 @@ import numpy as np
 
 from vd.gap.chain import candidates, others_in
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.evidence import JITTER, NO_GAP, cancelled, middles
+from vd.gap.evidence import JITTER, NO_GAP, cancelled
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.jitter_search import FIXED, try_jitter
 from vd.gap.joint_fit import JointFit
@@ -154,7 +154,6 @@ class Explainer:
             report=lambda line: self.progress(f"explain: {joint.name}: {line}"),
             rest=float(np.median([t.position[0, column] for t in own])),
             moves=np.array([bool(np.ptp(t.command[:, column])) for t in own]),
-            when=middles(recording)[list(spec.trajectories)],
         )
 
     def plain(self, joint: Joint, explained: Explained) -> JointFit:

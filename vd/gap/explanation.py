@@ -80,8 +80,6 @@ class Explanation:
     trials: tuple[Trial, ...] = ()
     rivals: Mapping[str, Sequence[JointFit]] = field(default_factory=dict)
     """Fits with others in the place of each effect."""
-    warms: bool = False
-    """Whether a friction of the final model changes over the recording, as none of the table does."""
 
 
 def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
@@ -90,7 +88,7 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
     To these come the error of the time step and the model's own, which all motions share.
     """
     folds, ridge = len(fit.refits), RIDGE * floor**2 * np.eye(len(fit.x))
-    white = floor**2 * np.diag(np.linalg.inv(fit.gram.sum(0) + ridge))
+    white = floor**2 * np.diag(np.linalg.inv(fit.gram + ridge))
     width = half_width(np.maximum((folds - 1) * fit.refits.var(axis=0), white), folds)
     sizes = np.array([1.0 if c.log else x for c, x in zip(fit.coordinates, fit.x, strict=True)])
     width = np.hypot(width, half_width((OWN_ERROR * sizes) ** 2, np.inf))

@@ -192,7 +192,6 @@ class JointProblem:
         x = model.best(x0, iterations)
         jacobian = model.jacobian(x)
         errors = self.split(model.residuals(x[None], None)[0], chosen)
-        parts = self.split(jacobian, chosen)
         fit = JointFit(
             effects=tuple(effects),
             coordinates=tuple(coordinates),
@@ -201,8 +200,7 @@ class JointProblem:
             sse=np.array([e @ e for e in errors]),
             held_out=np.full(len(chosen), np.nan),
             count=np.array([len(e) for e in errors], float),
-            gram=np.stack([j @ j.T for j in parts]),
-            gradient=np.stack([j @ e for j, e in zip(parts, errors, strict=True)]),
+            gram=jacobian @ jacobian.T,
             refits=x[None],
         )
         if trajectories is not None:

@@ -186,7 +186,7 @@ class JitterFit:
         count = self.problem.count
         # A motion that is far from its prediction has an error of a radian: as good as none.
         errors = count * np.exp(np.minimum(2.0 * self.losses(sigma, drop) / count - 1.0, 0.0))
-        gram, gradient, refits = self.base.gram, self.base.gradient, self.base.refits
+        refits = self.base.refits
         return JointFit(
             effects=(*self.base.effects, JITTER),
             coordinates=(*self.base.coordinates, *self.coordinates),
@@ -195,8 +195,7 @@ class JitterFit:
             sse=errors,
             held_out=errors,
             count=count,
-            gram=np.pad(gram, ((0, 0), (0, 2), (0, 2))),
-            gradient=np.pad(gradient, ((0, 0), (0, 2))),
+            gram=np.pad(self.base.gram, (0, 2)),
             refits=np.hstack([refits, np.tile(x, (len(refits), 1))]),
         )
 

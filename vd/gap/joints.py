@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from vd.gap.evidence import CANCELLING, JITTER, LEVELS, MIN_GAIN, explains
+from vd.gap.evidence import CANCELLING, JITTER, MIN_GAIN, explains
 from vd.gap.explain import Explained, Explainer, Joint, beside
 from vd.gap.explanation import NAMED, Explanation, estimates, intervals, polished
 from vd.gap.joint_fit import JointFit
@@ -14,9 +14,6 @@ from vd.gap.worker_pool import WorkerPool, parallel
 
 OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}
 """What all joints of a machine have or have not: its bus, its supply, gravity."""
-
-CHANGING = "its friction changes over the recording, as another joint of the finger shows"
-"""Why a constant friction is no name, nor what is found beside it."""
 
 SPRUNG = f"{explains(CANCELLING)} here, but cancel at rest on another joint of the finger, as a spring does"
 """Why a load and an offset are no names."""
@@ -58,23 +55,19 @@ def share(
 def doubted(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[Explanation]:
     """Explanations without what another joint of the finger shows to be a cause that is not in the table.
 
-    A friction that changes there: where it moves only early in a recording, or late, a joint shows no change
-    of its own, and a play or a coupling stands for it. And a load and an offset that cancel at rest there:
-    where a joint travels little they imitate the same spring.
+    That is a load and an offset that cancel at rest there: where a joint travels little they imitate the same
+    spring.
 
     Args:
         explanations: Of the joints.
         groups: Number of the finger of each joint.
     """
     both, pairs = {*CANCELLING}, list(zip(explanations, groups, strict=True))
-    changing = {group for e, group in pairs if e.warms}
     sprung = {group for e, group in pairs if e.verdict == "unknown" and both <= {*e.final.effects}}
 
     def judged(e: Explanation, group: int) -> Explanation:
         if not _answered(e):
             return e
-        if group in changing and {*LEVELS} & {*e.final.effects}:
-            return replace(e, verdict="unknown", reason=CHANGING)
         if group in sprung and both == {*e.final.effects}:
             return replace(e, verdict="unknown", reason=SPRUNG)
         return e
