@@ -1,6 +1,7 @@
 """The hidden plant obeys closed forms and another engine; recordings of it hide what they hide."""
 
 from dataclasses import replace
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -10,7 +11,7 @@ from test_hand_import import MESH, MIMIC, PARTS, write_urdf
 from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hands import load_hand
 from vd.bench.gap_sizes import effect_at
-from vd.bench.hidden_finger import body_of
+from vd.bench.hidden_finger import finger_of
 from vd.bench.hidden_plant import Physics, Plant, Run, simulate
 from vd.bench.hide import COUPLING, NOISE_RAD, Hiding, _Session, simulate_hidden
 from vd.gap.chain import chains
@@ -123,8 +124,8 @@ def test_gears_ripple_and_noise_has_a_colour_but_no_other_size():
 @pytest.mark.parametrize("payload", [0.0, 0.05])
 def test_a_finger_moves_as_by_the_steps_of_another_integrator(payload):
     """Also with a load at its tip [kg]."""
-    body = body_of(load_hand("dclaw3"), 0, np.ones(3))
-    model = body.model(payload)
+    body = partial(finger_of, load_hand("dclaw3"), 0, np.ones(3))
+    model = body(payload)
     model.opt.timestep, model.opt.integrator = 1e-4, mujoco.mjtIntegrator.mjINT_RK4
     model.dof_armature[:] = 1e-3
     data = mujoco.MjData(model)

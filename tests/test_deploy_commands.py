@@ -213,9 +213,9 @@ def test_a_recording_says_that_it_missed_its_rate(line, plan, tmp_path, capsys):
 def test_motions_go_finger_by_finger_and_a_plan_of_another_hand_is_refused(hand, tmp_path):
     joints = read_joints(hand)
     motions = record.motions_of(joints, (), ("gain_ladder", "slow_triangle"))
-    fingers = [motion.excitation.joints[0][:2] for motion in motions]
+    fingers = [motion.joints[0][:2] for motion in motions]
     assert fingers == sorted(fingers) and len({motion.file for motion in motions}) == len(motions)
-    assert {motion.excitation.conditions["p_gain"] for motion in motions} == {200.0, 100.0, 50.0}
+    assert {motion.conditions["p_gain"] for motion in motions} == {200.0, 100.0, 50.0}
     with pytest.raises(ValueError, match="fingers 0 to 2"):
         record.motions_of(joints, (3,), ("chirp",))
     (tmp_path / "of_another.csv").write_text("t,command.f9_j1\n0.0,0.0\n")
@@ -240,9 +240,9 @@ def test_the_largest_motions_touch_nothing(name, request, tmp_path):
     joints = read_joints(hand)
     plant = NewtonHand(hand, joints, SimCfg(physics_hz=240.0))
     for motion in record.motions_of(joints, (0,), ("steps_and_sines",)):
-        if motion.excitation.name != "step_large":
+        if motion.excitation != "step_large":
             continue
-        commands = [*[motion.excitation.command[0]] * 200, *motion.excitation.command]
+        commands = [*[motion.command[0]] * 200, *motion.command]
         for index, command in enumerate(commands):
             goals = zip(joints.to_motor(command), joints.motors, strict=True)
             plant.advance(0.01, [Drive(float(angle), motor.p_gain, 8.0, 2.6) for angle, motor in goals])
@@ -254,9 +254,9 @@ def test_the_largest_motions_touch_nothing(name, request, tmp_path):
 def test_a_payload_needs_somebody_to_hang_it(line, hand, tmp_path):
     cfg = record.RecordCfg(port=PORT, out=tmp_path, fingers=(0,), excitations=("second_payload",), yes=True)
     every = record.motions_of(read_joints(hand), (0,), cfg.excitations)
-    motions = [motion for motion in every if motion.payload[0]]
+    motions = [motion for motion in every if record.payload_of(motion)[0]]
     with record.connect(cfg) as connection, pytest.raises(record.RecordError, match=r"hang 0\.05 kg"):
-        record._session(cfg, connection, ("f0_j1",), motions, motions[0].payload, print)
+        record._session(cfg, connection, ("f0_j1",), motions, record.payload_of(motions[0]), print)
 
 
 def test_a_fault_of_the_table_ends_safely(hand):

@@ -79,7 +79,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     hand = import_hand(write_urdf(tmp_path, parts), tmp_path / "out", str(said)).hand
     joints = read_joints(hand)
     motions = record.motions_of(joints, (1,), ("steps_and_sines",))
-    chosen = [m for m in motions if m.excitation.joints == ("f1_j4",) and m.excitation.name in KINDS]
+    chosen = [m for m in motions if m.joints == ("f1_j4",) and m.excitation in KINDS]
 
     @contextlib.contextmanager
     def connect(_, **twin_options):

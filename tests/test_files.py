@@ -102,7 +102,6 @@ def commands(taken: str) -> dict[str, list[str]]:
         "vd-eval": ["zero", "--out", taken],
         "vd-play": ["zero", "--video", f"{taken}/x.mp4"],
         "vd-gap": ["run", "recording", "--out", taken],
-        "vd-gap ": ["identify", "recording", "--out", f"{taken}/x.usda"],
         "vd-deploy": ["record", "--twin", "--hand", "dclaw3", "--out", taken],
         "vd-deploy ": ["--twin", "--hand", "dclaw3", "--log", taken],
         "vd-assets": ["objects", "--procedural", "1", "--out", taken],

@@ -9,10 +9,9 @@ from gap_recordings import FLOOR, made_up
 import vd.kernels.servo.actuators as servo
 from vd.gap.coordinates import Coordinate
 from vd.gap.evidence import Evidence
-from vd.gap.explanation import Accepted, Explanation
-from vd.gap.joints import doubted, share
+from vd.gap.explanation import Explanation
+from vd.gap.joints import doubted
 from vd.gap.statistics import resamples
-from vd.kernels.servo.effects import EFFECTS
 
 
 @pytest.fixture
@@ -50,30 +49,6 @@ def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: 
     stuck = replace(stuck, coordinates=(*stuck.coordinates[:-1], end), x=np.array([0.0, 0.0, 0.0, 9.0]))
     inside = made_up(("dead_zone",), 0.005)
     assert stuck.at_bound == ("backlash.width_rad",) and judge.winner([stuck, inside]) is inside
-
-
-def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:
-    def explanation(name: str, *tied: str, verdict: str = "") -> Explanation:
-        known = {parameter.name: (1.0, 0.5, 1.5) for parameter in EFFECTS[name].parameters}
-        accepted = Accepted(name, 0.6 if tied else 1.0, known, (), tied, False)
-        fits = [made_up((other,), 0.01) for other in (name, *tied)]
-        verdict = verdict or ("ambiguous" if tied else "effects")
-        return Explanation(made_up((), 0.02), fits[0], verdict, "", (accepted,), (), {name: fits})
-
-    def names(*explanations: Explanation, groups: tuple[int, ...] = (0, 0)) -> list[str]:
-        shared = share(explanations, [FLOOR] * 2, groups, [lambda fit: fit] * 2)
-        return [e.accepted[0].name if e.accepted[0].named else "?" for e in shared]
-
-    one, other = explanation("backlash", "dead_zone"), explanation("backlash", "coulomb_friction")
-    assert names(one, other) == ["backlash", "backlash"]
-    assert names(one, explanation("dead_zone")) == ["dead_zone", "dead_zone"]
-    assert names(one, explanation("thermal_drift")) == ["?", "thermal_drift"]
-    # Separate servos share gravity, not the play of one gear.
-    assert names(one, explanation("backlash"), groups=(0, 1)) == ["?", "backlash"]
-    load = explanation("encoder_bias", "gravity_load")
-    assert names(load, explanation("gravity_load"), groups=(0, 1)) == ["gravity_load", "gravity_load"]
-    # What comes nearest where nothing explains the gap settles no other joint's set.
-    assert names(one, explanation("backlash", verdict="unknown"))[0] == "?"
 
 
 def test_a_cause_outside_the_table_on_one_joint_of_a_finger_is_one_on_the_others() -> None:

@@ -1,24 +1,21 @@
-"""Newton replays a recording as the rollouts predict it, and the paper's search finds what made one."""
+"""Newton replays a recording as the rollouts predict it."""
 
-import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pytest
 from test_hand_import import MIMIC, PARTS, link, write_urdf
 from test_hand_import import joint as a_joint
 
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hands import load_hand
-from vd.gap import cli
 from vd.gap.chain import chains
 from vd.gap.close import counterparts
 from vd.gap.excitations import JointRange, excitation_set
 from vd.gap.newton import simulate_hand
-from vd.gap.recording import Recording, Trajectory, write_recording
+from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators as servo
 
@@ -45,22 +42,10 @@ def motions(kind: str, joints: tuple[str, ...], seconds: float, hand: HandModel 
     reach = JointRange(hand.joint_names, hand.lower, hand.upper)
     trajectories = []
     for motion in excitation_set(reach):
-        if motion.name == kind and motion.joints[0] in joints:
-            keep = motion.time <= seconds
-            command = motion.command[keep]
-            start = np.tile(command[0], (len(command), 1))
-            trajectories.append(
-                Trajectory(
-                    f"{motion.joints[0]}.csv",
-                    kind,
-                    motion.joints,
-                    motion.conditions,
-                    motion.time[keep],
-                    command,
-                    start,
-                    motion.enabled[keep],
-                )
-            )
+        if motion.excitation == kind and motion.joints[0] in joints:
+            short = motion.piece(0, int(np.searchsorted(motion.time, seconds, side="right")))
+            start = np.broadcast_to(short.command[0], short.command.shape)
+            trajectories.append(replace(short, file=f"{motion.joints[0]}.csv", position=start))
     return Recording(Path("unsaved"), hand.name, hand.joint_names, {}, 1e-4, tuple(trajectories))
 
 
@@ -134,41 +119,3 @@ def test_torque_off_lets_a_finger_hang():
     held = simulate_hand(recording, HAND, rows(), dt=1.0 / 240.0)
     free = simulate_hand(limp, HAND, rows(), dt=1.0 / 240.0)
     assert np.ptp(held[:, 1]) > 0.3 and np.abs(free[:, 1] - held[:, 1]).max() > 0.3
-
-
-def test_the_search_finds_the_gains_that_made_a_recording(tmp_path, capsys):
-    """Two fingers, one joint each; the true gains are 40 % off the start, and Newton made the motions."""
-    joints = ("f0_j1", "f1_j2")
-    recording = motions("step_large", joints, 1.2)
-    truth = HAND.servo.copy()
-    chosen = [HAND.joint_names.index(name) for name in joints]
-    truth[chosen, servo.KP] *= 1.4
-    truth[chosen, servo.KD] *= 0.7
-    positions = simulate_hand(recording, HAND, truth)
-    lengths = np.cumsum([len(t.time) for t in recording.trajectories])[:-1]
-    moved = tuple(
-        replace(t, joints=(name,), position=p)
-        for name, t, p in zip(joints, recording.trajectories, np.split(positions, lengths), strict=True)
-    )
-    write_recording(replace(recording, trajectories=moved), tmp_path / "rec")
-    layer = tmp_path / "drives.usda"
-    flags = ["--generations", "10", "--population", "10", "--every-finger", "--out", str(layer), "--json"]
-    assert cli.main(["identify", str(tmp_path / "rec"), *flags]) == 0
-    captured = capsys.readouterr()
-    assert "f0: generation 1/10: " in captured.err and "f1: generation 10/10: " in captured.err
-    found = json.loads(captured.out)
-    assert tuple(found["joints"]) == joints and found["rollouts"] == 10 * 10 * 2
-    for finger in ("f0", "f1"):
-        assert found["rmse"][finger] < 0.15 * found["start_rmse"][finger]
-    # A step that never reaches the velocity limit shows the time constant best.
-    ratio = (truth[:, servo.KP] / truth[:, servo.KD])[chosen]
-    assert np.allclose(np.array(found["kp"]) / found["kd"], ratio, rtol=0.1)
-    layered = load_hand("dclaw3", layer=layer)
-    for i, pair in enumerate((("f0_j1", "f2_j1"), ("f1_j2", "f2_j2"))):
-        for name in pair:  # fingers that were not recorded have the drive of their counterpart
-            row = layered.servo[HAND.joint_names.index(name)]
-            assert row[servo.KP] == pytest.approx(found["kp"][i], rel=1e-5)
-    assert layered.servo[2, servo.KP] == HAND.servo[2, servo.KP]
-    assert cli.main(["hide", "servo", "--out", str(tmp_path / "bare")]) == 0
-    assert cli.main(["identify", str(tmp_path / "bare"), "--out", str(layer)]) == 1
-    assert "a bare servo is no hand" in capsys.readouterr().err

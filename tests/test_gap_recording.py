@@ -91,7 +91,7 @@ def test_commands_may_be_sent_at_other_times_than_the_stamps(tmp_path):
     assert late.time[0] == 0.0 and np.ptp(np.diff(late.time)) > 1e-6  # it need not be regular
     np.testing.assert_allclose(late.sent, sent, atol=1.2e-5)
     edit_table(folder, set_cells("t_command", "5.1", [7]))
-    refused(folder, "a.csv", "row 9", "'t_command'", "before")
+    refused(folder, "a.csv", "'t_command' runs backward")
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_commands_may_be_sent_at_other_times_than_the_stamps(tmp_path):
         ),
         (
             {"trajectories": [{"file": "a.csv", "joints": ["f0_j1"]}] * 2},
-            ("trajectories[1]", "'a.csv'", "trajectories[0]", "once"),
+            ("'a.csv'", "twice", "once"),
         ),
     ],
 )
@@ -130,7 +130,7 @@ def test_a_header_that_cannot_be_used_is_refused(folder, changes, words):
         (lambda t: [row[:-1] for row in t], ("row 1", "no column 'position.f0_j2'")),
         (lambda t: t[0].__setitem__(1, "command.f0_j9"), ("row 1", "unknown joint 'f0_j9'")),
         (lambda t: [t[0], ["s", *["rad"] * (len(t[0]) - 1)], *t[1:]], ("row 2", "'t'", "s is not a finite")),
-        (set_cells("t", lambda t: f"{1e3 * t:.3f}"), ("'t'", "10 s between samples", "milliseconds")),
+        (set_cells("t", lambda t: f"{1e3 * t:.3f}"), ("'t'", "10 s without a sample", "milliseconds")),
         (lambda t: t[:4], ("3 samples", "at least")),
         (lambda t: [*t[:50], t[48], *t[50:]], ("row 51", "'t'", "runs backward")),
         (set_cells("position.f0_j1", "nan", [7]), ("row 8", "'position.f0_j1'", "nan")),
@@ -230,8 +230,8 @@ SPEED = np.gradient(SOUND.position, AT_100_HZ, axis=0)
         ({"command": SOUND.position, "position": SOUND.command}, ("swapped", "before its command")),
         ({"position": np.roll(SOUND.command, -20, axis=0)}, ("200 ms before its command", "two clocks")),
         ({"position": SOUND.command}, ("position.joint", "copy of its command")),
-        ({"command_time": 1e3 * AT_100_HZ}, ("t_command", "1e+03 times as fast", "milliseconds")),
-        ({"command_time": AT_100_HZ + 3.0}, ("t_command", "3 s off", "another clock")),
+        ({"command_time": 1e3 * AT_100_HZ}, ("t_command", "another unit or clock")),
+        ({"command_time": AT_100_HZ + 3.0}, ("t_command", "or drop it")),
         ({"time": AT_100_HZ + 5.0 * (AT_100_HZ > 4.0)}, ("row 403", "'t'", "5.01 s without", "cut the file")),
     ],
 )
@@ -248,42 +248,11 @@ def wrapped(angle):
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
-@pytest.mark.parametrize("channels", [("position",), ("command",), ("position", "command")])
-def test_angles_wrapped_at_pi_are_unwrapped_and_said_so(tmp_path, channels):
+def test_angles_wrapped_at_pi_are_refused(tmp_path):
     true = servo(amplitude=0.8, middle=np.pi)
-    (t,) = true.trajectories
-    jumps = replace(t, **{name: wrapped(getattr(t, name)) for name in channels})
-    read = read_recording(write_recording(replace(true, trajectories=(jumps,)), tmp_path / "r"))
-    (got,) = read.trajectories
-    turns = (got.position - t.position) / (2.0 * np.pi)
-    np.testing.assert_allclose(turns, np.round(turns[0, 0]), atol=1e-6)
-    np.testing.assert_allclose(got.command - got.position, t.command - t.position, atol=3e-6)
-    assert any("joint jumped by whole turns" in line for line in cautions(read))
-    sound = read_recording(write_recording(servo(amplitude=0.8), tmp_path / "sound"))
-    assert not any("turns" in line for line in cautions(sound))
-
-
-def stepping(size):
-    """A servo that approaches each step of a square wave about pi with a time constant of 0.2 s."""
-    command = np.where(np.sin(AT_100_HZ) > 0, np.pi + size / 2, np.pi - size / 2)
-    position = np.full_like(command, np.pi)
-    for i in range(1, len(command)):
-        position[i] = position[i - 1] + 0.05 * (command[i - 1] - position[i - 1])
-    return servo(command=command[:, None], position=position[:, None])
-
-
-def test_a_position_wrapped_beside_large_steps_is_unwrapped_and_a_command_refused(tmp_path):
-    read_recording(write_recording(stepping(3.6), tmp_path / "sound"))
-    for size in (1.8, 3.6):
-        true = stepping(size)
-        (t,) = true.trajectories
-        jumps = replace(t, position=wrapped(t.position))
-        read = read_recording(write_recording(replace(true, trajectories=(jumps,)), tmp_path / f"p{size}"))
-        np.testing.assert_allclose(read.trajectories[0].position, t.position, atol=2e-6)
-        np.testing.assert_allclose(read.trajectories[0].command, t.command, atol=2e-6)
-    jumps = replace(t, command=wrapped(t.command))
-    folder = write_recording(replace(true, trajectories=(jumps,)), tmp_path / "c")
-    refused(folder, "a.csv", "'joint'", "wrapped at a turn", "unwrap it")
+    (t,) = read_recording(write_recording(true, tmp_path / "sound")).trajectories
+    jumps = replace(true, trajectories=(replace(t, position=wrapped(t.position)),))
+    refused(write_recording(jumps, tmp_path / "r"), "position.joint", "jumps by a turn", "numpy.unwrap")
 
 
 def test_large_effects_of_real_servos_are_no_faults_of_the_recording(tmp_path):
@@ -294,8 +263,7 @@ def test_large_effects_of_real_servos_are_no_faults_of_the_recording(tmp_path):
         "backlash": {"width_rad": 0.1},
     }
     (hidden,) = simulate_hidden([Hiding("servo", effects=effects)])
-    read = read_recording(write_recording(hidden.recording, tmp_path / "r"))
-    assert not any(t.unwrapped for t in read.trajectories)
+    read_recording(write_recording(hidden.recording, tmp_path / "r"))
 
 
 def test_a_file_that_is_none_is_refused(tmp_path, folder):
@@ -342,10 +310,3 @@ def test_samples_far_apart_are_told(machine):
     slow = tuple(replace(t, time=4.0 * t.time) for t in machine.trajectories)
     (line,) = cautions(replace(machine, trajectories=slow))
     assert "40 ms apart" in line and "50 Hz" in line
-
-
-def test_a_count_that_is_not_the_encoders_is_told(machine):
-    count = 4.0 * machine.encoder_resolution_rad
-    coarse = tuple(replace(t, position=np.round(t.position / count) * count) for t in machine.trajectories)
-    lines = cautions(replace(machine, trajectories=coarse))
-    assert ["steps of 6.1" in line and "1.53" in line for line in lines] == [True, True]

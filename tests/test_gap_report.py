@@ -82,37 +82,22 @@ def test_numbers_that_are_not_known_come_back_as_nan(report, tmp_path):
     assert all(math.isnan(x) for x in read.held_out.ci95)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"verdict": "no_gap"}, "effects names 1"),
-        ({"effects": ()}, "effects names 0"),
-        ({"verdict": "ambiguous", "effects": ()}, "ambiguous is empty"),
-        ({"ambiguous": (("stiction",),)}, "no effects are called stiction"),
-        ({"format": "vd-gap-report/0"}, "run vd-gap again"),
-    ],
-)
-def test_contradictions_are_refused(report, changes, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(report, **changes).validate()
-
-
 def test_a_file_that_is_no_report_is_named(tmp_path):
     path = tmp_path / "report.json"
-    for text in ("{", "[]", '{"verdict": "effects"}'):
+    for text in ("{", "[]", '{"verdict": "effects"}', '{"format": "vd-gap-report/0"}'):
         path.write_text(text)
         with pytest.raises(ValueError, match=re.escape(str(path))):
             Report.read(path)
 
 
-def test_curves_come_back_and_are_checked(curves, tmp_path):
+def test_curves_come_back(curves, tmp_path):
     path = tmp_path / "predictions.npz"
     curves.write(path)
     read = Predictions.read(path)
     assert read.joints == curves.joints and read.files == curves.files
     np.testing.assert_array_equal(read.identified, curves.identified)
-    dataclasses.replace(curves, measured=curves.measured[:-1]).write(path)
-    with pytest.raises(ValueError, match="measured has shape"):
+    path.write_text("t")
+    with pytest.raises(ValueError, match="not curves of vd-gap"):
         Predictions.read(path)
 
 
@@ -124,7 +109,7 @@ def test_parameters_reach_their_columns(report):
 
 
 def test_page_stands_alone_and_says_what_was_found(report, curves, tmp_path):
-    files = write_report(report, curves, tmp_path)
+    write_report(report, curves, tmp_path)
     page = (tmp_path / "report.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:)', page), "the page must not need another file"
     assert "http" not in re.sub(r"base64,[^\"]*", "", page)
@@ -136,7 +121,7 @@ def test_page_stands_alone_and_says_what_was_found(report, curves, tmp_path):
     for effect in EFFECTS.values():
         assert words.plain(effect.name) in text
         assert effect.meaning in text
-    pngs = {path.name for path in files if path.suffix == ".png"}
+    pngs = {path.name for path in tmp_path.glob("*.png")}
     assert {"gap.png", f"residual_{JOINT}.png"} <= pngs
     assert any(name.startswith(f"overlay_{JOINT}") for name in pngs)
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in pngs)
@@ -149,7 +134,7 @@ OUTCOMES = {
         "It is coulomb friction or backlash",
     ),
     "under_excited": ({"effects": (), "next_experiment": "Record a chirp."}, "do not determine"),
-    "unknown": ({"effects": ()}, "No effect that is known here explains it"),
+    "unknown": ({"effects": ()}, "No effect that was tried explains it"),
 }
 
 
@@ -157,7 +142,7 @@ OUTCOMES = {
 def test_every_verdict_has_its_sentence_and_its_page(report, curves, tmp_path, verdict):
     changes, sentence = OUTCOMES[verdict]
     joint = dataclasses.replace(report.joints[0], open_sets=changes.get("ambiguous", ()))
-    report = dataclasses.replace(report, verdict=verdict, joints=(joint,), closing=None, **changes).validate()
+    report = dataclasses.replace(report, verdict=verdict, joints=(joint,), closing=None, **changes)
     assert sentence in words.verdict_sentence(report)
     assert words.next_step(report)
     write_report(report, curves, tmp_path)
@@ -170,8 +155,8 @@ def test_of_one_recorded_finger_the_layer_of_all_is_to_be_trained_with(report, c
     closing = dataclasses.replace(report.closing, whole_hand_layer="identified-all-fingers.usda")
     one = dataclasses.replace(report, recording=source, closing=closing, hand="dclaw3")
     plain = dataclasses.replace(one, closing=report.closing)
-    assert "pass identified.usda with --hand-layer" in words.next_step(plain)
-    assert "pass identified-all-fingers.usda with --hand-layer" in words.next_step(one)
+    assert "--hand-layer identified.usda goes on" in words.next_step(plain)
+    assert "--hand-layer identified-all-fingers.usda goes on" in words.next_step(one)
     write_report(one, curves, tmp_path)
     page = (tmp_path / "report.html").read_text()
     assert "vd-train adapt POLICY --hand-layer identified-all-fingers.usda" in page

@@ -30,7 +30,6 @@ from vd.hand_log import read_columns
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
     from vd.deploy.hardware.joints import Joints
-    from vd.gap.excitations import Excitation
     from vd.gap.recording import Recording, Trajectory
 
 RATE_HZ = 100.0
@@ -83,19 +82,10 @@ class RecordCfg(HandOptions):
     """Do not ask before it moves."""
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """One motion to record: an excitation of the whole hand."""
-
-    file: str
-    """Its CSV file, by which it is known to be recorded."""
-    excitation: "Excitation"
-
-    @property
-    def payload(self) -> tuple[float, str]:
-        """Mass that has to hang at a fingertip [kg], and at whose; of nobody without one."""
-        mass = float(self.excitation.conditions.get("payload_kg", 0.0))
-        return mass, _finger(self.excitation.joints[0]) if mass > 0.0 else ""
+def payload_of(motion: "Trajectory") -> tuple[float, str]:
+    """Mass that has to hang at a fingertip [kg], and at whose; of nobody without one."""
+    mass = float(motion.conditions.get("payload_kg", 0.0))
+    return mass, _finger(motion.joints[0]) if mass > 0.0 else ""
 
 
 class Sample(NamedTuple):
@@ -107,26 +97,21 @@ class Sample(NamedTuple):
     enabled: np.ndarray
 
 
-def motions_of(motors: "Joints", fingers: Sequence[int], sets: Sequence[str]) -> list[Motion]:
+def motions_of(motors: "Joints", fingers: Sequence[int], sets: Sequence[str]) -> list["Trajectory"]:
     """The motions of excitation sets, finger by finger.
 
     Raises:
         ValueError: A set or a finger is unknown.
     """
-    from vd.gap.excitations import JointRange, excitation_set
+    from vd.gap.excitations import JointRange, excitation_set, numbered
 
     hand = motors.hand
     reach = JointRange(hand.joint_names, hand.lower, hand.upper, p_gain=float(motors.p_gain))
     every = excitation_set(reach, sets)
     joints = joints_of(hand, fingers)
-    ordered = sorted(
-        (motion for motion in every if motion.joints[0] in joints),
-        key=lambda motion: _finger(motion.joints[0]),
-    )
-    return [
-        _motion(f"{index:03d}_{motion.joints[0]}_{motion.name}.csv", motion, motors)
-        for index, motion in enumerate(ordered)
-    ]
+    chosen = [motion for motion in every if motion.joints[0] in joints]
+    ordered = sorted(chosen, key=lambda motion: _finger(motion.joints[0]))
+    return [_of_hand(motion, motors) for motion in numbered(ordered)]
 
 
 def _finger(joint: str) -> str:
@@ -134,17 +119,17 @@ def _finger(joint: str) -> str:
     return joint.partition("_")[0]
 
 
-def _motion(file: str, excitation: "Excitation", motors: "Joints") -> Motion:
-    """An excitation with the fingers aside that it does not move, and the usual gain if it names none."""
-    hand, command = motors.hand, excitation.command.copy()
-    moving = hand.joint_finger[hand.joint_names.index(excitation.joints[0])]
+def _of_hand(motion: "Trajectory", motors: "Joints") -> "Trajectory":
+    """A motion with the fingers aside that it does not move, and the usual gain if it names none."""
+    hand, command = motors.hand, motion.command.copy()
+    moving = hand.joint_finger[hand.joint_names.index(motion.joints[0])]
     others = hand.joint_finger != moving
     command[:, others] = aside(hand, int(moving))[others]
-    conditions = {"p_gain": float(motors.p_gain), **excitation.conditions}
-    return Motion(file, replace(excitation, command=command, conditions=conditions))
+    conditions = {"p_gain": float(motors.p_gain), **motion.conditions}
+    return replace(motion, command=command, conditions=conditions)
 
 
-def read_plan(path: Path, motors: "Joints") -> list[Motion]:
+def read_plan(path: Path, motors: "Joints") -> list["Trajectory"]:
     """The motions of a plan that ``vd-gap plan`` wrote; joints that it does not name are straight.
 
     ``path`` is next_experiment.json, or the folder with it.
@@ -164,9 +149,9 @@ def read_plan(path: Path, motors: "Joints") -> list[Motion]:
         ) from error
 
 
-def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], motors: "Joints") -> Motion:
+def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], motors: "Joints") -> "Trajectory":
     """The motion of a plan's entry, whose file is in ``folder``."""
-    from vd.gap.excitations import Excitation
+    from vd.gap.recording import Trajectory
 
     hand, columns = motors.hand, read_columns(folder / entry["file"])
     command = np.tile(0.5 * (hand.lower + hand.upper), (len(columns["t"]), 1))
@@ -177,9 +162,9 @@ def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], moto
         column = hand.joint_names.index(name)
         command[:, column] = columns[f"command.{name}"]
         enabled[:, column] = columns.get(f"enabled.{name}", np.ones(len(command))) > 0.0
-    joints = tuple(entry["joints"])
-    excitation = Excitation(entry["excitation"], joints, columns["t"], command, entry["conditions"], enabled)
-    return _motion("plan_" + Path(entry["file"]).name, excitation, motors)
+    file, kind, joints = "plan_" + Path(entry["file"]).name, entry["excitation"], tuple(entry["joints"])
+    motion = Trajectory(file, kind, joints, entry["conditions"], columns["t"], command, command, enabled)
+    return _of_hand(motion, motors)
 
 
 def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
@@ -218,17 +203,17 @@ def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
     return np.asarray(own * (1.0 + rate) + begin)
 
 
-def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float) -> "Trajectory":
+def play(safe: SafeHand, motion: "Trajectory", columns: Sequence[int], rate_hz: float) -> "Trajectory":
     """Go to where a motion starts, play it on an armed hand, and give what was measured of some joints.
 
     Raises:
         StoppedError: The hand was stopped.
         BusError: A gain could not be written.
     """
-    excitation, bus = motion.excitation, safe.bus
-    safe.move(excitation.command[0], SPEED_RAD_S)
+    bus = safe.bus
+    safe.move(motion.command[0], SPEED_RAD_S)
     # Of motors whose gains differ, each has the same share of its own.
-    share = float(excitation.conditions["p_gain"]) / safe.joints.p_gain
+    share = float(motion.conditions["p_gain"]) / safe.joints.p_gain
     own = {bus.ids[column]: safe.joints.motors[column].p_gain for column in columns}
     _set_gains(bus, {id: round(share * gain) for id, gain in own.items()})
     samples = list[Sample]()
@@ -236,12 +221,12 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
     pacer.wait()
     begin = pacer.due_s
     on = np.ones(len(bus.ids), dtype=bool)
-    while (now := pacer.due_s - begin) < excitation.duration:
-        at = int(np.searchsorted(excitation.time, now + ROUNDING_S, side="right")) - 1
-        if not np.array_equal(on, excitation.enabled[at]):
-            on = excitation.enabled[at]
+    while (now := pacer.due_s - begin) < motion.duration:
+        at = int(np.searchsorted(motion.time, now + ROUNDING_S, side="right")) - 1
+        if not np.array_equal(on, motion.enabled[at]):
+            on = motion.enabled[at]
             safe.switch(on)
-        goal = safe.command(excitation.command[at], with_state=True)
+        goal = safe.command(motion.command[at], with_state=True)
         sent_s = bus.clock.now()
         state = safe.read()
         if not samples or state.time_s > samples[-1].state.time_s:  # else the last one again
@@ -260,9 +245,8 @@ def _set_gains(bus: MotorBus, gains: Mapping[int, int]) -> None:
             bus.write(id, "position_p_gain", gain)
 
 
-def _trajectory(motion: Motion, columns: Sequence[int], samples: Sequence[Sample]) -> "Trajectory":
+def _trajectory(motion: "Trajectory", columns: Sequence[int], samples: Sequence[Sample]) -> "Trajectory":
     """What was measured, of some joints, at the times of the motors' clocks."""
-    from vd.gap.recording import Trajectory
 
     def of(name: str) -> np.ndarray:
         return np.array([getattr(one.state, name) for one in samples])[:, columns]
@@ -273,11 +257,8 @@ def _trajectory(motion: Motion, columns: Sequence[int], samples: Sequence[Sample
     # A goal arrives with the question for its state, unless that was asked again.
     sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
     measured: dict[str, Any] = {name: of(name) for name in STATE_CHANNELS}
-    return Trajectory(
-        file=motion.file,
-        excitation=motion.excitation.name,
-        joints=motion.excitation.joints,
-        conditions=motion.excitation.conditions,
+    return replace(
+        motion,
         time=measured_s - measured_s[0],
         command_time=sent_s - measured_s[0],
         command=np.array([one.goal for one in samples])[:, columns],
@@ -318,8 +299,8 @@ def record(cfg: RecordCfg) -> int:
                 only = (trajectory.file,)
                 written.append(writer.submit(write_recording, recording, cfg.out, only=only))
 
-            left.sort(key=lambda motion: motion.payload)
-            for payload, group in itertools.groupby(left, key=lambda motion: motion.payload):
+            left.sort(key=payload_of)
+            for payload, group in itertools.groupby(left, key=payload_of):
                 _session(cfg, connection, joints, list(group), payload, keep)
         for one in written:
             one.result()
@@ -331,13 +312,13 @@ def _session(
     cfg: RecordCfg,
     connection: Connection,
     joints: tuple[str, ...],
-    motions: Sequence[Motion],
+    motions: Sequence["Trajectory"],
     payload: tuple[float, str],
     keep: Callable[["Trajectory"], None],
 ) -> None:
     """Motions with one payload [kg] at one finger, between preflight and torque off."""
     payload_kg, finger = payload
-    seconds = sum(motion.excitation.duration for motion in motions)
+    seconds = sum(motion.duration for motion in motions)
     question = f"The hand will move for about {seconds:.0f} s, one joint at a time and quickly."
     if payload_kg > 0.0:
         if cfg.yes or cfg.twin:

@@ -1,7 +1,6 @@
 """A finger for the hidden plant: mass matrix and bias by MuJoCo's engine in C, dry friction of our own."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -15,83 +14,52 @@ FRICTION_SWEEPS = 8
 GRAVITY_M_S2 = 9.81
 
 
-@dataclass(frozen=True, eq=False)
-class FingerBody:
-    """Links of n joints, one after the other, with all joints at zero and in the axes of the base.
+def finger_of(hand: HandModel, finger: int, heavier: np.ndarray, payload: float = 0.0) -> Any:
+    """MuJoCo's model of a finger of a hand, with all joints at zero and in the axes of the base.
 
-    Attributes:
-        axis: Unit axes of the joints [n, 3].
-        offset: From the joint before to the joint [n, 3] [m].
-        mass: Masses of the links [n] [kg].
-        com: From each joint to its link's centre of mass [n, 3] [m].
-        inertia: Of the links about their centres [n, 3, 3] [kg m^2].
-        tip: From the last joint to the fingertip [3] [m], where a payload hangs.
-        gravity: Acceleration [3] [m/s^2].
+    Args:
+        hand: The hand.
+        finger: Number of the finger.
+        heavier: Factors of its links' masses and inertias [n].
+        payload: Point mass at its tip [kg].
     """
-
-    axis: np.ndarray
-    offset: np.ndarray
-    mass: np.ndarray
-    com: np.ndarray
-    inertia: np.ndarray
-    tip: np.ndarray
-    gravity: np.ndarray
-
-    def model(self, payload: float) -> Any:
-        """MuJoCo's model of it, with a point mass [kg] at its tip."""
-        spec = mujoco.MjSpec()
-        spec.option.gravity = self.gravity
-        spec.compiler.autolimits = False
-        body = spec.worldbody
-        for i in range(len(self.mass)):
-            x = self.inertia[i]
-            full = [x[0, 0], x[1, 1], x[2, 2], x[0, 1], x[0, 2], x[1, 2]]
-            body = body.add_body(
-                pos=self.offset[i],
-                mass=self.mass[i],
-                ipos=self.com[i],
-                fullinertia=full,
-                explicitinertial=True,
-            )
-            body.add_joint(axis=self.axis[i])
-        if payload:
-            tiny = [1e-12] * 3  # of a point, as small as the engine takes it
-            body.add_body(pos=self.tip, mass=payload, inertia=tiny, explicitinertial=True)
-        return spec.compile()
-
-
-def body_of(hand: HandModel, finger: int, heavier: np.ndarray) -> FingerBody:
-    """A finger of a hand, the masses and inertias of its links times factors [n]."""
     joints = np.arange(hand.num_joints)[hand.fingers[finger]]
     poses = hand.forward_kinematics(np.zeros(hand.num_joints))
     parents, frames = poses[hand.joint_parent[joints]], hand.joint_parent_frame[joints]
     turns = Rotation.from_quat(parents[:, 3:])
     place = parents[:, :3] + turns.apply(frames[:, :3])
+    axis = (turns * Rotation.from_quat(frames[:, 3:])).apply(hand.joint_axis[joints])
     links = hand.joint_child[joints]
     own = Rotation.from_quat(poses[links, 3:])
-    matrix = own.as_matrix()
-    return FingerBody(
-        axis=(turns * Rotation.from_quat(frames[:, 3:])).apply(hand.joint_axis[joints]),
-        offset=np.diff(place, axis=0, prepend=np.zeros((1, 3))),
-        mass=hand.link_mass[links] * heavier,
-        com=poses[links, :3] + own.apply(hand.link_com[links]) - place,
-        inertia=matrix @ hand.link_inertia[links] @ matrix.transpose(0, 2, 1) * heavier[:, None, None],
-        tip=poses[links[-1], :3] + own[-1].apply(hand.tip_frame[finger, :3]) - place[-1],
-        gravity=GRAVITY_M_S2 * hand.down,
-    )
+    matrix, offset = own.as_matrix(), np.diff(place, axis=0, prepend=np.zeros((1, 3)))
+    com = poses[links, :3] + own.apply(hand.link_com[links]) - place
+    inertia = matrix @ hand.link_inertia[links] @ matrix.transpose(0, 2, 1) * heavier[:, None, None]
+    spec = mujoco.MjSpec()
+    spec.option.gravity = GRAVITY_M_S2 * hand.down
+    spec.compiler.autolimits = False
+    body = spec.worldbody
+    for i, x in enumerate(inertia):
+        full = [x[0, 0], x[1, 1], x[2, 2], x[0, 1], x[0, 2], x[1, 2]]
+        mass = hand.link_mass[links[i]] * heavier[i]
+        inertial = {"ipos": com[i], "fullinertia": full, "explicitinertial": True}
+        body = body.add_body(pos=offset[i], mass=mass, **inertial)
+        body.add_joint(axis=axis[i])
+    if payload:
+        tip = poses[links[-1], :3] + own[-1].apply(hand.tip_frame[finger, :3]) - place[-1]
+        tiny = [1e-12] * 3  # of a point, as small as the engine takes it
+        body.add_body(pos=tip, mass=payload, inertia=tiny, explicitinertial=True)
+    return spec.compile()
 
 
 class Finger:
     """Equations of motion of fingers [B] with n joints each.
 
     Args:
-        bodies: The fingers.
-        payload: Point masses at their tips [B] [kg].
+        models: The fingers, as MuJoCo's models.
     """
 
-    def __init__(self, bodies: Sequence[FingerBody], payload: np.ndarray):
-        self._models = [body.model(float(mass)) for body, mass in zip(bodies, payload, strict=True)]
-        self._data = [mujoco.MjData(model) for model in self._models]
+    def __init__(self, models: Sequence[Any]):
+        self._models, self._data = models, [mujoco.MjData(model) for model in models]
 
     def weight(self, q: np.ndarray) -> np.ndarray:
         """Torques that hold the fingers against gravity [B, n] [N m]."""

@@ -8,14 +8,14 @@ trajectories, of several plants too, advance together, one array operation for a
 Effects: those of :data:`vd.kernels.servo.effects.EFFECTS`, and :data:`OUTSIDE` the table. SI units, radians.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
 
-from vd.bench.hidden_finger import Finger, FingerBody, slip
+from vd.bench.hidden_finger import Finger, slip
 
 STEP_S = 4.0e-4
 """Time step [s]: five times finer than the fitted model's, second order where the motion is smooth."""
@@ -73,7 +73,7 @@ class Plant:
         velocity_limit: Largest speed [rad/s].
         inertia: Inertia about each axis that is no link's: rotor, or the whole load [kg m^2].
         gravity_torque: Gravity load -g sin(q) of a pendulum [N m].
-        body: A finger, or None for joints on their own.
+        body: Of a finger, MuJoCo's model with a payload [kg] at its tip; None for joints on their own.
         effects: Name to parameter to values [J].
         full_gain: P gain, as recordings name it, at which ``kp`` holds.
         effort: Largest torque of the drives [N m]; None: no limit.
@@ -86,7 +86,7 @@ class Plant:
     velocity_limit: np.ndarray
     inertia: np.ndarray
     gravity_torque: np.ndarray
-    body: FingerBody | None = None
+    body: Callable[[float], Any] | None = None
     effects: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
     full_gain: float = 1.0
     effort: np.ndarray | None = None
@@ -182,11 +182,9 @@ class _Batch:
         )
 
     def _finger(self) -> Finger | None:
-        bodies = [plant.body for plant in self.plants if plant.body is not None]
-        if not bodies:
-            return None
-        payload = np.array([float(run.conditions.get("payload_kg", 0.0)) for run in self.runs])
-        return Finger(bodies, payload)
+        loads = [float(run.conditions.get("payload_kg", 0.0)) for run in self.runs]
+        bodies = [plant.body(kg) for plant, kg in zip(self.plants, loads, strict=True) if plant.body]
+        return Finger(bodies) if bodies else None
 
     def references(self) -> np.ndarray:
         """What the servos pull to, before the joint has a say: the command's path [K, PARTS, B, J] [rad]."""

@@ -7,6 +7,7 @@ counts and jittered stamps. What is hidden is written beside the folder, never i
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 from vd.assets_usd.hands import load_hand
-from vd.bench.hidden_finger import body_of
+from vd.bench.hidden_finger import finger_of
 from vd.bench.hidden_plant import OUTSIDE, TUNED, Motion, Physics, Plant, Run, simulate
 from vd.files import write_json
-from vd.gap.excitations import Excitation, JointRange, excitation_set
+from vd.gap.excitations import JointRange, excitation_set, numbered
 from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording, Trajectory, write_recording
 from vd.kernels.servo.effects import EFFECTS
 
@@ -183,7 +184,7 @@ class _Session:
         self.hiding = hiding
         self.rng = np.random.default_rng(hiding.seed)
         reach, self.plant = machine(hiding, self.rng)
-        self.motions = excitation_set(reach, hiding.excitations)
+        self.motions = numbered(excitation_set(reach, hiding.excitations))
         self.runs: list[Run] = []
         session_s = 0.0
         for motion in self.motions:
@@ -194,7 +195,7 @@ class _Session:
             )
             session_s += motion.duration + PAUSE_S
 
-    def _stamps(self, motion: Excitation) -> np.ndarray:
+    def _stamps(self, motion: Trajectory) -> np.ndarray:
         """The instants at which commands are written and positions read [T] [s], from 0."""
         time = motion.time + self.rng.normal(0.0, STAMP_JITTER_S, len(motion.time))
         time[0] = 0.0
@@ -216,18 +217,14 @@ class _Session:
         """Add noise and rounding; the recording and the truth."""
         hiding = self.hiding
         trajectories = []
-        for i, (motion, run, own) in enumerate(zip(self.motions, self.runs, moved, strict=True)):
+        for motion, run, own in zip(self.motions, self.runs, moved, strict=True):
             noisy = own.position + self._noise(own.position.shape, run.time)
             trajectories.append(
-                Trajectory(
-                    file=f"{i:03d}_{motion.joints[0]}_{motion.name}.csv",
-                    excitation=motion.name,
-                    joints=motion.joints,
+                replace(
+                    motion,
                     conditions={"p_gain": self.plant.full_gain, **motion.conditions},
                     time=run.time,
-                    command=motion.command,
                     position=np.round(noisy / ENCODER_COUNT) * ENCODER_COUNT,
-                    enabled=motion.enabled,
                     pwm=np.round(own.duty * PWM_COUNTS) / PWM_COUNTS if hiding.pwm else None,
                 )
             )
@@ -336,7 +333,7 @@ def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
         velocity_limit=hand.velocity_limit[index] * near[2],
         inertia=hand.armature[index],
         gravity_torque=np.zeros(n),
-        body=body_of(hand, finger, heavy),
+        body=partial(finger_of, hand, finger, heavy),
         full_gain=FULL_P_GAIN,
         effort=hand.effort[index],
     )

@@ -32,7 +32,8 @@ from vd.gap.worker_pool import JointSpec, Problems
 from vd.kernels.servo.effects import EFFECTS
 
 CLOSE = 0.1
-"""Values of one effect on two joints within this share of each other are one value."""
+"""Values of one effect on two joints within this share of each other are one value: a model that lacks
+something else moves them by more than their intervals tell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ class Analysed:
 
 
 def curves(
-    recording: Recording, problems: Problems, models: Sequence[tuple[str, JointSpec, np.ndarray]]
+    recording: Recording, problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]
 ) -> np.ndarray:
     """Positions of all trajectories one after the other [S, J] [rad]; NaN where no joint was fitted.
 
@@ -60,16 +61,14 @@ def curves(
     Args:
         recording: The recording.
         problems: Its chains.
-        models: Name, problem and parameter rows of each fitted joint.
+        models: Problem and parameter rows of each fitted joint.
     """
     total = sum(len(t.time) for t in recording.trajectories)
     result = np.full((total, len(recording.joints)), np.nan)
     for index, chain in enumerate(problems.chains):
-        rows, fitted = chain.start_row.copy(), False
-        for _, spec, own in models:
-            if spec.chain == index:
-                rows[spec.joint], fitted = own[spec.joint], True
-        if fitted:
+        own = {spec.joint: rows[spec.joint] for spec, rows in models if spec.chain == index}
+        if own:
+            rows = np.array([own.get(joint, row) for joint, row in enumerate(chain.start_row)])
             rollouts = Rollouts(chain, recording, dt=problems.dt / FINER[-1], device=problems.device)
             result[:, chain.columns] = rollouts.predict(rows[None])[0]
     return result
@@ -82,12 +81,11 @@ def assemble(
     findings: Sequence[Finding],
     *,
     seed: int,
-    seconds: float,
     simulated: int,
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
-    before = curves(recording, problems, [(j.name, j.spec, j.explanation.baseline.rows) for j in joints])
-    after = curves(recording, problems, [(j.name, j.spec, j.explanation.final.rows) for j in joints])
+    before = curves(recording, problems, [(j.spec, j.explanation.baseline.rows) for j in joints])
+    after = curves(recording, problems, [(j.spec, j.explanation.final.rows) for j in joints])
     predictions = Predictions.of(recording, before, after)
     rng = np.random.default_rng(seed)
     residuals = {j.name: _residuals(j, predictions) for j in joints}
@@ -104,7 +102,7 @@ def assemble(
         identified=_fit(joints, residuals, 1),
         held_out=_held_out(predictions.files, every, rng),
         next_experiment="",
-        seconds=seconds,
+        seconds=np.nan,
         recording=Source(
             path=str(recording.path),
             model=recording.model,
@@ -217,7 +215,7 @@ def _gap(joint: Analysed, rows: Sequence[TrajectoryError], rng: np.random.Genera
         identified_ci95=interval(rmse(new, count, weights)),
         verdict=joint.explanation.verdict,
         reason=joint.explanation.reason,
-        open_sets=tuple((one.name, *one.tied) for one in joint.found if one.tied and not one.named),
+        open_sets=tuple(_unique(one.name, *one.tied) for one in joint.found if one.tied and not one.named),
     )
 
 
@@ -238,15 +236,12 @@ def _pool(joints: Sequence[Analysed], *, named: bool) -> tuple[NamedEffect, ...]
 
 
 def _agree(one: Accepted, other: Accepted) -> bool:
-    """Whether the values of an effect on two joints can be the same."""
+    """Whether the values of an effect on two joints can be the same: close, or of intervals that overlap."""
     if one.estimates.keys() != other.estimates.keys():
         return False
-    for key, (value, low, high) in one.estimates.items():
-        theirs, their_low, their_high = other.estimates[key]
-        near = abs(value - theirs) <= CLOSE * max(abs(value), abs(theirs))
-        if not near and not (low <= their_high and their_low <= high):
-            return False
-    return True
+    pairs = [(one.estimates[key], other.estimates[key]) for key in one.estimates]
+    near = [abs(a[0] - b[0]) <= CLOSE * max(abs(a[0]), abs(b[0])) for a, b in pairs]
+    return all(close or (a[1] <= b[2] and b[1] <= a[2]) for close, (a, b) in zip(near, pairs, strict=True))
 
 
 def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
@@ -279,9 +274,13 @@ def _sets(joints: Sequence[Analysed]) -> tuple[tuple[str, ...], ...]:
     sets: dict[frozenset[str], tuple[str, ...]] = {}
     for accepted in (one for joint in joints for one in joint.found):
         if (accepted.tied and not accepted.named) or accepted.equivalent:
-            members = (accepted.name, *accepted.equivalent, *accepted.tied)
+            members = _unique(accepted.name, *accepted.equivalent, *accepted.tied)
             sets.setdefault(frozenset(members), members)
     return tuple(sets.values())
+
+
+def _unique(*names: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(names))
 
 
 def _evidence(joint: Analysed) -> list[Candidate]:

@@ -7,6 +7,7 @@ down as in the simulator.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,18 +20,10 @@ from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
 
 GRAVITY_M_S2 = 9.81
 """Acceleration of gravity, the simulator's."""
-FREE = 1.0e6
-"""A position [rad] that no joint and a torque [N m] that no drive reaches: the bound of one that has none."""
 
 
-@dataclass(frozen=True, eq=False)
-class Load:
-    """The point mass on a pendulum's arm.
-
-    Attributes:
-        mass_kg: Mass [kg].
-        arm_m: Length of the arm [m].
-    """
+class Load(NamedTuple):
+    """The point mass on a pendulum's arm, in kg and m."""
 
     mass_kg: float
     arm_m: float
@@ -89,22 +82,16 @@ class Chain:
     com: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
     inertia: np.ndarray = field(default_factory=lambda: np.zeros((1, 3, 3)))
     gravity: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    lower: np.ndarray = field(default_factory=lambda: np.array([-FREE]))
-    upper: np.ndarray = field(default_factory=lambda: np.array([FREE]))
-    effort: np.ndarray = field(default_factory=lambda: np.array([FREE]))
+    lower: np.ndarray = field(default_factory=lambda: np.array([-np.inf]))
+    upper: np.ndarray = field(default_factory=lambda: np.array([np.inf]))
+    effort: np.ndarray = field(default_factory=lambda: np.array([np.inf]))
 
     def inertia_scale(self, joint: int) -> float:
         """Inertia of the links about a joint with all joints at zero, without the drive's own [kg m^2]."""
-        if not self.bodies:
-            return 0.0
-        total, origin = 0.0, np.zeros(3)
-        for link in range(joint, len(self.joints)):
-            origin = origin + (self.offset[link] if link > joint else 0.0)
-            lever = np.cross(self.axis[joint], origin + self.com[link])
-            total += (
-                self.mass[link] * lever @ lever + self.axis[joint] @ self.inertia[link] @ self.axis[joint]
-            )
-        return float(total)
+        axis, places = self.axis[joint], np.cumsum(self.offset, axis=0) + self.com
+        levers = np.cross(axis, places - np.cumsum(self.offset, axis=0)[joint])[joint:]
+        own = np.einsum("i,kij,j->k", axis, self.inertia[joint:], axis)
+        return float(np.sum(self.mass[joint:] * (levers**2).sum(axis=1) + own))
 
 
 def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
@@ -158,9 +145,8 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
     load = None
     if recording.model == "pendulum":
         free.append("tau_g_nm")
-        loads = [load for t in recording.trajectories if (load := load_of(t.conditions)) is not None]
-        load = max(loads, key=lambda each: each.torque, default=None)
-        if load is not None:
+        loads = filter(None, (load_of(t.conditions) for t in recording.trajectories))
+        if load := max(loads, key=lambda each: each.torque, default=None):
             row[servo.GRAVITY_TORQUE] = load.torque
             row[servo.INERTIA] += load.inertia
     return Chain(

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -11,8 +11,8 @@ import tyro
 
 from vd import interrupt
 from vd.command_line import parse
-from vd.device import resolve_device
-from vd.files import check_file, check_folder
+from vd.device import warp_device
+from vd.files import check_folder
 from vd.gap.contact_cli import Contact, HideContact
 from vd.gap.convert import Convert
 from vd.warp_quiet import quiet_warp
@@ -20,32 +20,28 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
 
-UNUSABLE = 2
-"""Exit status where the recording cannot be used."""
-
-RecordingPath = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-
 
 @dataclass(frozen=True)
 class _Step:
-    """What all steps take; what is left out is as it was in the step before."""
+    """What all steps take; the same words for every step of an analysis."""
 
-    recording: RecordingPath = None
-    """Folder with recording.json and its CSV files; later steps know it from DIR."""
+    first: ClassVar[str] = "find"
+    last: ClassVar[str] = "report"
+
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
+    """Folder with recording.json and its CSV files."""
     out: Path = Path("gap")
     """DIR: folder of the analysis."""
-    hand: str | None = None
-    """Hand, dclaw3 or dclaw4; by default the recording's model."""
-    model: Path | None = None
-    """The hand's own USD file, in place of --hand."""
+    hand: Annotated[str | None, tyro.conf.arg(aliases=("--model",))] = None
+    """Hand, dclaw3 or dclaw4, or its USD file; by default the recording's model."""
     hand_layer: Path | None = None
     """Start from an identified model (identified.usda): is there a gap left?"""
-    effects: str | None = None
-    """Candidates, separated by commas; all effects by default."""
-    seed: int | None = None
+    effects: str = ""
+    """Candidates, separated by commas; all effects by default, none: the plain drives alone."""
+    seed: int = 0
     """Seed of the search and of the resampling."""
-    device: str | None = None
-    """cpu (the default), cuda, or auto."""
+    device: str = "cpu"
+    """cpu, cuda, or auto."""
     fresh: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Repeat finished steps even if nothing has changed."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -55,29 +51,30 @@ class _Step:
         """The analysis in DIR with these settings; a recording is checked before anything slow begins."""
         from vd.gap.recording import read_recording
 
-        recording = None if self.recording is None else read_recording(self.recording)
-        from vd.gap.steps import Analysis
+        recording = read_recording(self.recording)
+        from vd.gap.steps import Analysis, Settings
 
         quiet_warp()
-        if self.hand is not None and self.model is not None:
-            raise ValueError("--hand and --model both name the hand; give one of them")
-        analysis = Analysis.open(
-            self.out,
-            {
-                "recording": self.recording,
-                "hand": self.hand or (str(self.model) if self.model else None),
-                "hand_layer": self.hand_layer,
-                "effects": None if self.effects is None else _effects(self.effects),
-                "seed": self.seed,
-                "device": None if self.device is None else resolve_device(self.device),
-            },
-        )
-        if recording is not None:
-            analysis.recording = recording
+        effects = tuple(filter(None, map(str.strip, self.effects.split(","))))
+        settings = Settings(self.recording, self.hand, self.hand_layer, effects, self.seed)
+        analysis = Analysis(replace(settings, device=warp_device(self.device)), self.out)
+        analysis.recording = recording
         return analysis
 
+    def run(self) -> int:
+        """Run the steps, and print the verdict or what the last one wrote."""
+        analysis = self.analysis()
+        analysis.run(self.last, first=self.first, fresh=self.fresh or self.first == "report")
+        path = analysis.out / f"{self.last}.json"
+        if self.json:
+            print(path.read_text())
+        elif self.last == "report":
+            _print_report(analysis)
+        else:
+            print(path)
+        return 0
 
-@dataclass(frozen=True)
+
 class Run(_Step):
     """Find, explain, close and report: the whole analysis of a recording.
 
@@ -86,50 +83,29 @@ class Run(_Step):
     every verdict and 2 for a recording that cannot be used.
     """
 
-    def run(self) -> int:
-        """Run every step and print the verdict."""
-        analysis = self.analysis()
-        analysis.run("report", fresh=self.fresh)
-        return _print_report(analysis, self.json)
 
-
-@dataclass(frozen=True)
-class _OneStep(_Step):
-    name: ClassVar[str]
-
-    def run(self) -> int:
-        """Run the step."""
-        analysis = self.analysis()
-        analysis.run(self.name, first=self.name, fresh=self.fresh or self.name == "report")
-        path = analysis.out / f"{self.name}.json"
-        if self.name == "report":
-            return _print_report(analysis, self.json)
-        print(path.read_text() if self.json else path)
-        return 0
-
-
-class Find(_OneStep):
+class Find(_Step):
     """Fit the plain servo model of every joint, and say where and in what motion it fails."""
 
-    name = "find"
+    first = last = "find"
 
 
-class Explain(_OneStep):
+class Explain(_Step):
     """Try every effect on motions that the fit has not seen, and name what is missing, or abstain."""
 
-    name = "explain"
+    first = last = "explain"
 
 
-class Close(_OneStep):
+class Close(_Step):
     """Write identified.usda and simulate the recorded commands again with it, a hand in Newton."""
 
-    name = "close"
+    first = last = "close"
 
 
-class Report(_OneStep):
+class Report(_Step):
     """Write report.json, report.html and the figures from what the steps before have found."""
 
-    name = "report"
+    first = last = "report"
 
 
 @dataclass(frozen=True)
@@ -145,10 +121,8 @@ class Plan(_Step):
         from vd.gap.plan import plan, write_plan
 
         analysis = self.analysis()
-        if self.recording is not None:
-            analysis.run("explain", fresh=self.fresh)
-        device = analysis.settings.device
-        report = analysis.explained()
+        analysis.run("explain", fresh=self.fresh)
+        device, report = analysis.settings.device, analysis.explained()
         result = plan(report, analysis.recording, analysis.hand, analysis.start, device=device)
         path = write_plan(result, self.out)
         if self.json:
@@ -207,75 +181,6 @@ class Hide:
         return 0
 
 
-@dataclass(frozen=True)
-class Identify:
-    """The paper's identification alone: CMA-ES over the drives of each finger of a hand, without any effect.
-
-    Every motion of every candidate is simulated at once. vd-gap run needs none of it: it finds the same
-    drives, and what they lack.
-    """
-
-    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """Folder with recording.json and its CSV files."""
-    out: Path = Path("drives.usda")
-    """Layer to write, for --hand-layer."""
-    hand: str | None = None
-    """Hand's name or USD file; by default the recording's model."""
-    every_finger: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Give fingers that were not recorded the drives of the first, as the paper does."""
-    generations: int = 100
-    """Generations of the search."""
-    population: int = 64
-    """Candidates of a generation."""
-    rate: float = 480.0
-    """Physics steps a second; training has 120, a quarter of the work."""
-    seed: int = 0
-    """Seed of the search."""
-    device: str = "cpu"
-    """cpu, cuda, or auto."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print what was found as JSON."""
-
-    def run(self) -> int:
-        """Search, and write the layer."""
-        from vd.gap.recording import read_recording
-
-        recording = read_recording(self.recording)
-        from vd.gap.identify import identify, write_drives
-        from vd.gap.steps import Analysis, Settings
-
-        quiet_warp()
-        analysis = Analysis(Settings(self.recording, self.hand), self.out.parent)
-        analysis.recording, hand = recording, analysis.hand
-        if hand is None:
-            raise ValueError(f"{self.recording}: a bare {recording.model} is no hand; use vd-gap run")
-
-        def show(generation: int, finger: str, best: float) -> None:
-            line = f"{finger}: generation {generation}/{self.generations}: {1e3 * best:.2f} mrad"
-            print(line, file=sys.stderr, flush=True)
-
-        found = identify(
-            recording,
-            hand,
-            generations=self.generations,
-            population=self.population,
-            dt=1.0 / self.rate,
-            device=resolve_device(self.device),
-            seed=self.seed,
-            progress=show,
-        )
-        write_drives(found, self.out, hand, recording, every_finger=self.every_finger)
-        if self.json:
-            print(json.dumps(asdict(found), indent=1))
-            return 0
-        for joint, kp, kd, limit in zip(*list(asdict(found).values())[:4], strict=True):
-            print(f"{joint}: {kp:.3g} N m/rad, {kd:.3g} N m s/rad, at most {limit:.3g} rad/s")
-        print(
-            f"{found.rollouts} motions simulated, {found.rollouts / found.seconds:.0f} a second\n{self.out}"
-        )
-        return 0
-
-
 Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Find, tyro.conf.subcommand("find")]
@@ -283,7 +188,6 @@ Command = (
     | Annotated[Close, tyro.conf.subcommand("close")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Plan, tyro.conf.subcommand("plan")]
-    | Annotated[Identify, tyro.conf.subcommand("identify")]
     | Annotated[Hide, tyro.conf.subcommand("hide")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Contact, tyro.conf.subcommand("contact")]
@@ -294,31 +198,28 @@ Command = (
 @interrupt.command("vd-gap")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
-    command: (
-        Run | Find | Explain | Close | Report | Plan | Identify | Hide | Convert | Contact | HideContact
-    ) = parse(Command, arguments, prog="vd-gap", description=__doc__)
+    command: Run | Find | Explain | Close | Report | Plan | Hide | Convert | Contact | HideContact = parse(
+        Command, arguments, prog="vd-gap", description=__doc__
+    )
     from vd.gap.recording import RecordingError
 
     try:
-        (check_file if isinstance(command, Identify) else check_folder)(command.out)
+        check_folder(command.out)
         return command.run()
     except RecordingError as error:
         print(f"vd-gap: this recording cannot be used: {error}", file=sys.stderr)
-        return UNUSABLE
+        return 2
     except KeyboardInterrupt:
         again = "goes on with the step it was in" if isinstance(command, _Step) else "begins anew"
         print(f"vd-gap: stopped; the same command {again}", file=sys.stderr)
         return interrupt.INTERRUPTED
 
 
-def _print_report(analysis: "Analysis", as_json: bool) -> int:
+def _print_report(analysis: "Analysis") -> None:
     from vd.gap.result import Report as Contents
     from vd.gap.words import next_step, open_questions, verdict_sentence
 
     path = analysis.out / "report.json"
-    if as_json:
-        print(path.read_text())
-        return 0
     report = Contents.read(path)
     print(verdict_sentence(report))
     for finding in report.findings:
@@ -329,19 +230,6 @@ def _print_report(analysis: "Analysis", as_json: bool) -> int:
     for line in report.warnings:
         print(f"  note: {line}")
     print(f"\n{analysis.out / 'report.html'}\n{path}")
-    return 0
-
-
-def _effects(text: str) -> tuple[str, ...]:
-    """Names of effects, separated by commas."""
-    from vd.kernels.servo.effects import EFFECTS
-
-    names = tuple(filter(None, (name.strip() for name in text.split(","))))
-    if unknown := [name for name in names if name not in EFFECTS]:
-        raise ValueError(
-            f"--effects: no effect is called {', '.join(unknown)}; choose from {', '.join(EFFECTS)}"
-        )
-    return names
 
 
 if __name__ == "__main__":

@@ -13,65 +13,54 @@ import numpy as np
 
 from vd.gap.coordinates import GRAVITY
 from vd.gap.recording import Recording
-from vd.gap.result import Closing, NamedEffect, Predictions, Report, effect_values
+from vd.gap.result import LAYER, Closing, NamedEffect, Predictions, Report, effect_values
 from vd.kernels.servo.effects import BASELINE, EFFECTS
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
 
 WHOLE_HAND_LAYER = "identified-all-fingers.usda"
-"""The same on every finger, as the paper applies what it identified on one."""
+"""The same on every finger like the recorded one (paper, Dynamics Identification)."""
 
 
 def write_identified(
     report: Report,
-    path: Path,
+    folder: Path,
     recording: Recording,
     hand: "HandModel | None",
     start: Mapping[str, np.ndarray],
-    *,
-    every_finger: bool = False,
-) -> None:
-    """Write what a report identified as a layer.
+) -> str:
+    """Write what a report identified as a layer; for a hand with fingers like those recorded, one with them.
 
     Args:
         report: The report.
-        path: File to write, ``.usda``.
+        folder: Where.
         recording: What it was identified from.
         hand: The hand; None for a bare servo or pendulum.
         start: Parameter row of each joint that the analysis started from; its effects stay in the layer.
-        every_finger: Give the joints of the fingers that were not recorded the model of their counterpart on
-            the first recorded finger (paper, Dynamics Identification).
+
+    Returns:
+        Name of the layer for all fingers, empty without one.
     """
     from vd.assets_usd.hand_layer import write_layer
 
-    fitted = report.identified.parameters
-    held = (*report.effects, *report.provisional)
+    fitted, held = report.identified.parameters, (*report.effects, *report.provisional)
+    (folder / WHOLE_HAND_LAYER).unlink(missing_ok=True)
+    others = {} if hand is None else counterparts(hand, tuple(fitted))
     source = {joint: joint for joint in fitted}
-    if every_finger and hand is not None:
-        source |= counterparts(hand, tuple(fitted))
-    write_layer(
-        path,
-        hand if hand is not None else recording.model,
-        baseline={
-            joint: {p.name: fitted[known][p.name] for p in BASELINE if p.name in fitted[known]}
-            for joint, known in source.items()
-        },
-        effects={joint: _effects(held, known, fitted[known], start) for joint, known in source.items()},
-        tool="vd-gap",
-        recording=report.recording.path,
-    )
-
-
-def one_finger(recording: Recording, hand: "HandModel | None") -> bool:
-    """Whether a hand has more fingers than were recorded."""
-    if hand is None:
-        return False
-    return len({_finger(j) for j in recording.joints}) < len({_finger(j) for j in hand.joint_names})
-
-
-def _finger(joint: str) -> str:
-    return joint.partition("_")[0]
+    for name, known in ((LAYER, source), (WHOLE_HAND_LAYER, source | others))[: 2 if others else 1]:
+        write_layer(
+            folder / name,
+            hand if hand is not None else recording.model,
+            baseline={
+                joint: {p.name: fitted[own][p.name] for p in BASELINE if p.name in fitted[own]}
+                for joint, own in known.items()
+            },
+            effects={joint: _effects(held, own, fitted[own], start) for joint, own in known.items()},
+            tool="vd-gap",
+            recording=report.recording.path,
+        )
+    return WHOLE_HAND_LAYER if others else ""
 
 
 def counterparts(hand: "HandModel", known: tuple[str, ...]) -> dict[str, str]:
@@ -132,32 +121,19 @@ def simulate_again(
         What it showed, and the new curves.
     """
     if hand_name is None:
-        before, after = curves.baseline, _bare(layer, recording, curves, device)
+        models = np.stack([curves.baseline, _bare(layer, recording, curves, device)])
     else:
-        before, after = _newton(report, layer, recording, hand_name, start_layer, device)
-    unseen = np.isnan(curves.baseline)
-    before, after = (np.where(unseen, np.nan, each) for each in (before, after))
+        models = _newton(report, layer, recording, hand_name, start_layer, device)
+    models = np.where(np.isnan(curves.baseline), np.nan, models)
     squares = {}
     for joint in report.identified.per_joint:
         moved = [curves.files.index(row.file) for row in report.trajectories if row.joint == joint]
         rows, column = np.isin(curves.trajectory, moved), curves.joints.index(joint)
-        models = np.stack([before[rows, column], after[rows, column]], axis=1)
-        squares[joint] = (models - curves.measured[rows, column, None]) ** 2
-    plain, identified = _rms(np.concatenate(list(squares.values())))
-    closing = Closing(
-        simulator="rollout" if hand_name is None else "newton",
-        layer=layer.name,
-        baseline_rmse_rad=plain,
-        identified_rmse_rad=identified,
-        per_joint={joint: _rms(values) for joint, values in squares.items()},
-    )
-    return closing, replace(curves, baseline=before, identified=after)
-
-
-def _rms(squares: np.ndarray) -> tuple[float, float]:
-    """Of baseline and identified model."""
-    before, after = np.sqrt(squares.mean(axis=0))
-    return float(before), float(after)
+        squares[joint] = (models[:, rows, column] - curves.measured[rows, column]) ** 2
+    before, after = np.sqrt(np.concatenate([*squares.values()], axis=1).mean(axis=1)).tolist()
+    per_joint = {joint: tuple(np.sqrt(each.mean(axis=1)).tolist()) for joint, each in squares.items()}
+    closing = Closing("rollout" if hand_name is None else "newton", layer.name, before, after, per_joint)
+    return closing, replace(curves, baseline=models[0], identified=models[1])
 
 
 def _newton(

@@ -11,7 +11,7 @@ import tyro
 
 from vd.gap.motions import Recording, Trajectory
 from vd.gap.readers import FORMATS, Motion, Told, format_of
-from vd.gap.recording_checks import MOVING_COUNTS, RecordingError
+from vd.gap.recording_checks import MIN_SAMPLES, RecordingError
 
 REQUIRED = ("command", "position")
 
@@ -83,7 +83,7 @@ def convert(asked: Convert) -> Recording:
         raise ValueError(f"--rename {unused[0]}={rename[unused[0]]}: {asked.source} has no {unused[0]!r}")
     joints = asked.joints or motions[0].joints
     resolution = 2.0 * math.pi / asked.counts_per_turn
-    trajectories = tuple(_trajectory(asked, one, joints, MOVING_COUNTS * resolution) for one in motions)
+    trajectories = tuple(_trajectory(asked, one, joints, MIN_SAMPLES * resolution) for one in motions)
     if there := [one.file for one in trajectories if (asked.out / one.file).exists()]:
         raise ValueError(f"--out {asked.out} holds {there[0]}, which would be lost; name another folder")
     model = asked.model or ("pendulum" if format == "bam" else "servo")

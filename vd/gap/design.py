@@ -10,9 +10,8 @@ from vd.gap.statistics import held
 
 MAX_FOLDS = 6
 BYSTANDERS = 2
-"""Trajectories of each other joint of the chain in which a joint's own rest is fitted too."""
-CONDITION_VALUES = 3
-"""Values of a condition from which on its values, not the motions, are held out."""
+"""Trajectories of each other joint of the chain in which a joint's own rest is fitted too; of one, a coupling
+would have no interval."""
 MAX_MOTION_S = 150.0
 """Motion of a joint that is fitted [s]: twice what the paper records; the rest is held out for good."""
 MAX_MOTIONS = 30
@@ -92,10 +91,12 @@ def _widest(recording: Recording, chain: Chain, trajectory: Trajectory, share: f
 
 
 def varied(trajectories: list[Trajectory]) -> str | None:
-    """The condition whose values are held out: the one with the most values, if they are enough."""
-    names = sorted({name for t in trajectories for name in t.conditions})
-    counts = {
-        name: len({str(t.conditions[name]) for t in trajectories if name in t.conditions}) for name in names
+    """The condition whose values are held out: that with the most, if two are left when one is held out."""
+    values: dict[str, set[str]] = {
+        name: set() for name in sorted({n for t in trajectories for n in t.conditions})
     }
-    best = max(names, key=lambda name: counts[name], default=None)
-    return best if best is not None and counts[best] >= CONDITION_VALUES else None
+    for trajectory in trajectories:
+        for name, value in trajectory.conditions.items():
+            values[name].add(str(value))
+    best = max(values, key=lambda name: len(values[name]), default=None)
+    return best if best is not None and len(values[best]) > 2 else None

@@ -4,41 +4,17 @@ The paper commands steps and sines of 0.05 to 1.5 Hz, amplitudes in proportion t
 Commands are in rad, times in seconds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+
+from vd.gap.motions import Trajectory
 
 RATE_HZ = 100.0
 """Rate at which commands are written."""
 AMPLITUDE = 0.7
 """Largest command, as a share of half the joint's range: room for overshoot before the stops."""
-
-
-@dataclass(frozen=True, eq=False)
-class Excitation:
-    """One motion to be recorded.
-
-    Attributes:
-        name: Kind of motion, the ``excitation`` of a recording.
-        joints: The joints that it excites.
-        time: Time stamps [T] [s].
-        command: Commanded positions of all joints [T, J] [rad].
-        conditions: What is varied on purpose.
-        enabled: Torque on [T, J] bool.
-    """
-
-    name: str
-    joints: tuple[str, ...]
-    time: np.ndarray
-    command: np.ndarray
-    conditions: dict[str, float | str]
-    enabled: np.ndarray
-
-    @property
-    def duration(self) -> float:
-        """Length [s]."""
-        return float(self.time[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +54,7 @@ class Motion:
     payload: int | None = None
     release_s: float = np.inf
 
-    def of(self, reach: JointRange, joint: int) -> Excitation:
+    def of(self, reach: JointRange, joint: int) -> Trajectory:
         """This motion of one joint about the centre of its range, while the others hold there."""
         time = np.arange(len(self.shape)) / RATE_HZ
         command = np.tile(0.5 * (reach.lower + reach.upper), (len(time), 1))
@@ -90,7 +66,14 @@ class Motion:
             conditions["p_gain"] = self.gain * reach.p_gain
         if self.payload is not None:
             conditions["payload_kg"] = reach.payloads_kg[self.payload]
-        return Excitation(self.name, (reach.joints[joint],), time, command, conditions, enabled)
+        name = reach.joints[joint]
+        file = f"{name}_{self.name}.csv"
+        return Trajectory(file, self.name, (name,), conditions, time, command, command, enabled)
+
+
+def numbered(motions: Iterable[Trajectory]) -> tuple[Trajectory, ...]:
+    """Motions with their place in front of the names of their files."""
+    return tuple(replace(motion, file=f"{i:03d}_{motion.file}") for i, motion in enumerate(motions))
 
 
 def _levels(name: str, hold_s: float, *levels: float) -> Motion:
@@ -119,9 +102,6 @@ def _time(duration_s: float) -> np.ndarray:
     return np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ
 
 
-_LADDER = _levels("ladder_step", 1.75, 0.4, -0.2), _sine("ladder_sine", 0.4, 5.0)
-_LIFT = _sine("payload_sine", 0.25, 8.0)
-_SMALL = (0.04, 0.08, 0.12, 0.08, 0.04, 0.08, 0.04, 0.0, -0.04, 0.0, -0.08, -0.04, -0.08, 0.0)
 MENU: dict[str, tuple[Motion, ...]] = {
     "steps_and_sines": (
         _levels("step_small", 1.75, 0.12, -0.12),
@@ -136,23 +116,29 @@ MENU: dict[str, tuple[Motion, ...]] = {
     # A constant slow speed both ways: friction against its direction, play at its reversals.
     "slow_triangle": (_triangle("slow_triangle", 16.0, 20.0),),
     # Steps and sines at falling P gains: what scales with the gain is the servo's.
-    "gain_ladder": tuple(replace(motion, gain=gain) for gain in (1.0, 0.5, 0.25) for motion in _LADDER),
+    "gain_ladder": tuple(
+        replace(motion, gain=gain)
+        for gain in (1.0, 0.5, 0.25)
+        for motion in (_levels("ladder_step", 1.75, 0.4, -0.2), _sine("ladder_sine", 0.4, 5.0))
+    ),
     # The same sine with two payloads: what grows with the load.
-    "second_payload": tuple(replace(_LIFT, payload=payload) for payload in (0, 1)),
+    "second_payload": tuple(replace(_sine("payload_sine", 0.25, 8.0), payload=i) for i in (0, 1)),
     # Lifted, then the torque is switched off: what is left is gravity, friction and inertia.
     "torque_release": (replace(_levels("torque_release", 4.5, 0.8), release_s=2.0),),
     # Levels held for seconds: creep, warming, and where the joint comes to rest.
     "long_holds": (_levels("long_holds", 4.0, 0.5, 0.9, -0.3, -0.8),),
     # Small steps with more and more reversals: play, dead zone, stiction.
-    "reversal_staircase": (_levels("reversal_staircase", 0.8, *_SMALL),),
+    "reversal_staircase": (
+        _levels("reversal_staircase", 0.8, *0.04 * np.array([1, 2, 3, 2, 1, 2, 1, 0, -1, 0, -2, -1, -2, 0])),
+    ),
     # A small sine of rising frequency: delay against filter against inertia.
     "chirp": (_chirp("chirp", 0.25, 0.2, 6.0, 10.0),),
 }
 """Sets of motions by name."""
 
 
-def excitation_set(reach: JointRange, names: Sequence[str] = ("steps_and_sines",)) -> list[Excitation]:
-    """The motions of several sets, in order, joint by joint.
+def excitation_set(reach: JointRange, names: Sequence[str] = ("steps_and_sines",)) -> list[Trajectory]:
+    """The motions of several sets, in order, joint by joint, with their commands in the place of positions.
 
     Args:
         reach: Joints and limits.

@@ -1,4 +1,4 @@
-"""The motions of one machine, as they were recorded. SI units, radians, seconds."""
+"""The motions of one machine, as they are commanded and recorded. SI units, radians, seconds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -23,14 +23,13 @@ class Trajectory:
         conditions: What was varied on purpose (``p_gain``, ``payload_kg``, ``supply_v`` ...).
         time: Time stamps [T] [s], float64, starting at 0 (:meth:`piece`: later).
         command: Commanded positions [T, J] [rad].
-        position: Measured positions [T, J] [rad].
+        position: Measured positions [T, J] [rad]; the commands of a motion that is still to be recorded.
         velocity: Measured velocities [T, J] [rad/s], or None; NaN for joints without the column.
         current: Motor currents [T, J] [A], or None, as all telemetry.
         pwm: Duty cycles [T, J] in [-1, 1], or None.
         voltage: Supply voltages [T, J] [V], or None.
         temperature: Motor temperatures [T, J] [deg C], or None.
         command_time: When the commands were sent [T] [s], in the time of ``time``; None: at the time stamps.
-        unwrapped: Joints whose command and position jumped by whole turns in the file, and here do not.
         enabled: Whether the servo's torque is on [T, J] bool; all true where not recorded.
     """
 
@@ -48,12 +47,16 @@ class Trajectory:
     voltage: np.ndarray | None = None
     temperature: np.ndarray | None = None
     command_time: np.ndarray | None = None
-    unwrapped: tuple[str, ...] = ()
 
     @property
     def sent(self) -> np.ndarray:
         """When the commands were sent [T] [s]."""
         return self.time if self.command_time is None else self.command_time
+
+    @property
+    def duration(self) -> float:
+        """Time of the last sample [s]."""
+        return float(self.time[-1])
 
     def piece(self, first: int, end: int) -> "Trajectory":
         """Samples ``first`` to ``end`` (not included), with the times that they have in the whole."""

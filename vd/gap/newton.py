@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
-from vd.gap.recording import Recording, Trajectory
+from vd.gap.motions import Recording
 from vd.gap.rollout import STEP_S, STREAM_BITS
 from vd.kernels.launch import count_kernel, launch
 from vd.kernels.servo.actuators import BACKLASH_WIDTH, ENCODER_BIAS
@@ -61,11 +61,6 @@ def simulate_hand(
     return answers[0] if rows.ndim == 2 else answers
 
 
-def random_stream(trajectory: Trajectory) -> int:
-    """The stream of a trajectory's random delays, the same as in the rollouts."""
-    return zlib.crc32(trajectory.file.encode()) & ((1 << STREAM_BITS) - 1)
-
-
 class _Replay:
     """Worlds with a hand each, one for every trajectory of each of M models.
 
@@ -83,9 +78,8 @@ class _Replay:
         self._build()
         self.positions = zeros(w, max(len(t.time) for t in recording.trajectories), d)
         self._step = zeros(1, dtype=wp.int32)
-        self._write, self._read = zeros(w, d, dtype=wp.int32), zeros(w, d, dtype=wp.int32)
-        self._due_step, self._due_fraction = zeros(w, d, dtype=wp.int32), zeros(w, d)
-        self._held, self._held_power = zeros(w, d), zeros(w, d)
+        self._write, self._read, self._due_step = (zeros(w, d, dtype=wp.int32) for _ in range(3))
+        self._due_fraction, self._held, self._held_power = (zeros(w, d) for _ in range(3))
 
     def _load(self, recording: Recording, models: int) -> None:
         """Put the trajectories on the device, one after the other."""
@@ -97,7 +91,8 @@ class _Replay:
         power = np.concatenate([t.enabled * share for t, share in zip(trajectories, shares, strict=True)])
         command = np.concatenate([t.command for t in trajectories])
         column = np.array([names.index(n) if n in names else -1 for n in self.hand.joint_names])
-        self.duration = float(max(t.time[-1] for t in trajectories))
+        streams = [zlib.crc32(t.file.encode()) & ((1 << STREAM_BITS) - 1) for t in trajectories]
+        self.duration = max(t.duration for t in trajectories)
 
         def array(values: np.ndarray, dtype: Any = float) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
@@ -115,14 +110,14 @@ class _Replay:
             ("", [t.time for t in trajectories]),
             ("sent_", [t.sent for t in trajectories]),
         ):
-            steps = np.concatenate(times) / self.dt
-            setattr(self._samples, f"{prefix}step", array(np.floor(steps), int))
-            setattr(self._samples, f"{prefix}fraction", array(steps - np.floor(steps)))
+            step, fraction = np.divmod(np.concatenate(times) / self.dt, 1.0)
+            setattr(self._samples, f"{prefix}step", array(step, int))
+            setattr(self._samples, f"{prefix}fraction", array(fraction))
         self._samples.command, self._samples.power = array(command), array(power)
         self._tracks.column = array(column, int)
         self._tracks.first = array(np.tile(first, models), int)
         self._tracks.last = array(np.tile(first + lengths, models), int)
-        self._tracks.stream = array(np.tile([random_stream(t) for t in trajectories], models), int)
+        self._tracks.stream = array(np.tile(streams, models), int)
 
     def _build(self) -> None:
         """The worlds; without contacts a joint has three rows: its limit, friction, and whom it follows."""

@@ -9,7 +9,6 @@ disagree most is proposed.
 
 import contextlib
 import itertools
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,13 +17,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vd.config import to_dict
-from vd.files import write_json, write_text
-from vd.gap.chain import Chain, chains
+from vd.files import write_json
+from vd.gap.chain import Chain, candidates, chains
 from vd.gap.coordinates import BASELINE_PARAMETERS
 from vd.gap.design import design, pieces
-from vd.gap.excitations import MENU, Excitation, JointRange, excitation_set
+from vd.gap.excitations import MENU, JointRange, excitation_set, numbered
 from vd.gap.fit import FINER
-from vd.gap.recording import BARE_MODELS, Recording, Trajectory
+from vd.gap.recording import BARE_MODELS, Recording, Trajectory, entry_of, write_table
 from vd.gap.recording_checks import MIN_KINDS
 from vd.gap.result import Report, parameter_columns, parameters_of
 from vd.gap.rollout import STEP_S, Rollouts
@@ -55,10 +54,6 @@ class Score:
     disagreement: float
     """Of two models, RMS in units of the noise; of several pairs the one at which as much is learnt, which is
     log(1 + disagreement^2) in the mean."""
-    told: int
-    """Pairs of models that disagree by more than :data:`VISIBLE`."""
-    pairs: int
-    """Pairs in question."""
     seconds: float
     """Length of all its motions."""
 
@@ -74,7 +69,7 @@ class Plan:
     """Sets of models in question, by joint."""
     ranking: tuple[Score, ...]
     """Best first."""
-    motions: tuple[Excitation, ...]
+    motions: tuple[Trajectory, ...]
     """Of the best set."""
     sentence: str
 
@@ -105,13 +100,12 @@ def plan(
     competing: dict[str, tuple[tuple[str, ...], ...]] = {}
     for chain in chains(recording, hand):
         base = _base(chain, report, start or {})
-        for joint in (name for name in chain.joints if name in targets):
+        for joint, group in ((name, group) for name in chain.joints for group in targets.get(name, ())):
+            models = _models(report, chain, joint, base, group)
+            competing[joint] = (*competing.get(joint, ()), tuple(models))
             own = {name: [m for m in motions if m.joints == (joint,)] for name, motions in menu.items()}
-            for group in targets[joint]:
-                models = _models(report, chain, joint, base, group)
-                competing[joint] = (*competing.get(joint, ()), tuple(models))
-                values = _compare(chain, recording, own, joint, models, noise[joint], device)
-                found = {name: [*known, *values[name]] for name, known in found.items()}
+            for name, values in _compare(chain, recording, own, joint, models, noise[joint], device).items():
+                found[name] += values
     if not competing:
         raise ValueError(f"{recording.path}: no joint has a fitted model; run vd-gap explain first")
     motions = {name: [m for m in every if m.joints[0] in competing] for name, every in menu.items()}
@@ -119,23 +113,15 @@ def plan(
         Score(
             name,
             disagreement=float(np.sqrt(np.expm1(np.mean(np.log1p(np.square(values)))))),
-            told=sum(value > VISIBLE for value in values),
-            pairs=len(values),
             seconds=sum(motion.duration for motion in motions[name]),
         )
         for name, values in found.items()
     ]
-    best, *others = sorted(scores, key=lambda score: -score.disagreement)
-    return Plan(
-        model=recording.model,
-        joints=recording.joints,
-        competing=competing,
-        ranking=(best, *others),
-        motions=tuple(motions[best.name]),
-        sentence=_sentence(
-            best, report, tuple(competing), len({t.excitation for t in recording.trajectories})
-        ),
-    )
+    ranking = tuple(sorted(scores, key=lambda score: -score.disagreement))
+    kinds = len({t.excitation for t in recording.trajectories})
+    sentence = _sentence(ranking[0], report, tuple(competing), kinds)
+    chosen = tuple(motions[ranking[0].name])
+    return Plan(recording.model, recording.joints, competing, ranking, chosen, sentence)
 
 
 def write_plan(result: Plan, folder: Path) -> Path:
@@ -149,18 +135,9 @@ def write_plan(result: Plan, folder: Path) -> Path:
     """
     discard_plan(folder)
     path, entries = Path(folder) / PLAN_JSON, []
-    for index, motion in enumerate(result.motions):
-        name = f"{PLAN_FOLDER}/{index:03d}_{motion.joints[0]}_{motion.name}.csv"
-        write_text(Path(folder) / name, _csv(motion, result.joints))
-        entries.append(
-            {
-                "file": name,
-                "excitation": motion.name,
-                "joints": list(motion.joints),
-                "conditions": motion.conditions,
-                "duration_s": motion.duration,
-            }
-        )
+    for motion in numbered(result.motions):
+        entries.append(entry_of(replace(motion, file=f"{PLAN_FOLDER}/{motion.file}")))
+        write_table(Path(folder) / entries[-1]["file"], motion, result.joints, ("command", "enabled"))
     contents = {name: value for name, value in vars(result).items() if name != "motions"}
     contents |= {"format": FORMAT, "excitation": result.ranking[0].name, "trajectories": entries}
     write_json(path, to_dict(contents))
@@ -169,14 +146,8 @@ def write_plan(result: Plan, folder: Path) -> Path:
 
 def discard_plan(folder: Path) -> None:
     """Remove a plan that :func:`write_plan` wrote, and no other file."""
-    path = Path(folder) / PLAN_JSON
-    try:
-        files = [entry["file"] for entry in json.loads(path.read_text())["trajectories"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        files = []  # none, or not of this program
-    for file in files:
-        (Path(folder) / PLAN_FOLDER / Path(file).name).unlink(missing_ok=True)
-    path.unlink(missing_ok=True)
+    for file in (Path(folder) / PLAN_JSON, *(Path(folder) / PLAN_FOLDER).glob("[0-9][0-9][0-9]_*.csv")):
+        file.unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # something else is in it, or it is not there
         (Path(folder) / PLAN_FOLDER).rmdir()
 
@@ -190,7 +161,7 @@ def _targets(report: Report) -> dict[str, tuple[tuple[str, ...], ...]]:
     return {joint: groups for joint, groups in targets.items() if joint in report.identified.parameters}
 
 
-def _menu(recording: Recording, hand: "HandModel | None") -> dict[str, list[Excitation]]:
+def _menu(recording: Recording, hand: "HandModel | None") -> dict[str, list[Trajectory]]:
     """The menu for this machine, under the conditions that its recording has throughout.
 
     Joints move in the hand's range, or in that of the commands before. Only a pendulum's load is modelled.
@@ -220,11 +191,11 @@ def _menu(recording: Recording, hand: "HandModel | None") -> dict[str, list[Exci
 
 def _base(chain: Chain, report: Report, start: Mapping[str, np.ndarray]) -> np.ndarray:
     """Parameter rows of the chain as identified so far, shape [n, P]."""
-    rows = np.array(chain.start_row, dtype=float)
-    for index, joint in enumerate(chain.joints):
-        rows[index] = start.get(joint, rows[index])
+    given = [start.get(name, row) for name, row in zip(chain.joints, chain.start_row, strict=True)]
+    rows = np.array(given, dtype=float)
+    for row, joint in zip(rows, chain.joints, strict=True):
         for column, value in parameter_columns(report, joint).items():
-            rows[index, column] = value
+            row[column] = value
     return rows
 
 
@@ -241,9 +212,7 @@ def _models(
         return rows
 
     if len(group) < 2:  # nothing in particular competes: which motion would show the most of everything?
-        alone = len(chain.joints) == 1
-        effects = [name for name in EFFECTS if not (alone and name == "joint_coupling")]
-        return {PLAIN: base, **{name: having(name, {}) for name in effects}}
+        return {PLAIN: base, **{name: having(name, {}) for name in candidates(chain, tuple(EFFECTS))}}
     for parameter in (p for name in group for p in EFFECTS[name].parameters):
         base[index, parameter.column] = parameter.neutral  # one of them stands in the model for all
     held = {e.name for e in (*report.effects, *report.provisional) if joint in e.joints} - {*group}
@@ -261,7 +230,7 @@ def _fitted(report: Report, joint: str, name: str, given: set[str]) -> dict[str,
 def _compare(
     chain: Chain,
     recording: Recording,
-    menu: Mapping[str, Sequence[Excitation]],
+    menu: Mapping[str, Sequence[Trajectory]],
     joint: str,
     models: Mapping[str, np.ndarray],
     noise: float,
@@ -271,20 +240,7 @@ def _compare(
     index = chain.joints.index(joint)
     known = _analysed(recording, chain, index)
     owner = [""] * len(known) + [name for name, new in menu.items() for _ in new]
-    imagined = [
-        Trajectory(
-            file=str(number),
-            excitation=motion.name,
-            joints=motion.joints,
-            conditions=motion.conditions,
-            time=motion.time,
-            command=motion.command,
-            position=motion.command,
-            enabled=motion.enabled,
-        )
-        for number, motion in enumerate(itertools.chain(*menu.values()))
-    ]
-    everything = replace(recording, trajectories=(*known, *imagined))
+    everything = replace(recording, trajectories=(*known, *itertools.chain(*menu.values())))
     # Rivals of a set differ by less than a delay of the fit's own step.
     step = STEP_S if PLAIN in models else STEP_S / FINER[-1]
     rollouts = Rollouts(chain, everything, dt=step, device=device)
@@ -371,37 +327,17 @@ def _sentence(best: Score, report: Report, joints: tuple[str, ...], kinds: int) 
     """What to record, and what it would show."""
     sets = report.open_sets
     between = f" between {causes(sets[0], 'and')}" if len(sets) == 1 else ""
-    if best.disagreement < VISIBLE and kinds < MIN_KINDS:
-        return (
-            f"Record {MIN_KINDS} kinds of motion at least, here are {kinds}: with so few no motion of the "
-            f"menu decides alone. The best of the menu is in {PLAN_FOLDER}/."
-        )
     if best.disagreement < VISIBLE:
+        decide = "so either serves in simulation; another quantity may decide, current or an external sensor"
+        if kinds < MIN_KINDS:
+            decide = f"but here are {kinds} kinds of motion: record {MIN_KINDS} at least"
         return (
             f"No motion of the menu would decide{between}: on all of them the models in question differ by "
-            f"less than {VISIBLE:g} times the noise, so either serves in simulation. To decide, record "
-            "another quantity, such as current or an external sensor. The best of the menu is in "
-            f"{PLAN_FOLDER}/."
+            f"less than {VISIBLE:g} times the noise, {decide}. The best of the menu is in {PLAN_FOLDER}/."
         )
     goal = f"to decide{between}" if sets else "to see what these motions do not show"
-    shows = f"the models in question differ by {best.disagreement:.1f} times the noise"
-    if best.pairs > 1:
-        shows = f"{best.told} of {best.pairs} pairs of possible models differ by more than the noise"
     return (
-        f"Record the motions {best.name} on {joints_text(joints)}, {best.seconds:.0f} s, {goal}: "
-        f"there {shows}. The commands are in {PLAN_FOLDER}/; add what was measured to the recording and run "
-        "vd-gap again."
+        f"Record the motions {best.name} on {joints_text(joints)}, {best.seconds:.0f} s, {goal}: there the "
+        f"models in question differ by {best.disagreement:.1f} times the noise. The commands are in "
+        f"{PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
     )
-
-
-def _csv(motion: Excitation, joints: Sequence[str]) -> str:
-    """The commands of a motion, and where its torque is on if it is not always."""
-    columns = {
-        "t": motion.time,
-        **{f"command.{joint}": motion.command[:, i] for i, joint in enumerate(joints)},
-    }
-    cells = [[f"{value:.6f}" for value in column] for column in columns.values()]
-    if not motion.enabled.all():
-        columns |= {f"enabled.{joint}": motion.enabled[:, i] for i, joint in enumerate(joints)}
-        cells += motion.enabled.astype(int).astype(str).T.tolist()
-    return "\n".join(map(",".join, [list(columns), *zip(*cells, strict=True)])) + "\n"

@@ -10,7 +10,7 @@ import csv
 import json
 import math
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,6 @@ from vd.gap.recording_checks import (
     check_units,
     check_values,
     require,
-    unwrapped,
 )
 
 FORMAT = "vd-recording/1"
@@ -41,7 +40,6 @@ POSITIVE = ("p_gain", "payload_kg", "arm_length_m")
 """Conditions that the model computes with: numbers, not negative."""
 STIFFNESS = "kp_nm_rad"
 """Key of ``servo``: the drive's stiffness at the largest P gain recorded [N m/rad], one or by joint."""
-CSV_DIGITS = 6
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -76,12 +74,11 @@ def read_recording(path: str | Path) -> Recording:
     )
     trajectories = tuple(_read_trajectory(file, i, entry, joints) for i, entry in enumerate(entries))
     names = [trajectory.file for trajectory in trajectories]
-    for i, name in enumerate(names):
-        require(
-            name not in names[:i],
-            f"{file}: trajectories[{i}]: {name!r} is listed before as trajectories[{names.index(name)}]; "
-            "list each file once, or it counts twice as evidence",
-        )
+    twice = sorted({name for name in names if names.count(name) > 1})
+    require(
+        not twice,
+        f"{file}: 'trajectories' lists {twice} twice; list each once, or it counts as evidence twice",
+    )
     recording = Recording(file.parent, header["model"], joints, servo, float(resolution), trajectories)
     check_motion(recording)
     check_units(recording)
@@ -102,26 +99,28 @@ def write_recording(recording: Recording, folder: str | Path, *, only: Collectio
     folder = Path(folder)
     for trajectory in recording.trajectories:
         if only is None or trajectory.file in only:
-            _write_csv(folder / trajectory.file, trajectory, recording.joints)
+            write_table(folder / trajectory.file, trajectory, recording.joints)
     header = {
         "format": FORMAT,
         "model": recording.model,
         "joints": list(recording.joints),
         "servo": recording.servo,
         "encoder_resolution_rad": recording.encoder_resolution_rad,
-        "trajectories": [
-            {
-                "file": trajectory.file,
-                "excitation": trajectory.excitation,
-                "joints": list(trajectory.joints),
-                "duration_s": round(float(trajectory.time[-1]), CSV_DIGITS),
-                "conditions": trajectory.conditions,
-            }
-            for trajectory in recording.trajectories
-        ],
+        "trajectories": [entry_of(trajectory) for trajectory in recording.trajectories],
     }
     write_json(folder / "recording.json", header)
     return folder
+
+
+def entry_of(trajectory: Trajectory) -> dict[str, Any]:
+    """What ``recording.json`` says of a trajectory."""
+    return {
+        "file": trajectory.file,
+        "excitation": trajectory.excitation,
+        "joints": list(trajectory.joints),
+        "duration_s": round(trajectory.duration, 6),
+        "conditions": trajectory.conditions,
+    }
 
 
 def _read_text(file: Path) -> str:
@@ -225,13 +224,6 @@ def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...
     sent = columns.pop(COMMAND_TIME, None)
     channels = by_channel(columns, joints, len(time))
     enabled = np.nan_to_num(channels.pop("enabled", np.ones((len(time), len(joints)))), nan=1.0) > 0.5
-    jumped = []
-    command, position = channels["command"], channels["position"]
-    for j, joint in enumerate(joints):
-        where = f"{table}: joint {joint!r}"
-        if whole := unwrapped(where, command[:, j], position[:, j], enabled[:, j]):
-            command[:, j], position[:, j] = whole
-            jumped.append(joint)
     return Trajectory(
         file=name,
         excitation=str(entry.get("excitation", Path(name).stem)),
@@ -240,7 +232,6 @@ def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...
         time=time - time[0],
         command_time=None if sent is None else sent - time[0],
         enabled=enabled,
-        unwrapped=tuple(jumped),
         **channels,
     )
 
@@ -329,19 +320,27 @@ def _check_columns(file: Path, names: list[str], joints: tuple[str, ...]) -> dic
     return {name: index for index, name in enumerate(names) if name in wanted}
 
 
-def _write_csv(file: Path, trajectory: Trajectory, joints: tuple[str, ...]) -> None:
-    """The CSV of one trajectory; telemetry that is NaN throughout is left out."""
+def write_table(
+    file: Path, trajectory: Trajectory, joints: tuple[str, ...], channels: Sequence[str] = CHANNELS
+) -> None:
+    """Write the CSV of one trajectory, atomically; telemetry that is NaN throughout is left out.
+
+    Args:
+        file: Where.
+        trajectory: The trajectory.
+        joints: Names of its columns.
+        channels: Which of its arrays to write.
+    """
     columns = {"t": trajectory.time}
     if trajectory.command_time is not None:
         columns[COMMAND_TIME] = trajectory.command_time
-    for channel in CHANNELS:
+    for channel in channels:
         values = getattr(trajectory, channel)
         if values is None or (channel == "enabled" and values.all()):
             continue
-        for j, joint in enumerate(joints):
-            if not np.isnan(np.asarray(values[:, j], dtype=float)).all():
-                columns[f"{channel}.{joint}"] = values[:, j]
-    formats = ["%d" if name.startswith("enabled") else f"%.{CSV_DIGITS}f" for name in columns]
-    table = np.stack([np.asarray(values, dtype=float) for values in columns.values()], axis=1)
+        each = zip(joints, np.asarray(values, dtype=float).T, strict=True)
+        columns |= {f"{channel}.{joint}": column for joint, column in each if not np.isnan(column).all()}
+    formats = ["%d" if name.startswith("enabled") else "%.6f" for name in columns]
+    table, header = np.stack([*columns.values()], axis=1), ",".join(columns)
     with atomic_path(file) as temporary:
-        np.savetxt(temporary, table, formats, ",", header=",".join(columns), comments="")
+        np.savetxt(temporary, table, formats, ",", header=header, comments="")

@@ -8,16 +8,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import correlate, correlation_lags
 
 from vd.gap.motions import Recording, Trajectory
 
 COMMAND_TIME = "t_command"
 """Optional column: when the commands of a row were sent [s], if not at the row's time stamp."""
-TURN = 2.0 * math.pi
 RADIANS = "more than a turn, so these look like degrees or counts; write radians"
 RANGES = {
-    "command": (-1.1 * TURN, 1.1 * TURN, RADIANS),
-    "position": (-1.1 * TURN, 1.1 * TURN, RADIANS),
+    "command": (-1.1 * math.tau, 1.1 * math.tau, RADIANS),
+    "position": (-1.1 * math.tau, 1.1 * math.tau, RADIANS),
     "velocity": (-100.0, 100.0, "no servo is that fast, so these look like rpm or deg/s; write rad/s"),
     "current": (-50.0, 50.0, "no servo draws that much, so these look like mA or counts; write A"),
     "pwm": (-1.0, 1.0, "a duty cycle lies in [-1, 1]; divide by the full scale"),
@@ -28,16 +28,14 @@ RANGES = {
 """Least and largest value that a channel can have, and what one outside looks like. A servo in position mode
 turns once, and a tenth for offsets."""
 MIN_SAMPLES = 20
-"""Samples of a trajectory, and distinct positions, below which no motion or unit can be told from noise."""
-MOVING_COUNTS = 20.0
-"""Encoder counts by which a command must move before the position has to answer, and a step of a position
-that is another unit (degrees are 57 times radians)."""
+"""Samples of a trajectory, and distinct positions, below which no motion or unit can be told from noise.
+Counts by which a command must move before the position has to answer, and of a step that is another unit
+(degrees are 57 times radians)."""
 FEW = 3
 """Encoder counts within which a reading at rest flickers, rows within which an echo of the command comes
 back, samples by which stamps alone may let a position lead."""
 SLOWEST_S = 0.5
-"""Time between samples [s] that shows nothing of a servo (2 ms are 2.0 if written in milliseconds), and the
-longest lead of a position that is looked for: a longer one of a sine may be its next period."""
+"""Time between samples [s] that shows nothing of a servo (2 ms are 2.0 if written in milliseconds)."""
 CLEARLY = 0.5
 """Correlation against its command at which a joint turns the other way: lag alone spares slow motions. What a
 lead must leave of one less the correlation, in that of any lag: luck leaves 0.7."""
@@ -72,17 +70,18 @@ def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
         f"({time[i]:g} s, then {time[i + 1]:g} s); sort the rows and keep one per stamp",
     )
     typical, longest = float(np.median(between)), int(np.argmax(between))
-    require(
-        typical <= SLOWEST_S,
-        f"{file}: column 't': {typical:g} s between samples: these look like milliseconds, and as seconds "
-        "would show nothing of a servo; write seconds",
-    )
+    cut = "in which the motion is not known; cut the file there into two trajectories"
     require(
         between[longest] <= SLOWEST_S,
-        f"{file}: row {longest + 3}, column 't': {between[longest]:.3g} s without a sample, in which the "
-        "motion is not known; cut the file there into two trajectories",
+        f"{file}: row {longest + 3}, column 't': {between[longest]:.3g} s without a sample, "
+        + (cut if typical <= SLOWEST_S else "as everywhere: these look like milliseconds; write seconds"),
     )
-    _check_sent(file, time, columns.get(COMMAND_TIME, time))
+    sent = columns.get(COMMAND_TIME, time)
+    require(
+        float(np.diff(sent).min()) >= 0.0 and abs(float(np.median(sent - time))) <= SLOWEST_S,
+        f"{file}: {COMMAND_TIME!r} runs backward, or is of another unit or clock than 't'; write seconds "
+        "on that clock, in the order of the rows, or drop it",
+    )
     for name, values in columns.items():
         low, high, why = RANGES.get(name.partition(".")[0], (-np.inf, np.inf, ""))
         wrong = (values < low) | (values > high)
@@ -90,60 +89,12 @@ def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
             wrong = ~np.isin(values, (low, high))
         i = int(np.argmax(np.where(wrong, np.abs(values), -1.0)))
         require(not wrong.any(), f"{file}: row {i + 2}, column {name!r}: {values[i]:g}: {why}")
-
-
-def _check_sent(file: Path, time: np.ndarray, sent: np.ndarray) -> None:
-    """Commands went out in the order of the rows, on the clock of the rows."""
-    i = int(np.argmin(np.diff(sent)))
-    require(
-        sent[i + 1] >= sent[i],
-        f"{file}: row {i + 3}, column {COMMAND_TIME!r}: sent before the commands of the row before; commands "
-        "go out in the order of the rows: correct it",
-    )
-    apart, rate = float(np.median(sent - time)), np.ptp(sent) / np.ptp(time)
-    why = f"runs {rate:.3g} times as fast as 't'" if rate > 2.0 else f"is {apart:.3g} s off from 't'"
-    unit = "these look like milliseconds" if rate > 2.0 else "it is of another clock"
-    require(
-        abs(apart) <= SLOWEST_S,
-        f"{file}: column {COMMAND_TIME!r} {why}: {unit}; write seconds on the clock of 't', or drop "
-        "the column",
-    )
-
-
-def unwrapped(
-    where: str, command: np.ndarray, position: np.ndarray, on: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Command and position without jumps by a whole turn, the position beside its command.
-
-    Args:
-        where: File and joint, for the error.
-        command: Commands of the joint [T] [rad].
-        position: Its positions [T] [rad].
-        on: Where its torque is on [T] bool.
-
-    Returns:
-        Both [T], or None where nothing jumps.
-
-    Raises:
-        RecordingError: The commands are wrapped, but their steps are too large to tell the turn.
-    """
-    if not on.any() or np.abs(command - position)[on].max() <= math.pi >= np.abs(np.diff(position)).max():
-        return None
-    whole = np.unwrap(position)
-    whole += TURN * np.round(np.median((command - whole)[on]) / TURN)
-    apart = command - whole
-    near = apart - TURN * np.round(apart / TURN)
-    far = on & (np.abs(apart) > math.pi)
-    # A large step is far from its position for a moment, a wrapped command where it has arrived, too.
-    if far.any() and np.median(np.abs(near[far])) < TURN / 8.0:
+        i = int(np.argmax(np.abs(np.diff(values))))
         require(
-            np.abs(near[on]).max() <= math.pi - TURN / 8.0,
-            f"{where}: the command is wrapped at a turn, and its steps are too large to tell which; "
-            "unwrap it beside the position (numpy.unwrap)",
+            not name.startswith("position.") or abs(values[i + 1] - values[i]) <= math.pi,
+            f"{file}: row {i + 3}, column {name!r} jumps by a turn, as angles wrapped at pi do; unwrap it "
+            "and its command (numpy.unwrap)",
         )
-        apart = near
-    moved = whole - position, apart + whole - command
-    return (whole + apart, whole) if max(np.abs(shift).max() for shift in moved) > math.pi else None
 
 
 def check_motion(recording: Recording) -> None:
@@ -158,7 +109,7 @@ def check_motion(recording: Recording) -> None:
         told = [
             t
             for t in recording.trajectories
-            if np.ptp(t.command[:, j]) > MOVING_COUNTS * count and t.enabled[:, j].all()
+            if np.ptp(t.command[:, j]) > MIN_SAMPLES * count and t.enabled[:, j].all()
         ]
         if not told:
             continue
@@ -192,53 +143,31 @@ def _answer_fault(told: list[Trajectory], j: int, count: float) -> str:
 
 def _lead(t: Trajectory, j: int) -> float:
     """By how much the positions of a joint come before its commands [s]; 0 if they do not, clearly."""
-    step = max(float(np.median(np.diff(t.time))), SLOWEST_S / 100.0)
-    reach = int(SLOWEST_S / step)
+    step = float(np.median(np.diff(t.time)))
     when = np.arange(0.0, t.time[-1], step)
-    if len(when) < 4 * reach:
-        return 0.0
-    c = np.interp(when, t.sent, t.command[:, j])[reach:-reach]
-    p = np.lib.stride_tricks.sliding_window_view(np.interp(when, t.time, t.position[:, j]), len(c))
-    c, p = c - c.mean(), p - p.mean(axis=1, keepdims=True)
-    size = np.linalg.norm(c) * np.linalg.norm(p, axis=1)
-    if not size.all():
-        return 0.0
-    miss = 1.0 - p @ c / size
-    best = int(np.argmin(miss))
-    lead = reach - best
-    return lead * step if lead >= FEW and miss[best] < CLEARLY * miss[reach:].min() else 0.0
+    command, position = np.interp(when, t.sent, t.command[:, j]), np.interp(when, t.time, t.position[:, j])
+    command, position = command - command.mean(), position - position.mean()
+    miss = 1.0 - correlate(command, position) / (np.linalg.norm(command) * np.linalg.norm(position))
+    lead, best = int(correlation_lags(len(when), len(when))[np.argmin(miss)]), miss.min()
+    return lead * step if lead >= FEW and best < CLEARLY * miss[: len(when)].min() else 0.0
 
 
 def check_units(recording: Recording) -> None:
-    """Small motions in degrees show in the size of a count."""
-    for joint, step in _steps(recording).items():
-        require(
-            step <= MOVING_COUNTS * recording.encoder_resolution_rad,
-            f"{recording.path}: column 'position.{joint}' moves in steps of {step:.3g}, but "
-            f"'encoder_resolution_rad' is {recording.encoder_resolution_rad:g}: these look like degrees or "
-            "counts; write radians",
-        )
-
-
-def _steps(recording: Recording) -> dict[str, float]:
-    """Smallest step between two readings of each joint [rad]; of those that have enough to tell."""
-    found = {}
+    """Small motions in degrees show in the size of a count, the least step between two readings."""
+    count = recording.encoder_resolution_rad
     for column, joint in enumerate(recording.joints):
         levels = np.unique(np.concatenate([t.position[:, column] for t in recording.trajectories]).round(6))
-        if len(levels) >= MIN_SAMPLES:
-            found[joint] = float(np.diff(levels).min())
-    return found
+        step = float(np.diff(levels).min()) if len(levels) >= MIN_SAMPLES else 0.0
+        require(
+            step <= MIN_SAMPLES * count,
+            f"{recording.path}: column 'position.{joint}' moves in steps of {step:.3g}, but "
+            f"'encoder_resolution_rad' is {count:g}: these look like degrees or counts; write radians",
+        )
 
 
 def cautions(recording: Recording) -> tuple[str, ...]:
     """Plain sentences about what the recording cannot show well, joints together where they share one."""
     found: list[str] = []
-    jumped = {joint: None for t in recording.trajectories for joint in t.unwrapped}
-    if jumped:
-        found.append(
-            f"Command or position of {', '.join(jumped)} jumped by whole turns, as angles wrapped at pi do: "
-            "they are analysed unwrapped."
-        )
     kinds = {j: {t.excitation for t in recording.trajectories if j in t.joints} for j in recording.joints}
     idle = [joint for joint, names in kinds.items() if not names]
     few = [joint for joint, names in kinds.items() if 0 < len(names) < MIN_KINDS]
@@ -255,11 +184,4 @@ def cautions(recording: Recording) -> tuple[str, ...]:
             f"Samples are {1e3 * between:.0f} ms apart: what a servo does at the beginning of a step is not "
             "resolved; record at 50 Hz or more."
         )
-    for joint, step in _steps(recording).items():
-        if step > 1.5 * recording.encoder_resolution_rad:
-            found.append(
-                f"Positions of {joint} come in steps of {1e3 * step:.3g} mrad, where recording.json says "
-                f"{1e3 * recording.encoder_resolution_rad:.3g}: correct the size of a count, or the noise "
-                "floor may be too low."
-            )
     return tuple(found)

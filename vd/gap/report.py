@@ -16,7 +16,7 @@ from vd.kernels.servo.effects import EFFECTS
 from vd.page import FIGURE_DPI, write_html
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
-FIGURES = ("gap.png", "overlay_*.png", "residual_*.png", "evidence_*.png")
+FIGURES = ("gap.png", "overlay_*.png", "residual_*.png")
 """Those of an earlier analysis go; other motions were drawn."""
 
 _VERDICTS = {
@@ -31,27 +31,23 @@ _DECISIONS = {"named": "accepted: ", "tied": "", "rejected": "rejected: "}
 Row = tuple[str, ...]
 
 
-def write_report(report: Report, curves: Predictions, folder: Path) -> list[Path]:
+def write_report(report: Report, curves: Predictions, folder: Path) -> None:
     """Write ``report.json``, ``report.html`` and the figures.
 
     Args:
         report: What was found.
         curves: What the figures draw.
         folder: Folder to write to.
-
-    Returns:
-        The files written.
     """
     for path in (path for pattern in FIGURES for path in Path(folder).glob(pattern)):
         path.unlink()
-    files = [folder / REPORT_HTML, folder / REPORT_JSON]
-    report.write(files[1])
+    report.write(folder / REPORT_JSON)
 
     def draw(name: str, figure: Figure) -> Path:
-        files.append(folder / f"{name}.png")
-        with atomic_path(files[-1]) as temporary:
+        path = folder / f"{name}.png"
+        with atomic_path(path) as temporary:
             figure.savefig(temporary, dpi=FIGURE_DPI)
-        return files[-1]
+        return path
 
     overlays, residuals = [], {}
     with mpl.rc_context(figures.STYLE):
@@ -100,7 +96,6 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> list[Path
         model=_model(report),
         glossary=[(plain(name), effect.meaning) for name, effect in EFFECTS.items()],
     )
-    return files
 
 
 def _headline(report: Report) -> list[Row]:

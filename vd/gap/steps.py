@@ -1,18 +1,18 @@
 """The steps of ``vd-gap run``, each from files to files, skipped where they have run on the same input.
 
-``DIR/run.json`` keeps the settings, so that a later step needs only ``DIR``, and a digest of what each step
-was made from, so that an interrupted run goes on with the step it was in.
+``DIR/run.json`` keeps a digest of recording, model and settings, and which steps have run on them, so that an
+interrupted run goes on with the step it was in.
 """
 
 import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from vd.config import from_dict, to_dict
 from vd.files import make_folder, write_json
 from vd.gap.recording import BARE_MODELS, Recording, model_path, read_recording
 from vd.gap.result import LAYER, Closing, Predictions, Report
+from vd.kernels.servo.effects import EFFECTS
 from vd.versions import installed_versions
 
 if TYPE_CHECKING:
@@ -43,8 +44,10 @@ _DOES = {
 }
 METHOD = 13
 """Of the analysis; what another one made is made again."""
+NO_EFFECTS = "none"
+"""In place of candidates: identify the drives alone."""
 STEPS = tuple(OUTPUTS)
-_PACKAGES = ("visual-dexterity", "warp-lang", "newton", "cma", "numpy")
+_PACKAGES = ("visual-dexterity", "warp-lang", "newton", "scipy", "numpy")
 
 
 @dataclass(frozen=True)
@@ -58,9 +61,14 @@ class Settings:
     hand_layer: Path | None = None
     """Identified model to start from."""
     effects: tuple[str, ...] = ()
-    """Candidates; empty means all."""
+    """Candidates, or :data:`NO_EFFECTS`; empty means all."""
     seed: int = 0
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        known = (*EFFECTS, NO_EFFECTS)
+        if unknown := [name for name in self.effects if name not in known]:
+            raise ValueError(f"effects: there is no {unknown[0]}; choose from {', '.join(known)}")
 
 
 class Analysis:
@@ -74,31 +82,6 @@ class Analysis:
     def __init__(self, settings: Settings, out: Path):
         self.settings, self.out = settings, Path(out)
 
-    @staticmethod
-    def open(out: Path, changes: Mapping[str, Any]) -> "Analysis":
-        """An analysis of a recording, or the one that has begun in ``out`` where none is named.
-
-        Args:
-            out: Folder of the analysis.
-            changes: Settings by name; None leaves one as it was, or at its default.
-
-        Raises:
-            ValueError: No recording is named, and none is known from before.
-        """
-        path = Path(out) / RUN
-        changes = {name: value for name, value in changes.items() if value is not None}
-        if path.is_file() and "recording" not in changes:
-            try:
-                settings = from_dict(Settings, json.loads(path.read_text())["settings"])
-            except (ValueError, KeyError, TypeError) as error:
-                raise ValueError(f"{path}: not of vd-gap ({error}); delete it and start again") from error
-            return Analysis(replace(settings, **changes), out)
-        if "recording" not in changes:
-            raise ValueError(
-                f"{out}: no analysis has begun here; name the recording: vd-gap run RECORDING --out {out}"
-            )
-        return Analysis(Settings(**changes), out)
-
     @cached_property
     def recording(self) -> Recording:
         """The recording, checked."""
@@ -111,17 +94,15 @@ class Analysis:
         Raises:
             ValueError: A hand is named for a recording of a bare servo or pendulum.
         """
-        model, named = self.recording.model, self.settings.hand
-        if named is not None and model in BARE_MODELS:
-            raise ValueError(
-                f"{self.recording.path} is of a bare {model}, not of {named}: leave out --hand and --model, "
-                "or name the hand as 'model' in recording.json"
-            )
+        recording, named = self.recording, self.settings.hand
+        if recording.model not in BARE_MODELS:
+            return named or model_path(recording.path, recording.model)
         if named is not None:
-            return named
-        if model in BARE_MODELS:
-            return None
-        return model_path(self.recording.path, model)
+            raise ValueError(
+                f"{recording.path} is of a bare {recording.model}, not of {named}: leave out --hand, or name "
+                "the hand as 'model' in recording.json"
+            )
+        return None
 
     @cached_property
     def hand(self) -> "HandModel | None":
@@ -153,147 +134,122 @@ class Analysis:
         rows, _ = read_bare_layer(self.settings.hand_layer, joints)
         return dict(zip(joints, rows, strict=True))
 
-    def run(self, last: str, *, first: str | None = None, fresh: bool = False) -> None:
+    def run(self, last: str, *, first: str = STEPS[0], fresh: bool = False) -> None:
         """Run steps up to ``last``; those that have run on the same input are skipped.
 
         Args:
             last: Name of the last step.
-            first: First step; only what it needs may be there already. None is the very first.
+            first: First step; only what it needs may be there already.
             fresh: Repeat the steps even if nothing has changed.
 
         Raises:
             RecordingError: The recording cannot be used.
-            ValueError: A setting cannot be used, or what an earlier step writes is missing.
+            ValueError: A setting cannot be used, or a step before ``first`` has not run.
         """
-        begin = STEPS.index(first or STEPS[0])
-        for name in STEPS[begin : STEPS.index(last) + 1]:
-            self._step(name, fresh=fresh)
+        for index in range(STEPS.index(first), STEPS.index(last) + 1):
+            name, done = STEPS[index], self._done(STEPS[:index])
+            if name in self._seconds() and not fresh:
+                print(f"{name}: nothing has changed, kept", file=sys.stderr)
+                continue
+            for file in OUTPUTS[name]:  # what was found before is not what an interrupted step finds
+                (self.out / file).unlink(missing_ok=True)
+            self._note(done)
+            print(f"{name}: {_DOES[name]}", file=sys.stderr)
+            began = time.perf_counter()
+            _RUN[name](self)
+            self._note({**done, name: time.perf_counter() - began})
 
-    def _step(self, name: str, *, fresh: bool) -> None:
-        before = STEPS[STEPS.index(name) - 1] if name != STEPS[0] else None
-        for needed in OUTPUTS.get(before or "", ()):
-            self._need(needed, str(before))
-        made_from = self._digest(name)
-        record = self._record()
-        done = record["steps"].get(name, {})
-        files = [self.out / file for file in OUTPUTS[name]]
-        if not fresh and done.get("made_from") == made_from and all(file.is_file() for file in files):
-            print(f"{name}: nothing has changed, kept", file=sys.stderr)
-            return
-        for file in files:  # a step that is interrupted must not look finished
-            file.unlink(missing_ok=True)
-        make_folder(self.out)
-        record["settings"] = to_dict(self.settings)
-        write_json(self.out / RUN, record)
-        print(f"{name}: {_DOES[name]}", file=sys.stderr)
-        began = time.perf_counter()
-        _RUN[name](self)
-        record["steps"][name] = {"made_from": made_from, "seconds": time.perf_counter() - began}
-        write_json(self.out / RUN, record)
-
-    def _need(self, file: str, step: str) -> Path:
-        """A file that a step writes.
+    def _done(self, steps: Sequence[str]) -> dict[str, float]:
+        """Seconds that steps have taken.
 
         Raises:
-            ValueError: It has not run.
+            ValueError: One of them has not run on this input.
         """
-        if not (self.out / file).is_file():
-            raise ValueError(f"{self.out / file} is missing; run vd-gap {step} --out {self.out} first")
-        return self.out / file
+        seconds = self._seconds()
+        if missing := [name for name in steps if name not in seconds]:
+            again = f"vd-gap {missing[0]} {self.settings.recording} --out {self.out}"
+            raise ValueError(f"{self.out} lacks what comes before; run {again} first")
+        return {name: seconds[name] for name in steps}
 
-    def _record(self) -> dict[str, Any]:
-        path = self.out / RUN
-        if path.is_file():
-            try:
-                record = json.loads(path.read_text())
-                return {"settings": record["settings"], "steps": dict(record["steps"])}
-            except (ValueError, KeyError, TypeError):
-                pass  # written by something else, or by hand: start afresh
-        return {"settings": {}, "steps": {}}
+    def _seconds(self) -> dict[str, float]:
+        """Seconds of every step that has run on this input, and whose files are there."""
+        try:
+            record = json.loads((self.out / RUN).read_text())
+            ran = record["steps"].items() if record["made_from"] == self._made_from else ()
+            return {name: s for name, s in ran if all((self.out / f).is_file() for f in OUTPUTS[name])}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return {}  # none, or written by something else: start afresh
 
-    def _digest(self, name: str) -> str:
-        """Of everything a step is made from."""
-        digest = hashlib.sha256(f"{name} {METHOD}".encode())
-        digest.update(json.dumps(to_dict(replace(self.settings, recording=Path()))).encode())
-        recording = self.recording
-        digest.update((recording.path / "recording.json").read_bytes())
-        for trajectory in recording.trajectories:
-            digest.update((recording.path / trajectory.file).read_bytes())
-        for model in (self.hand_name, self.settings.hand_layer):  # the files, where they are some
-            if model is not None and Path(model).is_file():
-                digest.update(Path(model).read_bytes())
-        if name != STEPS[0]:
-            for file in OUTPUTS[STEPS[STEPS.index(name) - 1]]:
-                digest.update((self.out / file).read_bytes())
+    def _note(self, steps: Mapping[str, float]) -> None:
+        make_folder(self.out)
+        write_json(self.out / RUN, {"made_from": self._made_from, "steps": steps})
+
+    @cached_property
+    def _made_from(self) -> str:
+        """Digest of everything that the steps are made from."""
+        settings = to_dict(replace(self.settings, recording=Path()))
+        digest, folder = hashlib.sha256(json.dumps([METHOD, settings]).encode()), self.recording.path
+        files = ["recording.json", *(trajectory.file for trajectory in self.recording.trajectories)]
+        models = [Path(model) for model in (self.hand_name, self.settings.hand_layer) if model is not None]
+        for file in (*(folder / name for name in files), *(model for model in models if model.is_file())):
+            digest.update(file.read_bytes())
         return digest.hexdigest()
 
-    def options(self) -> dict[str, Any]:
-        """Keyword arguments of the steps of :mod:`vd.gap.workflow`."""
-        settings = self.settings
-        options: dict[str, Any] = {"seed": settings.seed, "device": settings.device, "progress": _show}
-        if settings.effects:
-            options["effects"] = settings.effects
-        if self.start:
-            options["start"] = self.start
-        return options
-
     def explained(self) -> Report:
-        """What ``explain`` wrote.
-
-        Raises:
-            ValueError: It has not run.
-        """
-        return Report.read(self._need(EXPLAIN, "explain"))
+        """What ``explain`` wrote."""
+        return Report.read(self.out / EXPLAIN)
 
     def command(self) -> str:
         """The command that repeats the analysis."""
         settings = self.settings
-        words = ["vd-gap run", str(settings.recording), "--out", str(self.out)]
-        for flag, value in (("--hand", settings.hand), ("--hand-layer", settings.hand_layer)):
-            words += [flag, str(value)] if value is not None else []
-        words += ["--effects", ",".join(settings.effects)] if settings.effects else []
-        words += ["--seed", str(settings.seed)] if settings.seed else []
-        words += ["--device", settings.device] if settings.device != "cpu" else []
-        return " ".join(words)
+        device = settings.device if settings.device != "cpu" else ""
+        flags = {
+            "--hand": settings.hand,
+            "--hand-layer": settings.hand_layer,
+            "--effects": ",".join(settings.effects),
+            "--seed": settings.seed,
+            "--device": device,
+        }
+        said = [word for flag, value in flags.items() if value for word in (flag, str(value))]
+        return " ".join(["vd-gap run", str(settings.recording), "--out", str(self.out), *said])
 
 
 def _show(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _find(analysis: Analysis) -> None:
+def _fit(analysis: Analysis, step: str) -> None:
     from vd.gap import workflow
 
-    workflow.find(analysis.recording, analysis.hand, analysis.out, **analysis.options())
-
-
-def _explain(analysis: Analysis) -> None:
-    from vd.gap import workflow
-
-    workflow.explain(analysis.recording, analysis.hand, analysis.out, **analysis.options())
+    settings = analysis.settings
+    getattr(workflow, step)(
+        analysis.recording,
+        analysis.hand,
+        analysis.out,
+        effects=tuple(name for name in settings.effects or EFFECTS if name != NO_EFFECTS),
+        seed=settings.seed,
+        device=settings.device,
+        start=analysis.start,
+        progress=_show,
+    )
 
 
 def _close(analysis: Analysis) -> None:
-    from vd.gap.close import WHOLE_HAND_LAYER, one_finger, simulate_again, write_identified
+    from vd.gap.close import simulate_again, write_identified
     from vd.gap.plan import discard_plan, plan, write_plan
 
-    report, layer = analysis.explained(), analysis.out / LAYER
-    whole = layer.with_name(WHOLE_HAND_LAYER)
-    whole.unlink(missing_ok=True)
-    write_identified(report, layer, analysis.recording, analysis.hand, analysis.start)
-    partly = one_finger(analysis.recording, analysis.hand)
-    if partly:
-        write_identified(report, whole, analysis.recording, analysis.hand, analysis.start, every_finger=True)
+    report = analysis.explained()
+    whole = write_identified(report, analysis.out, analysis.recording, analysis.hand, analysis.start)
     closing, curves = simulate_again(
         report,
-        layer,
+        analysis.out / LAYER,
         analysis.recording,
         analysis.hand_name,
         analysis.settings.hand_layer,
         Predictions.read(analysis.out / CURVES),
         device=analysis.settings.device,
     )
-    closing = replace(closing, whole_hand_layer=whole.name if partly else "")
+    closing = replace(closing, whole_hand_layer=whole)
     curves.write(analysis.out / CLOSING_CURVES)
     discard_plan(analysis.out)
     if report.verdict == "under_excited" or report.open_sets:
@@ -309,17 +265,12 @@ def _report(analysis: Analysis) -> None:
     from vd.gap.recording_checks import cautions
     from vd.gap.report import write_report
 
-    closing = from_dict(Closing, json.loads((analysis.out / CLOSE).read_text()))
-    steps = analysis._record()["steps"]
-    report = analysis.explained()
     planned = analysis.out / PLAN_JSON
     report = replace(
-        report,
-        closing=closing,
-        next_experiment=(
-            json.loads(planned.read_text())["sentence"] if planned.is_file() else report.next_experiment
-        ),
-        seconds=sum(step["seconds"] for step in steps.values()),
+        analysis.explained(),
+        closing=from_dict(Closing, json.loads((analysis.out / CLOSE).read_text())),
+        next_experiment=json.loads(planned.read_text())["sentence"] if planned.is_file() else "",
+        seconds=sum(analysis._seconds().values()),
         hand=analysis.hand_name,
         hand_layer=None if analysis.settings.hand_layer is None else str(analysis.settings.hand_layer),
         warnings=cautions(analysis.recording),
@@ -330,8 +281,8 @@ def _report(analysis: Analysis) -> None:
 
 
 _RUN: dict[str, Callable[[Analysis], None]] = {
-    "find": _find,
-    "explain": _explain,
+    "find": partial(_fit, step="find"),
+    "explain": partial(_fit, step="explain"),
     "close": _close,
     "report": _report,
 }

@@ -48,13 +48,21 @@ def vetoes(recording: Recording, chain: Chain, spec: JointSpec, rows: np.ndarray
         spec: The joint's problem.
         rows: Baseline rows of the chain [n, PARAMETER_COLUMNS].
     """
-    result = {}
-    if reason := _steady_voltage(_excited(recording, chain, spec), int(chain.columns[spec.joint])):
-        result["supply_sag"] = reason
-    reason, late = _plain_duty(recording, chain, spec) if rows[spec.joint, servo.KP] > 0.0 else ("", "")
-    if reason:
-        result |= {name: reason for name in UPSTREAM if name != late}
-    return result
+    parts = [recording.trajectories[i] for i in spec.trajectories]
+    driven = [t for t in parts if chain.joints[spec.joint] in t.joints]
+    steady = _steady_voltage(driven, int(chain.columns[spec.joint]))
+    result = {"supply_sag": steady} if steady else {}
+    if rows[spec.joint, servo.KP] <= 0.0:
+        return result
+    share = _follows(driven, chain, spec.joint)
+    if late := late_side(recording, chain, spec):
+        reason = f"the recorded duty cycle follows the error with a {late.replace('_', ' ')} alone"
+    elif share >= LINEAR:
+        told = f"{100.0 * share:.1f} % of it"
+        reason = f"the recorded duty cycle follows the plain error ({told}): it acts downstream"
+    else:
+        return result
+    return result | {name: reason for name in UPSTREAM if name != late}
 
 
 def late_side(recording: Recording, chain: Chain, spec: JointSpec) -> str:
@@ -79,12 +87,6 @@ def late_side(recording: Recording, chain: Chain, spec: JointSpec) -> str:
     return side if lag >= sample and clear else ""
 
 
-def _excited(recording: Recording, chain: Chain, spec: JointSpec) -> list[Trajectory]:
-    """The joint's trajectories in which it is driven."""
-    parts = [recording.trajectories[i] for i in spec.trajectories]
-    return [t for t in parts if chain.joints[spec.joint] in t.joints]
-
-
 def _told(values: np.ndarray | None, column: int) -> bool:
     """Whether a channel is recorded for a joint."""
     return values is not None and bool(np.isfinite(values[:, column]).all())
@@ -98,22 +100,16 @@ def _follows(
     read_delay: float = 0.0,
 ) -> float:
     """Share of a joint's duty cycle that follows the error if command or reading is that late [s]."""
-    errors, duties, column, reference = (
-        [np.zeros(0)],
-        [np.zeros(0)],
-        chain.columns[joint],
-        chain.reference_p_gain,
-    )
+    pairs, column, reference = [np.zeros((2, 0))], chain.columns[joint], chain.reference_p_gain
     for t in trajectories:
-        if t.pwm is None or not _told(t.pwm, column):
-            continue
-        sent = np.maximum(np.searchsorted(t.sent, t.time - command_delay, side="right") - 1, 0)
-        position = np.interp(t.time + read_delay, t.time, t.position[:, column])
-        gain = float(t.conditions.get("p_gain", reference)) / reference if reference else 1.0
-        used = t.enabled[:, column] & (np.abs(t.pwm[:, column]) < 1.0)
-        errors.append(gain * (t.command[sent, column] - position)[used])
-        duties.append(t.pwm[used, column])
-    error, duty = np.concatenate(errors), np.concatenate(duties)
+        if t.pwm is not None and _told(t.pwm, column):
+            duty = t.pwm[:, column]
+            sent = np.maximum(np.searchsorted(t.sent, t.time - command_delay, side="right") - 1, 0)
+            position = np.interp(t.time + read_delay, t.time, t.position[:, column])
+            gain = float(t.conditions.get("p_gain", reference)) / reference if reference else 1.0
+            used = t.enabled[:, column] & (np.abs(duty) < 1.0)
+            pairs.append(np.array([gain * (t.command[sent, column] - position), duty])[:, used])
+    error, duty = np.concatenate(pairs, axis=1)
     if len(error) < MIN_SAMPLES:
         return 0.0
     slope = float(error @ duty) / max(float(error @ error), 1e-300)
@@ -122,14 +118,13 @@ def _follows(
 
 def _steady_voltage(trajectories: list[Trajectory], column: int) -> str:
     """Why the voltage speaks against a sagging supply, or nothing."""
-    volts, pulls = [np.zeros(0)], [np.zeros(0)]
+    pairs = [np.zeros((2, 0))]
     for t in trajectories:
         if t.voltage is not None and _told(t.voltage, column):
-            on, pull = t.enabled[:, column], t.command - t.position
-            pull = t.pwm if t.pwm is not None and _told(t.pwm, column) else pull
-            volts.append(t.voltage[on, column])
-            pulls.append(np.abs(pull[on, column]))
-    volt, pull = np.concatenate(volts), np.concatenate(pulls)
+            pull = t.pwm if t.pwm is not None and _told(t.pwm, column) else t.command - t.position
+            on = t.enabled[:, column]
+            pairs.append(np.array([np.abs(pull[on, column]), t.voltage[on, column]]))
+    pull, volt = np.concatenate(pairs, axis=1)
     if len(volt) < MIN_SAMPLES:
         return ""
     slope, idle = np.polyfit(pull, volt, 1)
@@ -137,14 +132,3 @@ def _steady_voltage(trajectories: list[Trajectory], column: int) -> str:
     if fall >= SAG_NEEDED * idle:
         return ""
     return f"the recorded voltage falls by {fall:.2f} V of {idle:.1f} V at full pull, too little for sag"
-
-
-def _plain_duty(recording: Recording, chain: Chain, spec: JointSpec) -> tuple[str, str]:
-    """Why the duty cycle speaks against anything between command and controller, and but for which delay."""
-    if late := late_side(recording, chain, spec):
-        return f"the recorded duty cycle follows the error with a {late.replace('_', ' ')} alone", late
-    share = _follows(_excited(recording, chain, spec), chain, spec.joint)
-    text = (
-        f"the recorded duty cycle follows the plain error ({100.0 * share:.1f} % of it): it acts downstream"
-    )
-    return (text, "") if share >= LINEAR else ("", "")

@@ -69,10 +69,13 @@ def estimate(one: Estimate) -> str:
     return f"{value} {shown}".strip() + f" (95 %: {low} to {high})"
 
 
-def effect_sentence(effect: NamedEffect) -> str:
-    """``command delay on f0_j1 (40.2 ms)``."""
-    sizes = ", ".join(amount(p.value, p.unit) for p in effect.parameters.values())
-    return f"{plain(effect.name)} on {joints_text(effect.joints)}" + (f" ({sizes})" if sizes else "")
+def effects_sentence(effects: Iterable[NamedEffect]) -> str:
+    """``backlash on f0_j1 (40 mrad), f0_j2 (12 mrad) and dead zone on f0_j3 (8 mrad)``: each name once."""
+    places: dict[str, list[str]] = {}
+    for effect in effects:
+        sizes = ", ".join(amount(p.value, p.unit) for p in effect.parameters.values())
+        places.setdefault(effect.name, []).append(f"{joints_text(effect.joints)} ({sizes})")
+    return listing(f"{plain(name)} on {', '.join(where)}" for name, where in places.items())
 
 
 def verdict_sentence(report: Report) -> str:
@@ -81,12 +84,13 @@ def verdict_sentence(report: Report) -> str:
     sizes = f"{before} on motions that the fit has not seen, against a noise floor of "
     sizes += mrad(report.noise_floor_rad)
     if report.verdict == "effects":
-        missing = listing(map(effect_sentence, report.effects))
-        return f"The simulation lacks {missing}. {_shrinks(report)}{_besides(report)}"
+        return (
+            f"The simulation lacks {effects_sentence(report.effects)}. {_shrinks(report)}{_besides(report)}"
+        )
     if report.verdict == "ambiguous":
         text = f"There is a gap: {sizes}. {_leaves(report)}"
         if report.provisional:
-            text += f" With {listing(map(effect_sentence, report.provisional))} it falls to {after}."
+            text += f" With {effects_sentence(report.provisional)} it falls to {after}."
         return text
     if report.verdict == "no_gap":
         model = "plain servo model" if report.hand_layer is None else f"model in {report.hand_layer}"
@@ -99,18 +103,15 @@ def verdict_sentence(report: Report) -> str:
             "No verdict on effects: the motions in this recording do not determine the model. Different "
             "parameters fit equally well."
         )
-    return (
-        f"There is a gap: {sizes}. No effect that is known here explains it; its cause is not in the table."
-    )
+    return f"There is a gap: {sizes}. No effect that was tried explains it."
 
 
 def _shrinks(report: Report) -> str:
-    held = report.held_out
+    held, names = report.held_out, {one.name for one in report.effects}
     return (
-        f"With {'it' if len(report.effects) == 1 else 'them'} the error on motions that the fit has not seen "
-        f"falls from {mrad(held.baseline_rmse_rad)} to {mrad(held.identified_rmse_rad)} "
-        f"({percent(held.reduction)} less, 95 %: {percent_range(held.ci95)}); the noise floor is "
-        f"{mrad(report.noise_floor_rad)}."
+        f"With {'it' if len(names) == 1 else 'them'} the error on motions that the fit has not seen falls "
+        f"from {mrad(held.baseline_rmse_rad)} to {mrad(held.identified_rmse_rad)} ({percent(held.reduction)} "
+        f"less, 95 %: {percent_range(held.ci95)}); the noise floor is {mrad(report.noise_floor_rad)}."
     )
 
 
@@ -134,7 +135,9 @@ def _besides(report: Report) -> str:
 def _leaves(report: Report) -> str:
     """Which causes are still possible."""
     if len(report.open_sets) == 1:
-        return f"It is {causes(report.open_sets[0])}; this recording cannot say which."
+        (group,) = report.open_sets
+        where = f" on {_undecided(report, group)}" if len(report.joints) > 1 else ""
+        return f"It is {causes(group)}{where}; this recording cannot say which."
     return f"This recording leaves {len(report.open_sets)} sets of causes, listed under what to do next."
 
 
@@ -149,7 +152,7 @@ def next_step(report: Report) -> str:
     layer = training_layer(report)
     use = "identified.usda has the servo's model, with every effect by name."
     if report.hand is not None:
-        use = f"Use the identified model: pass {layer} with --hand-layer to vd-train, vd-eval and vd-play."
+        use = f"vd-train adapt POLICY --hand-layer {layer} goes on in it; vd-eval and vd-play take it too."
     return (
         f"Nothing is open. {use} To confirm that the gap is closed, run vd-gap on a new recording with "
         f"--hand-layer {LAYER}."
@@ -164,11 +167,12 @@ def training_layer(report: Report) -> str:
 
 def open_questions(report: Report) -> list[str]:
     """What is left open, joints with the same set together: ``f0_j1: backlash or dead zone``."""
-    return [
-        joints_text([joint.joint for joint in report.joints if {*group} in map(set, joint.open_sets)])
-        + f": {causes(group)}"
-        for group in report.open_sets
-    ]
+    return [f"{_undecided(report, group)}: {causes(group)}" for group in report.open_sets]
+
+
+def _undecided(report: Report, group: tuple[str, ...]) -> str:
+    """The joints that leave a set open."""
+    return joints_text([one.joint for one in report.joints if {*group} in map(set, one.open_sets)])
 
 
 def _size(value: float, unit: str) -> tuple[float, str]:

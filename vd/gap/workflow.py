@@ -6,7 +6,6 @@ effects (``DIR/explain.json``, ``DIR/predictions.npz``).
 
 import json
 import os
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -56,11 +55,6 @@ class Options:
     start: Mapping[str, np.ndarray] = field(default_factory=dict)
     progress: Progress = lambda line: None
 
-    def __post_init__(self) -> None:
-        unknown = sorted(set(self.effects) - set(EFFECTS))
-        if unknown:
-            raise ValueError(f"no effects are called {', '.join(unknown)}; choose from {', '.join(EFFECTS)}")
-
 
 def find(recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any) -> list[Finding]:
     """Identify the baseline of every excited joint, and say where it and the measurement disagree.
@@ -76,21 +70,20 @@ def find(recording: Recording | Path, hand: HandModel | None, out: Path, **optio
 
     Raises:
         RecordingError: The recording cannot be used.
-        ValueError: An unknown effect, or a recording that is not of this hand.
+        ValueError: A recording that is not of this hand.
     """
-    chosen, begin = Options(**options), time.perf_counter()
+    chosen = Options(**options)
     pool, specs = _workers(recording, hand, chosen)
     with pool:
         recording = pool.problems.recording
         joints = _identify(pool, specs, chosen)
-        predicted = curves(recording, pool.problems, [(j.name, j.spec, j.fit.rows) for j in joints])
+        predicted = curves(recording, pool.problems, [(j.spec, j.fit.rows) for j in joints])
         found = findings(recording, predicted, {j.name: j.spec.floor for j in joints})
         value = {
             "format": FIND_FORMAT,
             "findings": [asdict(f) for f in found],
             "joints": {j.name: {"rows": j.fit.rows.tolist(), "rmse_rad": j.fit.rmse} for j in joints},
             "simulated": pool.simulated,
-            "seconds": time.perf_counter() - begin,
         }
         write_json(Path(out) / "find.json", value)
     chosen.progress(f"find: {pool.simulated} motions simulated")
@@ -113,13 +106,12 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
 
     Raises:
         RecordingError: The recording cannot be used.
-        ValueError: An unknown effect, or a recording that is not of this hand.
+        ValueError: A recording that is not of this hand.
     """
     chosen, out = Options(**options), Path(out)
     if not (out / "find.json").is_file():
         find(recording, hand, out, **options)
     known = json.loads((out / "find.json").read_text())
-    begin = time.perf_counter()
     pool, specs = _workers(recording, hand, chosen)
     with pool:
         recording = pool.problems.recording
@@ -129,21 +121,19 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
             Analysed(j.name, j.spec, replace(e, baseline=j.fit))
             for j, e in zip(joints, explained, strict=True)
         ]
-        seconds = known["seconds"] + time.perf_counter() - begin
         report, predictions = assemble(
             recording,
             pool.problems,
             analysed,
             [Finding(**f) for f in known["findings"]],
             seed=chosen.seed,
-            seconds=seconds,
             simulated=known["simulated"] + pool.simulated,
         )
         source = replace(report.recording, relative_torques=relative_torques(recording))
         report = replace(report, recording=source)
         predictions.write(out / "predictions.npz")
         report.write(out / "explain.json")
-    chosen.progress(f"explain: {report.verdict} after {seconds:.0f} s, {pool.simulated} motions simulated")
+    chosen.progress(f"explain: {report.verdict} after {pool.simulated} motions simulated")
     return report
 
 
@@ -152,33 +142,20 @@ def _workers(
 ) -> tuple[WorkerPool, list[JointSpec]]:
     """Who fits, and the problems of all excited joints."""
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
-    parts = [_started(chain, options.start) for chain in chains(recording, hand)]
-    specs = _specs(recording, parts)
+    parts, specs = [], []
+    for index, chain in enumerate(chains(recording, hand)):
+        rows = [options.start.get(name, row) for name, row in zip(chain.joints, chain.start_row, strict=True)]
+        parts.append(replace(chain, start_row=np.array(rows, dtype=float)))
+        for joint, column in enumerate(chain.columns):
+            trajectories, folds = design(recording, chain, joint)
+            if trajectories:
+                floor, analysed = noise_floor(recording, int(column)), pieces(recording, chain, trajectories)
+                free = baseline_of(chain)
+                specs.append(JointSpec(index, joint, trajectories, folds, floor, free, analysed))
     # A recording so long that pieces of it are analysed would take minutes a joint with the usual step.
     dt = STEP_S * (2.0 if any(spec.pieces for spec in specs) else 1.0)
     cores = len(os.sched_getaffinity(0)) if options.device == "cpu" else 1
     return WorkerPool(Problems(recording, parts, dt, options.device), options.workers or cores), specs
-
-
-def _started(chain: Chain, start: Mapping[str, np.ndarray]) -> Chain:
-    """The chain with the joints of an identified model as they were identified."""
-    rows = [start.get(joint, row) for joint, row in zip(chain.joints, chain.start_row, strict=True)]
-    return replace(chain, start_row=np.array(rows, dtype=float))
-
-
-def _specs(recording: Recording, parts: Sequence[Chain]) -> list[JointSpec]:
-    """The problems of all excited joints."""
-    specs = []
-    for index, chain in enumerate(parts):
-        for joint in range(len(chain.joints)):
-            trajectories, folds = design(recording, chain, joint)
-            if trajectories:
-                floor = noise_floor(recording, int(chain.columns[joint]))
-                analysed = pieces(recording, chain, trajectories)
-                specs.append(
-                    JointSpec(index, joint, trajectories, folds, floor, baseline_of(chain), analysed)
-                )
-    return specs
 
 
 def baseline_of(chain: Chain) -> tuple[str, ...]:
@@ -225,8 +202,7 @@ def _resume(pool: WorkerPool, specs: Sequence[JointSpec], known: dict[str, Any])
         found = known[pool.problems.chains[spec.chain].joints[spec.joint]]
         rows = np.array(found["rows"])
         scales = _scales(pool, spec, rows, found["rmse_rad"])
-        joint = _fitted(pool, spec, rows, scales, iterations=1)
-        return replace(joint, scales=scales)
+        return replace(_fitted(pool, spec, rows, scales, iterations=1), scales=scales)
 
     return parallel(one, specs)
 
