@@ -15,6 +15,7 @@ from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import noise_floor
 from vd.gap.workflow import baseline_of
+from vd.kernels.servo.effects import EFFECTS
 
 ENCODER_COUNT = 2.0 * np.pi / 4096
 TRUE = {servo.KP: 3.0, servo.KD: 0.25, servo.VELOCITY_LIMIT: 7.0, servo.INERTIA: 2.5e-3}
@@ -83,15 +84,16 @@ def problem_of(recording: Recording) -> JointProblem:
 def made_up(effects: tuple[str, ...], errors: np.ndarray | float, fitted: float | None = None) -> JointFit:
     """A fit with given held-out RMSE of each trajectory, and on what was fitted [rad]."""
     held_out = COUNT * np.broadcast_to(errors, COUNT.shape) ** 2
-    size = 3 + len(effects)
+    keys = ["p0", "p1", "p2", *(f"{name}.{EFFECTS[name].parameters[0].name}" for name in effects)]
+    size = len(keys)
     return JointFit(
         effects=effects,
-        coordinates=tuple(Coordinate(f"p{i}", i, False, 1.0, -9.0, 9.0) for i in range(size)),
-        x=np.zeros(size),
+        coordinates=tuple(Coordinate(key, i, False, 1.0, -9.0, 9.0) for i, key in enumerate(keys)),
+        x=np.array([float("." in key) for key in keys]),
         rows=np.zeros((1, servo.PARAMETER_COLUMNS)),
         sse=held_out if fitted is None else COUNT * fitted**2,
         held_out=held_out,
         count=COUNT,
-        gram=np.tile(np.eye(size), (10, 1, 1)),
-        gradient=np.zeros((10, size)),
+        gram=10.0 * np.eye(size),
+        refits=np.zeros((2, size)),
     )

@@ -149,14 +149,13 @@ def test_the_evidence_has_every_effect_also_what_was_not_fitted(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_an_acceleration_limit_that_cannot_follow_is_named(tmp_path: Path) -> None:
-    """It lets errors of the clock grow, so that the right model leaves noise on weighted samples only."""
-    recording, said = hidden(acceleration_limit={"a_max_rad_s2": 10.0}), []
+    """It lets small errors grow, so that the right model leaves more than noise."""
+    recording = hidden(acceleration_limit={"a_max_rad_s2": 10.0})
     tried = ("acceleration_limit", "command_delay", "coulomb_friction", "torque_saturation")
-    report = analysed(recording, tmp_path / "gap", effects=tried, progress=said.append)
+    report = analysed(recording, tmp_path / "gap", effects=tried)
     assert report.verdict == "effects" and named(report) == {"acceleration_limit"}
     (estimate,) = report.effects[0].parameters.values()
     assert estimate.value == pytest.approx(10.0, rel=0.01)
-    assert sum("errors of the clock grow" in line for line in said) == 1
 
 
 @pytest.mark.slow

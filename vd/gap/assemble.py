@@ -27,7 +27,7 @@ from vd.gap.result import (
     parameters_of,
 )
 from vd.gap.rollout import Rollouts
-from vd.gap.statistics import interval, resamples, rmse
+from vd.gap.statistics import half_width, interval, resamples, rmse
 from vd.gap.worker_pool import JointSpec, Problems
 from vd.kernels.servo.effects import EFFECTS
 
@@ -253,9 +253,9 @@ def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
         weight = np.maximum(0.5 * (highs - lows), 1e-12) ** -2
         weight /= weight.sum()
         value = float(weight @ values)
-        # No narrower than the joints' own values lie apart from the pooled one.
-        apart = 2.0 * np.sqrt(weight @ (values - value) ** 2 / max(len(every) - 1, 1))
-        below, above = (max(np.linalg.norm(weight * d), apart) for d in (values - lows, highs - values))
+        # No narrower than the joints' own, whose errors are one model's, nor than their values lie apart.
+        apart = half_width(weight @ (values - value) ** 2 / max(len(every) - 1, 1), len(every))
+        below, above = (float(np.maximum(weight @ d, apart)) for d in (values - lows, highs - values))
         low = max(value - below, -np.inf if known[key].signed else 0.0)
         parameters[key] = Estimate(value, (float(low), float(value + above)), known[key].unit)
     return NamedEffect(

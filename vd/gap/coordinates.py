@@ -9,7 +9,7 @@ import numpy as np
 import vd.kernels.servo.actuators as servo
 from vd.kernels.servo.effects import BASELINE, EFFECTS, Parameter
 
-GRAVITY = EFFECTS["gravity_load"].parameters[0]
+GRAVITY, _ = EFFECTS["gravity_load"].parameters
 BASELINE_PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAVITY)}
 """Everything that a baseline can fit, by name."""
 
@@ -29,13 +29,6 @@ LIGHT = 0.1
 """An inertia that does none of it, in fitted ones."""
 FREE_SPEED = 3.0
 """A speed limit that does not bind, in largest speeds."""
-SLOW_RESONANCES = tuple(0.2 * 1.2**i for i in range(10))
-"""Frequencies of a second mass on its spring, in that of the drive with the joint. The valley of one that is
-hardly damped is some 15 % wide to either side, and from farther off a descent damps it until it is gone."""
-RINGING_MASS, RINGING_DAMPING = 0.5, 0.04
-"""Its inertia, in the joint's, and its damping ratio at these starts; from 0.1 a descent can end at more."""
-FLATTEST = 1e-3
-"""Scale of angles at least [rad], if the residual is smaller."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +141,7 @@ def _scale(parameter: Parameter, scales: Scales) -> float:
     if parameter.unit == "N m":
         return max(0.3 * scales.torque, 1e-4)
     if parameter.column in (servo.BACKLASH_WIDTH, servo.DEAD_ZONE_WIDTH, servo.ENCODER_BIAS):
-        return max(scales.residual, FLATTEST)
+        return scales.residual
     if parameter.column == servo.OFF_DAMPING:
         return 0.1 * max(scales.torque, 1e-4) / scales.speed
     if parameter.column == servo.SUPPLY_SAG:
@@ -164,17 +157,6 @@ def _scale(parameter: Parameter, scales: Scales) -> float:
     return parameter.typical if parameter.typical > 0.0 else 1.0
 
 
-def _resonance(share: float, scales: Scales) -> dict[str, float]:
-    """A second mass that rings at a share of the frequency of the drive with the joint."""
-    inertia = RINGING_MASS * scales.inertia
-    frequency = share * np.sqrt(scales.kp / scales.inertia)
-    return {
-        "k_nm_rad": inertia * frequency**2,
-        "c_nms_rad": 2.0 * RINGING_DAMPING * inertia * frequency,
-        "j_kgm2": inertia,
-    }
-
-
 def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, float]]:
     """Starting values of an effect's parameters, by key, from small to large.
 
@@ -184,7 +166,7 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         scales: Sizes of the joint's motion.
     """
     torque, peak, speed = scales.torque, scales.peak, scales.speed
-    small = max(scales.residual, FLATTEST)
+    small = scales.residual
     period = SECONDS_SCALE
     table: dict[str, list[dict[str, float]]] = {
         "command_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],
@@ -227,8 +209,7 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
                 "j_kgm2": g * scales.inertia,
             }
             for f, g in ((0.3, 0.3), (0.3, 0.6), (1.0, 0.3), (1.0, 1.0), (3.0, 0.3), (3.0, 2.0))
-        ]
-        + [_resonance(f, scales) for f in SLOW_RESONANCES],
+        ],
         "joint_coupling": [
             {f"from_{slot + 1}": f if slot == other else 0.0 for slot in others}
             for other in others

@@ -28,19 +28,19 @@ class LeastSquares:
         coordinates: The P coordinates.
         residuals: Simulates.
         ridge: Pull of the coordinates to their start [rad^2].
-        slopes: Simulates for Jacobians, if they may come from a coarser simulation.
+        slopes: Simulates for Jacobians, which may come from a coarser simulation.
     """
 
     coordinates: Sequence[Coordinate]
     residuals: Residuals
     ridge: float
-    slopes: Residuals | None = None
+    slopes: Residuals
 
     def jacobian(self, x: np.ndarray, keep: np.ndarray | None = None, widen: float = 1.0) -> np.ndarray:
         """d(predicted)/dx [P, N] at coordinates [P] by one-sided differences, their steps times a factor."""
         steps = np.array([c.step(v, widen) for c, v in zip(self.coordinates, x, strict=True)])
         moved = np.vstack([x, x + np.diag(steps)])
-        answers = (self.residuals if self.slopes is None else self.slopes)(moved, keep)
+        answers = self.slopes(moved, keep)
         return (answers[0] - answers[1:]) / steps[:, None]
 
     def descend(
@@ -80,7 +80,6 @@ class LeastSquares:
             bounds=(lower, upper),
             x_scale=scale,
             ftol=TOLERANCE,
-            xtol=1e-6,
             gtol=None,
             max_nfev=iterations,
         )

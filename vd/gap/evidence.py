@@ -10,70 +10,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 import vd.kernels.servo.actuators as servo
-from vd.gap.explanation import NAMED, Accepted, Explanation, Trial, estimates, intervals
-from vd.gap.fit import RIDGE
+from vd.gap.explanation import NAMED, OWN_ERROR, Accepted, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import DRY, ONE_SIDED, JointFit
-from vd.gap.recording import Recording
-from vd.gap.statistics import covariance, half_width, interval, rmse
+from vd.gap.statistics import interval, rmse
 from vd.kernels.servo.effects import BESIDE, TOGETHER
-
-LEVELS = {
-    "coulomb_friction": ("tau_c_nm",),
-    "stribeck_friction": ("tau_s_nm", "tau_c_nm"),
-    "asymmetric_friction": ("tau_plus_nm", "tau_minus_nm"),
-    "load_friction": ("k_load",),
-}
-"""Parameters of each friction that change together."""
-LEAST = 0.2
-"""Change over a recording, as a share of the friction, that is more than a model may miss."""
-SURE = 2.0
-"""Half widths of its 95 % interval that it is from 0 at least: all frictions of all joints are looked at."""
-
-
-def middles(recording: Recording) -> np.ndarray:
-    """When each trajectory was half way, if they followed each other as they are listed [T] [s]."""
-    lengths = np.array([float(trajectory.time[-1]) for trajectory in recording.trajectories])
-    return np.cumsum(lengths) - 0.5 * lengths
-
-
-def change(fit: JointFit, friction: str, when: np.ndarray, floor: float) -> tuple[float, float]:
-    """Change of a friction from the first motion to the last, as a share of it, and half its 95 % interval.
-
-    To first order, from the matrices of the fit: a further coordinate scales the friction in proportion to
-    the time, and the others are readjusted.
-
-    Args:
-        fit: The model.
-        friction: One of its effects.
-        when: Time of each trajectory [S] [s].
-        floor: Noise floor [rad].
-    """
-    keys = {f"{friction}.{name}" for name in LEVELS[friction]}
-    slope = [
-        (1.0 if c.log else float(x)) if c.key in keys else 0.0
-        for c, x in zip(fit.coordinates, fit.x, strict=True)
-    ]
-    size = len(slope)
-    basis = np.zeros((len(when), size, size + 1))
-    basis[:, :, :size] = np.eye(size)
-    basis[:, :, size] = ((when - when.mean()) / max(float(np.ptp(when)), 1e-9))[:, None] * slope
-    gram = np.einsum("spa,spq,sqb->sab", basis, fit.gram, basis)
-    gradient = np.einsum("spa,sp->sa", basis, fit.gradient)
-    ridge = np.full(size + 1, RIDGE * floor**2)
-    share = np.linalg.solve(gram.sum(0) + np.diag(ridge), gradient.sum(0))[size]
-    width = half_width(np.diag(covariance(gram, gradient, ridge, floor)), len(when))[size]
-    return float(share), float(width)
-
-
-def warming(fit: JointFit, when: np.ndarray, floor: float) -> str:
-    """Which friction of a model is sure to change over the recording, in words; empty if none is."""
-    for name in (effect for effect in fit.effects if effect in LEVELS):
-        share, width = change(fit, name, when, floor)
-        if abs(share) - width > LEAST and abs(share) > SURE * width:
-            way = "falls" if share < 0.0 else "rises"
-            return f"{name} {way} over the recording by {100.0 * abs(share):.0f} % of its mean"
-    return ""
-
 
 NESTED = {
     "stribeck_friction": ("coulomb_friction",),
@@ -93,9 +33,6 @@ JITTER_GAIN_FLOORS = 0.3
 """The same beside random delays: an effect of six floors leaves half of one there."""
 MEMORY = 8.0
 """Samples in a row that say the same beside them: what a late command does lasts that long."""
-MIN_SHARE = 0.02
-"""The same in whole gaps: no fit of a large effect is better than that. Of a friction of 97 noise floors a
-second effect came with a share of 0.015 that was not there."""
 PENALTY = 0.01
 """Relative RMSE that a further parameter must earn to be preferred."""
 EXCESS_FLOORS = 0.07
@@ -112,8 +49,6 @@ JITTER = "command_jitter"
 """The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
 
 
-UNEXPLAINED = 1.5
-"""A baseline beyond this factor of the noise floor has a gap, whether or not an effect explains it."""
 CANCELLING = ("gravity_load", "encoder_bias")
 """Effects that hold a joint off its command at rest. Where they cancel there, they are no two causes but one
 that pulls with the travel from there, a spring, which the table has not."""
@@ -121,8 +56,6 @@ CANCELLED = 0.1
 """Share of either that is left where they cancel; by luck they do so in a few of a hundred machines."""
 DETERMINED = ("kp", "kd", "inertia")
 """Baseline parameters that every useful excitation determines."""
-WIDE = 10.0
-"""Ratio of the ends of an interval from which a parameter counts as open."""
 
 
 @dataclass(kw_only=True)
@@ -130,24 +63,27 @@ class Evidence:
     """Compares fits of one joint, and judges the last.
 
     Attributes:
-        floor: Noise floor [rad].
+        noise: Noise floor of the recording [rad].
         weights: Bootstrap weights of the trajectories [R, S].
-        whole: Held-out RMSE of the plain model [rad]; what is small beside it is a model's own error.
+        whole: Held-out RMSE of the plain model [rad].
         moves: Whether the joint's command changes, of each trajectory [S]; None: in all.
         behind_jitter: Whether samples are weighted by what random delays do (:mod:`vd.gap.joint_fit`).
         equivalent: Effects that one stands for, since the recording cannot tell them apart.
         joint: Index of the joint in its chain.
-        when: Time of each trajectory [S] [s]; None where it is not known.
     """
 
-    floor: float
+    noise: float
     weights: np.ndarray
     whole: float = 0.0
     moves: np.ndarray | None = None
     behind_jitter: bool = False
     equivalent: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     joint: int = 0
-    when: np.ndarray | None = None
+
+    @property
+    def floor(self) -> float:
+        """The least error that a right model can have [rad]: noise, and what it misses of a large effect."""
+        return float(np.hypot(self.noise, OWN_ERROR * self.whole))
 
     def white(self, fit: JointFit) -> bool:
         """Whether samples tell how good a fit is: it leaves no more than noise, or jitter, on all of them."""
@@ -213,8 +149,6 @@ class Evidence:
             return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
         if float(np.quantile(1.0 - new / old, tail)) <= 0.0:
             return False, "its gain over trajectories is not distinguishable from 0"
-        if closed < MIN_SHARE * self.whole and not white:
-            return False, "what it removes is small beside the whole gap"
         if closed < (JITTER_GAIN_FLOORS if self.behind_jitter else MIN_GAIN_FLOORS) * self.floor:
             return False, "what it removes is below the noise floor"
         return True, ""
@@ -231,8 +165,8 @@ class Evidence:
             before: The model without them.
             after: The model with them.
         """
-        power = before.sse / after.count / self.floor**2
-        widths = self.floor**2 * np.where(power < 1.0, np.exp(np.minimum(power, 1.0) - 1.0), power)
+        power = before.sse / after.count / self.noise**2
+        widths = self.noise**2 * np.where(power < 1.0, np.exp(np.minimum(power, 1.0) - 1.0), power)
         count = after.count if self.moves is None else after.count * self.moves
         ratio = np.maximum(widths * after.count, 1e-30) / np.maximum(after.sse, 1e-30)
         gained = 0.5 * count * np.log(ratio)
@@ -271,7 +205,7 @@ class Evidence:
     def undetermined(self, fit: JointFit) -> str:
         """Which parameter of the baseline the motions leave open, in words; empty if none."""
         for key, (low, high) in intervals(fit, self.floor).items():
-            if key in DETERMINED and high > WIDE * low:
+            if key in DETERMINED and high > np.e**2 * low:  # as of a limit that is not shown
                 return f"{key} can lie anywhere between {low:.2g} and {high:.2g}: the motions do not show it"
         return ""
 
@@ -323,27 +257,17 @@ class Evidence:
         if share < RECOVERED and JITTER not in final.effects:
             text = f"the best candidate recovers {100.0 * share:.0f} % of the squared gap, less than half"
             return replace(explanation, reason=text)
-        warms = self.warms(told)
-        if warms:
-            text = f"{warms}: the cause is a friction that changes, as with temperature"
-            return replace(explanation, warms=True, reason=text)
         return _by_names(explanation)
 
     def nothing_earned(self, explanation: Explanation, loose: str) -> Explanation:
         """The verdict where no effect earned its place."""
         tried = [t for t in explanation.trials if not t.placebo and np.isfinite(t.gain)]
         why = tried[0].reason if tried else "there is no candidate"
-        if explanation.baseline.held_out_rmse > UNEXPLAINED * self.floor:
+        if explanation.baseline.held_out_rmse > REPEATABLE * self.floor:
             return replace(explanation, reason=f"a gap that no candidate explains: the best {why}")
         if loose:
             return replace(explanation, verdict="under_excited", reason=loose)
         return replace(explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}")
-
-    def warms(self, fit: JointFit) -> str:
-        """Which friction of a model near the floor changes over the recording, in words, or nothing."""
-        if self.when is None or self.behind_jitter or fit.rmse > REPEATABLE * self.floor:
-            return ""
-        return warming(fit, self.when, self.floor)
 
     def accept(
         self,

@@ -2,16 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from vd.gap.chain import candidates, others_in
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.evidence import JITTER, NO_GAP, cancelled, middles
+from vd.gap.evidence import JITTER, NO_GAP, cancelled
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.jitter_search import FIXED, try_jitter
-from vd.gap.joint_fit import JointFit, SampleWeighting
+from vd.gap.joint_fit import JointFit
 from vd.gap.search import MAX_ROUNDS, Search, alike, stood_for
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import BEHIND_SENSOR, vetoes
@@ -19,8 +18,6 @@ from vd.gap.worker_pool import JointSpec, WorkerPool
 from vd.kernels.servo.effects import EFFECTS
 
 MIN_TRAJECTORIES = 3
-WEIGHTED = "where errors of the recording's clock grow, samples count by how surely they are known"
-"""What a reason says of it."""
 
 
 def explain(search: Search, baseline: JointFit) -> Explanation:
@@ -33,12 +30,8 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
     loose, search.whole = search.undetermined(baseline), baseline.held_out_rmse
     if nothing := _nothing_to_explain(search, baseline, loose):
         return nothing
-    if weighting := search.clock_sensitivity(baseline):  # with an identified limit in it
-        return _explain_weighted(search, baseline, weighting)
     present, rows = search.search(baseline)
     trials = [*search.contradicted(baseline), *rows]
-    if weighting := search.clock_sensitivity(present):
-        return _explain_weighted(search, baseline, weighting)
     if present.effects:
         earned, why = search.better(baseline, present)
         if not earned:
@@ -66,14 +59,6 @@ def _nothing_to_explain(search: Search, baseline: JointFit, loose: str) -> Expla
         return None
     text = "the plain model is within the noise floor"
     return Explanation(baseline, baseline, "under_excited" if loose else "no_gap", loose or text)
-
-
-def _explain_weighted(search: Search, baseline: JointFit, weighting: SampleWeighting) -> Explanation:
-    """What a search finds with samples weighted by how surely they are known, which says so."""
-    search.report("errors of the clock grow: samples are weighted by how surely they are known")
-    inner = search.weighted(weighting, clocked=True)
-    found = explain(inner, inner.plain(baseline))
-    return replace(found, weighting=weighting, reason=f"{found.reason}; {WEIGHTED}")
 
 
 def _with_notes(search: Search, explanation: Explanation) -> Explanation:
@@ -161,14 +146,14 @@ class Explainer:
                 key: float(chain.start_row[spec.joint, BASELINE_PARAMETERS[key].column])
                 for key in spec.baseline
             },
-            floor=spec.floor,
+            noise=spec.floor,
             scales=joint.scales,
-            weights=resamples(len(spec.trajectories), rng),
+            # What is held out as a whole is drawn as a whole.
+            weights=resamples(max(spec.folds) + 1, rng)[:, spec.folds],
             vetoes={**stood_for(same), **told},
             report=lambda line: self.progress(f"explain: {joint.name}: {line}"),
             rest=float(np.median([t.position[0, column] for t in own])),
             moves=np.array([bool(np.ptp(t.command[:, column])) for t in own]),
-            when=middles(recording)[list(spec.trajectories)],
         )
 
     def plain(self, joint: Joint, explained: Explained) -> JointFit:
@@ -208,8 +193,3 @@ def beside(joint: Joint, explained: Explained) -> np.ndarray:
             for parameter in EFFECTS[JITTER].parameters:
                 rows[other.spec.joint, parameter.column] = parameter.neutral
     return rows
-
-
-def weighting_of(found: Explanation) -> dict[str, Any]:
-    """How the samples of an explained joint are weighted, as an argument of a call."""
-    return {} if found.weighting is None else {"weighting": found.weighting}

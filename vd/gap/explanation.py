@@ -7,11 +7,14 @@ import numpy as np
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.fit import RIDGE
-from vd.gap.joint_fit import JointFit, SampleWeighting
+from vd.gap.joint_fit import JointFit
 from vd.gap.result import Verdict
-from vd.gap.statistics import covariance, half_width
+from vd.gap.statistics import half_width
 from vd.kernels.servo.effects import EFFECTS
 
+OWN_ERROR = 0.02
+"""A model's own error, as a share of the whole gap and of each parameter: no fit of a large effect is better.
+Beside a friction of 97 noise floors a second effect came with a share of 0.015 that was not there."""
 NAMED = 0.9
 """Share of the resamples that must choose an effect for it to be named."""
 
@@ -53,12 +56,16 @@ class Accepted:
 
     @property
     def shown(self) -> bool:
-        """Whether the interval of its size is sure of some of it; several sizes stand in for each other."""
-        parameters = {p.name: p for p in EFFECTS[self.name].parameters if p.column != servo.GRAVITY_PHASE}
-        if any(p.lower > 0.0 == p.neutral for p in parameters.values()):
-            return True  # its absence is no value of it
-        sizes = [v for key, v in self.estimates.items() if key in parameters and parameters[key].lower == 0.0]
-        return len(sizes) != 1 or not sizes[0][1] <= 0.0 <= sizes[0][2]
+        """Whether the interval of its size leaves out its absence; several sizes stand in for each other.
+
+        Absence is 0, but infinity of a limit or a stiffness: its inverse is more than 0 for sure if half
+        the interval of its logarithm is less than 1, to first order.
+        """
+        known = {p.name: p for p in EFFECTS[self.name].parameters if p.column != servo.GRAVITY_PHASE}
+        told = [(known[key], *estimate) for key, estimate in self.estimates.items() if key in known]
+        limits = [high < np.e * value for p, value, _, high in told if p.lower > 0.0 == p.neutral]
+        sizes = limits or [not low <= 0.0 <= high for p, _, low, high in told if p.lower == 0.0]
+        return len(sizes) != 1 or sizes[0]
 
 
 @dataclass(frozen=True)
@@ -73,16 +80,18 @@ class Explanation:
     trials: tuple[Trial, ...] = ()
     rivals: Mapping[str, Sequence[JointFit]] = field(default_factory=dict)
     """Fits with others in the place of each effect."""
-    weighting: SampleWeighting | None = None
-    """How the samples were weighted; errors of the fits are in what it weighs them by."""
-    warms: bool = False
-    """Whether a friction of the final model changes over the recording, as none of the table does."""
 
 
 def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
-    """95 % intervals by key: the spread over trajectories, and the error of the time step."""
-    matrix = covariance(fit.gram, fit.gradient, np.full(len(fit.x), RIDGE * floor**2), floor)
-    width = half_width(np.diag(matrix), len(fit.gram))
+    """95 % intervals by key: of the jackknife over folds, or of white noise at the floor if that is wider.
+
+    To these come the error of the time step and the model's own, which all motions share.
+    """
+    folds, ridge = len(fit.refits), RIDGE * floor**2 * np.eye(len(fit.x))
+    white = floor**2 * np.diag(np.linalg.inv(fit.gram + ridge))
+    width = half_width(np.maximum((folds - 1) * fit.refits.var(axis=0), white), folds)
+    sizes = np.array([1.0 if c.log else x for c, x in zip(fit.coordinates, fit.x, strict=True)])
+    width = np.hypot(width, half_width((OWN_ERROR * sizes) ** 2, np.inf))
     if fit.step_error is not None:
         width = np.hypot(width, fit.step_error)
     result = {}

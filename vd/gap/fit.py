@@ -1,4 +1,4 @@
-"""Fit the servo model of one joint to its trajectories: CMA-ES for the start, least squares to finish.
+"""Fit the servo model of one joint to its trajectories by least squares.
 
 Every simulation is a rollout of the whole trajectory; all perturbed parameter sets of a step go through
 one call of :class:`vd.gap.rollout.Rollouts`.
@@ -7,6 +7,7 @@ one call of :class:`vd.gap.rollout.Rollouts`.
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -17,18 +18,9 @@ from vd.gap.descent import LeastSquares
 from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
 
-STILL_COUNTS = 0.05
-"""Encoder counts within which a prediction stands still."""
-
-
 RIDGE = 0.01
 """Pull towards the start, as information in units of the noise floor: holds directions that the data
 leave free (the torque scale of a bare servo), moves no others."""
-CMA_SIGMA = 0.7
-"""First step of CMA-ES in logarithmic coordinates."""
-CMA_TRAJECTORIES = 4
-CMA_POPULATION = 16
-
 ITERATIONS = 12
 """Trials of a fit at most."""
 REFITS = 4
@@ -72,9 +64,6 @@ class JointProblem:
         self._measured = {
             int(t): rollouts.measured[rollouts.sample_trajectory == t, joint] for t in self.trajectories
         }
-        column = int(rollouts.chain.columns[joint])
-        recorded = {int(t): rollouts.recording.trajectories[int(t)] for t in self.trajectories}
-        self._holds = {t: not np.ptp(part.command[:, column]) for t, part in recorded.items()}
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
         self._growth: dict[int, np.ndarray] = {}
 
@@ -105,44 +94,23 @@ class JointProblem:
         predicted = simulation.predict(rows, chosen, joint=self.joint, keep=keep)
         self.simulated += len(rows) * len(chosen) if keep is None else int(keep.sum())
         residual = measured - predicted
-        free = rows[:, self.joint, [servo.BACKLASH_WIDTH, servo.DEAD_ZONE_WIDTH]].max(axis=1)
-        parts = zip(chosen, self.split(residual, chosen), self.split(predicted, chosen), strict=True)
-        for trajectory, part, path in parts:
-            if self._holds[trajectory]:
-                self._forgive(part, path, free)
         if self._growth:
             residual /= np.concatenate([self._growth[t] for t in chosen])
         if keep is not None:
             residual *= np.repeat(keep, [len(self._measured[t]) for t in chosen], axis=1)
         return residual
 
-    def _forgive(self, residual: np.ndarray, predicted: np.ndarray, free: np.ndarray) -> None:
-        """Take the mean from the residuals [C, T] of a motion whose command never changes, in place.
-
-        A rollout starts at the first reading. Where dry friction holds the joint, the prediction stays there,
-        with the reading's error of up to a count, although the model is right; and so does the middle of what
-        play or a dead zone leave ``free`` [C] [rad], however the joint is shaken within.
-        """
-        least = STILL_COUNTS * self.rollouts.recording.encoder_resolution_rad
-        most, mean = np.where(np.ptp(predicted, axis=1) < least, np.inf, free), residual.mean(axis=1)
-        residual -= np.clip(mean, -most, most)[:, None]
-
     def squares(
         self, base: np.ndarray, coordinates: Sequence[Coordinate], trajectories: Trajectories = None
     ) -> LeastSquares:
         """The squared error of the model whose other parameters are those of ``base``."""
 
-        def every(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray | None:
-            return None if keep is None else np.repeat(keep[None], len(x), axis=0)
-
-        def residuals(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
-            return self.residuals(self.rows(base, coordinates, x), trajectories, every(x, keep))
-
-        def coarse(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
+        def residuals(x: np.ndarray, keep: np.ndarray | None, rollouts: Rollouts | None = None) -> np.ndarray:
             rows = self.rows(base, coordinates, x)
-            return self.residuals(rows, trajectories, every(x, keep), rollouts=self.coarse)
+            mask = None if keep is None else np.repeat(keep[None], len(x), axis=0)
+            return self.residuals(rows, trajectories, mask, rollouts=rollouts)
 
-        slopes = None if self.coarse is None else coarse
+        slopes = partial(residuals, rollouts=self.coarse)
         return LeastSquares(coordinates, residuals, RIDGE * self.floor**2, slopes)
 
     def rows(self, base: np.ndarray, coordinates: Sequence[Coordinate], x: np.ndarray) -> np.ndarray:
@@ -224,7 +192,6 @@ class JointProblem:
         x = model.best(x0, iterations)
         jacobian = model.jacobian(x)
         errors = self.split(model.residuals(x[None], None)[0], chosen)
-        parts = self.split(jacobian, chosen)
         fit = JointFit(
             effects=tuple(effects),
             coordinates=tuple(coordinates),
@@ -233,13 +200,12 @@ class JointProblem:
             sse=np.array([e @ e for e in errors]),
             held_out=np.full(len(chosen), np.nan),
             count=np.array([len(e) for e in errors], float),
-            gram=np.stack([j @ j.T for j in parts]),
-            gradient=np.stack([j @ e for j, e in zip(parts, errors, strict=True)]),
+            gram=jacobian @ jacobian.T,
+            refits=x[None],
         )
         if trajectories is not None:
             return fit
-        held_out, absolute = self.cross_validate(fit, jacobian)
-        return replace(fit, held_out=held_out, held_out_abs=absolute)
+        return self.cross_validate(fit, jacobian)
 
     def fitted(self, effects: Sequence[str]) -> list[str]:
         """Keys of what a model with these effects fits on this joint."""
@@ -251,8 +217,8 @@ class JointProblem:
         """d(predicted)/dx at a fit, shape [P, N]."""
         return self.squares(fit.rows, fit.coordinates).jacobian(fit.x)
 
-    def cross_validate(self, fit: JointFit, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Squared and absolute errors of each trajectory, predicted by a fit without its fold, [S] each.
+    def cross_validate(self, fit: JointFit, jacobian: np.ndarray) -> JointFit:
+        """A fit with the errors of each trajectory as a fit without its fold predicts it.
 
         Args:
             fit: The fit to all folds.
@@ -260,13 +226,16 @@ class JointProblem:
         """
         out = np.unique(self.folds)[:, None] == self.folds
         model = self.squares(fit.rows, fit.coordinates)
-        x = [
-            model.descend(fit.x, REFITS, ~fold, jacobian * np.repeat(~fold, self.count.astype(int)))
-            for fold in out
-        ]
-        residual = self.residuals(self.rows(fit.rows, fit.coordinates, np.array(x)), keep=out)
+        x = np.array(
+            [
+                model.descend(fit.x, REFITS, ~fold, jacobian * np.repeat(~fold, self.count.astype(int)))
+                for fold in out
+            ]
+        )
+        residual = self.residuals(self.rows(fit.rows, fit.coordinates, x), keep=out)
         parts = self.split(residual.sum(0))
-        return np.array([part @ part for part in parts]), np.array([np.abs(part).sum() for part in parts])
+        squared, absolute = (np.array([np.sum(abs(part) ** power) for part in parts]) for power in (2, 1))
+        return replace(fit, held_out=squared, held_out_abs=absolute, refits=x)
 
     def refine(self, fit: JointFit, scales: Scales) -> JointFit:
         """The same model fitted on with finer time steps, for values that do not depend on the step.
@@ -283,7 +252,8 @@ class JointProblem:
             result = fine.fit(fit.rows, fit.effects, given, scales, trajectories=self.trajectories)
             error = np.abs(result.x - before)
         self.simulated = fine.simulated
-        return replace(result, held_out=fit.held_out, held_out_abs=fit.held_out_abs, step_error=error)
+        held_out = {name: getattr(fit, name) for name in ("held_out", "held_out_abs", "refits")}
+        return replace(result, **held_out, step_error=error)
 
     def promise(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> np.ndarray:
         """Share of the squared error that each start could remove, the present parameters readjusted.
@@ -335,24 +305,3 @@ class JointProblem:
                 left += float(np.sum((old[i] - factor * shuffled[i]) ** 2))
         total = sum(float(part @ part) for part in old)
         return 1.0 - float(np.sqrt(left / max(total, 1e-300)))
-
-    def start_baseline(self, base: np.ndarray, scales: Scales, *, seed: int, generations: int) -> np.ndarray:
-        """The paper's search: CMA-ES on the squared error of a few trajectories. Returns rows."""
-        import cma  # half a second, which most worker processes do not need
-
-        coordinates = [coordinate(key, scales) for key in self.baseline]
-        x0 = np.array([c.inverse(float(base[self.joint, c.column])) for c in coordinates])
-        spread = np.linspace(0, len(self.trajectories) - 1, CMA_TRAJECTORIES).round().astype(int)
-        chosen = self.trajectories[np.unique(spread)]
-        bounds = [[c.lower for c in coordinates], [c.upper for c in coordinates]]
-        options = {"seed": seed + 1, "popsize": CMA_POPULATION, "bounds": bounds, "verbose": -9}
-        strategy = cma.CMAEvolutionStrategy(x0, CMA_SIGMA, options)
-        for _ in range(generations):
-            asked = strategy.ask()
-            x = np.array(asked)
-            residual = self.residuals(self.rows(base, coordinates, x), chosen)
-            strategy.tell(asked, list(np.log(np.einsum("cn,cn->c", residual, residual) + 1e-12)))
-            if strategy.stop():
-                break
-        best = np.asarray(strategy.result.xbest)
-        return self.rows(base, coordinates, best[None])[0]

@@ -17,9 +17,10 @@ from scipy.optimize import minimize
 
 from vd.gap.coordinates import Scales, coordinate
 from vd.gap.evidence import JITTER
-from vd.gap.fit import JointProblem
+from vd.gap.fit import RIDGE, JointProblem
 from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
+from vd.gap.statistics import half_width
 
 DRAWS = 16
 """Realisations of the delays."""
@@ -27,31 +28,14 @@ SMOOTH = 9
 """Samples over which the variance is averaged: 16 draws alone leave a third of error in it."""
 START_SIGMA_DROP = tuple((sigma, drop) for sigma in (0.0015, 0.005, 0.015) for drop in (0.01, 0.1, 0.4))
 """Where the search starts: [s] and the share of commands dropped."""
-CLOCK_S = 1e-4
-"""Standard deviation [s] of a recording's times from those of the machine: when a command leaves, by the
-computer's clock, is not quite when it arrives (our choice)."""
-ROUNDS = 2
-"""Searches, with the rest of the model linearised anew before the second."""
 NOISES = (1.0, 3.0, 10.0)
 """Noise floors that the first guess allows: what the model lacks besides must not look like jitter."""
-LARGEST = 2.0
-"""Logarithm of the largest equivalent error squared [rad^2]: as good as none."""
 NARROW = 0.5
 """Share of the first guess that is believed: behind more jitter than there is an effect would not show."""
-DAMPING = 1e-4
-TRUST = 0.5
-"""Largest shift of a coordinate of the rest of the model in a round."""
-EVALUATIONS = 30
-LEAST_DROP = 1e-4
-FACTORS = (0.5, 0.71, 0.85, 1.0, 1.18, 1.41, 2.0)
+FACTORS = (0.0, 0.5, 0.71, 0.85, 1.0, 1.18, 1.41, 2.0)
 """Multiples of the best standard deviation at which the likelihood is looked at for the intervals ..."""
-DROPS = (0.003, 0.01, 0.03, 0.1, 0.3)
+DROPS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)
 """... and shares of commands dropped."""
-NOT_WORSE = 2.0
-"""A pair of values is within the intervals if its likelihood is not worse, by this many standard
-deviations over the trajectories: within one, samples say the same thing over and over."""
-SURE = 1.92
-"""Loss of log-likelihood at the 95 % interval of one parameter, if all samples counted."""
 
 
 class JitterFit:
@@ -134,9 +118,8 @@ class JitterFit:
 
     def _likelihood(self, error: np.ndarray, variance: np.ndarray) -> np.ndarray:
         weighted = self.jacobian / variance
-        gram = weighted @ self.jacobian.T
-        gram += np.diag(DAMPING * np.diag(gram) + DAMPING)
-        self.shift = np.clip(np.linalg.solve(gram, weighted @ error), -TRUST, TRUST)
+        gram = weighted @ self.jacobian.T + RIDGE * np.eye(len(weighted))
+        self.shift = np.linalg.solve(gram, weighted @ error)
         error = error - self.shift @ self.jacobian
         losses = 0.5 * (np.log(variance) + error**2 / variance)
         return np.array([part.sum() for part in np.split(losses, self.ends)])
@@ -160,89 +143,67 @@ class JitterFit:
             return float(self.losses(*self._values(x)).sum())
 
         x = np.log(np.array(start))
-        for _ in range(ROUNDS):
-            simplex = x + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0]])
-            options = {"maxfev": EVALUATIONS, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
-            x = minimize(total, x, method="Nelder-Mead", options=options).x
-            self.losses(*self._values(x))
-            self._move(self.shift)
+        simplex = x + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0]])
+        options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
+        x = minimize(total, x, method="Nelder-Mead", options=options).x
+        total(x)
+        bounds = np.array([(c.lower, c.upper) for c in self.base.coordinates]).T
+        moved = np.clip(self.base.x + self.shift, *bounds)
+        rows = self.problem.rows(self.base.rows, self.base.coordinates, moved[None])[0]
+        self.base = replace(self.base, x=moved, rows=rows)
+        self.jacobian = self.problem.jacobian(self.base)
         return self._values(x)
 
-    def _equivalent(self, losses: np.ndarray) -> np.ndarray:
-        """Squared errors that a normal distribution of constant width has at the same likelihood [S]."""
-        count = self.problem.count
-        return count * np.exp(np.minimum(2.0 * losses / count - 1.0, LARGEST))
+    def _values(self, x: np.ndarray) -> tuple[float, float]:
+        sigma, drop = (float(v) for v in np.exp(x))
+        return self._limited(sigma, drop)
 
     def extents(self, sigma: float, drop: float) -> dict[str, tuple[float, float]]:
         """Intervals of both parameters: the values of the pairs that the trajectories do not reject.
 
-        Delays and losses stand in for each other in part, so that the pairs are what is judged; each end
-        is half way to the first value that is rejected with every other.
+        Delays and losses stand in for each other in part, so that the pairs are what is judged: by the sum of
+        their losses of likelihood over the trajectories, and its interval, since the model is not quite right
+        (Vuong 1989). Each end is half way to the first value that is rejected with every other.
         """
-        here = self.losses(sigma, drop)
-        sigmas = [sigma * f for f in FACTORS]
-        drops = sorted({max(drop, LEAST_DROP), *DROPS})
-        kept = np.zeros((len(sigmas), len(drops)), bool)
-        for i, one in enumerate(sigmas):
-            for k, other in enumerate(drops):
-                pair = self._limited(one, other)
-                worse = self.losses(*pair) - here
-                spread = np.sqrt(len(worse)) * float(np.std(worse, ddof=1)) if len(worse) > 1 else 0.0
-                kept[i, k] = float(worse.sum()) < SURE + NOT_WORSE * spread
-        kept[FACTORS.index(1.0), drops.index(max(drop, LEAST_DROP))] = True
+        here, sigmas, drops = self.losses(sigma, drop), [sigma * f for f in FACTORS], sorted({drop, *DROPS})
+        worse = np.array([[self.losses(*self._limited(s, d)) - here for d in drops] for s in sigmas])
+        kept = worse.sum(axis=-1) < half_width(self.size * worse.var(axis=-1, ddof=1), self.size)
+        kept[sigmas.index(sigma), drops.index(drop)] = True
         ranges = {}
-        for name, values, inside in (
-            ("sigma_s", sigmas, kept.any(axis=1)),
-            ("p_drop", drops, kept.any(axis=0)),
-        ):
-            first, last = int(np.flatnonzero(inside)[0]), int(np.flatnonzero(inside)[-1])
-            low = np.sqrt(values[first] * values[first - 1]) if first > 0 else 0.0
-            high = np.sqrt(values[last] * values[last + 1]) if last + 1 < len(values) else 2.0 * values[last]
-            ranges[f"command_jitter.{name}"] = float(low), float(high)
+        for name, values, inside in (("sigma_s", sigmas, kept.any(1)), ("p_drop", drops, kept.any(0))):
+            first, last = np.flatnonzero(inside)[[0, -1]]
+            ends = np.interp([first - 0.5, last + 0.5], range(len(values) + 1), [*values, 2.0 * values[-1]])
+            ranges[f"command_jitter.{name}"] = float(ends[0]), float(ends[1])
         return ranges
 
     def _limited(self, sigma: float, drop: float) -> tuple[float, float]:
         limits = [float(c.value(c.upper)) for c in self.coordinates]
         return min(sigma, limits[0]), min(drop, limits[1])
 
-    def _move(self, shift: np.ndarray) -> None:
-        """Take the shift of the rest of the model, and linearise it there."""
-        x = self.base.x.copy()
-        for i, (c, change) in enumerate(zip(self.base.coordinates, shift, strict=True)):
-            x[i] = min(max(x[i] + change, c.lower), c.upper)
-        rows = self.problem.rows(self.base.rows, self.base.coordinates, x[None])[0]
-        self.base = replace(self.base, x=x, rows=rows)
-        self.jacobian = self.problem.jacobian(self.base)
-
-    def _values(self, x: np.ndarray) -> tuple[float, float]:
-        sigma, drop = (float(v) for v in np.exp(x))
-        return self._limited(sigma, drop)
-
     def result(self, sigma: float, drop: float) -> JointFit:
-        """A pair of values as any other fit, with equivalent errors; its matrices leave the pair out."""
-        x = [c.inverse(v) for c, v in zip(self.coordinates, (sigma, drop), strict=True)]
-        size, equivalent = len(self.base.x) + 2, self._equivalent(self.losses(sigma, drop))
-        gram, gradient = np.zeros((self.size, size, size)), np.zeros((self.size, size))
-        gram[:, : size - 2, : size - 2], gradient[:, : size - 2] = self.base.gram, self.base.gradient
+        """A pair of values as any other fit, with the errors that a constant width has at its likelihood."""
+        x = np.array([c.inverse(v) for c, v in zip(self.coordinates, (sigma, drop), strict=True)])
+        count = self.problem.count
+        # A motion that is far from its prediction has an error of a radian: as good as none.
+        errors = count * np.exp(np.minimum(2.0 * self.losses(sigma, drop) / count - 1.0, 0.0))
+        refits = self.base.refits
         return JointFit(
             effects=(*self.base.effects, JITTER),
             coordinates=(*self.base.coordinates, *self.coordinates),
             x=np.concatenate([self.base.x, x]),
             rows=self.row(sigma, drop),
-            sse=equivalent,
-            held_out=equivalent,
-            count=self.problem.count,
-            gram=gram,
-            gradient=gradient,
+            sse=errors,
+            held_out=errors,
+            count=count,
+            gram=np.pad(self.base.gram, (0, 2)),
+            refits=np.hstack([refits, np.tile(x, (len(refits), 1))]),
         )
 
 
-def look(
-    problem: JointProblem, fit: JointFit, scales: Scales, start: tuple[float, float] | None = None
-) -> tuple[tuple[float, float], SampleWeighting]:
-    """A first guess of the jitter of a model, or what it starts from, and what it does to the samples."""
+def look(problem: JointProblem, fit: JointFit, scales: Scales) -> tuple[tuple[float, float], SampleWeighting]:
+    """A first guess of the jitter of a model, and what it does to the samples."""
     jitter = JitterFit(problem, fit, scales)
-    values = jitter.guess() if start is None else start
+    values = jitter.guess()
     return values, jitter.weighting(*values)
 
 
@@ -265,16 +226,9 @@ def bound_jitter(problem: JointProblem, fit: JointFit, scales: Scales) -> JointF
     return replace(fit, extents=JitterFit(problem, rest, scales).extents(sigma, drop))
 
 
-def clock_weighting(problem: JointProblem, fit: JointFit, scales: Scales) -> SampleWeighting:
-    """What errors of the recording's clock add to the samples under a model: no mean, and their spread."""
-    weighting = JitterFit(problem, fit, scales).weighting(CLOCK_S, 0.0)
-    return SampleWeighting(np.zeros_like(weighting.shift), weighting.growth)
-
-
 CALLS: dict[str, Callable[..., Any]] = {
     "look": look,
     "fit_jitter": fit_jitter,
     "bound_jitter": bound_jitter,
-    "clock_weighting": clock_weighting,
 }
 """What is asked of a joint's problem by name, besides its methods."""

@@ -26,11 +26,11 @@ class JointFit:
         sse: Sum of squared errors of each trajectory [S] [rad^2].
         held_out: The same, each trajectory predicted by a fit without its group [S].
         count: Samples of each trajectory [S].
-        gram: J^T J of each trajectory, [S, P, P].
-        gradient: J^T r of each trajectory, [S, P].
+        gram: J^T J [P, P].
+        refits: Coordinates of the fits without each fold [F, P].
         held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad]; None where not taken.
+        extents: 95 % intervals by key, of parameters for which the refits do not give them.
         step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
-        extents: 95 % intervals by key, of parameters for which the matrices do not give them.
     """
 
     effects: tuple[str, ...]
@@ -41,7 +41,7 @@ class JointFit:
     held_out: np.ndarray
     count: np.ndarray
     gram: np.ndarray
-    gradient: np.ndarray
+    refits: np.ndarray
     held_out_abs: np.ndarray | None = None
     step_error: np.ndarray | None = None
     extents: Mapping[str, tuple[float, float]] | None = None

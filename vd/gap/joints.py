@@ -5,13 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from vd.gap.evidence import CANCELLING, JITTER, LEVELS, explains
-from vd.gap.explain import Explained, Explainer, Joint, beside, weighting_of
+from vd.gap.evidence import CANCELLING, JITTER, explains
+from vd.gap.explain import Explained, Explainer, Joint, beside
 from vd.gap.explanation import Explanation, polished
 from vd.gap.worker_pool import WorkerPool, parallel
-
-CHANGING = "its friction changes over the recording, as another joint of the finger shows"
-"""Why a constant friction is no name, nor what is found beside it."""
 
 SPRUNG = f"{explains(CANCELLING)} here, but cancel at rest on another joint of the finger, as a spring does"
 """Why a load and an offset are no names."""
@@ -20,23 +17,19 @@ SPRUNG = f"{explains(CANCELLING)} here, but cancel at rest on another joint of t
 def doubted(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[Explanation]:
     """Explanations without what another joint of the finger shows to be a cause that is not in the table.
 
-    A friction that changes there: where it moves only early in a recording, or late, a joint shows no change
-    of its own, and a play or a coupling stands for it. And a load and an offset that cancel at rest there:
-    where a joint travels little they imitate the same spring.
+    That is a load and an offset that cancel at rest there: where a joint travels little they imitate the same
+    spring.
 
     Args:
         explanations: Of the joints.
         groups: Number of the finger of each joint.
     """
     both, pairs = {*CANCELLING}, list(zip(explanations, groups, strict=True))
-    changing = {group for e, group in pairs if e.warms}
     sprung = {group for e, group in pairs if e.verdict == "unknown" and both <= {*e.final.effects}}
 
     def judged(e: Explanation, group: int) -> Explanation:
         if e.verdict not in ("effects", "ambiguous"):
             return e
-        if group in changing and {*LEVELS} & {*e.final.effects}:
-            return replace(e, verdict="unknown", reason=CHANGING)
         if group in sprung and both == {*e.final.effects}:
             return replace(e, verdict="unknown", reason=SPRUNG)
         return e
@@ -81,7 +74,7 @@ def _consistent(
         if not changed or not own.final.effects or JITTER in own.final.effects:
             return own
         rows[joint.spec.joint] = own.final.rows[joint.spec.joint]
-        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales, **weighting_of(own)}
+        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales}
         return polished(own, pool.run(joint.spec, [("refine", call)])[0], joint.spec.floor)
 
     return parallel(again, range(len(joints)))

@@ -3,7 +3,6 @@
 Chains: :mod:`vd.gap.chain`. Physics: :mod:`vd.kernels.servo.chains`.
 """
 
-import itertools
 import zlib
 from collections.abc import Sequence
 from functools import cached_property
@@ -22,8 +21,6 @@ STEP_S = 1.0 / 480.0
 """Time step [s]: four of the simulator's, a fifth of a servo's fastest time constant (inertia / kd)."""
 STREAM_BITS = 28
 """Bits of the number of a trajectory's random stream."""
-RECALLED = 10_000
-"""Rollouts that are kept: searches ask for the same again, where one fit ends and the next begins."""
 
 
 def links_of(
@@ -90,7 +87,6 @@ class Rollouts:
             raise ValueError(f"dt is {dt}; give a positive time step in seconds")
         self.chain, self.recording, self.dt, self.device = chain, recording, dt, device
         self._finer: dict[float, Rollouts] = {}
-        self._recent: dict[bytes, np.ndarray] = {}
         self.num_joints = len(chain.joints)
         trajectories = recording.trajectories
         counts = [len(t.time) for t in trajectories]
@@ -114,7 +110,7 @@ class Rollouts:
     def __getstate__(self) -> dict[str, object]:
         """Leave the device's arrays behind: another process makes its own."""
         kept = {key: value for key, value in self.__dict__.items() if key not in ("_samples", "_links")}
-        return {**kept, "_finer": {}, "_recent": {}}
+        return {**kept, "_finer": {}}
 
     @cached_property
     def _samples(self) -> Samples:
@@ -195,36 +191,9 @@ class Rollouts:
         wanted = np.full(len(index), -1 if joint is None else joint)
         predicted = wp.zeros((len(rows) * length, width), dtype=float, device=self.device)
         if len(trajectory):
-            simulate = self._launch if wp.get_device(self.device).is_cuda else self._recall
-            simulate(parameters, trajectory, output, wanted, predicted)
+            self._launch(parameters, trajectory, output, wanted, predicted)
         shape = (len(rows), length, width)
         return predicted.numpy().reshape(shape if joint is None else shape[:2])
-
-    def _recall(
-        self,
-        parameters: np.ndarray,
-        trajectory: np.ndarray,
-        output: np.ndarray,
-        wanted: np.ndarray,
-        predicted: wp.array,
-    ) -> None:
-        """As :meth:`_launch`, but what was simulated a short while ago is not again. On a CPU each counts."""
-        positions, recent, counts = predicted.numpy(), self._recent, self._count[trajectory]
-        names = np.stack([trajectory, wanted], axis=1).astype(np.int64)
-        keys = [row.tobytes() + name.tobytes() for row, name in zip(parameters, names, strict=True)]
-        new = []
-        for i, key in enumerate(keys):
-            if (known := recent.pop(key, None)) is None:
-                new.append(i)
-            else:
-                recent[key] = known  # the last one used is the last to go
-                positions[output[i] : output[i] + counts[i]] = known
-        if new:
-            self._launch(parameters[new], trajectory[new], output[new], wanted[new], predicted)
-        for i in new[-RECALLED:]:
-            recent[keys[i]] = positions[output[i] : output[i] + counts[i]].copy()
-        for key in list(itertools.islice(recent, max(len(recent) - RECALLED, 0))):
-            del recent[key]
 
     def _launch(
         self,

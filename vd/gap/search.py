@@ -12,33 +12,22 @@ import numpy as np
 from vd.gap.coordinates import Scales, sizes, torque_power
 from vd.gap.evidence import JITTER, NESTED, Evidence
 from vd.gap.explanation import Trial
-from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.servo.effects import EFFECTS, equivalent
 
 MAX_EFFECTS = 3
-MAX_ROUNDS = 6
+MAX_ROUNDS = 2 * MAX_EFFECTS
 """Forward steps, some of which a backward step takes back."""
 SHORT_LIST = 10
 """Candidates of a round that are fitted, after the linear screening of all."""
 SEARCH_TAIL = 0.4
 """Share of the resamples that may see no gain from an effect that the search adds or keeps: one of two causes
 alone can make some motions worse."""
-PLAIN_FRICTION = "coulomb_friction"
-GROWN = 1.5
-"""Spread of the samples of a motion, in that of the noise alone, from which they are weighted. Motions that
-do not let errors grow have 1.05 at most (our choice)."""
 
 Call = tuple[str, dict[str, Any]]
 Run = Callable[[list[Call]], list[Any]]
 """Runs methods of the joint's :class:`vd.gap.fit.JointProblem` by name, in parallel."""
-
-
-def doubled(effects: Sequence[str]) -> list[str]:
-    """Frictions that one of a model is with other numbers, and that are none beside it."""
-    fuller = [name for name, simpler in NESTED.items() if PLAIN_FRICTION in simpler]
-    return fuller if PLAIN_FRICTION in effects else [PLAIN_FRICTION] if {*fuller} & {*effects} else []
 
 
 @dataclass(kw_only=True)
@@ -54,7 +43,6 @@ class Search(Evidence):
         nominal: Nominal values of the baseline's parameters, by key.
         report: Called with a line of progress.
         rest: Where the joint rests before it moves [rad].
-        clocked: Whether samples are weighted by what errors of the clock do.
         known: Values of the models that steps led to, by their effects: fits of these start there, too.
     """
 
@@ -66,7 +54,6 @@ class Search(Evidence):
     nominal: Mapping[str, float] = field(default_factory=dict)
     report: Callable[[str], None] = lambda line: None
     rest: float = 0.0
-    clocked: bool = False
     known: dict[frozenset[str], Mapping[str, float]] = field(default_factory=dict)
 
     def fit(self, base: np.ndarray, effects: Sequence[str], starts: Sequence[Mapping[str, float]]) -> Call:
@@ -144,32 +131,11 @@ class Search(Evidence):
         scaled = {key: value * torque ** torque_power(key) for key, value in starts[0].items()}
         return [*starts, {**scaled, **self.nominal}]
 
-    def clock_sensitivity(self, fit: JointFit) -> SampleWeighting | None:
-        """What errors of the clock do under a model that leaves more than noise; None where they do not grow.
-
-        A profile of bounded acceleration that cannot follow its command turns at moments that hang on ever
-        smaller things: a tenth of a millisecond is tens of milliradians some seconds later, and no fit of the
-        right model leaves noise there. Weighted by how surely they are known
-        (:mod:`vd.gap.joint_fit`), samples are noise again under the right model.
-        """
-        if self.clocked or self.behind_jitter or JITTER in fit.effects or self.no_gap(fit):
-            return None
-        weighting = self.run([("clock_weighting", {"fit": fit, "scales": self.scales})])[0]
-        ends = np.cumsum(fit.count.astype(int))[:-1]
-        spread = [float(np.sqrt(np.mean(part**2))) for part in np.split(weighting.growth, ends)]
-        return weighting if max(spread) > GROWN else None
-
     def weighted(self, weighting: SampleWeighting, **changes: Any) -> "Search":
         """The same search with samples weighted, and other attributes changed."""
 
         def run(calls: list[Call]) -> list[Any]:
-            # What jitter does is more than what the clock does, and is measured on the samples themselves.
-            return self.run(
-                [
-                    (name, options if name in CALLS else {"weighting": weighting, **options})
-                    for name, options in calls
-                ]
-            )
+            return self.run([(name, {"weighting": weighting, **options}) for name, options in calls])
 
         return replace(self, run=run, known=dict(self.known), **changes)
 
@@ -183,7 +149,7 @@ class Search(Evidence):
         for number in range(1, MAX_ROUNDS + 1):
             if self.is_last(present):
                 break
-            fits, promised = self.fit_candidates(present, doubled(present.effects))
+            fits, promised = self.fit_candidates(present)
             if not fits:
                 break
             best = self.winner(list(fits.values()))
@@ -205,7 +171,7 @@ class Search(Evidence):
     def is_last(self, present: JointFit) -> bool:
         """Whether no further effect is to be added to a model."""
         full = len(present.effects) >= MAX_EFFECTS
-        return full or self.no_gap(present) or self.clock_sensitivity(present) is not None
+        return full or self.no_gap(present)
 
     def revise(self, present: JointFit) -> JointFit:
         """Backward check: drop what is not needed, exchange what another effect does better."""

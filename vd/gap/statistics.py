@@ -12,8 +12,6 @@ from vd.gap.recording import Recording, Trajectory
 CONFIDENCE = 0.95
 BOOTSTRAP = 2000
 """Resamples of whole trajectories."""
-QUANTISATION = 1.0 / np.sqrt(12.0)
-"""Standard deviation of a uniform error of one encoder count."""
 HOLD_S = 0.25
 """The command must have been constant for this long before a sample counts as held."""
 HOLD_COUNTS = 3.0
@@ -23,9 +21,7 @@ WINDOW = 16
 SLOW_COUNTS = (4.0, 30.0)
 """Encoder counts that slow motion travels in a window: enough to dither, not enough to bend."""
 MIN_WINDOWS = 8
-"""Windows of slow motion below which their noise is not estimated."""
-MIN_HELD = 30
-"""Held samples below which their noise is not estimated."""
+"""Windows of slow motion, or of samples held, below which their noise is not estimated."""
 
 
 def held(trajectory: Trajectory, joint: int, resolution: float) -> np.ndarray:
@@ -52,7 +48,7 @@ def noise_floor(recording: Recording, joint: int) -> float:
     not contain it while noise is less than a count), and of what a parabola leaves of slow motion
     (which contains both).
     """
-    quantum = QUANTISATION * recording.encoder_resolution_rad
+    quantum = recording.encoder_resolution_rad / np.sqrt(12.0)  # of a uniform error of one count
     squares, count, moving = 0.0, 0, []
     for trajectory in recording.trajectories:
         position = trajectory.position[:, joint]
@@ -61,7 +57,7 @@ def noise_floor(recording: Recording, joint: int) -> float:
         squares += float(np.sum(second[rest] ** 2))
         count += int(rest.sum())
         moving += _slow_noise(trajectory.time, position, recording.encoder_resolution_rad)
-    resting = np.sqrt(squares / (6.0 * count)) if count >= MIN_HELD else 0.0
+    resting = np.sqrt(squares / (6.0 * count)) if count >= MIN_WINDOWS * WINDOW else 0.0
     slow = np.sqrt(np.median(moving)) if len(moving) >= MIN_WINDOWS else 0.0
     return float(max(quantum, resting, slow))
 
@@ -104,35 +100,7 @@ def rmse(sse: np.ndarray, count: np.ndarray, weights: np.ndarray | None = None) 
     return np.sqrt(np.maximum(sse @ weights.T, 0.0) / np.maximum(weights @ count, 1e-30))
 
 
-def covariance(gram: np.ndarray, gradient: np.ndarray, ridge: np.ndarray, floor: float) -> np.ndarray:
-    """Covariance of a least-squares estimate, robust against residuals that are correlated in a trajectory.
-
-    The jackknife over trajectories in one Gauss-Newton step each (the cluster-robust CR3 estimate),
-    but at least the textbook covariance of white noise at the floor.
-
-    Args:
-        gram: J^T J of each trajectory, shape [S, P, P].
-        gradient: J^T r of each trajectory, r = measured - predicted, shape [S, P].
-        ridge: Added to the diagonal of the sum, shape [P].
-        floor: Noise floor [rad].
-    """
-    total = gram.sum(0) + np.diag(ridge)
-    slope = gradient.sum(0)
-    center = np.linalg.solve(total, slope)
-    units = len(gram)
-    white = floor**2 * np.linalg.inv(total)
-    if units < 2:
-        return white
-    steps = np.array(
-        [np.linalg.lstsq(total - gram[s], slope - gradient[s], rcond=None)[0] - center for s in range(units)]
-    )
-    robust = (units - 1) / units * steps.T @ steps
-    larger = np.maximum(np.diag(robust), np.diag(white)) / np.maximum(np.diag(robust), 1e-300)
-    scale = np.sqrt(larger)
-    return robust * np.outer(scale, scale)
-
-
-def half_width(variance: np.ndarray, units: int) -> np.ndarray:
-    """Half the 95 % interval of estimates whose variance was estimated from ``units`` trajectories."""
+def half_width(variance: np.ndarray, units: float) -> np.ndarray:
+    """Half the 95 % interval of estimates whose variance was estimated from ``units`` parts of the data."""
     freedom = max(units - 1, 1)
     return float(student.ppf(0.5 + 0.5 * CONFIDENCE, freedom)) * np.sqrt(np.maximum(variance, 0.0))
