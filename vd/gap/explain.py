@@ -148,8 +148,7 @@ class Explainer:
             },
             noise=spec.floor,
             scales=joint.scales,
-            # What is held out as a whole is drawn as a whole.
-            weights=resamples(max(spec.folds) + 1, rng)[:, spec.folds],
+            weights=resamples(len(spec.trajectories), rng),
             vetoes={**stood_for(same), **told},
             report=lambda line: self.progress(f"explain: {joint.name}: {line}"),
             rest=float(np.median([t.position[0, column] for t in own])),

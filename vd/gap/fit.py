@@ -1,4 +1,4 @@
-"""Fit the servo model of one joint to its trajectories by least squares.
+"""Fit the servo model of one joint to its trajectories: CMA-ES for the start, least squares to finish.
 
 Every simulation is a rollout of the whole trajectory; all perturbed parameter sets of a step go through
 one call of :class:`vd.gap.rollout.Rollouts`.
@@ -21,6 +21,11 @@ from vd.gap.rollout import Rollouts
 RIDGE = 0.01
 """Pull towards the start, as information in units of the noise floor: holds directions that the data
 leave free (the torque scale of a bare servo), moves no others."""
+CMA_SIGMA = 0.7
+"""First step of CMA-ES in logarithmic coordinates."""
+CMA_TRAJECTORIES = 4
+CMA_POPULATION = 16
+
 ITERATIONS = 12
 """Trials of a fit at most."""
 REFITS = 4
@@ -305,3 +310,24 @@ class JointProblem:
                 left += float(np.sum((old[i] - factor * shuffled[i]) ** 2))
         total = sum(float(part @ part) for part in old)
         return 1.0 - float(np.sqrt(left / max(total, 1e-300)))
+
+    def start_baseline(self, base: np.ndarray, scales: Scales, *, seed: int, generations: int) -> np.ndarray:
+        """The paper's search: CMA-ES on the squared error of a few trajectories. Returns rows."""
+        import cma  # half a second, which most worker processes do not need
+
+        coordinates = [coordinate(key, scales) for key in self.baseline]
+        x0 = np.array([c.inverse(float(base[self.joint, c.column])) for c in coordinates])
+        spread = np.linspace(0, len(self.trajectories) - 1, CMA_TRAJECTORIES).round().astype(int)
+        chosen = self.trajectories[np.unique(spread)]
+        bounds = [[c.lower for c in coordinates], [c.upper for c in coordinates]]
+        options = {"seed": seed + 1, "popsize": CMA_POPULATION, "bounds": bounds, "verbose": -9}
+        strategy = cma.CMAEvolutionStrategy(x0, CMA_SIGMA, options)
+        for _ in range(generations):
+            asked = strategy.ask()
+            x = np.array(asked)
+            residual = self.residuals(self.rows(base, coordinates, x), chosen)
+            strategy.tell(asked, list(np.log(np.einsum("cn,cn->c", residual, residual) + 1e-12)))
+            if strategy.stop():
+                break
+        best = np.asarray(strategy.result.xbest)
+        return self.rows(base, coordinates, best[None])[0]
