@@ -246,7 +246,7 @@ class Evidence:
         for name in [n for n in final.effects if n not in {one.name for one in known}]:
             fits = rivals.get(name, [final])
             accepted.append(self.accept(final, name, fits, spread, told))
-        explanation = Explanation(baseline, told, "unknown", "", tuple(accepted), tuple(trials), rivals)
+        explanation = Explanation(baseline, told, "unknown", "", tuple(accepted), tuple(trials))
         if not accepted:
             return self.nothing_earned(explanation, loose)
         # One motion can be all that shows a parameter: that no fit without it predicts it says nothing then.

@@ -1,7 +1,7 @@
 """What the search for what a joint lacks has found: the evidence, effects with intervals, the verdict."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -78,8 +78,6 @@ class Explanation:
     reason: str
     accepted: tuple[Accepted, ...] = ()
     trials: tuple[Trial, ...] = ()
-    rivals: Mapping[str, Sequence[JointFit]] = field(default_factory=dict)
-    """Fits with others in the place of each effect."""
 
 
 def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
