@@ -55,7 +55,7 @@ def test_the_layer_is_the_object_with_what_was_identified(analysis: Path):
     assert set(item.contact) == {"table_friction", "mass", "centre_of_mass"}
     again = read_object(write_object(analysis / "again.usd", item))
     assert again.contact == item.contact
-    torn = analysis / "torn.usda"
+    torn = path.with_name("torn.usda")
     torn.write_text(path.read_text().replace("cube.usd@", "gone.usd@"))
     with pytest.raises(ObjectError, match=r"its sublayer .*gone.usd is missing"):
         read_object(torn)
