@@ -25,6 +25,8 @@ CMA_SIGMA = 0.7
 """First step of CMA-ES in logarithmic coordinates."""
 CMA_TRAJECTORIES = 4
 CMA_POPULATION = 16
+"""Ours, not tuned: without CMA-ES twelve baselines of servos, the SO-101 and the XL330 end within 0.1 % of
+the same error, but the XL330's search for effects then begins another way and keeps 40.6 mrad for 36.3."""
 
 ITERATIONS = 12
 """Trials of a fit at most."""
