@@ -57,10 +57,10 @@ PATIENCE_S = 300.0
 """For processes to end: two that load torch on a fresh, busy machine have taken more than a minute."""
 
 
-def _two_nodes(script: Path, said: Path) -> list[subprocess.Popen]:
+def _two_nodes(script: Path, folder: Path) -> list[subprocess.Popen]:
     """Starts torchrun on two addresses of this machine, as on two machines, with a process each.
 
-    What they say on stderr goes to the file `said`.
+    What they say on stderr goes to a file each: stacks that both write at once would be torn.
     """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -69,16 +69,20 @@ def _two_nodes(script: Path, said: Path) -> list[subprocess.Popen]:
     run = [sys.executable, "-m", "torch.distributed.run", *flags.split(), f"127.0.0.1:{port}", "--local-addr"]
     # No PATH: nothing may depend on a git binary, which rsl-rl's logger looks for.
     env = os.environ | {"PATH": ""}
-    with said.open("w") as file:
-        return [subprocess.Popen([*run, f"127.0.0.{node}", script], stderr=file, env=env) for node in (1, 2)]
+    return [
+        subprocess.Popen(
+            [*run, f"127.0.0.{node}", script], stderr=(folder / f"stderr{node}").open("w"), env=env
+        )
+        for node in (1, 2)
+    ]
 
 
 @pytest.mark.slow
 def test_two_nodes_keep_the_same_parameters_and_their_own_worlds_until_one_hangs(tmp_path):
     script = tmp_path / "run.py"
     script.write_text(HANGING.format(tests=str(Path(__file__).parent), folder=str(tmp_path)))
-    log, deadline = tmp_path / "stderr", time.monotonic() + PATIENCE_S
-    nodes = _two_nodes(script, log)
+    deadline = time.monotonic() + PATIENCE_S
+    nodes = _two_nodes(script, tmp_path)
     try:
         # The wait of one of them reaches its limit, and so do the others.
         while all(node.poll() is None for node in nodes):
@@ -89,7 +93,7 @@ def test_two_nodes_keep_the_same_parameters_and_their_own_worlds_until_one_hangs
             # Asked to end, one whose rendezvous has gone with the other waits for minutes.
             node.kill()
             node.wait(timeout=PATIENCE_S)
-    said = log.read_text()
+    said = "".join((tmp_path / f"stderr{node}").read_text() for node in (1, 2))
     assert "process 0 failed and ends the run; --resume" in said
     assert re.search(r"most recent call first\):\n  File .* in hang\n", said), "the stack of who hangs"
     one, two = (json.loads((tmp_path / f"rank{r}.json").read_text()) for r in range(2))
