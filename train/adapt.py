@@ -81,6 +81,8 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
     Raises:
         As :func:`adapt_command`.
     """
+    if str(cfg.hand_layer) == NO_LAYER:
+        raise ValueError("--hand-layer none is nothing to adapt to; name the identified.usda of vd-gap")
     check_names([cfg.policy], cfg.objects)
     _check_teacher(cfg.policy)
     try:
