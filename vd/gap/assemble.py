@@ -81,7 +81,6 @@ def assemble(
     findings: Sequence[Finding],
     *,
     seed: int,
-    simulated: int,
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
     before = curves(recording, problems, [(j.spec, j.explanation.baseline.rows) for j in joints])
@@ -116,7 +115,6 @@ def assemble(
         joints=tuple(_gap(j, rows[j.name], rng) for j in joints),
         evidence=tuple(c for j in joints for c in _evidence(j)),
         trajectories=tuple(every),
-        rollouts=simulated,
         seed=seed,
     )
     return report, predictions
@@ -299,7 +297,6 @@ def _evidence(joint: Analysed) -> list[Candidate]:
                 for key, value in trial.fit.values.items()
                 if key.startswith(f"{trial.name}.")
             },
-            placebo=trial.placebo,
             given=tuple(name for name in trial.fit.effects if name != trial.name),
         )
         for trial in joint.explanation.trials

@@ -261,7 +261,7 @@ class Evidence:
 
     def nothing_earned(self, explanation: Explanation, loose: str) -> Explanation:
         """The verdict where no effect earned its place."""
-        tried = [t for t in explanation.trials if not t.placebo and np.isfinite(t.gain)]
+        tried = [t for t in explanation.trials if np.isfinite(t.gain)]
         why = tried[0].reason if tried else "there is no candidate"
         if explanation.baseline.held_out_rmse > REPEATABLE * self.floor:
             return replace(explanation, reason=f"a gap that no candidate explains: the best {why}")

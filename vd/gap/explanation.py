@@ -31,7 +31,6 @@ class Trial:
     gain_ci: tuple[float, float]
     decision: str = "rejected"
     reason: str = ""
-    placebo: bool = False
 
 
 @dataclass(frozen=True)

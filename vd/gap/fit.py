@@ -67,7 +67,6 @@ class JointProblem:
         self.folds = np.asarray(folds)
         self.floor = floor
         self.baseline = tuple(baseline)
-        self.simulated = 0
         self._measured = {
             int(t): rollouts.measured[rollouts.sample_trajectory == t, joint] for t in self.trajectories
         }
@@ -99,7 +98,6 @@ class JointProblem:
         measured = np.concatenate([self._measured[t] for t in chosen])
         simulation = self.rollouts if rollouts is None else rollouts
         predicted = simulation.predict(rows, chosen, joint=self.joint, keep=keep)
-        self.simulated += len(rows) * len(chosen) if keep is None else int(keep.sum())
         residual = measured - predicted
         if self._growth:
             residual /= np.concatenate([self._growth[t] for t in chosen])
@@ -258,7 +256,6 @@ class JointProblem:
             before, given = result.x, [result.values]
             result = fine.fit(fit.rows, fit.effects, given, scales, trajectories=self.trajectories)
             error = np.abs(result.x - before)
-        self.simulated = fine.simulated
         held_out = {name: getattr(fit, name) for name in ("held_out", "held_out_abs", "refits")}
         return replace(result, **held_out, step_error=error)
 
@@ -291,27 +288,6 @@ class JointProblem:
         factor = np.clip(along / np.maximum(power, 1e-300), 0.0, 3.0)
         gain = 2.0 * factor * along - factor**2 * power
         return gain / max(float(residual[0] @ residual[0]), 1e-300)
-
-    def placebo(self, before: JointFit, after: JointFit) -> float:
-        """Share of the held-out RMSE that a control removes that must remove nothing.
-
-        The control is the change that the effect made to the prediction, less its mean (an offset is the
-        same at any time), reversed in time and handed to the next trajectory, with a free factor that is
-        fitted without the held-out fold.
-        """
-        old = self.split(self.residuals(before.rows[None])[0])
-        new = self.split(self.residuals(after.rows[None])[0])
-        change = [a - b - np.mean(a - b) for a, b in zip(old, new, strict=True)]
-        shuffled = [np.resize(change[i - 1][::-1], len(part)) for i, part in enumerate(change)]
-        left = 0.0
-        for fold in np.unique(self.folds):
-            inside = [i for i, f in enumerate(self.folds) if f != fold]
-            power = sum(float(shuffled[i] @ shuffled[i]) for i in inside)
-            factor = sum(float(shuffled[i] @ old[i]) for i in inside) / max(power, 1e-300)
-            for i in np.flatnonzero(self.folds == fold):
-                left += float(np.sum((old[i] - factor * shuffled[i]) ** 2))
-        total = sum(float(part @ part) for part in old)
-        return 1.0 - float(np.sqrt(left / max(total, 1e-300)))
 
     def start_baseline(self, base: np.ndarray, scales: Scales, *, seed: int, generations: int) -> np.ndarray:
         """The paper's search: CMA-ES on the squared error of a few trajectories. Returns rows."""

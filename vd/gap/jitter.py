@@ -89,7 +89,6 @@ class JitterFit:
         """Mean of the positions [N] [rad] over draws of the delays, and their variance [N] [rad^2]."""
         rows, joint = self.row(sigma, drop)[None], self.problem.joint
         predicted = self.rollouts.predict(rows, self.needed, joint=joint)[0]
-        self.problem.simulated += len(self.needed)
         mean, others = np.split(predicted.astype(float), [len(self.varied)])
         draws = np.concatenate([mean[None, self.varied], others.reshape(DRAWS - 1, -1)])
         variance = np.zeros(len(mean))

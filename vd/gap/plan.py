@@ -221,8 +221,7 @@ def _models(
 
 def _fitted(report: Report, joint: str, name: str, given: set[str]) -> dict[str, float]:
     """Parameters of an effect on a joint as they were fitted beside the effects given, or else last."""
-    rows = [row for row in report.evidence if row.name == name and joint in row.joints and not row.placebo]
-    rows = [row for row in rows if row.parameters]
+    rows = [row for row in report.evidence if row.name == name and joint in row.joints and row.parameters]
     beside = [row for row in rows if {*row.given} == given]
     return (beside or rows)[-1].parameters if rows else {}
 

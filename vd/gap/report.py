@@ -126,7 +126,7 @@ def _evidence_row(row: Candidate) -> Row:
     known = math.isfinite(row.gain)
     return (
         words.joints_text(row.joints),
-        plain(row.name) + (" (placebo)" if row.placebo else ""),
+        plain(row.name),
         ", ".join(map(plain, row.given)),
         mrad(row.held_out_rmse_rad) if known else "not fitted",
         f"{percent(row.gain)} ({words.percent_range(row.gain_ci95)})" if known else "",

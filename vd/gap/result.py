@@ -139,8 +139,6 @@ class Candidate:
     """Why, in a few words."""
     parameters: dict[str, float] = field(default_factory=dict)
     """Fitted values by name."""
-    placebo: bool = False
-    """A negative control (an effect driven by shuffled time), which must be rejected."""
     given: tuple[str, ...] = ()
     """Effects that were in the model before it was added."""
 
@@ -223,8 +221,6 @@ class Report:
     closing: Closing | None = None
     warnings: tuple[str, ...] = ()
     """What a reader should know about the data or the fit, in plain sentences."""
-    rollouts: int = 0
-    """Simulated trajectories."""
     seed: int = 0
     command: str = ""
     """Command that repeats the analysis."""

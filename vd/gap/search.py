@@ -214,7 +214,7 @@ class Search(Evidence):
         accepted: bool,
         why: str,
     ) -> list[Trial]:
-        """The rows of one round for the evidence table, best first, placebo last."""
+        """The rows of one round for the evidence table, best first."""
         rows = []
         for name, fit in sorted(fits.items(), key=lambda item: item[1].held_out_rmse):
             gain, ci = self.gain(before, fit)
@@ -226,12 +226,6 @@ class Search(Evidence):
                 if set(NESTED.get(name, ())) & {best.effects[-1]}:
                     decision, reason = "rejected", f"contains {best.effects[-1]} and adds nothing to it"
             rows.append(Trial(number, name, fit, gain, ci, decision, reason))
-        if accepted:
-            gain = self.run([("placebo", {"before": before, "after": best})])[0]
-            text = (
-                f"{best.effects[-1]} with its times reversed and its trajectories exchanged: must be rejected"
-            )
-            rows.append(Trial(number, best.effects[-1], best, gain, (gain, gain), reason=text, placebo=True))
         return rows
 
     def screened_out(

@@ -1,6 +1,5 @@
 """Who fits: worker processes that each hold the recording."""
 
-import copy
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -80,18 +79,13 @@ class Problems:
             )
         return self._problems[key]
 
-    def call(self, spec: JointSpec, call: Call) -> tuple[Any, int]:
-        """The result of a method of the problem, its samples weighted if its arguments say how.
-
-        Also how many trajectories were simulated for it.
-        """
+    def call(self, spec: JointSpec, call: Call) -> Any:
+        """The result of a method of the problem, its samples weighted if its arguments say how."""
         name, options = call[0], dict(call[1])
         weighting, problem = options.pop("weighting", None), self.of(spec)
-        # Calls side by side count, and change the time step.
-        problem = copy.copy(problem) if weighting is None else problem.weighted(weighting)
-        problem.simulated = 0
+        problem = problem if weighting is None else problem.weighted(weighting)
         method = partial(CALLS[name], problem) if name in CALLS else getattr(problem, name)
-        return method(**options), problem.simulated
+        return method(**options)
 
 
 _problems: Problems | None = None
@@ -105,7 +99,7 @@ def _start(problems: Problems, parent: int) -> None:
     _problems = problems
 
 
-def _work(spec: JointSpec, call: Call) -> tuple[Any, int]:
+def _work(spec: JointSpec, call: Call) -> Any:
     assert _problems is not None
     return _problems.call(spec, call)
 
@@ -116,14 +110,10 @@ class WorkerPool:
     Args:
         problems: The problems.
         workers: Processes.
-
-    Attributes:
-        simulated: Trajectories simulated so far.
     """
 
     def __init__(self, problems: Problems, workers: int):
         self.problems, self.workers = problems, workers
-        self.simulated = 0
         self._lock = threading.Lock()
         self._processes: ProcessPoolExecutor | None = None
 
@@ -147,19 +137,15 @@ class WorkerPool:
         """
         if self._processes is None:
             with self._lock:
-                made = [self.problems.call(spec, call) for call in calls]
-        else:
-            try:
-                waiting = [self._processes.submit(_work, spec, call) for call in calls]
-                made = [future.result() for future in waiting]
-            except BrokenProcessPool as error:
-                raise ChildProcessError(
-                    f"one of {self.workers} processes was killed, most often since memory ran out: free "
-                    "some, or give fewer processors (taskset), and run the same command again"
-                ) from error
-        with self._lock:
-            self.simulated += sum(simulated for _, simulated in made)
-        return [result for result, _ in made]
+                return [self.problems.call(spec, call) for call in calls]
+        try:
+            waiting = [self._processes.submit(_work, spec, call) for call in calls]
+            return [future.result() for future in waiting]
+        except BrokenProcessPool as error:
+            raise ChildProcessError(
+                f"one of {self.workers} processes was killed, most often since memory ran out: free "
+                "some, or give fewer processors (taskset), and run the same command again"
+            ) from error
 
 
 def parallel(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:

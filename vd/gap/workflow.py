@@ -84,10 +84,8 @@ def find(recording: Recording | Path, hand: HandModel | None, out: Path, **optio
             "format": FIND_FORMAT,
             "findings": [asdict(f) for f in found],
             "joints": {j.name: {"rows": j.fit.rows.tolist(), "rmse_rad": j.fit.rmse} for j in joints},
-            "simulated": pool.simulated,
         }
         write_json(Path(out) / "find.json", value)
-    chosen.progress(f"find: {pool.simulated} motions simulated")
     for finding in found:
         chosen.progress(f"  {finding.where}")
     return found
@@ -128,13 +126,12 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
             analysed,
             [Finding(**f) for f in known["findings"]],
             seed=chosen.seed,
-            simulated=known["simulated"] + pool.simulated,
         )
         source = replace(report.recording, relative_torques=relative_torques(recording))
         report = replace(report, recording=source)
         predictions.write(out / "predictions.npz")
         report.write(out / "explain.json")
-    chosen.progress(f"explain: {report.verdict} after {pool.simulated} motions simulated")
+    chosen.progress(f"explain: {report.verdict}")
     return report
 
 
