@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 
 from vd.gap.coordinates import BASELINE_PARAMETERS, GRAVITY
-from vd.gap.explanation import Accepted, Explanation
+from vd.gap.explanation import CLOSE, Accepted, Explanation
 from vd.gap.fit import FINER
 from vd.gap.recording import Recording
 from vd.gap.result import (
@@ -30,10 +30,6 @@ from vd.gap.rollout import Rollouts
 from vd.gap.statistics import half_width, interval, resamples, rmse
 from vd.gap.worker_pool import JointSpec, Problems
 from vd.kernels.servo.effects import EFFECTS
-
-CLOSE = 0.1
-"""Values of one effect on two joints within this share of each other are one value: a model that lacks
-something else moves them by more than their intervals tell."""
 
 
 @dataclass(frozen=True, eq=False)

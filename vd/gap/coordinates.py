@@ -19,8 +19,6 @@ LINEAR_STEP = 0.05
 """Finite-difference step of a linear coordinate, in its scale or in its value if that is larger."""
 LOG_TRUST, LINEAR_TRUST = 1.5, 5.0
 """First trust region of a fit, of a logarithmic coordinate and of a linear one, besides its size."""
-SECONDS_SCALE = 0.02
-"""Scale of delays [s]: with ``LINEAR_STEP`` a step of 2 ms, above the time step of the rollouts."""
 SLOWING = ("torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag", "acceleration_limit")
 """Effects whose work a speed limit does in part."""
 SMOOTHING = ("command_filter", "elastic_transmission")
@@ -136,8 +134,6 @@ def keys(effects: Sequence[str], baseline: Sequence[str]) -> list[str]:
 
 
 def _scale(parameter: Parameter, scales: Scales) -> float:
-    if parameter.unit == "s":
-        return SECONDS_SCALE
     if parameter.unit == "N m":
         return max(0.3 * scales.torque, 1e-4)
     if parameter.column in (servo.BACKLASH_WIDTH, servo.DEAD_ZONE_WIDTH, servo.ENCODER_BIAS):
@@ -167,7 +163,7 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
     """
     torque, peak, speed = scales.torque, scales.peak, scales.speed
     small = scales.residual
-    period = SECONDS_SCALE
+    period = EFFECTS["command_delay"].parameters[0].typical
     table: dict[str, list[dict[str, float]]] = {
         "command_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],
         "read_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],

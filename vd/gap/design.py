@@ -6,6 +6,7 @@ import numpy as np
 
 from vd.gap.chain import Chain
 from vd.gap.recording import Recording, Trajectory
+from vd.gap.recording_checks import MIN_KINDS
 from vd.gap.statistics import held
 
 MAX_FOLDS = 6
@@ -99,4 +100,4 @@ def varied(trajectories: list[Trajectory]) -> str | None:
         for name, value in trajectory.conditions.items():
             values[name].add(str(value))
     best = max(values, key=lambda name: len(values[name]), default=None)
-    return best if best is not None and len(values[best]) > 2 else None
+    return best if best is not None and len(values[best]) >= MIN_KINDS else None

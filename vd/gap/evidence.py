@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 import vd.kernels.servo.actuators as servo
-from vd.gap.explanation import NAMED, OWN_ERROR, Accepted, Explanation, Trial, estimates, intervals
+from vd.gap.explanation import CLOSE, NAMED, OWN_ERROR, Accepted, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import DRY, ONE_SIDED, JointFit
-from vd.gap.statistics import interval, rmse
+from vd.gap.statistics import REPEATABLE, interval, rmse
 from vd.kernels.servo.effects import BESIDE, TOGETHER
 
 NESTED = {
@@ -42,9 +42,6 @@ CONTAINED_FLOORS = 0.15
 """The same for one that the winner contains: with more parameters it imitates what the integrator misses."""
 RECOVERED = 0.5
 """Share of the squared gap that the named effects must recover; less is an unknown cause."""
-REPEATABLE = 2.0
-"""Final error, in noise floors, up to which residuals are held against noise alone. A real machine that is
-farther from it does not repeat its motions that well; how well is not known from one recording of each."""
 JITTER = "command_jitter"
 """The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
 
@@ -52,8 +49,6 @@ JITTER = "command_jitter"
 CANCELLING = ("gravity_load", "encoder_bias")
 """Effects that hold a joint off its command at rest. Where they cancel there, they are no two causes but one
 that pulls with the travel from there, a spring, which the table has not."""
-CANCELLED = 0.1
-"""Share of either that is left where they cancel; by luck they do so in a few of a hundred machines."""
 DETERMINED = ("kp", "kd", "inertia")
 """Baseline parameters that every useful excitation determines."""
 
@@ -354,7 +349,7 @@ def cancelled(fit: JointFit, joint: int, rest: float) -> str:
     values, kp = fit.values, float(fit.rows[joint, servo.KP])
     load = values["gravity_load.tau_g_nm"] * np.sin(rest + values["gravity_load.phase_rad"])
     offset = kp * values["encoder_bias.bias_rad"]
-    if abs(offset - load) > CANCELLED * min(abs(load), abs(offset)):
+    if abs(offset - load) > CLOSE * min(abs(load), abs(offset)):
         return ""
     return (
         "gravity_load and encoder_bias cancel where the joint rests: a spring about that place would look "

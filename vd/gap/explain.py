@@ -11,13 +11,12 @@ from vd.gap.evidence import JITTER, NO_GAP, cancelled
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.jitter_search import FIXED, try_jitter
 from vd.gap.joint_fit import JointFit
-from vd.gap.search import MAX_ROUNDS, Search, alike, stood_for
+from vd.gap.recording_checks import MIN_KINDS
+from vd.gap.search import Search, alike, stood_for
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import BEHIND_SENSOR, vetoes
 from vd.gap.worker_pool import JointSpec, WorkerPool
 from vd.kernels.servo.effects import EFFECTS
-
-MIN_TRAJECTORIES = 3
 
 
 def explain(search: Search, baseline: JointFit) -> Explanation:
@@ -41,7 +40,8 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
     if not search.no_gap(present) and not search.white(present):
         found, known, rows = try_jitter(search, explain, baseline, present)
         present = found if found is present or JITTER in found.effects else search.revise(found)
-        trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
+        rounds = max((row.round for row in trials), default=0)
+        trials += [replace(row, round=row.round + rounds) for row in rows]
     evidence = search.settle(trials, present)
     random = JITTER in present.effects
     rivals = {} if random else {name: search.rivals(present, name) for name in present.effects}
@@ -52,8 +52,8 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
 
 def _nothing_to_explain(search: Search, baseline: JointFit, loose: str) -> Explanation | None:
     """The explanation of a joint whose plain model leaves nothing to search for, or cannot be judged."""
-    if len(baseline.sse) < MIN_TRAJECTORIES:
-        text = f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_TRAJECTORIES} at least"
+    if len(baseline.sse) < MIN_KINDS:
+        text = f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_KINDS} at least"
         return Explanation(baseline, baseline, "under_excited", text)
     if not search.no_gap(baseline):
         return None

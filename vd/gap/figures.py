@@ -7,11 +7,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vd.gap.result import Predictions, Report, TrajectoryError
+from vd.gap.words import LISTED
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
 INK, BLUE, ORANGE, GREEN, GREY = "#1c2330", "#0072B2", "#D55E00", "#009E73", "#8a8f98"
-OVERLAYS = 3
-"""Joint and trajectory pairs of which curves are drawn."""
 WINDOW_S = 6.0
 """Longest piece of a trajectory that is drawn; the eye cannot follow more at the width of a page."""
 STYLE = {"axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
@@ -123,7 +122,7 @@ def chosen_overlays(report: Report, curves: Predictions) -> list[tuple[str, int]
     kinds = {(row.joint, row.excitation): row for row in reversed(rows)}
     chosen = [*sorted(worst.values(), key=order), *sorted(kinds.values(), key=order)]
     pairs = dict.fromkeys((row.joint, curves.files.index(row.file)) for row in chosen)
-    return list(pairs)[:OVERLAYS]
+    return list(pairs)[:LISTED]
 
 
 def _models(curves: Predictions, column: int, rows: np.ndarray) -> list[tuple[str, str, np.ndarray]]:

@@ -6,15 +6,10 @@ import numpy as np
 
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.result import Finding
-from vd.gap.statistics import HOLD_S, held
+from vd.gap.statistics import HOLD_S, REPEATABLE, held
 
 SMOOTH_S = 0.05
 """Window over which speeds are taken [s]: longer than an encoder count at low speed."""
-EXTREME = 0.3
-"""Share of the largest speed below which motion is slow, and within which of the largest speed or pull it is
-fast or the servo pulls hard."""
-NOTABLE = 2.0
-"""A phase is reported if its RMS is this many noise floors."""
 PHASES = {
     "onset": f"for {1e3 * HOLD_S:.0f} ms after the command starts to move",
     "reversal": f"for {1e3 * HOLD_S:.0f} ms after each reversal",
@@ -49,7 +44,8 @@ def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) ->
     changed = np.diff(command, prepend=command[0]) != 0.0
     count = np.cumsum(changed)
     onset = changed & (count - 1 == count[np.searchsorted(time, time - HOLD_S)])
-    pull = np.abs(command - position)
+    # More than half of the largest is fast, or a hard pull.
+    pull, fast = np.abs(command - position), np.abs(speed) > 0.5 * top
 
     def after(events: np.ndarray) -> np.ndarray:
         return time - np.maximum.accumulate(np.where(events, time, -np.inf)) <= HOLD_S
@@ -58,9 +54,9 @@ def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) ->
         "onset": after(onset),
         "reversal": after(np.diff(last, prepend=last[0]) != 0.0),
         "hold": rest,
-        "fast": np.abs(speed) > (1.0 - EXTREME) * top,
-        "slow": moving & (np.abs(speed) < EXTREME * top) & ~rest,
-        "load": pull > (1.0 - EXTREME) * max(float(pull.max()), 1e-12),
+        "fast": fast,
+        "slow": moving & ~fast & ~rest,
+        "load": pull > 0.5 * max(float(pull.max()), 1e-12),
     }
 
 
@@ -93,7 +89,7 @@ def _joint(
     rows = []
     for phase, when in PHASES.items():
         mask = np.concatenate([m[phase] for m in masks])
-        if mask.any() and _rms(residual[mask]) > NOTABLE * floor:
+        if mask.any() and _rms(residual[mask]) > REPEATABLE * floor:
             left, direction = residual[mask], np.sign(speed[mask])
             signature = {
                 "rms_rad": _rms(left),

@@ -8,10 +8,11 @@ in turn.
 from collections.abc import Callable
 from dataclasses import replace
 
-from vd.gap.evidence import JITTER, REPEATABLE
+from vd.gap.evidence import JITTER
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.joint_fit import JointFit
 from vd.gap.search import Search
+from vd.gap.statistics import REPEATABLE
 
 Explain = Callable[[Search, JointFit], Explanation]
 """Explains a joint by a search, from its plain model."""

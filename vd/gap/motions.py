@@ -1,5 +1,6 @@
 """The motions of one machine, as they are commanded and recorded. SI units, radians, seconds."""
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,8 @@ import numpy as np
 TELEMETRY = ("velocity", "current", "pwm", "voltage", "temperature")
 """Optional columns per joint: rad/s, A, [-1, 1], V, deg C."""
 CHANNELS = ("command", "position", *TELEMETRY, "enabled")
+FLICKER_COUNTS = 3.0
+"""Encoder counts within which a reading at rest flickers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +55,11 @@ class Trajectory:
     def sent(self) -> np.ndarray:
         """When the commands were sent [T] [s]."""
         return self.time if self.command_time is None else self.command_time
+
+    @property
+    def stream(self) -> int:
+        """Number of its stream of random delays, the same in every simulation and copy."""
+        return zlib.crc32(self.file.encode()) >> 1  # fits a signed integer
 
     @property
     def duration(self) -> float:

@@ -5,7 +5,6 @@ Every world replays one trajectory with one set of parameters. Contacts are off;
 
 import dataclasses
 import math
-import zlib
 from typing import Any
 
 import mujoco
@@ -15,7 +14,7 @@ import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
 from vd.gap.motions import Recording
-from vd.gap.rollout import STEP_S, STREAM_BITS
+from vd.gap.rollout import STEP_S
 from vd.kernels.launch import count_kernel, launch
 from vd.kernels.servo.actuators import BACKLASH_WIDTH, ENCODER_BIAS
 from vd.kernels.servo.chains import Samples
@@ -29,9 +28,6 @@ from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
 from vd.sim.joint_servo import JointServo
 from vd.sim.scene import build_hand, new_builder
-
-GRAPH_STEPS = 16
-"""Physics steps per graph; even, since states are swapped every step."""
 
 
 def simulate_hand(
@@ -91,7 +87,6 @@ class _Replay:
         power = np.concatenate([t.enabled * share for t, share in zip(trajectories, shares, strict=True)])
         command = np.concatenate([t.command for t in trajectories])
         column = np.array([names.index(n) if n in names else -1 for n in self.hand.joint_names])
-        streams = [zlib.crc32(t.file.encode()) & ((1 << STREAM_BITS) - 1) for t in trajectories]
         self.duration = max(t.duration for t in trajectories)
 
         def array(values: np.ndarray, dtype: Any = float) -> wp.array:
@@ -117,7 +112,7 @@ class _Replay:
         self._tracks.column = array(column, int)
         self._tracks.first = array(np.tile(first, models), int)
         self._tracks.last = array(np.tile(first + lengths, models), int)
-        self._tracks.stream = array(np.tile(streams, models), int)
+        self._tracks.stream = array(np.tile([t.stream for t in trajectories], models), int)
 
     def _build(self) -> None:
         """The worlds; without contacts a joint has three rows: its limit, friction, and whom it follows."""
@@ -177,7 +172,7 @@ class _Replay:
         self._launch_steps()  # loads every kernel, which a capture cannot
         with wp.ScopedCapture(device=self.device) as capture:  # a tenth of the time, on a CPU too
             self._launch_steps()
-        for _ in range(math.ceil((math.ceil(self.duration / self.dt) + 1) / GRAPH_STEPS) - 1):
+        for _ in range(math.ceil(0.5 * (math.ceil(self.duration / self.dt) + 1)) - 1):
             wp.capture_launch(capture.graph)
         return self.positions.numpy().astype(float)
 
@@ -191,11 +186,11 @@ class _Replay:
         return load
 
     def _launch_steps(self) -> None:
+        """Two steps: states are swapped every step."""
         servo = self.servo
         given = [servo.parameters, self._samples, self._tracks, self.dt, self._step]
         commands = [self._write, self._due_step, self._due_fraction, self._held, self._held_power]
-        for k in range(GRAPH_STEPS):
-            here, there = k % 2, 1 - k % 2
+        for here, there in ((0, 1), (1, 0)):
             inputs = [*given, *commands, servo.state]
             launch(replay_command_kernel, self.shape, inputs, [servo.reference, servo.power])
             servo.drive(self._q[here], self._qd[here])

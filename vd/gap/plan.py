@@ -27,6 +27,7 @@ from vd.gap.recording import BARE_MODELS, Recording, Trajectory, entry_of, write
 from vd.gap.recording_checks import MIN_KINDS
 from vd.gap.result import Report, parameter_columns, parameters_of
 from vd.gap.rollout import STEP_S, Rollouts
+from vd.gap.statistics import REPEATABLE
 from vd.gap.words import causes, joints_text
 from vd.kernels.servo.effects import EFFECTS
 
@@ -38,9 +39,6 @@ PLAN_JSON = "next_experiment.json"
 PLAN_FOLDER = "next_experiment"
 UNCERTAINTY = 0.1
 """Relative standard deviation of the parameters of a model before any data."""
-VISIBLE = 1.5
-"""Disagreement, in units of the noise, from which a recording is expected to decide: who is wrong leaves 1.8
-there, noise included."""
 PLAIN = "plain servo"
 """The model without any further effect."""
 
@@ -326,13 +324,13 @@ def _sentence(best: Score, report: Report, joints: tuple[str, ...], kinds: int) 
     """What to record, and what it would show."""
     sets = report.open_sets
     between = f" between {causes(sets[0], 'and')}" if len(sets) == 1 else ""
-    if best.disagreement < VISIBLE:
+    if best.disagreement < REPEATABLE:
         decide = "so either serves in simulation; another quantity may decide, current or an external sensor"
         if kinds < MIN_KINDS:
             decide = f"but here are {kinds} kinds of motion: record {MIN_KINDS} at least"
         return (
             f"No motion of the menu would decide{between}: on all of them the models in question differ by "
-            f"less than {VISIBLE:g} times the noise, {decide}. The best of the menu is in {PLAN_FOLDER}/."
+            f"less than {REPEATABLE:g} times the noise, {decide}. The best of the menu is in {PLAN_FOLDER}/."
         )
     goal = f"to decide{between}" if sets else "to see what these motions do not show"
     return (

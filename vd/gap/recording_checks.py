@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import correlate, correlation_lags
 
-from vd.gap.motions import Recording, Trajectory
+from vd.gap.motions import FLICKER_COUNTS, Recording, Trajectory
 
 COMMAND_TIME = "t_command"
 """Optional column: when the commands of a row were sent [s], if not at the row's time stamp."""
@@ -32,17 +32,15 @@ MIN_SAMPLES = 20
 Counts by which a command must move before the position has to answer, and of a step that is another unit
 (degrees are 57 times radians)."""
 FEW = 3
-"""Encoder counts within which a reading at rest flickers, rows within which an echo of the command comes
-back, samples by which stamps alone may let a position lead."""
+"""Rows within which an echo of the command comes back, samples by which stamps may let a position lead."""
 SLOWEST_S = 0.5
-"""Time between samples [s] that shows nothing of a servo (2 ms are 2.0 if written in milliseconds)."""
+"""Time between samples [s] that shows nothing of a servo (2 ms are 2.0 if written in milliseconds): a step is
+over. Of fewer than ``MIN_SAMPLES`` in it the beginning is not resolved."""
 CLEARLY = 0.5
 """Correlation against its command at which a joint turns the other way: lag alone spares slow motions. What a
 lead must leave of one less the correlation, in that of any lag: luck leaves 0.7."""
-MIN_KINDS = 4
-"""Kinds of motion below which little is left to fit when one is held out."""
-SLOW_S = 0.025
-"""Median time between samples [s] above which steps of a servo are not resolved: 50 Hz, a quarter late."""
+MIN_KINDS = 3
+"""Kinds of motion, and motions, below which one alone is left to fit when one is held out."""
 
 
 class RecordingError(ValueError):
@@ -116,7 +114,7 @@ def check_motion(recording: Recording) -> None:
         answers = np.array([np.ptp(t.position[:, j]) for t in told])
         least = int(np.argmin(answers))
         require(
-            answers.max() > FEW * count and answers.min() > 0.0,
+            answers.max() > FLICKER_COUNTS * count and answers.min() > 0.0,
             f"{recording.path / told[least].file}: column 'position.{joint}' only flickers, by "
             f"{answers[least]:.2g} rad, while 'command.{joint}' moves by "
             f"{np.ptp(told[least].command[:, j]):.3g} rad: a dead encoder, or a servo that is off; record it "
@@ -179,7 +177,7 @@ def cautions(recording: Recording) -> tuple[str, ...]:
             "is held out."
         )
     between = float(np.median(np.concatenate([np.diff(t.time) for t in recording.trajectories])))
-    if between > SLOW_S:
+    if between > SLOWEST_S / MIN_SAMPLES:
         found.append(
             f"Samples are {1e3 * between:.0f} ms apart: what a servo does at the beginning of a step is not "
             "resolved; record at 50 Hz or more."

@@ -3,7 +3,6 @@
 Chains: :mod:`vd.gap.chain`. Physics: :mod:`vd.kernels.servo.chains`.
 """
 
-import zlib
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -19,8 +18,6 @@ from vd.kernels.servo.chains import Samples, rollout_kernel
 
 STEP_S = 1.0 / 480.0
 """Time step [s]: four of the simulator's, a fifth of a servo's fastest time constant (inertia / kd)."""
-STREAM_BITS = 28
-"""Bits of the number of a trajectory's random stream."""
 
 
 def links_of(
@@ -92,9 +89,7 @@ class Rollouts:
         counts = [len(t.time) for t in trajectories]
         self._count = np.array(counts, np.int32)
         self._first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int32)
-        self._stream = np.array(
-            [zlib.crc32(t.file.encode()) & ((1 << STREAM_BITS) - 1) for t in trajectories], np.int32
-        )
+        self._stream = np.array([t.stream for t in trajectories], np.int32)
         self.time = np.concatenate([t.time for t in trajectories])
         self.measured = np.concatenate([t.position[:, chain.columns] for t in trajectories])
         self.sample_trajectory = np.repeat(np.arange(len(trajectories)), counts)

@@ -3,6 +3,7 @@
 A step of the search is tentative; :mod:`vd.gap.evidence` has the last word.
 """
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,8 +18,6 @@ from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.servo.effects import EFFECTS, equivalent
 
 MAX_EFFECTS = 3
-MAX_ROUNDS = 2 * MAX_EFFECTS
-"""Forward steps, some of which a backward step takes back."""
 SHORT_LIST = 10
 """Candidates of a round that are fitted, after the linear screening of all."""
 SEARCH_TAIL = 0.4
@@ -146,7 +145,7 @@ class Search(Evidence):
             The model, and the evidence.
         """
         present, trials, visited = baseline, [], {frozenset[str]()}
-        for number in range(1, MAX_ROUNDS + 1):
+        for number in itertools.count(1):
             if self.is_last(present):
                 break
             fits, promised = self.fit_candidates(present)

@@ -7,15 +7,17 @@ never the sample.
 import numpy as np
 from scipy.stats import t as student
 
-from vd.gap.recording import Recording, Trajectory
+from vd.gap.motions import FLICKER_COUNTS, Recording, Trajectory
 
 CONFIDENCE = 0.95
+REPEATABLE = 2.0
+"""Error, in noise floors, up to which residuals are held against noise alone, and no phase of motion or model
+in question stands out. A real machine that is farther from it does not repeat its motions that well; how well
+is not known from one recording of each."""
 BOOTSTRAP = 2000
 """Resamples of whole trajectories."""
 HOLD_S = 0.25
 """The command must have been constant for this long before a sample counts as held."""
-HOLD_COUNTS = 3.0
-"""Travel over ``HOLD_S`` [encoder counts] below which a joint is at rest apart from noise."""
 WINDOW = 16
 """Samples of a window in which slow motion is a parabola."""
 SLOW_COUNTS = (4.0, 30.0)
@@ -38,7 +40,7 @@ def held(trajectory: Trajectory, joint: int, resolution: float) -> np.ndarray:
     smooth = np.convolve(position, np.ones(half) / half, mode="full")[: len(position)]
     travel = np.abs(smooth - np.roll(smooth, half))
     travel[: 2 * half] = np.inf
-    return still & (travel < HOLD_COUNTS * resolution)
+    return still & (travel < FLICKER_COUNTS * resolution)
 
 
 def noise_floor(recording: Recording, joint: int) -> float:

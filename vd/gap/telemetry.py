@@ -9,14 +9,15 @@ import numpy as np
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain
+from vd.gap.explanation import CLOSE
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.recording_checks import MIN_SAMPLES
+from vd.gap.rollout import STEP_S
 from vd.gap.worker_pool import JointSpec
+from vd.kernels.servo.effects import EFFECTS
 
 LINEAR = 0.995
 """Share of the duty cycle's variance that plain error and speed must explain for it to be linear."""
-SAG_NEEDED = 0.1
-"""Share of the supply by which the voltage must fall for sag to matter: it takes that much torque."""
 UPSTREAM = (
     "command_delay",
     "read_delay",
@@ -33,8 +34,6 @@ BEHIND_SENSOR = {
     "supply_sag": "only as a resistance behind the voltage sensor, which loses torque like a sagging supply"
 }
 """Effects whose cause telemetry contradicts, but not a loss of the same form where it has no sensor."""
-LAGS_S = np.arange(0.0, 0.3, 2.5e-3)
-"""Lags that are tried [s]: up to the longest delay searched, as fine as the duty cycle tells."""
 CLEARER = 4.0
 """How many times more of the duty cycle the wrong delay must leave than the right one."""
 
@@ -75,12 +74,14 @@ def late_side(recording: Recording, chain: Chain, spec: JointSpec) -> str:
         ``command_delay``, ``read_delay``, or nothing where neither fits, both do, or no duty is recorded.
     """
     parts = [recording.trajectories[i] for i in spec.trajectories]
+    (delay,) = EFFECTS["command_delay"].parameters
+    lags = np.arange(0.0, delay.upper, STEP_S)
     left = {
-        side: [1.0 - _follows(parts, chain, spec.joint, **{side: lag}) for lag in LAGS_S]
+        side: [1.0 - _follows(parts, chain, spec.joint, **{side: lag}) for lag in lags]
         for side in ("command_delay", "read_delay")
     }
     side, other = sorted(left, key=lambda each: min(left[each]))
-    lag = LAGS_S[np.argmin(left[side])]
+    lag = lags[np.argmin(left[side])]
     # Registers read one after the other are less than a sample apart: that is nobody's delay.
     sample = float(np.median(np.concatenate([np.diff(t.time) for t in parts])))
     clear = min(left[side]) < 1.0 - LINEAR and CLEARER * min(left[side]) < min(left[other])
@@ -129,6 +130,6 @@ def _steady_voltage(trajectories: list[Trajectory], column: int) -> str:
         return ""
     slope, idle = np.polyfit(pull, volt, 1)
     fall = max(-slope * float(np.percentile(pull, 99.0)), 0.0)
-    if fall >= SAG_NEEDED * idle:
+    if fall >= CLOSE * idle:
         return ""
     return f"the recorded voltage falls by {fall:.2f} V of {idle:.1f} V at full pull, too little for sag"

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from vd.gap.result import LAYER, Estimate, Interval, NamedEffect, Report
 
 LISTED = 4
-"""More joints than this are counted rather than listed."""
+"""More joints than this are counted rather than listed, and no more curves are drawn than this."""
 
 
 def plain(name: str) -> str:
