@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from vd.gap.evidence import CANCELLING, JITTER, explains
-from vd.gap.explain import Explained, Explainer, Joint, beside
-from vd.gap.explanation import Explanation, polished
-from vd.gap.worker_pool import WorkerPool, parallel
+from vd.gap.evidence import CANCELLING, explains
+from vd.gap.explain import Explained, Explainer
+from vd.gap.explanation import Explanation
+from vd.gap.worker_pool import parallel
 
 SPRUNG = f"{explains(CANCELLING)} here, but cancel at rest on another joint of the finger, as a spring does"
 """Why a load and an offset are no names."""
@@ -55,26 +53,4 @@ def explain_joints(explainer: Explainer) -> list[Explanation]:
     explained = parallel(finger, sorted({joint.spec.chain for joint in joints}))
     by_name = {joint.name: found for each in explained for joint, found in each}
     alone = [by_name[joint.name] for joint in joints]
-    return doubted(_consistent(explainer.pool, joints, alone), [joint.spec.chain for joint in joints])
-
-
-def _consistent(
-    pool: WorkerPool, joints: Sequence[Joint], explanations: Sequence[Explanation]
-) -> list[Explanation]:
-    """Final models with the other joints of their chain as these are in the end, not without effects.
-
-    Joints that drive or load each other are else fitted to motions that the others do not make.
-    """
-    known = list(zip(joints, explanations, strict=True))
-
-    def again(index: int) -> Explanation:
-        joint, own = known[index]
-        rows = beside(joint, known)
-        changed = not np.array_equal(rows, joint.fit.rows)
-        if not changed or not own.final.effects or JITTER in own.final.effects:
-            return own
-        rows[joint.spec.joint] = own.final.rows[joint.spec.joint]
-        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales}
-        return polished(own, pool.run(joint.spec, [("refine", call)])[0], joint.spec.floor)
-
-    return parallel(again, range(len(joints)))
+    return doubted(alone, [joint.spec.chain for joint in joints])
