@@ -50,7 +50,7 @@ def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path)
     spec = JointSpec(0, 0, everything, everything, 1e-3, ("kd",))
     other = {"command_delay": "read_delay", "read_delay": "command_delay"}[late]
     assert late_side(recording, chain, spec) == late
-    contradicted = set(vetoes(recording, chain, spec, chain.start_row))
+    contradicted = set(vetoes(recording, chain, spec))
     assert {other, "command_filter", "dead_zone", "backlash"} <= contradicted and late not in contradicted
     silent = replace(recording, trajectories=tuple(replace(t, pwm=None) for t in recording.trajectories))
     assert late_side(silent, chain, spec) == ""

@@ -72,7 +72,7 @@ def test_trajectories_come_in_the_order_asked_for():
     data = recording("servo", ("j", "k"), *(trajectory(f"t{i}", wave(1.0 + i, 2, phase=i)) for i in range(3)))
     chain = chains(data)[1]
     rollouts = Rollouts(chain, data)
-    assert rollouts.measured.shape == (300, 1) and rollouts.excited.shape == (300, 1)
+    assert rollouts.measured.shape == (300, 1)
     rows = np.repeat(chain.start_row[None], 2, axis=0)
     rows[1, 0, servo.KP] *= 0.5
     everything = rollouts.predict(rows)

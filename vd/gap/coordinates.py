@@ -14,19 +14,18 @@ BASELINE_PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAV
 """Everything that a baseline can fit, by name."""
 
 LOG_STEP = 0.01
-"""Finite-difference step of a logarithmic coordinate: above the noise of single precision."""
+"""Finite-difference step of a logarithmic coordinate: above the noise of single precision. Not tuned."""
 LINEAR_STEP = 0.05
-"""Finite-difference step of a linear coordinate, in its scale or in its value if that is larger."""
-LOG_TRUST, LINEAR_TRUST = 1.5, 5.0
-"""First trust region of a fit, of a logarithmic coordinate and of a linear one, besides its size."""
+"""The same of a linear coordinate, in its scale or in its value if that is larger. Not tuned."""
 SLOWING = ("torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag", "acceleration_limit")
 """Effects whose work a speed limit does in part."""
 SMOOTHING = ("command_filter", "elastic_transmission")
 """Effects whose work a free inertia does in part: a lag is a lag, on which side of the motor it is."""
 LIGHT = 0.1
-"""An inertia that does none of it, in fitted ones."""
+"""An inertia that does none of it, in fitted ones. Not tuned."""
 FREE_SPEED = 3.0
-"""A speed limit that does not bind, in largest speeds."""
+"""A speed limit that does not bind, in largest speeds. Not tuned; without starts there the XL330 keeps
+45 mrad for 30 at one gain."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +63,11 @@ class Coordinate:
         return size if self.lower <= x + size <= self.upper else -size
 
     def trust(self, x: float) -> float:
-        """Change from x that a fit dares at first."""
-        return LOG_TRUST if self.log else LINEAR_TRUST + abs(x)
+        """Change from x that a fit dares at first: a factor of e, or as many steps and as much as x is.
+
+        With the same of all coordinates the XL330's search ends at 38.4 mrad for 36.3.
+        """
+        return 1.0 if self.log else LINEAR_STEP / LOG_STEP + abs(x)
 
     def bound(self, x: float) -> bool:
         """Whether x is at the far end of its range; 0 of an effect and half a turn are values like others."""
@@ -148,8 +150,6 @@ def _scale(parameter: Parameter, scales: Scales) -> float:
         return max(0.3 * scales.inertia, 1e-6)
     if parameter.column == servo.THERMAL_RATE:
         return 0.3 / scales.duration
-    if parameter.column == servo.ELASTIC_DAMPING:
-        return parameter.typical
     return parameter.typical if parameter.typical > 0.0 else 1.0
 
 
@@ -168,7 +168,7 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         "command_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],
         "read_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],
         "command_jitter": [
-            {"sigma_s": s, "p_drop": p} for s, p in ((0.01, 0.02), (0.03, 0.02), (0.01, 0.2), (0.03, 0.4))
+            {"sigma_s": s, "p_drop": p} for s in (0.0015, 0.005, 0.015) for p in (0.01, 0.1, 0.4)
         ],
         "command_filter": [{"tau_s": f * period} for f in (0.3, 1.0, 3.0, 10.0)],
         "acceleration_limit": [{"a_max_rad_s2": f * scales.acceleration} for f in (2.0, 1.0, 0.5, 0.25, 0.1)],

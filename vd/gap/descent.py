@@ -8,13 +8,14 @@ from scipy.optimize import least_squares
 
 from vd.gap.coordinates import Coordinate
 
-RACE_ITERATIONS = 4
-"""Iterations after which only the better half of several starts goes on."""
+SHORT = 4
+"""Trials after which the worse half of several starts ends, and of a refit near its start. Not tuned."""
 WIDEN = -3.0
 """Factor on the finite-difference steps of a second descent: dry friction and limits make the squared error
-rugged at the scale of the first one's. Less than 0: to the other side."""
+rugged at the scale of the first one's. Less than 0: to the other side. Without the second
+descent a limit of 10 comes out as 10.19; other factors were not tried."""
 TOLERANCE = 1e-4
-"""Relative improvement of the squared error at which a fit has converged."""
+"""Relative improvement of the squared error at which a fit has converged. Not tuned."""
 
 Residuals = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 """Residuals [C, N] of coordinates [C, P], those of trajectories that a mask [S] leaves out being 0."""
@@ -89,7 +90,7 @@ class LeastSquares:
         """Coordinates [P] of the least minimum from several starts [B, P]; the worse half ends early."""
         x = list(starts)
         while len(x) > 1:
-            x = [self.descend(one, RACE_ITERATIONS) for one in x]
+            x = [self.descend(one, SHORT) for one in x]
             costs = [float(np.sum(self.residuals(one[None], None) ** 2)) for one in x]
             x = [x[i] for i in np.argsort(costs)[: (len(x) + 1) // 2]]
         return self.descend(self.descend(x[0], iterations), iterations, widen=WIDEN)

@@ -10,15 +10,17 @@ from vd.gap.recording_checks import MIN_KINDS
 from vd.gap.statistics import held
 
 MAX_FOLDS = 6
+"""Groups of motions that are held out in turn: each costs a refit of every model. Not tuned."""
 BYSTANDERS = 2
 """Trajectories of each other joint of the chain in which a joint's own rest is fitted too; of one, a coupling
-would have no interval."""
+would have no interval. More were not tried."""
 MAX_MOTION_S = 150.0
-"""Motion of a joint that is fitted [s]: twice what the paper records; the rest is held out for good."""
+"""Motion of a joint that is fitted [s], twice what the paper records: for time. Not tuned."""
 MAX_MOTIONS = 30
-"""Trajectories of a joint that are fitted, spread over the recording: each is worth 5 s then."""
+"""Trajectories of a joint that are fitted, spread over the recording: 5 s of each. Not tuned."""
 NEARLY = 0.95
-"""Share of the widest range that a piece must cover to be taken for being the earliest."""
+"""Share of the widest range that a piece must cover to be taken for being the earliest. Of the SO-101's
+elbow the widest piece alone (1 in its place) names asymmetric friction for gravity and Coulomb friction."""
 
 
 def design(recording: Recording, chain: Chain, joint: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -93,11 +95,9 @@ def _widest(recording: Recording, chain: Chain, trajectory: Trajectory, share: f
 
 def varied(trajectories: list[Trajectory]) -> str | None:
     """The condition whose values are held out: that with the most, if two are left when one is held out."""
-    values: dict[str, set[str]] = {
-        name: set() for name in sorted({n for t in trajectories for n in t.conditions})
-    }
+    values: dict[str, set[str]] = {}
     for trajectory in trajectories:
         for name, value in trajectory.conditions.items():
-            values[name].add(str(value))
-    best = max(values, key=lambda name: len(values[name]), default=None)
+            values.setdefault(name, set()).add(str(value))
+    best = max(sorted(values), key=lambda name: len(values[name]), default=None)
     return best if best is not None and len(values[best]) >= MIN_KINDS else None

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 import vd.kernels.servo.actuators as servo
-from vd.gap.explanation import CLOSE, NAMED, OWN_ERROR, Accepted, Explanation, Trial, estimates, intervals
+from vd.gap.explanation import CLOSE, NAMED, Accepted, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import DRY, ONE_SIDED, JointFit
-from vd.gap.statistics import REPEATABLE, interval, rmse
+from vd.gap.statistics import OWN_ERROR, REPEATABLE, interval, rmse
 from vd.kernels.servo.effects import BESIDE, TOGETHER
 
 NESTED = {
@@ -27,14 +27,13 @@ NO_GAP = 1.15
 """A model within this factor of the noise floor leaves white residuals, and nothing to explain."""
 MIN_GAIN = 0.05
 """Share of the held-out RMSE that an effect must remove."""
-MIN_GAIN_FLOORS = 0.7
-"""Gap that an effect must close, as sqrt(before^2 - after^2), in noise floors."""
 JITTER_GAIN_FLOORS = 0.3
-"""The same beside random delays: an effect of six floors leaves half of one there."""
-MEMORY = 8.0
-"""Samples in a row that say the same beside them: what a late command does lasts that long."""
+"""Gap that an effect must close beside random delays, as sqrt(before^2 - after^2), in noise floors: one of
+six floors leaves half of one there. Without delays it is what :data:`NO_GAP` takes for none."""
+MEMORY = 8
+"""Samples in a row that say the same beside random delays: what a late command does lasts that long."""
 PENALTY = 0.01
-"""Relative RMSE that a further parameter must earn to be preferred."""
+"""Relative RMSE that a further parameter must earn to be preferred. Not tuned."""
 EXCESS_FLOORS = 0.07
 """What an alternative to a winner that leaves white residuals must leave more, in noise floors, to be worse:
 thousands of samples carry that difference."""
@@ -44,8 +43,6 @@ RECOVERED = 0.5
 """Share of the squared gap that the named effects must recover; less is an unknown cause."""
 JITTER = "command_jitter"
 """The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
-
-
 CANCELLING = ("gravity_load", "encoder_bias")
 """Effects that hold a joint off its command at rest. Where they cancel there, they are no two causes but one
 that pulls with the travel from there, a spring, which the table has not."""
@@ -121,7 +118,7 @@ class Evidence:
         old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
         return 1.0 - after.held_out_rmse / before.held_out_rmse, interval(1.0 - new / old)
 
-    def better(self, before: JointFit, after: JointFit, tail: float = 0.025) -> tuple[bool, str]:
+    def better(self, before: JointFit, after: JointFit, tentative: bool = False) -> tuple[bool, str]:
         """Whether the step from one model to the larger is earned, and if not why.
 
         Motions that no fit has seen decide; but a larger model that leaves white residuals is judged on
@@ -132,7 +129,8 @@ class Evidence:
         Args:
             before: The smaller model.
             after: The larger.
-            tail: Share of the resamples that may see no gain.
+            tentative: Whether the gain may be that of a few motions: one of two causes alone can make some
+                worse.
         """
         white = self.white(before) or self.white(after)
         if white:
@@ -142,9 +140,9 @@ class Evidence:
         closed = before.held_out_rmse * np.sqrt(max(1.0 - (1.0 - gain) ** 2, 0.0))
         if gain < MIN_GAIN:
             return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
-        if float(np.quantile(1.0 - new / old, tail)) <= 0.0:
+        if not tentative and interval(1.0 - new / old)[0] <= 0.0:
             return False, "its gain over trajectories is not distinguishable from 0"
-        if closed < (JITTER_GAIN_FLOORS if self.behind_jitter else MIN_GAIN_FLOORS) * self.floor:
+        if closed < (JITTER_GAIN_FLOORS if self.behind_jitter else np.sqrt(NO_GAP**2 - 1.0)) * self.floor:
             return False, "what it removes is below the noise floor"
         return True, ""
 
@@ -169,7 +167,7 @@ class Evidence:
         if len(after.effects) > len(before.effects) and share < MIN_GAIN:
             return False, f"narrows what is left by {100.0 * share:.1f} %, less than {100.0 * MIN_GAIN:.0f} %"
         price = 0.5 * np.log(np.maximum(count, 1.0))
-        if float(np.quantile(self.weights @ (gained + price), 0.025)) <= 0.0:
+        if interval(self.weights @ (gained + price))[0] <= 0.0:
             return False, "not likelier than a width of its own for every motion"
         return True, ""
 

@@ -12,9 +12,9 @@ import numpy as np
 from vd.gap.motions import Trajectory
 
 RATE_HZ = 100.0
-"""Rate at which commands are written."""
+"""Rate at which commands are written. Not tuned."""
 AMPLITUDE = 0.7
-"""Largest command, as a share of half the joint's range: room for overshoot before the stops."""
+"""Largest command, in half the joint's range: room for overshoot before the stops. Not tuned."""
 
 
 @dataclass(frozen=True, eq=False)

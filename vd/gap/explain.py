@@ -132,7 +132,7 @@ class Explainer:
         names = candidates(chain, self.effects)
         if _no_jitter(explained):
             names = [name for name in names if name != JITTER]
-        told = vetoes(recording, chain, spec, joint.fit.rows)
+        told = vetoes(recording, chain, spec)
         pairs = alike(self.effects, recording.model).items()
         same = {name: others for name, others in pairs if not {name, *others} & set(told)}
         rng = np.random.default_rng([self.seed, spec.chain, spec.joint])

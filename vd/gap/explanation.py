@@ -1,7 +1,7 @@
 """What the search for what a joint lacks has found: the evidence, effects with intervals, the verdict."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,13 +9,9 @@ import vd.kernels.servo.actuators as servo
 from vd.gap.fit import RIDGE
 from vd.gap.joint_fit import JointFit
 from vd.gap.result import Verdict
-from vd.gap.statistics import half_width
+from vd.gap.statistics import OWN_ERROR, half_width
 from vd.kernels.servo.effects import EFFECTS
 
-OWN_ERROR = 0.02
-"""A model's own error, as a share of the whole gap and of each parameter: no fit of a large effect is better.
-Beside a friction of 97 noise floors a second effect came with a share of 0.015 that was not there. Of 178
-parameters of the development battery 96 % are in their 95 % intervals, with half of it 93, twice 98 %."""
 CLOSE = 0.1
 """Two values within this share of each other are one: of an effect on two joints, as what a model lacks moves
 them by more than their intervals tell; of a load and an offset that cancel, which by luck few in a
@@ -112,10 +108,3 @@ def estimates(
         for p in EFFECTS[name].parameters
         if f"{name}.{p.name}" in final.values
     }
-
-
-def polished(explanation: Explanation, fit: JointFit, floor: float) -> Explanation:
-    """The explanation with its final model fitted anew."""
-    spread = intervals(fit, floor)
-    accepted = tuple(replace(a, estimates=estimates(fit, a.name, spread)) for a in explanation.accepted)
-    return replace(explanation, final=fit, accepted=accepted)

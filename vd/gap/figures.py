@@ -12,7 +12,7 @@ from vd.gap.words import LISTED
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
 INK, BLUE, ORANGE, GREEN, GREY = "#1c2330", "#0072B2", "#D55E00", "#009E73", "#8a8f98"
 WINDOW_S = 6.0
-"""Longest piece of a trajectory that is drawn; the eye cannot follow more at the width of a page."""
+"""Longest piece of a trajectory that is drawn: what the eye follows at a page's width. Not tuned."""
 STYLE = {"axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
 
 

@@ -9,7 +9,7 @@ from vd.gap.result import Finding
 from vd.gap.statistics import HOLD_S, REPEATABLE, held
 
 SMOOTH_S = 0.05
-"""Window over which speeds are taken [s]: longer than an encoder count at low speed."""
+"""Window over which speeds are taken [s]: longer than an encoder count at low speed. Not tuned."""
 PHASES = {
     "onset": f"for {1e3 * HOLD_S:.0f} ms after the command starts to move",
     "reversal": f"for {1e3 * HOLD_S:.0f} ms after each reversal",

@@ -7,35 +7,28 @@ delays do to the samples (:mod:`vd.gap.joint_fit`). The result stands in the tab
 normal distribution of constant width would need for the same likelihood.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import Bounds, minimize
 
-from vd.gap.coordinates import Scales, coordinate
-from vd.gap.evidence import JITTER
+from vd.gap.coordinates import Scales, coordinate, sizes
+from vd.gap.evidence import JITTER, MEMORY
 from vd.gap.fit import RIDGE, JointProblem
 from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import half_width
 
 DRAWS = 16
-"""Realisations of the delays."""
-SMOOTH = 9
-"""Samples over which the variance is averaged: 16 draws alone leave a third of error in it."""
-START_SIGMA_DROP = tuple((sigma, drop) for sigma in (0.0015, 0.005, 0.015) for drop in (0.01, 0.1, 0.4))
-"""Where the search starts: [s] and the share of commands dropped."""
-NOISES = (1.0, 3.0, 10.0)
-"""Noise floors that the first guess allows: what the model lacks besides must not look like jitter."""
+"""Realisations of the delays; alone they leave a third of error in the variance. Not tuned."""
 NARROW = 0.5
 """Share of the first guess that is believed: behind more jitter than there is an effect would not show."""
-FACTORS = (0.0, 0.5, 0.71, 0.85, 1.0, 1.18, 1.41, 2.0)
-"""Multiples of the best standard deviation at which the likelihood is looked at for the intervals ..."""
-DROPS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)
-"""... and shares of commands dropped."""
+FACTORS = (0.0, 0.5, 0.71, 1.0, 1.41, 2.0)
+"""Multiples of the best values at which the likelihood is looked at for the intervals. Not tuned: finer
+ones end closer to where the likelihood does."""
 
 
 class JitterFit:
@@ -48,17 +41,12 @@ class JitterFit:
     """
 
     def __init__(self, problem: JointProblem, base: JointFit, scales: Scales):
-        self.problem, self.base = problem, base
+        self.problem, self.base, self.scales = problem, base, scales
         self.coordinates = [coordinate(f"command_jitter.{name}", scales) for name in ("sigma_s", "p_drop")]
         recording = problem.rollouts.recording
         chosen = [recording.trajectories[int(t)] for t in problem.trajectories]
-        self.size = len(chosen)
         # A trajectory's name seeds its draws.
         copies = tuple(replace(t, file=f"{t.file}#{draw}") for draw in range(DRAWS) for t in chosen)
-        # Where the command stays as it is, delays change nothing: one draw is all.
-        varied = np.array([bool(np.ptp(t.command[:, self._column])) for t in chosen])
-        self.needed = np.flatnonzero(np.concatenate([np.ones(self.size, bool), np.tile(varied, DRAWS - 1)]))
-        self.varied = np.repeat(varied, [len(t.time) for t in chosen])
         self.rollouts = Rollouts(
             problem.rollouts.chain,
             replace(recording, trajectories=copies),
@@ -88,18 +76,14 @@ class JitterFit:
     def draws(self, sigma: float, drop: float) -> tuple[np.ndarray, np.ndarray]:
         """Mean of the positions [N] [rad] over draws of the delays, and their variance [N] [rad^2]."""
         rows, joint = self.row(sigma, drop)[None], self.problem.joint
-        predicted = self.rollouts.predict(rows, self.needed, joint=joint)[0]
-        mean, others = np.split(predicted.astype(float), [len(self.varied)])
-        draws = np.concatenate([mean[None, self.varied], others.reshape(DRAWS - 1, -1)])
-        variance = np.zeros(len(mean))
-        mean[self.varied], variance[self.varied] = draws.mean(axis=0), draws.var(axis=0, ddof=1)
-        spread = np.split(variance, self.ends)
-        kernel = np.ones(SMOOTH) / SMOOTH
+        draws = self.rollouts.predict(rows, joint=joint)[0].astype(float).reshape(DRAWS, -1)
+        spread = np.split(draws.var(axis=0, ddof=1), self.ends)
+        kernel = np.ones(MEMORY) / MEMORY
         smooth = np.concatenate([np.convolve(part, kernel, mode="same") for part in spread])
         # The mean of the draws has an error of its own.
-        return mean, (1.0 + 1.0 / DRAWS) * smooth
+        return draws.mean(axis=0), (1.0 + 1.0 / DRAWS) * smooth
 
-    def losses(self, sigma: float, drop: float, noises: Sequence[float] = (1.0,)) -> np.ndarray:
+    def losses(self, sigma: float, drop: float, noises: Iterable[float] = (1.0,)) -> np.ndarray:
         """Negative log-likelihood of each trajectory [S], less a constant that all models share.
 
         The rest of the model moves along, to first order, by weighted least squares.
@@ -124,9 +108,11 @@ class JitterFit:
         return np.array([part.sum() for part in np.split(losses, self.ends)])
 
     def guess(self) -> tuple[float, float]:
-        """Less than the likeliest of the starts, whatever else the model lacks: that counts as noise."""
-        totals = [float(self.losses(*start, NOISES).sum()) for start in START_SIGMA_DROP]
-        sigma, drop = START_SIGMA_DROP[int(np.argmin(totals))]
+        """Less than the likeliest of the starts, whatever else the model lacks: that can count as noise."""
+        noises = np.geomspace(1.0, max(self.base.rmse / self.problem.floor, 1.0), 3)
+        starts = [tuple(start.values()) for start in sizes(JITTER, (), self.scales)]
+        totals = [float(self.losses(sigma, drop, noises).sum()) for sigma, drop in starts]
+        sigma, drop = starts[int(np.argmin(totals))]
         return NARROW * sigma, NARROW * drop
 
     def weighting(self, sigma: float, drop: float) -> SampleWeighting:
@@ -139,23 +125,20 @@ class JitterFit:
         """The values of the largest likelihood; the rest of the model moves along."""
 
         def total(x: np.ndarray) -> float:
-            return float(self.losses(*self._values(x)).sum())
+            return float(self.losses(*np.exp(x)).sum())
 
-        x = np.log(np.array(start))
+        x, upper = np.log(start), np.log([c.value(c.upper) for c in self.coordinates])
         simplex = x + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0]])
         options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
-        x = minimize(total, x, method="Nelder-Mead", options=options).x
+        x = minimize(total, x, method="Nelder-Mead", bounds=Bounds(-np.inf, upper), options=options).x
         total(x)
         bounds = np.array([(c.lower, c.upper) for c in self.base.coordinates]).T
         moved = np.clip(self.base.x + self.shift, *bounds)
         rows = self.problem.rows(self.base.rows, self.base.coordinates, moved[None])[0]
         self.base = replace(self.base, x=moved, rows=rows)
         self.jacobian = self.problem.jacobian(self.base)
-        return self._values(x)
-
-    def _values(self, x: np.ndarray) -> tuple[float, float]:
-        sigma, drop = (float(v) for v in np.exp(x))
-        return self._limited(sigma, drop)
+        sigma, drop = np.exp(x).tolist()
+        return sigma, drop
 
     def extents(self, sigma: float, drop: float) -> dict[str, tuple[float, float]]:
         """Intervals of both parameters: the values of the pairs that the trajectories do not reject.
@@ -164,9 +147,12 @@ class JitterFit:
         their losses of likelihood over the trajectories, and its interval, since the model is not quite right
         (Vuong 1989). Each end is half way to the first value that is rejected with every other.
         """
-        here, sigmas, drops = self.losses(sigma, drop), [sigma * f for f in FACTORS], sorted({drop, *DROPS})
-        worse = np.array([[self.losses(*self._limited(s, d)) - here for d in drops] for s in sigmas])
-        kept = worse.sum(axis=-1) < half_width(self.size * worse.var(axis=-1, ddof=1), self.size)
+        here, sigmas = self.losses(sigma, drop), [sigma * f for f in FACTORS]
+        # A share that is found too small says nothing of larger ones by its multiples.
+        starts = [start[f"{JITTER}.p_drop"] for start in sizes(JITTER, (), self.scales)]
+        drops = sorted({*starts, *(drop * f for f in FACTORS)})
+        worse = np.array([[self.losses(s, d) - here for d in drops] for s in sigmas])
+        kept = worse.sum(axis=-1) < half_width(len(here) * worse.var(axis=-1, ddof=1), len(here))
         kept[sigmas.index(sigma), drops.index(drop)] = True
         ranges = {}
         for name, values, inside in (("sigma_s", sigmas, kept.any(1)), ("p_drop", drops, kept.any(0))):
@@ -174,10 +160,6 @@ class JitterFit:
             ends = np.interp([first - 0.5, last + 0.5], range(len(values) + 1), [*values, 2.0 * values[-1]])
             ranges[f"command_jitter.{name}"] = float(ends[0]), float(ends[1])
         return ranges
-
-    def _limited(self, sigma: float, drop: float) -> tuple[float, float]:
-        limits = [float(c.value(c.upper)) for c in self.coordinates]
-        return min(sigma, limits[0]), min(drop, limits[1])
 
     def result(self, sigma: float, drop: float) -> JointFit:
         """A pair of values as any other fit, with the errors that a constant width has at its likelihood."""
@@ -225,9 +207,5 @@ def bound_jitter(problem: JointProblem, fit: JointFit, scales: Scales) -> JointF
     return replace(fit, extents=JitterFit(problem, rest, scales).extents(sigma, drop))
 
 
-CALLS: dict[str, Callable[..., Any]] = {
-    "look": look,
-    "fit_jitter": fit_jitter,
-    "bound_jitter": bound_jitter,
-}
+CALLS: dict[str, Callable[..., Any]] = {call.__name__: call for call in (look, fit_jitter, bound_jitter)}
 """What is asked of a joint's problem by name, besides its methods."""

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from vd.gap.coordinates import Coordinate
-from vd.gap.statistics import rmse
+from vd.gap.statistics import OWN_ERROR, rmse
 
 ONE_SIDED, DRY = "asymmetric_friction", ("coulomb_friction", "stribeck_friction")
 """The friction that can have a direction without any, and those that fill it up."""
-SPARED = 0.05
-"""Share of the friction in one direction below which the other has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +67,7 @@ class JointFit:
         if ONE_SIDED in self.effects and not set(DRY) & set(self.effects):
             # No dry friction spares one direction: what does is a load, and a greater one would push.
             sides = {key: value for key, value in self.values.items() if key.startswith(ONE_SIDED)}
-            bound += [key for key, value in sides.items() if value <= SPARED * max(sides.values())]
+            bound += [key for key, value in sides.items() if value <= OWN_ERROR * max(sides.values())]
         return tuple(bound)
 
 

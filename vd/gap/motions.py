@@ -12,7 +12,7 @@ TELEMETRY = ("velocity", "current", "pwm", "voltage", "temperature")
 """Optional columns per joint: rad/s, A, [-1, 1], V, deg C."""
 CHANNELS = ("command", "position", *TELEMETRY, "enabled")
 FLICKER_COUNTS = 3.0
-"""Encoder counts within which a reading at rest flickers."""
+"""Encoder counts within which a reading at rest flickers. Not tuned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Trajectory:
     @property
     def stream(self) -> int:
         """Number of its stream of random delays, the same in every simulation and copy."""
-        return zlib.crc32(self.file.encode()) >> 1  # fits a signed integer
+        return zlib.crc32(self.file.encode()) & 0xFFFFFFF  # a signed integer of 32 bits holds it
 
     @property
     def duration(self) -> float:

@@ -38,7 +38,7 @@ FORMAT = "vd-experiment/1"
 PLAN_JSON = "next_experiment.json"
 PLAN_FOLDER = "next_experiment"
 UNCERTAINTY = 0.1
-"""Relative standard deviation of the parameters of a model before any data."""
+"""Relative standard deviation of the parameters of a model before any data. Not tuned."""
 PLAIN = "plain servo"
 """The model without any further effect."""
 

@@ -34,8 +34,6 @@ CONTACT_MODEL = "contact"
 BARE_MODELS = ("servo", "pendulum")
 """Models that need no articulation: an unknown inertia and gravity load, a point mass on an arm."""
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
-LEAST_COUNTS = 256
-"""Encoder counts a turn at least: eight bits. Twelve bits are 0.088 if written in degrees."""
 POSITIVE = ("p_gain", "payload_kg", "arm_length_m")
 """Conditions that the model computes with: numbers, not negative."""
 STIFFNESS = "kp_nm_rad"
@@ -58,11 +56,10 @@ def read_recording(path: str | Path) -> Recording:
     joints = _names(file, "joints", header.get("joints"))
     _check_model(file, header.get("model"), joints)
     resolution: Any = header.get("encoder_resolution_rad")
-    counts = 2.0 * math.pi / resolution if _is_number(resolution) and resolution > 0.0 else 0.0
     require(
-        counts >= LEAST_COUNTS,
-        f"{file}: 'encoder_resolution_rad' is {resolution!r}, {counts:.3g} counts a turn, as if in degrees; "
-        "give the size of one encoder count in rad, e.g. 0.001534 for 4096 counts a turn",
+        _is_number(resolution) and 0.0 < resolution < math.radians(1.0),
+        f"{file}: 'encoder_resolution_rad' is {resolution!r}, as if in degrees; give the size of one "
+        "encoder count in rad, e.g. 0.001534 for 4096 counts a turn",
     )
     servo: Any = header.get("servo", {})
     entries: Any = header.get("trajectories")

@@ -27,20 +27,20 @@ RANGES = {
 }
 """Least and largest value that a channel can have, and what one outside looks like. A servo in position mode
 turns once, and a tenth for offsets."""
-MIN_SAMPLES = 20
-"""Samples of a trajectory, and distinct positions, below which no motion or unit can be told from noise.
+MIN_SAMPLES = 16
+"""Samples of a trajectory, of a piece of it, and distinct positions, below which nothing is told.
 Counts by which a command must move before the position has to answer, and of a step that is another unit
-(degrees are 57 times radians)."""
+(degrees are 57 times radians). Not tuned."""
 FEW = 3
-"""Rows within which an echo of the command comes back, samples by which stamps may let a position lead."""
+"""Rows within which an echo of the command comes back, or stamps let a position lead. Not tuned."""
 SLOWEST_S = 0.5
 """Time between samples [s] that shows nothing of a servo (2 ms are 2.0 if written in milliseconds): a step is
-over. Of fewer than ``MIN_SAMPLES`` in it the beginning is not resolved."""
+over. Of fewer than ``MIN_SAMPLES`` in it the beginning is not resolved. Not tuned."""
 CLEARLY = 0.5
 """Correlation against its command at which a joint turns the other way: lag alone spares slow motions. What a
 lead must leave of one less the correlation, in that of any lag: luck leaves 0.7."""
 MIN_KINDS = 3
-"""Kinds of motion, and motions, below which one alone is left to fit when one is held out."""
+"""Kinds of motion, and motions, below which one alone is left to fit when one is held out. Not tuned."""
 
 
 class RecordingError(ValueError):
@@ -180,6 +180,6 @@ def cautions(recording: Recording) -> tuple[str, ...]:
     if between > SLOWEST_S / MIN_SAMPLES:
         found.append(
             f"Samples are {1e3 * between:.0f} ms apart: what a servo does at the beginning of a step is not "
-            "resolved; record at 50 Hz or more."
+            f"resolved; record at {MIN_SAMPLES / SLOWEST_S:.0f} Hz or more."
         )
     return tuple(found)

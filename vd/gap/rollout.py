@@ -58,7 +58,6 @@ class Rollouts:
         measured: Recorded positions [S, n] [rad], float64.
         time: Time stamps within each trajectory [S] [s].
         sample_trajectory: Index of each sample's trajectory [S].
-        excited: Whether each joint was excited in the sample's trajectory [S, n].
     """
 
     def __init__(
@@ -93,8 +92,6 @@ class Rollouts:
         self.time = np.concatenate([t.time for t in trajectories])
         self.measured = np.concatenate([t.position[:, chain.columns] for t in trajectories])
         self.sample_trajectory = np.repeat(np.arange(len(trajectories)), counts)
-        excited = np.array([[joint in t.joints for joint in chain.joints] for t in trajectories])
-        self.excited = excited[self.sample_trajectory]
 
     def at(self, dt: float) -> "Rollouts":
         """The same with another time step [s]; kept, so that who asks again simulates with the same."""

@@ -15,16 +15,14 @@ from vd.gap.evidence import JITTER, NESTED, Evidence
 from vd.gap.explanation import Trial
 from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.telemetry import BEHIND_SENSOR
+from vd.gap.worker_pool import Call
 from vd.kernels.servo.effects import EFFECTS, equivalent
 
 MAX_EFFECTS = 3
+"""Effects of a joint, but for random delays. Not tuned: hidden were two at most."""
 SHORT_LIST = 10
-"""Candidates of a round that are fitted, after the linear screening of all."""
-SEARCH_TAIL = 0.4
-"""Share of the resamples that may see no gain from an effect that the search adds or keeps: one of two causes
-alone can make some motions worse."""
+"""Candidates of a round that are fitted, after the linear screening of all: half of the table. Not tuned."""
 
-Call = tuple[str, dict[str, Any]]
 Run = Callable[[list[Call]], list[Any]]
 """Runs methods of the joint's :class:`vd.gap.fit.JointProblem` by name, in parallel."""
 
@@ -146,13 +144,13 @@ class Search(Evidence):
         """
         present, trials, visited = baseline, [], {frozenset[str]()}
         for number in itertools.count(1):
-            if self.is_last(present):
+            if len(present.effects) >= MAX_EFFECTS or self.no_gap(present):
                 break
             fits, promised = self.fit_candidates(present)
             if not fits:
                 break
             best = self.winner(list(fits.values()))
-            earned, why = self.better(present, best, SEARCH_TAIL)
+            earned, why = self.better(present, best, tentative=True)
             trials += self.judge(number, present, fits, best, earned, why)
             trials += self.screened_out(number, present, fits, promised)
             if not earned:
@@ -167,11 +165,6 @@ class Search(Evidence):
             visited.add(frozenset(present.effects))
         return present, trials
 
-    def is_last(self, present: JointFit) -> bool:
-        """Whether no further effect is to be added to a model."""
-        full = len(present.effects) >= MAX_EFFECTS
-        return full or self.no_gap(present)
-
     def revise(self, present: JointFit) -> JointFit:
         """Backward check: drop what is not needed, exchange what another effect does better."""
         for _ in range(MAX_EFFECTS):
@@ -185,7 +178,7 @@ class Search(Evidence):
         """The model without an effect that it does not need, or with a better one in its place, or None."""
         for name in present.effects if len(present.effects) > 1 else ():
             without = self.without(present, name)
-            if not self.better(without, present, SEARCH_TAIL)[0]:
+            if not self.better(without, present, tentative=True)[0]:
                 self.report(f"- {name}: not needed beside the others")
                 return without
             fits = self.rivals(present, name, without)

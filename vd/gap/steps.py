@@ -42,8 +42,8 @@ _DOES = {
     "close": "writing the identified model and simulating the commands again",
     "report": "drawing the page",
 }
-METHOD = 13
-"""Of the analysis; what another one made is made again."""
+METHOD = 14
+"""Version of the analysis; what another one made is made again."""
 NO_EFFECTS = "none"
 """In place of candidates: identify the drives alone."""
 STEPS = tuple(OUTPUTS)

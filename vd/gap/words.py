@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from vd.gap.result import LAYER, Estimate, Interval, NamedEffect, Report
 
 LISTED = 4
-"""More joints than this are counted rather than listed, and no more curves are drawn than this."""
+"""More joints than this are counted rather than listed, and no more curves are drawn than this. Not tuned."""
 
 
 def plain(name: str) -> str:

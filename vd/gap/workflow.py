@@ -31,8 +31,7 @@ from vd.kernels.servo.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"
 CMA_GENERATIONS = 20
-SPEED_STARTS = (1.05, FREE_SPEED)
-"""Starts of the velocity limit, in largest speeds seen: one that binds, one that does not."""
+"""Of the first search for a baseline, of which only where it leads matters; not tuned."""
 
 
 @dataclass(frozen=True)
@@ -177,10 +176,12 @@ def _identify(pool: WorkerPool, specs: Sequence[JointSpec], options: Options) ->
         scales = _scales(pool, spec, rows, spec.floor)
         start = {"base": rows, "scales": scales, "seed": options.seed, "generations": CMA_GENERATIONS}
         searched = pool.run(spec, [("start_baseline", start)])[0]
-        starts = [{}, *({"velocity_limit": f * scales.speed} for f in SPEED_STARTS)]
+        # One limit that binds, one that does not.
+        binding = {"velocity_limit": scales.speed}
+        starts = [{}, binding, {"velocity_limit": FREE_SPEED * scales.speed}]
         # A short search can end where the inertia is too small to show, from where no descent comes back.
         nominal = {key: float(rows[spec.joint, BASELINE_PARAMETERS[key].column]) for key in spec.baseline}
-        starts += [nominal, {**nominal, "velocity_limit": SPEED_STARTS[0] * scales.speed}]
+        starts += [nominal, nominal | binding]
         joint = _fitted(pool, spec, searched, scales, starts=starts)
         error, floor = 1e3 * joint.fit.rmse, 1e3 * spec.floor
         options.progress(f"find: {joint.name}: baseline {error:.2f} mrad, noise floor {floor:.2f}")
