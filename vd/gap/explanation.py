@@ -17,7 +17,7 @@ CLOSE = 0.1
 them by more than their intervals tell; of a load and an offset that cancel, which by luck few in a
 hundred machines do; of a supply idle and under load. Not tuned."""
 NAMED = 0.9
-"""Share of the resamples that must choose an effect for it to be named."""
+"""Share of the resamples that must choose an effect for it to be named. Not tuned."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ from vd.gap.statistics import half_width
 DRAWS = 16
 """Realisations of the delays; alone they leave a third of error in the variance. Not tuned."""
 NARROW = 0.5
-"""Share of the first guess that is believed: behind more jitter than there is an effect would not show."""
+"""Share of the first guess that is believed: behind more jitter than there is an effect would not show.
+Half and twice were not tried."""
 FACTORS = (0.0, 0.5, 0.71, 1.0, 1.41, 2.0)
 """Multiples of the best values at which the likelihood is looked at for the intervals. Not tuned: finer
 ones end closer to where the likelihood does."""
