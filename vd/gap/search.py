@@ -124,9 +124,11 @@ class Search(Evidence):
         by a servo twenty times as stiff), and from there no descent comes back.
         """
         starts, nominal = [{**present.values, **one} for one in added[:2]], self.nominal.get("kp", 0.0)
+        # No slope leads to a speed limit that binds from one that does not.
+        limit = {key: self.scales.speed for key in self.nominal if key == "velocity_limit"}
         torque = nominal / present.values["kp"] if nominal else 1.0
         scaled = {key: value * torque ** torque_power(key) for key, value in starts[0].items()}
-        return [*starts, {**scaled, **self.nominal}]
+        return [*starts, {**scaled, **self.nominal, **limit}]
 
     def weighted(self, weighting: SampleWeighting, **changes: Any) -> "Search":
         """The same search with samples weighted, and other attributes changed."""
