@@ -125,7 +125,7 @@ class Search(Evidence):
         """
         starts, nominal = [{**present.values, **one} for one in added[:2]], self.nominal.get("kp", 0.0)
         # No slope leads to a speed limit that binds from one that does not.
-        limit = {key: self.scales.speed for key in self.nominal if key == "velocity_limit"}
+        limit = {"velocity_limit": self.scales.speed} if "velocity_limit" in self.nominal else {}
         torque = nominal / present.values["kp"] if nominal else 1.0
         scaled = {key: value * torque ** torque_power(key) for key, value in starts[0].items()}
         return [*starts, {**scaled, **self.nominal, **limit}]

@@ -47,7 +47,7 @@ METHOD = 14
 NO_EFFECTS = "none"
 """In place of candidates: identify the drives alone."""
 STEPS = tuple(OUTPUTS)
-_PACKAGES = ("visual-dexterity", "warp-lang", "newton", "scipy", "numpy")
+_PACKAGES = ("visual-dexterity", "warp-lang", "newton", "cma", "scipy", "numpy")
 
 
 @dataclass(frozen=True)
