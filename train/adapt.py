@@ -22,6 +22,16 @@ PAGE = "adapted.html"
 """Page of the comparison, in the run's folder."""
 NOMINAL, IDENTIFIED = "nominal", "identified"
 """Models of the hand in which the policies are compared."""
+LOOSE = 0.4
+"""Tightness of the curriculum at which it begins: who has to stand still at once learns little. So begun, and
+with nothing random but the layer's numbers, 4.4 points more (2.1 to 6.8) come back than when the policy's own
+training goes on: 1300 validation episodes of two hidden models, 118 M steps. Neither was tried alone, nor half
+and twice."""
+RATE, RAISE_AT = 0.0013, 0.1
+"""It rises by so much an update while so many goals succeed, which they did: in 461 updates, 60 M steps of
+16384 environments, to 1. Tried with LOOSE."""
+KL = 0.015
+"""Between the policies before and after an update, with which LOOSE was tried."""
 
 
 @dataclass(kw_only=True)
@@ -29,11 +39,12 @@ class AdaptCfg:
     """Train a teacher further in the identified model of a hand, until it works there as it did before.
 
     Task and learner stay those of the policy's own training. The servos are the layer's: each number with an
-    interval is drawn from it in every episode. Effects of the policy's training that the layer lacks go.
+    interval is drawn from it in every episode; nothing else is random. To stand still is asked for little at
+    first, and as before after 461 updates.
 
     At the end the policy before and after turns the same objects in the nominal and in the identified model:
-    adapted.html in --out. The same command goes on where it was interrupted. For other settings take
-    vd-train teacher --init POLICY --hand-layer LAYER.
+    adapted.html in --out. The same command goes on where it was interrupted. For other settings, as the
+    policy's own randomisation, take vd-train teacher --init POLICY --hand-layer LAYER.
     """
 
     policy: Annotated[str, tyro.conf.Positional]
@@ -96,19 +107,32 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
     from vd.train.checkpoint import load_checkpoint
 
     load_hand(base.env.hand, base.env.fingertip, cfg.hand_layer)
-    before = base.env.randomisation
+    curriculum = base.env.curriculum
+    loosened = curriculum.tightening.enabled
+    if loosened:
+        again = replace(curriculum.tightening, rate=RATE, raise_at=RAISE_AT, lower_at=0.0)
+        curriculum = replace(curriculum, tightening=again)
     env = replace(
         base.env,
         hand_layer=str(cfg.hand_layer),
         objects=cfg.objects or base.env.objects,
         num_envs=cfg.num_envs or base.env.num_envs,
         seed=cfg.seed,
-        randomisation=replace(before, effects={}) if before.enabled else EXACT,
+        curriculum=curriculum,
+        randomisation=EXACT,
     )
     check_names([], env.objects)
     done = load_checkpoint(find_start(cfg.policy))["env_steps"]
     how = replace(base.run, out=cfg.out, device=cfg.device, max_minutes=cfg.max_minutes)
-    run = replace(base, init=cfg.policy, resume="auto", run=replace(how, max_steps=done + cfg.steps), env=env)
+    run = replace(
+        base,
+        init=cfg.policy,
+        init_stage=(1.0, LOOSE) if loosened else None,
+        resume="auto",
+        run=replace(how, max_steps=done + cfg.steps),
+        ppo=replace(base.ppo, desired_kl=KL),
+        env=env,
+    )
     there = saved_config(["--resume", "auto"], run)
     if there is not None and (there.init, there.env) != (run.init, run.env):
         raise FileExistsError(f"{cfg.out} holds a run of other settings; choose another --out")
