@@ -1,4 +1,4 @@
-"""Fit the servo model of one joint to its trajectories: CMA-ES for the start, least squares to finish.
+"""Fit the servo model of one joint to its trajectories by least squares.
 
 Every simulation is a rollout of the whole trajectory; all perturbed parameter sets of a step go through
 one call of :class:`vd.gap.rollout.Rollouts`.
@@ -22,8 +22,6 @@ from vd.gap.rollout import Rollouts
 RIDGE = 0.01
 """Pull towards the start, as information in units of the noise floor: holds directions that the data
 leave free (the torque scale of a bare servo), moves no others. Not tuned."""
-CMA_POPULATION = 16
-"""Not tuned; with cma's own, 7, one of three baselines of a servo ends at 9.4 mrad where 0.5 is least."""
 ITERATIONS = 12
 """Trials of a fit at most. Not tuned."""
 FINER = (2, 4)
@@ -270,25 +268,3 @@ class JointProblem:
         factor = np.clip(along / np.maximum(power, 1e-300), 0.0, 3.0)
         gain = 2.0 * factor * along - factor**2 * power
         return gain / max(float(residual[0] @ residual[0]), 1e-300)
-
-    def start_baseline(self, base: np.ndarray, scales: Scales, *, seed: int, generations: int) -> np.ndarray:
-        """The paper's search: CMA-ES on the squared error of a trajectory of each fold. Returns rows.
-
-        Without it twelve baselines of servos, the SO-101 and the XL330 end within 0.1 % of the same error,
-        but the XL330's search for effects then begins another way and keeps 40.6 mrad for 36.3.
-        """
-        import cma  # half a second, which most worker processes do not need
-
-        coordinates = [coordinate(key, scales) for key in self.baseline]
-        x0 = np.array([c.inverse(float(base[self.joint, c.column])) for c in coordinates])
-        chosen = self.trajectories[np.unique(self.folds, return_index=True)[1]]
-        bounds = [[c.lower for c in coordinates], [c.upper for c in coordinates]]
-        options = {"seed": seed + 1, "popsize": CMA_POPULATION, "maxiter": generations, "verbose": -9}
-        # The first step is one of each coordinate's scale.
-        strategy = cma.CMAEvolutionStrategy(x0, 1.0, {**options, "bounds": bounds})
-        while not strategy.stop():
-            asked = strategy.ask()
-            residual = self.residuals(self.rows(base, coordinates, np.array(asked)), chosen)
-            strategy.tell(asked, list(np.log(np.einsum("cn,cn->c", residual, residual) + 1e-12)))
-        best = np.asarray(strategy.result.xbest)
-        return self.rows(base, coordinates, best[None])[0]

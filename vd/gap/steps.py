@@ -42,12 +42,12 @@ _DOES = {
     "close": "writing the identified model and simulating the commands again",
     "report": "drawing the page",
 }
-METHOD = 14
+METHOD = 15
 """Version of the analysis; what another one made is made again."""
 NO_EFFECTS = "none"
 """In place of candidates: identify the drives alone."""
 STEPS = tuple(OUTPUTS)
-_PACKAGES = ("visual-dexterity", "warp-lang", "newton", "cma", "scipy", "numpy")
+_PACKAGES = ("visual-dexterity", "warp-lang", "newton", "scipy", "numpy")
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.chain import Chain, chains, relative_torques
-from vd.gap.coordinates import BASELINE_PARAMETERS, FREE_SPEED, Scales
+from vd.gap.coordinates import FREE_SPEED, Scales
 from vd.gap.design import design, pieces
 from vd.gap.explain import Explainer, Joint, Progress
 from vd.gap.find import findings
@@ -30,8 +30,6 @@ from vd.gap.worker_pool import JointSpec, Problems, WorkerPool, parallel
 from vd.kernels.servo.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"
-CMA_GENERATIONS = 20
-"""Of the first search for a baseline, of which only where it leads matters; not tuned."""
 
 
 @dataclass(frozen=True)
@@ -174,15 +172,9 @@ def _identify(pool: WorkerPool, specs: Sequence[JointSpec], options: Options) ->
         chain = pool.problems.chains[spec.chain]
         rows = chain.start_row.copy()
         scales = _scales(pool, spec, rows, spec.floor)
-        start = {"base": rows, "scales": scales, "seed": options.seed, "generations": CMA_GENERATIONS}
-        searched = pool.run(spec, [("start_baseline", start)])[0]
         # One limit that binds, one that does not.
-        binding = {"velocity_limit": scales.speed}
-        starts = [{}, binding, {"velocity_limit": FREE_SPEED * scales.speed}]
-        # A short search can end where the inertia is too small to show, from where no descent comes back.
-        nominal = {key: float(rows[spec.joint, BASELINE_PARAMETERS[key].column]) for key in spec.baseline}
-        starts += [nominal, nominal | binding]
-        joint = _fitted(pool, spec, searched, scales, starts=starts)
+        starts = [{}, *({"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED))]
+        joint = _fitted(pool, spec, rows, scales, starts=starts)
         error, floor = 1e3 * joint.fit.rmse, 1e3 * spec.floor
         options.progress(f"find: {joint.name}: baseline {error:.2f} mrad, noise floor {floor:.2f}")
         return joint
