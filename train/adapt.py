@@ -36,11 +36,11 @@ KL = 0.015
 
 @dataclass(kw_only=True)
 class AdaptCfg:
-    """Train a teacher further in the identified model of a hand, until it works there as it did before.
+    """Train a teacher further in the identified model of a hand.
 
     Task and learner stay those of the policy's own training. The servos are the layer's: each number with an
-    interval is drawn from it in every episode; nothing else is random. To stand still is asked for little at
-    first, and as before after 461 updates.
+    interval is drawn from it in every episode; nothing else is random, nor observed late. To stand still is
+    asked for little at first, and as before after 461 updates.
 
     At the end the policy before and after turns the same objects in the nominal and in the identified model:
     adapted.html in --out. The same command goes on where it was interrupted. For other settings, as the

@@ -65,7 +65,7 @@ class Coordinate:
     def trust(self, x: float) -> float:
         """Change from x that a fit dares at first: a factor of e, or as many steps and as much as x is.
 
-        With the same of all coordinates the XL330's search ends at 38.4 mrad for 36.7.
+        With the same of all coordinates the XL330's search ends at 36.8 mrad for 36.6: little.
         """
         return 1.0 if self.log else LINEAR_STEP / LOG_STEP + abs(x)
 
