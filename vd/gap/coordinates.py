@@ -62,13 +62,6 @@ class Coordinate:
         size = widen * (LOG_STEP if self.log else LINEAR_STEP * max(1.0, abs(x)))
         return size if self.lower <= x + size <= self.upper else -size
 
-    def trust(self, x: float) -> float:
-        """Change from x that a fit dares at first: a factor of e, or as many steps and as much as x is.
-
-        With the same of all coordinates the XL330's search ends at 36.8 mrad for 36.6: little.
-        """
-        return 1.0 if self.log else LINEAR_STEP / LOG_STEP + abs(x)
-
     def bound(self, x: float) -> bool:
         """Whether x is at the far end of its range; 0 of an effect and half a turn are values like others."""
         if self.column == servo.GRAVITY_PHASE:

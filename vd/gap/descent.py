@@ -72,14 +72,12 @@ class LeastSquares:
 
         lower = np.array([c.lower for c in self.coordinates]) - start
         upper = np.array([c.upper for c in self.coordinates]) - start
-        # The first trust region is one of each size.
-        scale = np.array([c.trust(v) for c, v in zip(self.coordinates, start, strict=True)])
         found = least_squares(
             residuals,
             np.zeros(len(start)),
             jacobian,
             bounds=(lower, upper),
-            x_scale=scale,
+            x_scale="jac",
             ftol=TOLERANCE,
             gtol=None,
             max_nfev=iterations,
