@@ -20,7 +20,7 @@ class AlignmentCfg:
     heads: int = 4
     """Heads of each; they divide the width."""
     tokens: int = 96
-    """Patches of a cloud. The larger network that was tried has 128, 6 layers and a width of 192."""
+    """Patches of a cloud. With 128, 6 layers and a width of 192 first looks are no better."""
     neighbours: int = 16
     """Points of a patch: of some hundred they reach about 2 cm."""
     patch: int = 64
