@@ -115,8 +115,8 @@ def train(cfg: TeacherCfg, say: Callable[[str], None], started: float) -> int:
         say(line)
     if not runner.run_to_end():
         if not cfg.smoke:
-            again = "the same command" if cfg.resume == "auto" else f"vd-train teacher --out {folder} --resume"
-            say(f"saved in {folder}; go on with: {again}")
+            again = f"vd-train teacher --out {folder} --resume"
+            say(f"saved in {folder}; go on with: {'the same command' if cfg.resume == 'auto' else again}")
         return interrupt.INTERRUPTED
     from vd.train.runner import POLICY_NAME  # loads torch, which the first message should not wait for
 
