@@ -17,7 +17,7 @@ from vd.train.student.align import AlignTrainer, alignment_losses, make_scenes
 from vd.train.student.config import AlignCfg
 from vd.train.student.views import Hands
 from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
-from vd.vision.cfg import AlignmentCfg, SearchCfg
+from vd.vision.cfg import AlignmentCfg
 from vd.vision.finder import LEAST, GoalFinder
 from vd.vision.rotations import (
     cube_rotations,
@@ -188,30 +188,6 @@ def test_points_are_chosen_evenly_whatever_their_number():
     for count in (16, 200, 512):
         often = (finder.share * count).long().bincount(minlength=count)
         assert len(often) == count and often.min() >= 512 // count - 1 and often.max() <= 512 // count + 2
-
-
-def test_of_orientations_that_look_alike_one_stays_until_another_fits_better(monkeypatch):
-    """All four turns fit, with misfits that tremble; the network changes nothing."""
-    turns = Rotation.from_rotvec(np.outer([0.0, 0.5, 1.0, 1.5], [0.0, 0.0, np.pi])).as_matrix()
-    turns, worse = torch.tensor(turns, dtype=torch.float32), torch.zeros(4)
-
-    def refined(goal, normal, seen, rotation, offset, steps):
-        nearest = turn_angle(turns @ rotation[:, None].transpose(-1, -2)).argmin(dim=1)
-        return turns[nearest], offset, 0.1 + 0.01 * torch.rand(len(rotation)) + worse[nearest]
-
-    def compared(self, goal, seen):
-        return Residual(torch.eye(3).expand(len(goal), 3, 3), torch.zeros(len(goal), 3))
-
-    monkeypatch.setattr("vd.vision.alignment.refine", refined)
-    monkeypatch.setattr("vd.vision.alignment.normals", torch.zeros_like)
-    monkeypatch.setattr(NearSighted, "compare", compared)
-    goal, seen = clouds(torch.zeros(4))
-    aligner = Aligner(NearSighted(turns[:1]), goal, SearchCfg(kept=24))
-    first = aligner.look(seen).rotation
-    for _ in range(12):
-        torch.testing.assert_close(aligner.look(seen).rotation, first, atol=1e-5, rtol=0.0)
-    worse[:3] = 0.1  # of all but the last
-    torch.testing.assert_close(aligner.look(seen).rotation, turns[3].expand(4, 3, 3), atol=1e-5, rtol=0.0)
 
 
 @pytest.fixture(scope="module")

@@ -350,7 +350,7 @@ class AlignTrainer(TrainingLoop):
         parts = []
         for some in shapes.split(max(1, self.cfg.batch // 8)):
             pairs = draw_pairs(self.scenes.hands, some, self.cfg.points, scans=scans)
-            found = Aligner(self.network, pairs.goal, self.cfg.search).look(pairs.seen)
+            found = Aligner(self.network, pairs.goal).look(pairs.seen)
             wrong = found.rotation.transpose(-1, -2) @ pairs.rotation
             apart = torch.cdist(pairs.goal @ wrong, pairs.surface).amin(dim=-1).mean(dim=-1)
             parts.append((turn_angle(wrong), (found.position - pairs.offset).norm(dim=-1), apart))

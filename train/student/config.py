@@ -9,7 +9,7 @@ import tyro
 
 from vd.config import Dropped, Renamed
 from vd.train.config import RunCfg, require
-from vd.vision.cfg import SEEN_POINTS, AlignmentCfg, SearchCfg
+from vd.vision.cfg import SEEN_POINTS, AlignmentCfg
 
 Stage = Literal[0, 1]
 PresetName = Literal["gpu", "cpu-demo"]
@@ -28,6 +28,9 @@ WHATEVER: dict[str, Any] = {"": Dropped(None)}
 class AlignCfg:
     """Turning a goal's cloud onto what a camera sees, learned from shapes without simulation."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "search": {"passes": Dropped(2), "kept": Dropped(2), "restart_looks": Dropped(3)}
+    }
     batch: int = 768
     """Pairs of clouds of an optimiser step on one GPU."""
     steps: int = 50
@@ -64,7 +67,6 @@ class AlignCfg:
     views: int = 64
     """Views of each object that is measured on."""
     network: AlignmentCfg = field(default_factory=AlignmentCfg)
-    search: SearchCfg = field(default_factory=SearchCfg)
 
     def validate(self) -> None:
         """Refuse settings that cannot train.

@@ -1,9 +1,6 @@
-"""Settings of the network that sees, and of how it is asked."""
+"""Settings of the network that sees."""
 
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
-
-from vd.config import Dropped
 
 SEEN_POINTS = 512
 """Points of what is seen that a policy looks at: as many as its network learns from."""
@@ -33,14 +30,3 @@ class AlignmentCfg:
                 raise ValueError(f"--align.network.{field_.name} must be positive")
         if self.width % self.heads:
             raise ValueError(f"--align.network.heads = {self.heads} must divide the width {self.width}")
-
-
-@dataclass(frozen=True)
-class SearchCfg:
-    """How rotations are searched for with that network."""
-
-    RETIRED: ClassVar[dict[str, Any]] = {"restart_looks": Dropped(3)}
-    passes: int = 2
-    """Passes that each of the 24 starts of a first look takes."""
-    kept: int = 2
-    """Hypotheses kept from look to look: the best, and others that may turn out better."""
