@@ -180,6 +180,9 @@ class Aligner:
         Args:
             seen: What is seen of the objects [m] [R, P', 3], points in no order.
             rows: Which objects, each once [R]; all by default.
+
+        Returns:
+            Tensors of inference mode: clone them before changing them or learning from them.
         """
         rows = torch.arange(len(self._goal), device=seen.device) if rows is None else rows
         mean = seen.mean(dim=1)

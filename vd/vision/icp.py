@@ -65,11 +65,12 @@ def refine(
     for left in range(steps, -1, -1):
         # Squared distances but for those of the moved points from the origins.
         apart = torch.baddbmm(square[:, None], moved, goal.transpose(-1, -2), alpha=-2.0)
-        near, facing = planes.take_along_dim(nearest(apart)[..., None], dim=1).split(3, dim=-1)
+        index = nearest(apart)[..., None]
+        near, facing = planes.take_along_dim(index, dim=1).split(3, dim=-1)
         away = (facing * (near - moved)).sum(dim=-1)
         if not left:
             break
-        apart = apart.amin(dim=-1) + moved.square().sum(dim=-1)
+        apart = apart.take_along_dim(index, dim=-1).squeeze(-1) + moved.square().sum(dim=-1)
         inside = apart <= apart.kthvalue(int(NEAREST * seen.shape[1]), dim=1, keepdim=True).values
         middle = moved.mean(dim=1, keepdim=True)
         slope = torch.cat([torch.linalg.cross((near - middle) / CLOUD_M, facing), facing], dim=-1)
