@@ -155,7 +155,8 @@ class Aligner:
     """Finds the rotation from goals to objects, and follows it from look to look.
 
     A first look begins from the 24 rotations of a cube: none is farther than 1.1 rad from one of them. They
-    are improved and laid onto what is seen; the one that fits best is believed. Each look improves it so.
+    are improved and laid onto what is seen; the one that fits best is believed. Every look, the first
+    too, improves it once more.
 
     Args:
         network: The trained network.

@@ -32,7 +32,7 @@ def normals(cloud: torch.Tensor) -> torch.Tensor:
 
 
 def nearest(apart: torch.Tensor) -> torch.Tensor:
-    """Indices [..] of the least of rows [.., P]. On a CPU NumPy needs an eighth of torch's time."""
+    """Indices [..] of the least of squared distances [.., P]; on a CPU NumPy takes an eighth of the time."""
     if apart.device.type == "cpu":
         return torch.from_numpy(apart.numpy().argmin(axis=-1))
     return apart.argmin(dim=-1)
