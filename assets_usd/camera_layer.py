@@ -1,7 +1,8 @@
 """Where a hand's depth camera was found to be, as a USD layer over the hand: ``camera.usda``.
 
-The layer holds the place of ``/<hand>/base/camera`` and nothing else, in the ops that the hand's own file
-has. Like the layer with an identified servo model it can be a sublayer of any stage in which the hand is.
+The layer holds the place of ``/<hand>/base/camera`` and nothing else, in the ops that the hand's
+own file has. Like the layer with an identified servo model it can be a sublayer of any stage in
+which the hand is.
 """
 
 from collections.abc import Mapping
@@ -20,13 +21,16 @@ CAMERA_LAYER_FORMAT = "vd-camera-layer/1"
 """What ``customLayerData`` of a layer says it is."""
 
 
-def write_camera_layer(path: Path, hand: HandModel, pose: np.ndarray, notes: Mapping[str, str]) -> None:
+def write_camera_layer(
+    path: Path, hand: HandModel, pose: np.ndarray, notes: Mapping[str, str]
+) -> None:
     """Write a camera's place as a layer over a hand, atomically.
 
     Args:
         path: File to write, ``.usda``.
         hand: The hand.
-        pose: Optical frame (x right, y down, z forward) in the hand's base: position [m], quaternion xyzw.
+        pose: Optical frame (x right, y down, z forward) in the hand's base: position [m],
+            quaternion xyzw.
         notes: How it was found, for people; goes into ``customLayerData``.
 
     Raises:
@@ -59,7 +63,10 @@ def read_camera(hand: HandModel, layer: Path) -> CameraModel:
     Raises:
         HandError: The file is missing, no such layer, or not one of this hand.
     """
-    if not Path(layer).is_file() or open_layer(layer).customLayerData.get("format") != CAMERA_LAYER_FORMAT:
+    if (
+        not Path(layer).is_file()
+        or open_layer(layer).customLayerData.get("format") != CAMERA_LAYER_FORMAT
+    ):
         raise HandError(
             f"{layer}: no camera layer ({CAMERA_LAYER_FORMAT}); name the camera.usda that "
             "vd-deploy calibrate wrote"

@@ -42,7 +42,9 @@ class Hand:
             if self.out is not None:
                 target, text = self.out / path.name, path.read_text()
                 if target.exists() and target.read_text(errors="replace") != text:
-                    raise ValueError(f"{target} is there and another hand; write to another folder (--out)")
+                    raise ValueError(
+                        f"{target} is there and another hand; write to another folder (--out)"
+                    )
                 write_text(target, text)
                 path = target
             print(path)
@@ -53,8 +55,9 @@ class Hand:
 class HandImport:
     """Import a hand from a URDF or MJCF; `vd-assets hand import FILE` is the same.
 
-    Fixed joints are welded; fingers, tips and palm are found, and what the file does not say is guessed and
-    printed. Beside the USD lies a picture, <name>.png. Commands then take the hand by its name.
+    Fixed joints are welded; fingers, tips and palm are found, and what the file does not say is
+    guessed and printed. Beside the USD lies a picture, <name>.png. Commands then take the hand by
+    its name.
     """
 
     file: tyro.conf.Positional[Path]
@@ -91,7 +94,9 @@ class Objects:
     held_out: bool = False
     """Take the held-out families, which share no kind with the training families."""
     out: Path | None = None
-    """Folder to write to; by default the named set in the asset cache (such as procedural-150-seed0)."""
+    """Folder to write to; by default the named set in the asset cache (such as
+    procedural-150-seed0).
+    """
 
     def run(self) -> int:
         """Author procedural objects."""
@@ -113,16 +118,19 @@ class Objects:
 class Import:
     """Import meshes (OBJ, STL, PLY, GLB, USD): repair, scale, decompose, one USD per object.
 
-    A mesh is scaled as little as makes it fit the hand: longest side 0.095-0.165 m, mean width at most
-    0.13 m, shortest side at least 0.025 m where the others let it. An object is called like its file, or
-    like the nearest folder that says something if the file's name does not (mug/meshes/model.obj: mug).
-    An import that was interrupted goes on where it stopped. The exit status is 1 if any mesh was refused.
+    A mesh is scaled as little as makes it fit the hand: longest side 0.095-0.165 m, mean width at
+    most 0.13 m, shortest side at least 0.025 m where the others let it. An object is called like
+    its file, or like the nearest folder that says something if the file's name does not
+    (mug/meshes/model.obj: mug). An import that was interrupted goes on where it stopped. The exit
+    status is 1 if any mesh was refused.
     """
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Mesh files, or folders to search for them."""
     out: Path | None = None
-    """Folder to write to; by default a set in the asset cache, named after the folder of the meshes."""
+    """Folder to write to; by default a set in the asset cache, named after the folder of the
+    meshes.
+    """
     settings: tyro.conf.OmitArgPrefixes[ImportSettings] = field(default_factory=ImportSettings)
     """Unit, size, mass and parts of the objects."""
     jobs: int = 0
@@ -219,10 +227,13 @@ def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
         lines.append(f"volume error of the parts: median {median:.1%}, worst {named}")
         scaled = sum("scaled by" in note for model in worst for note in model.notes)
         lines.append(
-            f"longest side {_span([model.longest_side for model in worst])} m ({scaled} of {len(worst)} "
+            f"longest side {_span([model.longest_side for model in worst])} m ({scaled} of "
+            f"{len(worst)} "
             f"scaled), mass {_span([model.mass_kg for model in worst])} kg"
         )
-    lines += [f"warning {name}: {words}" for name, model in good.items() for words in model.warnings]
+    lines += [
+        f"warning {name}: {words}" for name, model in good.items() for words in model.warnings
+    ]
     lines += [f"refused {r.job.source}: {r.reason}" for r in results if r.status == "refused"]
     return "\n".join(lines)
 

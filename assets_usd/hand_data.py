@@ -13,7 +13,10 @@ from scipy.spatial.transform import Rotation
 
 
 class HandError(ValueError):
-    """A USD file that is not a hand, or no layer of it; says which file, prim, attribute, and what to do."""
+    """A USD file that is not a hand, or no layer of it.
+
+    Says which file, prim, attribute, and what to do.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +28,8 @@ class Intrinsics:
         height: Rows of the image.
         fx: Horizontal focal length [px].
         fy: Vertical focal length [px].
-        cx: Principal point, from the left edge of the image [px]; the first pixel's centre is at 0.5.
+        cx: Principal point, from the left edge of the image [px]; the first pixel's centre is at
+            0.5.
         cy: Principal point, from the top edge of the image [px].
     """
 
@@ -63,7 +67,9 @@ class CameraModel(Intrinsics):
     quaternion: np.ndarray
 
     def at(self, place: Sequence[float] | None) -> "CameraModel":
-        """The camera at a pose in the base frame, position [m] and quaternion xyzw; where it is by default.
+        """The camera at a pose in the base frame, position [m] and quaternion xyzw.
+
+        Where it is by default.
 
         Raises:
             ValueError: It is no pose.
@@ -97,9 +103,9 @@ class CollisionShape:
         path: Prim path, which is also the label of the shape in Newton.
         link: Index of its link.
         kind: ``box``, ``sphere``, ``capsule``, ``cylinder`` or ``hull``.
-        size: Half extents of a box, or of the box around a hull; (radius,) of a sphere; (radius, half the
-            length without the caps) of a capsule; (radius, half height) of a cylinder [m]. The last two lie
-            along z of ``frame``.
+        size: Half extents of a box, or of the box around a hull; (radius,) of a sphere; (radius,
+            half the length without the caps) of a capsule; (radius, half height) of a cylinder [m].
+            The last two lie along z of ``frame``.
         frame: Pose in the link frame [7]; of a hull that of the box around it.
         vertices: Corners of a hull in ``frame`` [V, 3] [m]; of other kinds [0, 3].
         friction: Coefficient of (dynamic) friction.
@@ -145,7 +151,9 @@ class MotorModel:
     gear: float = 1.0
     """Its turns for one of the joint."""
     p_gain: int = 200
-    """Position gain with which it is as stiff as the joint's drive, in its units; by default the paper's."""
+    """Position gain with which it is as stiff as the joint's drive, in its units; by default the
+    paper's.
+    """
     d_gain: int = 10
     """Its damping likewise."""
     current: float = 0.0
@@ -154,16 +162,19 @@ class MotorModel:
 
 @dataclass(frozen=True, eq=False)
 class HandModel:
-    """A hand as read from USD; F fingers of 1 to 6 joints, D joints, L = D + 1 links (``base`` is link 0).
+    """A hand as read from USD.
 
-    Joints and links are ordered by finger and from the palm: ``f0_j1, f0_j2, ..., f1_j1, ...``. Joints are
-    all that move, those included that follow another one and have no motor.
+    F fingers of 1 to 6 joints, D joints, L = D + 1 links (``base`` is link 0).
+
+    Joints and links are ordered by finger and from the palm: ``f0_j1, f0_j2, ..., f1_j1, ...``.
+    Joints are all that move, those included that follow another one and have no motor.
 
     Attributes:
         name: Name of the hand.
         fingertip: Selected kind of fingertip.
         path: The file it was read from.
-        layer: The layer over it with an identified servo model, if any (:mod:`vd.assets_usd.hand_layer`).
+        layer: The layer over it with an identified servo model, if any
+            (:mod:`vd.assets_usd.hand_layer`).
         fingers: Each finger's joints, as columns [F].
         mount: Pose of the base in the world [7].
         palm: Where the palm looks, a unit vector in the base frame [3].
@@ -187,10 +198,11 @@ class HandModel:
         mimic_factor: Its angle is that of the joint it follows times this, [D],
         mimic_offset: plus this [D] [rad].
         motors: Motor of each joint, as far as the file says it [D].
-        servo: Servo model of each joint [D, P], P = PARAMETER_COLUMNS of :mod:`vd.kernels.servo.actuators`:
-            drive, speed limit, armature, and every effect that the USD authors; SI units, radians.
-        servo_interval: 95 % interval (low, high) of each number of ``servo`` [D, P, 2], NaN where none is
-            known.
+        servo: Servo model of each joint [D, P], P = PARAMETER_COLUMNS of
+            :mod:`vd.kernels.servo.actuators`: drive, speed limit, armature, and every effect that
+            the USD authors; SI units, radians.
+        servo_interval: 95 % interval (low, high) of each number of ``servo`` [D, P, 2], NaN where
+            none is known.
         link_mass: Masses [L] [kg].
         link_com: Centres of mass in the link frames [L, 3] [m].
         link_inertia: Inertia about the centre of mass in the link frames [L, 3, 3] [kg m^2].
@@ -198,8 +210,10 @@ class HandModel:
         tip_frame: Pose of each site in its link [F, 7].
         mounted_camera: The depth camera, if it has one.
         point_link: Link whose frame each set of surface samples is in [P].
-        link_points: Surface samples [P, 500, 3] [m]: of every link of the fingers, and of the base what the
-            file samples: its first motors, not the palm, of D'Claw hands, as in the paper's released code.
+        link_points: Surface samples [P, 500, 3] [m]: of every link of the fingers, and of the base
+            what the
+            file samples: its first motors, not the palm, of D'Claw hands, as in the paper's
+                released code.
         shapes: Colliders.
     """
 
@@ -255,7 +269,9 @@ class HandModel:
     @property
     def joint_finger(self) -> np.ndarray:
         """Finger of each joint, int [D]."""
-        return np.repeat(np.arange(self.num_fingers), [finger.stop - finger.start for finger in self.fingers])
+        return np.repeat(
+            np.arange(self.num_fingers), [finger.stop - finger.start for finger in self.fingers]
+        )
 
     @property
     def joints_per_finger(self) -> int:
@@ -267,8 +283,10 @@ class HandModel:
         counts = [finger.stop - finger.start for finger in self.fingers]
         if len(set(counts)) > 1:
             raise HandError(
-                f"{self.path}: the fingers of {self.name} have {counts} joints; what was asked for needs "
-                "equal fingers: observe goals in the world frame (observation.view), without a camera"
+                f"{self.path}: the fingers of {self.name} have {counts} joints; what was asked for "
+                f"needs "
+                "equal fingers: observe goals in the world frame (observation.view), without a "
+                "camera"
             )
         return counts[0]
 
@@ -285,7 +303,9 @@ class HandModel:
             HandError: It has none.
         """
         if self.mounted_camera is None:
-            raise HandError(f"{self.path}: {self.name} has no camera; add the prim base/camera (hand.md)")
+            raise HandError(
+                f"{self.path}: {self.name} has no camera; add the prim base/camera (hand.md)"
+            )
         return self.mounted_camera
 
     @property
@@ -319,7 +339,8 @@ class HandModel:
         q = np.asarray(q, dtype=float)
         if q.shape[-1:] != (self.num_joints,):
             raise ValueError(
-                f"{self.name}: q has shape {q.shape}; its last axis must be {self.num_joints} joints"
+                f"{self.name}: q has shape {q.shape}; its last axis must be {self.num_joints} "
+                f"joints"
             )
         batch = q.shape[:-1]
         flat = q.reshape(-1, self.num_joints)
@@ -340,7 +361,9 @@ class HandModel:
 
 def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Poses ``first * second``; [.., 7] each, broadcast against each other."""
-    first, second = np.broadcast_arrays(np.asarray(first, dtype=float), np.asarray(second, dtype=float))
+    first, second = np.broadcast_arrays(
+        np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    )
     a, b = first.reshape(-1, 7), second.reshape(-1, 7)
     turn = Rotation.from_quat(a[:, 3:])
     moved = turn.apply(b[:, :3]) + a[:, :3]
@@ -356,6 +379,9 @@ def invert(pose: np.ndarray) -> np.ndarray:
 
 
 def canonical_quat(quat: np.ndarray) -> np.ndarray:
-    """Of q and -q, one rotation, the one whose first of w, x, y, z that is not 0 is positive; xyzw [4]."""
+    """Of q and -q, one rotation, the one whose first of w, x, y, z that is not 0 is positive.
+
+    Xyzw [4].
+    """
     first = next((value for value in (quat[3], *quat[:3]) if value != 0.0), 1.0)
     return -quat if first < 0.0 else quat

@@ -1,4 +1,7 @@
-"""What a hand's USD says of it beside its bodies: mount, palm, workspace, start, mimic joints and motors."""
+"""What a hand's USD says of it beside its bodies.
+
+Mount, palm, workspace, start, mimic joints and motors.
+"""
 
 import math
 from pathlib import Path
@@ -28,7 +31,10 @@ ROUNDING_RAD = 1e-5
 
 
 class Described:
-    """The prims of one hand's file, and their attributes; every method raises :class:`HandError`."""
+    """The prims of one hand's file, and their attributes.
+
+    Every method raises :class:`HandError`.
+    """
 
     def __init__(self, path: Path, stage: Usd.Stage, layer: Path | None):
         self.path, self.stage, self.layer = path, stage, layer
@@ -90,7 +96,9 @@ class Described:
         """Where objects are handled."""
         low, high = self._vector("vd:workspace:size", 2)
         if not 0.0 < low <= high:
-            raise self.fail(self.root, f"'vd:workspace:size' is ({low}, {high})", "smallest first, above 0")
+            raise self.fail(
+                self.root, f"'vd:workspace:size' is ({low}, {high})", "smallest first, above 0"
+            )
         return Workspace(
             drop_m=tuple(self._vector("vd:workspace:drop").tolist()),
             goal_m=tuple(self._vector("vd:workspace:goal").tolist()),
@@ -120,9 +128,15 @@ class Described:
         paths = [other.GetPath() for other in joints]
         if len(targets) != 1 or targets[0] not in paths:
             named = [str(target) for target in targets]
-            raise self.fail(joint, f"'newton:mimicJoint' is {named}", "point it at one joint of the hand")
+            raise self.fail(
+                joint, f"'newton:mimicJoint' is {named}", "point it at one joint of the hand"
+            )
         factor = self.number(joint, "newton:mimicCoef1")
-        return paths.index(targets[0]), factor, math.radians(self.number(joint, "newton:mimicCoef0"))
+        return (
+            paths.index(targets[0]),
+            factor,
+            math.radians(self.number(joint, "newton:mimicCoef0")),
+        )
 
     def check_mimic(self, joints: list[Usd.Prim], leaders: list[int]) -> None:
         """Refuse a joint that follows one which follows another."""
@@ -134,25 +148,36 @@ class Described:
     def motors(self, joints: list[Usd.Prim]) -> tuple[MotorModel | None, ...]:
         """The motor of each joint that says which it has; no two have one ID."""
         if self.earlier:
-            return tuple(MotorModel(EARLIER_MOTOR, 10 * (n // 3 + 1) + n % 3) for n in range(len(joints)))
+            return tuple(
+                MotorModel(EARLIER_MOTOR, 10 * (n // 3 + 1) + n % 3) for n in range(len(joints))
+            )
         motors: list[MotorModel | None] = []
         for joint in joints:
             if not joint.GetAuthoredPropertiesInNamespace("vd:motor"):
                 motors.append(None)
                 continue
-            said = {n: k for n, k in GAINS.items() if joint.GetAttribute(f"vd:motor:{n}").HasAuthoredValue()}
+            said = {
+                n: k
+                for n, k in GAINS.items()
+                if joint.GetAttribute(f"vd:motor:{n}").HasAuthoredValue()
+            }
             motor = MotorModel(
                 model=str(self.value(joint, "vd:motor:model")),
                 id=int(self.value(joint, "vd:motor:id")),
                 sign=self.number(joint, "vd:motor:sign"),
                 offset_rad=self.number(joint, "vd:motor:offset"),
                 gear=self.number(joint, "vd:motor:gear", positive=True),
-                **{name: kind(self.number(joint, f"vd:motor:{name}")) for name, kind in said.items()},
+                **{
+                    name: kind(self.number(joint, f"vd:motor:{name}"))
+                    for name, kind in said.items()
+                },
             )
             if abs(motor.sign) != 1.0:
                 raise self.fail(joint, f"'vd:motor:sign' is {motor.sign:g}", "it is 1, or -1")
             if motor.id in [other.id for other in motors if other]:
-                raise self.fail(joint, f"'vd:motor:id' {motor.id} is another joint's too", "change one")
+                raise self.fail(
+                    joint, f"'vd:motor:id' {motor.id} is another joint's too", "change one"
+                )
             motors.append(motor)
         return tuple(motors)
 

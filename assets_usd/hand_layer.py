@@ -3,16 +3,17 @@
 The layer holds ``over`` prims for joints, ``/dclaw3/f0_j1`` for example, and nothing else:
 
 * the drive as it was identified, in the attributes that every reader of UsdPhysics knows:
-  ``drive:angular:physics:stiffness`` and ``damping`` (per degree), ``newton:velocityLimit`` (degrees per
-  second) and ``newton:armature``,
+  ``drive:angular:physics:stiffness`` and ``damping`` (per degree), ``newton:velocityLimit``
+  (degrees per second) and ``newton:armature``,
 * every effect, ``vd:<effect>:<parameter>`` (double, SI units, radians), by the names of
   :data:`vd.kernels.servo.effects.EFFECTS`,
-* 95 % intervals, ``vd:<effect>:<parameter>:ci95`` (float2: low, high; SI units, radians), with ``baseline``
-  as the effect for stiffness, damping, speed limit and armature (``vd:baseline:kp:ci95``).
+* 95 % intervals, ``vd:<effect>:<parameter>:ci95`` (float2: low, high; SI units, radians), with
+  ``baseline`` as the effect for stiffness, damping, speed limit and armature
+  (``vd:baseline:kp:ci95``).
 
-The layer is plain USD: it can be a sublayer of any stage in which the hand is, and the same attributes may
-be authored in a hand's own file. A motor on a bench, which has no hand, has the same on ``/servo/<joint>``
-or ``/pendulum/<joint>``.
+The layer is plain USD: it can be a sublayer of any stage in which the hand is, and the same
+attributes may be authored in a hand's own file. A motor on a bench, which has no hand, has the same
+on ``/servo/<joint>`` or ``/pendulum/<joint>``.
 """
 
 import math
@@ -33,9 +34,13 @@ LAYER_FORMAT = "vd-hand-layer/1"
 
 NAMESPACE = "vd"
 DESCRIPTION_GROUPS = ("start", "source", "motor")
-"""Attributes ``vd:<group>`` and ``vd:<group>:...`` of joints that describe the hand, not its servo model."""
+"""Attributes ``vd:<group>`` and ``vd:<group>:...`` of joints that describe the hand, not its servo
+model.
+"""
 BASELINE_GROUP = "baseline"
-"""In the place of an effect's name: intervals of the drive, whose values are in USD's own attributes."""
+"""In the place of an effect's name: intervals of the drive, whose values are in USD's own
+attributes.
+"""
 INTERVAL = ":ci95"
 
 DRIVE: dict[str, tuple[str, float]] = {
@@ -45,7 +50,9 @@ DRIVE: dict[str, tuple[str, float]] = {
     "inertia": ("newton:armature", 1.0),
     "kd_off": ("vd:baseline:kd_off", 1.0),
 }
-"""USD attribute of each parameter of the baseline, and the factor from SI and radians to its unit."""
+"""USD attribute of each parameter of the baseline, and the factor from SI and radians to its
+unit.
+"""
 
 Estimate = float | Sequence[float]
 """A value, or (value, low, high) with its 95 % interval."""
@@ -67,7 +74,9 @@ class _Number(NamedTuple):
 _NUMBERS: dict[str, dict[str, _Number]] = {
     BASELINE_GROUP: {p.name: _Number(BASELINE_GROUP, p, *DRIVE[p.name]) for p in BASELINE},
     **{
-        name: {p.name: _Number(name, p, f"{NAMESPACE}:{name}:{p.name}", 1.0) for p in effect.parameters}
+        name: {
+            p.name: _Number(name, p, f"{NAMESPACE}:{name}:{p.name}", 1.0) for p in effect.parameters
+        }
         for name, effect in EFFECTS.items()
     },
 }
@@ -88,8 +97,8 @@ def write_layer(
     Args:
         path: File to write, ``.usda``.
         hand: The hand, or the name of its root prim where there is no hand (a bare servo).
-        baseline: By joint, then by name (``kp``, ``kd``, ``velocity_limit``, ``inertia``): the drive, in SI
-            units and radians. What is left out stays as the hand's file has it.
+        baseline: By joint, then by name (``kp``, ``kd``, ``velocity_limit``, ``inertia``): the
+            drive, in SI units and radians. What is left out stays as the hand's file has it.
         effects: By joint, effect and parameter: what the plain drive lacks.
         tool: What wrote it, for people: ``vd-gap run``.
         recording: Which recording it was identified from.
@@ -102,13 +111,17 @@ def write_layer(
     if not isinstance(hand, str):
         for name in names:
             if name not in hand.joint_names:
-                raise HandError(f"{path}: {root} has no joint {name!r}; it has {', '.join(hand.joint_names)}")
+                raise HandError(
+                    f"{path}: {root} has no joint {name!r}; it has {', '.join(hand.joint_names)}"
+                )
         names.sort(key=hand.joint_names.index)
     layer = Sdf.Layer.CreateAnonymous(".usda")
     layer.defaultPrim = root
     layer.documentation = (
-        f"Servo model of {root}, identified by {tool} from {recording}. A layer over the hand: pass it with "
-        f"--hand-layer, or make it a sublayer. Drives are in USD's units (degrees), vd:* in SI and radians."
+        f"Servo model of {root}, identified by {tool} from {recording}. A layer over the hand: "
+        f"pass it with "
+        f"--hand-layer, or make it a sublayer. Drives are in USD's units (degrees), vd:* in SI and "
+        f"radians."
     )
     layer.customLayerData = {"format": LAYER_FORMAT, "tool": tool, "recording": recording}
     top = Sdf.PrimSpec(layer, root, Sdf.SpecifierOver)
@@ -143,7 +156,8 @@ def open_layer(path: Path) -> Sdf.Layer:
     """
     if not Path(path).is_file():
         raise HandError(
-            f"{path}: no such hand layer; name the identified.usda that vd-gap wrote, or, for a policy "
+            f"{path}: no such hand layer; name the identified.usda that vd-gap wrote, or, for a "
+            f"policy "
             "trained with one that is not here, --hand-layer none"
         )
     try:
@@ -164,13 +178,16 @@ def add_layer(stage: Usd.Stage, path: Path) -> None:
         path: The layer.
 
     Raises:
-        HandError: The file is missing, no USD or empty, or changes prims that the hand does not have.
+        HandError: The file is missing, no USD or empty, or changes prims that the hand does not
+            have.
     """
     layer = open_layer(path)
     hand = stage.GetRootLayer().realPath
     root = stage.GetDefaultPrim().GetName()
     if not layer.rootPrims:
-        raise HandError(f"{path}: not an identified servo model, it has no joints; let vd-gap write it again")
+        raise HandError(
+            f"{path}: not an identified servo model, it has no joints; let vd-gap write it again"
+        )
     for prim in layer.rootPrims:
         if prim.name != root:
             raise HandError(
@@ -186,7 +203,8 @@ def add_layer(stage: Usd.Stage, path: Path) -> None:
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     if unknown:
         raise HandError(
-            f"{path}: {min(unknown)}: {root} has no such prim ({hand}); name a joint that it has, f0_j1 ..."
+            f"{path}: {min(unknown)}: {root} has no such prim ({hand}); name a joint that it has, "
+            f"f0_j1 ..."
         )
     stage.GetSessionLayer().subLayerPaths.append(layer.identifier)
 
@@ -206,19 +224,25 @@ def read_bare_layer(path: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.n
     """
     layer = open_layer(path)
     if layer.customLayerData.get("format") != LAYER_FORMAT:
-        raise HandError(f"{path}: not an identified servo model ({LAYER_FORMAT}); let vd-gap write it again")
+        raise HandError(
+            f"{path}: not an identified servo model ({LAYER_FORMAT}); let vd-gap write it again"
+        )
     stage = Usd.Stage.Open(layer)
     prims = [stage.GetPrimAtPath(f"/{layer.defaultPrim}/{name}") for name in joints]
     for name, prim in zip(joints, prims, strict=True):
         if not prim:
-            raise HandError(f"{path}: there is no joint /{layer.defaultPrim}/{name}; identify it first")
+            raise HandError(
+                f"{path}: there is no joint /{layer.defaultPrim}/{name}; identify it first"
+            )
     baseline = {}
     for name, (attribute, factor) in DRIVE.items():
         if attribute.startswith(f"{NAMESPACE}:"):
             continue
         for prim in prims:
             if not prim.GetAttribute(attribute).HasAuthoredValue():
-                raise HandError(f"{path}: {prim.GetPath()}: '{attribute}' is not authored; give it a value")
+                raise HandError(
+                    f"{path}: {prim.GetPath()}: '{attribute}' is not authored; give it a value"
+                )
         baseline[name] = np.array([prim.GetAttribute(attribute).Get() / factor for prim in prims])
     return read_servo(prims, baseline, path)
 
@@ -230,15 +254,16 @@ def read_servo(
 
     Args:
         joints: Joint prims [D].
-        baseline: Values of the parameters of :data:`vd.kernels.servo.effects.BASELINE` by name, [D] each, SI
-            units.
+        baseline: Values of the parameters of :data:`vd.kernels.servo.effects.BASELINE` by name, [D]
+            each, SI units.
         source: The file to name in errors.
 
     Returns:
         Rows of parameters [D, P] and their 95 % intervals [D, P, 2], NaN where none is authored.
 
     Raises:
-        HandError: An attribute of ``vd:`` that is no parameter of an effect, or a value that cannot be one.
+        HandError: An attribute of ``vd:`` that is no parameter of an effect, or a value that cannot
+            be one.
     """
     rows = np.tile(np.array(neutral_row(), dtype=float), (len(joints), 1))
     intervals = np.full((len(joints), PARAMETER_COLUMNS, 2), np.nan)
@@ -250,14 +275,24 @@ def read_servo(
         valued: dict[str, set[str]] = {}
         for name, number, is_interval, value in _authored(where, joint):
             if is_interval:
-                intervals[index, number.parameter.column] = _interval(where, name, number.parameter, value)
+                intervals[index, number.parameter.column] = _interval(
+                    where, name, number.parameter, value
+                )
             else:
-                rows[index, number.parameter.column] = _checked(where, name, number.parameter, value)
+                rows[index, number.parameter.column] = _checked(
+                    where, name, number.parameter, value
+                )
                 valued.setdefault(number.group, set()).add(number.parameter.name)
         for name, number, is_interval, _ in _authored(where, joint):
             given = valued.get(number.group, set())
-            if is_interval and number.group != BASELINE_GROUP and number.parameter.name not in given:
-                raise HandError(f"{where}: '{name}' is an interval without a value; author the value too")
+            if (
+                is_interval
+                and number.group != BASELINE_GROUP
+                and number.parameter.name not in given
+            ):
+                raise HandError(
+                    f"{where}: '{name}' is an interval without a value; author the value too"
+                )
         for group, given in valued.items():
             _check_complete(where, group, given)
     return rows, intervals
@@ -271,11 +306,15 @@ def _authored(where: str, joint: Usd.Prim) -> Iterator[tuple[str, _Number, bool,
         if group in DESCRIPTION_GROUPS:
             continue
         if group not in _NUMBERS:
-            raise HandError(f"{where}: '{name}': no effect is called {group!r}; one of {', '.join(EFFECTS)}")
+            raise HandError(
+                f"{where}: '{name}': no effect is called {group!r}; one of {', '.join(EFFECTS)}"
+            )
         known = {number.attribute: (number, False) for number in _NUMBERS[group].values()}
         known |= {number.interval: (number, True) for number in _NUMBERS[group].values()}
         if name not in known:
-            raise HandError(f"{where}: '{name}' is no attribute of {group}; one of {', '.join(known)}")
+            raise HandError(
+                f"{where}: '{name}' is no attribute of {group}; one of {', '.join(known)}"
+            )
         yield name, *known[name], attribute.Get() if isinstance(attribute, Usd.Attribute) else None
 
 
@@ -283,17 +322,23 @@ def _check_complete(where: str, group: str, given: "set[str] | Mapping[str, Esti
     """Refuse an effect without a parameter that has no value at which it does nothing."""
     for name, number in _NUMBERS[group].items():
         if group != BASELINE_GROUP and number.parameter.lower > 0.0 and name not in given:
-            raise HandError(f"{where}: {group} lacks '{number.attribute}'; author it, or remove {group}")
+            raise HandError(
+                f"{where}: {group} lacks '{number.attribute}'; author it, or remove {group}"
+            )
 
 
 def _checked(where: str, name: str, parameter: Parameter, value: object) -> float:
     """A value that the parameter can have."""
     if not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise HandError(f"{where}: '{name}' is {value!r}; it must be a finite number [{parameter.unit}]")
+        raise HandError(
+            f"{where}: '{name}' is {value!r}; it must be a finite number [{parameter.unit}]"
+        )
     if value < 0.0 and not parameter.signed:
         raise HandError(f"{where}: '{name}' is {value:g} {parameter.unit}; it cannot be negative")
     if value == 0.0 and parameter.lower > 0.0:
-        raise HandError(f"{where}: '{name}' is 0; it must be positive; leave it out if there is none")
+        raise HandError(
+            f"{where}: '{name}' is 0; it must be positive; leave it out if there is none"
+        )
     return float(value)
 
 
@@ -302,15 +347,23 @@ def _interval(where: str, name: str, parameter: Parameter, value: object) -> tup
     try:
         low, high = (float(v) for v in value)  # type: ignore[attr-defined]
     except (TypeError, ValueError) as error:
-        raise HandError(f"{where}: '{name}' is {value!r}; it must be two numbers, low and high") from error
+        raise HandError(
+            f"{where}: '{name}' is {value!r}; it must be two numbers, low and high"
+        ) from error
     if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-        raise HandError(f"{where}: '{name}' is ({low:g}, {high:g}); low comes first, and both are finite")
+        raise HandError(
+            f"{where}: '{name}' is ({low:g}, {high:g}); low comes first, and both are finite"
+        )
     if low < 0.0 and not parameter.signed:
-        raise HandError(f"{where}: '{name}' begins at {low:g} {parameter.unit}; it cannot be negative")
+        raise HandError(
+            f"{where}: '{name}' begins at {low:g} {parameter.unit}; it cannot be negative"
+        )
     return low, high
 
 
-def _write_numbers(where: str, joint: Sdf.PrimSpec, group: str, values: Mapping[str, Estimate]) -> None:
+def _write_numbers(
+    where: str, joint: Sdf.PrimSpec, group: str, values: Mapping[str, Estimate]
+) -> None:
     """Author the numbers of an effect, or of the baseline, on a joint."""
     if group not in _NUMBERS:
         raise HandError(f"{where}: no effect is called {group!r}; one of {', '.join(EFFECTS)}")
@@ -318,21 +371,29 @@ def _write_numbers(where: str, joint: Sdf.PrimSpec, group: str, values: Mapping[
     _check_complete(where, group, values)
     for name, estimate in values.items():
         if name not in known:
-            raise HandError(f"{where}: {group} has no parameter {name!r}; one of {', '.join(known)}")
+            raise HandError(
+                f"{where}: {group} has no parameter {name!r}; one of {', '.join(known)}"
+            )
         number, unit = known[name], known[name].parameter.unit
         alone = isinstance(estimate, (int, float))
         value, *bounds = [float(estimate)] if alone else map(float, estimate)  # type: ignore[arg-type]
         checked = _checked(where, number.attribute, number.parameter, value)
         own = number.attribute.startswith(f"{NAMESPACE}:")
         kind = Sdf.ValueTypeNames.Double if own else Sdf.ValueTypeNames.Float
-        spec = Sdf.AttributeSpec(joint, number.attribute, kind, Sdf.VariabilityVarying, declaresCustom=own)
+        spec = Sdf.AttributeSpec(
+            joint, number.attribute, kind, Sdf.VariabilityVarying, declaresCustom=own
+        )
         spec.default = checked * number.factor
         meaning = f"{name} = {value:g} {unit}"
         spec.documentation = f"{EFFECTS[group].meaning} [{unit}]" if group in EFFECTS else meaning
         if bounds:
             low, high = _interval(where, number.interval, number.parameter, bounds)
             spec = Sdf.AttributeSpec(
-                joint, number.interval, Sdf.ValueTypeNames.Float2, Sdf.VariabilityVarying, declaresCustom=True
+                joint,
+                number.interval,
+                Sdf.ValueTypeNames.Float2,
+                Sdf.VariabilityVarying,
+                declaresCustom=True,
             )
             spec.default = Gf.Vec2f(low, high)
             spec.documentation = f"95 % interval of {name} [{unit}]"

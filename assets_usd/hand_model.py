@@ -1,6 +1,7 @@
 """Read a hand back from USD: everything that simulator, training and deployment know about it.
 
-The layout is that of docs/reference/hand.md; a hand of anyone reads the same as those of the package.
+The layout is that of docs/reference/hand.md; a hand of anyone reads the same as those of the
+package.
 
 Units are SI and radians, quaternions are xyzw. Frames: the base frame is that of link ``base``; a
 pose is a row ``(x, y, z, qx, qy, qz, qw)``.
@@ -50,7 +51,8 @@ def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) 
         layer: Layer over the hand (:func:`vd.assets_usd.hand_layer.write_layer`).
 
     Raises:
-        HandError: A file is missing or no USD, the hand lacks the fingertip, or the layer is of another hand.
+        HandError: A file is missing or no USD, the hand lacks the fingertip, or the layer is of
+            another hand.
     """
     path = Path(path)
     if not path.is_file():
@@ -87,7 +89,8 @@ def read_hand(path: Path, *, fingertip: str = "rigid", layer: Path | None = None
         layer: Layer over the hand with an identified servo model.
 
     Raises:
-        HandError: The file is not a hand, or the layer not one of it; names the prim and the attribute.
+        HandError: The file is not a hand, or the layer not one of it; names the prim and the
+            attribute.
     """
     return _Reader(Path(path), fingertip, None if layer is None else Path(layer)).read()
 
@@ -104,7 +107,9 @@ class _Reader(Described):
         """The whole hand."""
         self._check_units()
         if not self.root.HasAPI(UsdPhysics.ArticulationRootAPI):
-            raise self.fail(self.root, "PhysicsArticulationRootAPI is missing", "apply it to the root prim")
+            raise self.fail(
+                self.root, "PhysicsArticulationRootAPI is missing", "apply it to the root prim"
+            )
         counts = self._fingers()
         self.earlier = self.earlier and set(counts) == {len(EARLIER_START)}
         self._refuse_unknown(counts)
@@ -117,10 +122,15 @@ class _Reader(Described):
         frames = [self._joint_frames(joint, index) for joint in joints]
         mimic = [self.mimic(joint, joints) for joint in joints]
         drives = np.array(
-            [self._drive(joint, driven=row[0] < 0) for joint, row in zip(joints, mimic, strict=True)]
+            [
+                self._drive(joint, driven=row[0] < 0)
+                for joint, row in zip(joints, mimic, strict=True)
+            ]
         )
         self.check_mimic(joints, [row[0] for row in mimic])
-        baseline = dict(zip(("kp", "kd", "velocity_limit", "inertia"), drives.T[[2, 3, 5, 6]], strict=True))
+        baseline = dict(
+            zip(("kp", "kd", "velocity_limit", "inertia"), drives.T[[2, 3, 5, 6]], strict=True)
+        )
         servo, servo_interval = read_servo(joints, baseline, self.layer or self.path)
         tip_prims = [self.prim(f"f{f}_l{count}/f{f}_tip") for f, count in enumerate(counts)]
         tips = {prim.GetParent().GetPath() for prim in tip_prims}
@@ -165,7 +175,9 @@ class _Reader(Described):
             mounted_camera=self._camera(camera, bodies[0]) if camera else None,
             point_link=np.array([link for _, link in points]),
             link_points=self._points([prim for prim, _ in points]),
-            shapes=tuple(shape for i, body in enumerate(bodies) for shape in self._shapes(body, i, tips)),
+            shapes=tuple(
+                shape for i, body in enumerate(bodies) for shape in self._shapes(body, i, tips)
+            ),
         )
 
     def _check_units(self) -> None:
@@ -176,7 +188,9 @@ class _Reader(Described):
             ("kilogramsPerUnit", UsdPhysics.GetStageKilogramsPerUnit(self.stage)),
         ):
             if unit != 1.0:
-                raise self.fail("/", f"'{name}' is {unit}", "author the hand in metres and kilograms")
+                raise self.fail(
+                    "/", f"'{name}' is {unit}", "author the hand in metres and kilograms"
+                )
 
     def _fingers(self) -> list[int]:
         """Joints of each finger, by the names of its links, which have no gaps."""
@@ -185,8 +199,15 @@ class _Reader(Described):
             if match := LINK_NAME.fullmatch(child.GetName()):
                 found.setdefault(int(match[1]), []).append(int(match[2]))
         counts = [len(found.get(finger, ())) for finger in range(len(found))]
-        if not counts or 0 in counts or any(sorted(n) != [*range(1, len(n) + 1)] for n in found.values()):
-            names = ", ".join(f"f{f}_l{i}" for f in sorted(found) for i in sorted(found[f])) or "no links"
+        if (
+            not counts
+            or 0 in counts
+            or any(sorted(n) != [*range(1, len(n) + 1)] for n in found.values())
+        ):
+            names = (
+                ", ".join(f"f{f}_l{i}" for f in sorted(found) for i in sorted(found[f]))
+                or "no links"
+            )
             raise self.fail(
                 self.root,
                 f"fingers {sorted(found)} found, of {names}",
@@ -204,7 +225,9 @@ class _Reader(Described):
     def _refuse_unknown(self, counts: list[int]) -> None:
         """Refuse links and joints that the model would leave out."""
         numbers = [f"{i + 1}" for i in range(MAX_JOINTS)]
-        known = {"base"} | {f"f{f}_{k}{i}" for f, n in enumerate(counts) for i in numbers[:n] for k in "lj"}
+        known = {"base"} | {
+            f"f{f}_{k}{i}" for f, n in enumerate(counts) for i in numbers[:n] for k in "lj"
+        }
         for prim in Usd.PrimRange(self.root):
             if not (prim.HasAPI(UsdPhysics.RigidBodyAPI) or prim.IsA(UsdPhysics.Joint)):
                 continue
@@ -216,7 +239,8 @@ class _Reader(Described):
                 raise self.fail(
                     prim,
                     "is a link or joint besides those of the fingers, f0_l1 and f0_j1 and so on",
-                    "rename it if it is a finger's, weld it to its link if it is fixed, or remove it",
+                    "rename it if it is a finger's, weld it to its link if it is fixed, or remove "
+                    "it",
                 )
 
     def _point_prims(self, links: tuple[str, ...]) -> list[tuple[Usd.Prim, int]]:
@@ -236,11 +260,16 @@ class _Reader(Described):
         rows = np.array(matrix)[:3, :3]
         scale = np.linalg.norm(rows, axis=1)
         turn = (rows / scale[:, None]).T  # USD transforms row vectors
-        if np.abs(turn @ turn.T - np.eye(3)).max() > ORTHONORMAL_TOLERANCE or np.linalg.det(turn) < 0.0:
+        if (
+            np.abs(turn @ turn.T - np.eye(3)).max() > ORTHONORMAL_TOLERANCE
+            or np.linalg.det(turn) < 0.0
+        ):
             raise self.fail(
                 prim, "its transform shears or mirrors", "use translation, rotation and scale only"
             )
-        return np.concatenate([np.array(matrix.ExtractTranslation()), Rotation.from_matrix(turn).as_quat()])
+        return np.concatenate(
+            [np.array(matrix.ExtractTranslation()), Rotation.from_matrix(turn).as_quat()]
+        )
 
     def _mass(self, body: Usd.Prim) -> tuple[float, np.ndarray, np.ndarray]:
         if not body.HasAPI(UsdPhysics.RigidBodyAPI):
@@ -248,7 +277,9 @@ class _Reader(Described):
         mass = self.number(body, "physics:mass", positive=True)
         com = np.array(self.value(body, "physics:centerOfMass"), dtype=float)
         moments = np.array(self.value(body, "physics:diagonalInertia"), dtype=float)
-        if not np.all(moments > 0.0) or 2.0 * moments.max() > moments.sum() * (1.0 + ORTHONORMAL_TOLERANCE):
+        if not np.all(moments > 0.0) or 2.0 * moments.max() > moments.sum() * (
+            1.0 + ORTHONORMAL_TOLERANCE
+        ):
             raise self.fail(
                 body,
                 f"'physics:diagonalInertia' is {moments}",
@@ -266,31 +297,46 @@ class _Reader(Described):
         """Parent link, child link, and the joint frame in each."""
         if not joint.IsA(UsdPhysics.RevoluteJoint):
             raise self.fail(
-                joint, f"is a {joint.GetTypeName() or 'typeless prim'}", "make it a PhysicsRevoluteJoint"
+                joint,
+                f"is a {joint.GetTypeName() or 'typeless prim'}",
+                "make it a PhysicsRevoluteJoint",
             )
         links, frames = [], []
         for side in (0, 1):
             targets = joint.GetRelationship(f"physics:body{side}").GetTargets()
             if len(targets) != 1 or targets[0] not in index:
                 names = [str(target) for target in targets]
-                raise self.fail(joint, f"'physics:body{side}' is {names}", "point it at one link of the hand")
+                raise self.fail(
+                    joint, f"'physics:body{side}' is {names}", "point it at one link of the hand"
+                )
             links.append(index[targets[0]])
             position = np.array(self.value(joint, f"physics:localPos{side}"), dtype=float)
-            frames.append(np.concatenate([position, xyzw(self.value(joint, f"physics:localRot{side}"))]))
+            frames.append(
+                np.concatenate([position, xyzw(self.value(joint, f"physics:localRot{side}"))])
+            )
         finger, number = re.findall(r"\d+", joint.GetName())
         child = self.root.GetPath().AppendChild(f"f{finger}_l{number}")
-        parent = self.root.GetPath().AppendChild("base" if number == "1" else f"f{finger}_l{int(number) - 1}")
+        parent = self.root.GetPath().AppendChild(
+            "base" if number == "1" else f"f{finger}_l{int(number) - 1}"
+        )
         if links != [index[parent], index[child]]:
-            raise self.fail(joint, "joins other links than its name says", f"join {parent} and {child}")
+            raise self.fail(
+                joint, "joins other links than its name says", f"join {parent} and {child}"
+            )
         return links[0], links[1], frames[0], frames[1]
 
     def _drive(self, joint: Usd.Prim, *, driven: bool) -> tuple[float, ...]:
-        """Limits, kp, kd, effort, velocity limit and armature, in radians; gains only if ``driven``."""
+        """Limits, kp, kd, effort, velocity limit and armature, in radians.
+
+        Gains only if ``driven``.
+        """
         lower = self.number(joint, "physics:lowerLimit")
         upper = self.number(joint, "physics:upperLimit")
         if lower >= upper:
             raise self.fail(
-                joint, f"'physics:lowerLimit' {lower} is not below 'physics:upperLimit' {upper}", "swap"
+                joint,
+                f"'physics:lowerLimit' {lower} is not below 'physics:upperLimit' {upper}",
+                "swap",
             )
         stiffness = self.number(joint, "drive:angular:physics:stiffness", positive=driven)
         damping = self.number(joint, "drive:angular:physics:damping", positive=driven)
@@ -306,16 +352,21 @@ class _Reader(Described):
 
     def _camera(self, prim: Usd.Prim, base: Usd.Prim) -> CameraModel:
         if not prim.IsA(UsdGeom.Camera):
-            raise self.fail(prim, f"is a {prim.GetTypeName() or 'typeless prim'}", "make it a Camera")
+            raise self.fail(
+                prim, f"is a {prim.GetTypeName() or 'typeless prim'}", "make it a Camera"
+            )
         width, height = (int(n) for n in self.value(prim, "vd:resolution"))
         if min(width, height) < 1:
-            raise self.fail(prim, f"'vd:resolution' is {width} x {height}", "give the image size in pixels")
+            raise self.fail(
+                prim, f"'vd:resolution' is {width} x {height}", "give the image size in pixels"
+            )
         focal = self.number(prim, "focalLength", positive=True)
         across = self.number(prim, "horizontalAperture", positive=True)
         down = self.number(prim, "verticalAperture", positive=True)
         near, far = self.value(prim, "clippingRange")
         pose = self._relative(prim, base)
-        # A window shifted to the right moves the principal point to the left in the image; up, down.
+        # A window shifted to the right moves the principal point to the left in the image; up,
+        # down.
         return CameraModel(
             width=width,
             height=height,
@@ -344,7 +395,9 @@ class _Reader(Described):
         """Colliders of a link; only those with fingertips need one."""
         prims = [prim for prim in Usd.PrimRange(body) if prim.HasAPI(UsdPhysics.CollisionAPI)]
         if not prims and body.GetPath() in tips:
-            raise self.fail(body, "has no collider", "apply PhysicsCollisionAPI to a primitive below it")
+            raise self.fail(
+                body, "has no collider", "apply PhysicsCollisionAPI to a primitive below it"
+            )
         return [self._shape(prim, body, link) for prim in prims]
 
     def _shape(self, prim: Usd.Prim, body: Usd.Prim, link: int) -> CollisionShape:
@@ -361,7 +414,8 @@ class _Reader(Described):
                 raise self.fail(
                     prim,
                     "'physics:approximation' is not convexHull",
-                    "split the mesh into convex parts and give each PhysicsMeshCollisionAPI with it",
+                    "split the mesh into convex parts and give each PhysicsMeshCollisionAPI with "
+                    "it",
                 )
             corners = np.array(self.value(prim, "points"), dtype=float) * scale
             vertices = corners[ConvexHull(corners).vertices]
@@ -370,15 +424,21 @@ class _Reader(Described):
             vertices, size = vertices - (low + high) / 2.0, tuple(((high - low) / 2.0).tolist())
         elif kind in ("Sphere", "Capsule", "Cylinder"):
             if np.abs(scale - 1.0).max() > ORTHONORMAL_TOLERANCE:
-                raise self.fail(prim, f"is scaled by {scale}", "put the size into its radius and height")
+                raise self.fail(
+                    prim, f"is scaled by {scale}", "put the size into its radius and height"
+                )
             size = (self.number(prim, "radius", positive=True),)
             if kind != "Sphere":
                 size += (self.number(prim, "height", positive=True) / 2.0,)
                 upright = np.roll(np.eye(3), "XYZ".index(self.value(prim, "axis")) - 2, axis=1)
-                frame[3:] = (Rotation.from_quat(frame[3:]) * Rotation.from_matrix(upright)).as_quat()
+                frame[3:] = (
+                    Rotation.from_quat(frame[3:]) * Rotation.from_matrix(upright)
+                ).as_quat()
         else:
             raise self.fail(
-                prim, f"is a {kind}", "collide with a Cube, Sphere, Capsule, Cylinder or convex Mesh"
+                prim,
+                f"is a {kind}",
+                "collide with a Cube, Sphere, Capsule, Cylinder or convex Mesh",
             )
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
         if not material:

@@ -27,7 +27,8 @@ def read_surfaces(hand: HandModel) -> dict[int, Surface]:
             mesh = UsdGeom.Mesh(prim)
             if set(mesh.GetFaceVertexCountsAttr().Get() or ()) != {3}:
                 raise HandError(
-                    f"{hand.path}: {prim.GetPath()}: 'faceVertexCounts' are not all 3; triangulate the mesh"
+                    f"{hand.path}: {prim.GetPath()}: 'faceVertexCounts' are not all 3; triangulate "
+                    f"the mesh"
                 )
             # USD transforms row vectors.
             matrix = np.array(cache.ComputeRelativeTransform(prim, body)[0])

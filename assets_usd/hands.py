@@ -1,4 +1,7 @@
-"""Hands by name, as the rest of the project asks for them: of this package, imported, or USD files."""
+"""Hands by name, as the rest of the project asks for them.
+
+Of this package, imported, or USD files.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,13 +47,17 @@ def hand_usd(name: str) -> Path:
 
     how = f" URDF --describe {name}" if name in BUILT_IN else ""
     raise ValueError(
-        f"no hand is called {name!r}: choose one of {', '.join(HANDS)}, give a hand's USD file, or import "
+        f"no hand is called {name!r}: choose one of {', '.join(HANDS)}, give a hand's USD file, or "
+        f"import "
         f"one (vd-assets hand import{how})"
     )
 
 
 def called(hand: "HandModel") -> str:
-    """What :func:`load_hand` finds a hand by: its name, or its file if no hand of that name is this one."""
+    """What :func:`load_hand` finds a hand by.
+
+    Its name, or its file if no hand of that name is this one.
+    """
     try:
         return hand.name if hand_usd(hand.name).samefile(hand.path) else str(hand.path.resolve())
     except ValueError:
@@ -58,7 +65,10 @@ def called(hand: "HandModel") -> str:
 
 
 def root_name(hand: str) -> str:
-    """What a hand is called in its USD, given by name or file; a file that is not here, as that is called."""
+    """What a hand is called in its USD, given by name or file.
+
+    A file that is not here, as that is called.
+    """
     return load_hand(hand).name if Path(hand).is_file() else Path(hand).stem
 
 

@@ -20,8 +20,8 @@ COMMANDS = {
     "record": ("hardware.record", "record motions for vd-gap"),
     "score": ("loop.score", "the object's error at each stop, by motion capture"),
 }
-"""Module of each command and what it does. A module has its options, such as RunCfg, and a function of the
-command's name, which takes them and returns a status."""
+"""Module of each command and what it does. A module has its options, such as RunCfg, and a function
+of the command's name, which takes them and returns a status."""
 GONE = {
     "scan": "vd-deploy check names what is silent; ROBOTIS' DYNAMIXEL Wizard 2.0 tries other rates",
     "reboot": "switch the motors' power off and on",

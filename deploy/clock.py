@@ -1,4 +1,6 @@
-"""Time, as everything near the motors knows it: one clock, passed on, so that a test can bring its own.
+"""Time, as everything near the motors knows it.
+
+One clock, passed on, so that a test can bring its own.
 
 A simulated clock makes a run exact and repeatable: it goes on only when somebody waits.
 """
@@ -24,7 +26,10 @@ class Clock(Protocol):
         """Do something again and again, whatever the program does, until what is returned was called."""
 
     def beside(self, do: Callable[[], object]) -> Callable[[], bool]:
-        """Begin what takes long; what is returned tells whether it has ended, and raises what that raised."""
+        """Begin what takes long.
+
+        What is returned tells whether it has ended, and raises what that raised.
+        """
 
 
 class MonotonicClock:
@@ -46,7 +51,9 @@ class MonotonicClock:
             while not end.wait(seconds):
                 do()
 
-        thread = threading.Thread(target=work, name=getattr(do, "__qualname__", "beside"), daemon=True)
+        thread = threading.Thread(
+            target=work, name=getattr(do, "__qualname__", "beside"), daemon=True
+        )
 
         def stop() -> None:
             end.set()
@@ -76,14 +83,14 @@ MONOTONIC = MonotonicClock()
 class Pacer:
     """The grid of control steps, or of samples.
 
-    A step is due at a point of the grid and has to end by the next. One that ends later misses each point
-    passed; the step after it begins at once, and the grid stays where it was.
+    A step is due at a point of the grid and has to end by the next. One that ends later misses each
+    point passed; the step after it begins at once, and the grid stays where it was.
 
     Args:
         hz: Steps a second.
         clock: Time.
-        latest: Share of a period by which a step may begin late; one that would begin later is left out, or
-            it would be late too, and the next.
+        latest: Share of a period by which a step may begin late; one that would begin later is left
+            out, or it would be late too, and the next.
     """
 
     def __init__(self, hz: float, clock: Clock = MONOTONIC, *, latest: float = 1.0):

@@ -1,12 +1,15 @@
-"""A hand and its camera behind ROS 2: in place of motors, camera, and command line for the control loop.
+"""A hand and its camera behind ROS 2.
 
-The node ``visual_dexterity`` reads JointState on ``joint_states`` and, for a policy that sees, depth of
-16UC1 or 32FC1 on ``depth/image_rect_raw``, with ``depth/camera_info``. On ``commands`` it sends
-Float64MultiArray, an angle [rad] for each joint in the order of the hand's USD, as ros2_control's
-forward_position_controller takes it. A value of its parameter ``goal``, a quaternion xyzw, is a further
-goal: ``ros2 param set`` calls the service ``set_parameters``, which says why it refuses one. The service
-``~/finish`` (Trigger) ends the run after the last goal. ``~/events`` (String) tells of goals and stops.
-Topics get other names by remapping.
+In place of motors, camera, and command line for the control loop.
+
+The node ``visual_dexterity`` reads JointState on ``joint_states`` and, for a policy that sees,
+depth of 16UC1 or 32FC1 on ``depth/image_rect_raw``, with ``depth/camera_info``. On ``commands`` it
+sends Float64MultiArray, an angle [rad] for each joint in the order of the hand's USD, as
+ros2_control's forward_position_controller takes it. A value of its parameter ``goal``, a quaternion
+xyzw, is a further
+goal: ``ros2 param set`` calls the service ``set_parameters``, which says why it refuses one. The
+service ``~/finish`` (Trigger) ends the run after the last goal. ``~/events`` (String) tells of
+goals and stops. Topics get other names by remapping.
 
 Motors stay in the care of the driver: their torque, temperature and current are not looked at.
 """
@@ -58,7 +61,9 @@ class _Joints(Joints):
 
 
 class RosHand:
-    """What :class:`vd.deploy.safety.safety.SafeHand` asks of a bus, over topics; stops hold, torque stays on.
+    """What :class:`vd.deploy.safety.safety.SafeHand` asks of a bus, over topics.
+
+    Stops hold, torque stays on.
 
     Args:
         hand: The hand, whose joints have the same names there.
@@ -72,7 +77,11 @@ class RosHand:
         from sensor_msgs.msg import JointState
         from std_msgs.msg import Float64MultiArray
 
-        self.hand, self.ids, self._message = hand, tuple(range(len(hand.joint_names))), Float64MultiArray
+        self.hand, self.ids, self._message = (
+            hand,
+            tuple(range(len(hand.joint_names))),
+            Float64MultiArray,
+        )
         self._node, self._state, self._wrong, self.count = node, cast(HandState | None, None), "", 0
         self._arrived = threading.Condition()
         self._commands = node.create_publisher(Float64MultiArray, COMMANDS, 1)
@@ -87,7 +96,11 @@ class RosHand:
         none = np.full(len(self.ids), np.nan)
         with self._arrived:
             if missing or not len(message.position) == len(message.velocity) == len(places):
-                lacks = f"lacks {missing[0]}" if missing else "has no position and velocity for each joint"
+                lacks = (
+                    f"lacks {missing[0]}"
+                    if missing
+                    else "has no position and velocity for each joint"
+                )
                 self._wrong = f"JointState {lacks}; names are those of the hand's USD"
                 return
             order = [places[name] for name in self.hand.joint_names]
@@ -111,7 +124,10 @@ class RosHand:
         with self._arrived:
             came = self._arrived.wait_for(lambda: self._state is not None, FIRST_S)
         if not came:
-            why = self._wrong or f"none of {self.hand.name} on {topic}: start its driver, or remap {STATES}"
+            why = (
+                self._wrong
+                or f"none of {self.hand.name} on {topic}: start its driver, or remap {STATES}"
+            )
             yield Finding("joint states", False, why)
             return
         begin, first, ages = self.clock.now(), self.count, []
@@ -124,8 +140,12 @@ class RosHand:
         if rate < FEWEST * PAPER.scene.control_hz:
             wrong.append(f"{rate:.0f} a second, fewer than {FEWEST * PAPER.scene.control_hz:.0f}")
         if not abs(age) <= STATE_S:
-            wrong.append(f"{1e3 * age:.0f} ms old: stamp them when they are read, and set clocks (NTP)")
-        yield finding("joint states", wrong, f"{rate:.0f} a second on {topic}, {1e3 * age:.0f} ms old")
+            wrong.append(
+                f"{1e3 * age:.0f} ms old: stamp them when they are read, and set clocks (NTP)"
+            )
+        yield finding(
+            "joint states", wrong, f"{rate:.0f} a second on {topic}, {1e3 * age:.0f} ms old"
+        )
         listen = self._commands.get_subscription_count()
         remedy = f"nobody listens on {self._node.resolve_topic_name(COMMANDS)}: start a controller, or remap"
         yield finding("commands", [] if listen else [remedy], f"{listen} listen")
@@ -179,7 +199,10 @@ class RosHand:
 
 
 class RosGoals:
-    """Goals that others give while a hand is driven; also a sink of the log, whose events it publishes."""
+    """Goals that others give while a hand is driven.
+
+    Also a sink of the log, whose events it publishes.
+    """
 
     def __init__(self, node: Any, goals: list[np.ndarray]):
         from rcl_interfaces.msg import SetParametersResult
@@ -199,7 +222,11 @@ class RosGoals:
 
     def _set(self, parameters: Sequence[Any]) -> Any:
         try:
-            new = [make_goals([",".join(map(str, one.value))])[0] for one in parameters if one.name == "goal"]
+            new = [
+                make_goals([",".join(map(str, one.value))])[0]
+                for one in parameters
+                if one.name == "goal"
+            ]
         except (GoalError, TypeError) as error:
             return self._result(successful=False, reason=str(error))
         self._goals.extend(new)
@@ -238,7 +265,9 @@ def connect_ros(options: HandOptions, arguments: str = "") -> Iterator[Connectio
 
     hand = load_hand(options.hand, layer=options.hand_layer)
     words = ["--ros-args", *shlex.split(arguments)]
-    rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)  # a signal stops the hand first
+    rclpy.init(
+        args=words, signal_handler_options=SignalHandlerOptions.NO
+    )  # a signal stops the hand first
     node = rclpy.create_node(NODE)
     executor = SingleThreadedExecutor()
     executor.add_node(node)

@@ -8,22 +8,26 @@ from collections.abc import Iterator
 from pathlib import Path
 
 TURN_S = 1e-4
-"""Longest turn of a thread of this process while another one waits: less than what a packet takes."""
+"""Longest turn of a thread of this process while another one waits: less than what a packet
+takes.
+"""
 
 
 @contextlib.contextmanager
 def undisturbed(before_all: bool, *, level: int = 0) -> Iterator[bool]:
     """Run without the garbage collector, without long turns of other threads, and before other programs.
 
-    The collector pauses for a second where there is much; a run makes little. A thread that waits for the
-    interpreter, as after every packet, waits for whoever has it: 5 ms by default. Before all ordinary
-    programs run all threads, those that begin later too, where the system permits it (root, ``ulimit -r 1``):
-    the watchdog must not wait for other programs. Loop and twin need it on a busy machine; both mostly sleep.
+    The collector pauses for a second where there is much; a run makes little. A thread that waits
+    for the
+    interpreter, as after every packet, waits for whoever has it: 5 ms by default. Before all
+    ordinary programs run all threads, those that begin later too, where the system permits it
+    (root, ``ulimit -r 1``): the watchdog must not wait for other programs. Loop and twin need it on
+    a busy machine; both mostly sleep.
 
     Args:
         before_all: Whether to try that.
-        level: Above the lowest real-time priority. A twin's is higher than the loop's, as motors' processors
-            do not wait for ours.
+        level: Above the lowest real-time priority. A twin's is higher than the loop's, as motors'
+            processors do not wait for ours.
 
     Yields:
         Whether it does.
@@ -34,9 +38,13 @@ def undisturbed(before_all: bool, *, level: int = 0) -> Iterator[bool]:
     gc.freeze()
     gc.disable()
     before: dict[int, tuple[int, os.sched_param]] = {}
-    with contextlib.suppress(AttributeError, FileNotFoundError, PermissionError):  # not Linux, not permitted
+    with contextlib.suppress(
+        AttributeError, FileNotFoundError, PermissionError
+    ):  # not Linux, not permitted
         priority = os.sched_param(os.sched_get_priority_min(os.SCHED_RR) + level)
-        for thread in (int(entry.name) for entry in Path("/proc/self/task").iterdir() if before_all):
+        for thread in (
+            int(entry.name) for entry in Path("/proc/self/task").iterdir() if before_all
+        ):
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 had = os.sched_getscheduler(thread), os.sched_getparam(thread)
                 os.sched_setscheduler(thread, os.SCHED_RR, priority)

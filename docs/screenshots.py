@@ -1,7 +1,7 @@
 """``python docs/screenshots.py [NAME ...]``: the pages of the commands as pictures in docs/media.
 
-It runs every command on a CPU and looks with a headless Chromium; minutes. Look at each picture before you
-commit it.
+It runs every command on a CPU and looks with a headless Chromium; minutes. Look at each picture
+before you commit it.
 """
 
 import json
@@ -46,7 +46,10 @@ PAGES: dict[str, tuple[tuple[str, ...], str, int]] = {
         710,
     ),
     "gap": (
-        ("vd-gap hide servo --effect backlash:width_rad=0.06 --out rec", "vd-gap run rec --out gap"),
+        (
+            "vd-gap hide servo --effect backlash:width_rad=0.06 --out rec",
+            "vd-gap run rec --out gap",
+        ),
         "gap/report.html",
         738,
     ),
@@ -56,9 +59,13 @@ PAGES: dict[str, tuple[tuple[str, ...], str, int]] = {
         780,
     ),
 }
-"""Of each picture the commands, the page that they leave (the viewer is one itself), and its height."""
+"""Of each picture the commands, the page that they leave (the viewer is one itself), and its
+height.
+"""
 LOOK_S, START_S = 60, 600.0
-"""Time that the viewer is watched for [s]: its panel unfolds slowly; and the longest it takes to start."""
+"""Time that the viewer is watched for [s]: its panel unfolds slowly; and the longest it takes to
+start.
+"""
 
 
 def main(names: list[str]) -> None:
@@ -88,13 +95,17 @@ def main(names: list[str]) -> None:
                     try:
                         wait_for(f"http://127.0.0.1:{PORT}")
                         address = f"http://127.0.0.1:{PORT}"
-                        subprocess.run([*look, f"--virtual-time-budget={1000 * LOOK_S}", address], check=True)
+                        subprocess.run(
+                            [*look, f"--virtual-time-budget={1000 * LOOK_S}", address], check=True
+                        )
                     finally:
                         server.terminate()
             with Image.open(shot) as picture:
                 size = WIDTH, round(picture.height * WIDTH / picture.width)
                 target = MEDIA / f"page-{name}.webp"
-                picture.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(target, quality=QUALITY)
+                picture.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(
+                    target, quality=QUALITY
+                )
         print(f"{target}: {target.stat().st_size / 1e3:.0f} kB", flush=True)
 
 

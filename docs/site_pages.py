@@ -1,4 +1,6 @@
-"""What the site has beyond the files of ``docs``: documents of the root, and tables made from the code.
+"""What the site has beyond the files of ``docs``.
+
+Documents of the root, and tables made from the code.
 
 A hook of mkdocs (``mkdocs.yml``). The package has to be installed.
 """
@@ -48,19 +50,25 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         markdown = markdown.replace("](docs/", "](")
     names = "|".join(map(re.escape, AT_ROOT))
     up = "../" * uri.count("/")
-    markdown = re.sub(rf"\]\((?:\.\./)*({names})(?=[)#])", lambda link: f"]({up}{AT_ROOT[link[1]]}", markdown)
+    markdown = re.sub(
+        rf"\]\((?:\.\./)*({names})(?=[)#])", lambda link: f"]({up}{AT_ROOT[link[1]]}", markdown
+    )
     return re.sub(r"<!-- generated: (\w+) -->", lambda mark: GENERATED[mark[1]](), markdown)
 
 
 def on_page_content(html: str, **_: Any) -> str:
     """Show a film where a page links to one."""
-    return re.sub(r'<a href="([^"]+\.mp4)">(.*?)</a>', r'\2 <video controls muted src="\1"></video>', html)
+    return re.sub(
+        r'<a href="([^"]+\.mp4)">(.*?)</a>', r'\2 <video controls muted src="\1"></video>', html
+    )
 
 
 def commands() -> str:
     """Every command and subcommand with its own help text."""
     parts = []
-    for script, target in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"].items():
+    for script, target in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "scripts"
+    ].items():
         module, _, function = target.partition(":")
         main = getattr(importlib.import_module(module), function)
         text = _help(main, script, ())
@@ -84,7 +92,9 @@ def _help(main: Callable[[], object], script: str, words: Sequence[str]) -> str:
     lines = shown.getvalue().replace("``", "").strip().splitlines()
     if not lines:
         raise ValueError(f"`{script} {' '.join(words)} {flag}` prints nothing")
-    return "\n".join(line.rstrip() if line[:1] == " " else textwrap.fill(line, COLUMNS) for line in lines)
+    return "\n".join(
+        line.rstrip() if line[:1] == " " else textwrap.fill(line, COLUMNS) for line in lines
+    )
 
 
 def _subcommands(text: str) -> Iterator[str]:
@@ -139,7 +149,13 @@ def effects() -> str:
     from vd.kernels.servo.effects import EFFECTS
 
     rows = (
-        (f"`{effect.name}`", effect.meaning, f"`vd:{effect.name}:{p.name}`", p.unit, f"{p.typical:g}")
+        (
+            f"`{effect.name}`",
+            effect.meaning,
+            f"`vd:{effect.name}:{p.name}`",
+            p.unit,
+            f"{p.typical:g}",
+        )
         for effect in EFFECTS.values()
         for p in effect.parameters
     )

@@ -14,5 +14,8 @@ result = vd.evaluate_policies(
     out=Path("eval"),
 )
 for row in result.rows:
-    print(f"{row.policy}, stopped by {row.stopped_by}: {row.successes.mean():.0%} of {row.successes.size}")
+    print(
+        f"{row.policy}, stopped by {row.stopped_by}: {row.successes.mean():.0%} of "
+        f"{row.successes.size}"
+    )
 print(len(vd.read("eval/eval.json").rows), "rows in eval/eval.json")

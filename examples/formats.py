@@ -19,7 +19,9 @@ header = {
     "trajectories": [{"file": "step.csv", "excitation": "step", "joints": ["joint"]}],
 }
 Path("mine").mkdir(exist_ok=True)
-np.savetxt("mine/step.csv", table, delimiter=",", header="t,command.joint,position.joint", comments="")
+np.savetxt(
+    "mine/step.csv", table, delimiter=",", header="t,command.joint,position.joint", comments=""
+)
 Path("mine/recording.json").write_text(json.dumps(header))
 
 recording = vd.read("mine")  # checked: a mistake is named by file, row and column

@@ -1,4 +1,7 @@
-"""Learn with rsl-rl's own runner; vd-train teacher has a loop of its own, with curriculum and checkpoints."""
+"""Learn with rsl-rl's own runner.
+
+Vd-train teacher has a loop of its own, with curriculum and checkpoints.
+"""
 
 from rsl_rl.runners import OnPolicyRunner
 
@@ -20,9 +23,12 @@ settings = {
         "critic": ["policy"],
     },  # and "privileged", where the critic is told more
     "algorithm": {"class_name": "PPO", "num_learning_epochs": 2},
-    "actor": network | {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.5}},
+    "actor": network
+    | {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.5}},
     "critic": network,
 }
 runner = OnPolicyRunner(env, settings, device=env.device)  # with a folder it logs and saves
 runner.learn(2)
-print("actions of", env.num_envs, "environments:", tuple(runner.alg.act(env.get_observations()).shape))
+print(
+    "actions of", env.num_envs, "environments:", tuple(runner.alg.act(env.get_observations()).shape)
+)

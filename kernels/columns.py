@@ -1,4 +1,7 @@
-"""Vectors and quaternions in consecutive columns of a row: how joint states and observations are laid out."""
+"""Vectors and quaternions in consecutive columns of a row.
+
+How joint states and observations are laid out.
+"""
 
 from itertools import accumulate
 
@@ -10,7 +13,9 @@ wp.set_module_options({"enable_backward": False})
 def consecutive(sizes: dict[str, int]) -> dict[str, slice]:
     """Columns of parts of so many values each, one after the other from 0 on."""
     ends = accumulate(sizes.values())
-    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+    return {
+        name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)
+    }
 
 
 @wp.func
@@ -23,7 +28,10 @@ def read_vec3(row: int, column: int, values: wp.array2d[float]) -> wp.vec3:
 def read_quat(row: int, column: int, values: wp.array2d[float]) -> wp.quat:
     """A quaternion xyzw from ``values[row, column:]``."""
     return wp.quat(
-        values[row, column], values[row, column + 1], values[row, column + 2], values[row, column + 3]
+        values[row, column],
+        values[row, column + 1],
+        values[row, column + 2],
+        values[row, column + 3],
     )
 
 

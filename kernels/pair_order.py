@@ -1,4 +1,6 @@
-"""Order of the solver's candidate pairs: by the kinds of their shapes, so that threads beside do the same.
+"""Order of the solver's candidate pairs.
+
+By the kinds of their shapes, so that threads beside do the same.
 
 P pairs at most, of which the first few are there; G geoms.
 """
@@ -8,7 +10,9 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 KINDS = 8
-"""Kinds of shapes that a key has room for: MuJoCo's from planes to meshes, all but signed distance fields."""
+"""Kinds of shapes that a key has room for: MuJoCo's from planes to meshes, all but signed distance
+fields.
+"""
 KEY_BITS = 7
 """Bits of a key: three for either kind, and one more for what is no pair."""
 NO_PAIR = 2**KEY_BITS - 1

@@ -18,7 +18,10 @@ def rotation_difference(q: wp.quat, q_goal: wp.quat) -> wp.quat:
 
 @wp.func
 def rotation_angle(q: wp.quat) -> float:
-    """Angle of the rotation ``q`` in [0, pi]: 2 asin(min(norm(vec(q)), 1)). The same for q and -q."""
+    """Angle of the rotation ``q`` in [0, pi]: 2 asin(min(norm(vec(q)), 1)).
+
+    The same for q and -q.
+    """
     return 2.0 * wp.asin(wp.min(wp.length(wp.vec3(q[0], q[1], q[2])), 1.0))
 
 
@@ -46,7 +49,10 @@ def goal_beside(goal: wp.quat, q: wp.quat) -> wp.quat:
 
 @wp.func
 def random_rotation(rng: wp.uint32):
-    """Draw uniformly from SO(3): four standard normals, normalised. Returns ``(rng, quaternion)``."""
+    """Draw uniformly from SO(3): four standard normals, normalised.
+
+    Returns ``(rng, quaternion)``.
+    """
     x = wp.randn(rng)
     y = wp.randn(rng)
     z = wp.randn(rng)
@@ -56,12 +62,14 @@ def random_rotation(rng: wp.uint32):
 
 @wp.func
 def random_rotation_within(rng: wp.uint32, max_angle: float):
-    """Draw uniformly (Haar) among the rotations of at most ``max_angle``; returns ``(rng, quaternion)``.
+    """Draw uniformly (Haar) among the rotations of at most ``max_angle``.
+
+    Returns ``(rng, quaternion)``.
 
     The axis is uniform on the sphere and the angle has density proportional to 1 - cos(angle) on
-    [0, max_angle]. It is drawn by rejection from the density proportional to angle^2, which bounds it
-    (1 - cos(a) <= a^2 / 2); 61 % are accepted at max_angle = pi, more below. ``max_angle >= pi`` is all
-    of SO(3).
+    [0, max_angle]. It is drawn by rejection from the density proportional to angle^2, which bounds
+    it (1 - cos(a) <= a^2 / 2); 61 % are accepted at max_angle = pi, more below. ``max_angle >= pi``
+    is all of SO(3).
     """
     bound = wp.clamp(max_angle, 0.0, PI)
     half = wp.float32(0.0)

@@ -1,4 +1,7 @@
-"""The RealSense SDK's software device: a camera without the camera, to which a test hands images."""
+"""The RealSense SDK's software device.
+
+A camera without the camera, to which a test hands images.
+"""
 
 import time
 from typing import Any
@@ -47,7 +50,9 @@ class SoftwareCamera:
         video.intrinsics = given
         return self._sensor.add_video_stream(video).as_video_stream_profile()
 
-    def show(self, image: np.ndarray, time_s: float | None = None, *, own_clock: bool = False) -> None:
+    def show(
+        self, image: np.ndarray, time_s: float | None = None, *, own_clock: bool = False
+    ) -> None:
         """Send a depth image [m], or of uint8 an infrared one, exposed at a time [s], now by default."""
         lens, infrared = self._lens, image.dtype == np.uint8
         pixels = image if infrared else np.rint(image / DEPTH_UNIT_M).astype(np.uint16)

@@ -5,7 +5,9 @@ import signal
 from collections import Counter
 from pathlib import Path
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # before anything reads it: of shared cores each gets one thread
+if (
+    "PYTEST_XDIST_WORKER" in os.environ
+):  # before anything reads it: of shared cores each gets one thread
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
@@ -14,7 +16,8 @@ import warp as wp
 from vd.warp_quiet import quiet_warp
 
 quiet_warp()
-# What a shell starts in the background, or nohup, is deaf to these; the tests and what they start are not.
+# What a shell starts in the background, or nohup, is deaf to these; the tests and what they start
+# are not.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
@@ -42,5 +45,7 @@ def shared_dir() -> Path:
     """The folder of measured data and meshes that is not part of the project (VD_SHARED, or ../shared)."""
     folder = Path(os.environ.get("VD_SHARED", Path(__file__).resolve().parents[2] / "shared"))
     if not folder.is_dir():
-        pytest.skip(f"no shared data at {folder}; set VD_SHARED to a folder with objects/ and dclaw/")
+        pytest.skip(
+            f"no shared data at {folder}; set VD_SHARED to a folder with objects/ and dclaw/"
+        )
     return folder

@@ -1,8 +1,8 @@
 """A test double of the environment: objects turn as the action says, without physics.
 
-The first three actions of a world are its object's angular velocity [rad/s, world frame]; ``fall_at`` makes
-chosen environments drop their object. Everything evaluation and viewing read is there, with the meaning it
-has in ``vd.envs``.
+The first three actions of a world are its object's angular velocity [rad/s, world frame];
+``fall_at`` makes chosen environments drop their object. Everything evaluation and viewing read is
+there, with the meaning it has in ``vd.envs``.
 """
 
 from dataclasses import dataclass, field
@@ -33,7 +33,9 @@ class FakeEnv:
         hand=None,
     ):
         self.objects = list(objects)
-        self.hand = hand or SimpleNamespace(name="dclaw3", workspace=SimpleNamespace(goal_m=(0.0, 0.0, 0.08)))
+        self.hand = hand or SimpleNamespace(
+            name="dclaw3", workspace=SimpleNamespace(goal_m=(0.0, 0.0, 0.08))
+        )
         self.device = "cpu"
         self.num_envs = n = num_envs
         self.num_actions, self.num_observations = 9, 8
@@ -56,7 +58,9 @@ class FakeEnv:
         self.rotation_error, self.goal_quat = zeros(n), zeros(n, wp.quat)
         self.step_count = zeros(n, wp.int32)
         self.object_pose_end = zeros(n, wp.transform)
-        self.sim = SimpleNamespace(joint_q=zeros((n, self.num_actions + 7)), failed=zeros(n, wp.int32))
+        self.sim = SimpleNamespace(
+            joint_q=zeros((n, self.num_actions + 7)), failed=zeros(n, wp.int32)
+        )
         self._rng = np.random.default_rng(0)
         self.resets = 0
         self.reset()

@@ -78,10 +78,14 @@ def problem_of(recording: Recording) -> JointProblem:
     (chain,) = chains(recording)
     trajectories, folds = design(recording, chain, 0)
     floor = noise_floor(recording, 0)
-    return JointProblem(Rollouts(chain, recording), 0, trajectories, folds, floor, baseline_of(chain))
+    return JointProblem(
+        Rollouts(chain, recording), 0, trajectories, folds, floor, baseline_of(chain)
+    )
 
 
-def made_up(effects: tuple[str, ...], errors: np.ndarray | float, fitted: float | None = None) -> JointFit:
+def made_up(
+    effects: tuple[str, ...], errors: np.ndarray | float, fitted: float | None = None
+) -> JointFit:
     """A fit with given held-out RMSE of each trajectory, and on what was fitted [rad]."""
     held_out = COUNT * np.broadcast_to(errors, COUNT.shape) ** 2
     keys = ["p0", "p1", "p2", *(f"{name}.{EFFECTS[name].parameters[0].name}" for name in effects)]

@@ -30,7 +30,10 @@ FRICTION = 0.15
 
 def rubbing_servo(folder: Path, friction: float = FRICTION) -> Path:
     """Record a bare servo with friction."""
-    hide(Hiding("servo", {"coulomb_friction": {"tau_c_nm": friction}}, seed=3, base_spread=0.0), folder)
+    hide(
+        Hiding("servo", {"coulomb_friction": {"tau_c_nm": friction}}, seed=3, base_spread=0.0),
+        folder,
+    )
     return folder
 
 
@@ -79,12 +82,16 @@ def servo_report(folder, *, verdict="effects", ambiguous=(), friction=FRICTION):
         seconds=1.0,
         recording=Source(str(folder), "servo", (JOINT,), len(curves.files), len(curves.time), 40.0),
         joints=(
-            JointGap(JOINT, FLOOR, before, (0.0, 1.0), after, (0.0, 1.0), verdict, "made up", ambiguous),
+            JointGap(
+                JOINT, FLOOR, before, (0.0, 1.0), after, (0.0, 1.0), verdict, "made up", ambiguous
+            ),
         ),
         evidence=tuple(
             Candidate((JOINT,), 1, name, after, 0.8, (0.7, 0.9), decision, "made up", values)
             for name, values in names.items()
         ),
-        trajectories=tuple(TrajectoryError(file, file, JOINT, before, after) for file in curves.files),
+        trajectories=tuple(
+            TrajectoryError(file, file, JOINT, before, after) for file in curves.files
+        ),
     )
     return report, curves

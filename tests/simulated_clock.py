@@ -20,7 +20,9 @@ class SimulatedClock:
         end = self._now + max(0.0, seconds)
         while True:
             # One that waits itself is not begun again before it has ended.
-            due = min((one for one in self._beside if not one[3]), key=lambda one: one[0], default=None)
+            due = min(
+                (one for one in self._beside if not one[3]), key=lambda one: one[0], default=None
+            )
             if due is None or due[0] > end:
                 break
             self._now = max(self._now, due[0])

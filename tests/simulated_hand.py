@@ -101,5 +101,7 @@ def energised(line: MotorLine) -> list[int]:
 
 def push(line: MotorLine) -> np.ndarray:
     """How far each motor's goal is from where it is [rad]; none if its torque is off."""
-    error = [to_angle(m.get("goal_position")) - to_angle(m.get("present_position")) for m in line.motors]
+    error = [
+        to_angle(m.get("goal_position")) - to_angle(m.get("present_position")) for m in line.motors
+    ]
     return np.abs(error) * [motor.get("torque_enable") for motor in line.motors]

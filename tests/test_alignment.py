@@ -97,14 +97,18 @@ class NearSighted(torch.nn.Module):
         turned = torch.nn.functional.normalize(turned[:, :3], dim=-1).transpose(-1, -2)
         wanted = self.truth[seen[:, 0, 0].round().long()]
         left, near = self.halfway(turned, wanted)
-        wrong = torch.tensor(Rotation.random(len(left), random_state=0).as_matrix(), dtype=torch.float32)
+        wrong = torch.tensor(
+            Rotation.random(len(left), random_state=0).as_matrix(), dtype=torch.float32
+        )
         return Residual(torch.where(near, left, wrong), torch.full((len(left), 3), 0.01))
 
     @staticmethod
     def halfway(turned, wanted):
         """Half of what is left, and where that is near."""
         left = wanted @ turned.transpose(-1, -2)
-        half = torch.tensor((Rotation.from_matrix(left.numpy()) ** 0.5).as_matrix(), dtype=torch.float32)
+        half = torch.tensor(
+            (Rotation.from_matrix(left.numpy()) ** 0.5).as_matrix(), dtype=torch.float32
+        )
         return half, (turn_angle(left) < 1.2)[:, None, None]
 
 
@@ -157,7 +161,9 @@ def test_a_reset_begins_anew(near_sighted):
     goal, seen = clouds(torch.arange(2.0))
     aligner = Aligner(network, goal)
     aligner.look(seen)
-    network.truth = truth @ Rotation.from_euler("x", 2.0).as_matrix().astype(np.float32)  # it was wrong
+    network.truth = truth @ Rotation.from_euler("x", 2.0).as_matrix().astype(
+        np.float32
+    )  # it was wrong
     aligner.reset(torch.tensor([True, False]))
     first = turn_angle(aligner.look(seen).rotation.transpose(-1, -2) @ network.truth)
     assert first[0] < 0.2 and first[1] > 0.5
@@ -173,7 +179,11 @@ def test_a_pose_is_that_of_the_frame_of_the_goals_points(near_sighted):
     )
     seen = torch.tensor([0.1, 0.2, 0.3]) + 0.001 * torch.randn(3, 20, 3)
     for look in range(4):
-        finder.look(seen, torch.tensor([20, 20, LEAST - 1]), fresh=torch.tensor([look == 0, look == 3, True]))
+        finder.look(
+            seen,
+            torch.tensor([20, 20, LEAST - 1]),
+            fresh=torch.tensor([look == 0, look == 3, True]),
+        )
     assert finder.looks.tolist() == [4, 1, 0]
     assert torch.equal(finder.pose[2, 0], torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
     found = Rotation.from_quat(finder.pose[:2, 0, 3:].numpy())
@@ -184,10 +194,16 @@ def test_a_pose_is_that_of_the_frame_of_the_goals_points(near_sighted):
 
 
 def test_points_are_chosen_evenly_whatever_their_number():
-    finder = GoalFinder(AlignmentNetwork(TINY), load_set("cube"), world_object=[0], world_scale=[1.0])
+    finder = GoalFinder(
+        AlignmentNetwork(TINY), load_set("cube"), world_object=[0], world_scale=[1.0]
+    )
     for count in (16, 200, 512):
         often = (finder.share * count).long().bincount(minlength=count)
-        assert len(often) == count and often.min() >= 512 // count - 1 and often.max() <= 512 // count + 2
+        assert (
+            len(often) == count
+            and often.min() >= 512 // count - 1
+            and often.max() <= 512 // count + 2
+        )
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +252,9 @@ def test_losses_are_least_at_the_truth_and_fall(scenes):
 def test_goals_turned_by_the_network_keep_their_label(scenes):
     runner = make_runner(scenes, cfg=replace(QUICK, searched_share=1.0))
     pairs = runner.pairs()
-    turned = runner.searched(pairs, [runner.network.neighbours(c) for c in (pairs.goal, pairs.seen)])
+    turned = runner.searched(
+        pairs, [runner.network.neighbours(c) for c in (pairs.goal, pairs.seen)]
+    )
     assert not torch.allclose(turned.rotation, pairs.rotation, atol=1e-2)
     for name in ("goal", "surface"):
         place = [getattr(each, name) @ each.rotation.transpose(-1, -2) for each in (pairs, turned)]
@@ -254,7 +272,10 @@ def test_a_run_measures_goes_on_and_leaves_a_network(scenes, tmp_path):
     figures = again.measure()
     for name in ("made", "validation"):
         assert 0.0 <= figures[f"{name}/within_0.1"] <= figures[f"{name}/within_0.4"] <= 1.0
-        assert 0.0 < figures[f"{name}/rotation_error"] <= np.pi and figures[f"{name}/offset_error"] > 0.0
+        assert (
+            0.0 < figures[f"{name}/rotation_error"] <= np.pi
+            and figures[f"{name}/offset_error"] > 0.0
+        )
     network, spec = load_alignment(tmp_path / "alignment.pt")
     assert spec.hand == "dclaw3" and spec.network == TINY
     pairs = again.pairs()

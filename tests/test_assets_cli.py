@@ -38,16 +38,23 @@ def test_import_then_show(
     trimesh.creation.box((0.12, 0.05, 0.03)).export(folder / "brick.stl")
     (folder / "broken.obj").write_text("v 0 0 0\n")
     crumb = trimesh.creation.box((0.005, 0.005, 0.005)).apply_translation([0.0, 1.0, 0.0])
-    trimesh.util.concatenate([trimesh.creation.box((0.12, 0.05, 0.03)), crumb]).export(folder / "dirty.stl")
+    trimesh.util.concatenate([trimesh.creation.box((0.12, 0.05, 0.03)), crumb]).export(
+        folder / "dirty.stl"
+    )
     assert run(monkeypatch, "import", folder) == 1
     assert "2 imported, 0 unchanged, 1 refused" in capsys.readouterr().out
     # Without --out, the set lies in the cache under the folder's name and can be loaded by it.
     assert [m.name for m in load_set("things")] == ["brick", "dirty"]
 
-    assert run(monkeypatch, "import", folder / "brick.stl", "--out", cache / "objects" / "things") == 0
+    assert (
+        run(monkeypatch, "import", folder / "brick.stl", "--out", cache / "objects" / "things") == 0
+    )
     assert "0 imported, 1 unchanged, 0 refused" in capsys.readouterr().out
     nothing = tmp_path / "nothing"
-    assert run(monkeypatch, "import", folder / "broken.obj", "--out", nothing) == 1 and not nothing.exists()
+    assert (
+        run(monkeypatch, "import", folder / "broken.obj", "--out", nothing) == 1
+        and not nothing.exists()
+    )
     assert run(monkeypatch, "import", folder) == 1
     out = capsys.readouterr().out
     assert "1 refused" in out and "broken.obj: " in out and "volume error" in out
@@ -64,7 +71,9 @@ def test_import_then_show(
     assert (saturation > 0.3).mean() > 0.02, "the coloured parts are missing"
 
 
-def test_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_objects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     assert run(monkeypatch, "objects", "--procedural", 3, "--seed", 4) == 0
     assert "3 objects" in (said := capsys.readouterr().out) and "procedural-3-seed4" in said
     assert len(load_set("procedural-3-seed4")) == 3

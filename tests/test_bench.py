@@ -16,8 +16,8 @@ def test_sim_rows_add_up(tmp_path, capsys):
     SimCommand(envs=(2,), objects=("cube",), policy="dclaw4-cube", device="cpu", json=out).run()
     (row,) = json.loads(out.read_text())["rows"]
     assert row["envs"] == 2 and row["rows_max"] > 0 and row["contacts_mean"] > 0.0
-    # The step alone is what is left when the policy's time is taken off; how fast either is depends on what
-    # else runs here.
+    # The step alone is what is left when the policy's time is taken off; how fast either is depends
+    # on what else runs here.
     assert 0.0 < row["with_policy"] < row["whole_step"]
     assert json.loads(capsys.readouterr().out) == row
 

@@ -25,7 +25,8 @@ def report(*named, sets=(), verdict=None, baseline=5e-3, left=5.5e-4, **values):
     return {
         "verdict": verdict or ("effects" if named else "ambiguous" if sets else "no_gap"),
         "effects": [
-            {"name": name, "joints": ["joint"], "parameters": estimates.get(name, {})} for name in named
+            {"name": name, "joints": ["joint"], "parameters": estimates.get(name, {})}
+            for name in named
         ],
         "ambiguous": [list(group) for group in sets],
         "baseline": {"rmse_rad": baseline},
@@ -49,7 +50,9 @@ def test_the_effect_that_stands_for_another_is_right_if_the_report_says_so():
     truth = {**TRUTH, "effects": {"read_delay": {"joints": ["joint"], "parameters": {}}}}
     said = score(one, report("command_delay", sets=[("command_delay", "read_delay")]), truth)
     silent = score(one, report("command_delay"), truth)
-    more = score(one, report("command_delay", "backlash", sets=[("command_delay", "read_delay")]), truth)
+    more = score(
+        one, report("command_delay", "backlash", sets=[("command_delay", "read_delay")]), truth
+    )
     results = [said, silent, more]
     assert [value([r], "first name right").value for r in results] == [1.0, 0.0, 0.0]
     assert [bool(r["false"]) for r in results] == [False, True, True]
@@ -66,7 +69,8 @@ def test_batteries_share_neither_seeds_nor_plants():
         for which in BATTERIES
     }
     seeds, plants = (
-        [{getattr(h, name) for h in made} for made in hidings.values()] for name in ("seed", "physics")
+        [{getattr(h, name) for h in made} for made in hidings.values()]
+        for name in ("seed", "physics")
     )
     assert len(set.union(*seeds)) == sum(map(len, seeds))
     assert len(set.union(*plants)) == sum(len(each.plants) for each in BATTERIES.values())
@@ -145,7 +149,9 @@ def test_a_battery_goes_on_where_it_ended_and_names_what_is_hidden(tmp_path, mon
     monkeypatch.setattr(gap, "NOTHING_A_SEED", 1)
     GapCommand(**some, kinds=("none",)).run()
     GapCommand(**some, kinds=("single",), shard="1/2").run()
-    assert len(ran) == 2 and "coulomb" not in (tmp_path / "summary.md").read_text(), "others are at work"
+    assert len(ran) == 2 and "coulomb" not in (tmp_path / "summary.md").read_text(), (
+        "others are at work"
+    )
     GapCommand(**some, kinds=("single",)).run()
     results = {one.effects: json.loads((tmp_path / f"{one.name}.json").read_text()) for one in ran}
     assert len(ran) == 3 and not any(r["false"] for r in results.values())
@@ -154,7 +160,9 @@ def test_a_battery_goes_on_where_it_ended_and_names_what_is_hidden(tmp_path, mon
     assert results[("coulomb_friction",)]["found"] == ["coulomb_friction"]
     assert results[()]["verdict"] == "no_gap"
     assert results[("coulomb_friction",)]["shrunk"] > 5.0
-    assert all(row["error"] < 0.1 for one in results.values() for row in one["parameters"]), "in N m"
+    assert all(row["error"] < 0.1 for one in results.values() for row in one["parameters"]), (
+        "in N m"
+    )
     assert (
         "| figure |" in capsys.readouterr().out
         and "coulomb_friction" in (tmp_path / "summary.md").read_text()

@@ -30,7 +30,10 @@ def test_the_recording_tells_nothing_and_the_truth_lies_beside_it(tmp_path):
     assert not any(name in text for name in (*EFFECTS, *OUTSIDE, "seed", "truth"))
     truth = json.loads(truth_path(out).read_text())
     assert truth_path(out).parent == tmp_path
-    assert truth["effects"]["backlash"] == {"joints": ["joint"], "parameters": {"width_rad": {"joint": 0.05}}}
+    assert truth["effects"]["backlash"] == {
+        "joints": ["joint"],
+        "parameters": {"width_rad": {"joint": 0.05}},
+    }
     assert 2.4 <= truth["base"]["kp"]["joint"] <= 3.6
     recording = read_recording(out)
     trajectory, made = recording.trajectories[3], hidden.recording.trajectories[3]
@@ -51,8 +54,15 @@ def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path)
     other = {"command_delay": "read_delay", "read_delay": "command_delay"}[late]
     assert late_side(recording, chain, spec) == late
     contradicted = set(vetoes(recording, chain, spec))
-    assert {other, "command_filter", "dead_zone", "backlash"} <= contradicted and late not in contradicted
-    silent = replace(recording, trajectories=tuple(replace(t, pwm=None) for t in recording.trajectories))
+    assert {
+        other,
+        "command_filter",
+        "dead_zone",
+        "backlash",
+    } <= contradicted and late not in contradicted
+    silent = replace(
+        recording, trajectories=tuple(replace(t, pwm=None) for t in recording.trajectories)
+    )
     assert late_side(silent, chain, spec) == ""
 
 
@@ -93,7 +103,10 @@ def test_a_finger_is_recorded_by_name():
         ({"model": "servo", "effects": {"backlash": {"width_rad": np.nan}}}, "finite"),
         ({"model": "servo", "effects": {"backlash": {"width_rad": -0.04}}}, "negative"),
         ({"model": "servo", "effects": {"joint_coupling": {}}}, "one joint"),
-        ({"model": "servo", "effects": {"backlash": {}}, "effect_joints": {"backlash": ("x",)}}, "'x'"),
+        (
+            {"model": "servo", "effects": {"backlash": {}}, "effect_joints": {"backlash": ("x",)}},
+            "'x'",
+        ),
         ({"model": "servo", "excitations": ("dance",)}, "dance"),
     ],
 )
@@ -124,4 +137,8 @@ def test_excitations_stay_within_the_joints_and_excite_one_each():
             assert motion.time[0] == 0.0 and np.allclose(np.diff(motion.time), 0.01)
     paper = excitation_set(reach)
     assert 40.0 < sum(m.duration for m in paper) / 2 < 60.0 and len(paper) == 16
-    assert {m.conditions["p_gain"] for m in excitation_set(reach, ("gain_ladder",))} == {200.0, 400.0, 800.0}
+    assert {m.conditions["p_gain"] for m in excitation_set(reach, ("gain_ladder",))} == {
+        200.0,
+        400.0,
+        800.0,
+    }

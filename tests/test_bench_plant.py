@@ -32,11 +32,15 @@ def servo(joints=1, gravity=0.0, limit=50.0, **effects) -> Plant:
         limit * ones,
         INERTIA * ones,
         gravity * ones,
-        effects={name: {key: v * ones for key, v in values.items()} for name, values in effects.items()},
+        effects={
+            name: {key: v * ones for key, v in values.items()} for name, values in effects.items()
+        },
     )
 
 
-def answer(plant, command, duration=2.0, rate=500.0, dt=4e-4, **run) -> tuple[np.ndarray, np.ndarray]:
+def answer(
+    plant, command, duration=2.0, rate=500.0, dt=4e-4, **run
+) -> tuple[np.ndarray, np.ndarray]:
     """Positions [T, J] at regular stamps to a command, a function of time."""
     time = np.arange(int(duration * rate) + 1) / rate
     values = np.stack([np.broadcast_to(command(time), time.shape)] * len(plant.joints), axis=1)
@@ -53,7 +57,12 @@ def ramp(time):
     return 0.2 * np.minimum(time, 4.0 - time)
 
 
-BASE = {"kp": kernel.KP, "kd": kernel.KD, "velocity_limit": kernel.VELOCITY_LIMIT, "inertia": kernel.INERTIA}
+BASE = {
+    "kp": kernel.KP,
+    "kd": kernel.KD,
+    "velocity_limit": kernel.VELOCITY_LIMIT,
+    "inertia": kernel.INERTIA,
+}
 
 SMALL = ("thermal_drift", "load_friction", "supply_sag", "torque_saturation")
 """Effects that show little at the size of the others."""
@@ -66,7 +75,9 @@ def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect(monkeypatch):
     monkeypatch.setattr("vd.bench.hide.STAMP_JITTER_S", 0.0)
     exact = {"base_spread": 0.0, "excitations": ("gain_ladder",)}
     sizes = {name: effect_at(name, 3.0 if name in SMALL else 1.0) for name in names}
-    hidden = simulate_hidden([Hiding("servo", {name: sizes[name]}, seed=1, **exact) for name in names])
+    hidden = simulate_hidden(
+        [Hiding("servo", {name: sizes[name]}, seed=1, **exact) for name in names]
+    )
     for name, made in zip(names, hidden, strict=True):
         (chain,) = chains(made.recording)
         rows = np.stack([chain.start_row] * 2)
@@ -77,7 +88,9 @@ def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect(monkeypatch):
         measured = np.concatenate([t.position for t in made.recording.trajectories])
         predicted = Rollouts(chain, made.recording).predict(rows)
         true, without = np.sqrt(np.mean((predicted - measured) ** 2, axis=(1, 2)))
-        assert true < 0.7e-3 and without > 1.2 * true, f"{name}: {true:.1e} rad, without it {without:.1e}"
+        assert true < 0.7e-3 and without > 1.2 * true, (
+            f"{name}: {true:.1e} rad, without it {without:.1e}"
+        )
 
 
 def test_another_joint_pulls_through_the_coupling():
@@ -100,7 +113,9 @@ def test_effects_outside_the_table_act():
 def test_dry_friction_builds_up_over_a_travel_and_stays_within_its_bounds():
     """Below it a joint bends and comes back, as on the spring that friction over the travel is."""
     friction, travel = 0.2, 2.0e-3
-    stiff = replace(servo(coulomb_friction={"tau_c_nm": friction}), physics=Physics(presliding_rad=travel))
+    stiff = replace(
+        servo(coulomb_friction={"tau_c_nm": friction}), physics=Physics(presliding_rad=travel)
+    )
     time, path = answer(stiff, lambda time: np.where((time > 0.1) & (time < 1.0), 0.05, 0.0))
     held = KP * 0.05 / (KP + friction / travel)
     assert path[time < 1.0][-1, 0] == pytest.approx(held, rel=0.02) and abs(path[-1, 0]) < 1e-5
@@ -113,7 +128,9 @@ def test_gears_ripple_and_noise_has_a_colour_but_no_other_size():
     _, path = answer(geared, step)
     assert KP * (STEP - path[-1, 0]) == pytest.approx(-0.2 * np.sin(20 * path[-1, 0]), abs=1e-3)
     white, coloured = (
-        _Session(Hiding("servo", physics=Physics(noise_s=noise_s)))._noise((9999, 1), np.arange(9999) * 0.01)
+        _Session(Hiding("servo", physics=Physics(noise_s=noise_s)))._noise(
+            (9999, 1), np.arange(9999) * 0.01
+        )
         for noise_s in (0.0, 0.02)
     )
     for noise, memory in ((white, 0.0), (coloured, np.exp(-0.5))):
@@ -137,7 +154,8 @@ def test_a_finger_moves_as_by_the_steps_of_another_integrator(payload):
         mujoco.mj_step(model, data, 50)
     ones = np.ones(3)
     plant = Plant(("a", "b", "c"), ones, 0.02 * ones, 99 * ones, 1e-3 * ones, 0 * ones, body=body)
-    # Switched off at the start, and so without damping: it falls and swings, bends driving each other.
+    # Switched off at the start, and so without damping: it falls and swings, bends driving each
+    # other.
     time = np.arange(100) * 5e-3
     off = np.zeros((100, 3), dtype=bool)
     conditions = {"payload_kg": payload}
@@ -147,7 +165,10 @@ def test_a_finger_moves_as_by_the_steps_of_another_integrator(payload):
 
 
 def test_a_finger_of_any_hand_moves_as_the_rollouts_say(tmp_path, monkeypatch):
-    """Four joints about skewed axes, links off them, and dry friction; rounded to encoder counts."""
+    """Four joints about skewed axes, links off them, and dry friction.
+
+    Rounded to encoder counts.
+    """
     monkeypatch.setattr("vd.bench.hide.NOISE_RAD", 0.0)
     parts = [part.replace(MIMIC, "").replace(MESH, '<sphere radius="0.01"/>') for part in PARTS]
     hand = import_hand(write_urdf(tmp_path, parts), tmp_path / "out").hand
@@ -161,7 +182,9 @@ def test_a_finger_of_any_hand_moves_as_the_rollouts_say(tmp_path, monkeypatch):
     measured = np.concatenate([t.position for t in made.recording.trajectories])
     predicted = Rollouts(chain, made.recording, dt=1.0 / 1920.0).predict(rows)
     true, without = np.sqrt(np.mean((predicted - measured) ** 2, axis=(1, 2)))
-    assert len(names) == 4 and true < 1.5e-3 and without > 3.0 * true, f"{true:.1e}, {without:.1e} rad"
+    assert len(names) == 4 and true < 1.5e-3 and without > 3.0 * true, (
+        f"{true:.1e}, {without:.1e} rad"
+    )
 
 
 def test_too_stiff_a_spring_is_refused():

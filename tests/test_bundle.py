@@ -56,7 +56,10 @@ def edit(folder, change, *, sign=True):
 
 
 def test_a_teacher_comes_back(teacher_bundle):
-    policy, original = open_policy(str(teacher_bundle), "cpu"), load_policy(SHIPPED_POLICIES[TEACHER])
+    policy, original = (
+        open_policy(str(teacher_bundle), "cpu"),
+        load_policy(SHIPPED_POLICIES[TEACHER]),
+    )
     observation = torch.randn(5, policy.num_observations)
     assert torch.equal(policy.act(observation), original.act(observation))
     assert policy.task == original.task and policy.env_steps == original.env_steps
@@ -106,10 +109,14 @@ def test_a_vision_policy_comes_back_and_answers_with_its_network(tmp_path):
 
 def test_a_policys_hand_is_refused_once_it_is_another_one_of_the_same_name(hand):
     wanted = trained_hand(hand)
-    assert load_policy(SHIPPED_POLICIES["leap-cube"]).trained_hand["effort_nm"][0] == pytest.approx(0.28)
+    assert load_policy(SHIPPED_POLICIES["leap-cube"]).trained_hand["effort_nm"][0] == pytest.approx(
+        0.28
+    )
     for other in (hand, load_hand("dclaw4")):  # of another name, a person chose it
         check_trained_hand(wanted, other, "policy.pt")
-    with pytest.raises(ContractError, match=r"hand\.effort_nm\[0\] is .* here, but .* in its training; use"):
+    with pytest.raises(
+        ContractError, match=r"hand\.effort_nm\[0\] is .* here, but .* in its training; use"
+    ):
         check_trained_hand(wanted, replace(hand, effort=2.0 * hand.effort), "policy.pt")
     with pytest.raises(ContractError, match=r"hand\.tips_in_base\[0\]\[0\]"):
         check_trained_hand(wanted, replace(hand, tip_frame=hand.tip_frame + 1e-3), "policy.pt")
@@ -122,7 +129,10 @@ def test_another_hand_is_refused_by_field(teacher_bundle, hand, capsys):
     limited[3] = 1.2
     for other, message in (
         (load_hand("dclaw4"), r"hand.name is 'dclaw4' here, but 'dclaw3' in the bundle; use the"),
-        (replace(hand, joint_names=swapped), r"hand\.joint_names\[0\] is 'f0_j2' here, but 'f0_j1'"),
+        (
+            replace(hand, joint_names=swapped),
+            r"hand\.joint_names\[0\] is 'f0_j2' here, but 'f0_j1'",
+        ),
         (replace(hand, upper=limited), r"hand\.upper_rad\[3\] is 1\.2"),
     ):
         with pytest.raises(ContractError, match=message):
@@ -143,10 +153,15 @@ def test_another_hand_is_refused_by_field(teacher_bundle, hand, capsys):
 
 def test_another_camera_is_refused_unless_the_policy_has_its_own(tmp_path, hand):
     moved = replace(
-        hand, mounted_camera=replace(hand.camera, position=hand.camera.position + np.array([0.0, 0.0, 0.02]))
+        hand,
+        mounted_camera=replace(
+            hand.camera, position=hand.camera.position + np.array([0.0, 0.0, 0.02])
+        ),
     )
     write_bundle(make_tracking(), tmp_path / "own")
-    with pytest.raises(ContractError, match=r"camera\.pose_in_base\[2\] is .*write it for this one"):
+    with pytest.raises(
+        ContractError, match=r"camera\.pose_in_base\[2\] is .*write it for this one"
+    ):
         check_hand(read_contract(tmp_path / "own"), moved, "it")
     write_bundle(make_tracking(PLACED), tmp_path / "placed")
     check_hand(read_contract(tmp_path / "placed"), moved, "it")
@@ -191,7 +206,9 @@ def test_what_does_not_answer_as_it_did_or_is_not_of_this_version_is_refused(tea
     with pytest.raises(ContractError, match=r'Missing key.* "0\.bias".*: write the bundle again'):
         read_bundle(teacher_bundle)
     edit(teacher_bundle, lambda values: values["provenance"]["task"].update(gone=1))
-    with pytest.raises(ContractError, match=r"has no field gone.* another one wrote .*vd-train bundle"):
+    with pytest.raises(
+        ContractError, match=r"has no field gone.* another one wrote .*vd-train bundle"
+    ):
         read_bundle(teacher_bundle)
 
 

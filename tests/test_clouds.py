@@ -19,7 +19,9 @@ def test_poses_and_points_are_those_of_the_hand(name, device):
     links = generator.permutation(len(hand.link_names) + 2)[: len(hand.link_names)]
     hand = replace(hand, mount=compose(hand.mount, np.array([0.1, 0, 0, 0, 0, 0, 1.0])))
     cloud = HandCloud(hand, link_body=links, device=device)
-    body_q = wp.full((20, len(links) + 2), wp.transform(*[np.nan] * 7), dtype=wp.transform, device=device)
+    body_q = wp.full(
+        (20, len(links) + 2), wp.transform(*[np.nan] * 7), dtype=wp.transform, device=device
+    )
     cloud.pose(wp.array(q, dtype=float, device=device), body_q)
     poses, in_base = body_q.numpy(), hand.forward_kinematics(q)
     expected = compose(hand.mount, in_base)
@@ -33,4 +35,6 @@ def test_poses_and_points_are_those_of_the_hand(name, device):
     for number, link in enumerate(hand.point_link):
         local = np.c_[hand.link_points[number], np.tile([0, 0, 0, 1.0], (each, 1))]
         wanted = compose(in_base[:, link, None], local)[..., :3]
-        np.testing.assert_allclose(points[:, number * each : (number + 1) * each], wanted, atol=2e-6)
+        np.testing.assert_allclose(
+            points[:, number * each : (number + 1) * each], wanted, atol=2e-6
+        )

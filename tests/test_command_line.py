@@ -84,15 +84,24 @@ def test_a_file_that_cannot_be_used_is_refused_by_name(line, text, tmp_path, run
 
 def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
     path = tmp_path / "run.yaml"
-    path.write_text("objects: [cuboid]\nin_air: true\nquick: true\ntable_friction: 3e-1\npolicies: [random]")
-    values = yaml.safe_load(run(f"vd-eval zero --config={path} --in-air --no-quick --print-config")[1])
+    path.write_text(
+        "objects: [cuboid]\nin_air: true\nquick: true\ntable_friction: 3e-1\npolicies: [random]"
+    )
+    values = yaml.safe_load(
+        run(f"vd-eval zero --config={path} --in-air --no-quick --print-config")[1]
+    )
     assert values["policies"] == ["zero"] and values["objects"] == ["cuboid"]
     assert values["in_air"] and not values["quick"] and values["table_friction"] == 0.3
 
     path.write_text("preset: cpu-demo\nppo: {epochs: 3}\nrun: {out: a}\nenv: {hand: dclaw4}")
-    cfg, preset = parse_teacher(["--config", str(path), "--ppo.gamma", "0.5"]), PRESETS["cpu-demo"]()
+    cfg, preset = (
+        parse_teacher(["--config", str(path), "--ppo.gamma", "0.5"]),
+        PRESETS["cpu-demo"](),
+    )
     assert (cfg.ppo.epochs, cfg.ppo.gamma, cfg.run.out) == (3, 0.5, Path("a"))
-    assert cfg.ppo.minibatch_size == preset.ppo.minibatch_size and cfg.env.observation.view == "goal"
+    assert (
+        cfg.ppo.minibatch_size == preset.ppo.minibatch_size and cfg.env.observation.view == "goal"
+    )
     path.write_text("ppo: {epochs: 3}")
     cfg = parse_teacher(["--config", str(path), "--preset", "gpu"])
     assert cfg.policy == PRESETS["gpu"]().policy and cfg.ppo.epochs == 3
@@ -102,7 +111,9 @@ def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
     assert parse_student(["--config", str(path)]).run.out.name == "cpu-stage1"
 
 
-def test_a_logger_that_is_not_installed_is_refused_and_one_that_is_gets_the_curve(tmp_path, monkeypatch):
+def test_a_logger_that_is_not_installed_is_refused_and_one_that_is_gets_the_curve(
+    tmp_path, monkeypatch
+):
     from train_dummy import make_runner
 
     monkeypatch.setitem(sys.modules, "wandb", None)
@@ -114,6 +125,9 @@ def test_a_logger_that_is_not_installed_is_refused_and_one_that_is_gets_the_curv
     (tmp_path / "config.json").write_text('{"ppo": {}}')
     make_runner(tmp_path, logger="wandb").learn(2)
     logged = {(call.kwargs["step"], *call.args[0]) for call in wandb.log.call_args_list}
-    assert {(1, "reward/total"), (2, "run/steps_per_s")} <= logged and wandb.run.name == tmp_path.name
+    assert {
+        (1, "reward/total"),
+        (2, "run/steps_per_s"),
+    } <= logged and wandb.run.name == tmp_path.name
     wandb.config.update.assert_called_with({"ppo": {}})
     wandb.finish.assert_called_once()

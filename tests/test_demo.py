@@ -43,7 +43,11 @@ def leave_flight(line: list[str]) -> None:
     import numpy as np
 
     hand = load_hand("dclaw4")
-    run = {"object": {"name": "mug", "set": "x"}, "goals": [[0.0, 0.0, 0.0, 1.0]], "control_hz": 12.0}
+    run = {
+        "object": {"name": "mug", "set": "x"},
+        "goals": [[0.0, 0.0, 0.0, 1.0]],
+        "control_hz": 12.0,
+    }
     log = LogWriter(option(line, "--log"), hand, run, servo={})
     joints = dict.fromkeys(JOINT_CHANNELS, np.zeros(hand.num_joints))
     for step in range(3):
@@ -56,7 +60,8 @@ def leave_flight(line: list[str]) -> None:
 
 def leave_training(line: list[str]) -> None:
     rows = [
-        {"env_steps": 1000 * k, "goals_per_episode": goals} for k, goals in enumerate((None, 5.0, 4.5, 9.9))
+        {"env_steps": 1000 * k, "goals_per_episode": goals}
+        for k, goals in enumerate((None, 5.0, 4.5, 9.9))
     ]
     option(line, "--out").mkdir()
     (option(line, "--out") / PROGRESS_FILE).write_text("\n".join(map(json.dumps, rows)))
@@ -110,7 +115,9 @@ def test_the_page_shows_every_part(played, tmp_path):
     assert text.count("<video") == 3 and "http-equiv" not in text
     for words in ("The simulation lacks", "mug", "stopped", "9.9 goals an episode", "4.5"):
         assert words in text
-    assert [line[0] for line in played if "--seed" in line and option(line, "--seed").name != "3"] == []
+    assert [
+        line[0] for line in played if "--seed" in line and option(line, "--seed").name != "3"
+    ] == []
     assert (tmp_path / "demo" / "gap" / "analysis" / "report.html").is_file()
 
 
@@ -139,7 +146,10 @@ def test_meshes_are_turned_in_place_of_built_in_objects(played, tmp_path, monkey
     assert [Path(word).name for word in played[0][2:6]] == ["d.obj", "c.obj", "b.obj", "a.obj"]
     folder = tmp_path / "demo" / "camera" / "objects"
     assert option(played[1], "--objects") == folder
-    assert option(next(line for line in played if line[0] == "vd-deploy"), "--object") == folder / "d.usda"
+    assert (
+        option(next(line for line in played if line[0] == "vd-deploy"), "--object")
+        == folder / "d.usda"
+    )
 
 
 def test_a_part_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch, capsys):
@@ -152,13 +162,17 @@ def test_a_part_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch, 
     for name in ("camera", "gap", "twin", "training"):
         monkeypatch.setattr(Demo, name, fail)
     assert main(["--out", str(tmp_path)]) == 1
-    assert "failed: Objects never seen, turned by camera, A hidden effect" in capsys.readouterr().err
+    assert (
+        "failed: Objects never seen, turned by camera, A hidden effect" in capsys.readouterr().err
+    )
     assert "http-equiv" in seen[1] and "This part failed.</b> vd-x &lt;y&gt; ended" in seen[1]
     assert '<p class="small">running' in seen[1] and '<p class="small">waiting' in seen[1]
 
 
 def test_a_command_that_fails_says_which_and_why(tmp_path):
-    with pytest.raises(RuntimeError, match=r"(?s)vd-play nosuch .*with status 1: .*no policy at nosuch"):
+    with pytest.raises(
+        RuntimeError, match=r"(?s)vd-play nosuch .*with status 1: .*no policy at nosuch"
+    ):
         Part("x", "X", tmp_path).run(["vd-play", "nosuch", "--video", tmp_path / "x.mp4"])
 
 
@@ -168,7 +182,9 @@ def test_ctrl_c_ends_the_command_under_way_and_the_page_says_so(tmp_path):
         "demo.Demo.camera = lambda demo, part: part.run(['sleep', '100'])\n"
         "sys.exit(demo.main(['--quick', '--out', sys.argv[1]]))"
     )
-    process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE
+    )
     while b"$ sleep" not in process.stdout.readline():
         assert process.poll() is None
     process.send_signal(signal.SIGINT)

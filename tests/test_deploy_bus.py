@@ -116,7 +116,9 @@ def test_motors_refuse_what_the_manual_says(name, value, torque, failure):
 
 
 def test_a_blocked_motor_shuts_down_and_says_why_until_rebooted(bus, twin):
-    full = MotorSettings(current_limit_a=0.923, velocity_limit_rad_s=5.0, lower_rad=-1.5, upper_rad=1.5)
+    full = MotorSettings(
+        current_limit_a=0.923, velocity_limit_rad_s=5.0, lower_rad=-1.5, upper_rad=1.5
+    )
     bus.configure(dict.fromkeys(IDS, full))
     bus.torque(True)
     twin.plant.blocked[1] = True
@@ -150,7 +152,10 @@ def test_a_program_that_did_not_run_is_not_called_a_lost_cable(starved_s):
 
 
 def test_late_lost_and_corrupted_states_are_not_taken_for_fresh_ones(bus, twin):
-    """Axes move all the time; each accepted state is compared with where they were when it was read."""
+    """Axes move all the time.
+
+    Each accepted state is compared with where they were when it was read.
+    """
     ready(bus)
     twin.faults = Faults(lose=0.02, corrupt=0.05, truncate=0.03, late=0.05, late_s=0.06, seed=1)
     accepted = 0

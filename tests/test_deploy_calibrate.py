@@ -1,6 +1,7 @@
 """Hand-eye calibration: exact views, noisy ones against the predicted intervals, and drawn pictures.
 
-The camera is where the hand's USD has it; views are what it would see, made here from forward kinematics.
+The camera is where the hand's USD has it; views are what it would see, made here from forward
+kinematics.
 """
 
 import contextlib
@@ -32,7 +33,9 @@ SLIP = np.array(
     [0.002, -0.003, 0.001, *Rotation.from_euler("xyz", (8.0, -5.0, 12.0), degrees=True).as_quat()]
 )
 """From where a marker should sit to where somebody has stuck it."""
-AWAY = np.array([0.03, -0.03, 0.04, *Rotation.from_euler("xyz", (8.0, -6.0, 10.0), degrees=True).as_quat()])
+AWAY = np.array(
+    [0.03, -0.03, 0.04, *Rotation.from_euler("xyz", (8.0, -6.0, 10.0), degrees=True).as_quat()]
+)
 """From where the camera is thought to be to where it is, in its own frame: mounted by eye."""
 QUARTER = np.array([0.0, 0.0, 0.0, *Rotation.from_euler("z", 90, degrees=True).as_quat()])
 
@@ -55,7 +58,10 @@ def camera(hand):
 
 @pytest.fixture(scope="module")
 def poses(hand, lens, camera):
-    """Joints of the hand, one finger bent after the other to show its marker: of the first, of all."""
+    """Joints of the hand, one finger bent after the other to show its marker.
+
+    Of the first, of all.
+    """
     generator = np.random.default_rng(0)
     waiting = hand.start
     rows = []
@@ -67,8 +73,16 @@ def poses(hand, lens, camera):
             q[axes] = generator.uniform(hand.lower[axes], hand.upper[axes])
             pose = compose(invert(camera), compose(hand.tip_poses(q)[finger], marker))
             pixels = marker_corners(pose[None], lens, SIDE_M)[0]
-            facing = -Rotation.from_quat(pose[3:]).apply([0, 0, 1.0]) @ pose[:3] / np.linalg.norm(pose[:3])
-            if facing > 0.6 and (pixels > 20).all() and (pixels < [lens.width - 20, lens.height - 20]).all():
+            facing = (
+                -Rotation.from_quat(pose[3:]).apply([0, 0, 1.0])
+                @ pose[:3]
+                / np.linalg.norm(pose[:3])
+            )
+            if (
+                facing > 0.6
+                and (pixels > 20).all()
+                and (pixels < [lens.width - 20, lens.height - 20]).all()
+            ):
                 rows.append(q)
                 found += 1
         rows.append(waiting)
@@ -83,18 +97,24 @@ def thought(hand, camera):
 
 
 def views(hand, camera, lens, joints, fingers, *, noise_px=0.0, joint_rad=0.0, seed=0, stuck=SLIP):
-    """What a camera sees of the fingers that move; the joints are off by ``joint_rad`` from what they say."""
+    """What a camera sees of the fingers that move.
+
+    The joints are off by ``joint_rad`` from what they say.
+    """
     generator = np.random.default_rng(seed)
     tip, finger, corners = [], [], []
     for number in fingers:
         marker = compose(seat(hand, number, camera), stuck)
-        for q in joints[np.abs(joints - joints[-1])[:, 3 * number : 3 * number + 3].max(axis=1) > 0.01]:
+        for q in joints[
+            np.abs(joints - joints[-1])[:, 3 * number : 3 * number + 3].max(axis=1) > 0.01
+        ]:
             pose = compose(invert(camera), compose(hand.tip_poses(q)[number], marker))
             said = q + joint_rad * generator.standard_normal(len(q))
             tip.append(hand.tip_poses(said)[number])
             finger.append(number)
             corners.append(
-                marker_corners(pose[None], lens, SIDE_M)[0] + noise_px * generator.standard_normal((4, 2))
+                marker_corners(pose[None], lens, SIDE_M)[0]
+                + noise_px * generator.standard_normal((4, 2))
             )
     return Views(np.array(tip), np.array(finger), np.array(corners), lens, SIDE_M)
 
@@ -102,7 +122,9 @@ def views(hand, camera, lens, joints, fingers, *, noise_px=0.0, joint_rad=0.0, s
 def misplaced(camera, truth):
     """By how much what is where objects are seems moved to a camera [7] that is at another place [3] [m]."""
     point = load_hand("dclaw3").goal_in_base
-    return compose(camera, compose(invert(truth), np.array([*point, 0.0, 0.0, 0.0, 1.0])))[:3] - point
+    return (
+        compose(camera, compose(invert(truth), np.array([*point, 0.0, 0.0, 0.0, 1.0])))[:3] - point
+    )
 
 
 def draw(image, number, pose, lens):
@@ -138,26 +160,40 @@ def test_exact_views_give_the_exact_camera(hand, camera, lens, poses, thought, f
 
 
 def test_noisy_views_err_as_predicted(hand, camera, lens, poses):
-    """Corners off by 0.3 pixels and joints by 0.2 degrees: 95 % intervals hold in about 95 of 100."""
+    """Corners off by 0.3 pixels and joints by 0.2 degrees.
+
+    95 % intervals hold in about 95 of 100.
+    """
     covered, errors, predicted = [], [], []
     marker = {0: seat(hand, 0, camera)}
     for seed in range(40):
         seen = views(
-            hand, camera, lens, poses[(0,)], (0,), noise_px=0.3, joint_rad=np.radians(0.2), seed=seed
+            hand,
+            camera,
+            lens,
+            poses[(0,)],
+            (0,),
+            noise_px=0.3,
+            joint_rad=np.radians(0.2),
+            seed=seed,
         )
         found = refine(seen, camera, marker)
         covered.append(np.abs(off(camera, found.camera)) < found.half_width)
         errors.append(np.linalg.norm(misplaced(found.camera, camera)))
         predicted.append(found.point_error(hand.goal_in_base))
     share = np.mean(covered)
-    assert 0.90 < share < 0.995, share  # 240 correlated components; the sandwich is known to be careful
+    assert 0.90 < share < 0.995, (
+        share
+    )  # 240 correlated components; the sandwich is known to be careful
     assert np.quantile(errors, 0.95) < 1.3 * np.median(predicted)
     assert np.median(errors) > 0.15 * np.median(predicted)
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_wrong_views_are_left_out(hand, camera, lens, poses, thought, seed):
-    seen = views(hand, camera, lens, poses[(0, 1, 2)], (0, 1, 2), noise_px=0.3, joint_rad=0.003, seed=seed)
+    seen = views(
+        hand, camera, lens, poses[(0, 1, 2)], (0, 1, 2), noise_px=0.3, joint_rad=0.003, seed=seed
+    )
     wrong = np.arange(2, len(seen), 6)
     corners = seen.corners.copy()
     corners[wrong] += 40.0
@@ -187,12 +223,16 @@ def test_drawn_markers_are_found_where_they_are(lens, noise):
         ).as_quat()
         image = np.full((lens.height, lens.width), 70, dtype=np.uint8)
         draw(image, number, pose, lens)
-        image = np.clip(image + noise * generator.standard_normal(image.shape), 0, 255).astype(np.uint8)
+        image = np.clip(image + noise * generator.standard_normal(image.shape), 0, 255).astype(
+            np.uint8
+        )
         found = find_markers(image)
         assert list(found) == [number]
         errors.append(found[number] - marker_corners(pose[None], lens, SIDE_M)[0])
     assert np.sqrt(np.mean(np.square(errors))) < 0.5
-    assert np.abs(np.mean(errors, axis=(0, 1))).max() < 0.1  # half a pixel of another convention would show
+    assert (
+        np.abs(np.mean(errors, axis=(0, 1))).max() < 0.1
+    )  # half a pixel of another convention would show
 
 
 class Bench:
@@ -222,7 +262,12 @@ class Bench:
         for number, tip in enumerate(self.hand.tip_poses(self.poses[self.at])):
             marker = compose(seat(self.hand, number, self.said), SLIP)
             with contextlib.suppress(ValueError):  # out of the picture
-                draw(image, number, compose(invert(self.camera), compose(tip, marker)), self.intrinsics)
+                draw(
+                    image,
+                    number,
+                    compose(invert(self.camera), compose(tip, marker)),
+                    self.intrinsics,
+                )
         noisy = image + 3.0 * self.generator.standard_normal(image.shape, dtype=np.float32)
         return Frame(np.clip(np.rint(noisy), 0, 255).astype(np.uint8), 0.0)
 
@@ -246,7 +291,10 @@ def test_pictures_of_markers_give_the_layer_that_the_loop_reads(
     out = tmp_path / "camera.usda"
     assert calibrated(bench, monkeypatch, out=out, count=VIEWS) == 0
     moved_m = (
-        float(re.search(r"([\d.]+) mm from where the hand's file has it", capsys.readouterr().out)[1]) / 1e3
+        float(
+            re.search(r"([\d.]+) mm from where the hand's file has it", capsys.readouterr().out)[1]
+        )
+        / 1e3
     )
     place = read_camera(hand, out)
     found = np.concatenate([place.position, place.quaternion])

@@ -1,4 +1,7 @@
-"""What the preflight finds of a camera: one that is as it should be, and each thing that can be wrong."""
+"""What the preflight finds of a camera.
+
+One that is as it should be, and each thing that can be wrong.
+"""
 
 from dataclasses import dataclass, field, replace
 
@@ -64,7 +67,10 @@ def test_a_camera_that_falls_silent_is_named_and_nothing_else_looked_at(images):
 
 def test_few_and_old_images_are_named():
     slow = look(Camera(fps=15.0))
-    assert wrong(slow) == ["rate"] and "15.0 images a second, not 30: use a USB 3 cable" in slow["rate"][1]
+    assert (
+        wrong(slow) == ["rate"]
+        and "15.0 images a second, not 30: use a USB 3 cable" in slow["rate"][1]
+    )
     old = look(Camera(age_s=0.2))
     assert wrong(old) == ["rate"] and "200 ms old" in old["rate"][1]
 
@@ -80,5 +86,9 @@ def test_depth_counts_where_the_object_is_handled():
     depth = np.full((180, 320), 0.6, dtype=np.float32)
     depth[int(row) - 40 : int(row) + 40, int(column) - 40 : int(column) + 40] = 0.0
     found = look(Camera(depth=depth))
-    assert wrong(found) == ["depth"] and "89 % of the pixels have it, 0 % around" in found["depth"][1]
-    assert "depth" in wrong(look(Camera(depth=np.full((180, 320), 9.0, dtype=np.float32))))  # out of range
+    assert (
+        wrong(found) == ["depth"] and "89 % of the pixels have it, 0 % around" in found["depth"][1]
+    )
+    assert "depth" in wrong(
+        look(Camera(depth=np.full((180, 320), 9.0, dtype=np.float32)))
+    )  # out of range

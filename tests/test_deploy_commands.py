@@ -43,7 +43,10 @@ def hand():
 
 @pytest.fixture
 def line(hand, monkeypatch):
-    """What commands connect to: motors on a simulated line, where nothing is late on a busy machine."""
+    """What commands connect to.
+
+    Motors on a simulated line, where nothing is late on a busy machine.
+    """
     joints = read_joints(hand)
     with simulated_bus(hand, joints) as (motors, bus):
         motors.plant.position[:] = hand.start + 0.1
@@ -60,14 +63,18 @@ def line(hand, monkeypatch):
 def test_check_finds_nothing_wrong_and_leaves_the_torque_off(line, capsys):
     assert check.check(check.CheckCfg(port=PORT, json=True, no_camera=True)) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["ok"] and {"registers", "torque", "loop rate"} < {f["what"] for f in report["findings"]}
+    assert report["ok"] and {"registers", "torque", "loop rate"} < {
+        f["what"] for f in report["findings"]
+    }
     assert not any(motor.get("torque_enable") for motor in line.motors)
     assert line.motors[0].get("position_p_gain") == 200
 
 
 def test_check_misses_the_camera(line, capsys):
     assert check.check(check.CheckCfg(port=PORT, camera=RealSenseCfg(serial="none"))) == 1
-    assert re.search("WRONG  camera .*(no RealSense|SDK cannot be imported)", capsys.readouterr().out)
+    assert re.search(
+        "WRONG  camera .*(no RealSense|SDK cannot be imported)", capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize("name", BEFORE)
@@ -164,7 +171,9 @@ def plan(tmp_path, hand):
         name = f"next_experiment/{index:03d}_{joint}_wave.csv"
         (folder / name).write_text("\n".join(rows) + "\n")
         conditions = {"p_gain": gain}
-        entries.append({"file": name, "excitation": "wave", "joints": [joint], "conditions": conditions})
+        entries.append(
+            {"file": name, "excitation": "wave", "joints": [joint], "conditions": conditions}
+        )
         path = folder / f"{joint}.json"
         path.write_text(json.dumps({"joints": [joint], "trajectories": [entries[-1]]}))
     return folder
@@ -173,20 +182,36 @@ def plan(tmp_path, hand):
 def test_a_plan_is_recorded_and_gone_on_with(line, plan, hand, tmp_path, capsys):
     out = tmp_path / "rec"
     first = record.RecordCfg(
-        port=PORT, out=out, fingers=(0,), plan=plan / "f0_j1.json", yes=True, safety=QUICK, realtime=False
+        port=PORT,
+        out=out,
+        fingers=(0,),
+        plan=plan / "f0_j1.json",
+        yes=True,
+        safety=QUICK,
+        realtime=False,
     )
     assert record.record(first) == 0
     assert re.search(r"at (100|99) Hz\n", capsys.readouterr().err)
     before = (out / "plan_000_f0_j1_wave.csv").read_bytes()
     second = record.RecordCfg(
-        port=PORT, out=out, fingers=(0,), plan=plan / "f0_j2.json", yes=True, safety=QUICK, realtime=False
+        port=PORT,
+        out=out,
+        fingers=(0,),
+        plan=plan / "f0_j2.json",
+        yes=True,
+        safety=QUICK,
+        realtime=False,
     )
     assert record.record(second) == 0 and record.record(second) == 0
     assert (out / "plan_000_f0_j1_wave.csv").read_bytes() == before
     found = read_recording(out)
     assert found.model == "dclaw3" and found.joints == ("f0_j1", "f0_j2", "f0_j3")
     wave, release = found.trajectories
-    assert (wave.excitation, wave.joints, wave.conditions) == ("wave", ("f0_j1",), {"p_gain": 200.0})
+    assert (wave.excitation, wave.joints, wave.conditions) == (
+        "wave",
+        ("f0_j1",),
+        {"p_gain": 200.0},
+    )
     np.testing.assert_allclose(wave.command[:, 0], 0.3 * np.sin(12 * wave.time), atol=0.15)
     assert np.ptp(wave.position[:, 0]) > 0.1 and np.ptp(wave.position[:, 2]) < 0.02
     assert wave.enabled.all() and not release.enabled[-1, 1] and release.enabled[0, 1]
@@ -206,7 +231,9 @@ def test_a_recording_says_that_it_missed_its_rate(line, plan, tmp_path, capsys):
     with record.connect(cfg) as connection:
         connection.bus._port.lag_s = 0.016
     assert record.record(cfg) == 0
-    rate = re.search(r"at (\d+) Hz, not 100: .*latency timer.* --rate-hz \1", capsys.readouterr().err)
+    rate = re.search(
+        r"at (\d+) Hz, not 100: .*latency timer.* --rate-hz \1", capsys.readouterr().err
+    )
     assert rate and int(rate[1]) < 60
 
 
@@ -231,7 +258,9 @@ def test_motions_go_finger_by_finger_and_a_plan_of_another_hand_is_refused(hand,
 @pytest.mark.parametrize("name", ["dclaw3", "dclaw4", "leap"])
 def test_the_largest_motions_touch_nothing(name, request, tmp_path):
     if name == "leap":
-        path = request.getfixturevalue("shared_dir") / "hands" / "leap_hand" / "leap_hand_right.urdf"
+        path = (
+            request.getfixturevalue("shared_dir") / "hands" / "leap_hand" / "leap_hand_right.urdf"
+        )
         if not path.is_file():
             pytest.skip(f"there is no {path}")
         hand = import_hand(path, tmp_path, "leap").hand
@@ -245,17 +274,24 @@ def test_the_largest_motions_touch_nothing(name, request, tmp_path):
         commands = [*[motion.command[0]] * 200, *motion.command]
         for index, command in enumerate(commands):
             goals = zip(joints.to_motor(command), joints.motors, strict=True)
-            plant.advance(0.01, [Drive(float(angle), motor.p_gain, 8.0, 2.6) for angle, motor in goals])
+            plant.advance(
+                0.01, [Drive(float(angle), motor.p_gain, 8.0, 2.6) for angle, motor in goals]
+            )
             found = plant._solver.mjw_data
             touching = np.count_nonzero(found.contact.dist.numpy()[: found.nacon.numpy()[0]] < 0.0)
             assert index < 200 or touching == 0, f"{motion.file}: {touching} contacts"
 
 
 def test_a_payload_needs_somebody_to_hang_it(line, hand, tmp_path):
-    cfg = record.RecordCfg(port=PORT, out=tmp_path, fingers=(0,), excitations=("second_payload",), yes=True)
+    cfg = record.RecordCfg(
+        port=PORT, out=tmp_path, fingers=(0,), excitations=("second_payload",), yes=True
+    )
     every = record.motions_of(read_joints(hand), (0,), cfg.excitations)
     motions = [motion for motion in every if record.payload_of(motion)[0]]
-    with record.connect(cfg) as connection, pytest.raises(record.RecordError, match=r"hang 0\.05 kg"):
+    with (
+        record.connect(cfg) as connection,
+        pytest.raises(record.RecordError, match=r"hang 0\.05 kg"),
+    ):
         record._session(cfg, connection, ("f0_j1",), motions, record.payload_of(motions[0]), print)
 
 
@@ -266,7 +302,8 @@ def test_a_fault_of_the_table_ends_safely(hand):
 
 
 @pytest.mark.parametrize(
-    ("twin", "status", "said"), [("--seed no", 2, "seed"), ("--hand nobody", 1, "no hand is called")]
+    ("twin", "status", "said"),
+    [("--seed no", 2, "seed"), ("--hand nobody", 1, "no hand is called")],
 )
 def test_a_twin_that_cannot_be_says_why(twin, status, said):
     command = [sys.executable, "-m", "vd.deploy.cli", "check", "--twin", f"--twin-args={twin}"]

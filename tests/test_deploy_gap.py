@@ -1,4 +1,7 @@
-"""What vd-gap makes of a recording of the twin and of the log of a run, exactly: on a simulated clock."""
+"""What vd-gap makes of a recording of the twin and of the log of a run, exactly.
+
+On a simulated clock.
+"""
 
 import contextlib
 import json
@@ -61,7 +64,9 @@ def test_late_packets_do_not_move_the_times_of_states(seed, rate, begin):
     true = 1000.0 + 0.01 * np.arange(300) + rng.uniform(0.0, 0.002, 300)
     phase = begin + rng.uniform(0.0, 1e-3, 9)
     ticks = (1e3 * ((true[:, None] - 1000.0) * (1.0 + rate) + phase)).astype(int) % TICK_MODULUS
-    waited = np.where(rng.random(300) < 0.25, rng.uniform(0.0, 0.02, 300), rng.uniform(0.0, 1e-4, 300))
+    waited = np.where(
+        rng.random(300) < 0.25, rng.uniform(0.0, 0.02, 300), rng.uniform(0.0, 1e-4, 300)
+    )
     found = record.measured_at(true - waited, ticks)
     assert np.abs(found - true).max() < 0.7e-3
     assert np.sqrt(np.mean((found - true) ** 2)) < 0.3e-3
@@ -73,7 +78,9 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     layer, said = tmp_path / "late.usda", tmp_path / "said.yaml"
     layer.write_text(LAYER)
     ids = dict(zip(("a1", "a2", "b1", "b2", "b3", "b4"), (5, 1, 2, 4, 3, 9), strict=True))
-    motors = {name: {"model": "XL330-M288", "id": id, "sign": (-1) ** id} for name, id in ids.items()}
+    motors = {
+        name: {"model": "XL330-M288", "id": id, "sign": (-1) ** id} for name, id in ids.items()
+    }
     said.write_text(json.dumps({"motors": motors}))
     parts = [part.replace(MIMIC, "") for part in PARTS]
     hand = import_hand(write_urdf(tmp_path, parts), tmp_path / "out", str(said)).hand
@@ -83,13 +90,17 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
 
     @contextlib.contextmanager
     def connect(_, **twin_options):
-        plant = NewtonHand(load_hand(str(hand.path), layer=layer), joints, SimCfg(physics_hz=3840.0))
+        plant = NewtonHand(
+            load_hand(str(hand.path), layer=layer), joints, SimCfg(physics_hz=3840.0)
+        )
         with simulated_bus(hand, joints, plant) as (_, bus):
             yield Connection(joints, bus)
 
     monkeypatch.setattr(record, "connect", connect)
     monkeypatch.setattr(record, "motions_of", lambda *_: chosen)
-    cfg = record.RecordCfg(hand=str(hand.path), port="simulated", out=tmp_path / "rec", fingers=(1,))
+    cfg = record.RecordCfg(
+        hand=str(hand.path), port="simulated", out=tmp_path / "rec", fingers=(1,)
+    )
     assert record.record(replace(cfg, yes=True, realtime=False)) == 0
     candidates = ("command_delay", "coulomb_friction", "backlash")
     analysis = Analysis(Settings(tmp_path / "rec", effects=candidates), tmp_path / "gap")
@@ -129,7 +140,9 @@ def rollout(folder, plant_hand, episode_s):
             safe.move(np.tile([0.0, 0.3, -0.5], 3), 0.5)
             log = LogWriter(folder, hand, run, servo={}, clock=bus.clock)
             pacer, actions = Pacer(12.0, bus.clock), ActionFilter(hand, ReorientCfg())
-            loop = ControlLoop(safe, Waving(bus.clock), actions, pacer, log, episode_s=episode_s, hold_s=0.0)
+            loop = ControlLoop(
+                safe, Waving(bus.clock), actions, pacer, log, episode_s=episode_s, hold_s=0.0
+            )
             loop.run([np.array([0.0, 0.0, 0.0, 1.0])])
         log.finish("done")
     return folder

@@ -67,7 +67,8 @@ def test_a_closed_mesh_is_taken_as_it_is(item, tmp_path, suffix):
     scan = scan_object(tmp_path / f"object{suffix}")
     centred = mesh.vertices - mesh.center_mass
     assert np.abs(np.ptp(scan.surface_points, axis=0) - np.ptp(centred, axis=0)).max() < 0.005
-    # On a convex mesh a point's largest height over the faces' planes is its distance from the surface.
+    # On a convex mesh a point's largest height over the faces' planes is its distance from the
+    # surface.
     corner = centred[mesh.faces[:, 0]]
     height = np.einsum("pfi,fi->pf", scan.surface_points[:, None] - corner, mesh.face_normals)
     assert np.abs(height.max(axis=1)).max() < 1e-5
@@ -86,7 +87,9 @@ def test_scans_of_no_use_are_refused_by_name(tmp_path):
     refused("text.ply", "neither mesh nor points")
     trimesh.PointCloud(generator.normal(0, 0.03, (50, 3))).export(tmp_path / "few.ply")
     refused("few.ply", "50 points")
-    trimesh.PointCloud(generator.uniform(-0.05, 0.05, (5000, 3)) * [1, 1, 0]).export(tmp_path / "flat.ply")
+    trimesh.PointCloud(generator.uniform(-0.05, 0.05, (5000, 3)) * [1, 1, 0]).export(
+        tmp_path / "flat.ply"
+    )
     refused("flat.ply", "one side only")
     trimesh.creation.box((2.0, 1.0, 1.0)).export(tmp_path / "table.ply")
     refused("table.ply", "scale the file to metres")

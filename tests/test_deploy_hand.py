@@ -55,7 +55,9 @@ def test_the_hand_goes_where_its_motors_drive_and_falls_without_them(hand, turne
     position, velocity, torque = plant.read()
     # Gravity bends the joints by torque over stiffness, and the motors' torque says so.
     np.testing.assert_allclose(turned.to_joint(position), goal, atol=0.05)
-    np.testing.assert_allclose(turned.sign * torque / hand.kp, goal - turned.to_joint(position), atol=0.01)
+    np.testing.assert_allclose(
+        turned.sign * torque / hand.kp, goal - turned.to_joint(position), atol=0.01
+    )
     assert np.abs(velocity).max() < 0.05
     for _ in range(60):
         plant.advance(0.02, drives(turned, None))
@@ -71,7 +73,9 @@ def test_limits_are_the_hands_in_the_motors_frame(hand, turned):
         assert settings[id].lower_rad == min(ends) and settings[id].upper_rad == max(ends)
         torque = settings[id].current_limit_a * MODELS[MODEL].torque_nm_per_a
         assert torque == pytest.approx(hand.effort[axis], rel=1e-6)
-    far = Joints(hand, tuple(replace(motor, offset_rad=motor.offset_rad + 3.0) for motor in turned.motors))
+    far = Joints(
+        hand, tuple(replace(motor, offset_rad=motor.offset_rad + 3.0) for motor in turned.motors)
+    )
     with pytest.raises(CalibrationError, match=r"f0_j1, motor 10: its range"):
         far.settings()
 
@@ -84,7 +88,9 @@ def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_pa
     np.testing.assert_array_equal(again.offset, turned.offset)
     with pytest.raises(CalibrationError, match="f3_j1"):
         read_joints(load_hand("dclaw4"), path)
-    with pytest.raises(CalibrationError, match=r"^--calibration \S+none\.json: No such file.*leave it out"):
+    with pytest.raises(
+        CalibrationError, match=r"^--calibration \S+none\.json: No such file.*leave it out"
+    ):
         read_joints(hand, tmp_path / "none.json")
 
 
@@ -97,18 +103,23 @@ def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_pa
         ({"offset_rad": float("nan")}, r"motors\.offset_rad of f0_j2 is nan"),
         (
             {"offset": 0.1},
-            r"motors\[1\] has no field offset; is it offset_rad\? it has id, joint, offset_rad, sign",
+            r"motors\[1\] has no field offset; is it offset_rad\? it has id, joint, offset_rad, "
+            r"sign",
         ),
         ({"sign": None}, r"motors\[1\] has no sign; name it"),
         ({"joint": "f0_j1"}, "motors has 2 entries of f0_j1"),
         ({"joint": "thumb"}, "motors has no entries of f0_j2"),
     ],
 )
-def test_what_is_no_calibration_is_refused_with_file_and_field(hand, turned, tmp_path, change, reason):
+def test_what_is_no_calibration_is_refused_with_file_and_field(
+    hand, turned, tmp_path, change, reason
+):
     path = tmp_path / "motors.json"
     record = save(turned, path, hand.name)
     record["motors"][1] |= change
-    record["motors"][1] = {name: value for name, value in record["motors"][1].items() if value is not None}
+    record["motors"][1] = {
+        name: value for name, value in record["motors"][1].items() if value is not None
+    }
     path.write_text(json.dumps(record))
     with pytest.raises(CalibrationError, match=rf"motors\.json.*{reason}"):
         read_joints(hand, path)
@@ -140,7 +151,10 @@ def test_goals_and_readings_do_not_wait_for_steps(hand, effect):
 
 
 def test_the_recorded_steps_are_the_solvers(hand):
-    """Fingers that press on each other: contacts come and go, and the solver's iterations differ."""
+    """Fingers that press on each other.
+
+    Contacts come and go, and the solver's iterations differ.
+    """
     joints = read_joints(hand)
     recorded, stepped = NewtonHand(hand, joints), NewtonHand(hand, joints)
     goal = np.tile([0.3, hand.lower[1], hand.lower[2]], 3)

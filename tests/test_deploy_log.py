@@ -18,7 +18,14 @@ from vd.deploy.loop import run_page
 from vd.deploy.loop.log import LogWriter
 from vd.gap.recording import read_recording
 from vd.hand_log import is_log, read_log
-from vd.log_format import FOUND_COLUMNS, JOINT_CHANNELS, STEP_COLUMNS, STEPS_FILE, TRUTH_COLUMNS, LogError
+from vd.log_format import (
+    FOUND_COLUMNS,
+    JOINT_CHANNELS,
+    STEP_COLUMNS,
+    STEPS_FILE,
+    TRUTH_COLUMNS,
+    LogError,
+)
 from vd.mcap_log import McapLog
 from vd.play.cli import main as play
 from vd.play.replay import Replay
@@ -47,7 +54,10 @@ def folder(tmp_path):
         values = [float(step >= 10), 1.0, 0.5, 0.001, -0.03, 0.002, 0.02, 0.02, 0.0]
         assert len(values) == len(STEP_COLUMNS)
         now = clock.now()
-        truth, depth = [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step], np.full((2, 3), 0.5, np.float32)
+        truth, depth = (
+            [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step],
+            np.full((2, 3), 0.5, np.float32),
+        )
         log.step(now, now + SENT_S, joints, values, truth, [0.1 * step] * 7, depth)
         if step == 9:
             log.event("stop", goal=0, outcome="stopped", distance=0.2)
@@ -86,13 +96,17 @@ def test_the_mcap_beside_it_has_all_of_it_and_ros_2_messages_for_others(folder, 
         told = list(whole.iter_decoded_messages())
     topics = [channel.topic for _, channel, _, _ in told]
     assert (
-        topics.count("/joint_states") == topics.count("/goal_pose") == STEPS and topics.count("/depth") == 3
+        topics.count("/joint_states") == topics.count("/goal_pose") == STEPS
+        and topics.count("/depth") == 3
     )
     depth = told[topics.index("/depth")][3]
     assert (depth.encoding, depth.height, depth.width) == ("16UC1", 2, 3)
     assert np.frombuffer(depth.data, "<u2").tolist() == [500] * 6
     pose = told[topics.index("/object_pose")][3]
-    assert pose.header.frame_id == "world" and (pose.pose.position.z, pose.pose.orientation.w) == (0.03, 1.0)
+    assert pose.header.frame_id == "world" and (pose.pose.position.z, pose.pose.orientation.w) == (
+        0.03,
+        1.0,
+    )
     for size in (2000, 5):
         file.write_bytes(file.read_bytes()[:size])
         assert play([str(file)]) == 1 and "is damaged" in capsys.readouterr().err
@@ -105,13 +119,22 @@ def test_rerun_reads_what_is_written_for_it(folder, tmp_path):
     hand, log, path = load_hand("dclaw3"), read_log(folder), tmp_path / "log.rrd"
     sink = RerunLog(path, log.run, hand, load_set("cube")[0], hand.camera)
     for step in range(STEPS):
-        sink.step({name: values[step] for name, values in log.columns.items()}, np.ones((2, 3), np.float32))
+        sink.step(
+            {name: values[step] for name, values in log.columns.items()},
+            np.ones((2, 3), np.float32),
+        )
     sink.event(log.events[0])
     sink.close(log.run)
     told = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "print", str(path)], capture_output=True, text=True
     )
-    for name in ("/world/found", "/world/camera/depth", "/joints/position", "/loop/sent_s", "/events"):
+    for name in (
+        "/world/found",
+        "/world/camera/depth",
+        "/joints/position",
+        "/loop/sent_s",
+        "/events",
+    ):
         assert name in told.stdout
 
 
@@ -129,7 +152,9 @@ def test_a_log_is_shown(folder, tmp_path, capsys):
     for name in FOUND_COLUMNS:
         real.columns[name][[0, 4, 5]] = np.nan
     shots = Replay(real).snapshots
-    np.testing.assert_allclose([s.joint_q[9] for s in shots[1:7]], [0.1, 0.2, 0.3, 0.3, 0.3, 0.6], atol=1e-6)
+    np.testing.assert_allclose(
+        [s.joint_q[9] for s in shots[1:7]], [0.1, 0.2, 0.3, 0.3, 0.3, 0.6], atol=1e-6
+    )
     np.testing.assert_allclose(shots[0].joint_q[9:], OUT_OF_SIGHT)
     assert play([str(folder), "--video", str(tmp_path / "log.mp4")]) == 0
     assert iio.imread(tmp_path / "log.mp4").shape[0] == STEPS
@@ -220,7 +245,9 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch):
 
     log = LogWriter(tmp_path / "log", load_hand("dclaw3"), {"goals": GOALS}, servo={})
     monkeypatch.setattr("vd.deploy.loop.log.os.write", full)
-    with pytest.raises(OSError, match=r"cannot write .*log: No space left on device; free some space"):
+    with pytest.raises(
+        OSError, match=r"cannot write .*log: No space left on device; free some space"
+    ):
         log.finish("done")
 
 

@@ -110,7 +110,9 @@ def test_without_torch_decisions_are_those_of_torch(tmp_path, name, told):
     assert main(["export", name, str(path)]) == 0
     sensed.write_bytes(pickle.dumps(states))
     runner = load_runner(name, "dclaw3", load_hand("dclaw3"), load_set("cube")[0], object=told)
-    (tmp_path / "torch.py").write_text("raise ModuleNotFoundError('torch is not here', name='torch')")
+    (tmp_path / "torch.py").write_text(
+        "raise ModuleNotFoundError('torch is not here', name='torch')"
+    )
     command = [sys.executable, "-c", WITHOUT_TORCH, str(path), told or "", str(sensed)]
     done = subprocess.run(
         command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(tmp_path)}

@@ -70,7 +70,10 @@ class LateCamera:
 
 
 class Countdown(PolicyRunner):
-    """A policy whose predicted distance falls by 0.1 rad a step from ``start``; its first look takes long."""
+    """A policy whose predicted distance falls by 0.1 rad a step from ``start``.
+
+    Its first look takes long.
+    """
 
     def __init__(self, clock: SimulatedClock, start: float = 1.0):
         super().__init__(ReorientCfg(), StoppingRule(0.35, 2.0))
@@ -97,7 +100,9 @@ class Countdown(PolicyRunner):
 def parts(tmp_path):
     clock = SimulatedClock()
     hand = load_hand("dclaw3")
-    log = LogWriter(tmp_path / "log", hand, {"goals": [list(GOAL)] * 2}, servo={}, truth=True, clock=clock)
+    log = LogWriter(
+        tmp_path / "log", hand, {"goals": [list(GOAL)] * 2}, servo={}, truth=True, clock=clock
+    )
     actions = ActionFilter(hand, ReorientCfg())
     return Hand(clock), Countdown(clock), actions, Pacer(HZ, clock), log
 
@@ -168,7 +173,14 @@ def test_the_hand_is_held_while_the_first_look_takes_longer_than_a_step_may(part
         safe.arm()
         camera, runner = LateCamera(bus.clock), Countdown(bus.clock)
         loop = ControlLoop(
-            safe, runner, actions, Pacer(HZ, bus.clock), log, hold_s=0.0, camera=camera, twin=Truth()
+            safe,
+            runner,
+            actions,
+            Pacer(HZ, bus.clock),
+            log,
+            hold_s=0.0,
+            camera=camera,
+            twin=Truth(),
         )
         assert loop.run([GOAL]) == ["stopped"] and loop.times[-1].late_s < 0.01
         assert push(line).any()
@@ -176,7 +188,9 @@ def test_the_hand_is_held_while_the_first_look_takes_longer_than_a_step_may(part
     read = read_log(log.folder)
     held = read.columns["acting"] == 0.0
     assert held.tolist() == [True] * 5 + [False] * 7
-    np.testing.assert_allclose(read.channel("command")[held], hand.start.astype(float)[None].repeat(5, 0))
+    np.testing.assert_allclose(
+        read.channel("command")[held], hand.start.astype(float)[None].repeat(5, 0)
+    )
 
 
 @pytest.mark.parametrize(
@@ -184,7 +198,11 @@ def test_the_hand_is_held_while_the_first_look_takes_longer_than_a_step_may(part
     [
         (0.0, 10.0, "goal 1: reached: stopped after 0.5 s, 0.00 rad from it, predicted 0.30"),
         (1.0, 10.0, "goal 1: not reached: stopped after 0.5 s, 1.00 rad from it, predicted 0.30"),
-        (0.0, 0.25, "goal 1: not reached: time limit after 0.2 s, 0.00 rad from it, predicted 0.70"),
+        (
+            0.0,
+            0.25,
+            "goal 1: not reached: time limit after 0.2 s, 0.00 rad from it, predicted 0.70",
+        ),
         (None, 10.0, "goal 1: error not known: stopped after 0.5 s, predicted 0.30"),
     ],
 )
@@ -194,12 +212,20 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
     quat = np.array([0.0, 0.0, np.sin(0.5 * (turned or 0.0)), np.cos(0.5 * (turned or 0.0))])
     truth = None if turned is None else Truth(quat=tuple(quat))
     if truth is None:
-        log = LogWriter(log.folder / "real", load_hand("dclaw3"), log._run, servo={}, clock=hand.clock)
-    ControlLoop(hand, runner, actions, pacer, log, episode_s=limit_s, hold_s=0.2, twin=truth).run([GOAL])
+        log = LogWriter(
+            log.folder / "real", load_hand("dclaw3"), log._run, servo={}, clock=hand.clock
+        )
+    ControlLoop(hand, runner, actions, pacer, log, episode_s=limit_s, hold_s=0.2, twin=truth).run(
+        [GOAL]
+    )
     log.finish("done")
     results = goal_results(read_log(log.folder))
     assert [str(one) for one in results] == [said]
-    expected = "1 of 2 goals stopped" if turned is None else f"{int(': reached' in said)} of 2 goals reached"
+    expected = (
+        "1 of 2 goals stopped"
+        if turned is None
+        else f"{int(': reached' in said)} of 2 goals reached"
+    )
     assert summary_line(results, 2).startswith(expected)
 
 
@@ -242,7 +268,9 @@ def test_missed_deadlines_are_counted_and_told(parts):
     loop = ControlLoop(hand, runner, actions, pacer, log, episode_s=0.5, hold_s=0.0)
     loop.run([GOAL])
     assert hand.missed == [False, False, True, False, False, False] and pacer.missed == 1
-    assert loop.times[2].sent_s == pytest.approx(0.1) and loop.times[3].late_s == pytest.approx(0.1 - 1 / HZ)
+    assert loop.times[2].sent_s == pytest.approx(0.1) and loop.times[3].late_s == pytest.approx(
+        0.1 - 1 / HZ
+    )
 
 
 def test_latency_is_told_as_training_draws_it(parts):
@@ -252,8 +280,12 @@ def test_latency_is_told_as_training_draws_it(parts):
     loop.run([GOAL])
     log.finish("done")
     found = summary(loop.times)
-    assert found["observation_latency_ms"]["median"] == pytest.approx(40.0)  # the image, when joints are read
-    assert found["command_delay_ms"]["median"] == pytest.approx(20.0)  # from then until goals are sent
+    assert found["observation_latency_ms"]["median"] == pytest.approx(
+        40.0
+    )  # the image, when joints are read
+    assert found["command_delay_ms"]["median"] == pytest.approx(
+        20.0
+    )  # from then until goals are sent
     np.testing.assert_allclose(read_log(log.folder).columns["image_s"], 0.005 - 0.04, atol=1e-6)
     blind = summary([replace(loop.times[0], image_s=np.nan)])
     assert "observation_latency_ms" not in blind and "command_delay_ms" in blind
@@ -278,8 +310,22 @@ def driven(flags: list[str], capsys) -> tuple[int, str, str]:
 def test_the_installed_policy_drives_a_twin(tmp_path, capsys, patient):
     """Everything but a real hand: the process of the twin, its bus, limits, policy, log."""
     folder = tmp_path / "log"
-    flags = ["--hand", "dclaw3", "--twin", "--episode-s", "2", "--hold-s", "0.2", "--log", str(folder)]
-    goals = ["--goal", "0,0,0,1", "0,0,0.84147,0.5403"]  # the second 2 rad away, so that it takes a while
+    flags = [
+        "--hand",
+        "dclaw3",
+        "--twin",
+        "--episode-s",
+        "2",
+        "--hold-s",
+        "0.2",
+        "--log",
+        str(folder),
+    ]
+    goals = [
+        "--goal",
+        "0,0,0,1",
+        "0,0,0.84147,0.5403",
+    ]  # the second 2 rad away, so that it takes a while
     status, out, words = driven([*flags, *patient, *goals], capsys)
     assert status == 0, words
     log = read_log(folder)
@@ -292,11 +338,15 @@ def test_the_installed_policy_drives_a_twin(tmp_path, capsys, patient):
     assert np.abs(log.channel("command") - log.channel("position")).max() < step + 0.3
     assert np.isfinite(log.object_pose).all() and log.object_pose[:, 2].max() < 0.2
     assert "of 2 goals reached" in out and f"page: {folder / PAGE_FILE}" in out
-    assert "<video" in (folder / PAGE_FILE).read_text() and (folder / FILM_FILE).stat().st_size > 1000
+    assert (
+        "<video" in (folder / PAGE_FILE).read_text() and (folder / FILM_FILE).stat().st_size > 1000
+    )
 
 
 @pytest.mark.slow
-def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(tmp_path, capsys, patient, monkeypatch):
+def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(
+    tmp_path, capsys, patient, monkeypatch
+):
     folder = tmp_path / "log"
     decide, seen = TrackingRunner.decide, []
 
@@ -313,14 +363,19 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(tmp_path, cap
     assert all(image.shape == (180, 320) and (image > 0.0).mean() > 0.5 for image in seen)
     assert read_log(folder).run["kind"] == "tracking"
     assert "goal 1: not reached: aborted" in out
-    assert "aborted" in (folder / PAGE_FILE).read_text() and (folder / FILM_FILE).stat().st_size > 1000
+    assert (
+        "aborted" in (folder / PAGE_FILE).read_text() and (folder / FILM_FILE).stat().st_size > 1000
+    )
 
 
 @pytest.mark.parametrize(
     ("flags", "error"),
     [
         ("--hand dclaw3 --port /dev/none dclaw3", "no robot senses; vd-train tracker"),
-        ("--hand dclaw4 --twin dclaw3-tracking", "was trained for dclaw3 (9 motors), not for dclaw4 (12)"),
+        (
+            "--hand dclaw4 --twin dclaw3-tracking",
+            "was trained for dclaw3 (9 motors), not for dclaw4 (12)",
+        ),
         ("--hand dclaw3 --port /dev/none", "name the policy"),
         ("--hand dclaw3 --twin zero --goal 1,2,3", "give a quaternion"),
     ],

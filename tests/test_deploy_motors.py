@@ -1,4 +1,7 @@
-"""Hands of other motors: the map in the USD, models mixed on one bus, current-based control, and refusals."""
+"""Hands of other motors.
+
+The map in the USD, models mixed on one bus, current-based control, and refusals.
+"""
 
 from dataclasses import replace
 
@@ -33,7 +36,9 @@ MIXED = (
     MotorModel("XL430-W250", 7, gear=1.5),
     MotorModel("XM430-W210", 9, sign=-1.0, offset_rad=-0.2),
 )
-"""Motors of one finger: a LEAP's, one that measures no current, and one of the size of a D'Claw's."""
+"""Motors of one finger: a LEAP's, one that measures no current, and one of the size of a
+D'Claw's.
+"""
 
 
 def with_motors(motors: tuple[MotorModel, ...]) -> HandModel:
@@ -54,7 +59,10 @@ class Bending(PolicyRunner):
 
 
 def fly(hand: HandModel, folder) -> tuple[np.ndarray, list[Motor]]:
-    """A second of the whole loop on the hand's twin: how the joints moved [rad] [D], and the motors."""
+    """A second of the whole loop on the hand's twin.
+
+    How the joints moved [rad] [D], and the motors.
+    """
     joints = read_joints(hand)
     plant = NewtonHand(hand, joints)
     with simulated_bus(hand, joints, plant) as (line, bus):
@@ -62,7 +70,9 @@ def fly(hand: HandModel, folder) -> tuple[np.ndarray, list[Motor]]:
             safe.arm()
             safe.move(hand.start, 2.0)
             before = plant.joint_q.copy()
-            log = LogWriter(folder, hand, {"goals": [list(GOAL)]}, servo=joints.servo(), clock=bus.clock)
+            log = LogWriter(
+                folder, hand, {"goals": [list(GOAL)]}, servo=joints.servo(), clock=bus.clock
+            )
             task = ReorientCfg()
             runner = Bending(task, StoppingRule())
             pacer, actions = Pacer(12.0, bus.clock), ActionFilter(hand, task)
@@ -82,11 +92,20 @@ def test_a_leap_hand_flies_with_the_motors_of_its_file(tmp_path, shared_dir):
     if not path.is_file():
         pytest.skip(f"there is no {path}")
     hand = import_hand(path, tmp_path, "leap").hand
-    turned = [replace(motor, sign=-1.0, offset_rad=0.1) if motor.id == 2 else motor for motor in hand.motors]
+    turned = [
+        replace(motor, sign=-1.0, offset_rad=0.1) if motor.id == 2 else motor
+        for motor in hand.motors
+    ]
     moved, motors = fly(replace(hand, motors=tuple(turned)), tmp_path / "log")
     assert_bent(moved)
     assert [motor.id for motor in motors[:4]] == [1, 0, 2, 3]
-    items = ("operating_mode", "goal_current", "position_p_gain", "position_i_gain", "position_d_gain")
+    items = (
+        "operating_mode",
+        "goal_current",
+        "position_p_gain",
+        "position_i_gain",
+        "position_d_gain",
+    )
     told = [[motor.get(name) for name in items] for motor in motors]
     assert told[0] == [5, 550, 600, 0, 200] and told[1] == [5, 550, 450, 0, 150]
 
@@ -117,7 +136,10 @@ def test_states_are_in_the_units_of_each_model_and_a_wrong_model_is_named(monkey
         np.testing.assert_allclose(told.position, hand.start, atol=0.002)
         line.motors[0].temperature = 61.0
         bus.clock.sleep(0.02)
-        with SafeHand(bus, joints) as safe, pytest.raises(StoppedError, match="motor 3: 61 deg C, over 60"):
+        with (
+            SafeHand(bus, joints) as safe,
+            pytest.raises(StoppedError, match="motor 3: 61 deg C, over 60"),
+        ):
             safe.read()
         line.motors[0] = Motor(MODELS["XL330-M288"], 3)
         (wrong,) = (one.found for one in check.preflight(connection) if not one.ok)
@@ -139,12 +161,20 @@ def test_a_current_limit_bounds_the_torque_in_current_based_mode(model):
 @pytest.mark.parametrize(
     ("motors", "said"),
     [
-        ((replace(MIXED[1], current=0.5), *MIXED[1:]), "f0_j1 has a largest current, which XL430-W250"),
-        ((replace(MIXED[0], model="AX-12A"), *MIXED[1:]), "no motor is called AX-12A; choose of XL330"),
+        (
+            (replace(MIXED[1], current=0.5), *MIXED[1:]),
+            "f0_j1 has a largest current, which XL430-W250",
+        ),
+        (
+            (replace(MIXED[0], model="AX-12A"), *MIXED[1:]),
+            "no motor is called AX-12A; choose of XL330",
+        ),
         (None, "does not say which motor turns f0_j1"),
     ],
 )
 def test_motors_that_cannot_be_driven_are_refused(motors, said):
-    hand = replace(load_hand("dclaw3"), motors=(None,) * 9) if motors is None else with_motors(motors)
+    hand = (
+        replace(load_hand("dclaw3"), motors=(None,) * 9) if motors is None else with_motors(motors)
+    )
     with pytest.raises(CalibrationError, match=said):
         read_joints(hand)

@@ -21,7 +21,9 @@ packets = st.builds(
     parameters=st.one_of(
         st.binary(max_size=40),
         # What has to be stuffed, again and again.
-        st.lists(st.sampled_from([b"\xff", b"\xfd", b"\xff\xff\xfd", b"\x00"]), max_size=20).map(b"".join),
+        st.lists(st.sampled_from([b"\xff", b"\xfd", b"\xff\xff\xfd", b"\x00"]), max_size=20).map(
+            b"".join
+        ),
     ),
 )
 
@@ -52,7 +54,9 @@ def test_packets_are_found_in_noise_and_in_pieces(sent, noise, cut):
     noise = [piece.replace(b"\xff", b"") for piece in noise] + [b""] * len(sent)
     stream = b"".join(piece + encode(packet) for piece, packet in zip(noise, sent, strict=False))
     reader = PacketReader()
-    found = [packet for i in range(0, len(stream), cut) for packet in reader.feed(stream[i : i + cut])]
+    found = [
+        packet for i in range(0, len(stream), cut) for packet in reader.feed(stream[i : i + cut])
+    ]
     assert found == sent
 
 

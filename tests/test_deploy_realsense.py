@@ -1,4 +1,6 @@
-"""A RealSense through the SDK: its software device stands for the camera, everything else is what meets one.
+"""A RealSense through the SDK.
+
+Its software device stands for the camera, everything else is what meets one.
 
 Oracle: an inclined plane, whose depth is known in every pixel.
 """
@@ -59,7 +61,9 @@ def test_the_newest_image_comes_once_with_its_time(stand_in):
         stand_in.show(np.full((360, 640), depth), exposed)
     deadline = time.monotonic() + PATIENCE_S
     frame = camera.read(PATIENCE_S)
-    while abs(frame.image[0, 0] - 0.7) > 1e-3 and time.monotonic() < deadline:  # the SDK's thread may lag
+    while (
+        abs(frame.image[0, 0] - 0.7) > 1e-3 and time.monotonic() < deadline
+    ):  # the SDK's thread may lag
         frame = camera.read(PATIENCE_S)
     assert frame.image[0, 0] == pytest.approx(0.7, abs=1e-3)
     assert frame.time_s == pytest.approx(exposed, abs=5e-3)

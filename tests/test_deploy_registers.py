@@ -1,4 +1,7 @@
-"""What the preflight reads of the motors: a wrong register is named, and set or refused; remedies do mend."""
+"""What the preflight reads of the motors: a wrong register is named, and set or refused.
+
+Remedies do mend.
+"""
 
 import re
 from dataclasses import replace

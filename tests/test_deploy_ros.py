@@ -67,7 +67,14 @@ def stand_in(monkeypatch):
     rclpy = MagicMock(create_node=make_node, __spec__="here")
     ended = MagicMock(ExternalShutdownException=RuntimeError)
     messages = MagicMock(Float64MultiArray=Message, String=Message, SetParametersResult=Message)
-    for name in ("rclpy.signals", "rclpy.qos", "sensor_msgs", "sensor_msgs.msg", "std_srvs", "std_srvs.srv"):
+    for name in (
+        "rclpy.signals",
+        "rclpy.qos",
+        "sensor_msgs",
+        "sensor_msgs.msg",
+        "std_srvs",
+        "std_srvs.srv",
+    ):
         monkeypatch.setitem(sys.modules, name, MagicMock())
     for name in ("std_msgs", "std_msgs.msg", "rcl_interfaces", "rcl_interfaces.msg"):
         monkeypatch.setitem(sys.modules, name, messages)
@@ -79,7 +86,10 @@ def stand_in(monkeypatch):
 
 
 class Driver(threading.Thread):
-    """Joints in another order, beside one of an arm, that go to their commands at once; told at 100 Hz."""
+    """Joints in another order, beside one of an arm, that go to their commands at once.
+
+    Told at 100 Hz.
+    """
 
     def __init__(self):
         super().__init__(daemon=True)
@@ -93,7 +103,11 @@ class Driver(threading.Thread):
         while not self.over.wait(0.01):
             self.q = self.sent[-1] if self.sent else self.q
             position = array("d", [9.0, *self.q[::-1]])
-            told = {"position": position, "velocity": array("d", [0.0] * len(names)), "effort": array("d")}
+            told = {
+                "position": position,
+                "velocity": array("d", [0.0] * len(names)),
+                "effort": array("d"),
+            }
             publish("/joint_states", Message(header=stamped(), name=names, **told))
             publish("/joint_states", Message(header=stamped(), name=["arm"], position=[0.0]))
 
@@ -104,7 +118,9 @@ class Driver(threading.Thread):
 
 
 @pytest.mark.slow
-def test_a_hand_behind_ros_pursues_goals_of_the_service_until_it_is_told_to_finish(tmp_path, monkeypatch):
+def test_a_hand_behind_ros_pursues_goals_of_the_service_until_it_is_told_to_finish(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr("vd.deploy.loop.run.write_page", lambda log, _: log.path)
     driver, answers = Driver(), []
     driver.start()

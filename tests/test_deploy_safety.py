@@ -1,4 +1,7 @@
-"""Limits and stops between a policy and the motors, on a simulated clock: times are exact, on any machine."""
+"""Limits and stops between a policy and the motors, on a simulated clock.
+
+Times are exact, on any machine.
+"""
 
 import os
 import signal
@@ -23,7 +26,9 @@ EXCHANGE_S = 0.006
 STEP_S = PERIOD_S + EXCHANGE_S
 """A step of the loop below."""
 HOLD_S = 0.05
-"""What a hold may take: two units of the motors' own watchdog, and an exchange. A control period is 83 ms."""
+"""What a hold may take: two units of the motors' own watchdog, and an exchange. A control period is
+83 ms.
+"""
 QUICK = SafetyCfg(hold_s=0.05)
 START = load_hand("dclaw3").start
 
@@ -116,8 +121,16 @@ def run_until_stopped(safe: SafeHand, target: np.ndarray, seconds: float = 5.0) 
         (lambda line: line.faults.cut_off.add(11), "lost the bus: motor 11", 0.25 + STEP_S),
         # 40 degrees to go at 400 a second, and a step.
         (lambda line: setattr(line.motors[4], "heat_c_per_s", 400.0), "motor 21", 0.102 + STEP_S),
-        (lambda line: line.motors[8].reboot(), "f2_j3, motor 32: another program on the line", STEP_S),
-        (lambda line: line.motors[3].put("torque_enable", 0), "torque went off: f1_j1, motor 20", STEP_S),
+        (
+            lambda line: line.motors[8].reboot(),
+            "f2_j3, motor 32: another program on the line",
+            STEP_S,
+        ),
+        (
+            lambda line: line.motors[3].put("torque_enable", 0),
+            "torque went off: f1_j1, motor 20",
+            STEP_S,
+        ),
         # No cable: nobody listens for 50 ms. The last sound state is older than 0.25 s, as above.
         (
             lambda line: setattr(line.put.__self__, "starved_s", 0.05),
@@ -129,7 +142,9 @@ def run_until_stopped(safe: SafeHand, target: np.ndarray, seconds: float = 5.0) 
     ],
     ids=["cable", "heat", "restart", "torque", "starved", "ctrl-c", "hangup"],
 )
-def test_faults_stop_the_hand_in_time_and_are_named(bus, line, hand, joints, fault, reason, found_s):
+def test_faults_stop_the_hand_in_time_and_are_named(
+    bus, line, hand, joints, fault, reason, found_s
+):
     target = START + 0.3
     with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
@@ -231,7 +246,9 @@ def test_an_exception_stops_the_hand(bus, line, hand, joints):
             safe.command(START + 0.3)
             _ = 1 / 0
     assert safe.report.held_s - safe.report.detected_s < EXCHANGE_S
-    assert energised(line) == [] and said == ["stopped: ZeroDivisionError: division by zero; torque off"]
+    assert energised(line) == [] and said == [
+        "stopped: ZeroDivisionError: division by zero; torque off"
+    ]
 
 
 def test_the_hand_can_be_left_holding(bus, line, hand, joints):

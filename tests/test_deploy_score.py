@@ -49,11 +49,16 @@ class Run:
             for step in range(steps):
                 here = number * steps + step
                 turns.append((Rotation.from_rotvec(angle[step] * axis) * goal).as_quat())
-                values = dict.fromkeys(STEP_COLUMNS, 0.0) | {"goal": number, "distance": angle[step] + 0.02}
+                values = dict.fromkeys(STEP_COLUMNS, 0.0) | {
+                    "goal": number,
+                    "distance": angle[step] + 0.02,
+                }
                 now = log.started_s + self.t[here]
                 log.step(now, now, joints, list(values.values()))
             end = self.t[(number + 1) * steps - 1]
-            monkeypatch.setattr("vd.deploy.loop.log.time.monotonic", lambda end=end: log.started_s + end)
+            monkeypatch.setattr(
+                "vd.deploy.loop.log.time.monotonic", lambda end=end: log.started_s + end
+            )
             outcome = "time limit" if number == FIFTH_ENDS_BY_TIME else "stopped"
             log.event("stop", goal=number, outcome=outcome, distance=ERRORS[number] + 0.02)
         log.finish("all goals pursued")
@@ -82,7 +87,11 @@ class Run:
         columns = [
             (body, kind, axis)
             for body in ("hand", "cube")
-            for kind, axes in (("Rotation", "XYZW"), ("Position", "XYZ"), ("Mean Marker Error", "E"))
+            for kind, axes in (
+                ("Rotation", "XYZW"),
+                ("Position", "XYZ"),
+                ("Mean Marker Error", "E"),
+            )
             for axis in axes
         ]
         rows = [head, ""]
@@ -90,7 +99,9 @@ class Run:
         rows.append(",".join(["", "Name", *[c[0] for c in columns]]))
         rows.append(",".join(["", "ID", *["1"] * len(columns)]))
         rows.append(",".join([*blank, *[c[1] for c in columns]]))
-        rows.append(",".join(["Frame", "Time (Seconds)", *[c[2].replace("E", "") for c in columns]]))
+        rows.append(
+            ",".join(["Frame", "Time (Seconds)", *[c[2].replace("E", "") for c in columns]])
+        )
         place = frame.inv().apply([0.01, 0.02, 0.1]) * 1e3
         for number, when in enumerate(np.arange(0.0, self.t[-1], 1.0 / 60)):
             turn = self.turn[min(round(when * RATE), len(self.t) - 1)]
@@ -111,7 +122,10 @@ NONE = np.array([[0.0, 0.0, 0.0, 1.0]])
 
 def test_errors_are_those_at_the_stops_and_lost_markers_discard(run, tmp_path):
     ends = [stop.time_s for stop in run.log.stops]
-    lost = [(ends[2] - 0.5, ends[2] + 0.5), (ends[0] + 1.0, ends[0] + 2.0)]  # at a stop, and on the way
+    lost = [
+        (ends[2] - 0.5, ends[2] + 0.5),
+        (ends[0] + 1.0, ends[0] + 2.0),
+    ]  # at a stop, and on the way
     mocap = read_mocap(run.export(tmp_path / "m.csv", lost=lost))
     result = score_run(run.log, mocap, NONE, offset_s=0.0)
     errors = [trial.error_rad for trial in result.trials]

@@ -1,8 +1,10 @@
-"""The depth camera on the hand's scene: against Newton's camera, its clouds, viewpoints and late images.
+"""The depth camera on the hand's scene.
 
-Rule of the edge: in comparisons with Newton a pixel is left out if Newton's inverse depth, which is affine
-on a plane, bends by more than 0.001 / m at it (0.4 mm at 0.6 m), along its row or its column. None of the
-others may differ, and of all pixels one in a thousand.
+Against Newton's camera, its clouds, viewpoints and late images.
+
+Rule of the edge: in comparisons with Newton a pixel is left out if Newton's inverse depth, which is
+affine on a plane, bends by more than 0.001 / m at it (0.4 mm at 0.6 m), along its row or its
+column. None of the others may differ, and of all pixels one in a thousand.
 """
 
 import numpy as np
@@ -50,7 +52,10 @@ def host(array):
 
 
 def smooth(depth):
-    """Pixels that are no edge: not at the border, inverse depth even along row and column, [N, H, W]."""
+    """Pixels that are no edge.
+
+    Not at the border, inverse depth even along row and column, [N, H, W].
+    """
     inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0.0)
     bend = np.full(depth.shape, np.inf)
     middle = 2 * inverse[:, 1:-1, 1:-1]
@@ -72,7 +77,9 @@ def newton_depth(scene, state, camera_q):
         vertical_aperture=camera.height * camera.fx / camera.fy,
         device=str(scene.model.device),
     )
-    turned = (Rotation.from_quat(camera_q[:, 3:]) * Rotation.from_euler("x", 180, degrees=True)).as_quat()
+    turned = (
+        Rotation.from_quat(camera_q[:, 3:]) * Rotation.from_euler("x", 180, degrees=True)
+    ).as_quat()
     poses = np.concatenate([camera_q[:, :3], turned], axis=1).astype(np.float32)
     depth = sensor.allocate_image_depth_forward(len(poses), camera.width, camera.height)
     scene.model.bvh_refit_shapes(state)
@@ -101,7 +108,10 @@ def image_points(hand, depth):
     m, mount = hand.camera, wp.transform(*hand.mount)
     v, u = np.mgrid[: m.height, : m.width] + 0.5
     rays = np.stack([(u - m.cx) / m.fx, (v - m.cy) / m.fy, np.ones_like(u)], axis=-1)
-    base = Rotation.from_quat(m.quaternion).apply((rays * depth[..., None]).reshape(-1, 3)) + m.position
+    base = (
+        Rotation.from_quat(m.quaternion).apply((rays * depth[..., None]).reshape(-1, 3))
+        + m.position
+    )
     world = Rotation.from_quat(mount.q).apply(base) + np.array(mount.p)
     return base.reshape(rays.shape), world.reshape(rays.shape)
 
@@ -173,7 +183,9 @@ def test_viewpoints_differ_between_worlds_as_asked(device, scenes):
     poses = host(camera.extrinsics)
     nominal = scene.hand.camera
     moved = np.linalg.norm(poses[:, :3] - nominal.position, axis=1)
-    turned = (Rotation.from_quat(poses[:, 3:]) * Rotation.from_quat(nominal.quaternion).inv()).magnitude()
+    turned = (
+        Rotation.from_quat(poses[:, 3:]) * Rotation.from_quat(nominal.quaternion).inv()
+    ).magnitude()
     assert (moved > 0).all() and moved.max() < 0.06 and (turned > 0).all() and turned.max() < 0.12
     assert len(np.unique(np.round(host(camera.camera_q)[:, 0], 6))) == WORLDS
 
@@ -216,7 +228,9 @@ def test_late_images_are_past_images(device, scenes):
         history.append(host(now.depth))
         for world, delay in enumerate((0, 1, 2)):
             if len(history) > delay:
-                np.testing.assert_allclose(host(late.depth)[world], history[-1 - delay][world], atol=1e-5)
+                np.testing.assert_allclose(
+                    host(late.depth)[world], history[-1 - delay][world], atol=1e-5
+                )
     # After a reset of world 2, its past is gone; that of world 1 is not.
     pose(scene, state, generator)
     late.reset(wp.array([0, 0, 1], dtype=wp.int32, device=device))
@@ -250,6 +264,9 @@ def test_a_camera_goes_on_where_another_stopped(device, scenes):
         array.assign(host(one.stateful()[name]))
     for camera in (one, other):
         camera.capture()
-    assert np.isfinite(host(one.depth)).all() and (host(one.depth) != host(one.true_depth)).mean() > 0.3
+    assert (
+        np.isfinite(host(one.depth)).all()
+        and (host(one.depth) != host(one.true_depth)).mean() > 0.3
+    )
     np.testing.assert_array_equal(host(other.depth), host(one.depth))
     np.testing.assert_array_equal(host(other.points), host(one.points))

@@ -40,7 +40,10 @@ def update(env: ReorientEnv, success_rate: float) -> dict[str, float]:
 
 
 def thresholds(env: ReorientEnv) -> list[float]:
-    """Joint speed, speed and spin of the object, norm of the action, angle: what success asks at present."""
+    """Joint speed, speed and spin of the object, norm of the action, angle.
+
+    What success asks at present.
+    """
     values = env.parameters.success.numpy()
     names = ("joint_speed", "object_speed", "object_spin", "action_norm", "rotation")
     return [float(values[name][0]) for name in names]
@@ -80,7 +83,13 @@ def test_stillness_tightens_after_the_goals_and_loosens_before_them():
 def test_thresholds_shrink_by_the_same_factor_from_loose_to_those_of_success():
     success = SuccessCfg(object_spin_rad_s=0.0, rotation_rad=0.1)
     env = make(CurriculumCfg(tightening=TIGHTENING), success=success)
-    loose = [TIGHTENING.joint_speed_rad_s, TIGHTENING.object_speed_m_s, 0.0, TIGHTENING.action_norm, 0.4]
+    loose = [
+        TIGHTENING.joint_speed_rad_s,
+        TIGHTENING.object_speed_m_s,
+        0.0,
+        TIGHTENING.action_norm,
+        0.4,
+    ]
     tight = [success.joint_speed_rad_s, success.object_speed_m_s, 0.0, success.action_norm, 0.1]
     seen = [thresholds(env)]
     for tightness in (0.25, 0.5, 0.75, 1.0):
@@ -114,7 +123,9 @@ def test_what_has_to_be_lifted_gets_its_weight_as_stillness_tightens():
     assert plain == pytest.approx(0.5 * 9.81 * step**2, rel=0.2)
     assert light == pytest.approx(0.01 * plain, rel=0.05)
     env.set_stage(Stage())
-    assert fallen() == pytest.approx(plain[0], rel=1e-3), "at the end of the curriculum they weigh the same"
+    assert fallen() == pytest.approx(plain[0], rel=1e-3), (
+        "at the end of the curriculum they weigh the same"
+    )
 
 
 def test_a_saved_environment_goes_on_with_its_tightness():

@@ -103,7 +103,9 @@ def test_tables_leave_their_share_of_worlds_in_time():
     assert (fell[lost] > 0).all() and not fell[~lost].any()
     assert env.has_table().all(), "tables are back when episodes begin anew"
     before, after = heights[gone - 1], heights[gone + 1]
-    assert (after[lost] < before[lost] - 0.02).all() and np.allclose(after[~lost], before[~lost], atol=2e-3)
+    assert (after[lost] < before[lost] - 0.02).all() and np.allclose(
+        after[~lost], before[~lost], atol=2e-3
+    )
 
 
 def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
@@ -120,14 +122,22 @@ def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
 
 
 ANYTHING = SuccessCfg(
-    rotation_rad=4.0, joint_speed_rad_s=0.0, object_speed_m_s=0.0, object_spin_rad_s=0.0, action_norm=0.0
+    rotation_rad=4.0,
+    joint_speed_rad_s=0.0,
+    object_speed_m_s=0.0,
+    object_spin_rad_s=0.0,
+    action_norm=0.0,
 )
 
 
 def test_a_goal_given_in_the_middle_is_seen_at_once_and_moves_nothing():
     env, goal = make(), np.array([[0.0, 0.0, np.sin(0.3), np.cos(0.3)]])
     run(env, 5)
-    before, steps, q = env.goal_quat.numpy().copy(), env.step_count.numpy().copy(), env.sim.joint_q.numpy()
+    before, steps, q = (
+        env.goal_quat.numpy().copy(),
+        env.step_count.numpy().copy(),
+        env.sim.joint_q.numpy(),
+    )
     env.give_goals(np.array([1]), goal)
     np.testing.assert_array_equal(env.sim.joint_q.numpy(), q)
     np.testing.assert_array_equal(env.step_count.numpy(), steps)
@@ -148,7 +158,9 @@ def test_a_success_gives_a_new_goal_without_a_reset():
     after = env.goal_quat.numpy()
     assert not np.allclose(before, after)
     columns = teacher_observation_slices(3, 9)["goal_orientation"]
-    assert np.allclose(env.observation.numpy()[:, columns], after), "the observation shows the new goal"
+    assert np.allclose(env.observation.numpy()[:, columns], after), (
+        "the observation shows the new goal"
+    )
 
 
 def test_evaluation_stops_at_success():
@@ -219,7 +231,9 @@ def test_a_state_that_is_not_finite_stops_the_run():
         run(env, 3)
 
 
-@pytest.mark.parametrize("effects", [{}, {"command_delay.delay_s": (0.0, 0.04)}], ids=["drives", "servos"])
+@pytest.mark.parametrize(
+    "effects", [{}, {"command_delay.delay_s": (0.0, 0.04)}], ids=["drives", "servos"]
+)
 def test_a_run_goes_on_without_the_few_worlds_that_fail(effects):
     random = RandomisationCfg(enabled=bool(effects), effects=effects)
     env = make(failures_per_million=1e5, randomisation=random)  # one more in ten steps
@@ -230,7 +244,11 @@ def test_a_run_goes_on_without_the_few_worlds_that_fail(effects):
     before = env.step_count.numpy().copy()
     env.sim.joint_qd.numpy()[2, 0] = np.nan
     env.step(env.action)
-    assert env.timed_out.numpy()[2] == 1 and env.done.numpy()[2] == 1 and env.step_count.numpy()[2] == 0
+    assert (
+        env.timed_out.numpy()[2] == 1
+        and env.done.numpy()[2] == 1
+        and env.step_count.numpy()[2] == 0
+    )
     np.testing.assert_array_equal(np.delete(env.step_count.numpy(), 2), np.delete(before + 1, 2))
     assert env.reward.numpy()[2] == 0.0
     run(env, 3)
@@ -259,13 +277,19 @@ def test_saved_state_continues_exactly():
     for gone in ("goals_reached", "grasps", "grasp_count"):
         older[gone] = np.zeros(WORLDS, dtype=np.int32)  # of earlier versions
     other.load_state_dict(state | {"arrays": older})
-    assert np.array_equal(other.goal_steps.numpy(), state["arrays"]["step_count"]), "no goal is older"
+    assert np.array_equal(other.goal_steps.numpy(), state["arrays"]["step_count"]), (
+        "no goal is older"
+    )
     with pytest.raises(ValueError, match="num_envs"):
         make(num_envs=2, **cfg).load_state_dict(state)
 
 
 def test_the_shape_is_seen_behind_the_state_and_changes_nothing_else(device):
-    seeing = {"objects": ("symmetric",), "num_envs": 14, "observation": ObservationCfg(shape="full")}
+    seeing = {
+        "objects": ("symmetric",),
+        "num_envs": 14,
+        "observation": ObservationCfg(shape="full"),
+    }
     random = RandomisationCfg(enabled=True, observation_noise_mean=0.0, observation_noise_std=0.0)
     env = make(device, **seeing, randomisation=random)
     run(env, 3)
@@ -273,19 +297,31 @@ def test_the_shape_is_seen_behind_the_state_and_changes_nothing_else(device):
     observation = env.observation.numpy()
     assert env.num_observations == observation.shape[1] == state + shape_observation_size(3)
     slices = shape_observation_slices(3)
-    tips = observation[:, teacher_observation_slices(3, 9)["fingertips"]].reshape(-1, 3, 13)[..., :3]
+    tips = observation[:, teacher_observation_slices(3, 9)["fingertips"]].reshape(-1, 3, 13)[
+        ..., :3
+    ]
     vectors = SHAPE_UNIT_M * observation[:, state:][:, slices["surface"]].reshape(-1, 3, 3)
     extents = EXTENT_CENTRE_M + SHAPE_UNIT_M * observation[:, state:][:, slices["extent"]]
     pose, goal = env.object_pose(), env.goal_quat.numpy()
     assert set(np.round(env.scene.world_scale, 3)) == {0.95, 1.0, 1.05}, "sizes differ"
     for w in range(env.num_envs):
-        cloud = env.scene.world_scale[w] * env.objects[env.world_object[w]].surface_points.astype(float)
+        cloud = env.scene.world_scale[w] * env.objects[env.world_object[w]].surface_points.astype(
+            float
+        )
         placed = Rotation.from_quat(pose[w, 3:]).apply(cloud)
-        assert extents[w] == pytest.approx((placed @ np.array(extent_directions(3)).T).max(axis=0), abs=1e-5)
+        assert extents[w] == pytest.approx(
+            (placed @ np.array(extent_directions(3)).T).max(axis=0), abs=1e-5
+        )
         aim = Rotation.from_quat(goal[w]).apply(cloud)
-        goal_extents = EXTENT_CENTRE_M + SHAPE_UNIT_M * observation[w, state:][slices["goal_extent"]]
-        assert goal_extents == pytest.approx((aim @ np.array(extent_directions(3)).T).max(axis=0), abs=1e-5)
-        distance = np.linalg.norm(tips[w][:, None] - (pose[w, :3] + placed)[None], axis=2).min(axis=1)
+        goal_extents = (
+            EXTENT_CENTRE_M + SHAPE_UNIT_M * observation[w, state:][slices["goal_extent"]]
+        )
+        assert goal_extents == pytest.approx(
+            (aim @ np.array(extent_directions(3)).T).max(axis=0), abs=1e-5
+        )
+        distance = np.linalg.norm(tips[w][:, None] - (pose[w, :3] + placed)[None], axis=2).min(
+            axis=1
+        )
         assert np.linalg.norm(vectors[w], axis=1) == pytest.approx(distance, abs=1e-5)
 
 
@@ -306,7 +342,9 @@ def test_randomisation_reaches_the_solver():
 def test_objects_weigh_what_their_files_say_where_nothing_is_drawn(tmp_path):
     write_object(tmp_path / "cube.usd", dataclasses.replace(cube(), mass_kg=0.25))
     env = make(num_envs=2, objects=(str(tmp_path),))
-    assert env.sim.model.body_mass.numpy().reshape(2, -1)[:, env.scene.object_body] == pytest.approx(0.25)
+    assert env.sim.model.body_mass.numpy().reshape(2, -1)[
+        :, env.scene.object_body
+    ] == pytest.approx(0.25)
     assert env.randomiser.object_mass.numpy() == pytest.approx(0.25)
 
 
@@ -318,7 +356,10 @@ def tightening(**changes) -> CurriculumCfg:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"randomisation": RandomisationCfg(observation_latency_s=(0.7, 0.7))}, "observation_latency_s"),
+        (
+            {"randomisation": RandomisationCfg(observation_latency_s=(0.7, 0.7))},
+            "observation_latency_s",
+        ),
         ({"table": TableCfg(away_share=0.3, away_s=(3.0, 1.0))}, r"table\.away_s"),
         ({"sim": SimCfg(physics_hz=100.0)}, r"sim\.physics_hz"),
         ({"curriculum": tightening(action_norm=0.0)}, r"curriculum\.tightening\.action_norm is 0"),

@@ -24,9 +24,14 @@ def make(**changes) -> ReorientEnv:
 
 
 def run(env: ReorientEnv, steps: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Random actions from equal starts: what was observed, before the first step too, and what was true."""
+    """Random actions from equal starts.
+
+    What was observed, before the first step too, and what was true.
+    """
     quats = Rotation.random(WORLDS, rng=np.random.default_rng(1)).as_quat()
-    env.state.rng.assign(np.arange(WORLDS, dtype=np.uint32))  # building one drew a latency, another did not
+    env.state.rng.assign(
+        np.arange(WORLDS, dtype=np.uint32)
+    )  # building one drew a latency, another did not
     env.reset(object_quat=quats, goal_quat=quats[::-1])
     rng = np.random.default_rng(seed)
     seen, rewards, states = [env.observation.numpy().copy()], [], [env.sim.joint_q.numpy().copy()]
@@ -43,11 +48,15 @@ def run(env: ReorientEnv, steps: int, seed: int = 0) -> dict[str, np.ndarray]:
 
 def late(latency_s: float, encoder_s: float = 0.0, **changes) -> RandomisationCfg:
     late_s, encoder = (latency_s, latency_s), (encoder_s, encoder_s)
-    return dataclasses.replace(EXACT, observation_latency_s=late_s, encoder_latency_s=encoder, **changes)
+    return dataclasses.replace(
+        EXACT, observation_latency_s=late_s, encoder_latency_s=encoder, **changes
+    )
 
 
 @pytest.mark.parametrize(("object_late", "hand_late"), [(0, 0), (2, 0), (2, 2), (1, 3)])
-def test_object_and_hand_are_seen_as_old_as_each_is_and_what_is_true_is_paid(object_late, hand_late):
+def test_object_and_hand_are_seen_as_old_as_each_is_and_what_is_true_is_paid(
+    object_late, hand_late
+):
     observation = ObservationCfg(shape="full")
     present = run(make(observation=observation), 7)
     random = late(max(1e-9, object_late * STEP_S), hand_late * STEP_S)
@@ -58,12 +67,15 @@ def test_object_and_hand_are_seen_as_old_as_each_is_and_what_is_true_is_paid(obj
         ages[parts[name]] = hand_late
     for name in ("goal_orientation", "previous_action"):  # known, not measured
         ages[parts[name]] = 0
-    if object_late != hand_late:  # a late object and other fingertips: what lies between them is of no state
+    if (
+        object_late != hand_late
+    ):  # a late object and other fingertips: what lies between them is of no state
         ages[parts["previous_action"].stop :][:9] = -1
     for step in range(8):
         for age in set(ages) - {-1}:
             np.testing.assert_array_equal(
-                then["seen"][step][:, ages == age], present["seen"][max(0, step - age)][:, ages == age]
+                then["seen"][step][:, ages == age],
+                present["seen"][max(0, step - age)][:, ages == age],
             )
     np.testing.assert_array_equal(then["reward"], present["reward"])
     assert np.ptp(present["state"], axis=0).max() > 0.05, "something moves"
@@ -94,7 +106,9 @@ def test_a_latency_between_steps_is_that_of_the_nearest_physics_step():
     parts, q = teacher_observation_slices(3, 9)["object_position"], present.num_actions
     past: list[np.ndarray] = []
     present.step = lambda _: present.launch_step()  # a captured graph would not call back
-    present.sim.after_physics_step = lambda joint_q, *_: past.append(joint_q.numpy()[:, q : q + 3].copy())
+    present.sim.after_physics_step = lambda joint_q, *_: past.append(
+        joint_q.numpy()[:, q : q + 3].copy()
+    )
     run(present, 3)
     np.testing.assert_array_equal(run(env, 3)["seen"][-1][:, parts], past[-1 - 4])
 
@@ -156,7 +170,9 @@ def test_dynamics_are_told_in_the_order_of_the_joints_that_are_seen(view):
     order, drawn = np.tile(np.arange(9), (WORLDS, 1)), env.randomiser
     if view == "goal":
         # Joint of the view that is each joint of the world, turned round.
-        order = np.argsort(env.symmetry_frames.tables.joints[env.symmetry_frames.chosen.numpy()], axis=1)
+        order = np.argsort(
+            env.symmetry_frames.tables.joints[env.symmetry_frames.chosen.numpy()], axis=1
+        )
     channels = [
         (drawn.kp.numpy() / env.hand.kp - 1.0) / dynamics.GAIN_UNIT,
         (drawn.kd.numpy() / env.hand.kd - 1.0) / dynamics.GAIN_UNIT,
@@ -177,11 +193,15 @@ def test_dynamics_are_told_in_the_order_of_the_joints_that_are_seen(view):
     )
     assert np.abs(told(env, "dynamics")).max() < 4.0, "of order one"
     delays = rows[:, :, actuators.COMMAND_DELAY]
-    assert np.ptp(delays, axis=1).max() < 1e-6 < np.ptp(delays[:, 0]), "one bus, and another in every world"
+    assert np.ptp(delays, axis=1).max() < 1e-6 < np.ptp(delays[:, 0]), (
+        "one bus, and another in every world"
+    )
 
 
 def test_only_the_critic_is_told_and_nothing_varies_where_nothing_is_drawn():
-    env = make(randomisation=RandomisationCfg(enabled=False), observation=ObservationCfg(dynamics="critic"))
+    env = make(
+        randomisation=RandomisationCfg(enabled=False), observation=ObservationCfg(dynamics="critic")
+    )
     plain = make(randomisation=RandomisationCfg(enabled=False))
     assert env.num_observations == plain.num_observations
     np.testing.assert_array_equal(run(env, 3)["seen"], run(plain, 3)["seen"])
@@ -217,7 +237,9 @@ def test_a_saved_past_goes_on_exactly():
         for _ in range(3):
             env.action.fill_(0.3)
             env.step(env.action)
-    np.testing.assert_array_equal(first.observer.all_values.numpy(), second.observer.all_values.numpy())
+    np.testing.assert_array_equal(
+        first.observer.all_values.numpy(), second.observer.all_values.numpy()
+    )
     with pytest.raises(ValueError, match="observation_latency_s"):
         make().load_state_dict(first.state_dict())
 
@@ -242,7 +264,9 @@ def test_a_force_gives_its_impulse_in_the_time_it_acts(force_s, share, sim):
         each.sim.step()
         ends.append(np.array(speeds))
     gained = ends[0] - ends[1]
-    direction = env.randomiser.force.numpy() / np.linalg.norm(env.randomiser.force.numpy(), axis=1)[:, None]
+    direction = (
+        env.randomiser.force.numpy() / np.linalg.norm(env.randomiser.force.numpy(), axis=1)[:, None]
+    )
     np.testing.assert_allclose(gained[-1], 15.0 * force_s * direction, atol=2e-3)
     steps = round(share * env.cfg.sim.substeps)
     np.testing.assert_allclose(gained[steps - 1], gained[-1], atol=1e-5)
@@ -258,9 +282,12 @@ def test_an_object_is_believed_off_by_the_same_all_through_an_episode_and_anew_i
     for _ in range(3):
         seen, true = env.observation.numpy(), env.object_pose()
         turn = (
-            Rotation.from_quat(seen[:, parts["object_orientation"]]) * Rotation.from_quat(true[:, 3:]).inv()
+            Rotation.from_quat(seen[:, parts["object_orientation"]])
+            * Rotation.from_quat(true[:, 3:]).inv()
         )
-        errors.append(np.hstack([seen[:, parts["object_position"]] - true[:, :3], turn.as_rotvec()]))
+        errors.append(
+            np.hstack([seen[:, parts["object_position"]] - true[:, :3], turn.as_rotvec()])
+        )
         goal = Rotation.from_quat(env.goal_quat.numpy())
         believed = Rotation.from_quat(seen[:, parts["relative_orientation"]]) * goal
         off = believed * Rotation.from_quat(seen[:, parts["object_orientation"]]).inv()

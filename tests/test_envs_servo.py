@@ -1,4 +1,7 @@
-"""Identified servos in the environment: effects act, are drawn per world, and end with an episode."""
+"""Identified servos in the environment.
+
+Effects act, are drawn per world, and end with an episode.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -22,7 +25,10 @@ WORLDS = 4
 STILL = RandomisationCfg(enabled=False)
 # Gains and servos only: nothing else is drawn, so that what is seen comes from them.
 SERVOS = RandomisationCfg(
-    action_noise_std=0.0, observation_noise_mean=0.0, observation_noise_std=0.0, force_probability=0.0
+    action_noise_std=0.0,
+    observation_noise_mean=0.0,
+    observation_noise_std=0.0,
+    force_probability=0.0,
 )
 JOINTS = [f"f{finger}_j{joint}" for finger in range(3) for joint in (1, 2, 3)]
 
@@ -39,7 +45,9 @@ def layer(hand, tmp_path):
     def write(baseline=None, **effects) -> str:
         path = tmp_path / f"identified_{len(list(tmp_path.iterdir()))}.usda"
         everywhere = dict.fromkeys(JOINTS, effects)
-        write_layer(path, hand, baseline=baseline or {}, effects=everywhere, tool="test", recording="none")
+        write_layer(
+            path, hand, baseline=baseline or {}, effects=everywhere, tool="test", recording="none"
+        )
         return str(path)
 
     return write
@@ -66,7 +74,9 @@ def test_identified_gains_reach_the_solver_without_a_servo(layer):
     model = env.sim.solver.mjw_model
     joint = JOINTS.index("f1_j2")
     assert model.actuator_gainprm.numpy()[:, joint, 0] == pytest.approx(1.25)
-    assert model.actuator_biasprm.numpy()[:, joint, 1:3] == pytest.approx(np.tile([-1.25, -0.1], (WORLDS, 1)))
+    assert model.actuator_biasprm.numpy()[:, joint, 1:3] == pytest.approx(
+        np.tile([-1.25, -0.1], (WORLDS, 1))
+    )
 
 
 def test_the_policy_sees_and_acts_on_what_the_encoder_reports(layer):
@@ -156,7 +166,9 @@ def test_saved_state_continues_exactly_and_other_servos_are_refused(layer):
     run(other, 3, seed=9)
     other.load_state_dict(state)
     assert np.array_equal(run(other, 5, seed=2), expected)
-    rows = np.delete(state["arrays"]["servo_parameters"], [36, 37, 38], axis=1)  # of an earlier version
+    rows = np.delete(
+        state["arrays"]["servo_parameters"], [36, 37, 38], axis=1
+    )  # of an earlier version
     other.load_state_dict({**state, "arrays": {**state["arrays"], "servo_parameters": rows}})
     assert np.array_equal(run(other, 5, seed=2), expected)
     with pytest.raises(ValueError, match=r"other servos, .*; resume with hand_layer"):
@@ -166,10 +178,16 @@ def test_saved_state_continues_exactly_and_other_servos_are_refused(layer):
 @pytest.mark.parametrize(
     ("effects", "message"),
     [
-        ({"command_delay": (0.0, 0.1)}, "no parameter 'command_delay'; one of command_delay.delay_s"),
+        (
+            {"command_delay": (0.0, 0.1)},
+            "no parameter 'command_delay'; one of command_delay.delay_s",
+        ),
         ({"command_delay.delay_s": (0.1, 0.0)}, "the low end comes first"),
         ({"command_delay.delay_s": (0.0, 9.0)}, "between 0 and 0.3 s"),
-        ({"torque_speed_limit.tau_stall_nm": (0.5, 1.0)}, "but not torque_speed_limit.omega_0_rad_s"),
+        (
+            {"torque_speed_limit.tau_stall_nm": (0.5, 1.0)},
+            "but not torque_speed_limit.omega_0_rad_s",
+        ),
     ],
 )
 def test_wrong_effects_are_refused(effects, message):
@@ -179,6 +197,12 @@ def test_wrong_effects_are_refused(effects, message):
 
 def test_an_interval_of_stiffness_alone_needs_no_servo(hand, layer):
     changed = read_hand(hand_usd("dclaw3"), layer=Path(layer({"f0_j1": {"kp": (2.0, 1.9, 2.1)}})))
-    assert not needs_servo(servo_ranges(changed, SERVOS)) and not needs_servo(servo_ranges(hand, SERVOS))
-    changed = read_hand(hand_usd("dclaw3"), layer=Path(layer({"f0_j1": {"inertia": (2e-3, 1e-3, 3e-3)}})))
-    assert needs_servo(servo_ranges(changed, SERVOS)) and not needs_servo(servo_ranges(changed, STILL))
+    assert not needs_servo(servo_ranges(changed, SERVOS)) and not needs_servo(
+        servo_ranges(hand, SERVOS)
+    )
+    changed = read_hand(
+        hand_usd("dclaw3"), layer=Path(layer({"f0_j1": {"inertia": (2e-3, 1e-3, 3e-3)}}))
+    )
+    assert needs_servo(servo_ranges(changed, SERVOS)) and not needs_servo(
+        servo_ranges(changed, STILL)
+    )

@@ -23,7 +23,9 @@ def hand_depth(hand: HandModel, item: ObjectModel, poses: np.ndarray) -> list[fl
     for shape in hand.shapes:
         pose = compose(links[shape.link], shape.frame)
         size = [*shape.size, 0.0][:3]
-        spec.worldbody.add_geom(type=GEOMS[shape.kind], size=size, pos=pose[:3], quat=pose[[6, 3, 4, 5]])
+        spec.worldbody.add_geom(
+            type=GEOMS[shape.kind], size=size, pos=pose[:3], quat=pose[[6, 3, 4, 5]]
+        )
     body = spec.worldbody.add_body(mass=0.1, inertia=[1e-4] * 3, explicitinertial=True)
     body.add_freejoint()
     for index, (vertices, _) in enumerate(item.hulls):

@@ -62,7 +62,9 @@ def moved(env: ReorientEnv) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray]:
     action = rng.uniform(-1, 1, (WORLDS, env.num_actions)).astype(np.float32)
     act(env, action)
     kept = env.done.numpy() == 0
-    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the environments are in different frames"
+    assert kept.any() and len(set(state["arrays"]["view"])) > 1, (
+        "the environments are in different frames"
+    )
     return state, before, action, np.where(kept[:, None], env.observation.numpy(), np.nan)
 
 
@@ -83,7 +85,9 @@ def test_turned_worlds_look_and_move_the_same(hand):
     azimuth = np.arctan2(tips[:, 1], -tips[:, 0])  # the base is upside down, turned about y
     for step in range(1, fingers):
         angle = 2.0 * np.pi * step / fingers
-        new = [int(np.argmin(np.abs(np.angle(np.exp(1j * (azimuth - a - angle)))))) for a in azimuth]
+        new = [
+            int(np.argmin(np.abs(np.angle(np.exp(1j * (azimuth - a - angle)))))) for a in azimuth
+        ]
         source = np.argsort(new)
         arrays = {name: value.copy() for name, value in state["arrays"].items()}
         for name in ("joint_q", "joint_qd", "target", "smoothed"):
@@ -120,7 +124,9 @@ def test_mirrored_worlds_look_and_move_the_same():
         source = np.arange(3)
         source[others] = source[others[::-1]]
         x, y = np.cos(azimuth[finger]), np.sin(azimuth[finger])
-        mirror = np.array([[x * x - y * y, 2 * x * y, 0.0], [2 * x * y, y * y - x * x, 0.0], [0.0, 0.0, 1.0]])
+        mirror = np.array(
+            [[x * x - y * y, 2 * x * y, 0.0], [2 * x * y, y * y - x * x, 0.0], [0.0, 0.0, 1.0]]
+        )
 
         def in_mirror(quat, mirror=mirror):
             axes = mirror @ Rotation.from_quat(quat).as_matrix() @ np.diag([1.0, -1.0, 1.0])
@@ -141,7 +147,9 @@ def test_mirrored_worlds_look_and_move_the_same():
         points.assign(surface * [1.0, -1.0, 1.0])
         look(env)
         was, now = state["arrays"]["view"] >= 3, env.symmetry_frames.chosen.numpy() >= 3
-        assert (was != now).all(), "what was seen in the mirror is seen as it is, and the other way round"
+        assert (was != now).all(), (
+            "what was seen in the mirror is seen as it is, and the other way round"
+        )
         seen = with_signs_of(before, env.observation.numpy(), 3)
         np.testing.assert_allclose(seen, before, atol=2e-4)
         assert_same_after(env, action, after)
@@ -172,7 +180,9 @@ def test_the_axis_of_the_wanted_rotation_is_in_one_sector_when_the_goal_is_new()
     for _ in range(5):
         act(env, np.full((60, 9), 0.5, dtype=np.float32))
     same = env.step_count.numpy() == 5
-    assert (env.symmetry_frames.chosen.numpy() == frames)[same].all(), "a frame lasts as long as its goal"
+    assert (env.symmetry_frames.chosen.numpy() == frames)[same].all(), (
+        "a frame lasts as long as its goal"
+    )
 
 
 def test_the_world_frame_is_a_view_too():
@@ -182,7 +192,9 @@ def test_the_world_frame_is_a_view_too():
     assert np.array_equal(plain.observation.numpy(), viewed.world_observation.numpy())
     first = viewed.symmetry_frames.chosen.numpy() == 0
     assert first.any()
-    np.testing.assert_allclose(viewed.observation.numpy()[first], plain.observation.numpy()[first], atol=1e-6)
+    np.testing.assert_allclose(
+        viewed.observation.numpy()[first], plain.observation.numpy()[first], atol=1e-6
+    )
 
     viewed.acts_in_frame = False
     rng = np.random.default_rng(0)

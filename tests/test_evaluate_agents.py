@@ -24,24 +24,33 @@ from vd.policy_store import describe, read_store
 
 
 def task_of(policy, **changes):
-    return task_for(policy, **{"stop_tolerance_rad": 0.4, "randomised": False, "num_envs": 2} | changes)
+    return task_for(
+        policy, **{"stop_tolerance_rad": 0.4, "randomised": False, "num_envs": 2} | changes
+    )
 
 
 @pytest.mark.parametrize("name", SHIPPED_POLICIES)
 def test_installed_policies_load_act_and_are_listed(name):
     policy, listed = open_policy(name, "cpu"), read_store(POLICY_FOLDER).policies
-    assert listed[name] == describe(name, SHIPPED_POLICIES[name]) and listed.keys() == SHIPPED_POLICIES.keys()
+    assert (
+        listed[name] == describe(name, SHIPPED_POLICIES[name])
+        and listed.keys() == SHIPPED_POLICIES.keys()
+    )
     assert name.split("-")[0] == policy.task["hand"], "the name begins with the hand"
     layers = policy if policy.kind == "teacher" else policy.teacher
     action = layers.act(torch.zeros(3, layers.num_observations))
     assert action.shape == (3, layers.num_actions) and torch.isfinite(action).all()
-    assert not any("/" in item for item in policy.task["objects"]), "a path of the machine it was trained on"
+    assert not any("/" in item for item in policy.task["objects"]), (
+        "a path of the machine it was trained on"
+    )
 
 
 def test_names_mean_files_and_files_have_names(tmp_path, monkeypatch):
     path = SHIPPED_POLICIES["dclaw4-cube"]
     monkeypatch.chdir(path.parent)
-    assert policy_name(path) == policy_name(path.name) == policy_name("dclaw4-cube") == "dclaw4-cube"
+    assert (
+        policy_name(path) == policy_name(path.name) == policy_name("dclaw4-cube") == "dclaw4-cube"
+    )
     assert policy_name(tmp_path / "dclaw4-cube.pt") == str(tmp_path / "dclaw4-cube.pt")
     with pytest.raises(FileNotFoundError, match=r"holds no policy\.pt"):
         find_policy(tmp_path)
@@ -58,7 +67,10 @@ def test_another_hand_is_refused_before_anything_is_built(policy, tmp_path, caps
     from vd.play.cli import main as play
 
     monkeypatch.setattr(reorient, "ReorientEnv", lambda *_: pytest.fail("the scene is built"))
-    for command, flags in ((main, ["--out", str(tmp_path)]), (play, ["--video", str(tmp_path / "m.mp4")])):
+    for command, flags in (
+        (main, ["--out", str(tmp_path)]),
+        (play, ["--video", str(tmp_path / "m.mp4")]),
+    ):
         assert command([policy, "--hand", "dclaw3", "--device", "cpu", *flags]) == 1
         error = capsys.readouterr().err
         assert f"{policy} was trained for dclaw4 (12 motors), not for dclaw3 (9); use" in error
@@ -91,31 +103,55 @@ def test_conditions_replace_what_a_policy_was_trained_in_and_nobody_tells_a_crit
         task.validate()
         assert task.randomisation == condition
         assert task.observation.dynamics == "none" and task.observation.canonical
-    assert not CONDITIONS["nominal"].enabled and CONDITIONS["mixed"].observation_latency_s == (0.0, 0.12)
+    assert not CONDITIONS["nominal"].enabled and CONDITIONS["mixed"].observation_latency_s == (
+        0.0,
+        0.12,
+    )
     assert CONDITIONS["hard"].force_s == 5.0 * CONDITIONS["s3"].force_s
 
 
 @pytest.mark.parametrize("extra", [[], ["--consecutive"], ["--engine", "mujoco"]], ids=str)
-def test_an_environment_whose_physics_fails_costs_its_episode_alone(tmp_path, monkeypatch, capsys, extra):
+def test_an_environment_whose_physics_fails_costs_its_episode_alone(
+    tmp_path, monkeypatch, capsys, extra
+):
     def act(env, policy, envs):
         if env.step_count.numpy()[1] == 2:
             env.sim.joint_qd.numpy()[1, 0] = np.nan
         return policy.act(wp.to_torch(env.observation))
 
     monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
-    monkeypatch.setattr(f"vd.evaluate.{'in_a_row' if '--consecutive' in extra else 'trace'}.act_in", act)
-    flags = ["--objects", "cube", "--episodes", "3", "--episode-s", "0.5", "--device", "cpu", *extra]
+    monkeypatch.setattr(
+        f"vd.evaluate.{'in_a_row' if '--consecutive' in extra else 'trace'}.act_in", act
+    )
+    flags = [
+        "--objects",
+        "cube",
+        "--episodes",
+        "3",
+        "--episode-s",
+        "0.5",
+        "--device",
+        "cpu",
+        *extra,
+    ]
     assert main(["zero", *flags, "--out", str(tmp_path)]) == 0
     assert "warning zero cube: physics failed in 1 of 3 episodes" in capsys.readouterr().out
     row = Result.read(tmp_path / "eval.json").rows[0]
-    assert [e.steps <= 3 for e in row.episodes] == [False, True, False] and not row.episodes[1].stopped
+    assert [e.steps <= 3 for e in row.episodes] == [False, True, False] and not row.episodes[
+        1
+    ].stopped
     assert math.isfinite(row.overall.median_error_rad.value)
 
 
 @pytest.mark.slow
 def test_evaluation_at_rest_of_the_installed_policy_beats_doing_nothing(tmp_path):
     flags = ["--objects", "cube", "--episodes", "8", "--max-goal-angle", "1.0", "--episode-s", "3"]
-    assert main(["dclaw4-cube", "zero", "--at-rest", *flags, "--device", "cpu", "--out", str(tmp_path)]) == 0
+    assert (
+        main(
+            ["dclaw4-cube", "zero", "--at-rest", *flags, "--device", "cpu", "--out", str(tmp_path)]
+        )
+        == 0
+    )
     rows = [row for row in Result.read(tmp_path / "eval.json").rows if row.stopped_by == SUCCESS]
     trained, zero = (row.episodes for row in rows)
     assert all(row.protocol.at_rest for row in rows)

@@ -28,7 +28,10 @@ class SeriesEnv(HeldEnv):
     def __init__(self, length_s=AIR_GOALS.length_s, **settings):
         self.given = []
         super().__init__(
-            OBJECTS, num_envs=len(OBJECTS) * EPISODES, max_episode_steps=round(12 * length_s), **settings
+            OBJECTS,
+            num_envs=len(OBJECTS) * EPISODES,
+            max_episode_steps=round(12 * length_s),
+            **settings,
         )
 
     def give_goals(self, envs, goal_quat):
@@ -38,7 +41,10 @@ class SeriesEnv(HeldEnv):
 
 
 class Seeker:
-    """Turns every object to its goal by STEP_RAD a step; may predict the distance, by so much too small."""
+    """Turns every object to its goal by STEP_RAD a step.
+
+    May predict the distance, by so much too small.
+    """
 
     def __init__(self, env, blind_rad=None):
         self.env, self.blind_rad = env, blind_rad
@@ -53,7 +59,9 @@ class Seeker:
         if self.blind_rad is not None:
             self.predicted[:] = torch.as_tensor(angle[:, 0] - self.blind_rad)
         action = torch.zeros((self.env.num_envs, self.env.num_actions))
-        action[:, :3] = torch.as_tensor(12.0 * turn / np.maximum(angle, 1e-9) * np.minimum(angle, STEP_RAD))
+        action[:, :3] = torch.as_tensor(
+            12.0 * turn / np.maximum(angle, 1e-9) * np.minimum(angle, STEP_RAD)
+        )
         wp.to_torch(self.env.smoothed)[:] = 0.5 * action
         return action
 
@@ -64,7 +72,9 @@ def flown(blind_rad=None, **settings):
     turns = draw_turns([item.name for item in OBJECTS], EPISODES, 3, seed=2, max_goal_angle=np.pi)
     policy, by = Seeker(env, blind_rad), "exact" if blind_rad is None else "predicted"
     way = StoppingRule(), by
-    trace = record_series(env, policy, turns, way, AIR_GOALS, tolerance=0.4, **drawn(OBJECTS, EPISODES))
+    trace = record_series(
+        env, policy, turns, way, AIR_GOALS, tolerance=0.4, **drawn(OBJECTS, EPISODES)
+    )
     return trace, env, turns
 
 
@@ -83,10 +93,14 @@ def test_goals_follow_one_another_once_the_table_is_gone():
     assert env.tables[:2] == [(0, True), (24, False)] and env.tables[-1][1]
     assert trace.held.all() and (trace.reached == 3).all() and not trace.lost.any()
     assert env.given[0] == (36, list(range(8))), "all get the first goal at once"
-    assert sum(len(envs) for _, envs in env.given) == 3 * 8 and len(env.given) > 3, "and others as they come"
+    assert sum(len(envs) for _, envs in env.given) == 3 * 8 and len(env.given) > 3, (
+        "and others as they come"
+    )
     angle = Rotation.from_quat(turns[:, :, 0].reshape(-1, 4)).magnitude().reshape(2, 4)
     np.testing.assert_allclose(rotation_angle(trace.start_quat, trace.goal_quat), angle, atol=1e-5)
-    np.testing.assert_array_equal(trace.steps, np.maximum(1, np.floor((angle - 0.4) / STEP_RAD) + 1))
+    np.testing.assert_array_equal(
+        trace.steps, np.maximum(1, np.floor((angle - 0.4) / STEP_RAD) + 1)
+    )
     error = rotation_angle(trace.end_quat, trace.goal_quat)
     assert trace.stopped.all() and (error < 0.4).all()
     np.testing.assert_array_equal(trace.let_go, [[0, 1, 0, 0], [0, 0, 0, 0]])
@@ -96,7 +110,9 @@ def test_goals_follow_one_another_once_the_table_is_gone():
 
 def test_what_is_lost_before_or_after_the_first_goal_was_drawn_is_told_apart(tmp_path):
     trace, _, _ = flown(fall_at={0: 20, 5: 37})
-    np.testing.assert_array_equal(trace.lost, [[True, False, False, False], [False, True, False, False]])
+    np.testing.assert_array_equal(
+        trace.lost, [[True, False, False, False], [False, True, False, False]]
+    )
     np.testing.assert_array_equal(trace.held, [[False, True, True, True], [True] * 4])
     row = row_of(trace, air_goals=True)
     assert row.overall.outcomes["success"].value == row.in_air.in_a_row.value == 6 / 8
@@ -126,7 +142,9 @@ def test_successes_in_a_row_end_with_a_fall_or_a_goal_that_takes_too_long(tmp_pa
     series = replace(CONSECUTIVE, most=6, goal_s=1.5)
     env = SeriesEnv(series.length_s, fall_at={0: 1, 5: 20})
     turns = draw_turns(["a", "b"], EPISODES, series.most, seed=2, max_goal_angle=1.5)
-    turns[0, 2, 3] = Rotation.from_rotvec([0.0, 0.0, 3.0]).as_quat()  # 26 steps away, of which it has 18
+    turns[0, 2, 3] = Rotation.from_rotvec(
+        [0.0, 0.0, 3.0]
+    ).as_quat()  # 26 steps away, of which it has 18
     start = drawn(OBJECTS, EPISODES)["starts"]
     ahead = Rotation.from_rotvec([0.0, 1.05, 0.0]) * Rotation.from_quat(start.reshape(-1, 4))
     given = {"starts": start, "goals": ahead.as_quat().reshape(start.shape)}
@@ -137,13 +155,20 @@ def test_successes_in_a_row_end_with_a_fall_or_a_goal_that_takes_too_long(tmp_pa
     np.testing.assert_allclose(rotation_angle(trace.start_quat, trace.goal_quat), 1.05, atol=1e-5)
     np.testing.assert_array_equal(trace.steps[:, 2:], 7)
     reached = trace.reached.tolist()
-    assert reached[0][0] == 0 and reached[0][2] == 3 and 1 <= reached[1][1] < 6 and trace.lost.sum() == 2
+    assert (
+        reached[0][0] == 0
+        and reached[0][2] == 3
+        and 1 <= reached[1][1] < 6
+        and trace.lost.sum() == 2
+    )
     assert [count for row in reached for count in row if count == 6] == [6] * 5
     monkeypatch.setattr("vd.evaluate.in_a_row.CONSECUTIVE", series)
     row = row_of(trace, consecutive=True, episode_s=1.5)
     both, a, b = row.consecutive
     total = trace.reached.sum()
-    assert (both.mean, both.median, both.full, both.lost) == pytest.approx((total / 8, 6.0, 5 / 8, 2 / 8))
+    assert (both.mean, both.median, both.full, both.lost) == pytest.approx(
+        (total / 8, 6.0, 5 / 8, 2 / 8)
+    )
     assert both.goals == pytest.approx(total / (total + 3)) and (a.name, b.name) == ("a", "b")
     assert a.mean == pytest.approx(15 / 4) and a.median == 4.5 and row.successes.sum() == 7
     write_page(Result((row,)), tmp_path / "eval.html")

@@ -22,7 +22,9 @@ class References(HTMLParser):
     def handle_starttag(self, tag, attrs):
         """Keep the tag and its addresses."""
         self.tags.append(tag)
-        self.addresses += [value for name, value in attrs if name in ("src", "href", "poster", "data")]
+        self.addresses += [
+            value for name, value in attrs if name in ("src", "href", "poster", "data")
+        ]
         if tag not in ("meta", "img", "br", "link"):
             self.stack.append(tag)
 
@@ -65,7 +67,11 @@ def test_the_page_is_one_offline_file_with_rates_intervals_and_warnings(tmp_path
     assert "Predicted distance" not in text
     write_page(Result(tuple(compared())), tmp_path / "camera.html")
     text, _ = read_page(tmp_path / "camera.html")
-    assert "Predicted distance" in text and "complete clouds" in text and "500 exact points" not in text
+    assert (
+        "Predicted distance" in text
+        and "complete clouds" in text
+        and "500 exact points" not in text
+    )
 
 
 def test_curves_end_at_one_minus_the_share_of_lost_objects(found):

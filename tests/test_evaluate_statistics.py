@@ -53,10 +53,17 @@ def coverage(intervals, truth):
     return np.mean([interval.low <= value <= interval.high for interval, value in pairs])
 
 
-@pytest.mark.parametrize(("objects", "episodes", "runs"), [(13, 20, 3000), (13, 100, 2000), (159, 20, 1000)])
+@pytest.mark.parametrize(
+    ("objects", "episodes", "runs"), [(13, 20, 3000), (13, 100, 2000), (159, 20, 1000)]
+)
 @pytest.mark.parametrize("rate", [0.5, 0.9, 0.97])
-def test_intervals_over_objects_that_differ_cover_as_often_as_they_say(objects, episodes, runs, rate):
-    """Rates of objects spread by 0.22 of the widest spread possible: 0.07 about 0.9, 0.04 about 0.97."""
+def test_intervals_over_objects_that_differ_cover_as_often_as_they_say(
+    objects, episodes, runs, rate
+):
+    """Rates of objects spread by 0.22 of the widest spread possible.
+
+    0.07 about 0.9, 0.04 about 0.97.
+    """
     rng = np.random.default_rng(objects + episodes)
     each = rng.beta(20.0 * rate, 20.0 * (1.0 - rate), size=(runs, objects, 1))
     intervals = rate_intervals(rng.random((runs, objects, episodes)) < each, "object")
@@ -99,7 +106,9 @@ def test_a_sample_without_spread_has_an_exact_interval(unit):
     none, every = rate_intervals(np.stack([np.zeros((10, 30)), np.ones((10, 30))]), unit)
     width = 1 - 0.025 ** (1 / 300)
     assert none.method == every.method == "clopper-pearson"
-    assert (none.low, none.high, every.low, every.high) == pytest.approx((0.0, width, 1 - width, 1.0))
+    assert (none.low, none.high, every.low, every.high) == pytest.approx(
+        (0.0, width, 1 - width, 1.0)
+    )
 
 
 @pytest.mark.parametrize("shape", list(itertools.product([1, 2, 9], [1, 2, 7])))
@@ -113,7 +122,10 @@ def test_small_samples_give_finite_intervals(shape, unit):
 
 @pytest.mark.parametrize("unit", ["object", "episode"])
 def test_paired_differences_cover_and_are_narrower_than_rates(unit):
-    """Two policies on the same objects, of which some are hard for both; one succeeds 0.1 more often."""
+    """Two policies on the same objects, of which some are hard for both.
+
+    One succeeds 0.1 more often.
+    """
     rng = np.random.default_rng(9)
     each = rng.uniform(0.2, 0.8, size=(500, 13, 1))
     luck = rng.random((500, 13, 20))

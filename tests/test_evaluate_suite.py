@@ -1,4 +1,7 @@
-"""The paper's suite: what is run, what is not run again, and the page; evaluation is a test double."""
+"""The paper's suite: what is run, what is not run again, and the page.
+
+Evaluation is a test double.
+"""
 
 import json
 from dataclasses import fields, replace
@@ -31,7 +34,9 @@ from vd.paper import ResultConstants
 TEACHER, CAMERA = "dclaw3", "dclaw3-tracking"
 OBJECTS = ("training=cube", "held-out=cube", "symmetric=cube")
 """Sets that need no authoring; the test double looks at none of them."""
-OF_TEACHERS = [c.name for c in CONDITIONS if c.objects != "validation" and "goals" not in c.settings]
+OF_TEACHERS = [
+    c.name for c in CONDITIONS if c.objects != "validation" and "goals" not in c.settings
+]
 """Conditions of a teacher: its goals are no clouds, to be scanned or told by points."""
 
 
@@ -65,13 +70,17 @@ def run(tmp_path, *policies, **changes):
 
 
 def command(tmp_path, *flags):
-    return main([TEACHER, "--suite", "paper", "--objects", *OBJECTS, "--out", str(tmp_path / "out"), *flags])
+    return main(
+        [TEACHER, "--suite", "paper", "--objects", *OBJECTS, "--out", str(tmp_path / "out"), *flags]
+    )
 
 
 def test_every_figure_of_the_paper_is_claimed_under_its_conditions():
     by_name = {condition.name: condition for condition in CONDITIONS}
     assert len(by_name) == len(CONDITIONS)
-    assert {claim.paper for claim in CLAIMS} - {None} == {item.name for item in fields(ResultConstants)}
+    assert {claim.paper for claim in CLAIMS} - {None} == {
+        item.name for item in fields(ResultConstants)
+    }
     assert {claim.condition for claim in CLAIMS} <= by_name.keys()
     texts = {claim.paper: claim.paper_text() for claim in CLAIMS}
     assert texts["table_held_out"] == "85 % (82 to 88)"
@@ -79,7 +88,9 @@ def test_every_figure_of_the_paper_is_claimed_under_its_conditions():
     assert texts["air_time_s"] == "below 7" and texts["air_by_truth"] == "80.9 %"
     for condition in CONDITIONS:
         for camera in (False, True):
-            cfg = suite_run.settings(EvalCfg(seed=3), condition, TEACHER, (("x",), "x"), camera=camera)
+            cfg = suite_run.settings(
+                EvalCfg(seed=3), condition, TEACHER, (("x",), "x"), camera=camera
+            )
             assert cfg.sensor_errors and cfg.no_at_rest and cfg.seed == 3
             assert cfg.objects == (f"{condition.objects}=x",)
             assert cfg.episodes == (condition.camera_episodes if camera else condition.episodes)
@@ -124,7 +135,9 @@ def test_the_reduced_suite_ends_in_its_time_and_shows_what_it_has(tmp_path, aske
     monkeypatch.setattr(suite_run, "compare", slow)
     result = run(tmp_path, CAMERA, TEACHER, quick=True)
     assert [name for _, name in asked] == [TEACHER, TEACHER], "a camera policy takes longest"
-    assert len(result.missing) > 10 and {why for *_, why in result.missing} == {suite_run.OUT_OF_TIME}
+    assert len(result.missing) > 10 and {why for *_, why in result.missing} == {
+        suite_run.OUT_OF_TIME
+    }
     assert suite_run.OUT_OF_TIME in (tmp_path / "out" / "paper.html").read_text()
 
 
@@ -134,7 +147,9 @@ def test_side_by_side_the_same_is_measured_camera_policies_first(tmp_path, asked
     def in_this_process(work, tasks, finished, *, jobs, limit_s, gpu):
         told.update(jobs=jobs, gpu=gpu)
         for number, task in enumerate(tasks):
-            finished(task, None, "its process died") if number == 1 else finished(task, work(task), "")
+            finished(task, None, "its process died") if number == 1 else finished(
+                task, work(task), ""
+            )
 
     monkeypatch.setattr(suite_run, "run_tasks", in_this_process)
     together = run(tmp_path, TEACHER, CAMERA, jobs=3)
@@ -200,7 +215,13 @@ def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monk
         result = Result.read(cfg.out / "eval.json")
         if condition != "nominal":
             rows = [
-                replace(row, episodes=(replace(row.episodes[0], fell=True, stopped=False), *row.episodes[1:]))
+                replace(
+                    row,
+                    episodes=(
+                        replace(row.episodes[0], fell=True, stopped=False),
+                        *row.episodes[1:],
+                    ),
+                )
                 for row in result.rows
             ]
             replace(result, rows=tuple(rows)).write(cfg.out / "eval.json")
@@ -209,7 +230,9 @@ def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monk
     run(tmp_path, TEACHER, CAMERA, suite="robust", objects=("held-out=cube",))
     of_state = {"observation-late", "all-late", "pose-error"}
     names = [c.name for c in ROBUST]
-    assert set(names) == {*get_args(Condition), "air-nominal", "air-mixed"} and names[0] == "nominal"
+    assert (
+        set(names) == {*get_args(Condition), "air-nominal", "air-mixed"} and names[0] == "nominal"
+    )
     assert {n for n, policy in asked if policy == CAMERA} == set(names) - of_state
     assert {n for n, policy in asked if policy == TEACHER} == set(names)
     table = json.loads((tmp_path / "out" / "robust.json").read_text())["figures"]
@@ -220,20 +243,30 @@ def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monk
     cost = {float(row["points from nominal"].split()[0]) for row in table[2:]}
     assert len(cost) <= 2 and min(cost) < 0.0
     text, _ = read_page(tmp_path / "out" / "robust.html")
-    assert "Condition by condition" in text and "--condition off-centre" in text and "72.3 %" not in text
+    assert (
+        "Condition by condition" in text
+        and "--condition off-centre" in text
+        and "72.3 %" not in text
+    )
 
 
-def test_our_objects_stand_for_the_papers_where_none_are_given_and_the_reduced_suite_takes_a_few(tmp_path):
+def test_our_objects_stand_for_the_papers_where_none_are_given_and_the_reduced_suite_takes_a_few(
+    tmp_path,
+):
     groups = suite_run.object_groups((), set(OWN_SETS), quick=False)
     assert "validation" not in groups, "nothing stands in for it"
     assert groups["training"][0] == ("procedural-150-seed0",) and "our own" in groups["held-out"][1]
     left_out = set(SHIPPED_POLICIES) - set(EvalCfg(suite="paper").agent_names)
     assert left_out == {"allegro-cube", "leap-cube", "leap-objects"}, "not imported"
-    with pytest.raises(ValueError, match="'table' is no group of the suite; training, validation, held-out"):
+    with pytest.raises(
+        ValueError, match="'table' is no group of the suite; training, validation, held-out"
+    ):
         suite_run.object_groups(("table=cube",), set(OWN_SETS), quick=False)
     for index in range(QUICK_OBJECTS * 3):
         (tmp_path / f"{index:02}.usd").touch()
-    sets, text = suite_run.object_groups((f"training={tmp_path}",), {"training"}, quick=True)["training"]
+    sets, text = suite_run.object_groups((f"training={tmp_path}",), {"training"}, quick=True)[
+        "training"
+    ]
     assert [item[-6:] for item in sets] == [f"{i:02}.usd" for i in range(0, 18, 3)]
     assert f"{QUICK_OBJECTS} of the 18" in text
 
@@ -243,7 +276,10 @@ def test_our_objects_stand_for_the_papers_where_none_are_given_and_the_reduced_s
     [
         (["--suite", "paper", "--condition", "mixed"], "--condition is decided by --suite paper"),
         (["--suite", "paper", "--in-air"], "--in-air is decided by --suite paper"),
-        (["dclaw4-cube", "--jobs", "2"], "--quick, --jobs and --shard are of a suite; add --suite paper"),
+        (
+            ["dclaw4-cube", "--jobs", "2"],
+            "--quick, --jobs and --shard are of a suite; add --suite paper",
+        ),
         (["--suite", "paper", "--jobs", "0"], "--jobs is 0; it has to be positive"),
         (["--suite", "paper", "--shard", "2/2"], "--shard is '2/2'; it has to be I/N"),
         (
@@ -251,7 +287,10 @@ def test_our_objects_stand_for_the_papers_where_none_are_given_and_the_reduced_s
             "--condition and --table-friction exclude",
         ),
         (["zero", "--at-rest", "--no-at-rest"], "--at-rest and --no-at-rest exclude each other"),
-        (["zero", "--air-goals", "--episode-s", "3"], "--air-goals and --episode-s exclude each other"),
+        (
+            ["zero", "--air-goals", "--episode-s", "3"],
+            "--air-goals and --episode-s exclude each other",
+        ),
         (
             ["dclaw4-cube", "--table-friction", "-1"],
             "--table-friction is -1.0; it has to be zero",

@@ -25,7 +25,10 @@ STEP_RAD = 0.1
 
 
 class Turner:
-    """Turns the object about z by STEP_RAD a step, for some steps; predicts the distance and an offset."""
+    """Turns the object about z by STEP_RAD a step, for some steps.
+
+    Predicts the distance and an offset.
+    """
 
     def __init__(self, env, *, until=100, offset=None):
         self.env, self.until = env, until
@@ -45,7 +48,10 @@ class Turner:
 
 
 class HeldEnv(FakeEnv):
-    """Objects that go on turning by a tenth of a radian a step while they are held; some are lost then."""
+    """Objects that go on turning by a tenth of a radian a step while they are held.
+
+    Some are lost then.
+    """
 
     lost, held = (), 0
 
@@ -53,7 +59,9 @@ class HeldEnv(FakeEnv):
         super().__init__(*args, tolerance=NEVER_RAD, **settings)
         self.cfg.success = SuccessCfg(fall_m=0.24)
         self.lost, self.tables, self.held_tables = lost, [], []
-        self.sim.place_table = lambda present: self.tables.append((int(self.step_count.numpy()[0]), present))
+        self.sim.place_table = lambda present: self.tables.append(
+            (int(self.step_count.numpy()[0]), present)
+        )
         self.sim.place_tables = lambda count, last: self.held_tables.append(
             (count.numpy()[0], last.numpy()[0])
         )
@@ -84,9 +92,13 @@ def goal_ahead(angle, objects=1, episodes=1):
     return {"starts": starts, "goals": goals}
 
 
-def traced(angle=0.85, *, objects=(FakeObject("a"),), episodes=1, policy=None, steps=12, **settings):
+def traced(
+    angle=0.85, *, objects=(FakeObject("a"),), episodes=1, policy=None, steps=12, **settings
+):
     env = HeldEnv(objects, num_envs=len(objects) * episodes, max_episode_steps=steps, **settings)
-    return record(env, Turner(env, **(policy or {})), episodes, **goal_ahead(angle, len(objects), episodes))
+    return record(
+        env, Turner(env, **(policy or {})), episodes, **goal_ahead(angle, len(objects), episodes)
+    )
 
 
 def drawn(objects, episodes):
@@ -109,13 +121,18 @@ def protocol(episodes):
     )
 
 
-def judged(trace, objects, *, policy="p", kind="teacher", sees="state", rules=lambda _: StoppingRule()):
+def judged(
+    trace, objects, *, policy="p", kind="teacher", sees="state", rules=lambda _: StoppingRule()
+):
     agent = Agent(policy, kind, sees, rules)
     return judge(trace, protocol(trace.steps.shape[1]), list(objects), agent, group="training")
 
 
 def rows_of(objects, episodes=10, fall_at=None):
-    """Rows of a policy that does nothing: by the true distance, and by the success criteria of training."""
+    """Rows of a policy that does nothing.
+
+    By the true distance, and by the success criteria of training.
+    """
     env = HeldEnv(objects, num_envs=len(objects) * episodes, max_episode_steps=4, fall_at=fall_at)
     trace = record(env, Turner(env, until=0), episodes, **drawn(objects, episodes))
     return judged(trace, objects, policy="zero", kind="zero", sees="nothing")
@@ -132,7 +149,9 @@ def compared(offset=-0.3, fall_at=None, rules=lambda _: StoppingRule(0.2)):
 def test_what_happened_is_written_down_and_the_first_step_within_the_bounds_ends_it():
     trace = traced()
     assert trace.predicted is None and trace.steps[0, 0] == 12 and not trace.fell.any()
-    np.testing.assert_allclose(trace.exact[0, 0], np.abs(0.85 - STEP_RAD * np.arange(13)), atol=1e-5)
+    np.testing.assert_allclose(
+        trace.exact[0, 0], np.abs(0.85 - STEP_RAD * np.arange(13)), atol=1e-5
+    )
     np.testing.assert_allclose(trace.error, trace.exact, atol=1e-9)
     assert np.isnan(trace.action_norm[0, 0, 12]) and np.isfinite(trace.action_norm[0, 0, :12]).all()
     for bound, steps, error in ((0.5, 4, 0.45), (0.3, 6, 0.25), (0.01, 12, 0.35)):
@@ -146,7 +165,9 @@ def test_what_happened_is_written_down_and_the_first_step_within_the_bounds_ends
 
 def test_a_prediction_stops_where_it_says_and_the_truth_is_scored():
     trace = traced(policy={"offset": -0.3})
-    by_prediction, by_truth = (trace.episodes(StoppingRule(0.2, 2.0), by)[0] for by in ("predicted", "error"))
+    by_prediction, by_truth = (
+        trace.episodes(StoppingRule(0.2, 2.0), by)[0] for by in ("predicted", "error")
+    )
     assert by_prediction.steps == 4 and by_prediction.error_rad == pytest.approx(0.45, abs=1e-5)
     assert by_truth.steps == 7 and by_truth.error_rad == pytest.approx(0.15, abs=1e-5)
 
@@ -189,16 +210,25 @@ def test_errors_and_stops_are_up_to_symmetry_and_the_headline_is_of_the_very_goa
 
 
 def test_what_was_stopped_is_held_and_looked_at_again():
-    """The rule stops at 0.35 rad of 0.85; in 2 s the object turns on by 0.24 rad, past the goal or away."""
+    """The rule stops at 0.35 rad of 0.85.
+
+    In 2 s the object turns on by 0.24 rad, past the goal or away.
+    """
     way = (StoppingRule(0.4, 2.0), "exact")
     env = HeldEnv([FakeObject("a")], num_envs=3, max_episode_steps=12, lost=[1])
     goals = goal_ahead(0.85, 1, 3)
     goals["goals"][0, 2] = Rotation.from_rotvec([0.0, 0.0, -2.0]).as_quat()
     trace = record(env, Turner(env), 3, **goals, held=[way], table_steps=8)
     ahead, lost, never = trace.held[way][0]
-    assert ahead == pytest.approx(0.35 - 0.24, abs=1e-4) and lost == pytest.approx(np.pi) and np.isnan(never)
+    assert (
+        ahead == pytest.approx(0.35 - 0.24, abs=1e-4)
+        and lost == pytest.approx(np.pi)
+        and np.isnan(never)
+    )
     assert env.held == 24 and env.held_tables[:4] == [(5, 8), (6, 8), (7, 8), (8, 8)], "in its time"
-    assert trace.exact[0, 0, 12] == pytest.approx(0.35, abs=1e-5), "the record itself is not changed"
+    assert trace.exact[0, 0, 12] == pytest.approx(0.35, abs=1e-5), (
+        "the record itself is not changed"
+    )
     assert trace.of([0]).held[way].shape == (1, 3)
 
 
@@ -235,7 +265,9 @@ def test_every_start_and_goal_is_run_once_whatever_the_number_of_environments(en
     told = drawn(objects, 4)
     episodes = record(env, Turner(env, until=0), 4, **told).episodes(StoppingRule(0.0), "exact")
     assert [e.object_index for e in episodes] == [0] * 4 + [1] * 4 + [2] * 4
-    np.testing.assert_allclose([e.goal_quat for e in episodes], told["goals"].reshape(-1, 4), atol=1e-6)
+    np.testing.assert_allclose(
+        [e.goal_quat for e in episodes], told["goals"].reshape(-1, 4), atol=1e-6
+    )
     errors = [e.error_rad for e in episodes]
     np.testing.assert_allclose(errors, [e.start_error_rad for e in episodes], atol=2e-3)
     plain = rotation_angle(told["starts"], told["goals"]).ravel()
@@ -248,15 +280,22 @@ def test_every_start_and_goal_is_run_once_whatever_the_number_of_environments(en
 
 def test_what_the_environment_draws_is_recorded_and_does_not_depend_on_the_policy():
     def run(until, fall_at):
-        # Environments that drop their object reset, and so draw, more often before the second round begins.
+        # Environments that drop their object reset, and so draw, more often before the second round
+        # begins.
         env = HeldEnv([FakeObject("a")], num_envs=3, max_episode_steps=6, fall_at=fall_at)
         return record(env, Turner(env, until=until), 9).episodes(StoppingRule(0.0), "exact")
 
     first, second = run(0, {0: 1}), run(6, {1: 2, 2: 3})
     assert [e.error_rad for e in first] != [e.error_rad for e in second]
-    assert [(e.start_quat, e.goal_quat) for e in first] == [(e.start_quat, e.goal_quat) for e in second]
-    starts, goals = (np.array([getattr(e, name) for e in first]) for name in ("start_quat", "goal_quat"))
-    np.testing.assert_allclose([e.error_rad for e in first], rotation_angle(starts, goals), atol=2e-3)
+    assert [(e.start_quat, e.goal_quat) for e in first] == [
+        (e.start_quat, e.goal_quat) for e in second
+    ]
+    starts, goals = (
+        np.array([getattr(e, name) for e in first]) for name in ("start_quat", "goal_quat")
+    )
+    np.testing.assert_allclose(
+        [e.error_rad for e in first], rotation_angle(starts, goals), atol=2e-3
+    )
     apart = rotation_angle(starts[:, None], starts[None]) + 4.0 * np.eye(len(starts))
     assert apart.min() > 1e-3, "a start was used twice"
 
@@ -279,10 +318,15 @@ def test_every_episode_is_in_one_class_and_rates_count_them():
     rows = compared(fall_at={1: 2, 5: 12})
     assert [row.stopped_by for row in rows] == ["prediction", "true distance"]
     assert Result(tuple(rows)).warnings == {"b": "open; parts are off"}
-    by_prediction, by_truth = ({k: v.value for k, v in row.overall.outcomes.items()} for row in rows)
+    by_prediction, by_truth = (
+        {k: v.value for k, v in row.overall.outcomes.items()} for row in rows
+    )
     assert tuple(by_prediction) == OUTCOMES
-    # It stops at 0.45 rad by its prediction, and at 0.35 by the truth; one fell before, one long after.
-    assert by_prediction == pytest.approx(dict(zip(OUTCOMES, (0.0, 7 / 8, 0.0, 1 / 8), strict=True)))
+    # It stops at 0.45 rad by its prediction, and at 0.35 by the truth; one fell before, one long
+    # after.
+    assert by_prediction == pytest.approx(
+        dict(zip(OUTCOMES, (0.0, 7 / 8, 0.0, 1 / 8), strict=True))
+    )
     assert by_truth == pytest.approx(dict(zip(OUTCOMES, (7 / 8, 0.0, 0.0, 1 / 8), strict=True)))
     assert rows[1].overall.time_s.value == pytest.approx(5 / 12) and rows[0].overall.time_s is None
     assert [one.outcomes["object falls"].value for one in rows[0].per_object] == [0.25, 0.0]
@@ -312,11 +356,17 @@ def test_what_predictions_are_worth():
 
 
 def test_each_tolerance_has_its_own_rule():
-    """Predictions are 0.3 rad too small; the rule for 0.4 rad knows of it, the one for 0.1 does not."""
+    """Predictions are 0.3 rad too small.
+
+    The rule for 0.4 rad knows of it, the one for 0.1 does not.
+    """
     bounds = {0.1: 0.1, 0.4: 0.05}
     by_prediction, by_truth = compared(rules=lambda tolerance: StoppingRule(bounds[tolerance]))
     assert by_prediction.rule.distance_rad == 0.05 and by_truth.rule.distance_rad == 0.4
-    assert by_prediction.overall.outcomes["success"].value == 1.0 and by_prediction.precise.value == 0.0
+    assert (
+        by_prediction.overall.outcomes["success"].value == 1.0
+        and by_prediction.precise.value == 0.0
+    )
     assert by_truth.precise.value == 1.0
 
 
@@ -359,7 +409,9 @@ def test_without_a_table_objects_fall_and_it_comes_back():
         randomisation=RandomisationCfg(redraw_s=0.0, force_probability=0.0),
     )
     env = ReorientEnv(task, "cpu")
-    starts, goals = (np.tile(quat, (1, 3, 1)) for quat in ([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]))
+    starts, goals = (
+        np.tile(quat, (1, 3, 1)) for quat in ([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0])
+    )
     settings = dict(starts=starts, goals=goals)
     rests = record(env, Still(), 3, **settings)
     falls = record(env, Still(), 3, **settings, table_steps=24)

@@ -48,7 +48,9 @@ def test_a_file_that_cannot_grow_is_named_and_the_old_one_stays(tmp_path, name):
     path.write_bytes(b"old")
     with (
         small_files(LIMIT),
-        pytest.raises(OutputError, match=rf"cannot write .*{name}: File too large; free some space"),
+        pytest.raises(
+            OutputError, match=rf"cannot write .*{name}: File too large; free some space"
+        ),
     ):
         write(path)
     assert path.read_bytes() == b"old"
@@ -58,7 +60,10 @@ def test_a_file_that_cannot_grow_is_named_and_the_old_one_stays(tmp_path, name):
 def test_a_bundle_that_does_not_fit_is_not_there(tmp_path):
     load_hand("dclaw3")  # authored on first use
     policy = open_policy("dclaw3", "cpu")
-    with small_files(LIMIT), pytest.raises(OutputError, match=r"cannot write .*first: File too large"):
+    with (
+        small_files(LIMIT),
+        pytest.raises(OutputError, match=r"cannot write .*first: File too large"),
+    ):
         write_bundle(policy, tmp_path / "first")
     assert not list(tmp_path.iterdir())
 
@@ -114,7 +119,9 @@ def commands(taken: str) -> dict[str, list[str]]:
 
 @pytest.mark.parametrize("command", commands(""))
 def test_every_command_says_so_at_once(tmp_path, command, monkeypatch, capsys):
-    scripts = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
+    scripts = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"][
+        "scripts"
+    ]
     module, _, function = scripts[command.strip()].partition(":")
     (tmp_path / "file").touch()
     arguments = commands(str(tmp_path / "file" / "out"))[command]

@@ -1,4 +1,7 @@
-"""What a newcomer meets first: names that are wrong, quiet starts, and command lines of the documentation."""
+"""What a newcomer meets first.
+
+Names that are wrong, quiet starts, and command lines of the documentation.
+"""
 
 import importlib
 import json
@@ -16,7 +19,10 @@ from vd.train.cli import USAGE as TRAIN_USAGE
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-PAGES = (*sorted({*ROOT.glob("*.md")} - {ROOT / "CHANGELOG.md"}), *sorted((ROOT / "docs").rglob("*.md")))
+PAGES = (
+    *sorted({*ROOT.glob("*.md")} - {ROOT / "CHANGELOG.md"}),
+    *sorted((ROOT / "docs").rglob("*.md")),
+)
 """What users read; the list of changes names what is gone."""
 HEAVY = {"torch", "newton", "warp", "pxr", "mujoco", "matplotlib", "viser"}
 RUN = """
@@ -41,7 +47,9 @@ WRONG = {
     "vd-train teacher --env.objects nosuchset": "no object set or path 'nosuchset'",
     "vd-train student --stage 1 --teacher nosuch": "no policy at nosuch",
 }
-DAMAGED = dict.fromkeys(("vd-eval bad.pt", "vd-play bad.pt", "vd-bench sim --policy bad.pt"), "bad.pt")
+DAMAGED = dict.fromkeys(
+    ("vd-eval bad.pt", "vd-play bad.pt", "vd-bench sim --policy bad.pt"), "bad.pt"
+)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +67,9 @@ def test_what_cannot_be_used_is_refused_before_anything_slow_is_imported(lines, 
     run = [sys.executable, "-c", RUN.format(heavy=heavy), json.dumps(calls)]
     done = subprocess.run(run, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["bad.pt"], "what is refused leaves nothing behind"
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.pt"], (
+        "what is refused leaves nothing behind"
+    )
 
 
 @pytest.mark.skipif(wp.is_cuda_available(), reason="this machine has a GPU driver")
@@ -77,10 +87,15 @@ def documented_lines():
     """Every command line of the pages: those of code blocks, and those in running text."""
     for page in PAGES:
         text = page.read_text()
-        for block in re.findall(r"^ *```(?:bash|sh|console)?\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE):
+        for block in re.findall(
+            r"^ *```(?:bash|sh|console)?\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE
+        ):
             for line in block.replace("\\\n", " ").splitlines():
                 if re.match(r"\s*vd-\w+(\s|$)", line):
-                    yield page.name, shlex.join(shlex.split(line.partition(" > ")[0], comments=True))
+                    yield (
+                        page.name,
+                        shlex.join(shlex.split(line.partition(" > ")[0], comments=True)),
+                    )
         running = re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE)
         for code in re.findall(r"`(vd-[^`]* --[^`]+)`", running):
             yield page.name, " ".join(code.split())

@@ -31,7 +31,9 @@ def env(request):
     )
     random = np.random.default_rng(0)
     for _ in range(5):
-        made.step(wp.array(random.uniform(-1, 1, (WORLDS, made.num_actions)), dtype=float, device="cpu"))
+        made.step(
+            wp.array(random.uniform(-1, 1, (WORLDS, made.num_actions)), dtype=float, device="cpu")
+        )
     every = wp.ones(WORLDS, dtype=wp.int32, device="cpu")
     made.symmetry_frames.choose(every, every)
     made.observe()
@@ -43,14 +45,20 @@ def maps(env):
     def array(values, dtype):
         return torch.tensor(values, dtype=getattr(torch, dtype))
 
-    return FrameMaps(env.hand, replace(env.cfg.observation, dynamics="critic"), array)  # who is not asked
+    return FrameMaps(
+        env.hand, replace(env.cfg.observation, dynamics="critic"), array
+    )  # who is not asked
 
 
 def test_views_are_chosen_seen_and_acted_in_as_in_the_simulator(env, maps):
     world, view = wp.to_torch(env.world_observation), wp.to_torch(env.symmetry_frames.chosen).long()
-    assert set(view.tolist()) == set(range(env.cfg.observation.num_frames(env.num_fingers))), "all are tried"
+    assert set(view.tolist()) == set(range(env.cfg.observation.num_frames(env.num_fingers))), (
+        "all are tried"
+    )
     assert torch.equal(maps.choose(world), view)
-    torch.testing.assert_close(maps.take(world, view), wp.to_torch(env.observation), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        maps.take(world, view), wp.to_torch(env.observation), rtol=1e-5, atol=1e-6
+    )
     action = torch.rand(WORLDS, env.num_actions)
     wanted = wp.to_torch(env.symmetry_frames.world_action(wp.from_torch(action)))
     torch.testing.assert_close(maps.world_action(action, view), wanted)
@@ -59,5 +67,7 @@ def test_views_are_chosen_seen_and_acted_in_as_in_the_simulator(env, maps):
 def test_a_rotation_by_more_than_half_a_turn_is_in_the_view_of_the_shorter_one(env, maps):
     observation = torch.zeros(50, env.num_observations)
     columns = teacher_observation_slices(env.num_fingers, env.num_actions)["relative_orientation"]
-    observation[:, columns] = torch.from_numpy(Rotation.random(50, random_state=0).as_quat()).float()
+    observation[:, columns] = torch.from_numpy(
+        Rotation.random(50, random_state=0).as_quat()
+    ).float()
     assert torch.equal(maps.choose(observation), maps.choose(-observation))

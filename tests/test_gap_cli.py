@@ -91,7 +91,9 @@ def no_figures(monkeypatch):
     monkeypatch.setattr("vd.gap.report.write_report", write)
 
 
-def test_finished_steps_are_kept_until_something_changes(fitted, no_figures, recording, tmp_path, capsys):
+def test_finished_steps_are_kept_until_something_changes(
+    fitted, no_figures, recording, tmp_path, capsys
+):
     out = str(tmp_path / "gap")
     arguments = ["run", str(recording), "--out", out]
     assert cli.main(arguments) == cli.main(arguments) == 0
@@ -106,7 +108,9 @@ def test_finished_steps_are_kept_until_something_changes(fitted, no_figures, rec
     assert (fitted["find"], fitted["explain"]) == (3, 4)
 
 
-def test_steps_go_on_from_what_the_one_before_wrote(fitted, no_figures, recording, tmp_path, capsys):
+def test_steps_go_on_from_what_the_one_before_wrote(
+    fitted, no_figures, recording, tmp_path, capsys
+):
     said = [str(recording), "--out", str(tmp_path / "gap"), "--seed", "7"]
     assert cli.main(["explain", *said]) == 1
     assert "run vd-gap find" in capsys.readouterr().err
@@ -134,7 +138,9 @@ def test_wrong_flags_are_named(recording, tmp_path, capsys, flags, message):
 def test_hide_writes_a_recording_and_the_truth(tmp_path, capsys):
     out = tmp_path / "rec"
     assert (
-        cli.main(["hide", "servo", "--effect", "command_delay:delay_s=0.04", "--out", str(out), "--json"])
+        cli.main(
+            ["hide", "servo", "--effect", "command_delay:delay_s=0.04", "--out", str(out), "--json"]
+        )
         == 0
     )
     truth = json.loads(capsys.readouterr().out)
@@ -158,7 +164,9 @@ def test_layer_of_a_bare_servo_reads_back_as_it_was_identified(recording, tmp_pa
     np.testing.assert_allclose(intervals[0, actuators.COULOMB_TORQUE], (0.14, 0.16), rtol=1e-6)
     closing, again = simulate_again(report, layer, found, None, None, curves)
     np.testing.assert_allclose(again.identified, curves.identified, atol=1e-5)
-    assert closing.identified_rmse_rad == pytest.approx(report.held_out.identified_rmse_rad, rel=1e-3)
+    assert closing.identified_rmse_rad == pytest.approx(
+        report.held_out.identified_rmse_rad, rel=1e-3
+    )
     start = chains(found, None)[0].start_row[0].copy()
     start[actuators.COMMAND_DELAY] = 0.02
     write_identified(report, tmp_path, found, None, {JOINT: start})  # what was started from stays
@@ -171,7 +179,11 @@ def test_layer_of_a_bare_servo_reads_back_as_it_was_identified(recording, tmp_pa
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [(None, "no such hand layer"), ("not USD", "x.usda"), ("#usda 1.0\n", "not an identified servo model")],
+    [
+        (None, "no such hand layer"),
+        ("not USD", "x.usda"),
+        ("#usda 1.0\n", "not an identified servo model"),
+    ],
 )
 def test_layers_that_are_none_are_named(tmp_path, text, message):
     layer = tmp_path / "x.usda"
@@ -182,12 +194,16 @@ def test_layers_that_are_none_are_named(tmp_path, text, message):
 
 
 def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tmp_path):
-    report, _ = servo_report(recording, verdict="ambiguous", ambiguous=(("coulomb_friction", "backlash"),))
+    report, _ = servo_report(
+        recording, verdict="ambiguous", ambiguous=(("coulomb_friction", "backlash"),)
+    )
     result = plan(report, read_recording(recording), None)
     assert result.competing == {JOINT: (("coulomb_friction", "backlash"),)}
     scores = [score.disagreement for score in result.ranking]
     assert scores == sorted(scores, reverse=True) and scores[0] > 3.0
-    assert "second_payload" not in {score.name for score in result.ranking}, "a bare servo's load is unknown"
+    assert "second_payload" not in {score.name for score in result.ranking}, (
+        "a bare servo's load is unknown"
+    )
     assert "coulomb friction and backlash" in result.sentence
     written = json.loads(write_plan(result, tmp_path).read_text())
     assert written["excitation"] == result.ranking[0].name
@@ -210,17 +226,24 @@ def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tm
 
 
 def test_plan_does_not_explain_two_rivals_away_together(tmp_path):
-    """Friction and a dead zone leave the same errors at one gain; at others they cannot both be right."""
+    """Friction and a dead zone leave the same errors at one gain.
+
+    At others they cannot both be right.
+    """
     friction = 0.015
     rubbing_servo(tmp_path / "r", friction)
     names = ("coulomb_friction", "dead_zone")
-    report, _ = servo_report(tmp_path / "r", verdict="ambiguous", ambiguous=(names,), friction=friction)
+    report, _ = servo_report(
+        tmp_path / "r", verdict="ambiguous", ambiguous=(names,), friction=friction
+    )
     values = ({"tau_c_nm": friction}, {"width_rad": 2.0 * friction / BASE["kp"]})
     evidence = tuple(
         Candidate((JOINT,), 1, name, 0.01, 0.8, (0.7, 0.9), "tied", "", fitted)
         for name, fitted in zip(names, values, strict=True)
     )
-    result = plan(dataclasses.replace(report, evidence=evidence), read_recording(tmp_path / "r"), None)
+    result = plan(
+        dataclasses.replace(report, evidence=evidence), read_recording(tmp_path / "r"), None
+    )
     assert result.ranking[0].name == "gain_ladder" and result.ranking[0].disagreement > 3.0
     assert "to decide between coulomb friction and dead zone" in result.sentence
 
@@ -235,7 +258,9 @@ def test_disagreement_is_what_no_change_of_the_parameters_takes_away():
         rivals.append(Rival.of(curves, measured, seen, 4))
         slopes = curves[1:] - curves[0]
         prior = np.concatenate([np.eye(parameters), np.sqrt(4 / 30) * slopes[:, seen].T])
-        target = np.concatenate([np.zeros(parameters), np.sqrt(4 / 30) * (measured - curves[0])[seen]])
+        target = np.concatenate(
+            [np.zeros(parameters), np.sqrt(4 / 30) * (measured - curves[0])[seen]]
+        )
         best = np.linalg.lstsq(prior, target, rcond=None)[0]
         np.testing.assert_allclose(rivals[-1].curve, curves[0] + best @ slopes, atol=1e-12)
         rows.append((prior, slopes[:, new].T / np.sqrt(20)))

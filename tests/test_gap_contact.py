@@ -1,4 +1,7 @@
-"""Contact from an object's recorded motions: named or not, written, read by the task; bad input refused."""
+"""Contact from an object's recorded motions: named or not, written, read by the task.
+
+Bad input refused.
+"""
 
 import csv
 import json
@@ -25,14 +28,20 @@ def analysis(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plant = ContactPlant(load_set("cube")[0], hidden, seed=3)
     hide_contact(plant, folder / "rec", {"drop": 12, "slide": 5, "push": 5})
     file = str(set_files(["cube"])[0])
-    assert main(["contact", str(folder / "rec"), "--object", file, "--out", str(folder / "out")]) == 0
+    assert (
+        main(["contact", str(folder / "rec"), "--object", file, "--out", str(folder / "out")]) == 0
+    )
     return folder
 
 
 def test_what_is_hidden_is_named_and_what_was_not_recorded_is_unknown(analysis: Path):
     report = json.loads((analysis / "out" / "report.json").read_text())
     assert report["verdict"] == "effects"
-    assert {effect["name"] for effect in report["effects"]} == {"table_friction", "mass", "centre_of_mass"}
+    assert {effect["name"] for effect in report["effects"]} == {
+        "table_friction",
+        "mass",
+        "centre_of_mass",
+    }
     found = report["parameters"]
     assert found["table_friction"]["value"][0] == pytest.approx(0.4, abs=0.03)
     assert found["mass"]["value"][0] == pytest.approx(0.2, rel=0.05)
@@ -51,7 +60,9 @@ def test_the_layer_is_the_object_with_what_was_identified(analysis: Path):
     path = analysis / "out" / "identified.usda"
     item, plain = read_object(path), load_set("cube")[0]
     assert item.mass_kg == pytest.approx(item.contact["mass"][0][0])
-    np.testing.assert_allclose(item.inertia / item.mass_kg, plain.inertia / plain.mass_kg, rtol=1e-5)
+    np.testing.assert_allclose(
+        item.inertia / item.mass_kg, plain.inertia / plain.mass_kg, rtol=1e-5
+    )
     assert set(item.contact) == {"table_friction", "mass", "centre_of_mass"}
     again = read_object(write_object(analysis / "again.usd", item))
     assert again.contact == item.contact
@@ -70,7 +81,9 @@ def test_the_task_has_the_identified_contact_and_varies_it_within_its_interval(
 ):
     path = analysis / "out" / "identified.usda"
     found = replace(RandomisationCfg(), enabled=randomised)
-    env = ReorientEnv(ReorientCfg(objects=(str(path), "cuboid"), num_envs=8, randomisation=found), "cpu")
+    env = ReorientEnv(
+        ReorientCfg(objects=(str(path), "cuboid"), num_envs=8, randomisation=found), "cpu"
+    )
     env.randomiser.write_model()
     model, scene = env.sim.model, env.scene
     contact = read_object(path).contact
@@ -89,10 +102,26 @@ def test_the_task_has_the_identified_contact_and_varies_it_within_its_interval(
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
-        ("drop_0.csv", lambda rows: [[*r[:3], str(1000 * float(r[3])), *r[4:]] for r in rows], "in metres"),
-        ("drop_0.csv", lambda rows: [[*r[:7], "3"] for r in rows], "column 'qx': quaternions have length 1"),
-        ("push_0.csv", lambda rows: [r[:8] for r in rows], "no one column 'force_x', which a push needs"),
-        ("slide_0.csv", lambda rows: [*rows[:9], [*rows[9][:4], "", *rows[9][5:]], *rows[10:]], "row 11"),
+        (
+            "drop_0.csv",
+            lambda rows: [[*r[:3], str(1000 * float(r[3])), *r[4:]] for r in rows],
+            "in metres",
+        ),
+        (
+            "drop_0.csv",
+            lambda rows: [[*r[:7], "3"] for r in rows],
+            "column 'qx': quaternions have length 1",
+        ),
+        (
+            "push_0.csv",
+            lambda rows: [r[:8] for r in rows],
+            "no one column 'force_x', which a push needs",
+        ),
+        (
+            "slide_0.csv",
+            lambda rows: [*rows[:9], [*rows[9][:4], "", *rows[9][5:]], *rows[10:]],
+            "row 11",
+        ),
     ],
 )
 def test_a_recording_that_cannot_be_used_is_refused(

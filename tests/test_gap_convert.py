@@ -26,7 +26,9 @@ def csv(folder):
 
 def bam(folder):
     keys = ("timestamp", "goal_position", "position")
-    rows = [dict(zip(keys, map(float, row), strict=True)) for row in zip(TIME, *_first(), strict=True)]
+    rows = [
+        dict(zip(keys, map(float, row), strict=True)) for row in zip(TIME, *_first(), strict=True)
+    ]
     log = {"mass": 0.4, "length": 0.1, "kp": 8, "vin": 12.0, "trajectory": "sin", "entries": rows}
     (folder / "log.json").write_text(json.dumps(log))
     return folder / "log.json", ["--rename", "pendulum=elbow"]
@@ -45,7 +47,10 @@ def lerobot(folder):
     (folder / "meta" / "info.json").write_text(json.dumps(info))
     (folder / "data" / "chunk-000").mkdir(parents=True)
     columns = {"episode_index": np.zeros(len(TIME), int), "timestamp": TIME}
-    columns |= {"action": list(np.degrees(COMMAND)), "observation.state": list(np.degrees(POSITION))}
+    columns |= {
+        "action": list(np.degrees(COMMAND)),
+        "observation.state": list(np.degrees(POSITION)),
+    }
     pq.write_table(pa.table(columns), folder / "data" / "chunk-000" / "file-000.parquet")
     return folder, ["--unit", "deg"]
 
@@ -70,7 +75,9 @@ def ros(folder, *, mcap=False):
             told = kinds[array](layout, command)
             measured = kinds[state](header, list(JOINTS), position, np.zeros(0), np.zeros(0))
             gripper = kinds[state](header, ["gripper"], np.ones(1), np.ones(1), np.zeros(0))
-            turned = kinds[state](header, list(JOINTS[::-1]), position[::-1].copy(), np.zeros(0), np.zeros(0))
+            turned = kinds[state](
+                header, list(JOINTS[::-1]), position[::-1].copy(), np.zeros(0), np.zeros(0)
+            )
             measured = turned if round(t * RATE) % 2 else measured  # names say which is which
             for kind, message, late in (
                 (array, told, 0),
@@ -90,7 +97,9 @@ def test_a_sample_of_each_format_is_read_as_it_was_made(make, tmp_path, capsys):
     (tmp_path / "in").mkdir()
     source, flags = make(tmp_path / "in")
     out = tmp_path / "rec"
-    assert main(["convert", str(source), "--out", str(out), "--counts-per-turn", "4096", *flags]) == 0
+    assert (
+        main(["convert", str(source), "--out", str(out), "--counts-per-turn", "4096", *flags]) == 0
+    )
     recording = read_recording(out)
     (motion,) = recording.trajectories
     joints = len(recording.joints)
@@ -101,7 +110,9 @@ def test_a_sample_of_each_format_is_read_as_it_was_made(make, tmp_path, capsys):
     np.testing.assert_allclose(motion.sent, TIME - 1e-3 * (make in (ros, mcap)), atol=2e-6)
     assert motion.conditions.get("p_gain", 8) == 8 and (motion.excitation == "sin") == (make is bam)
     before = (out / "recording.json").read_bytes()
-    assert main(["convert", str(source), "--out", str(out), "--counts-per-turn", "4096", *flags]) == 1
+    assert (
+        main(["convert", str(source), "--out", str(out), "--counts-per-turn", "4096", *flags]) == 1
+    )
     assert (
         out / "recording.json"
     ).read_bytes() == before and "name another folder" in capsys.readouterr().err
@@ -120,9 +131,17 @@ def test_a_sample_of_each_format_is_read_as_it_was_made(make, tmp_path, capsys):
         ),
         (csv, ["--rename", "clock=t", "elbow angle=x"], "has no 'elbow angle'"),
         (csv, ["--rename", "clock=t", "--out", "."], "a.csv, which would be lost"),
-        (csv, ["--rename", "clock=t", "command.wrist [deg]=command.elbow [deg]"], "two columns are"),
+        (
+            csv,
+            ["--rename", "clock=t", "command.wrist [deg]=command.elbow [deg]"],
+            "two columns are",
+        ),
         (csv, ["--format", "bam"], "no log of BAM"),
-        (csv, ["--rename", "clock=t", "--command-topic", "/goal"], "read as csv, which has no topics"),
+        (
+            csv,
+            ["--rename", "clock=t", "--command-topic", "/goal"],
+            "read as csv, which has no topics",
+        ),
         (lerobot, [], "give --unit deg or rad"),
         (ros, ["--state-topic", "/nosuch"], "/nosuch is none; give --state-topic"),
     ],
@@ -131,5 +150,7 @@ def test_what_a_source_does_not_say_is_asked_for(make, flags, said, tmp_path, ca
     source, _ = make(tmp_path)
     out = tmp_path / "rec"
     monkeypatch.chdir(tmp_path)
-    assert main(["convert", str(source), "--out", str(out), "--counts-per-turn", "4096", *flags]) != 0
+    assert (
+        main(["convert", str(source), "--out", str(out), "--counts-per-turn", "4096", *flags]) != 0
+    )
     assert said in capsys.readouterr().err and not out.exists()

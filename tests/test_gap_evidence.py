@@ -19,7 +19,9 @@ def judge() -> Evidence:
     return Evidence(noise=FLOOR, weights=resamples(10, np.random.default_rng(0)))
 
 
-def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(judge: Evidence) -> None:
+def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(
+    judge: Evidence,
+) -> None:
     before, name = made_up((), 0.010), ("backlash",)
     assert judge.better(before, made_up(name, 0.005))[0]
     assert not judge.better(before, made_up(name, 0.0097))[0]
@@ -46,7 +48,9 @@ def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: 
     assert judge.winner([fuller, worse]) is fuller
     end = Coordinate("backlash.width_rad", servo.BACKLASH_WIDTH, False, 1.0, 0.0, 9.0)
     stuck = made_up(("backlash",), 0.004)
-    stuck = replace(stuck, coordinates=(*stuck.coordinates[:-1], end), x=np.array([0.0, 0.0, 0.0, 9.0]))
+    stuck = replace(
+        stuck, coordinates=(*stuck.coordinates[:-1], end), x=np.array([0.0, 0.0, 0.0, 9.0])
+    )
     inside = made_up(("dead_zone",), 0.005)
     assert stuck.at_bound == ("backlash.width_rad",) and judge.winner([stuck, inside]) is inside
 

@@ -17,7 +17,13 @@ from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain
 from vd.kernels.servo.effects import EFFECTS
 
-SMALL = ("command_delay", "coulomb_friction", "torque_saturation", "thermal_drift", "command_filter")
+SMALL = (
+    "command_delay",
+    "coulomb_friction",
+    "torque_saturation",
+    "thermal_drift",
+    "command_filter",
+)
 STRIBECK = {servo.STRIBECK_STATIC: 0.13, servo.STRIBECK_SLIDING: 0.07, servo.STRIBECK_SPEED: 0.4}
 JITTER, BIAS = {"sigma_s": 0.008, "p_drop": 0.05}, {"bias_rad": 0.005}
 
@@ -86,7 +92,13 @@ ALIKE = {
     ),
     "a direction beside Stribeck friction": (
         {**STRIBECK, servo.FRICTION_PLUS: 0.05},
-        ("stribeck_friction", "asymmetric_friction", "coulomb_friction", "encoder_bias", "command_delay"),
+        (
+            "stribeck_friction",
+            "asymmetric_friction",
+            "coulomb_friction",
+            "encoder_bias",
+            "command_delay",
+        ),
         {"stribeck_friction", "encoder_bias"},
         ("encoder_bias", "asymmetric_friction"),
     ),
@@ -95,7 +107,10 @@ ALIKE = {
 
 @pytest.mark.parametrize("cause", ALIKE)
 def test_a_name_says_for_what_it_stands(cause: str, tmp_path: Path) -> None:
-    """Causes that leave the same positions whatever the motion: one is named, and nothing is left open."""
+    """Causes that leave the same positions whatever the motion.
+
+    One is named, and nothing is left open.
+    """
     columns, effects, names, stands = ALIKE[cause]
     recording = recorded(columns, model="pendulum" if "pendulum" in cause else "servo")
     report = analysed(recording, tmp_path, effects=effects)
@@ -141,7 +156,9 @@ def test_the_evidence_has_every_effect_also_what_was_not_fitted(tmp_path: Path) 
     report = analysed(recorded({servo.COMMAND_DELAY: 0.03}), tmp_path, effects=tuple(EFFECTS))
     out = [row for row in report.evidence if row.reason.startswith("screened out: promised")]
     first = {row.name for row in report.evidence if row.round == 1}
-    assert out and all(np.isnan(row.held_out_rmse_rad) and row.decision == "rejected" for row in out)
+    assert out and all(
+        np.isnan(row.held_out_rmse_rad) and row.decision == "rejected" for row in out
+    )
     assert {"load_friction", "encoder_bias", "command_delay"} <= first
 
 

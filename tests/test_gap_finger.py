@@ -21,7 +21,11 @@ def blank() -> Recording:
     """Steps and sines of each joint of a finger, one after the other."""
     time = np.arange(0.0, 2.0, 0.01)
     step = np.where(time > 0.3, 0.7, 0.0) - np.where(time > 1.1, 1.2, 0.0)
-    shapes = {"step": step, "slow": 0.7 * np.sin(np.pi * time), "fast": 0.6 * np.sin(3.0 * np.pi * time)}
+    shapes = {
+        "step": step,
+        "slow": 0.7 * np.sin(np.pi * time),
+        "fast": 0.6 * np.sin(3.0 * np.pi * time),
+    }
     parts = []
     for column, joint in enumerate(JOINTS):
         for name, shape in shapes.items():
@@ -63,4 +67,6 @@ def test_links_of_other_mass_are_no_friction_and_friction_beside_them_is_named(
     assert ("coulomb_friction" in named) == bool(friction)
     if friction:
         assert named["coulomb_friction"].joints == JOINTS
-        assert named["coulomb_friction"].parameters["tau_c_nm"].value == pytest.approx(friction, rel=0.1)
+        assert named["coulomb_friction"].parameters["tau_c_nm"].value == pytest.approx(
+            friction, rel=0.1
+        )

@@ -1,4 +1,7 @@
-"""Fit of a joint's servo model: floors, folds, intervals, and what the optimiser finds in simulated data."""
+"""Fit of a joint's servo model.
+
+Floors, folds, intervals, and what the optimiser finds in simulated data.
+"""
 
 from dataclasses import replace
 
@@ -101,7 +104,9 @@ def test_conditions_are_held_out_before_motions() -> None:
     trajectories, folds = design(recording, chain, 0)
     gains = [recording.trajectories[t].conditions["p_gain"] for t in trajectories]
     assert len(set(folds)) == 3
-    assert all(len({g for g, f in zip(gains, folds, strict=True) if f == fold}) == 1 for fold in set(folds))
+    assert all(
+        len({g for g, f in zip(gains, folds, strict=True) if f == fold}) == 1 for fold in set(folds)
+    )
     recording = blank()
     (chain,) = chains(recording)
     assert len(set(design(recording, chain, 0)[1])) == 5
@@ -121,5 +126,7 @@ def test_findings_say_where_friction_shows() -> None:
     found = findings(recording, predicted, {"j": noise_floor(recording, 0)})
     assert found and all(f.joint == "j" and f.where.startswith("j: ") for f in found)
     assert all(f.signature["rms_rad"] > f.signature["noise_floor_rad"] for f in found)
-    same = findings(recording, np.concatenate([t.position for t in recording.trajectories]), {"j": 1e-3})
+    same = findings(
+        recording, np.concatenate([t.position for t in recording.trajectories]), {"j": 1e-3}
+    )
     assert same == []

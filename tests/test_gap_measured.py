@@ -36,7 +36,9 @@ def only(recording: Recording, *joints: str) -> Recording:
     parts = []
     for t in recording.trajectories:
         if moved := tuple(joint for joint in joints if joint in t.joints):
-            arrays = {name: getattr(t, name)[:, columns] for name in ("command", "position", "enabled")}
+            arrays = {
+                name: getattr(t, name)[:, columns] for name in ("command", "position", "enabled")
+            }
             parts.append(replace(t, joints=moved, current=None, **arrays))
     return replace(recording, joints=joints, trajectories=tuple(parts))
 
@@ -47,7 +49,10 @@ def names(report: Report, joint: str) -> set[str]:
 
 @pytest.fixture(scope="module")
 def pendulum(shared_dir, tmp_path_factory) -> Report:
-    """Three of its four motions, at all gains: the fourth takes ten times as long and shows nothing else."""
+    """Three of its four motions, at all gains.
+
+    The fourth takes ten times as long and shows nothing else.
+    """
     recording = measured(shared_dir, "xl330_pendulum")
     quick = tuple(t for t in recording.trajectories if t.excitation != "up_and_down")
     out = tmp_path_factory.mktemp("xl330")
@@ -57,7 +62,9 @@ def pendulum(shared_dir, tmp_path_factory) -> Report:
 def test_losses_of_the_pendulum_are_load_friction_and_a_set(pendulum):
     joint = pendulum.joints[0].joint
     assert "load_friction" in names(pendulum, joint)
-    assert not {"torque_saturation", "supply_sag", "command_delay", "backlash"} & names(pendulum, joint)
+    assert not {"torque_saturation", "supply_sag", "command_delay", "backlash"} & names(
+        pendulum, joint
+    )
     assert any("torque_saturation" in members for members in pendulum.ambiguous)
     # What hangs on the arm is known, not fitted, and belongs to the model all the same.
     assert pendulum.identified.parameters[joint]["tau_g_nm"] == pytest.approx(0.49 * 9.81 * 0.1)
@@ -70,7 +77,10 @@ def test_telemetry_speaks_against_sag_latency_and_backlash(pendulum):
 
 
 def test_the_pendulum_is_predicted_at_gains_left_out(pendulum):
-    gains = [[row for row in pendulum.trajectories if f"_p{gain}." in row.file] for gain in (100, 400, 800)]
+    gains = [
+        [row for row in pendulum.trajectories if f"_p{gain}." in row.file]
+        for gain in (100, 400, 800)
+    ]
     # Coulomb and viscous friction alone leave 63.9 mrad, a load-dependent Stribeck model 51.7.
     assert pendulum.held_out.identified_mae_rad < MAE_RAD
     for rows in gains:  # their motions are about equally long
@@ -85,7 +95,9 @@ def test_the_pendulum_is_predicted_at_gains_left_out(pendulum):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("gains", "left"), [((100, 400, 800), 0.038), ((100,), 0.02), ((400,), 0.034)])
+@pytest.mark.parametrize(
+    ("gains", "left"), [((100, 400, 800), 0.038), ((100,), 0.02), ((400,), 0.034)]
+)
 def test_all_candidates_leave_no_more_of_the_pendulum(shared_dir, tmp_path, gains, left):
     """Fits that end in the valley of a smaller model leave 42, 41 and 42 mrad."""
     recording = measured(shared_dir, "xl330_pendulum")
@@ -106,7 +118,9 @@ def test_long_recordings_are_analysed_in_pieces_from_rest(arm):
         column = int(chain.columns[0])
         assert len(trajectories) >= 10 and len(set(folds)) == 6
         chosen = [arm.trajectories[i] for i in trajectories]
-        length = sum(t.time[end - 1] - t.time[first] for t, (first, end) in zip(chosen, parts, strict=True))
+        length = sum(
+            t.time[end - 1] - t.time[first] for t, (first, end) in zip(chosen, parts, strict=True)
+        )
         assert 0.9 * MAX_MOTION_S < length <= MAX_MOTION_S
         for t, (first, _) in zip(chosen, parts, strict=True):
             assert first == 0 or held(t, column, arm.encoder_resolution_rad)[first]

@@ -22,7 +22,12 @@ from vd.kernels.servo import actuators as servo
 HAND = load_hand("dclaw3")
 EFFECTS: dict[str, dict[str, float]] = {
     "plain": {},
-    "late": {"COMMAND_DELAY": 0.013, "READ_DELAY": 0.021, "ENCODER_BIAS": 0.02, "JITTER_SIGMA": 0.01},
+    "late": {
+        "COMMAND_DELAY": 0.013,
+        "READ_DELAY": 0.021,
+        "ENCODER_BIAS": 0.02,
+        "JITTER_SIGMA": 0.01,
+    },
     "shaped": {"FILTER_TAU": 0.03, "ACCELERATION_LIMIT": 40.0, "BACKLASH_WIDTH": 0.03},
     "rubbing": {"COULOMB_TORQUE": 0.1, "LOAD_FRICTION": 0.15},
     "weak": {"TORQUE_LIMIT": 0.5, "THERMAL_RATE": 0.1, "SUPPLY_SAG": 0.3},
@@ -37,7 +42,9 @@ EFFECTS: dict[str, dict[str, float]] = {
 
 
 @cache
-def motions(kind: str, joints: tuple[str, ...], seconds: float, hand: HandModel = HAND) -> Recording:
+def motions(
+    kind: str, joints: tuple[str, ...], seconds: float, hand: HandModel = HAND
+) -> Recording:
     """The start of one of the paper's excitations on some joints, with the commands as positions."""
     reach = JointRange(hand.joint_names, hand.lower, hand.upper)
     trajectories = []
@@ -96,7 +103,9 @@ def test_commands_act_from_when_they_were_sent():
     (motion,) = recording.trajectories
     sent = replace(recording, trajectories=(replace(motion, command_time=motion.time + 0.007),))
     got = simulate_hand(sent, HAND, rows())
-    np.testing.assert_allclose(got, simulate_hand(recording, HAND, rows(COMMAND_DELAY=0.007)), atol=1e-5)
+    np.testing.assert_allclose(
+        got, simulate_hand(recording, HAND, rows(COMMAND_DELAY=0.007)), atol=1e-5
+    )
     assert np.abs(got - simulate_hand(recording, HAND, rows())).max() > 1e-3
 
 

@@ -108,7 +108,11 @@ def test_commands_may_be_sent_at_other_times_than_the_stamps(tmp_path):
         ({"trajectories": [{"file": "b.csv", "joints": ["f0_j1"]}]}, ("b.csv", "no such file")),
         ({"trajectories": [{"file": "../a.csv", "joints": ["f0_j1"]}]}, ("folder",)),
         (
-            {"trajectories": [{"file": "a.csv", "joints": ["f0_j1"], "conditions": {"payload_kg": -0.2}}]},
+            {
+                "trajectories": [
+                    {"file": "a.csv", "joints": ["f0_j1"], "conditions": {"payload_kg": -0.2}}
+                ]
+            },
             ("trajectories[0]", "'payload_kg'", "-0.2", "not negative"),
         ),
         (
@@ -129,13 +133,22 @@ def test_a_header_that_cannot_be_used_is_refused(folder, changes, words):
     [
         (lambda t: [row[:-1] for row in t], ("row 1", "no column 'position.f0_j2'")),
         (lambda t: t[0].__setitem__(1, "command.f0_j9"), ("row 1", "unknown joint 'f0_j9'")),
-        (lambda t: [t[0], ["s", *["rad"] * (len(t[0]) - 1)], *t[1:]], ("row 2", "'t'", "s is not a finite")),
-        (set_cells("t", lambda t: f"{1e3 * t:.3f}"), ("'t'", "10 s without a sample", "milliseconds")),
+        (
+            lambda t: [t[0], ["s", *["rad"] * (len(t[0]) - 1)], *t[1:]],
+            ("row 2", "'t'", "s is not a finite"),
+        ),
+        (
+            set_cells("t", lambda t: f"{1e3 * t:.3f}"),
+            ("'t'", "10 s without a sample", "milliseconds"),
+        ),
         (lambda t: t[:4], ("3 samples", "at least")),
         (lambda t: [*t[:50], t[48], *t[50:]], ("row 51", "'t'", "runs backward")),
         (set_cells("position.f0_j1", "nan", [7]), ("row 8", "'position.f0_j1'", "nan")),
         (lambda t: t[30].append("0"), ("row 31", "cells")),
-        (set_cells("position.f0_j2", lambda q: f"{np.degrees(q):.6f}"), ("position.f0_j2", "degrees")),
+        (
+            set_cells("position.f0_j2", lambda q: f"{np.degrees(q):.6f}"),
+            ("position.f0_j2", "degrees"),
+        ),
         (set_cells("position.f0_j2", lambda q: f"{-q:.6f}"), ("position.f0_j2", "sign")),
         (set_cells("position.f0_j1", "0.1"), ("position.f0_j1", "dead encoder")),
     ],
@@ -165,7 +178,13 @@ def test_an_encoder_that_only_flickers_is_dead(tmp_path):
     recording = example()
     (trajectory,) = recording.trajectories
     trajectory.position[:, 1] = COUNT * np.random.default_rng(0).integers(-1, 2, SAMPLES)
-    refused(write_recording(recording, tmp_path / "r"), "a.csv", "position.f0_j2", "flickers", "dead encoder")
+    refused(
+        write_recording(recording, tmp_path / "r"),
+        "a.csv",
+        "position.f0_j2",
+        "flickers",
+        "dead encoder",
+    )
     moves = replace(trajectory, file="b.csv", position=0.9 * trajectory.command)
     whole = replace(recording, trajectories=(trajectory, moves))
     read_recording(write_recording(whole, tmp_path / "sticks"))  # it may stick in one motion
@@ -189,11 +208,19 @@ def test_small_motions_in_degrees_show_in_the_encoder_counts(tmp_path):
     (trajectory,) = small.trajectories
     for values in (trajectory.command, trajectory.position):
         values[:] = np.degrees(np.round(values / 3.0 / COUNT) * COUNT)
-    refused(write_recording(small, tmp_path / "r"), "degrees", "encoder_resolution_rad", "position.f0_j1")
+    refused(
+        write_recording(small, tmp_path / "r"),
+        "degrees",
+        "encoder_resolution_rad",
+        "position.f0_j1",
+    )
 
 
 def test_telemetry_out_of_range_is_refused(tmp_path):
-    for channel, value, remedy in (("pwm", 400.0, "full scale"), ("velocity", 400.0, "write rad/s")):
+    for channel, value, remedy in (
+        ("pwm", 400.0, "full scale"),
+        ("velocity", 400.0, "write rad/s"),
+    ):
         off = example(**{channel: np.full((SAMPLES, 2), value)})
         refused(write_recording(off, tmp_path / channel), f"{channel}.f0_j1", "row 2", remedy)
 
@@ -228,20 +255,30 @@ SPEED = np.gradient(SOUND.position, AT_100_HZ, axis=0)
     ("change", "words"),
     [
         ({"command": SOUND.position, "position": SOUND.command}, ("swapped", "before its command")),
-        ({"position": np.roll(SOUND.command, -20, axis=0)}, ("200 ms before its command", "two clocks")),
+        (
+            {"position": np.roll(SOUND.command, -20, axis=0)},
+            ("200 ms before its command", "two clocks"),
+        ),
         ({"position": SOUND.command}, ("position.joint", "copy of its command")),
         ({"command_time": 1e3 * AT_100_HZ}, ("t_command", "another unit or clock")),
         ({"command_time": AT_100_HZ + 3.0}, ("t_command", "or drop it")),
-        ({"time": AT_100_HZ + 5.0 * (AT_100_HZ > 4.0)}, ("row 403", "'t'", "5.01 s without", "cut the file")),
+        (
+            {"time": AT_100_HZ + 5.0 * (AT_100_HZ > 4.0)},
+            ("row 403", "'t'", "5.01 s without", "cut the file"),
+        ),
     ],
 )
-def test_a_recording_of_other_clocks_units_or_columns_is_refused_by_its_cause(tmp_path, change, words):
+def test_a_recording_of_other_clocks_units_or_columns_is_refused_by_its_cause(
+    tmp_path, change, words
+):
     change = {name: np.array(values) for name, values in change.items()}
     refused(write_recording(servo(**change), tmp_path / "r"), *words)
 
 
 def test_a_servo_that_lags_and_tells_its_speed_is_read(tmp_path):
-    read_recording(write_recording(servo(velocity=SPEED, command_time=AT_100_HZ - 0.004), tmp_path / "r"))
+    read_recording(
+        write_recording(servo(velocity=SPEED, command_time=AT_100_HZ - 0.004), tmp_path / "r")
+    )
 
 
 def wrapped(angle):
@@ -252,7 +289,9 @@ def test_angles_wrapped_at_pi_are_refused(tmp_path):
     true = servo(amplitude=0.8, middle=np.pi)
     (t,) = read_recording(write_recording(true, tmp_path / "sound")).trajectories
     jumps = replace(true, trajectories=(replace(t, position=wrapped(t.position)),))
-    refused(write_recording(jumps, tmp_path / "r"), "position.joint", "jumps by a turn", "numpy.unwrap")
+    refused(
+        write_recording(jumps, tmp_path / "r"), "position.joint", "jumps by a turn", "numpy.unwrap"
+    )
 
 
 def test_large_effects_of_real_servos_are_no_faults_of_the_recording(tmp_path):
@@ -299,7 +338,9 @@ def machine():
 
 def test_joints_that_no_motion_or_few_move_are_named(machine):
     assert cautions(machine) == ()
-    first = replace(machine, trajectories=tuple(t for t in machine.trajectories if t.joints == ("a",)))
+    first = replace(
+        machine, trajectories=tuple(t for t in machine.trajectories if t.joints == ("a",))
+    )
     (idle,) = cautions(first)
     assert "No motion moves b" in idle
     few = replace(first, trajectories=first.trajectories[:2])

@@ -68,7 +68,11 @@ def test_json_has_the_keys_of_the_contract_and_comes_back_as_it_was(report, tmp_
     assert {"joint", "where", "signature"} == set(values["findings"][0])
     effect = values["effects"][0]
     assert {"name", "joints", "confidence", "parameters", "alternatives"} <= set(effect)
-    assert effect["parameters"]["tau_c_nm"] == {"value": FRICTION, "ci95": [0.14, 0.16], "unit": "N m"}
+    assert effect["parameters"]["tau_c_nm"] == {
+        "value": FRICTION,
+        "ci95": [0.14, 0.16],
+        "unit": "N m",
+    }
     assert {"name", "held_out_rmse_rad", "difference_ci95"} == set(effect["alternatives"][0])
     assert {"trajectories", "baseline_rmse_rad", "identified_rmse_rad", "reduction", "ci95"} <= set(
         values["held_out"]
@@ -76,7 +80,9 @@ def test_json_has_the_keys_of_the_contract_and_comes_back_as_it_was(report, tmp_
 
 
 def test_numbers_that_are_not_known_come_back_as_nan(report, tmp_path):
-    report = dataclasses.replace(report, held_out=dataclasses.replace(report.held_out, ci95=(math.nan,) * 2))
+    report = dataclasses.replace(
+        report, held_out=dataclasses.replace(report.held_out, ci95=(math.nan,) * 2)
+    )
     report.write(tmp_path / "report.json")
     read = Report.read(tmp_path / "report.json")
     assert all(math.isnan(x) for x in read.held_out.ci95)
@@ -104,7 +110,9 @@ def test_curves_come_back(curves, tmp_path):
 def test_parameters_reach_their_columns(report):
     columns = parameter_columns(report, JOINT)
     assert columns[actuators.COULOMB_TORQUE] == FRICTION and columns[actuators.KP] == 3.0
-    assert effect_values(report.effects, JOINT) == {"coulomb_friction": {"tau_c_nm": (FRICTION, 0.14, 0.16)}}
+    assert effect_values(report.effects, JOINT) == {
+        "coulomb_friction": {"tau_c_nm": (FRICTION, 0.14, 0.16)}
+    }
     assert effect_values(report.effects, "another") == {}
 
 

@@ -15,13 +15,17 @@ from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators as servo
 
 
-def trajectory(name, command, *, conditions=None, time=None, position=None, joints=None, enabled=None):
+def trajectory(
+    name, command, *, conditions=None, time=None, position=None, joints=None, enabled=None
+):
     """A trajectory of command [T, J]; the position only matters at the start."""
     command = np.asarray(command, float)
     time = np.arange(len(command)) * 0.02 if time is None else time
     position = np.zeros_like(command) if position is None else position
     enabled = np.ones(command.shape, bool) if enabled is None else enabled
-    return Trajectory(f"{name}.csv", name, joints, conditions or {}, time, command, position, enabled)
+    return Trajectory(
+        f"{name}.csv", name, joints, conditions or {}, time, command, position, enabled
+    )
 
 
 def recording(model, joints, *trajectories):
@@ -69,7 +73,9 @@ def test_each_trajectory_has_its_own_load(device):
 
 
 def test_trajectories_come_in_the_order_asked_for():
-    data = recording("servo", ("j", "k"), *(trajectory(f"t{i}", wave(1.0 + i, 2, phase=i)) for i in range(3)))
+    data = recording(
+        "servo", ("j", "k"), *(trajectory(f"t{i}", wave(1.0 + i, 2, phase=i)) for i in range(3))
+    )
     chain = chains(data)[1]
     rollouts = Rollouts(chain, data)
     assert rollouts.measured.shape == (300, 1)
@@ -81,15 +87,22 @@ def test_trajectories_come_in_the_order_asked_for():
     keep = np.array([[True, False], [True, True]])
     some = rollouts.predict(rows, [2, 0], joint=0, keep=keep)
     simulated = np.repeat(keep, [part.shape[1] for part in parts], axis=1)
-    np.testing.assert_array_equal(some, np.where(simulated, np.concatenate(parts, axis=1)[..., 0], 0.0))
+    np.testing.assert_array_equal(
+        some, np.where(simulated, np.concatenate(parts, axis=1)[..., 0], 0.0)
+    )
     assert rollouts.predict(rows[:0]).shape == (0, 300, 1)
     again = pickle.loads(pickle.dumps(rollouts))
     np.testing.assert_array_equal(again.predict(rows), everything)
 
 
-@pytest.mark.parametrize(("sent_s", "delay_s", "same_as"), [(0.007, 0.0, 0.007), (-0.003, 0.003, 0.0)])
+@pytest.mark.parametrize(
+    ("sent_s", "delay_s", "same_as"), [(0.007, 0.0, 0.007), (-0.003, 0.003, 0.0)]
+)
 def test_commands_act_from_when_they_were_sent(hand, device, sent_s, delay_s, same_as):
-    """Sent after the rows' stamps they act as delayed ones; sent before them and late, as at the stamps."""
+    """Sent after the rows' stamps they act as delayed ones.
+
+    Sent before them and late, as at the stamps.
+    """
     plain = recording("dclaw3", hand.joint_names[:3], trajectory("a", 0.2 * wave(joints=3)))
     (motion,) = plain.trajectories
     sent = replace(plain, trajectories=(replace(motion, command_time=motion.time + sent_s),))
@@ -105,7 +118,10 @@ def test_commands_act_from_when_they_were_sent(hand, device, sent_s, delay_s, sa
 
 
 def test_play_begins_where_the_joint_rests():
-    """Between the ends of its play a joint stays where it is; from beyond them its drive takes it to one."""
+    """Between the ends of its play a joint stays where it is.
+
+    From beyond them its drive takes it to one.
+    """
     start = np.array([0.18, 0.21, 0.3])
     motions = [
         trajectory(str(i), np.full((200, 1), 0.2), position=np.full((200, 1), at))
@@ -127,11 +143,16 @@ def test_play_begins_where_the_joint_rests():
 
 
 def test_a_finger_droops_as_its_weight_asks(hand):
-    """In rest the springs carry the weight: the gradient of the potential energy by the hand's kinematics."""
+    """In rest the springs carry the weight.
+
+    The gradient of the potential energy by the hand's kinematics.
+    """
     names = ("f1_j3", "f1_j1", "f1_j2")  # columns in another order than the finger's
     target = np.array([-0.7, 0.3, 0.5])
     data = recording(
-        "dclaw3", names, trajectory("a", np.tile(target, (200, 1)), position=np.tile(target, (200, 1)))
+        "dclaw3",
+        names,
+        trajectory("a", np.tile(target, (200, 1)), position=np.tile(target, (200, 1))),
     )
     (chain,) = chains(data, hand)
     assert chain.joints == ("f1_j1", "f1_j2", "f1_j3") and list(chain.columns) == [1, 2, 0]

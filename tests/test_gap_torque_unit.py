@@ -16,7 +16,9 @@ def test_a_known_stiffness_makes_torques_absolute_and_nothing_else():
     recording = recorded({servo.COULOMB_TORQUE: FRICTION})
     fits = []
     for told in (None, 2.0 * TRUE[servo.KP]):
-        problem = problem_of(replace(recording, servo={} if told is None else {"kp_nm_rad": {"j": told}}))
+        problem = problem_of(
+            replace(recording, servo={} if told is None else {"kp_nm_rad": {"j": told}})
+        )
         start = problem.rollouts.chain.start_row
         scales = problem.scales(start[0], 0.02)
         starts = [{"coulomb_friction.tau_c_nm": 0.1 * scales.torque}]

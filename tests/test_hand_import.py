@@ -1,4 +1,7 @@
-"""Hands from URDF and MJCF: what the USD says against what MuJoCo reads in the same file, and refusals."""
+"""Hands from URDF and MJCF.
+
+What the USD says against what MuJoCo reads in the same file, and refusals.
+"""
 
 import itertools
 import json
@@ -40,7 +43,9 @@ def link(name: str, length: float, shape: str = "", *, mass: float = 0.03) -> st
     )
 
 
-def joint(name: str, parent: str, child: str, origin: str, axis: str = "0 1 0", more: str = "") -> str:
+def joint(
+    name: str, parent: str, child: str, origin: str, axis: str = "0 1 0", more: str = ""
+) -> str:
     limit = '<limit lower="-0.2" upper="1.4" effort="0.7" velocity="6"/>'
     return (
         f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
@@ -73,7 +78,9 @@ PARTS = [
     link("b_4", 0.03),
     joint("b4", "b_3", "b_4", 'xyz="0 0 0.03"', more=MIMIC),
 ]
-"""A hand of 2 and 4 joints, of which the last follows the third, with a fixed frame and a mesh to collide."""
+"""A hand of 2 and 4 joints, of which the last follows the third, with a fixed frame and a mesh to
+collide.
+"""
 
 
 def write_urdf(folder: Path, parts: list[str] | None = None) -> Path:
@@ -84,7 +91,10 @@ def write_urdf(folder: Path, parts: list[str] | None = None) -> Path:
 
 
 def write_mjcf(folder: Path, model: mujoco.MjSpec) -> Path:
-    """The same hand as an MJCF, with what an MJCF has beside: motors, a site, armature, an excluded pair."""
+    """The same hand as an MJCF, with what an MJCF has beside.
+
+    Motors, a site, armature, an excluded pair.
+    """
     for body in model.bodies:
         for one in body.joints:
             one.armature, one.damping = 0.002, [0.01, 0.0, 0.0]
@@ -137,20 +147,29 @@ def assert_like_mujoco(hand: HandModel, sources: list[str], model: mujoco.MjMode
         turn = Rotation.from_quat(base.xquat[[1, 2, 3, 0]])
         for pose, body, joint_id in zip(links[1:], bodies, number, strict=True):
             np.testing.assert_allclose(turn.apply(pose[:3]) + base.xpos, body.xpos, atol=1e-6)
-            off = (turn * Rotation.from_quat(pose[3:])).inv() * Rotation.from_quat(body.xquat[[1, 2, 3, 0]])
+            off = (turn * Rotation.from_quat(pose[3:])).inv() * Rotation.from_quat(
+                body.xquat[[1, 2, 3, 0]]
+            )
             assert off.magnitude() < 1e-5
             below = model.body_subtreemass[model.jnt_bodyid[joint_id]]
             finger = next(
-                f for f in hand.fingers if sources.index(model.joint(joint_id).name) in range(f.start, f.stop)
+                f
+                for f in hand.fingers
+                if sources.index(model.joint(joint_id).name) in range(f.start, f.stop)
             )
             first = sources.index(model.joint(joint_id).name)
-            assert hand.link_mass[first + 1 : finger.stop + 1].sum() == pytest.approx(below, rel=1e-5)
+            assert hand.link_mass[first + 1 : finger.stop + 1].sum() == pytest.approx(
+                below, rel=1e-5
+            )
         centre = (
-            hand.link_mass[:, None] * (links[:, :3] + Rotation.from_quat(links[:, 3:]).apply(hand.link_com))
+            hand.link_mass[:, None]
+            * (links[:, :3] + Rotation.from_quat(links[:, 3:]).apply(hand.link_com))
         ).sum(0)
         centre = turn.apply(centre / hand.link_mass.sum()) + base.xpos
         np.testing.assert_allclose(centre, data.subtree_com[1], atol=1e-5)
-    np.testing.assert_allclose(np.stack([hand.lower, hand.upper], axis=1), model.jnt_range[number], atol=1e-6)
+    np.testing.assert_allclose(
+        np.stack([hand.lower, hand.upper], axis=1), model.jnt_range[number], atol=1e-6
+    )
 
 
 def test_the_usd_is_the_hand_that_mujoco_reads(toy):
@@ -168,7 +187,9 @@ def test_the_usd_is_the_hand_that_mujoco_reads(toy):
     kinds = [shape.kind for shape in hand.shapes]
     assert sorted(kinds) == ["box"] * 5 + ["cylinder", "hull", "sphere"]
     (hull,) = (shape for shape in hand.shapes if shape.kind == "hull")
-    assert trimesh.convex.convex_hull(hull.vertices).volume == pytest.approx(0.02 * 0.016 * 0.04, rel=1e-4)
+    assert trimesh.convex.convex_hull(hull.vertices).volume == pytest.approx(
+        0.02 * 0.016 * 0.04, rel=1e-4
+    )
     tips = [shape.link for shape in hand.shapes if shape.fingertip]
     assert tips == list(hand.tip_link)
     assert hand.palm_up and hand.workspace.drop_m[2] > hand.workspace.goal_m[2] > 0.05
@@ -205,7 +226,9 @@ def test_newton_reads_the_same(toy):
     off = (turn * Rotation.from_quat(local[:, 3:])).inv() * Rotation.from_quat(poses[:, 3:])
     assert off.magnitude().max() < 1e-5
     np.testing.assert_allclose(builder.body_mass, hand.link_mass, rtol=1e-6)
-    colliding = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES]
+    colliding = [
+        i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES
+    ]
     assert sorted(builder.shape_body[i] for i in colliding) == [shape.link for shape in hand.shapes]
 
 
@@ -224,7 +247,8 @@ def test_what_an_mjcf_says_of_its_drives_is_taken(tmp_path):
 def test_a_description_overrides_what_is_guessed(tmp_path):
     said = tmp_path / "toy.yaml"
     said.write_text(
-        "name: other\nhold: {b1: 0.3}\ndrive: {kp: 1.5, armature: 0.004}\ndrives: {a1: {effort: 0.4}}\n"
+        "name: other\nhold: {b1: 0.3}\ndrive: {kp: 1.5, armature: 0.004}\ndrives: {a1: {effort: "
+        "0.4}}\n"
         "tips: {b_4: [0, 0, 0.02]}\npalm: [0, 0, 2]\nstart: {b2: 0.5}\n"
         "limits: {a2: [0, 1]}\nmass: {b_2: 0.06}\n"
         "mount: {position: [0, 0, 0.3], quaternion: [0, 1, 0, 0]}\nparts: [a_2]\nfriction: 0.6\n"
@@ -241,7 +265,9 @@ def test_a_description_overrides_what_is_guessed(tmp_path):
     np.testing.assert_allclose(hand.tip_frame[1, :3], [0.0, 0.0, 0.02], atol=1e-7)
     assert hand.palm.tolist() == [0.0, 0.0, 1.0] and not hand.palm_up
     assert hand.workspace.drop_m == (0.0, 0.0, 0.1) and hand.workspace.size_m == (0.05, 0.06)
-    assert hand.link_mass[3] == pytest.approx(0.06) and hand.shapes[0].friction == pytest.approx(0.6)
+    assert hand.link_mass[3] == pytest.approx(0.06) and hand.shapes[0].friction == pytest.approx(
+        0.6
+    )
     motor = hand.motors[2]
     assert motor and (motor.model, motor.id, motor.sign, motor.gear) == ("XL330-M288", 7, -1.0, 2.0)
     assert hand.motors[0] is None
@@ -276,19 +302,34 @@ ARM = [
         (replaced('lower="-0.2" upper="1.4" ', ""), ("a2 has the limits", "limits: {a2")),
         (TWO_ON_ONE, ("b_1 moves, and carries the fingers of b2, c1", "hold: {b1: 0}")),
         (ARM, ("an arm", "arm0: 0, arm1: 0")),
-        (replaced('effort="0.7"', 'effort="0"'), ("a1, a2, b1, b2, b3: no torque limit", "drive: {effort")),
+        (
+            replaced('effort="0.7"', 'effort="0"'),
+            ("a1, a2, b1, b2, b3: no torque limit", "drive: {effort"),
+        ),
         (replaced('joint="b3"', 'joint="weld"'), ("Follower joint", "FIXED")),
         (replaced("knob.stl", "gone.stl"), ("gone.stl", "put the file there")),
         (replaced('xyz="0 0 0.05"', 'xyz="0 0 50"'), ("m long", "convert the file to metres")),
         ([PARTS[0]], ("no joint moves",)),
         (replaced(' scale="0.001 0.001 0.001"', ""), ("a mesh of a_2 is 40 m long", "scale")),
         (replaced('radius="0.012"', 'radius="0"'), ("a sphere of b_2 is 0 m long",)),
-        (replaced('upper="1.4"', 'upper="90"'), ("a1 has the limits -0.2 and 90 rad", "in radians")),
-        (replaced('mass value="0.03"', 'mass value="-0.03"'), ("a_1 weighs -0.03 kg", "mass: {a_1")),
+        (
+            replaced('upper="1.4"', 'upper="90"'),
+            ("a1 has the limits -0.2 and 90 rad", "in radians"),
+        ),
+        (
+            replaced('mass value="0.03"', 'mass value="-0.03"'),
+            ("a_1 weighs -0.03 kg", "mass: {a_1"),
+        ),
         (replaced('xyz="0 0.6 0.8"', 'xyz="0 0 0"'), ("b3 has no axis",)),
-        (replaced('joint name="b2"', 'joint name="b1"'), ("b1 is the name of more than one joint",)),
+        (
+            replaced('joint name="b2"', 'joint name="b1"'),
+            ("b1 is the name of more than one joint",),
+        ),
         (replaced('joint="b3"', 'joint="zz"'), ("unknown joint 'zz'",)),
-        (replaced("knob.stl", "package://toys/knob.stl"), ("package://toys", "folder above toy.urdf")),
+        (
+            replaced("knob.stl", "package://toys/knob.stl"),
+            ("package://toys", "folder above toy.urdf"),
+        ),
         (replaced('rpy="0 0 0.3"', 'rpy="0 0 ${turn}"'), ("xacro toy.urdf > hand.urdf",)),
         ([re.sub("<collision>.*</collision>", "", p) for p in PARTS], ("nothing collides of a_2",)),
     ],
@@ -305,8 +346,12 @@ def test_what_cannot_be_imported_is_refused_by_name(tmp_path, parts, words):
 
 def test_a_mirrored_mesh_is_not_inside_out(tmp_path):
     path = write_urdf(tmp_path, replaced('scale="0.001', 'scale="-0.001'))
-    (mesh,) = (shape for link in read_source(path).links for shape in link.shapes if shape.kind == "mesh")
-    assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume == pytest.approx(0.02 * 0.016 * 0.04, rel=1e-4)
+    (mesh,) = (
+        shape for link in read_source(path).links for shape in link.shapes if shape.kind == "mesh"
+    )
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume == pytest.approx(
+        0.02 * 0.016 * 0.04, rel=1e-4
+    )
 
 
 def test_a_tendon_over_two_joints_is_refused_until_it_is_described(tmp_path):
@@ -350,7 +395,8 @@ def test_what_is_seldom_meant_or_left_out_is_said(tmp_path):
     assert not any("replaces" in text for text in done.warnings)
     other = write_urdf(tmp_path).rename(tmp_path / "left.urdf")
     assert any(
-        "toy was imported from toy.urdf" in text for text in import_hand(other, tmp_path / "out").warnings
+        "toy was imported from toy.urdf" in text
+        for text in import_hand(other, tmp_path / "out").warnings
     )
 
 
@@ -403,7 +449,9 @@ def test_leap_and_allegro_are_imported_with_their_descriptions(tmp_path, shared_
     assert_like_mujoco(hand, done.sources, oracle(tmp_path / "bare.urdf").compile())
     assert hand.palm_up and hand.palm.tolist() == [1.0, 0.0, 0.0]
     if name == "leap":
-        assert [motor and motor.id for motor in hand.motors] == [int(source) for source in done.sources]
+        assert [motor and motor.id for motor in hand.motors] == [
+            int(source) for source in done.sources
+        ]
         assert not done.warnings
 
 
@@ -411,13 +459,16 @@ def test_leap_and_allegro_are_imported_with_their_descriptions(tmp_path, shared_
 def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
     """Of many colliders, as LEAP has, MuJoCo's masks hold who meets whom by the groups of fingers alone."""
     parts = [
-        re.sub(r"<collision>.*?</collision>", lambda found: colliders * found[0], part) for part in PARTS
+        re.sub(r"<collision>.*?</collision>", lambda found: colliders * found[0], part)
+        for part in PARTS
     ]
     hand = import_hand(write_urdf(tmp_path, parts), tmp_path / "out").hand
     cfg = ReorientCfg(hand=str(hand.path), objects=("cube",), num_envs=4)
     env = ReorientEnv(cfg, "cpu")
     assert len(np.unique(env.scene.world_scale)) > 1, "worlds differ, and so need masks"
-    assert (env.num_actions, env.num_observations) == (5, 3 * 6 + 13 * 2 + 21), "the sixth joint has no motor"
+    assert (env.num_actions, env.num_observations) == (5, 3 * 6 + 13 * 2 + 21), (
+        "the sixth joint has no motor"
+    )
     model, geoms = env.sim.solver.mj_model, {}
     for geom in range(model.ngeom):
         name = model.body(model.geom_bodyid[geom]).name.removeprefix("_toy_")
@@ -453,10 +504,21 @@ def test_the_task_runs_with_fingers_that_differ(tmp_path, colliders):
 def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
     (tmp_path / "said.yaml").write_text("workspace: {size: [0.04, 0.05]}")
     hand = import_hand(write_urdf(tmp_path), tmp_path / "out", tmp_path / "said.yaml").hand
-    small = ["--num-envs", "8", "--ppo.minibatch-size", "32", "--max-steps", "128", "--device", "cpu"]
+    small = [
+        "--num-envs",
+        "8",
+        "--ppo.minibatch-size",
+        "32",
+        "--max-steps",
+        "128",
+        "--device",
+        "cpu",
+    ]
     flags = ["--preset", "leap-objects", "--objects", "cube", "--hand", str(hand.path), *small]
     assert train(["teacher", *flags, "--out", str(tmp_path / "run")]) == 0
-    rows = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
+    rows = [
+        json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()
+    ]
     assert len(rows) > 1 and all(row["loss/kl"] > 0.0 and row["loss/value"] > 0.0 for row in rows)
     policy = load_policy(tmp_path / "run" / "policy.pt")
     assert policy.num_actions == 5

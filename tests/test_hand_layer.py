@@ -1,4 +1,7 @@
-"""Identified servo models as layers over a hand: written, read, composed for Newton, refused when wrong."""
+"""Identified servo models as layers over a hand.
+
+Written, read, composed for Newton, refused when wrong.
+"""
 
 import re
 from pathlib import Path
@@ -17,7 +20,10 @@ from vd.kernels.servo.effects import EFFECTS
 
 HEADER = '#usda 1.0\n(\n    defaultPrim = "dclaw3"\n)\n'
 EVERYTHING = {
-    name: {p.name: (p.typical or 0.1, 0.9 * p.typical, 1.1 * p.typical + 0.2) for p in effect.parameters}
+    name: {
+        p.name: (p.typical or 0.1, 0.9 * p.typical, 1.1 * p.typical + 0.2)
+        for p in effect.parameters
+    }
     for name, effect in EFFECTS.items()
 }
 """Every effect with every parameter, and an interval around each."""
@@ -30,7 +36,12 @@ def hand() -> HandModel:
 
 def write(path: Path, hand: HandModel | str, baseline=None, effects=None) -> Path:
     write_layer(
-        path, hand, baseline=baseline or {}, effects=effects or {}, tool="a test", recording="bench/one"
+        path,
+        hand,
+        baseline=baseline or {},
+        effects=effects or {},
+        tool="a test",
+        recording="bench/one",
     )
     return path
 
@@ -86,7 +97,9 @@ def test_newton_sees_the_identified_drive_and_the_fingertip(hand, tmp_path):
         np.testing.assert_allclose(values, expected, rtol=1e-6)
         assert values[dof] == pytest.approx(wanted)
     plain = read_hand(hand.path)
-    assert got.shapes[-1].friction != plain.shapes[-1].friction, "the variant is still the one asked for"
+    assert got.shapes[-1].friction != plain.shapes[-1].friction, (
+        "the variant is still the one asked for"
+    )
 
 
 def test_the_layer_is_plain_usd_that_says_where_it_comes_from(hand, tmp_path):
@@ -97,7 +110,9 @@ def test_the_layer_is_plain_usd_that_says_where_it_comes_from(hand, tmp_path):
     stage = Usd.Stage.CreateInMemory()
     stage.GetRootLayer().subLayerPaths = [str(path), str(hand.path)]
     joint = stage.GetPrimAtPath("/dclaw3/f0_j1")
-    assert UsdPhysics.DriveAPI(joint, "angular").GetStiffnessAttr().Get() == pytest.approx(np.radians(2.0))
+    assert UsdPhysics.DriveAPI(joint, "angular").GetStiffnessAttr().Get() == pytest.approx(
+        np.radians(2.0)
+    )
     assert joint.GetAttribute("vd:command_delay:delay_s").Get() == 0.02
 
 
@@ -113,19 +128,36 @@ def test_a_layer_written_anew_is_read_anew(hand, tmp_path):
 
 def test_another_hand_is_refused(hand, tmp_path):
     path = write(tmp_path / "identified.usda", hand, {"f0_j1": {"kp": 2.0}})
-    with pytest.raises(HandError, match=r"identified\.usda: /dclaw3: .* for dclaw3, not for dclaw4"):
+    with pytest.raises(
+        HandError, match=r"identified\.usda: /dclaw3: .* for dclaw3, not for dclaw4"
+    ):
         read(path, "dclaw4")
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (overs("f0_j9", "custom double vd:backlash:width_rad = 0.1"), "/dclaw3/f0_j9: dclaw3 has no such"),
-        (overs("f0_j1", "custom double vd:backlsh:width_rad = 0.1"), "no effect is called 'backlsh'; one of"),
-        (overs("f0_j1", "custom double vd:backlash:width = 0.1"), "no attribute of backlash; one of vd:back"),
-        (overs("f0_j1", "custom double vd:backlash:width_rad = -1"), "is -1 rad; it cannot be negative"),
+        (
+            overs("f0_j9", "custom double vd:backlash:width_rad = 0.1"),
+            "/dclaw3/f0_j9: dclaw3 has no such",
+        ),
+        (
+            overs("f0_j1", "custom double vd:backlsh:width_rad = 0.1"),
+            "no effect is called 'backlsh'; one of",
+        ),
+        (
+            overs("f0_j1", "custom double vd:backlash:width = 0.1"),
+            "no attribute of backlash; one of vd:back",
+        ),
+        (
+            overs("f0_j1", "custom double vd:backlash:width_rad = -1"),
+            "is -1 rad; it cannot be negative",
+        ),
         (overs("f0_j1", "custom double vd:backlash:width_rad = nan"), "it must be a finite number"),
-        (overs("f0_j1", "custom float2 vd:backlash:width_rad:ci95 = (0, 1)"), "interval without a value"),
+        (
+            overs("f0_j1", "custom float2 vd:backlash:width_rad:ci95 = (0, 1)"),
+            "interval without a value",
+        ),
         (
             overs(
                 "f0_j1",
@@ -138,8 +170,14 @@ def test_another_hand_is_refused(hand, tmp_path):
             overs("f0_j1", "custom double vd:baseline:kp = 2"),
             "no attribute of baseline; one of drive:angular:physics:stif",
         ),
-        (overs("f0_j1", "custom double vd:torque_speed_limit:tau_stall_nm = 1"), "omega_0_rad_s'; author it"),
-        (overs("f0_j1", "float drive:angular:physics:stiffness = -1"), "stiffness' is -1.0; it must be pos"),
+        (
+            overs("f0_j1", "custom double vd:torque_speed_limit:tau_stall_nm = 1"),
+            "omega_0_rad_s'; author it",
+        ),
+        (
+            overs("f0_j1", "float drive:angular:physics:stiffness = -1"),
+            "stiffness' is -1.0; it must be pos",
+        ),
         ("not USD at all", "not a USD layer"),
         ("#usda 1.0\n", "it has no joints"),
     ],
@@ -158,7 +196,11 @@ def test_wrong_layers_name_file_prim_and_attribute(tmp_path, text, message):
         ({"f9_j1": {"kp": 1.0}}, {}, "dclaw3 has no joint 'f9_j1'; it has f0_j1"),
         ({"f0_j1": {"stiffness": 1.0}}, {}, "baseline has no parameter 'stiffness'; one of kp"),
         ({}, {"f0_j1": {"wear": {"x": 1.0}}}, "no effect is called 'wear'"),
-        ({}, {"f0_j1": {"backlash": {"width_rad": 1.0, "d": 1.0}}}, "backlash has no parameter 'd'"),
+        (
+            {},
+            {"f0_j1": {"backlash": {"width_rad": 1.0, "d": 1.0}}},
+            "backlash has no parameter 'd'",
+        ),
         (
             {},
             {"f0_j1": {"elastic_transmission": {"k_nm_rad": 1.0}}},

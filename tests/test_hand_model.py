@@ -60,7 +60,10 @@ def assert_tips(hand: HandModel, q: np.ndarray) -> None:
 
 
 def test_four_fingers_reset_as_in_released_code(four_fingers: HandModel) -> None:
-    """Radius 0.120 m and world height 0.0415 m; the dropped tilt of 0.54 degrees is worth about 1 mm."""
+    """Radius 0.120 m and world height 0.0415 m.
+
+    The dropped tilt of 0.54 degrees is worth about 1 mm.
+    """
     tips = four_fingers.tip_poses(np.tile(RESET, 4))
     np.testing.assert_allclose(np.hypot(tips[:, 0], tips[:, 1]), 0.120, atol=0.0015)
     np.testing.assert_allclose(0.25 - tips[:, 2], 0.0415, atol=0.0005)
@@ -103,9 +106,13 @@ def test_surface_samples_lie_on_the_drawn_surface_and_cover_it(hand: HandModel) 
         motor = name.endswith("motor")
         assert hand.link_names[link] == ("base" if motor else name)
         mesh = drawn(hand, "base" if motor else name, name if motor else "")
-        corners = 1e3 * np.tile(mesh.triangles, (len(points), 1, 1))  # mm: trimesh's tolerances are absolute
+        corners = 1e3 * np.tile(
+            mesh.triangles, (len(points), 1, 1)
+        )  # mm: trimesh's tolerances are absolute
         targets = 1e3 * np.repeat(points, len(mesh.faces), axis=0).astype(float)
-        distance = np.linalg.norm(trimesh.triangles.closest_point(corners, targets) - targets, axis=1)
+        distance = np.linalg.norm(
+            trimesh.triangles.closest_point(corners, targets) - targets, axis=1
+        )
         assert distance.reshape(len(points), -1).min(axis=1).max() < 1e-3
         np.testing.assert_allclose(points.min(axis=0), mesh.bounds[0], atol=0.004)
         np.testing.assert_allclose(points.max(axis=0), mesh.bounds[1], atol=0.004)
@@ -120,7 +127,9 @@ def test_camera_against_the_published_pose(four_fingers: HandModel) -> None:
     )
     flip = np.diag([-1.0, 1.0, -1.0])  # base to world: pi about +y
     turn = flip @ Rotation.from_quat(camera.quaternion).as_matrix()
-    np.testing.assert_allclose(flip @ camera.position + (0, 0, 0.25), (-0.574, 0.034, 0.285), atol=5e-4)
+    np.testing.assert_allclose(
+        flip @ camera.position + (0, 0, 0.25), (-0.574, 0.034, 0.285), atol=5e-4
+    )
     np.testing.assert_allclose(turn[:, 2], (0.902, 0.018, -0.431), atol=1e-3)  # optical axis
     np.testing.assert_allclose(turn[:, 0], (0.016, -1.000, -0.007), atol=1e-3)  # right
 
@@ -183,7 +192,10 @@ def aiming(prim: str, relationship: str, target: str) -> Callable[[Usd.Stage, st
 
 
 def longer(joints: int) -> Callable[[Usd.Stage, str], None]:
-    """The first finger with so many joints, copies of the third; the last bends as much as the one before."""
+    """The first finger with so many joints, copies of the third.
+
+    The last bends as much as the one before.
+    """
 
     def change(stage: Usd.Stage, root: str) -> None:
         layer = stage.GetRootLayer()
@@ -243,7 +255,11 @@ def mesh_collider(stage: Usd.Stage, root: str) -> None:
         ),
         (aiming("f0_j2", "physics:body1", "f1_l2"), "f0_j2", ("joins other links", "f0_l2")),
         (aiming("f0_j2", "physics:body1", "camera"), "f0_j2", ("physics:body1", "one link")),
-        (setting("f0_l2/points", "points", [Gf.Vec3f(0)] * 3), "f0_l2/points", ("points", "(3, 3)")),
+        (
+            setting("f0_l2/points", "points", [Gf.Vec3f(0)] * 3),
+            "f0_l2/points",
+            ("points", "(3, 3)"),
+        ),
         (longer(7), "dclaw4", ("finger 0 has 7 joints", "weld")),
         (following_in_turn, "f0_j3", ("follows f0_j2, which follows another",)),
         (fixed_link, "weld", ("besides those of the fingers", "weld it")),
@@ -252,9 +268,17 @@ def mesh_collider(stage: Usd.Stage, root: str) -> None:
         (setting("f0_j2", "vd:motor:id", 10), "f0_j2", ("vd:motor:id", "another joint's")),
         (setting("f0_j2", "vd:motor:sign", 0.5), "f0_j2", ("vd:motor:sign", "or -1")),
         (setting("", "vd:palm", Gf.Vec3d(0)), "dclaw4", ("vd:palm", "direction")),
-        (setting("", "vd:workspace:size", Gf.Vec2d(2, 1)), "dclaw4", ("vd:workspace:size", "smallest first")),
+        (
+            setting("", "vd:workspace:size", Gf.Vec2d(2, 1)),
+            "dclaw4",
+            ("vd:workspace:size", "smallest first"),
+        ),
         (clearing("", "vd:mount:position"), "dclaw4", ("vd:mount:position", "not authored")),
-        (lambda stage, root: UsdGeom.SetStageMetersPerUnit(stage, 0.01), "/", ("metersPerUnit", "metres")),
+        (
+            lambda stage, root: UsdGeom.SetStageMetersPerUnit(stage, 0.01),
+            "/",
+            ("metersPerUnit", "metres"),
+        ),
         (lambda stage, root: UsdGeom.SetStageUpAxis(stage, "Y"), "/", ("upAxis", "z up")),
     ],
 )
@@ -273,7 +297,9 @@ def test_broken_hand_is_refused_with_the_reason(
         assert word in message
 
 
-def test_fingers_may_differ_and_joints_follow_others(tmp_path: Path, four_fingers: HandModel) -> None:
+def test_fingers_may_differ_and_joints_follow_others(
+    tmp_path: Path, four_fingers: HandModel
+) -> None:
     hand = read_hand(edited(four_fingers.path, tmp_path, longer(5)))
     assert hand.fingers == (slice(0, 5), slice(5, 8), slice(8, 11), slice(11, 14))
     assert hand.joint_names[:6] == ("f0_j1", "f0_j2", "f0_j3", "f0_j4", "f0_j5", "f1_j1")
@@ -283,11 +309,15 @@ def test_fingers_may_differ_and_joints_follow_others(tmp_path: Path, four_finger
     assert list(hand.actuated) == [0, 1, 2, 3, *range(5, 14)]
     builder = newton.ModelBuilder()
     builder.add_usd(open_stage(hand.path), floating=False)
-    assert builder.joint_mimic_joint[5] == 4, "Newton couples them too; its first joint fixes the base"
+    assert builder.joint_mimic_joint[5] == 4, (
+        "Newton couples them too; its first joint fixes the base"
+    )
     assert builder.joint_mimic_coeffs[5] == pytest.approx((np.radians(10.0), 0.5))
 
 
-def test_a_file_of_an_earlier_version_is_mounted_as_it_was(tmp_path: Path, four_fingers: HandModel) -> None:
+def test_a_file_of_an_earlier_version_is_mounted_as_it_was(
+    tmp_path: Path, four_fingers: HandModel
+) -> None:
     def older(stage: Usd.Stage, root: str) -> None:
         for prim in stage.Traverse():
             for found in prim.GetAuthoredPropertiesInNamespace("vd"):

@@ -13,14 +13,19 @@ MOUNT = ((0.0, 0.0, 0.25), (0.0, 1.0, 0.0, 0.0))
 
 
 @pytest.fixture(
-    scope="module", params=[(n, t) for n in ("dclaw3", "dclaw4") for t in ("rigid", "soft")], ids="-".join
+    scope="module",
+    params=[(n, t) for n in ("dclaw3", "dclaw4") for t in ("rigid", "soft")],
+    ids="-".join,
 )
 def imported(request: pytest.FixtureRequest) -> tuple[HandModel, newton.ModelBuilder]:
     name, fingertip = request.param
     path = hand_usd(name)
     builder = newton.ModelBuilder()
     builder.add_usd(
-        open_stage(path, fingertip), xform=wp.transform(*MOUNT), floating=False, load_visual_shapes=False
+        open_stage(path, fingertip),
+        xform=wp.transform(*MOUNT),
+        floating=False,
+        load_visual_shapes=False,
     )
     return read_hand(path, fingertip=fingertip), builder
 
@@ -61,13 +66,19 @@ def test_shapes(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
         i = builder.shape_label.index(shape.path)
         assert builder.shape_body[i] == shape.link
         assert builder.shape_type[i] == kinds[shape.kind]
-        np.testing.assert_allclose(tuple(builder.shape_scale[i])[: len(shape.size)], shape.size, rtol=1e-6)
-        np.testing.assert_allclose(tuple(builder.shape_transform[i])[:3], shape.frame[:3], atol=1e-7)
+        np.testing.assert_allclose(
+            tuple(builder.shape_scale[i])[: len(shape.size)], shape.size, rtol=1e-6
+        )
+        np.testing.assert_allclose(
+            tuple(builder.shape_transform[i])[:3], shape.frame[:3], atol=1e-7
+        )
         assert abs(np.dot(tuple(builder.shape_transform[i])[3:], shape.frame[3:])) == pytest.approx(
             1.0, abs=1e-6
         )
         assert builder.shape_material_mu[i] == pytest.approx(shape.friction, rel=1e-6)
-    colliding = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES]
+    colliding = [
+        i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES
+    ]
     assert len(colliding) == len(hand.shapes)
 
 

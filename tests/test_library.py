@@ -1,4 +1,7 @@
-"""What programs build on: the stable names, the examples, and own terms of reward and observation."""
+"""What programs build on.
+
+The stable names, the examples, and own terms of reward and observation.
+"""
 
 import re
 import runpy
@@ -28,7 +31,9 @@ def beside_examples(monkeypatch, tmp_path):
 
 def test_the_package_loads_no_name_before_it_is_used():
     code = "import sys, vd; print({'torch', 'warp', 'numpy', 'tyro'} & set(sys.modules), dir(vd))"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     assert said.startswith("set()") and all(f"'{name}'" in said for name in vd.__all__)
     stub = Path(vd.__file__).with_suffix(".pyi").read_text()  # for editors and type checkers
     assert set(re.findall(r'"(\w+)",', stub)) == set(vd.__all__)
@@ -47,7 +52,9 @@ def test_own_terms_pay_and_show_what_they_say_and_change_nothing_else(beside_exa
     seen = ObservationCfg(shape="full", view="goal", dynamics="critic")
     cfg = ReorientCfg(hand="dclaw3", num_envs=3, observation=seen, reward=RewardCfg(scale=0.5))
     seen = replace(seen, terms={"own_terms:height": 1}, critic_terms={"own_terms:quiet": 1})
-    own = replace(cfg, observation=seen, reward=replace(cfg.reward, terms={"own_terms:quiet": -0.1}))
+    own = replace(
+        cfg, observation=seen, reward=replace(cfg.reward, terms={"own_terms:quiet": -0.1})
+    )
     plain, env = vd.ReorientEnv(cfg, "cpu"), vd.ReorientEnv(own, "cpu")
     width, rng = plain.num_observations, np.random.default_rng(0)
     for _ in range(4):
@@ -58,7 +65,9 @@ def test_own_terms_pay_and_show_what_they_say_and_change_nothing_else(beside_exa
         assert np.array_equal(env.privileged.numpy()[:, :-1], plain.privileged.numpy())
         speeds = np.square(plain.measured_qd.numpy()[:, :9]).sum(axis=1)
         np.testing.assert_allclose(env.reward_terms.numpy()[:, -1], -0.1 * speeds, rtol=1e-5)
-        np.testing.assert_allclose(env.reward.numpy(), plain.reward.numpy() - 0.05 * speeds, rtol=1e-4)
+        np.testing.assert_allclose(
+            env.reward.numpy(), plain.reward.numpy() - 0.05 * speeds, rtol=1e-4
+        )
         np.testing.assert_array_equal(env.observation.numpy()[:, width], env.object_pose()[:, 2])
         np.testing.assert_allclose(env.privileged.numpy()[:, -1], speeds, rtol=1e-5)
 
@@ -68,7 +77,9 @@ def test_a_term_that_is_none_or_gives_what_cannot_be_is_named(beside_examples, m
     monkeypatch.setattr("own_terms.height", lambda env: given[0])
 
     def observing(name: str) -> vd.ReorientEnv:
-        return vd.ReorientEnv(ReorientCfg(num_envs=2, observation=ObservationCfg(terms={name: 1})), "cpu")
+        return vd.ReorientEnv(
+            ReorientCfg(num_envs=2, observation=ObservationCfg(terms={name: 1})), "cpu"
+        )
 
     for name in ("own_terms:loud", "own:quiet"):
         with pytest.raises(ValueError, match=f"'{name}' is not found .*; name it module:function"):
@@ -102,11 +113,20 @@ def test_what_is_no_file_of_ours_is_refused_with_file_and_remedy(tmp_path):
         vd.read(path)
     path.unlink()
     path.mkdir()
-    good = {"run.json": '{"format": "vd-hand-log/1", "joints": [], "goals": []}', "steps.csv": "t\n1\n"}
-    for name, text in (("events.jsonl", "{\n"), ("steps.csv", "t,a\n1,2\n3,4,5\n"), ("run.json", "{")):
+    good = {
+        "run.json": '{"format": "vd-hand-log/1", "joints": [], "goals": []}',
+        "steps.csv": "t\n1\n",
+    }
+    for name, text in (
+        ("events.jsonl", "{\n"),
+        ("steps.csv", "t,a\n1,2\n3,4,5\n"),
+        ("run.json", "{"),
+    ):
         for file, written in {**good, name: text}.items():
             (path / file).write_text(written)
-        with pytest.raises(ValueError, match=f"{path / name} is damaged .*; copy the whole folder again"):
+        with pytest.raises(
+            ValueError, match=f"{path / name} is damaged .*; copy the whole folder again"
+        ):
             vd.read(path)
     path = tmp_path / "a.pt"
     torch.save(torch.nn.Linear(1, 1), path)
@@ -116,14 +136,18 @@ def test_what_is_no_file_of_ours_is_refused_with_file_and_remedy(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_tutorials_run_logs_its_terms_and_its_policy_knows_them(beside_examples, tmp_path, capsys):
+def test_the_tutorials_run_logs_its_terms_and_its_policy_knows_them(
+    beside_examples, tmp_path, capsys
+):
     terms = "--env.reward.terms own_terms:quiet -0.1 --env.observation.terms own_terms:height 1"
     flags = ["--smoke", "--num-envs", "4", "--max-steps", "64", *terms.split()]
     assert main(["teacher", "--out", "run", *flags]) == 0
     assert read_progress(Path("run") / PROGRESS_FILE)[-1]["reward/own_terms:quiet"] < 0.0
     policy = vd.load_policy("run", device="cpu")
     assert policy.task["reward"]["terms"] == {"own_terms:quiet": -0.1}
-    result = vd.evaluate_policies("run", episodes=1, episode_s=0.5, device="cpu", out=tmp_path / "eval")
+    result = vd.evaluate_policies(
+        "run", episodes=1, episode_s=0.5, device="cpu", out=tmp_path / "eval"
+    )
     assert result.rows[0].overall.episodes == 1
     assert main(["tracker", "run", "--objects", "cube", "--out", "tracking.pt"]) == 1
     assert "observes own_terms:height, which no camera shows" in capsys.readouterr().err

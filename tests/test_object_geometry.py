@@ -46,7 +46,9 @@ def test_simplified_hull_is_convex_small_and_keeps_its_volume(seed: int, count: 
     full = g.convex_hull(points)
     simple = g.simplify_hull(full, limit)
     assert len(simple.vertices) <= limit
-    assert g.hull_depth(simple, simple.vertices).max() < 1e-6 * np.ptp(simple.vertices, axis=0).max()
+    assert (
+        g.hull_depth(simple, simple.vertices).max() < 1e-6 * np.ptp(simple.vertices, axis=0).max()
+    )
     assert g.mesh_volume(*simple) == pytest.approx(g.mesh_volume(*full), rel=1e-9)
 
 

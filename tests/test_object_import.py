@@ -46,7 +46,10 @@ L_VOLUME = (0.12 * 0.03 + 0.03 * 0.05) * 0.03
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory: pytest.TempPathFactory):
-    """A folder with good and bad meshes, imported once: (folder, out, settings, results by name)."""
+    """A folder with good and bad meshes, imported once.
+
+    (folder, out, settings, results by name).
+    """
     root = tmp_path_factory.mktemp("import")
     folder = root / "meshes"
     (folder / "sub").mkdir(parents=True)
@@ -168,7 +171,9 @@ def test_interrupted_import_leaves_no_part_and_no_process(ending: signal.Signals
     while left := [pid for pid in processes if _runs(pid)]:
         assert time.monotonic() < deadline, left
         time.sleep(0.1)
-    assert not [p for p in (tmp_path / "out").iterdir() if p.suffix != ".usd" or p.name.startswith(".")]
+    assert not [
+        p for p in (tmp_path / "out").iterdir() if p.suffix != ".usd" or p.name.startswith(".")
+    ]
 
 
 def _children(parent: int) -> list[int]:
@@ -195,9 +200,17 @@ def _runs(pid: int) -> bool:
         ((120.0, 80.0, 50.0), (0.12, 0.08, 0.05), "taken as mm"),
         ((2.0, 1.0, 1.0), (0.095, 0.0475, 0.0475), "taken as cm, scaled"),
         ((0.16, 0.12, 0.04), (0.13, 0.0975, 0.0325), "scaled by 0.812"),  # too wide for the fingers
-        ((0.12, 0.12, 0.12), (0.095, 0.095, 0.095), "scaled by 0.792"),  # which is as far as its length goes
+        (
+            (0.12, 0.12, 0.12),
+            (0.095, 0.095, 0.095),
+            "scaled by 0.792",
+        ),  # which is as far as its length goes
         ((0.1, 0.03, 0.02), (0.125, 0.0375, 0.025), "scaled by 1.25"),  # too thin to be got hold of
-        ((0.15, 0.03, 0.02), (0.165, 0.033, 0.022), "scaled by 1.1"),  # which is as far as its length goes
+        (
+            (0.15, 0.03, 0.02),
+            (0.165, 0.033, 0.022),
+            "scaled by 1.1",
+        ),  # which is as far as its length goes
         ((0.12, 0.1, 0.02), (0.13, 0.13 / 1.2, 0.13 / 6.0), "scaled by 1.08"),  # or its width
     ],
 )
@@ -225,7 +238,9 @@ def test_repair_closes_and_turns_a_mesh():
 def dome(height: float) -> trimesh.Trimesh:
     """A sphere of radius 0.06 without what is above a height, open there."""
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.06)
-    return trimesh.Trimesh(mesh.vertices, mesh.faces[mesh.triangles_center[:, 2] < height], process=False)
+    return trimesh.Trimesh(
+        mesh.vertices, mesh.faces[mesh.triangles_center[:, 2] < height], process=False
+    )
 
 
 def test_a_small_hole_is_filled_and_a_large_opening_is_said():
@@ -246,7 +261,9 @@ def test_a_small_hole_is_filled_and_a_large_opening_is_said():
 
 
 def test_debris_does_not_set_the_scale(tmp_path: Path):
-    speck = trimesh.Trimesh([[2.0, 0, 0], [2.001, 0, 0], [2.0, 0.001, 0]], [[0, 1, 2]], process=False)
+    speck = trimesh.Trimesh(
+        [[2.0, 0, 0], [2.001, 0, 0], [2.0, 0.001, 0]], [[0, 1, 2]], process=False
+    )
     crumb = trimesh.creation.box((0.008, 0.008, 0.008)).apply_translation([0.0, 2.0, 0.0])
     for debris in (speck, crumb):
         repaired = repair_mesh(trimesh.util.concatenate([l_shape(), debris]))
@@ -288,7 +305,9 @@ def test_a_cavity_counts_in_mass_properties_and_is_said(tmp_path: Path, inward: 
     assert model.volume_error == pytest.approx(empty / (full - empty) if hollow else 0.0, abs=1e-6)
     # About x, through the centre of both boxes: of the full box and of the one that is missing.
     missing = empty if hollow else 0.0
-    about_x = (full * (0.1**2 + 0.1**2) - missing * (0.08**2 + 0.08**2)) / 12.0 * 0.1 / (full - missing)
+    about_x = (
+        (full * (0.1**2 + 0.1**2) - missing * (0.08**2 + 0.08**2)) / 12.0 * 0.1 / (full - missing)
+    )
     scale = model.longest_side / 0.12
     assert model.inertia_matrix[0, 0] == pytest.approx(about_x * scale**2, rel=1e-5)
 

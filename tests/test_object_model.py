@@ -89,11 +89,15 @@ def test_bad_files_are_named(tmp_path: Path):
         read_object(junk)
     foreign = tmp_path / "foreign.usda"
     foreign.write_text('#usda 1.0\n(defaultPrim = "a")\ndef Xform "a" {}\n')
-    with pytest.raises(ObjectError, match=r"foreign\.usda: formatVersion is None.*vd-assets import"):
+    with pytest.raises(
+        ObjectError, match=r"foreign\.usda: formatVersion is None.*vd-assets import"
+    ):
         read_object(foreign)
 
 
-def test_load_set_takes_files_folders_and_names(tmp_path: Path, cache: Path, example: procedural.ObjectModel):
+def test_load_set_takes_files_folders_and_names(
+    tmp_path: Path, cache: Path, example: procedural.ObjectModel
+):
     folder = tmp_path / "mine"
     sets.write_set(folder, [example])
     models = load_set([folder, "cube"])
@@ -120,7 +124,9 @@ def test_a_users_folder_with_the_name_of_a_built_in_set_is_left_alone(
     assert mine.read_bytes() == before and (mine.parent / "notes.txt").read_text() == "mine"
 
 
-def test_authored_objects_are_not_written_over_others(tmp_path: Path, example: procedural.ObjectModel):
+def test_authored_objects_are_not_written_over_others(
+    tmp_path: Path, example: procedural.ObjectModel
+):
     sets.write_set(tmp_path, [example])
     sets.write_set(tmp_path, [example])  # the same, made anew
     mine = write_object(tmp_path / "cube.usd", replace(example, name="cube", source="cube.stl"))
@@ -141,11 +147,20 @@ def test_a_folder_of_meshes_does_not_hide_the_set_of_its_name(
     assert [model.name for model in load_set("meshes")] == [example.name]
 
 
-def test_unknown_set_says_what_there_is(tmp_path: Path, cache: Path, example: procedural.ObjectModel):
+def test_unknown_set_says_what_there_is(
+    tmp_path: Path, cache: Path, example: procedural.ObjectModel
+):
     sets.write_set(cache / "objects" / "shelf", [example])
     with pytest.raises(ObjectError) as error:
         load_set("shelves")
-    for word in ("'shelves'", "shelf", "cube", "procedural-heldout", "vd-assets import", "vd-assets objects"):
+    for word in (
+        "'shelves'",
+        "shelf",
+        "cube",
+        "procedural-heldout",
+        "vd-assets import",
+        "vd-assets objects",
+    ):
         assert word in str(error.value)
     (tmp_path / "empty").mkdir()
     with pytest.raises(ObjectError, match=r"empty: no object file"):

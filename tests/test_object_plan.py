@@ -1,4 +1,7 @@
-"""What an import finds, what it calls objects and where it writes them; their unit, size and mass."""
+"""What an import finds, what it calls objects and where it writes them.
+
+Their unit, size and mass.
+"""
 
 from pathlib import Path
 
@@ -60,8 +63,13 @@ def test_an_object_is_called_by_what_says_something(path: str, name: str, tmp_pa
     assert object_name(tmp_path / path) == name
 
 
-def test_two_meshes_of_one_name_are_refused_whether_in_one_call_or_two(in_process: None, tmp_path: Path):
-    first, second = brick(tmp_path / "a" / "mug.stl"), brick(tmp_path / "b" / "mug.stl", (0.1, 0.05, 0.05))
+def test_two_meshes_of_one_name_are_refused_whether_in_one_call_or_two(
+    in_process: None, tmp_path: Path
+):
+    first, second = (
+        brick(tmp_path / "a" / "mug.stl"),
+        brick(tmp_path / "b" / "mug.stl", (0.1, 0.05, 0.05)),
+    )
     out = tmp_path / "out"
     with pytest.raises(m.MeshError) as both:
         import_meshes([first, second], out)
@@ -72,7 +80,9 @@ def test_two_meshes_of_one_name_are_refused_whether_in_one_call_or_two(in_proces
         import_meshes([second], out)
     assert (out / "mug.usd").read_bytes() == before
     for error in (both, later):
-        assert all(word in str(error.value) for word in (str(first), str(second), "rename", "--out"))
+        assert all(
+            word in str(error.value) for word in (str(first), str(second), "rename", "--out")
+        )
     # The same file by another way is no other object.
     (tmp_path / "link").symlink_to(tmp_path / "a")
     assert import_meshes([tmp_path / "link" / "mug.stl"], out)[0].status == "cached"
@@ -84,7 +94,9 @@ def test_what_is_no_object_of_ours_is_never_written_over(text: str, tmp_path: Pa
     mine = tmp_path / "out" / "mug.usd"
     mine.parent.mkdir()
     mine.write_text(text)
-    with pytest.raises(m.MeshError, match=r"mug\.usd is there and no object of vd-assets.*remove it.*--out"):
+    with pytest.raises(
+        m.MeshError, match=r"mug\.usd is there and no object of vd-assets.*remove it.*--out"
+    ):
         import_meshes([mesh], mine.parent)
     assert mine.read_text() == text
 
@@ -93,10 +105,14 @@ def test_a_default_set_has_the_objects_of_one_folder(
     in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("VD_ASSETS", str(tmp_path / "cache"))
-    kits = [brick(tmp_path / place / "kit" / "meshes" / f"{place}.stl") for place in ("here", "there")]
+    kits = [
+        brick(tmp_path / place / "kit" / "meshes" / f"{place}.stl") for place in ("here", "there")
+    ]
     first, second = (kit.parent for kit in kits)
     out = default_set([first])
-    assert out == default_set(kits[:1] * 2).parent / "meshes" and default_set(kits[:1]).name == "here"
+    assert (
+        out == default_set(kits[:1] * 2).parent / "meshes" and default_set(kits[:1]).name == "here"
+    )
     import_meshes([first], out)
     assert default_set([first]) == out
     with pytest.raises(m.MeshError) as error:
@@ -123,9 +139,16 @@ def test_a_default_set_has_the_objects_of_one_folder(
     ],
 )
 def test_unit_size_and_mass(
-    settings: ImportSettings, mass: float, longest: float, words: str, in_process: None, tmp_path: Path
+    settings: ImportSettings,
+    mass: float,
+    longest: float,
+    words: str,
+    in_process: None,
+    tmp_path: Path,
 ):
-    mesh = brick(tmp_path / "block.stl", (6.0, 2.0, 1.0) if "mean" not in words else (6.0, 3.0, 2.0))
+    mesh = brick(
+        tmp_path / "block.stl", (6.0, 2.0, 1.0) if "mean" not in words else (6.0, 3.0, 2.0)
+    )
     (result,) = import_meshes([mesh], tmp_path / "out", settings)
     model = read_object(tmp_path / "out" / "block.usd")
     assert model.longest_side == pytest.approx(longest, rel=1e-3)

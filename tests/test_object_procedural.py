@@ -24,14 +24,22 @@ def held_out() -> list[ObjectModel]:
 
 
 def test_only_what_has_no_rotational_symmetry_is_for_training(training: list[ObjectModel]):
-    """A symmetric solid is told by turning it, and none is drawn; a turned copy makes one of any."""
+    """A symmetric solid is told by turning it, and none is drawn.
+
+    A turned copy makes one of any.
+    """
     for model in (procedural.cube(), procedural.cuboid()):
         assert procedural.asymmetry(model) < procedural.MIN_ASYMMETRY / 10
     for model in training:
         assert procedural.asymmetry(model) >= procedural.MIN_ASYMMETRY, model.name
     half_turn = np.array([-1.0, -1.0, 1.0])
-    parts = [Hull(h.vertices * s, h.faces) for h in training[0].hulls for s in (np.ones(3), half_turn)]
-    assert procedural.asymmetry(procedural.model_of_parts("twice", parts)) < procedural.MIN_ASYMMETRY / 4
+    parts = [
+        Hull(h.vertices * s, h.faces) for h in training[0].hulls for s in (np.ones(3), half_turn)
+    ]
+    assert (
+        procedural.asymmetry(procedural.model_of_parts("twice", parts))
+        < procedural.MIN_ASYMMETRY / 4
+    )
 
 
 @pytest.mark.parametrize("model", [procedural.cube(), procedural.cuboid()], ids=lambda m: m.name)
@@ -60,7 +68,9 @@ def test_equal_seeds_are_equal_and_others_differ(training: list[ObjectModel]):
 def test_every_object_is_valid(training: list[ObjectModel], held_out: list[ObjectModel]):
     for model in training + held_out:
         assert 1 < len(model.hulls) <= procedural.MAX_PARTS, model.name
-        assert LONGEST_SIDE_M[0] - 1e-6 <= model.longest_side <= LONGEST_SIDE_M[1] + 1e-6, model.name
+        assert LONGEST_SIDE_M[0] - 1e-6 <= model.longest_side <= LONGEST_SIDE_M[1] + 1e-6, (
+            model.name
+        )
         # It fits the hand, neither wedged between the fingers nor too flat to get hold of.
         everything = np.concatenate([hull.vertices for hull in model.hulls])
         assert mean_width(everything) <= MEAN_WIDTH_M + 1e-6, model.name

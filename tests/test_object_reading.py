@@ -1,4 +1,7 @@
-"""What mesh files are and what is read from them: formats by content, whole files, USD made elsewhere."""
+"""What mesh files are and what is read from them.
+
+Formats by content, whole files, USD made elsewhere.
+"""
 
 import gzip
 from pathlib import Path
@@ -108,10 +111,12 @@ def add_box(stage: Usd.Stage, path: str, points: np.ndarray) -> UsdGeom.Mesh:
 
 @pytest.fixture
 def mug(tmp_path: Path) -> Path:
-    """A USD as others make them: centimetres, y up, parts by reference, an instance, variants, a collider.
+    """A USD as others make them.
 
-    By the variant selected it is a box of 4 x 10 x 4 cm from (0, 0, 0) with a mirrored copy of a part of
-    1 x 2 x 1 cm, twice as large, beside it.
+    Centimetres, y up, parts by reference, an instance, variants, a collider.
+
+    By the variant selected it is a box of 4 x 10 x 4 cm from (0, 0, 0) with a mirrored copy of a
+    part of 1 x 2 x 1 cm, twice as large, beside it.
     """
     part = Usd.Stage.CreateNew(str(tmp_path / "parts" / "part.usda"))
     UsdGeom.SetStageMetersPerUnit(part, 0.01)
@@ -166,7 +171,9 @@ def test_usd_that_is_not_all_there_or_not_read_is_refused(mug: Path, tmp_path: P
     for kind in (UsdGeom.PointInstancer, UsdGeom.Cube):
         name = kind.Define(stage, "/many").GetPrim().GetTypeName()
         stage.Save()
-        with pytest.raises(MeshError, match=f"/many is a {name}, which is not read; make it a mesh"):
+        with pytest.raises(
+            MeshError, match=f"/many is a {name}, which is not read; make it a mesh"
+        ):
             load_mesh(tmp_path / "many.usda")
 
 

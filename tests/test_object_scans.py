@@ -38,7 +38,9 @@ def test_a_ball_is_found_behind_noise(device, count, noise, within, volume):
     mesh = trimesh.Trimesh(*surface, process=False)
     assert mesh.is_watertight and len(mesh.split()) == 1
     assert abs(np.linalg.norm(surface.vertices, axis=1) - RADIUS_M).mean() < within
-    assert mesh_volume(*surface) == pytest.approx(4 / 3 * np.pi * RADIUS_M**3, rel=volume), "faces look out"
+    assert mesh_volume(*surface) == pytest.approx(4 / 3 * np.pi * RADIUS_M**3, rel=volume), (
+        "faces look out"
+    )
 
 
 def test_what_is_missing_is_closed():
@@ -73,17 +75,25 @@ def test_an_object_is_known_by_its_scan(device):
     of = {"world_object": np.arange(2), "world_scale": np.ones(2), "library": library_on(device)}
     found = Registration(known, **of, camera=None, device=device)
     assert (found._shapes.distance.numpy().min(axis=(1, 2, 3)) < 0.0).all()
-    assert [len(turns) for turns in symmetries(known, device)] == [1] * 2, "noise makes nothing symmetric"
+    assert [len(turns) for turns in symmetries(known, device)] == [1] * 2, (
+        "noise makes nothing symmetric"
+    )
 
 
 def test_a_scan_is_noisy_and_misses_one_side():
     rng, whole = np.random.default_rng(0), ball(4000)
     scanned = scan(whole, rng)
     assert scanned.shape == whole.shape
-    assert scan(whole.astype(np.float32), rng).dtype == np.float32, "of the kind that the search for it takes"
+    assert scan(whole.astype(np.float32), rng).dtype == np.float32, (
+        "of the kind that the search for it takes"
+    )
     first = np.abs(scanned[:100].mean(axis=0) - scanned.mean(axis=0))
-    assert first.max() < 0.3 * RADIUS_M, "in no order: a network takes the first points for the whole"
-    off = np.linalg.norm(scanned, axis=1) - RADIUS_M  # across the surface only one axis of the noise shows
+    assert first.max() < 0.3 * RADIUS_M, (
+        "in no order: a network takes the first points for the whole"
+    )
+    off = (
+        np.linalg.norm(scanned, axis=1) - RADIUS_M
+    )  # across the surface only one axis of the noise shows
     assert off.std() == pytest.approx(NOISE_M, rel=0.1)
     side = -scanned.mean(axis=0) / np.linalg.norm(scanned.mean(axis=0))
     # A cap with a fifth of a sphere's area begins at 0.6 of its radius.
@@ -93,7 +103,9 @@ def test_a_scan_is_noisy_and_misses_one_side():
 
 def test_what_is_known_of_objects_is_a_surface_or_points_alone():
     cubes = load_set("cube")
-    surface, points = (known_objects(cubes, "scan", seed=0, device="cpu", surfaces=yes)[0] for yes in (1, 0))
+    surface, points = (
+        known_objects(cubes, "scan", seed=0, device="cpu", surfaces=yes)[0] for yes in (1, 0)
+    )
     assert known_objects(cubes, "mesh", seed=0, device="cpu") is cubes
     exact = known_objects(cubes, "points", seed=0, device="cpu", surfaces=False)[0]
     np.testing.assert_array_equal(exact.surface_points, cubes[0].surface_points)

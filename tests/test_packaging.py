@@ -21,7 +21,10 @@ from vd.train.demo import CAMERA_POLICY
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PACKAGE_DIRS: dict[str, str] = PROJECT["tool"]["setuptools"]["package-dir"]
-MAX_POLICY_BYTES, ALIGNMENT_BYTES = 3 * 2**20, 2**20  # the network of vision policies, beside no critic
+MAX_POLICY_BYTES, ALIGNMENT_BYTES = (
+    3 * 2**20,
+    2**20,
+)  # the network of vision policies, beside no critic
 
 
 def installed_names() -> set[str]:
@@ -42,7 +45,9 @@ def required_distributions() -> set[str]:
         requirement = Requirement(waiting.pop())
         name = canonicalize_name(requirement.name)
         extras = {"", *requirement.extras}
-        if requirement.marker and not any(requirement.marker.evaluate({"extra": extra}) for extra in extras):
+        if requirement.marker and not any(
+            requirement.marker.evaluate({"extra": extra}) for extra in extras
+        ):
             continue
         key = f"{name}[{','.join(sorted(requirement.extras))}]"
         if key in needed:
@@ -61,7 +66,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, built from a copy: setuptools leaves build products beside its sources."""
     source = tmp_path_factory.mktemp("source")
     for folder in PACKAGE_DIRS.values():
-        shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__")
+        )
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source / name)
     folder = tmp_path_factory.mktemp("wheel")
@@ -77,13 +84,22 @@ def test_wheel_holds_modules_policies_and_what_else_is_read(wheel):
         sizes = {item.filename: item.file_size for item in archive.infolist()}
     assert {name for name in sizes if name.endswith(".py")} == installed_names()
     assert {name.split("/")[0] for name in sizes if ".dist-info/" not in name} == {"vd"}
-    assert {f"vd/templates/{path.name}" for path in (ROOT / "vd/templates").iterdir()} <= sizes.keys()
-    assert {f"vd/assets_usd/usd/{path.name}" for path in (ROOT / "assets_usd/usd").iterdir()} <= sizes.keys()
+    assert {
+        f"vd/templates/{path.name}" for path in (ROOT / "vd/templates").iterdir()
+    } <= sizes.keys()
+    assert {
+        f"vd/assets_usd/usd/{path.name}" for path in (ROOT / "assets_usd/usd").iterdir()
+    } <= sizes.keys()
     assert "vd/py.typed" in sizes and any(name.endswith("licenses/LICENSE") for name in sizes)
     shipped = {DEFAULT_POLICY, CAMERA_POLICY}  # others are pulled
-    assert {name for name in sizes if name.endswith(".pt")} == {f"vd/policies/{name}.pt" for name in shipped}
+    assert {name for name in sizes if name.endswith(".pt")} == {
+        f"vd/policies/{name}.pt" for name in shipped
+    }
     assert f"vd/policies/{POLICY_LIST}" in sizes
-    for name, path in SHIPPED_POLICIES.items():  # exports, not checkpoints: those hold optimiser and worlds
+    for (
+        name,
+        path,
+    ) in SHIPPED_POLICIES.items():  # exports, not checkpoints: those hold optimiser and worlds
         most = MAX_POLICY_BYTES + (ALIGNMENT_BYTES if name.endswith("-vision") else 0)
         assert path.stat().st_size < most
 
@@ -92,7 +108,10 @@ def test_wheel_runs_from_a_fresh_folder(wheel, tmp_path):
     target = tmp_path / "site"
     command = ["install", "--quiet", "--no-deps", "--no-index", "--target", target, wheel]
     subprocess.run([sys.executable, "-m", "pip", *map(str, command)], check=True)
-    assert {path.name for path in target.iterdir() if not path.name.endswith(".dist-info")} == {"vd", "bin"}
+    assert {path.name for path in target.iterdir() if not path.name.endswith(".dist-info")} == {
+        "vd",
+        "bin",
+    }
     scripts = PROJECT["project"]["scripts"]
     assert {path.name for path in (target / "bin").iterdir()} == set(scripts)
     code = f"import sys, importlib\nsys.path.insert(0, {str(target)!r})\n"
@@ -107,11 +126,15 @@ def test_wheel_runs_from_a_fresh_folder(wheel, tmp_path):
 def test_constraints_pin_everything():
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = dict(line.split("==") for line in lines if not line.startswith("#"))
-    assert not [name for name, version in pins.items() if "+" in version], "a build tag binds to one machine"
+    assert not [name for name, version in pins.items() if "+" in version], (
+        "a build tag binds to one machine"
+    )
     pinned = {canonicalize_name(name) for name in pins}
     # torch itself pins the libraries of its CUDA build.
     missing = {
-        n for n in required_distributions() - pinned if not n.startswith(("nvidia-", "cuda-", "triton"))
+        n
+        for n in required_distributions() - pinned
+        if not n.startswith(("nvidia-", "cuda-", "triton"))
     }
     assert not missing, f"add to constraints.txt: {sorted(missing)}"
 

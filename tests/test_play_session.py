@@ -38,7 +38,9 @@ def test_new_goal_changes_the_goal_alone():
     np.testing.assert_allclose(after.joint_q, before.joint_q)
     assert rotation_angle(after.goal_quat, before.goal_quat) > 1e-3
     assert after.error_rad <= 0.5 + 1e-3
-    assert after.error_rad == pytest.approx(rotation_angle(after.joint_q[-4:], after.goal_quat), abs=1e-3)
+    assert after.error_rad == pytest.approx(
+        rotation_angle(after.joint_q[-4:], after.goal_quat), abs=1e-3
+    )
 
 
 def test_reset_shows_the_error_of_the_new_start_and_keeps_counts():
@@ -47,11 +49,15 @@ def test_reset_shows_the_error_of_the_new_start_and_keeps_counts():
     assert session.snapshot.success and session.snapshot.goals == 1
     shot = session.reset()
     assert not shot.success and shot.goals == 1
-    assert shot.error_rad == pytest.approx(rotation_angle(shot.joint_q[-4:], shot.goal_quat), abs=1e-3)
+    assert shot.error_rad == pytest.approx(
+        rotation_angle(shot.joint_q[-4:], shot.goal_quat), abs=1e-3
+    )
 
 
 def test_watcher_counts_goals_and_drops_of_its_worlds_alone():
-    env = FakeEnv([FakeObject("a")], num_envs=3, max_episode_steps=1000, tolerance=-1.0, fall_at={1: 2})
+    env = FakeEnv(
+        [FakeObject("a")], num_envs=3, max_episode_steps=1000, tolerance=-1.0, fall_at={1: 2}
+    )
     watcher = Watcher(env, [2, 1])
     policy = Turn(0.0)
     for _ in range(6):
@@ -74,7 +80,17 @@ def test_video_of_the_real_environment(tmp_path):
     from vd.play.cli import main
 
     path = tmp_path / "random.mp4"
-    flags = ["--hand", "dclaw3", "--video", str(path), "--seconds", "2.084", "--in-air", "--device", "cpu"]
+    flags = [
+        "--hand",
+        "dclaw3",
+        "--video",
+        str(path),
+        "--seconds",
+        "2.084",
+        "--in-air",
+        "--device",
+        "cpu",
+    ]
     assert main(["random", *flags]) == 0
     frames = iio.imread(path)
     assert frames.shape == (26, 460, 640, 3)

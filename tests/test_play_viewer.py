@@ -38,7 +38,9 @@ PATIENCE_S = 300.0
 
 def session(policy=None, hand="dclaw3"):
     objects = [box("brick", [0.09, 0.05, 0.03]), box("stick", [0.14, 0.02, 0.02])]
-    env = FakeEnv(objects, num_envs=2, max_episode_steps=10_000, tolerance=-1.0, hand=load_hand(hand))
+    env = FakeEnv(
+        objects, num_envs=2, max_episode_steps=10_000, tolerance=-1.0, hand=load_hand(hand)
+    )
     return Session(env, policy or Turn(1.0))
 
 
@@ -48,8 +50,12 @@ class Sees(Turn):
     def __init__(self):
         super().__init__(1.0)
         self.hand, self.predicted = load_hand("dclaw4"), torch.full((2,), 0.25)
-        camera = replace(self.hand.camera, position=np.zeros(3), quaternion=np.array([0.0, 0.0, 0.0, 1.0]))
-        self.camera = SimpleNamespace(camera=camera, depth=wp.full((2, camera.height, camera.width), 0.5))
+        camera = replace(
+            self.hand.camera, position=np.zeros(3), quaternion=np.array([0.0, 0.0, 0.0, 1.0])
+        )
+        self.camera = SimpleNamespace(
+            camera=camera, depth=wp.full((2, camera.height, camera.width), 0.5)
+        )
         tips = self.hand.tip_poses(self.hand.start)[:, :3].mean(axis=0)
         finder = SimpleNamespace(pose=torch.tensor([*tips, 0.0, 0.0, 0.0, 1.0]).expand(2, 1, 7))
         self.tracker = SimpleNamespace(observer=SimpleNamespace(finder=finder))
@@ -66,7 +72,9 @@ def player():
             raise ValueError("it is broken")
         return session(Sees(), "dclaw4")
 
-    viewer = PlayViewer(session(), policies=("turn", "broken", "sees"), reopen=reopen, verbose=False)
+    viewer = PlayViewer(
+        session(), policies=("turn", "broken", "sees"), reopen=reopen, verbose=False
+    )
     yield viewer
     viewer.close()
 

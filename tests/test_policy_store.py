@@ -54,12 +54,17 @@ def refused(capsys, *words):
 
 
 def test_a_pulled_policy_has_a_name_and_nothing_takes_its_place_unasked(place, capsys):
-    pull, push = ["pull", "mine", "--at", str(place)], ["push", "dclaw4", "--at", str(place), "--name"]
+    pull, push = (
+        ["pull", "mine", "--at", str(place)],
+        ["push", "dclaw4", "--at", str(place), "--name"],
+    )
     assert main(pull) == 0
     (pulled_folder() / "policies.json").unlink()
     assert main(pull) == main(["list", "--at", str(place)]) == 0
     assert find_policy("mine") == pulled_folder() / "mine.pt"
-    assert re.search(r"^mine +teacher +dclaw4 +0\.5 MB  installed$", capsys.readouterr().out, re.MULTILINE)
+    assert re.search(
+        r"^mine +teacher +dclaw4 +0\.5 MB  installed$", capsys.readouterr().out, re.MULTILINE
+    )
 
     assert "another policy" in refused(capsys, *push, "mine")
     assert main([*push, "mine", "--replace"]) == main([*push, "mine"]) == 0
@@ -70,7 +75,9 @@ def test_a_pulled_policy_has_a_name_and_nothing_takes_its_place_unasked(place, c
     assert "which stays" in refused(capsys, "pull", "dclaw4-cube", "--at", str(place))
 
 
-def test_a_download_that_broke_off_leaves_nothing_and_sizes_of_a_list_do_not_matter(served, place, capsys):
+def test_a_download_that_broke_off_leaves_nothing_and_sizes_of_a_list_do_not_matter(
+    served, place, capsys
+):
     url, _, how = served
     how["most"] = 300_000
     assert "IncompleteRead(300000 bytes read" in refused(capsys, "pull", "mine", "--at", url)
@@ -95,11 +102,15 @@ def test_what_is_not_as_listed_or_has_no_name_is_refused(place, capsys, monkeypa
     listed.unlink()
     assert "policies.json cannot be read" in said("list", *at)
     monkeypatch.setattr(agents, "SHIPPED_POLICIES", {})  # as in a wheel
-    with pytest.raises(ValueError, match=r"dclaw3 is not on this machine: vd-policies pull dclaw3 --at"):
+    with pytest.raises(
+        ValueError, match=r"dclaw3 is not on this machine: vd-policies pull dclaw3 --at"
+    ):
         find_policy("dclaw3")
 
 
-def test_a_repository_of_hugging_face_is_read_and_gets_policy_and_list_at_once(served, monkeypatch, capsys):
+def test_a_repository_of_hugging_face_is_read_and_gets_policy_and_list_at_once(
+    served, monkeypatch, capsys
+):
     url, asked, _ = served
     monkeypatch.setattr(policy_store, "HUB_URL", url)
     monkeypatch.setenv("HF_TOKEN", "secret")

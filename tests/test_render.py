@@ -1,4 +1,7 @@
-"""The headless renderer: things are where the camera model says, in their colours, and files decode."""
+"""The headless renderer.
+
+Things are where the camera model says, in their colours, and files decode.
+"""
 
 import numpy as np
 import pytest
@@ -17,7 +20,9 @@ def box(name, size):
     corners = np.array([[-1, -1, -1], [-1, 1, -1], [1, 1, -1], [1, -1, -1]], dtype=float)
     vertices = np.concatenate([corners, corners * [1, 1, -1]]) * half
     inertia = np.full(3, 1e-4)
-    return ObjectModel(name, vertices, np.array(FACES), (), 0.1, inertia, np.array(IDENTITY), vertices)
+    return ObjectModel(
+        name, vertices, np.array(FACES), (), 0.1, inertia, np.array(IDENTITY), vertices
+    )
 
 
 def project(camera, points, width, height):
@@ -65,7 +70,9 @@ def test_object_is_drawn_where_the_camera_projects_it(cube_renderer, position):
     np.testing.assert_allclose(
         [columns.min(), columns.max() + 1], [spots[:, 0].min(), spots[:, 0].max()], atol=1.5
     )
-    np.testing.assert_allclose([rows.min(), rows.max() + 1], [spots[:, 1].min(), spots[:, 1].max()], atol=1.5)
+    np.testing.assert_allclose(
+        [rows.min(), rows.max() + 1], [spots[:, 1].min(), spots[:, 1].max()], atol=1.5
+    )
 
 
 def test_goal_has_the_outline_of_the_object_in_the_same_orientation():

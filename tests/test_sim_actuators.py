@@ -1,4 +1,7 @@
-"""The servo in the simulator: off it is not there, on it delays, rubs, measures and forgets as it should."""
+"""The servo in the simulator.
+
+Off it is not there, on it delays, rubs, measures and forgets as it should.
+"""
 
 import dataclasses
 
@@ -38,7 +41,11 @@ def rows(**columns: float) -> np.ndarray:
 def simulator(servo_rows: np.ndarray | None, worlds: int = 1) -> Simulator:
     """Environments at rest at the task's start, commands at the present positions."""
     scene = build_scene(
-        hand=HAND, objects=load_set("cube")[:1], num_envs=worlds, cfg=CFG, device=wp.get_device().alias
+        hand=HAND,
+        objects=load_set("cube")[:1],
+        num_envs=worlds,
+        cfg=CFG,
+        device=wp.get_device().alias,
     )
     sim = Simulator(scene, CFG, servo_rows=servo_rows)
     state = sim.joint_q.numpy()
@@ -57,7 +64,9 @@ def command(sim: Simulator, offset: float) -> None:
     sim.target.assign(target)
 
 
-def response(sim: Simulator, offset: float = 0.2, steps: int = STEPS) -> tuple[np.ndarray, np.ndarray]:
+def response(
+    sim: Simulator, offset: float = 0.2, steps: int = STEPS
+) -> tuple[np.ndarray, np.ndarray]:
     """Positions and measured positions after each control step of a step command, [steps, N, D]."""
     command(sim, offset)
     true, measured = [], []

@@ -6,7 +6,10 @@ import pytest
 
 from vd.sim.cfg import SimCfg, coarser
 
-FINE, SLOW = {"physics_hz": 240.0, "iterations": 2}, {"physics_hz": 72.0, "contact_time_constant_s": 0.03}
+FINE, SLOW = (
+    {"physics_hz": 240.0, "iterations": 2},
+    {"physics_hz": 72.0, "contact_time_constant_s": 0.03},
+)
 
 
 @pytest.mark.parametrize("changes", [{}, FINE, SLOW])

@@ -52,8 +52,8 @@ def moved(env: ReorientEnv, steps: int) -> np.ndarray:
 def test_both_engines_move_alike_in_equal_steps(changes):
     """Objects fall, land, and are pushed.
 
-    Single precision leaves 0.01 mm; one mass, friction, hull, servo or force that did not arrive moves an
-    object by millimetres.
+    Single precision leaves 0.01 mm; one mass, friction, hull, servo or force that did not arrive
+    moves an object by millimetres.
     """
     newton, mujoco = (moved(make(engine, **changes), 8) for engine in ("newton", "mujoco"))
     assert np.ptp(newton[:, :, 11], axis=0).min() > 0.01, "all fell"
@@ -105,7 +105,16 @@ def test_threads_and_a_saved_state_do_not_change_the_motion(monkeypatch):
 
 
 def test_an_evaluation_says_whose_physics_it_was(tmp_path):
-    few = ["--episodes", "1", "--episode-s", "0.3", "--out", str(tmp_path), "--condition", "stiff-contacts"]
+    few = [
+        "--episodes",
+        "1",
+        "--episode-s",
+        "0.3",
+        "--out",
+        str(tmp_path),
+        "--condition",
+        "stiff-contacts",
+    ]
     assert main(["zero", "--engine", "mujoco", *few]) == 0
     (row, *_) = Result.read(tmp_path / "eval.json").rows
     assert row.protocol.engine == "mujoco"

@@ -1,4 +1,7 @@
-"""Candidate pairs sorted between the solver's phases: they arrive sorted, and contacts stay as they are."""
+"""Candidate pairs sorted between the solver's phases.
+
+They arrive sorted, and contacts stay as they are.
+"""
 
 from types import SimpleNamespace
 

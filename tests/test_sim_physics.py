@@ -54,7 +54,10 @@ def test_free_fall(cube):
 
 
 def inertia_about(hand, q: np.ndarray, joint: int) -> float:
-    """Inertia of all that a joint moves about its axis, rotor included [kg m^2]: sum of I + m r^2."""
+    """Inertia of all that a joint moves about its axis, rotor included [kg m^2].
+
+    Sum of I + m r^2.
+    """
     poses = hand.forward_kinematics(q)
     parent, frame = poses[hand.joint_parent[joint]], hand.joint_parent_frame[joint]
     turn = Rotation.from_quat(parent[3:])
@@ -77,13 +80,18 @@ def sliced(cube, count):
     slabs = []
     for k in range(count):
         ends = low[0] + (high[0] - low[0]) * np.array([k, k + 1]) / count
-        slabs.append(Hull(np.where(hull.vertices > 0, [ends[1], *high[1:]], [ends[0], *low[1:]]), hull.faces))
+        slabs.append(
+            Hull(np.where(hull.vertices > 0, [ends[1], *high[1:]], [ends[0], *low[1:]]), hull.faces)
+        )
     return dataclasses.replace(cube, hulls=tuple(slabs))
 
 
 @pytest.mark.parametrize("hand", ["dclaw3", "dclaw4"])
 def test_an_object_of_as_many_parts_as_an_import_makes_fits_beside_a_hand(cube, hand):
-    """MuJoCo's masks have 32 bits for who touches whom; parts of one object need none among themselves."""
+    """MuJoCo's masks have 32 bits for who touches whom.
+
+    Parts of one object need none among themselves.
+    """
     item = sliced(cube, ImportSettings().max_hulls)
     scene = build_scene(hand=load_hand(hand), objects=[item], num_envs=1, cfg=CFG, device="cpu")
     model = Simulator(scene, CFG).solver.mj_model
@@ -95,7 +103,10 @@ def test_an_object_of_as_many_parts_as_an_import_makes_fits_beside_a_hand(cube, 
 
 @pytest.mark.parametrize("joint", [0, 1, 2])
 def test_step_response_of_a_joint_is_the_pd_closed_form(joint):
-    """A joint with inertia J follows J q'' + kd q' + kp q = kp target; gravity off, the others hold."""
+    """A joint with inertia J follows J q'' + kd q' + kp q = kp target.
+
+    Gravity off, the others hold.
+    """
     hand = load_hand("dclaw4")
     world = build_hand(hand, CFG, visuals=False)
     world.gravity = (0.0, 0.0, 0.0)
@@ -113,9 +124,15 @@ def test_step_response_of_a_joint_is_the_pd_closed_form(joint):
     for _ in times:
         scene.run(CFG.physics_dt)
         measured.append(scene.state.joint_q.numpy()[joint] - start[joint])
-    kp, kd, inertia = float(hand.kp[joint]), float(hand.kd[joint]), inertia_about(hand, start, joint)
+    kp, kd, inertia = (
+        float(hand.kp[joint]),
+        float(hand.kd[joint]),
+        inertia_about(hand, start, joint),
+    )
     slow, fast = sorted(-np.roots([inertia, kd, kp]).real)
-    closed = step * (1.0 + (slow * np.exp(-fast * times) - fast * np.exp(-slow * times)) / (fast - slow))
+    closed = step * (
+        1.0 + (slow * np.exp(-fast * times) - fast * np.exp(-slow * times)) / (fast - slow)
+    )
     # The implicit integrator blurs the start by about one physics step.
     assert np.abs(np.array(measured) - closed).max() < 0.05 * step
     assert np.abs(np.array(measured) - closed)[len(times) // 2 :].max() < 0.02 * step

@@ -24,7 +24,10 @@ def outcome(predicted, norm, true, steps, distance, limit):
 
 
 def episodes(seed, *, bias=0.0, noise=0.1, length=41, count=60):
-    """Objects that near the goal while the action calms down, seen with an error; NaN after their ends."""
+    """Objects that near the goal while the action calms down, seen with an error.
+
+    NaN after their ends.
+    """
     rng = np.random.default_rng(seed)
     start, floor = rng.uniform(1.0, 3.0, (count, 1)), rng.uniform(0.0, 0.8, (count, 1))
     decay = np.exp(-np.arange(length) / 8.0)

@@ -32,7 +32,9 @@ NEAR_M = 0.006
 def make_looks(points: int) -> SimulatedLooks:
     """Two cuboids of so many points, seen by a policy of random weights."""
     torch.manual_seed(0)
-    cfg = ReorientCfg(hand="dclaw3", objects=("cuboid",), num_envs=2, randomisation=RandomisationCfg())
+    cfg = ReorientCfg(
+        hand="dclaw3", objects=("cuboid",), num_envs=2, randomisation=RandomisationCfg()
+    )
     env = ReorientEnv(cfg, "cpu")
     network = AlignmentNetwork(TINY)
     teacher = load_policy(find_policy("dclaw3"))
@@ -50,7 +52,12 @@ def test_goals_turned_as_the_label_says_lie_on_what_was_seen():
     back = pairs.surface @ pairs.rotation.transpose(-1, -2) + pairs.offset[:, None]
     apart = torch.cdist(pairs.seen, back).amin(dim=-1).median(dim=-1).values
     assert apart.median() < NEAR_M
-    turned = torch.cdist(pairs.seen, pairs.surface + pairs.offset[:, None]).amin(dim=-1).median(dim=-1).values
+    turned = (
+        torch.cdist(pairs.seen, pairs.surface + pairs.offset[:, None])
+        .amin(dim=-1)
+        .median(dim=-1)
+        .values
+    )
     assert turned.median() > 1.3 * apart.median()
     for _ in range(5):  # more than are kept
         looks.collect(lambda: False)
@@ -60,9 +67,24 @@ def test_goals_turned_as_the_label_says_lie_on_what_was_seen():
 
 @pytest.mark.slow
 def test_stages_on_the_command_line(tmp_path, capsys):
-    sizes = {"batch": 8, "steps": 2, "shapes": 8, "hands": 4, "points": 64, "views": 1, "fresh-shapes": 1}
+    sizes = {
+        "batch": 8,
+        "steps": 2,
+        "shapes": 8,
+        "hands": 4,
+        "points": 64,
+        "views": 1,
+        "fresh-shapes": 1,
+    }
     small = [word for name, value in sizes.items() for word in (f"--align.{name}", str(value))]
-    network = ["--align.network.width", "16", "--align.network.tokens", "12", "--align.network.layers", "1"]
+    network = [
+        "--align.network.width",
+        "16",
+        "--align.network.tokens",
+        "12",
+        "--align.network.layers",
+        "1",
+    ]
     common = ["--preset", "cpu-demo", "--num-envs", "2", "--logger", "none", "--teacher", "dclaw3"]
     common += ["--objects", "cube", *small]
     folders = [tmp_path / f"stage{number}" for number in (0, 1)]
@@ -130,7 +152,16 @@ def test_with_its_network_set_to_zero_success_falls_to_chance(name, tmp_path):
                 policy.alignment.parameters(),
             )
         save_checkpoint(tmp_path / f"{blind}.pt", tracking_export(policy))
-        flags = ["--objects", "cuboid", "--episodes", "16", "--device", "cpu", "--out", str(tmp_path)]
+        flags = [
+            "--objects",
+            "cuboid",
+            "--episodes",
+            "16",
+            "--device",
+            "cpu",
+            "--out",
+            str(tmp_path),
+        ]
         assert evaluate([str(tmp_path / f"{blind}.pt"), *flags]) == 0
         rates.append(Result.read(tmp_path / "eval.json").rows[0].overall.outcomes["success"].value)
     assert rates[1] < 0.3 * rates[0]

@@ -1,4 +1,7 @@
-"""Shapes for the training of vision: bodies against their equations, unions, deformations, sizes."""
+"""Shapes for the training of vision.
+
+Bodies against their equations, unions, deformations, sizes.
+"""
 
 from dataclasses import replace
 
@@ -37,7 +40,8 @@ def test_points_of_superquadrics_solve_their_equation_and_normals_follow_it(plac
         step = 1e-6 * half.min()
         slope = np.stack(
             [
-                implicit(own + step * axis, half, exponents) - implicit(own - step * axis, half, exponents)
+                implicit(own + step * axis, half, exponents)
+                - implicit(own - step * axis, half, exponents)
                 for axis in np.eye(3)
             ],
             axis=1,
@@ -93,7 +97,9 @@ def test_a_hollow_opens_the_first_body(monkeypatch):
     # From the wall of a hollow the normal leads into the hollow: towards the middle of the body.
     row = int((~bodies[0].ring).nonzero()[0])
     wall = made[row][level[row] < -0.05]
-    assert (bodies[0].level((wall[:, :3] + 1e-3 * wall[:, 3:])[None].expand(40, -1, -1))[row] < 0).all()
+    assert (
+        bodies[0].level((wall[:, :3] + 1e-3 * wall[:, 3:])[None].expand(40, -1, -1))[row] < 0
+    ).all()
 
 
 def test_deformed_normals_are_those_of_the_deformed_surface():
@@ -105,7 +111,9 @@ def test_deformed_normals_are_those_of_the_deformed_surface():
     _, carried = torch.func.jvp(deformation, (0.4 * ball,), (tangent,))
     along = torch.nn.functional.normalize(carried, dim=-1)
     assert ((found[..., 3:] * along).sum(-1).abs() < 0.02).float().mean() > 0.995
-    outwards = ((found[..., :3] - found[..., :3].mean(dim=1, keepdim=True)) * found[..., 3:]).sum(-1) > 0
+    outwards = ((found[..., :3] - found[..., :3].mean(dim=1, keepdim=True)) * found[..., 3:]).sum(
+        -1
+    ) > 0
     assert outwards.float().mean() > 0.95
 
 
@@ -113,7 +121,9 @@ def test_shapes_have_sizes_of_objects_and_differ():
     meshes = torch.cat([made_shapes(3, 600, CPU) for _ in range(2)])
     for some in (made_shapes(40, 512, CPU), mesh_shapes(meshes.half(), 40, 512)):
         assert some.shape == (40, 512, 6) and some.isfinite().all()
-        torch.testing.assert_close(some[..., 3:].norm(dim=-1), torch.ones(40, 512), atol=1e-3, rtol=0)
+        torch.testing.assert_close(
+            some[..., 3:].norm(dim=-1), torch.ones(40, 512), atol=1e-3, rtol=0
+        )
         side = (some[..., :3].amax(dim=1) - some[..., :3].amin(dim=1)).amax(dim=-1)
         low, high = shapes.LENGTH_M
         assert side.min() >= low - 1e-5 and side.max() <= high + 1e-5 and side.std() > 0.01

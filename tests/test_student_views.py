@@ -1,4 +1,7 @@
-"""What a camera sees of shapes in a hand: hidden sides, the hand before and beside them, goals from scans."""
+"""What a camera sees of shapes in a hand.
+
+Hidden sides, the hand before and beside them, goals from scans.
+"""
 
 import numpy as np
 import pytest
@@ -41,13 +44,16 @@ def shapes():
 
 
 def plates(hands, gap_m):
-    """Two plates across the line of sight, both facing the camera, one behind the other: [1, 800, 6]."""
+    """Two plates across the line of sight, both facing the camera, one behind the other.
+
+    [1, 800, 6].
+    """
     middle = hands.box.mean(dim=0)
     towards = torch.nn.functional.normalize(hands.eye - middle, dim=0)
     side = torch.nn.functional.normalize(torch.linalg.cross(towards, torch.eye(3)[2]), dim=0)
-    grid = torch.stack(torch.meshgrid(*2 * [torch.linspace(-0.03, 0.03, 20)], indexing="ij"), -1).reshape(
-        -1, 2
-    )
+    grid = torch.stack(
+        torch.meshgrid(*2 * [torch.linspace(-0.03, 0.03, 20)], indexing="ij"), -1
+    ).reshape(-1, 2)
     front = middle + grid[:, :1] * side + grid[:, 1:] * torch.linalg.cross(towards, side)
     points = torch.cat([front, front - gap_m * towards])
     return torch.cat([points, towards.expand(len(points), 3)], dim=1)[None]
@@ -63,7 +69,9 @@ def test_what_is_before_hides_what_is_behind(hands, monkeypatch):
     empty(hands, monkeypatch)
     row = torch.zeros(1, dtype=torch.long)
     shown = visible(hands, row, plates(hands, 0.05))[0]
-    assert shown[:400].all() and shown[400:].float().mean() < 0.15  # perspective lets its rim be seen
+    assert (
+        shown[:400].all() and shown[400:].float().mean() < 0.15
+    )  # perspective lets its rim be seen
     turned = plates(hands, 0.05) * torch.tensor([1.0, 1, 1, -1, -1, -1])
     assert not visible(hands, row, turned)[0].any(), "a surface shows its outside alone"
 

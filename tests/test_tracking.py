@@ -45,7 +45,10 @@ CLOSE_RAD = 0.15
 def vision_of(name: str) -> TrackingPolicy:
     """An installed tracking policy that finds its object by a network of random weights."""
     torch.manual_seed(0)
-    policy, sizes = read_policy(find_policy(name)), AlignmentCfg(width=16, layers=1, heads=2, tokens=12)
+    policy, sizes = (
+        read_policy(find_policy(name)),
+        AlignmentCfg(width=16, layers=1, heads=2, tokens=12),
+    )
     network = AlignmentNetwork(sizes).eval().requires_grad_(False)
     return replace(policy, spec=replace(policy.spec, alignment=sizes), alignment=network)
 
@@ -96,9 +99,14 @@ def test_it_observes_what_its_teacher_does(env):
         teacher_observation_slices(env.num_fingers, env.num_actions),
     )
     for name in ("joint_position", "joint_velocity", "fingertips", "previous_action"):
-        torch.testing.assert_close(observed[:, columns[name]], true[:, columns[name]], atol=2e-5, rtol=1e-4)
+        torch.testing.assert_close(
+            observed[:, columns[name]], true[:, columns[name]], atol=2e-5, rtol=1e-4
+        )
     torch.testing.assert_close(
-        observed[:, columns["object_position"]], true[:, columns["object_position"]], atol=6e-3, rtol=0.0
+        observed[:, columns["object_position"]],
+        true[:, columns["object_position"]],
+        atol=6e-3,
+        rtol=0.0,
     )
     for name in (*UNSEEN, "object_velocity", "object_spin"):  # a first look knows no motion
         assert not observed[:, columns[name]].any()
@@ -107,7 +115,9 @@ def test_it_observes_what_its_teacher_does(env):
     group, pose = Rotation.create_group("O"), env.object_pose()
     for world, goal in enumerate(env.goal_quat.numpy()):
         found = Rotation.from_quat(observer.found.orientation[world].numpy())
-        assert (Rotation.from_quat(pose[world, 3:7]).inv() * found * group).magnitude().min() < CLOSE_RAD
+        assert (
+            Rotation.from_quat(pose[world, 3:7]).inv() * found * group
+        ).magnitude().min() < CLOSE_RAD
         least = (found * group * Rotation.from_quat(goal).inv()).magnitude().min()
         assert least == pytest.approx(float(angle[world]), abs=1e-3)
         told = Rotation.from_quat(observed[world, columns["relative_orientation"]].numpy())
@@ -127,20 +137,26 @@ def test_the_shape_of_a_true_pose_is_as_the_environment_observes_it(env, monkeyp
 
 
 def test_motion_is_that_between_two_looks():
-    env = ReorientEnv(ReorientCfg(num_envs=1, objects=("cube",), seed=1, randomisation=EXACT), "cpu")
+    env = ReorientEnv(
+        ReorientCfg(num_envs=1, objects=("cube",), seed=1, randomisation=EXACT), "cpu"
+    )
     camera, observer = camera_of(env), observer_of(env)
     observer(sensed(env, camera))
     wp.to_torch(env.step_count).fill_(1)
     body_q, item = wp.to_torch(env.sim.body_q), env.scene.object_body
     turn = Rotation.from_rotvec([0.0, 0.0, 0.1])
-    body_q[:, item, 3:] = torch.tensor((turn * Rotation.from_quat(body_q[:, item, 3:].numpy())).as_quat())
+    body_q[:, item, 3:] = torch.tensor(
+        (turn * Rotation.from_quat(body_q[:, item, 3:].numpy())).as_quat()
+    )
     body_q[:, item, :3] += torch.tensor([0.01, 0.0, 0.0])
     observer(sensed(env, camera))
     np.testing.assert_allclose(observer.found.velocity[0], [12.0 * 0.01, 0.0, 0.0], atol=0.05)
     np.testing.assert_allclose(observer.found.spin[0], [0.0, 0.0, 12.0 * 0.1], atol=0.5)
 
 
-@pytest.fixture(scope="module", params=["dclaw3 goal", "dclaw4 goal", "dclaw3 mirrored", "dclaw4 world"])
+@pytest.fixture(
+    scope="module", params=["dclaw3 goal", "dclaw4 goal", "dclaw3 mirrored", "dclaw4 world"]
+)
 def teacher(request):
     """A teacher of random weights, whose observation is not normalised by nature."""
     hand, view = request.param.split()
@@ -156,11 +172,15 @@ def teacher(request):
     return TrainedPolicy(spec, weights, task=to_dict(task))
 
 
-def tracker_of(teacher: TrainedPolicy, monkeypatch, world: torch.Tensor, angle: torch.Tensor) -> Tracker:
+def tracker_of(
+    teacher: TrainedPolicy, monkeypatch, world: torch.Tensor, angle: torch.Tensor
+) -> Tracker:
     """A tracker that observes what it is told."""
     hand, envs = load_hand(teacher.hand), len(world)
     policy = TrackingPolicy(teacher, TrackingSpec())
-    tracker = Tracker(policy, hand, load_set("cube"), hand.camera, world_object=np.zeros(envs, dtype=int))
+    tracker = Tracker(
+        policy, hand, load_set("cube"), hand.camera, world_object=np.zeros(envs, dtype=int)
+    )
     monkeypatch.setattr(CameraObserver, "__call__", lambda self, senses: (world, angle))
     return tracker
 
@@ -185,7 +205,10 @@ def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_ca
     decision, maps = tracker.step(None), tracker._maps
     assert torch.equal(decision.angle, angle)
     seen = world if maps is None else maps.take(world, maps.choose(world))
-    told, columns = seen.clone(), teacher_observation_slices(teacher.num_actions // 3, teacher.num_actions)
+    told, columns = (
+        seen.clone(),
+        teacher_observation_slices(teacher.num_actions // 3, teacher.num_actions),
+    )
     for name in UNSEEN:
         told[:, columns[name]] = teacher.network.offset[:, columns[name]]
     action = teacher.act(told)
@@ -199,7 +222,9 @@ def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
     path = SHIPPED_POLICIES[name]
     policy = read_policy(path)
     assert sees_clouds(open_policy(name, "cpu"))
-    assert path.stat().st_size < (1.5e6 if policy.kind == "tracking" else 4.2e6), "no critic, no optimiser"
+    assert path.stat().st_size < (1.5e6 if policy.kind == "tracking" else 4.2e6), (
+        "no critic, no optimiser"
+    )
     assert policy.spec.calibrated_on and "/" not in policy.spec.teacher + policy.spec.calibrated_on
     if policy.kind == "tracking":  # the layers of others may be of a teacher that is not installed
         teacher = load_policy(find_policy(policy.spec.teacher))
@@ -225,8 +250,12 @@ def test_files_come_back_and_a_damaged_one_is_told(tmp_path):
 
 def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
     policy = read_policy(find_policy("dclaw3-tracking"))
-    plain, real = (TrackingActor(env, policy, sensor_errors=errs).camera.cfg for errs in (False, True))
-    assert not plain.sensor.enabled and plain.latency_s == (0.0, 0.0) and plain.position_noise_m == 0.0
+    plain, real = (
+        TrackingActor(env, policy, sensor_errors=errs).camera.cfg for errs in (False, True)
+    )
+    assert (
+        not plain.sensor.enabled and plain.latency_s == (0.0, 0.0) and plain.position_noise_m == 0.0
+    )
     assert real.sensor == DepthSensorCfg.realistic() and real.latency_s[1] > real.latency_s[0] > 0.0
     assert real.position_noise_m > 0.0 and real.rotation_noise_rad > 0.0
     assert real.points == plain.points, "all else is as in its training"
@@ -236,7 +265,9 @@ def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
 @pytest.mark.parametrize("kind", ["tracking", "vision"])
 def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
     """An episode of the policy; the deploy side is given joints, goal and image, nothing else."""
-    policy = vision_of("dclaw3-tracking") if kind == "vision" else open_policy("dclaw3-tracking", "cpu")
+    policy = (
+        vision_of("dclaw3-tracking") if kind == "vision" else open_policy("dclaw3-tracking", "cpu")
+    )
     task = task_for(
         policy,
         objects=("cube",),
@@ -269,7 +300,17 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
 
 @pytest.mark.slow
 def test_an_evaluation_in_the_air_by_scans(tmp_path):
-    flags = ["--in-air", "--goals", "scan", "--episodes", "1", "--device", "cpu", "--episode-s", "0.5"]
+    flags = [
+        "--in-air",
+        "--goals",
+        "scan",
+        "--episodes",
+        "1",
+        "--device",
+        "cpu",
+        "--episode-s",
+        "0.5",
+    ]
     assert cli.main(["dclaw3-tracking", *flags, "--out", str(tmp_path)]) == 0
     row = Result.read(tmp_path / "eval.json").rows[0]
     assert (row.kind, row.sees, row.stopped_by) == ("tracking", "rendered clouds", "prediction")
@@ -277,7 +318,9 @@ def test_an_evaluation_in_the_air_by_scans(tmp_path):
     assert row.prediction is not None and row.held is not None
 
 
-def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(
+    tmp_path, monkeypatch, capsys
+):
     asked = []
 
     def spy(cfg, *_others):
@@ -293,7 +336,10 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
     flags += ["--out", str(path)]
     assert vd_train(flags) == 0
     policy, cfg = read_policy(path), asked[-1]
-    assert policy.spec.calibrated_on == "cube: 1 episodes, goals by points, tolerance 0.4 rad, seed 1000"
+    assert (
+        policy.spec.calibrated_on
+        == "cube: 1 episodes, goals by points, tolerance 0.4 rad, seed 1000"
+    )
     assert policy.spec.teacher == "dclaw3" and policy.spec.precise is not None
     assert 0.0 < policy.spec.stopping.action_norm < 1.0
     assert cfg.sensor_errors and cfg.goals == "points"
@@ -302,12 +348,20 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
     assert asked[-1].in_air and "in the air" in read_policy(path).spec.calibrated_on
     network, camera = vision_of("dclaw3-tracking").alignment, (0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)
     learned = AlignmentSpec(network=network.cfg, points=512, hand="dclaw4", camera=camera)
-    state = {"student_state_dict": network.state_dict(), "spec": to_dict(learned), "iter": 1, "env_steps": 2}
+    state = {
+        "student_state_dict": network.state_dict(),
+        "spec": to_dict(learned),
+        "iter": 1,
+        "env_steps": 2,
+    }
     save_checkpoint(tmp_path / "alignment.pt", alignment_export(state))
     assert vd_train([*flags, "--alignment", str(tmp_path / "alignment.pt")]) == 0
     assert read_policy(path).kind == "vision" and read_policy(path).spec.camera == camera
     assert vd_train([*flags, "--alignment", "dclaw3-vision"]) == 0
-    assert read_policy(path).spec.alignment == read_policy(SHIPPED_POLICIES["dclaw3-vision"]).spec.alignment
+    assert (
+        read_policy(path).spec.alignment
+        == read_policy(SHIPPED_POLICIES["dclaw3-vision"]).spec.alignment
+    )
     assert vd_train([*flags, "--alignment", "dclaw3-tracking"]) == 1
     assert vd_train(["tracker", "dclaw3-tracking", *flags[2:]]) == 1
     assert "give a teacher" in capsys.readouterr().err

@@ -1,4 +1,7 @@
-"""Fingertips from joints: where the simulator has them and how they move; nothing of them is estimated."""
+"""Fingertips from joints: where the simulator has them and how they move.
+
+Nothing of them is estimated.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -25,7 +28,10 @@ hand_named = cache(load_hand)
 def oracle(hand: HandModel, joint_q: np.ndarray) -> list[tuple[np.ndarray, Rotation]]:
     """Places and orientations of the tips in the world [G] of joint positions [D]."""
     poses, mount = hand.tip_poses(joint_q), Rotation.from_quat(hand.mount[3:])
-    return [(hand.mount[:3] + mount.apply(pose[:3]), mount * Rotation.from_quat(pose[3:])) for pose in poses]
+    return [
+        (hand.mount[:3] + mount.apply(pose[:3]), mount * Rotation.from_quat(pose[3:]))
+        for pose in poses
+    ]
 
 
 @pytest.mark.parametrize("name", HANDS)
@@ -42,7 +48,9 @@ def test_poses_and_velocities_are_those_of_the_tree_of_links(name, seed):
         np.testing.assert_allclose(tip[:3], place, atol=1e-6)
         assert (Rotation.from_quat(tip[3:7]) * turn.inv()).magnitude() < 1e-5
         np.testing.assert_allclose(tip[7:10], (place_after - place) / STEP_S, atol=1e-4)
-        np.testing.assert_allclose(tip[10:], (turn_after * turn.inv()).as_rotvec() / STEP_S, atol=1e-3)
+        np.testing.assert_allclose(
+            tip[10:], (turn_after * turn.inv()).as_rotvec() / STEP_S, atol=1e-3
+        )
 
 
 def test_a_finger_that_is_no_chain_is_refused():

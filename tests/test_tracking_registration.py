@@ -33,23 +33,31 @@ def corner() -> ObjectModel:
     return replace(load_set(["cube"])[0], surface_points=np.float32(points - points.mean(axis=0)))
 
 
-def seen_of(item: ObjectModel, pose: np.ndarray, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+def seen_of(
+    item: ObjectModel, pose: np.ndarray, seed: int = 0
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Noisy points of poses [N, 7], as many as are looked at."""
     rng = np.random.default_rng(seed)
     chosen = rng.permutation(len(item.surface_points))[:POINTS]
     clouds = [Rotation.from_quat(p[3:]).apply(item.surface_points[chosen]) + p[:3] for p in pose]
     points = np.stack(clouds) + rng.normal(scale=0.002, size=(len(pose), len(chosen), 3))
-    return torch.tensor(points, dtype=torch.float32), torch.full((len(pose),), len(chosen), dtype=torch.int32)
+    return torch.tensor(points, dtype=torch.float32), torch.full(
+        (len(pose),), len(chosen), dtype=torch.int32
+    )
 
 
 def poses(count: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     turns = Rotation.random(count, rng=rng).as_quat()
-    return np.concatenate([np.array([0.0, 0.0, 0.15]) + rng.uniform(-0.05, 0.05, (count, 3)), turns], axis=1)
+    return np.concatenate(
+        [np.array([0.0, 0.0, 0.15]) + rng.uniform(-0.05, 0.05, (count, 3)), turns], axis=1
+    )
 
 
 def errors(found: torch.Tensor, pose: np.ndarray) -> np.ndarray:
-    return (Rotation.from_quat(found.numpy()[:, 3:]) * Rotation.from_quat(pose[:, 3:]).inv()).magnitude()
+    return (
+        Rotation.from_quat(found.numpy()[:, 3:]) * Rotation.from_quat(pose[:, 3:]).inv()
+    ).magnitude()
 
 
 def registration(item: ObjectModel, envs: int, device: str = "cpu", camera=None) -> Registration:
@@ -63,21 +71,30 @@ def test_distances_are_those_of_the_mesh_where_the_samples_lie_on_it(device):
     missed = cube.surface_points.copy()
     missed[:2] *= 1.0 + 0.0015 / (cube.longest_side / 2)
     simpler = replace(cube, surface_points=missed)
-    scan = replace(cube, surface_points=cube.surface_points + rng.normal(scale=0.004, size=(500, 3)))
+    scan = replace(
+        cube, surface_points=cube.surface_points + rng.normal(scale=0.004, size=(500, 3))
+    )
     for item in (cube, simpler, scan):
         shapes = registration(item, 1, device)._shapes
         half, grid = float(shapes.half.numpy()[0]), shapes.distance.numpy()[0]
-        place = np.stack(np.meshgrid(*3 * [np.linspace(-half, half, len(grid))], indexing="ij"), axis=-1)
+        place = np.stack(
+            np.meshgrid(*3 * [np.linspace(-half, half, len(grid))], indexing="ij"), axis=-1
+        )
         if item is not scan:
             beyond = np.abs(place) - cube.longest_side / 2
-            wanted = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(axis=-1), 0.0)
+            wanted = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(
+                beyond.max(axis=-1), 0.0
+            )
         else:
             wanted = cKDTree(scan.surface_points).query(place)[0]
         np.testing.assert_allclose(grid, wanted, atol=1e-5)
 
 
 def test_a_shape_is_found_and_followed(device, corner):
-    """Eight environments, each turned a little from look to look; the second look is of four of them anew."""
+    """Eight environments, each turned a little from look to look.
+
+    The second look is of four of them anew.
+    """
     found, place = registration(corner, 8, device), torch.device(wp.device_to_torch(device))
     pose, turn = poses(8), Rotation.from_rotvec([0.0, 0.1, 0.05])
     fresh = torch.ones(8, dtype=torch.bool, device=place)
@@ -141,7 +158,10 @@ def test_what_is_not_seen_stays_where_it_was(corner):
 
 
 def test_what_would_stand_before_what_is_seen_is_not_believed():
-    """Boards with a leg behind them, which does not show: turned over they fit as well, but for the leg."""
+    """Boards with a leg behind them, which does not show.
+
+    Turned over they fit as well, but for the leg.
+    """
     envs, camera, rng = 8, load_hand("dclaw3").camera, np.random.default_rng(1)
     # What is seen are not the samples of the shape, which would tell its sides apart.
     board, other = rng.uniform(-1.0, 1.0, (2, 400, 3)) * [0.05, 0.02, 0.002]

@@ -20,7 +20,9 @@ from vd.train.flags import write_config
 @pytest.fixture
 def cfg(tmp_path) -> AdaptCfg:
     hand, layer = load_hand("dclaw4"), tmp_path / "late.usda"
-    effects = {name: {"command_delay": {"delay_s": (0.08, 0.07, 0.09)}} for name in hand.joint_names}
+    effects = {
+        name: {"command_delay": {"delay_s": (0.08, 0.07, 0.09)}} for name in hand.joint_names
+    }
     write_layer(layer, hand, baseline={}, effects=effects, tool="a test", recording="none")
     return AdaptCfg(policy="dclaw4", hand_layer=layer, out=tmp_path / "run", objects=("cube",))
 
@@ -49,11 +51,16 @@ def test_both_policies_are_compared_in_both_models(cfg, monkeypatch):
         rows, nominal = [], asked.hand_layer == "none"
         for name in asked.policies:
             trace = traced(policy={} if nominal or name == str(cfg.out) else {"until": 0})
-            rows += [replace(row, condition=model) for row in judged(trace, (FakeObject("a"),), policy=name)]
+            rows += [
+                replace(row, condition=model)
+                for row in judged(trace, (FakeObject("a"),), policy=name)
+            ]
         return Result(tuple(rows))
 
     monkeypatch.setattr("vd.evaluate.compare.compare", compare)
     said: list[str] = []
     adapt.compare_models(cfg, teacher_cfg(cfg), said.append)
-    assert re.findall(r"(\S+) %", said[-1]) == ["100.0", "0.0", "100.0"], "before, there, and adapted"
+    assert re.findall(r"(\S+) %", said[-1]) == ["100.0", "0.0", "100.0"], (
+        "before, there, and adapted"
+    )
     assert "training, identified" in (cfg.out / adapt.PAGE).read_text()

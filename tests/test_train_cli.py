@@ -58,7 +58,12 @@ def test_the_machine_decides_where_no_preset_is_named(monkeypatch, capsys, gpus,
     assert parse_teacher(["--preset", "paper"], say=said.append).ppo == PRESETS["paper"]().ppo
     assert parse_teacher(["--smoke"], say=said.append).smoke and len(said) == 1
     tiny = smoke(PRESETS["leap-cube"]())
-    assert tiny.smoke and tiny.env.hand == "leap" and tiny.run.device == "cpu" and tiny.env.num_envs == 16
+    assert (
+        tiny.smoke
+        and tiny.env.hand == "leap"
+        and tiny.run.device == "cpu"
+        and tiny.env.num_envs == 16
+    )
 
 
 def test_a_preset_for_a_hand_of_its_own_serves_the_other():
@@ -81,14 +86,25 @@ def test_help_lists_at_most_80_flags_and_help_all_the_others_too(capsys):
     assert len(short) <= 80 and {"--env.reward.success", "--max-minutes"} <= everything >= short
     hidden = ["--" + name.replace("_", "-") for name in OF_HELP_ALL]
     for flag in everything:
-        assert (flag in short) != any(flag == name or flag.startswith(f"{name}.") for name in hidden), flag
+        assert (flag in short) != any(
+            flag == name or flag.startswith(f"{name}.") for name in hidden
+        ), flag
     assert parse_teacher(["--preset", "gpu", "--env.sim.njmax", "200"]).env.sim.njmax == 200
 
 
 def test_flags_override_the_preset_and_short_forms_mean_the_environment():
     cfg = parse_teacher(
         [
-            *("--preset", "gpu", "--hand", "dclaw3", "--objects", "cube", "cuboid", "--num_envs=128"),
+            *(
+                "--preset",
+                "gpu",
+                "--hand",
+                "dclaw3",
+                "--objects",
+                "cube",
+                "cuboid",
+                "--num_envs=128",
+            ),
             *("--seed", "7", "--ppo.epochs", "3", "--env.reward.energy=-1.5", "--out", "runs/x"),
             *("--max-minutes", "2.5", "--hand-layer", "bench/identified.usda", "--randomise"),
             *("--env.randomisation.effects", "backlash.width_rad", "0", "0.03"),
@@ -102,7 +118,9 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
     assert cfg.env.reward.energy == -1.5 and cfg.ppo.epochs == 3
     assert cfg.run.out == Path("runs/x") and cfg.run.max_minutes == 2.5
     assert cfg.policy == PRESETS["gpu"]().policy
-    with pytest.raises(ValueError, match=r"--env\.randomisation\.force-s draws nothing; add --randomise"):
+    with pytest.raises(
+        ValueError, match=r"--env\.randomisation\.force-s draws nothing; add --randomise"
+    ):
         parse_teacher(["--preset", "gpu", "--env.randomisation.force-s", "0.1"])
 
 
@@ -125,7 +143,9 @@ def test_resume_starts_from_the_runs_own_configuration(tmp_path):
     saved = dataclasses.replace(saved, preset="multi-gpu")  # as earlier versions wrote it
     (tmp_path / "config.json").write_text(json.dumps(to_dict(saved)))
     asked = dataclasses.replace(saved, preset="gpu")
-    assert parse_teacher(["--config", str(tmp_path / "config.json")]) == asked, "another run like it"
+    assert parse_teacher(["--config", str(tmp_path / "config.json")]) == asked, (
+        "another run like it"
+    )
     cfg = parse_teacher(["--out", str(tmp_path), "--resume", "--max-steps", "123"])
     assert cfg.resume == "latest" and cfg.run.save_every == 17 and cfg.run.max_steps == 123
     assert cfg.env == saved.env and cfg.run.out == tmp_path
@@ -189,7 +209,9 @@ def test_files_from_before_a_field_went_are_read_if_it_was_off():
     before["env"]["caught"] = {"after_s": 2.0, "beyond_rad": 0.4, "go_on_share": 0.0}
     before["env"]["aim"] = {"enabled": False, "past_rad": 0.3, "within_rad": 0.3}
     before["env"]["focus"] = {"success": {}, "share": 0.7}
-    before["env"]["table"]["handed_share"] = 0.25  # of installed policies, which nobody needs to be told
+    before["env"]["table"]["handed_share"] = (
+        0.25  # of installed policies, which nobody needs to be told
+    )
     before["run"] |= {"keep_last": 3, "tensorboard": before["run"].pop("logger") != "none"}
     before["run"]["run_dir"] = before["run"].pop("out")
     before["env"]["num_worlds"] = before["env"].pop("num_envs")
@@ -202,7 +224,9 @@ def test_files_from_before_a_field_went_are_read_if_it_was_off():
     ):
         on = json.loads(json.dumps(before))
         on["env"][group][field] = value
-        with pytest.raises(ValueError, match=rf"env\.{group}\.{field} is .*, and this version has only"):
+        with pytest.raises(
+            ValueError, match=rf"env\.{group}\.{field} is .*, and this version has only"
+        ):
             from_dict(TeacherCfg, on)
     before["env"]["aim"]["enabled"] = True
     with pytest.warns(UserWarning, match=r"env\.aim\.enabled is True; this version ignores it"):

@@ -1,4 +1,7 @@
-"""Runs that meet damaged files, refused settings and full disks: nothing is lost, and it is said."""
+"""Runs that meet damaged files, refused settings and full disks.
+
+Nothing is lost, and it is said.
+"""
 
 import json
 from pathlib import Path
@@ -95,14 +98,19 @@ def test_a_setting_that_is_refused_leaves_a_run_that_can_go_on_also_an_older_one
 def test_a_run_goes_on_from_its_newest_sound_checkpoint(tmp_path, monkeypatch, capsys, how, resume):
     simulating_the_dummy(monkeypatch)
     run = ["--out", str(tmp_path)]
-    assert teacher("--smoke", *run, "--max-steps", "384") == 0  # 128 an iteration, a checkpoint each
+    assert (
+        teacher("--smoke", *run, "--max-steps", "384") == 0
+    )  # 128 an iteration, a checkpoint each
     newest = checkpoint_path(tmp_path, 3)
     spoil(newest, how)
     assert teacher(*run, *resume, "--max-steps", "512") == 0
     said = capsys.readouterr()
     assert f"{newest} {DAMAGES[how]}" in said.err and "resumed after iteration 2 of 4" in said.out
     assert iterations(tmp_path) == [1, 2, 3, 4]
-    assert [path.name for path in list_checkpoints(tmp_path)][-2:] == ["model_0000003.pt", "model_0000004.pt"]
+    assert [path.name for path in list_checkpoints(tmp_path)][-2:] == [
+        "model_0000003.pt",
+        "model_0000004.pt",
+    ]
     for path in (tmp_path / "checkpoints").iterdir():
         path.write_bytes(b"")
     assert teacher(*run, *resume) == 1
@@ -137,7 +145,10 @@ def test_a_full_disk_ends_a_run_in_words_and_it_can_go_on(tmp_path, capfd, limit
     make_runner(tmp_path).learn(1)
     runner = make_runner(tmp_path, save_every=10, logger=logger)
     runner.load(str(find_checkpoint(tmp_path, "latest")))
-    with small_files(limit), pytest.raises(OutputError, match=rf"cannot write .*{named}: File too large"):
+    with (
+        small_files(limit),
+        pytest.raises(OutputError, match=rf"cannot write .*{named}: File too large"),
+    ):
         runner.learn(100)
     assert "Traceback" not in capfd.readouterr().err
     assert (tmp_path / "progress.jsonl").read_text().endswith("}\n")

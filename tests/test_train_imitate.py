@@ -13,7 +13,9 @@ from vd.train.cli import main
 from vd.train.config import PolicyCfg
 from vd.train.metrics import read_progress
 
-NETWORK = PolicyCfg(hidden=(32, 32), distribution="state-dependent", initial_std=0.2, std_range=(0.05, 0.5))
+NETWORK = PolicyCfg(
+    hidden=(32, 32), distribution="state-dependent", initial_std=0.2, std_range=(0.05, 0.5)
+)
 IMITATING = replace(SMALL_PPO, imitation_iterations=60)
 
 
@@ -95,7 +97,9 @@ def test_ppo_goes_on_from_there_with_its_own_rates_and_small_first_steps(taught,
     before = {name: value.clone() for name, value in runner.alg.actor.named_parameters()}
     runner.learn(1)
     rows = read_progress(tmp_path / "progress.jsonl")
-    assert [row["critic_warmup"] for row in rows[-2:]] == [0, 0] and "loss/imitation" not in rows[-1]
+    assert [row["critic_warmup"] for row in rows[-2:]] == [0, 0] and "loss/imitation" not in rows[
+        -1
+    ]
     assert rows[-1]["actor_learning_rate"] == 1e-4 and rows[-1]["loss/kl"] < 0.01
     steps = SMALL_PPO.epochs * runner.alg.num_mini_batches
     after = runner.alg.actor.named_parameters()
@@ -105,7 +109,9 @@ def test_ppo_goes_on_from_there_with_its_own_rates_and_small_first_steps(taught,
 
 def test_a_run_that_was_stopped_on_the_way_goes_on_imitating_the_same(taught, tmp_path):
     def runner(ppo=IMITATING):
-        return make_runner(tmp_path, env=LateEnv(num_envs=32), policy=NETWORK, ppo=ppo, save_every=1)
+        return make_runner(
+            tmp_path, env=LateEnv(num_envs=32), policy=NETWORK, ppo=ppo, save_every=1
+        )
 
     first = runner()
     first.begin_from(str(taught))
@@ -125,7 +131,10 @@ def test_a_run_that_was_stopped_on_the_way_goes_on_imitating_the_same(taught, tm
 def test_it_is_refused_without_a_policy_or_without_the_present(taught, tmp_path, capsys):
     flags = ["--ppo.imitation-iterations", "5", "--out", str(tmp_path / "run"), "--device", "cpu"]
     assert main(["teacher", "--preset", "gpu", *flags]) == 1
-    assert "--ppo.imitation-iterations imitates the policy that --init names" in capsys.readouterr().err
+    assert (
+        "--ppo.imitation-iterations imitates the policy that --init names"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "run").exists()
     runner = make_runner(tmp_path, env=PromptEnv(num_envs=4), policy=NETWORK, ppo=IMITATING)
     with pytest.raises(

@@ -1,4 +1,7 @@
-"""Beginning a run from an exported policy: what is taken over, what the critic learns, what is refused."""
+"""Beginning a run from an exported policy.
+
+What is taken over, what the critic learns, what is refused.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +39,9 @@ def _export(folder: Path, *, critic: bool = True, learner: bool = True) -> Path:
 
 def _begun(folder: Path, policy: Path, **options):
     ppo = replace(LEARNED, **options)
-    runner = make_runner(folder, env=DummyEnv(num_envs=16, seed=7), seed=7, policy=NORMALISING, ppo=ppo)
+    runner = make_runner(
+        folder, env=DummyEnv(num_envs=16, seed=7), seed=7, policy=NORMALISING, ppo=ppo
+    )
     runner.begin_from(str(policy))
     return runner
 
@@ -71,7 +76,9 @@ def test_a_run_begun_from_a_policy_acts_as_it_and_says_how_long_the_critic_learn
         assert _same(values, load_checkpoint(path)["critic_state_dict"]) == list(values)
     else:
         normaliser = [name for name in values if name.startswith("obs_normalizer")]
-        assert normaliser and set(_same(values, actor)) >= set(normaliser), "both read the same observations"
+        assert normaliser and set(_same(values, actor)) >= set(normaliser), (
+            "both read the same observations"
+        )
 
 
 @pytest.mark.parametrize("schedule", ["fixed", "adaptive"])
@@ -79,17 +86,25 @@ def test_only_the_critic_learns_while_it_warms_up(tmp_path, monkeypatch, schedul
     monkeypatch.setattr(begin, "CRITIC_WARMUP", 2)
     path = _export(tmp_path / "first", critic=False)
     runner = _begun(tmp_path / "second", path, schedule=schedule)
-    actor, critic, rate = _state(runner.alg.actor), _state(runner.alg.critic), runner.alg.learning_rate
+    actor, critic, rate = (
+        _state(runner.alg.actor),
+        _state(runner.alg.critic),
+        runner.alg.learning_rate,
+    )
     runner.learn(2)
     assert _same(actor, _state(runner.alg.actor)) == list(actor)
     assert not _same(critic, _state(runner.alg.critic))
     assert runner.alg.learning_rate == rate == runner.alg.optimizer.param_groups[0]["lr"]
     moments = runner.alg.optimizer.state_dict()["state"]
-    assert all(moment["exp_avg_sq"].abs().max() > 0.0 for moment in moments.values()), "the actor's too"
+    assert all(moment["exp_avg_sq"].abs().max() > 0.0 for moment in moments.values()), (
+        "the actor's too"
+    )
     runner.learn(1)
     assert runner.critic_warmup == 0
     assert _same(actor, _state(runner.alg.actor)) == [], "afterwards both learn"
-    assert [row["critic_warmup"] for row in read_progress(tmp_path / "second" / "progress.jsonl")] == [
+    assert [
+        row["critic_warmup"] for row in read_progress(tmp_path / "second" / "progress.jsonl")
+    ] == [
         1,
         0,
         0,
@@ -100,14 +115,23 @@ def test_only_the_critic_learns_while_it_warms_up(tmp_path, monkeypatch, schedul
     ("tightened", "asked", "wanted"),
     [(True, None, (1.0, 1.0)), (False, None, (1.0, 0.0)), (True, (0.5, 0.0), (0.5, 0.0))],
 )
-def test_a_policy_that_does_not_say_how_far_it_came_has_come_to_the_end(tmp_path, tightened, asked, wanted):
-    """The installed policies of old have no stage; whether stillness tightened stands in their task."""
+def test_a_policy_that_does_not_say_how_far_it_came_has_come_to_the_end(
+    tmp_path, tightened, asked, wanted
+):
+    """The installed policies of old have no stage.
+
+    Whether stillness tightened stands in their task.
+    """
     path = _export(tmp_path / "first", learner=False)
     state = load_checkpoint(path)
-    state["task"]["curriculum"] = to_dict(CurriculumCfg(tightening=TighteningCfg(enabled=tightened)))
+    state["task"]["curriculum"] = to_dict(
+        CurriculumCfg(tightening=TighteningCfg(enabled=tightened))
+    )
     save_checkpoint(path, state)
     env = DummyEnv(num_envs=16)
-    env.cfg = replace(env.cfg, curriculum=CurriculumCfg(enabled=True, tightening=TighteningCfg(enabled=True)))
+    env.cfg = replace(
+        env.cfg, curriculum=CurriculumCfg(enabled=True, tightening=TighteningCfg(enabled=True))
+    )
     runner = make_runner(tmp_path / "second", env=env, policy=NORMALISING)
     runner.begin_from(str(path), asked)
     assert (env.stage.difficulty, env.stage.tightness) == wanted
@@ -118,8 +142,14 @@ def test_a_policy_that_does_not_say_how_far_it_came_has_come_to_the_end(tmp_path
 def test_what_does_not_fit_is_named_with_the_flag_that_would(tmp_path):
     path = _export(tmp_path / "first")
     for policy, message in (
-        (replace(NORMALISING, hidden=(8,)), r"has --policy\.hidden \(16, 16\), and this run \(8,\)"),
-        (replace(NORMALISING, distribution="gaussian"), r"has --policy\.distribution state-dependent"),
+        (
+            replace(NORMALISING, hidden=(8,)),
+            r"has --policy\.hidden \(16, 16\), and this run \(8,\)",
+        ),
+        (
+            replace(NORMALISING, distribution="gaussian"),
+            r"has --policy\.distribution state-dependent",
+        ),
         (SMALL_POLICY, r"has --policy\.normalise-observations True.*leave --preset out"),
     ):
         runner = make_runner(tmp_path / "other", policy=policy)
@@ -132,13 +162,17 @@ def test_what_does_not_fit_is_named_with_the_flag_that_would(tmp_path):
         def _observe(self) -> None: ...
 
     runner = make_runner(tmp_path / "hand", env=Larger(num_envs=4), policy=NORMALISING)
-    with pytest.raises(ValueError, match="moves 2 joints of dummy, and this run's hand, dummy, has 3"):
+    with pytest.raises(
+        ValueError, match="moves 2 joints of dummy, and this run's hand, dummy, has 3"
+    ):
         runner.begin_from(str(path))
     state = load_checkpoint(path)
     state["policy"]["num_observations"] = 9
     save_checkpoint(path, state)
     runner = make_runner(tmp_path / "less", policy=NORMALISING)
-    with pytest.raises(ValueError, match=r"reads 9 values and this run observes 5.*leave --preset out"):
+    with pytest.raises(
+        ValueError, match=r"reads 9 values and this run observes 5.*leave --preset out"
+    ):
         runner.begin_from(str(path))
 
 
@@ -153,9 +187,13 @@ class Telling(DummyEnv):
 
 
 @pytest.mark.parametrize("critic", [True, False])
-def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it_did(tmp_path, critic):
+def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it_did(
+    tmp_path, critic
+):
     path = _export(tmp_path / "first", critic=critic)
-    runner = make_runner(tmp_path / "told", env=Telling(num_envs=16), policy=NORMALISING, ppo=LEARNED)
+    runner = make_runner(
+        tmp_path / "told", env=Telling(num_envs=16), policy=NORMALISING, ppo=LEARNED
+    )
     runner.begin_from(str(path))
     assert runner.new_inputs == 2 * critic and runner.num_observations == 5
     observation, plain = runner.env.get_observations(), load_policy(path)
@@ -168,12 +206,18 @@ def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it
         assert torch.allclose(values, before(observation["policy"])[:, 0], atol=1e-5)
     runner.critic_warmup = 0
     runner.learn(2)
-    assert runner.alg.critic.state_dict()["mlp.0.weight"][:, 5:].abs().max() > 0.0, "it was not told"
+    assert runner.alg.critic.state_dict()["mlp.0.weight"][:, 5:].abs().max() > 0.0, (
+        "it was not told"
+    )
     ended = load_policy(tmp_path / "told" / "policy.pt")
     assert ended.act(observation["policy"]).shape == (16, 2)
-    again = make_runner(tmp_path / "told", env=Telling(num_envs=16), policy=NORMALISING, ppo=LEARNED)
+    again = make_runner(
+        tmp_path / "told", env=Telling(num_envs=16), policy=NORMALISING, ppo=LEARNED
+    )
     again.load(str(find_checkpoint(tmp_path / "told", "latest")))
-    assert _same(_state(runner.alg.critic), _state(again.alg.critic)) == list(_state(again.alg.critic))
+    assert _same(_state(runner.alg.critic), _state(again.alg.critic)) == list(
+        _state(again.alg.critic)
+    )
 
 
 def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys):
@@ -181,9 +225,18 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     make_runner(tmp_path).learn(1)
     assert find_start(str(tmp_path)) == tmp_path / "checkpoints" / BEST_NAME, "it has the optimiser"
     assert find_start(str(tmp_path / "policy.pt")) == tmp_path / "policy.pt"
-    with pytest.raises(FileNotFoundError, match=r"--init: no policy at .*installed policy: .*dclaw3"):
+    with pytest.raises(
+        FileNotFoundError, match=r"--init: no policy at .*installed policy: .*dclaw3"
+    ):
         find_start(str(tmp_path / "none"))
-    start = ["--preset", "gpu", "--init", str(tmp_path / "no.pt"), "--env.observation.shape", "full"]
+    start = [
+        "--preset",
+        "gpu",
+        "--init",
+        str(tmp_path / "no.pt"),
+        "--env.observation.shape",
+        "full",
+    ]
     cfg = parse_teacher([*start, "--out", str(tmp_path / "run"), "--resume", "auto"])
     assert cfg.env.observation.shape == "full" and cfg.ppo == PRESETS["gpu"]().ppo
     assert main(["teacher", *start, "--out", str(tmp_path / "run")]) == 1

@@ -15,7 +15,9 @@ from vd.train.metrics import GoalWindow, StepMeans, read_progress
 from vd.train.ppo import RUNAWAY_KL
 from vd.train.vec_env import ReorientVecEnv
 
-needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs and waits need a GPU")
+needs_gpu = pytest.mark.skipif(
+    not torch.cuda.is_available(), reason="CUDA graphs and waits need a GPU"
+)
 NORMALISING = dataclasses.replace(SMALL_POLICY, normalise_observations=True)
 TIGHTENING = dataclasses.replace(NORMALISING, std_range=(0.2, 1.0), quiet_std=0.05)
 
@@ -44,7 +46,9 @@ def test_success_is_done_and_a_pure_time_out_adds_the_discounted_value_of_what_w
     expected = reward + runner.alg.gamma * value * torch.tensor([0.0, 0.0, 1.0, 0.0])
     assert torch.allclose(runner.alg.storage.rewards[0].squeeze(1), expected)
     assert runner.alg.storage.dones[0].flatten().tolist() == [1, 1, 1, 1]
-    shares = {name: float(extras["log"][f"task/{name}"]) for name in ("reached", "dropped", "timed_out")}
+    shares = {
+        name: float(extras["log"][f"task/{name}"]) for name in ("reached", "dropped", "timed_out")
+    }
     assert shares == {"reached": 0.5, "dropped": 0.25, "timed_out": 0.25}
 
 
@@ -82,7 +86,9 @@ def test_an_update_that_runs_away_ends_with_its_epoch(tmp_path):
         kls[schedule] = [float(statistics[3]) for statistics in kls[schedule]]
         assert row["loss/kl"] == pytest.approx(np.mean(kls[schedule]), rel=1e-5)
     share = len(kls["fixed"]) // 4
-    epochs = [np.mean(kls["adaptive"][i : i + share]) for i in range(0, len(kls["adaptive"]), share)]
+    epochs = [
+        np.mean(kls["adaptive"][i : i + share]) for i in range(0, len(kls["adaptive"]), share)
+    ]
     assert len(kls["adaptive"]) == share * len(epochs) < len(kls["fixed"])
     assert epochs[-1] > RUNAWAY_KL * 0.01 >= max(epochs[:-1], default=0.0)
 
@@ -104,9 +110,12 @@ def test_gradient_is_clipped_by_the_joint_norm(tmp_path):
 def test_means_beyond_the_bound_come_back_only_with_their_loss(tmp_path):
     beyond = {}
     for coefficient in (0.0, 0.1):
-        ppo = dataclasses.replace(SMALL_PPO, bound_coefficient=coefficient, actor_learning_rate=1e-2)
+        ppo = dataclasses.replace(
+            SMALL_PPO, bound_coefficient=coefficient, actor_learning_rate=1e-2
+        )
         runner = make_runner(tmp_path / str(coefficient), ppo=ppo)
-        # Flat advantages leave the surrogate without a gradient in the mean: the loss alone moves it.
+        # Flat advantages leave the surrogate without a gradient in the mean: the loss alone moves
+        # it.
         with torch.no_grad():
             runner.alg.actor.mlp[-2].bias[: runner.env.num_actions] = 3.0
         with torch.inference_mode():
@@ -169,7 +178,9 @@ def test_step_means_and_window_ratios():
 @pytest.mark.parametrize("distribution", ["state-dependent", "gaussian"])
 @pytest.mark.parametrize("normalise", [False, True])
 def test_policy_equals_the_actor_it_came_from(tmp_path, distribution, normalise):
-    policy = dataclasses.replace(SMALL_POLICY, distribution=distribution, normalise_observations=normalise)
+    policy = dataclasses.replace(
+        SMALL_POLICY, distribution=distribution, normalise_observations=normalise
+    )
     runner = make_runner(tmp_path, policy=policy)
     runner.learn(3)
     from vd.policy import load_policy
@@ -208,7 +219,12 @@ def test_what_gradients_are_computed_from_stays_where_it_is_in_memory(tmp_path):
     runner = make_runner(tmp_path, policy=TIGHTENING, save_every=1)
     runner.learn(1)
     before = read(runner.alg)
-    assert {"advantages", "old 1", "actor.obs_normalizer._std", "actor.distribution.log_floor"} <= set(before)
+    assert {
+        "advantages",
+        "old 1",
+        "actor.obs_normalizer._std",
+        "actor.distribution.log_floor",
+    } <= set(before)
     std = runner.alg.actor.obs_normalizer._std.clone()
     runner.learn(2)
     runner.load(str(tmp_path / "checkpoints" / "model_0000002.pt"))
@@ -227,7 +243,10 @@ def test_a_recorded_graph_gives_the_gradients_of_every_minibatch(tmp_path):
         for ppo in (SMALL_PPO, graphed)
     )
     assert torch.equal(plain.samples["actions"], recorded.samples["actions"])
-    for rows in (*torch.randperm(128, device="cuda:0").split(64), torch.arange(64, device="cuda:0")):
+    for rows in (
+        *torch.randperm(128, device="cuda:0").split(64),
+        torch.arange(64, device="cuda:0"),
+    ):
         for alg in (plain, recorded):
             alg.actor.distribution.set_floor(0.1)
         statistics = [alg._minibatch_step(rows) for alg in (plain, recorded)]

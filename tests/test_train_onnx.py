@@ -20,7 +20,9 @@ def test_onnxruntime_gives_the_same_actions_for_any_number_of_worlds(tmp_path, n
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
     for envs in (1, 7):
         # observations of the size they have, not of size 1
-        noise = torch.randn(envs, policy.num_observations, generator=torch.Generator().manual_seed(0))
+        noise = torch.randn(
+            envs, policy.num_observations, generator=torch.Generator().manual_seed(0)
+        )
         observation = policy.network.offset + policy.network.scale * noise
         (found,) = session.run(["action"], {"observation": observation.numpy()})
         assert found.shape == (envs, policy.num_actions)
@@ -33,7 +35,9 @@ def test_a_vision_policy_has_two_networks_and_looks_at_any_number_of_points(tmp_
     policy = open_policy("dclaw4-vision", "cpu")
     for pairs, goals, seen in ((1, 500, 512), (5, 300, 200)):
         clouds = [0.03 * torch.randn(pairs, points, 3) for points in (goals, seen)]
-        told = dict(zip(("goal_points", "seen_points"), (cloud.numpy() for cloud in clouds), strict=True))
+        told = dict(
+            zip(("goal_points", "seen_points"), (cloud.numpy() for cloud in clouds), strict=True)
+        )
         for name, wanted in vars(policy.alignment(*clouds)).items():
             (found,) = session.run([name], told)
             np.testing.assert_allclose(found, wanted.detach().numpy(), atol=1e-4)

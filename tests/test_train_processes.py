@@ -1,4 +1,7 @@
-"""A run of several processes: the same parameters, own environments, and errors and hangs of one of them."""
+"""A run of several processes.
+
+The same parameters, own environments, and errors and hangs of one of them.
+"""
 
 import json
 import os
@@ -54,7 +57,9 @@ with distributed.ending_together():
 
 
 PATIENCE_S = 300.0
-"""For processes to end: two that load torch on a fresh, busy machine have taken more than a minute."""
+"""For processes to end: two that load torch on a fresh, busy machine have taken more than a
+minute.
+"""
 
 
 def _two_nodes(script: Path, folder: Path) -> list[subprocess.Popen]:
@@ -66,7 +71,14 @@ def _two_nodes(script: Path, folder: Path) -> list[subprocess.Popen]:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     flags = "--nnodes 2 --nproc-per-node 1 --rdzv-backend c10d --rdzv-endpoint"
-    run = [sys.executable, "-m", "torch.distributed.run", *flags.split(), f"127.0.0.1:{port}", "--local-addr"]
+    run = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        *flags.split(),
+        f"127.0.0.1:{port}",
+        "--local-addr",
+    ]
     # No PATH: nothing may depend on a git binary, which rsl-rl's logger looks for.
     env = os.environ | {"PATH": ""}
     return [
@@ -95,7 +107,9 @@ def test_two_nodes_keep_the_same_parameters_and_their_own_worlds_until_one_hangs
             node.wait(timeout=PATIENCE_S)
     said = "".join((tmp_path / f"stderr{node}").read_text() for node in (1, 2))
     assert "process 0 failed and ends the run; --resume" in said
-    assert re.search(r"most recent call first\):\n  File .* in hang\n", said), "the stack of who hangs"
+    assert re.search(r"most recent call first\):\n  File .* in hang\n", said), (
+        "the stack of who hangs"
+    )
     one, two = (json.loads((tmp_path / f"rank{r}.json").read_text()) for r in range(2))
     assert one["weights"] == two["weights"]
     assert one["draw"] != two["draw"] and one["target"] != two["target"]
@@ -109,7 +123,13 @@ def test_two_nodes_keep_the_same_parameters_and_their_own_worlds_until_one_hangs
     assert alone.new_episodes == "it is of 2 processes, this run has 1"
     assert alone.env_steps == one["steps"] and alone.env.env.stage.difficulty == pytest.approx(0.02)
     networks = (alone.alg.actor, alone.alg.critic)
-    weights = torch.cat([p.detach().flatten() for network in networks for p in network.parameters()])
+    weights = torch.cat(
+        [p.detach().flatten() for network in networks for p in network.parameters()]
+    )
     assert weights.tolist() == one["weights"]
     alone.learn(1)
-    assert [row["env_steps"] for row in read_progress(tmp_path / "progress.jsonl")] == [128, 256, 256 + 64]
+    assert [row["env_steps"] for row in read_progress(tmp_path / "progress.jsonl")] == [
+        128,
+        256,
+        256 + 64,
+    ]

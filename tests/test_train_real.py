@@ -59,7 +59,9 @@ def test_a_run_goes_on_bit_for_bit_and_another_sees_more_from_there(tmp_path):
 
     blind = load_policy(checkpoint_path(tmp_path / "part", 4))
     seen = replace(smoke().env.observation, shape="full", dynamics="critic")
-    seeing = _train(tmp_path / "seeing", 0, init=str(checkpoint_path(tmp_path / "part", 4)), observation=seen)
+    seeing = _train(
+        tmp_path / "seeing", 0, init=str(checkpoint_path(tmp_path / "part", 4)), observation=seen
+    )
     told = seeing.env.env.privileged.shape[1]
     before = blind.num_observations
     assert seeing.new_inputs == seeing.env.env.num_observations + told - before > told > 0

@@ -22,12 +22,15 @@ TIMING = ("elapsed_s", "steps_per_s", "collect_s", "learn_s")
 
 def _weights(runner) -> dict[str, torch.Tensor]:
     saved = runner.alg.save()
-    return saved["actor_state_dict"] | {f"critic.{k}": v for k, v in saved["critic_state_dict"].items()}
+    return saved["actor_state_dict"] | {
+        f"critic.{k}": v for k, v in saved["critic_state_dict"].items()
+    }
 
 
 def _rows(folder: Path) -> list[dict]:
     return [
-        {k: v for k, v in row.items() if k not in TIMING} for row in read_progress(folder / "progress.jsonl")
+        {k: v for k, v in row.items() if k not in TIMING}
+        for row in read_progress(folder / "progress.jsonl")
     ]
 
 
@@ -57,9 +60,13 @@ def test_keeps_the_last_and_the_best_since_two_episodes_are_over(tmp_path):
     runner = make_runner(tmp_path, save_every=1)
     runner._window = GoalWindow(2)
     runner.learn(1)
-    assert load_checkpoint(find_checkpoint(tmp_path, "best"))["iter"] == 1, "before, it is the latest"
+    assert load_checkpoint(find_checkpoint(tmp_path, "best"))["iter"] == 1, (
+        "before, it is the latest"
+    )
     runner.learn(5)
-    assert [p.name for p in list_checkpoints(tmp_path)] == [f"model_000000{i}.pt" for i in (4, 5, 6)]
+    assert [p.name for p in list_checkpoints(tmp_path)] == [
+        f"model_000000{i}.pt" for i in (4, 5, 6)
+    ]
     best = load_checkpoint(find_checkpoint(tmp_path, "best"))
     scores = [
         (row["task/difficulty"], row["success_per_goal"] or 0.0, row["mean_reward"])
@@ -105,7 +112,9 @@ def test_a_signal_saves_and_the_run_goes_on(tmp_path, number):
 
 
 def test_limits_of_steps_and_time(tmp_path):
-    runner = make_runner(tmp_path / "steps", max_steps=300)  # 16 environments x 8 steps = 128 an iteration
+    runner = make_runner(
+        tmp_path / "steps", max_steps=300
+    )  # 16 environments x 8 steps = 128 an iteration
     runner.learn()
     assert runner.iteration == 3 and runner.env_steps == 384
     timed = make_runner(tmp_path / "time", deadline=time.monotonic(), save_every=100)
@@ -233,13 +242,17 @@ def test_a_new_run_can_begin_from_anothers_checkpoint_at_its_own_rates(tmp_path)
     one, two = _weights(first), _weights(second)
     assert all(torch.equal(one[name], two[name]) for name in one)
     assert not second.env.env.step_count.numpy().any()
-    assert second._best is None and not second._window.full, "another run's rates would decide which is best"
+    assert second._best is None and not second._window.full, (
+        "another run's rates would decide which is best"
+    )
     second.learn(1)
     assert [row["iteration"] for row in _rows(tmp_path / "second")] == [4]
     with pytest.raises(ValueError, match="is a policy, which nothing can resume; --init"):
         second.load(str(tmp_path / "first" / "policy.pt"))
     second.load(str(checkpoint))
-    assert second.alg.learning_rate == first.alg.learning_rate, "a resumed run goes on with those it had"
+    assert second.alg.learning_rate == first.alg.learning_rate, (
+        "a resumed run goes on with those it had"
+    )
 
 
 def test_a_run_goes_on_with_another_number_of_worlds_to_the_same_steps(tmp_path):

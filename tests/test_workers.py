@@ -33,6 +33,12 @@ def test_tasks_that_hang_or_die_cost_themselves_only():
 def test_workers_have_one_thread_each_and_no_gpu():
     before = dict(os.environ)
     answers = []
-    run_tasks(work, [("threads", 0)], lambda task, result, why: answers.append(result), jobs=1, limit_s=60.0)
+    run_tasks(
+        work,
+        [("threads", 0)],
+        lambda task, result, why: answers.append(result),
+        jobs=1,
+        limit_s=60.0,
+    )
     assert answers == [["1"] * len(SINGLE) + [""]]
     assert dict(os.environ) == before

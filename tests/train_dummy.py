@@ -28,8 +28,8 @@ class DummyCfg:
 class DummyEnv:
     """Reward is minus the squared distance of the action to a target that the observation shows.
 
-    A target within ``reach`` of the action counts as success and is replaced; environments "fall" with a
-    small probability and time out after ``max_episode_steps``.
+    A target within ``reach`` of the action counts as success and is replaced; environments "fall"
+    with a small probability and time out after ``max_episode_steps``.
     """
 
     num_actions = 2
@@ -40,7 +40,9 @@ class DummyEnv:
     reach = 0.2
     fall_probability = 0.02
 
-    def __init__(self, num_envs: int = 4, max_episode_steps: int = 10, seed: int = 0, device: str = "cpu"):
+    def __init__(
+        self, num_envs: int = 4, max_episode_steps: int = 10, seed: int = 0, device: str = "cpu"
+    ):
         self.cfg = DummyCfg(seed=seed)
         self.num_envs, self.max_episode_steps, self.device = num_envs, max_episode_steps, device
         n = num_envs
@@ -117,8 +119,12 @@ class DummyEnv:
         """Everything."""
         return {
             "arrays": {"target": self._target.copy(), "step_count": self.step_count.numpy().copy()},
-            "generator": self._generator.bit_generator.state["state"]["state"].to_bytes(16, "little").hex(),
-            "increment": self._generator.bit_generator.state["state"]["inc"].to_bytes(16, "little").hex(),
+            "generator": self._generator.bit_generator.state["state"]["state"]
+            .to_bytes(16, "little")
+            .hex(),
+            "increment": self._generator.bit_generator.state["state"]["inc"]
+            .to_bytes(16, "little")
+            .hex(),
             "steps": self.steps,
             "difficulty": self.stage.difficulty,
         }

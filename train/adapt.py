@@ -23,13 +23,14 @@ PAGE = "adapted.html"
 NOMINAL, IDENTIFIED = "nominal", "identified"
 """Models of the hand in which the policies are compared."""
 LOOSE = 0.4
-"""Tightness of the curriculum at which it begins: who has to stand still at once learns little. So begun, and
-with nothing random but the layer's numbers, 4.4 points more (2.1 to 6.8) come back than when the policy's own
-training goes on: 1300 validation episodes of two hidden models, 118 M steps. Neither was tried alone, nor
-half and twice."""
+"""Tightness of the curriculum at which it begins: who has to stand still at once learns little. So
+begun, and with nothing random but the layer's numbers, 4.4 points more (2.1 to 6.8) come back than
+when the policy's own
+training goes on: 1300 validation episodes of two hidden models, 118 M steps. Neither was tried
+alone, nor half and twice."""
 RATE, RAISE_AT = 0.0013, 0.1
-"""It rises by so much an update while so many goals succeed, which they did: in 461 updates, 60 M steps of
-16384 environments, to 1. Tried with LOOSE."""
+"""It rises by so much an update while so many goals succeed, which they did: in 461 updates, 60 M
+steps of 16384 environments, to 1. Tried with LOOSE."""
 KL = 0.015
 """Between the policies before and after an update, with which LOOSE was tried."""
 
@@ -38,13 +39,14 @@ KL = 0.015
 class AdaptCfg:
     """Train a teacher further in the identified model of a hand.
 
-    Task and learner stay those of the policy's own training. The servos are the layer's: each number with an
-    interval is drawn from it in every episode; nothing else is random, nor observed late. To stand still is
-    asked for little at first, and as before after 461 updates.
+    Task and learner stay those of the policy's own training. The servos are the layer's: each
+    number with an interval is drawn from it in every episode; nothing else is random, nor observed
+    late. To stand still is asked for little at first, and as before after 461 updates.
 
-    At the end the policy before and after turns the same objects in the nominal and in the identified model:
-    adapted.html in --out. The same command goes on where it was interrupted. For other settings, as the
-    policy's own randomisation, take vd-train teacher --init POLICY --hand-layer LAYER.
+    At the end the policy before and after turns the same objects in the nominal and in the
+    identified model: adapted.html in --out. The same command goes on where it was interrupted. For
+    other settings, as the policy's own randomisation, take vd-train teacher --init POLICY
+    --hand-layer LAYER.
     """
 
     policy: Annotated[str, tyro.conf.Positional]
@@ -93,7 +95,9 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
         As :func:`adapt_command`.
     """
     if str(cfg.hand_layer) == NO_LAYER:
-        raise ValueError("--hand-layer none is nothing to adapt to; name the identified.usda of vd-gap")
+        raise ValueError(
+            "--hand-layer none is nothing to adapt to; name the identified.usda of vd-gap"
+        )
     check_names([cfg.policy], cfg.objects)
     _check_teacher(cfg.policy)
     try:
@@ -150,7 +154,8 @@ def _check_teacher(name: str) -> None:
     if isinstance(policy, TrackingPolicy):
         network = "" if policy.alignment is None else f" --alignment {name}"
         raise ValueError(
-            f"{name} sees by camera; adapt its teacher, {policy.spec.teacher}, and let that see again: "
+            f"{name} sees by camera; adapt its teacher, {policy.spec.teacher}, and let that see "
+            f"again: "
             f"vd-train tracker runs/adapted --objects SET{network}"
         )
 

@@ -17,10 +17,14 @@ if TYPE_CHECKING:
     from vd.train.presets import TeacherCfg
 
 CRITIC_WARMUP = 50
-"""Iterations in which a critic that begins from nothing learns alone. Its targets hold its own values of up
-to 8 steps later, 4.5 in the mean, so an error of states that last shrinks by gamma^4.5 a time: to a tenth."""
+"""Iterations in which a critic that begins from nothing learns alone. Its targets hold its own
+values of up to 8 steps later, 4.5 in the mean, so an error of states that last shrinks by gamma^4.5
+a time: to a tenth.
+"""
 MOMENTS_WARMUP = 3
-"""Iterations of it where only the optimiser is missing: about a hundred steps, for Adam's second moment."""
+"""Iterations of it where only the optimiser is missing: about a hundred steps, for Adam's second
+moment.
+"""
 REMEDY = "give the policy's settings, or leave --preset out, which takes them over"
 NEW_INPUTS = {
     "mlp.0.weight": 0.0,
@@ -34,7 +38,9 @@ _SENSES = ("hand", "fingertip", "hand_layer", "sim", "action", "observation")
 
 
 def find_start(name: str) -> Path:
-    """The file that ``--init`` names: an installed policy, a file, or the best checkpoint of a run's folder.
+    """The file that ``--init`` names.
+
+    An installed policy, a file, or the best checkpoint of a run's folder.
 
     Raises:
         FileNotFoundError: There is none.
@@ -52,7 +58,9 @@ def find_start(name: str) -> Path:
     except FileNotFoundError as error:
         raise FileNotFoundError(f"--init: {error}") from error
     if is_bundle(path):
-        raise ValueError(f"--init: {name} is a bundle; give the policy or checkpoint that it was made from")
+        raise ValueError(
+            f"--init: {name} is a bundle; give the policy or checkpoint that it was made from"
+        )
     return path
 
 
@@ -73,12 +81,18 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
         raise ValueError(f"--init: {path} does not say how it was trained; add --preset")
     try:
         env = from_dict(ReorientCfg, state["task"], where="task")
-        learner, how = state["learner"], {"critic_warmup_iterations": None, "imitation_iterations": 0}
-        ppo = from_dict(PpoCfg, learner["ppo"] | how, where="learner.ppo")  # how it began is its own
+        learner, how = (
+            state["learner"],
+            {"critic_warmup_iterations": None, "imitation_iterations": 0},
+        )
+        ppo = from_dict(
+            PpoCfg, learner["ppo"] | how, where="learner.ppo"
+        )  # how it began is its own
         policy = from_dict(PolicyCfg, learner["policy"], where="learner.policy")
     except ValueError as error:
         raise ValueError(
-            f"--init: {path} was written by another version ({error}); add --preset and the settings that it "
+            f"--init: {path} was written by another version ({error}); add --preset and the "
+            f"settings that it "
             "was trained with"
         ) from error
     run = replace(base.run, out=Path("runs") / f"from-{Path(name).stem}")
@@ -94,13 +108,17 @@ def warmup_iterations(state: Mapping[str, Any]) -> int:
     return int(state.get("critic_warmup", 0))  # what its own run still lacked
 
 
-def widen(state: dict[str, Any], actor: "nn.Module", critic: "nn.Module") -> tuple[dict[str, Any], int]:
+def widen(
+    state: dict[str, Any], actor: "nn.Module", critic: "nn.Module"
+) -> tuple[dict[str, Any], int]:
     """A checkpoint or policy with the networks of a run that observes more, acting as before.
 
-    Of a network that reads more nothing is taken over of the optimiser: its moments are of another shape.
+    Of a network that reads more nothing is taken over of the optimiser: its moments are of another
+    shape.
 
     Args:
-        state: The checkpoint, not changed. Critic and optimiser may be missing, as in an exported policy.
+        state: The checkpoint, not changed. Critic and optimiser may be missing, as in an exported
+            policy.
         actor: The actor it is for, which reads at least as much as that of the checkpoint.
         critic: The critic it is for.
 
@@ -112,10 +130,13 @@ def widen(state: dict[str, Any], actor: "nn.Module", critic: "nn.Module") -> tup
     from vd.policy import policy_export
 
     widened, most = {}, 0
-    before, now = (w["mlp.0.weight"].shape[1] for w in (state["actor_state_dict"], actor.state_dict()))
+    before, now = (
+        w["mlp.0.weight"].shape[1] for w in (state["actor_state_dict"], actor.state_dict())
+    )
     told = state.get("critic_state_dict", {}).get("mlp.0.weight")
     if told is not None and told.shape[1] > before < now:
-        # What a critic is told besides comes after what is new, where its weights do not look for it.
+        # What a critic is told besides comes after what is new, where its weights do not look for
+        # it.
         state = {key: value for key, value in state.items() if key != "critic_state_dict"}
     for key, network in (("actor_state_dict", actor), ("critic_state_dict", critic)):
         if key not in state:
@@ -135,13 +156,13 @@ def completed(
 ) -> dict[str, Any]:
     """What a run begins from as a checkpoint: what it lacks is that of the run.
 
-    The critic reads what the actor reads, so where it is missing it begins with the actor's normalisation.
-    A policy without a stage of the curriculum has come to the end of it.
+    The critic reads what the actor reads, so where it is missing it begins with the actor's
+    normalisation. A policy without a stage of the curriculum has come to the end of it.
 
     Args:
         state: A checkpoint, or a policy, widened for the run.
-        own: Networks, optimiser and window of the run: ``critic_state_dict``, ``optimizer_state_dict``,
-            ``window``.
+        own: Networks, optimiser and window of the run: ``critic_state_dict``,
+            ``optimizer_state_dict``, ``window``.
         stage: Difficulty and tightness to begin at, rather than those of the file.
 
     Raises:
@@ -158,7 +179,9 @@ def completed(
         state = state | {"critic_state_dict": critic | (normaliser if len(normaliser) == 4 else {})}
     if "optimizer_state_dict" not in state:
         tightening = state["task"].get("curriculum", {}).get("tightening", {}).get("enabled", False)
-        reached = state.get("stage", {"difficulty": 1.0, "tightness": 1.0, "tightening": tightening})
+        reached = state.get(
+            "stage", {"difficulty": 1.0, "tightness": 1.0, "tightening": tightening}
+        )
         state = state | {
             "optimizer_state_dict": own["optimizer_state_dict"],
             "elapsed_s": 0.0,
@@ -172,7 +195,8 @@ def completed(
     difficulty, tightness = stage
     if not (0.0 <= difficulty <= 1.0 and 0.0 <= tightness <= 1.0):
         raise ValueError(
-            f"--init-stage is {difficulty:g} {tightness:g}; difficulty and tightness lie within 0 and 1"
+            f"--init-stage is {difficulty:g} {tightness:g}; difficulty and tightness lie within 0 "
+            f"and 1"
         )
     moved = {"difficulty": difficulty, "tightness": tightness, "tightening": True}
     return state | {"ranks": [rank | {"env": rank["env"] | moved} for rank in state["ranks"]]}
@@ -184,8 +208,8 @@ def check_fit(
     """Refuse what a run cannot go on with.
 
     Raises:
-        ValueError: Another hand, an actor of another shape, or one that observes what is no more; with the
-            remedy.
+        ValueError: Another hand, an actor of another shape, or one that observes what is no more;
+            with the remedy.
     """
     from vd.envs.cfg import ObservationCfg
     from vd.policy import PolicySpec
@@ -194,10 +218,15 @@ def check_fit(
     hand, here = state["task"].get("hand"), task.get("hand")
     if found.num_actions != spec.num_actions:
         raise ValueError(
-            f"--init: {path} moves {found.num_actions} joints of {hand}, and this run's hand, {here}, has "
+            f"--init: {path} moves {found.num_actions} joints of {hand}, and this run's hand, "
+            f"{here}, has "
             f"{spec.num_actions}; give --hand {hand}"
         )
-    from_dict(ObservationCfg, state["task"].get("observation", {}), where=f"--init: {path}: task.observation")
+    from_dict(
+        ObservationCfg,
+        state["task"].get("observation", {}),
+        where=f"--init: {path}: task.observation",
+    )
     for name in ("hidden", "distribution", "normalise_observations"):
         theirs, ours = getattr(found, name), getattr(spec, name)
         if theirs != ours:
@@ -213,8 +242,9 @@ def check_fit(
 def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
     """Settings that change what observations and actions mean to a policy, each with what it was and is.
 
-    Such as ``env.observation.view goal, here world``. A run may want them changed; so they are no errors.
-    What is younger than the policy's file counts as it is by default, as it does where the file is read.
+    Such as ``env.observation.view goal, here world``. A run may want them changed; so they are no
+    errors. What is younger than the policy's file counts as it is by default, as it does where the
+    file is read.
     """
     from vd.envs.cfg import ReorientCfg
 

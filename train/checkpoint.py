@@ -14,11 +14,18 @@ from vd.policy import read_state
 CHECKPOINT_FOLDER = "checkpoints"
 BEST_NAME = "best.pt"
 KEEP_LAST = 3
-"""Periodic checkpoints to keep besides the best: one to go on from, and others should it be damaged."""
+"""Periodic checkpoints to keep besides the best: one to go on from, and others should it be
+damaged.
+"""
 AUTO = "auto"
 """``--resume auto`` goes on with a run where there is one, and starts it otherwise."""
-_NEEDED = {"actor": ("policy", "task", "iter", "env_steps"), "student": ("spec", "task", "iter", "env_steps")}
-"""What belongs to the weights of a teacher or a student. Other projects' files have an actor too."""
+_NEEDED = {
+    "actor": ("policy", "task", "iter", "env_steps"),
+    "student": ("spec", "task", "iter", "env_steps"),
+}
+"""What belongs to the weights of a teacher or a student. Other projects' files have an actor
+too.
+"""
 _ARRAY = "__numpy__"
 _WORLDS = "arrays"
 """Key in the environment's state under which that of its environments lies."""
@@ -39,7 +46,8 @@ def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") ->
 
     Args:
         run_dir: Folder of the run.
-        which: ``latest``: the newest that is sound. ``auto``: the same, or none in a folder without any.
+        which: ``latest``: the newest that is sound. ``auto``: the same, or none in a folder without
+            any.
             ``best``, or a file. None: a new run.
         network: What has to be in it, as in :func:`load_checkpoint`.
 
@@ -75,7 +83,10 @@ def _newest_sound(files: list[Path], network: str) -> Path:
             reasons.append(str(error).partition(";")[0])
             continue
         if reasons and os.environ.get("RANK", "0") == "0":
-            print(f"{'; '.join(reasons)}; {path.name}, which is sound, takes its place", file=sys.stderr)
+            print(
+                f"{'; '.join(reasons)}; {path.name}, which is sound, takes its place",
+                file=sys.stderr,
+            )
         return path
     raise ValueError(
         f"--resume: no checkpoint is sound ({', '.join(reasons)}); start anew with another --out"
@@ -95,7 +106,10 @@ def prune_checkpoints(run_dir: Path, newest: int) -> None:
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write ``state`` (tensors, arrays, plain values); ``path`` is the old file or the whole new one."""
+    """Write ``state`` (tensors, arrays, plain values).
+
+    ``path`` is the old file or the whole new one.
+    """
     with atomic_path(path) as temporary:
         with temporary.open("wb") as file:
             torch.save(_plain(state), file)
@@ -124,16 +138,25 @@ def load_checkpoint(
 
 
 def without_worlds(state: dict[str, Any]) -> dict[str, Any]:
-    """A checkpoint without what each process simulates: a tenth in size, and of any number of processes.
+    """A checkpoint without what each process simulates.
 
-    Networks, optimiser, curriculum and counters stay; a run that goes on from it starts its episodes anew.
+    A tenth in size, and of any number of processes.
+
+    Networks, optimiser, curriculum and counters stay; a run that goes on from it starts its
+    episodes anew.
     """
-    kept = [{"env": {key: v for key, v in rank["env"].items() if key != _WORLDS}} for rank in state["ranks"]]
+    kept = [
+        {"env": {key: v for key, v in rank["env"].items() if key != _WORLDS}}
+        for rank in state["ranks"]
+    ]
     return state | {"ranks": kept}
 
 
 def saved_worlds(rank: dict[str, Any]) -> int:
-    """Environments in one process's part of a checkpoint (an item of ``ranks``); 0 if it was left out."""
+    """Environments in one process's part of a checkpoint (an item of ``ranks``).
+
+    0 if it was left out.
+    """
     arrays = rank["env"].get(_WORLDS)
     return 0 if arrays is None else len(arrays["step_count"])
 

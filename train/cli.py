@@ -53,8 +53,8 @@ COMMANDS = {
     "export": ("vd.train.export", "export_command"),
     "bundle": ("vd.train.export", "bundle_command"),
 }
-"""Module and function of each command: it takes its flags and ``time.monotonic()`` of the start, and returns
-the exit status."""
+"""Module and function of each command: it takes its flags and ``time.monotonic()`` of the start,
+and returns the exit status."""
 
 
 @interrupt.command("vd-train")
@@ -72,7 +72,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     name = arguments.pop(0)
     if name not in COMMANDS:
         known = f"no command '{name}'; one of {', '.join(COMMANDS)}\n\n{USAGE}"
-        print(f"vd-train: {f'{name!r} is no more; {GONE[name]}' if name in GONE else known}", file=sys.stderr)
+        print(
+            f"vd-train: {f'{name!r} is no more; {GONE[name]}' if name in GONE else known}",
+            file=sys.stderr,
+        )
         return interrupt.USAGE_ERROR
     module, function = COMMANDS[name]
     if name in ("teacher", "adapt", "student") and not {"-h", "--help"} & set(arguments):
@@ -80,7 +83,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return int(getattr(importlib.import_module(module), function)(arguments, started))
     except KeyboardInterrupt:
-        hint = "; --resume goes on from the last checkpoint" if name in ("teacher", "student") else ""
+        hint = (
+            "; --resume goes on from the last checkpoint" if name in ("teacher", "student") else ""
+        )
         print(f"vd-train: stopped at once{hint}", file=sys.stderr)
         return interrupt.INTERRUPTED
 

@@ -48,15 +48,21 @@ class PpoCfg:
     entropy_coefficient: float = 0.0
     """Weight of the entropy bonus."""
     bound_coefficient: float = 0.0
-    """Weight of the squared excess of mean actions beyond [-1, 1], where the environment clips them."""
+    """Weight of the squared excess of mean actions beyond [-1, 1], where the environment clips
+    them.
+    """
     grad_norm: float = PAPER.teacher.grad_norm_code
     """Joint gradient norm of actor and critic is clipped to this."""
     cuda_graph: bool = False
-    """Record forward and backward pass of a minibatch once as a CUDA graph, and replay it: where launching
-    some hundred kernels takes longer than running them, as on busy processors. Ignored on a CPU."""
+    """Record forward and backward pass of a minibatch once as a CUDA graph, and replay it: where
+    launching some hundred kernels takes longer than running them, as on busy processors. Ignored on
+    a CPU.
+    """
     imitation_iterations: int = 0
-    """Iterations after --init in which the actor imitates, in what it does itself, the policy that it began
-    from, which sees the present state and shape (--env.observation.dynamics); the critic learns alone."""
+    """Iterations after --init in which the actor imitates, in what it does itself, the policy that
+    it began from, which sees the present state and shape (--env.observation.dynamics); the critic
+    learns alone.
+    """
 
 
 @dataclass
@@ -67,7 +73,9 @@ class PolicyCfg:
     hidden: tuple[int, ...] = PAPER.teacher.hidden
     """Width of the hidden layers, the same for actor and critic."""
     distribution: Literal["gaussian", "state-dependent"] = "gaussian"
-    """gaussian: a learned std per action, as in the paper's code; state-dependent: the network's, bounded."""
+    """gaussian: a learned std per action, as in the paper's code; state-dependent: the network's,
+    bounded.
+    """
     initial_std: float = math.exp(PAPER.teacher.initial_log_std_code)
     """Standard deviation of every action at the start."""
     std_range: tuple[float, float] = (1e-6, 1e6)
@@ -93,22 +101,29 @@ class RunCfg:
     out: Path = Path("runs/teacher")
     """Folder for configuration, checkpoints and TensorBoard files."""
     device: str = "auto"
-    """cpu, cuda:0, ... or auto: the first GPU, else the CPU (under torchrun: each process its own GPU)."""
+    """cpu, cuda:0, ... or auto: the first GPU, else the CPU (under torchrun: each process its own
+    GPU).
+    """
     max_steps: int = 10_000_000_000
-    """End after this many control steps, all environments and GPUs together, resumed ones counted."""
+    """End after this many control steps, all environments and GPUs together, resumed ones
+    counted.
+    """
     max_minutes: float | None = None
     """End after this much time since the start of this command, with a checkpoint."""
     coarse_physics: bool = False
-    """Learn in coarser physics than the task's (vd.sim.cfg.coarser), half as fast again on a GPU. Policies
-    keep the task's own, and are judged in it."""
+    """Learn in coarser physics than the task's (vd.sim.cfg.coarser), half as fast again on a GPU.
+    Policies keep the task's own, and are judged in it."""
     save_every: int = 100
     """Iterations between checkpoints."""
     logger: Literal["tensorboard", "wandb", "none"] = "tensorboard"
-    """Where curves go beside progress.jsonl: files for tensorboard --logdir RUN, or these and Weights &
-    Biases (pip install wandb; WANDB_MODE=offline needs no account)."""
+    """Where curves go beside progress.jsonl: files for tensorboard --logdir RUN, or these and
+    Weights & Biases (pip install wandb; WANDB_MODE=offline needs no account)."""
 
     def deadline(self, started: float | None) -> float | None:
-        """``time.monotonic()`` at which a run that began at ``started``, or now, ends; None: no limit."""
+        """``time.monotonic()`` at which a run that began at ``started``, or now, ends.
+
+        None: no limit.
+        """
         if self.max_minutes is None:
             return None
         return (time.monotonic() if started is None else started) + 60.0 * self.max_minutes
@@ -117,7 +132,9 @@ class RunCfg:
         """Raise ValueError naming the flag, its value and what it has to be."""
         require(self, "--", "positive", "max_steps max_minutes save_every")
         if self.logger == "wandb" and importlib.util.find_spec("wandb") is None:
-            raise ValueError("--logger wandb needs wandb, which is not installed: pip install wandb")
+            raise ValueError(
+                "--logger wandb needs wandb, which is not installed: pip install wandb"
+            )
 
 
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:
@@ -141,13 +158,15 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
     low, high = policy.std_range
     if not 0.0 < low < policy.initial_std < high:
         raise ValueError(
-            f"--policy.std-range is {low} {high}; it has to be positive and hold --policy.initial-std "
+            f"--policy.std-range is {low} {high}; it has to be positive and hold "
+            f"--policy.initial-std "
             f"{policy.initial_std} inside"
         )
     if policy.quiet_std is not None and (
         policy.distribution != "state-dependent" or not 0.0 < policy.quiet_std <= low
     ):
         raise ValueError(
-            f"--policy.quiet-std is {policy.quiet_std}; it has to be positive and at most the lower end "
+            f"--policy.quiet-std is {policy.quiet_std}; it has to be positive and at most the "
+            f"lower end "
             f"{low} of --policy.std-range, and needs --policy.distribution state-dependent"
         )

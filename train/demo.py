@@ -1,9 +1,9 @@
 """``python -m vd.train.demo`` (``make demo``): what the project is for, on the machine at hand.
 
-A script over the public commands, in four parts: an installed policy turns objects that it has never seen,
-by camera; an effect that is hidden in a servo is found and closed; a hand runs behind the protocol of its
-motors; a small training learns. ``index.html`` is written anew whenever a part begins or ends. A part that
-fails says so there, and the others go on.
+A script over the public commands, in four parts: an installed policy turns objects that it has
+never seen, by camera; an effect that is hidden in a servo is found and closed; a hand runs behind
+the protocol of its motors; a small training learns. ``index.html`` is written anew whenever a part
+begins or ends. A part that fails says so there, and the others go on.
 """
 
 import shutil
@@ -30,9 +30,12 @@ if TYPE_CHECKING:
 CAMERA_POLICY = "dclaw4-tracking"
 """Installed policy that finds the object by camera."""
 UNSEEN, UNSEEN_ONE = "procedural-heldout-4-seed0", "procedural-heldout-1-seed0"
-"""Built-in objects of kinds that no policy was trained on: those of the first part, and that of the twin."""
+"""Built-in objects of kinds that no policy was trained on: those of the first part, and that of the
+twin.
+"""
 MESHES, IMPORT_S, IMPORT_SEARCH = 4, 40.0, 5
-"""Of the user's meshes so many, the smallest, are imported in so much time [s], with a quarter of the usual
+"""Of the user's meshes so many, the smallest, are imported in so much time [s], with a quarter of
+the usual
 search effort: a stapler then takes 8 s of CPU time in place of 29, and its parts are as good."""
 EPISODES = 3
 """Starts and goals of every object: what two cores simulate in half a minute."""
@@ -41,9 +44,13 @@ FILM_S = 8.0
 HIDDEN = "backlash:width_rad=0.06"
 """Effect that is hidden in a single servo: a quarter of a finger's time."""
 MISSES = "12"
-"""Deadlines missed in a row at which the twin stops: a second, since the machine may do other things too."""
+"""Deadlines missed in a row at which the twin stops: a second, since the machine may do other
+things too.
+"""
 LEAST_TRAINING_MIN, AROUND_TRAINING_MIN = 1.0, 1.5
-"""Time that training gets at least [min], and that its start with cold caches, curve and film take."""
+"""Time that training gets at least [min], and that its start with cold caches, curve and film
+take.
+"""
 REFRESH_S = 15
 """Seconds after which a browser reads an unfinished page again."""
 REASON_LINES = 4
@@ -52,16 +59,23 @@ REASON_LINES = 4
 
 @dataclass
 class DemoCfg:
-    """Show what the project is for, on the machine at hand: one page, written as its parts finish."""
+    """Show what the project is for, on the machine at hand.
+
+    One page, written as its parts finish.
+    """
 
     out: Path = Path("demo")
     """Folder to write; the page is index.html. What an earlier demo left there is replaced."""
     meshes: Path | None = None
-    """Folder of OBJ, STL, PLY, GLB or USD files: the smallest are turned in place of built-in objects."""
+    """Folder of OBJ, STL, PLY, GLB or USD files: the smallest are turned in place of built-in
+    objects.
+    """
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
     """End after the first part."""
     minutes: float = 8.0
-    """Time for everything [min], of which training gets what the other parts leave, and a minute at least."""
+    """Time for everything [min], of which training gets what the other parts leave, and a minute at
+    least.
+    """
     seed: int = 0
     """Of starts, goals, the hidden machine and the training."""
 
@@ -86,8 +100,8 @@ class Part:
 
         Args:
             commands: Their words, the name first.
-            seconds: Time after which they are ended. Whoever says so looks for what they left, and no exit
-                status is a failure.
+            seconds: Time after which they are ended. Whoever says so looks for what they left, and
+                no exit status is a failure.
 
         Raises:
             RuntimeError: One failed; the others are ended.
@@ -110,12 +124,18 @@ class Part:
                 running.append((process, line, log))
             for process, line, log in running:
                 try:
-                    status = process.wait(None if until is None else max(until - time.monotonic(), 0.0))
+                    status = process.wait(
+                        None if until is None else max(until - time.monotonic(), 0.0)
+                    )
                 except subprocess.TimeoutExpired:
                     continue
                 if status != 0 and seconds is None:
-                    reason = "\n".join(log.read_text(errors="replace").split("\n")[-REASON_LINES - 1 :])
-                    raise RuntimeError(f"{' '.join(line)} ended with status {status}: {reason.strip()}")
+                    reason = "\n".join(
+                        log.read_text(errors="replace").split("\n")[-REASON_LINES - 1 :]
+                    )
+                    raise RuntimeError(
+                        f"{' '.join(line)} ended with status {status}: {reason.strip()}"
+                    )
         finally:
             for process, _, _ in running:
                 process.terminate()  # nothing to one that has ended; another saves first
@@ -191,7 +211,12 @@ class Demo:
         row = next(row for row in Result.read(out / "eval.json").rows if row.headline)
         tolerance = str(PAPER.success.rotation_rad)
         lines = [
-            (one.name, one.episodes, percent(one.success[tolerance]), percent(one.outcomes["object falls"]))
+            (
+                one.name,
+                one.episodes,
+                percent(one.success[tolerance]),
+                percent(one.outcomes["object falls"]),
+            )
             for one in (*row.per_object, row.overall)
         ]
         shown = {"policy": CAMERA_POLICY, "meshes": self.cfg.meshes, "film": film, "rows": lines}
@@ -214,13 +239,24 @@ class Demo:
     def twin(self, part: Part) -> dict[str, Any]:
         """A simulated hand behind the protocol of its motors, with the policy that sees."""
         log = part.folder / "log"
-        words = ["vd-deploy", CAMERA_POLICY, "--hand", "dclaw4", "--twin", "--object", self.objects[1]]
+        words = [
+            "vd-deploy",
+            CAMERA_POLICY,
+            "--hand",
+            "dclaw4",
+            "--twin",
+            "--object",
+            self.objects[1],
+        ]
         words += ["--random-goals", "2", "--seed", str(self.cfg.seed), "--safety.misses", MISSES]
         part.run([*words, "--log", log])
         from vd.hand_log import read_log
 
         run = read_log(log)
-        sent, stops = sorted(1e3 * run.columns["sent_s"]), ", ".join(stop.outcome for stop in run.stops)
+        sent, stops = (
+            sorted(1e3 * run.columns["sent_s"]),
+            ", ".join(stop.outcome for stop in run.stops),
+        )
         late = f"{sent[len(sent) // 2]:.0f}, at most {sent[-1]:.0f}"
         row = (len(sent), f"{run.columns['missed'][-1]:.0f}", late, stops)
         film, name = log / "run.mp4", run.run["object"]["name"]
@@ -231,12 +267,24 @@ class Demo:
         run, film = part.folder / "run", part.folder / "film.mp4"
         minutes = max(self.cfg.minutes - self.minutes - AROUND_TRAINING_MIN, LEAST_TRAINING_MIN)
         seed = ("--seed", str(self.cfg.seed))
-        words = ("vd-train", "teacher", "--preset", "cpu-demo", *seed, "--max-minutes", f"{minutes:.2f}")
+        words = (
+            "vd-train",
+            "teacher",
+            "--preset",
+            "cpu-demo",
+            *seed,
+            "--max-minutes",
+            f"{minutes:.2f}",
+        )
         part.run([*words, "--out", run])
         part.run(["vd-play", run, "--cells", "4", "--seconds", str(FILM_S), *seed, "--video", film])
         from vd.train.metrics import PROGRESS_FILE, read_progress
 
-        rows = [row for row in read_progress(run / PROGRESS_FILE) if row["goals_per_episode"] is not None]
+        rows = [
+            row
+            for row in read_progress(run / PROGRESS_FILE)
+            if row["goals_per_episode"] is not None
+        ]
         goals = [row["goals_per_episode"] for row in rows]
         curves = goal_curve([row["env_steps"] for row in rows], goals)
         shown = {"film": film, "curves": curves, "low": min(goals), "last": goals[-1]}
@@ -274,7 +322,8 @@ def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:
     if not found:
         names = ", ".join(path.name for path in chosen)
         raise RuntimeError(
-            f"none of {names} was imported within {IMPORT_S:.0f} s; the files in {part.folder} say why. "
+            f"none of {names} was imported within {IMPORT_S:.0f} s; the files in {part.folder} say "
+            f"why. "
             f"By hand, without haste: vd-assets import {meshes}"
         )
     return str(out), str(found[0])

@@ -16,10 +16,12 @@ from torch.distributed.rendezvous import rendezvous
 from vd.files import OutputError
 
 START_TIMEOUT = timedelta(minutes=20)
-"""Longest wait for the slowest process to build its environments; compiling kernels takes 3 minutes."""
+"""Longest wait for the slowest process to build its environments; compiling kernels takes 3
+minutes.
+"""
 COLLECTIVE_TIMEOUT = timedelta(minutes=2)
-"""Longest wait in a collective: an iteration takes about a second and a checkpoint a few. NCCL's default of
-10 minutes is that much of every GPU lost when one process hangs."""
+"""Longest wait in a collective: an iteration takes about a second and a checkpoint a few. NCCL's
+default of 10 minutes is that much of every GPU lost when one process hangs."""
 REPORT_AFTER_S = 90.0
 """An iteration that takes this long is reported, before the others' wait in a collective ends."""
 
@@ -39,11 +41,12 @@ def join_processes(device: str) -> tuple[int, int]:
     cuda = device.startswith("cuda")
     if cuda and device != f"cuda:{local_rank}":
         raise ValueError(
-            f"--device is {device}, but this is process {local_rank} of its machine; leave --device out, "
+            f"--device is {device}, but this is process {local_rank} of its machine; leave "
+            f"--device out, "
             "then each process takes its own GPU"
         )
-    # Environments are built by now, on some machines minutes later than on others. All wait here, so that the
-    # short limit below is one of collectives alone.
+    # Environments are built by now, on some machines minutes later than on others. All wait here,
+    # so that the short limit below is one of collectives alone.
     store, rank, world_size = next(iter(rendezvous("env://", timeout=START_TIMEOUT)))
     if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":
         # torchrun's own store outlives its workers: after a restart it still holds their addresses.
@@ -65,8 +68,8 @@ def join_processes(device: str) -> tuple[int, int]:
 def watch_iteration() -> None:
     """Print every thread's stack on stderr if this is not called again within ``REPORT_AFTER_S``.
 
-    Of a run that hangs, the process whose main thread is not in ``torch.distributed`` is the one that the
-    others wait for.
+    Of a run that hangs, the process whose main thread is not in ``torch.distributed`` is the one
+    that the others wait for.
     """
     # A stderr without a file, as in a notebook, cannot be written to by the watching thread.
     with contextlib.suppress(AttributeError, ValueError, io.UnsupportedOperation):
@@ -77,8 +80,10 @@ def watch_iteration() -> None:
 def ending_together(*agreed: type[BaseException]) -> Iterator[None]:
     """End this process at once when the block fails, and with it, through ``torchrun``, all others.
 
-    The others wait in a collective that this process will never enter. Leaving the process group, as at
-    a regular end, waits for them in turn: the error would be held back until the time limit, or for ever.
+    The others wait in a collective that this process will never enter. Leaving the process group,
+    as at
+    a regular end, waits for them in turn: the error would be held back until the time limit, or for
+    ever.
     """
     try:
         yield
@@ -86,7 +91,10 @@ def ending_together(*agreed: type[BaseException]) -> Iterator[None]:
         raise
     except BaseException as error:
         rank = os.environ.get("RANK", "0")
-        print(f"vd-train: process {rank} failed and ends the run; --resume goes on with it", file=sys.stderr)
+        print(
+            f"vd-train: process {rank} failed and ends the run; --resume goes on with it",
+            file=sys.stderr,
+        )
         if isinstance(error, OutputError):
             print(error, file=sys.stderr)
         else:

@@ -29,12 +29,14 @@ class FreeStdGaussian(_Drawn, GaussianDistribution):
 class BoundedStdGaussian(_Drawn, HeteroscedasticGaussianDistribution):
     """Gaussian with ``log std = low + (high - low) * sigmoid(x)``, ``x`` from the network.
 
-    rsl-rl's own state-dependent Gaussian clamps ``log std``: outside the range the gradient is zero, so a
-    state whose std has reached a bound stays there whatever the reward says. A sigmoid has the same range
-    and always a gradient. A bounded std matters here: unbounded it drifts upwards, and success asks for
-    slow fingers, which exploration noise at a std of 0.1 already hides.
+    rsl-rl's own state-dependent Gaussian clamps ``log std``: outside the range the gradient is
+    zero, so a state whose std has reached a bound stays there whatever the reward says. A sigmoid
+    has the same range
+    and always a gradient. A bounded std matters here: unbounded it drifts upwards, and success asks
+    for slow fingers, which exploration noise at a std of 0.1 already hides.
 
-    ``init_std`` is that of every action in every state at the start, ``std_range`` an open interval.
+    ``init_std`` is that of every action in every state at the start, ``std_range`` an open
+    interval.
     """
 
     log_floor: torch.Tensor
@@ -50,7 +52,10 @@ class BoundedStdGaussian(_Drawn, HeteroscedasticGaussianDistribution):
         self.register_buffer("log_floor", torch.tensor(math.log(low)), persistent=False)
 
     def set_floor(self, std: float) -> None:
-        """Lower the standard deviation's least value to ``std``, or raise it; those above move with it."""
+        """Lower the standard deviation's least value to ``std``, or raise it.
+
+        Those above move with it.
+        """
         self.log_floor.fill_(math.log(std))
 
     def update(self, mlp_output: torch.Tensor) -> None:
@@ -60,7 +65,10 @@ class BoundedStdGaussian(_Drawn, HeteroscedasticGaussianDistribution):
         self._distribution = Normal(mean, torch.exp(low + (high - low) * torch.sigmoid(raw)))
 
     def init_mlp_weights(self, mlp: torch.nn.Module) -> None:
-        """Make the standard deviation ``init_std`` everywhere: zero weights, and the bias that gives it."""
+        """Make the standard deviation ``init_std`` everywhere.
+
+        Zero weights, and the bias that gives it.
+        """
         low, high = (math.log(bound) for bound in self.std_range)
         share = (math.log(self.init_std) - low) / (high - low)
         head = mlp[-2]  # the linear layer before the reshape to [2, D]

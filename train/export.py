@@ -1,4 +1,7 @@
-"""``vd-train export`` and ``vd-train bundle``: policies without their training, for others to use."""
+"""``vd-train export`` and ``vd-train bundle``.
+
+Policies without their training, for others to use.
+"""
 
 import logging
 import timeit
@@ -43,22 +46,25 @@ class ExportCfg:
     """
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
-    """Checkpoint of vd-train teacher, its policy.pt, its run's folder, or a policy's name; for ONNX by camera
-    too."""
+    """Checkpoint of vd-train teacher, its policy.pt, its run's folder, or a policy's name; for ONNX
+    by camera too."""
     output: Annotated[Path, tyro.conf.Positional] = Path("policy.pt")
     """File to write. A name that ends in .onnx gets the layers from observation to mean action, and
-    NAME-alignment.onnx beside it the network of a vision policy. They are checked against onnxruntime where
-    that is installed."""
+    NAME-alignment.onnx beside it the network of a vision policy. They are checked against
+    onnxruntime where that is installed."""
     resumable: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Write a checkpoint for --resume instead, all but the state of the environments: a run that moves to
-    another machine or number of GPUs starts its episodes anew anyway."""
+    """Write a checkpoint for --resume instead, all but the state of the environments: a run that
+    moves to another machine or number of GPUs starts its episodes anew anyway."""
 
 
 @dataclass
 class BundleCfg:
-    """Write a policy as it is deployed: weights, a contract in JSON, golden inputs and outputs, in a folder.
+    """Write a policy as it is deployed.
 
-    vd-eval takes the folder in place of a policy, and refuses it for a hand that it was not made for.
+    Weights, a contract in JSON, golden inputs and outputs, in a folder.
+
+    vd-eval takes the folder in place of a policy, and refuses it for a hand that it was not made
+    for.
     """
 
     policy: Annotated[str, tyro.conf.Positional]
@@ -72,7 +78,9 @@ def export_command(arguments: list[str], _started: float) -> int:
     cfg: ExportCfg = parse(ExportCfg, arguments, prog="vd-train export")
     check_file(cfg.output)
     if cfg.resumable and cfg.output.suffix == ONNX:
-        raise ValueError(f"--resumable writes a checkpoint, which {cfg.output} is not; leave one of them out")
+        raise ValueError(
+            f"--resumable writes a checkpoint, which {cfg.output} is not; leave one of them out"
+        )
     from vd.train.checkpoint import save_checkpoint
 
     if cfg.output.suffix == ONNX:
@@ -96,17 +104,20 @@ def _exported(cfg: ExportCfg) -> dict[str, Any]:
     path = cfg.checkpoint if cfg.resumable else find_policy(cfg.checkpoint)
     state = load_checkpoint(path, flag="vd-train export")
     if cfg.resumable and "optimizer_state_dict" not in state:
-        raise ValueError(f"{cfg.checkpoint} is a policy, not a checkpoint; nothing can go on from it")
+        raise ValueError(
+            f"{cfg.checkpoint} is a policy, not a checkpoint; nothing can go on from it"
+        )
     return without_worlds(state) if cfg.resumable else policy_export(state)
 
 
 def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path) -> None:
     """Write a policy's networks, and compare them with onnxruntime if that is installed.
 
-    The layers of a teacher, or of that of a camera policy, take ``observation`` [N, O], which they normalise,
-    to the mean ``action`` [N, D]. The network of a vision policy goes to NAME-alignment.onnx: clouds about
-    their means, ``goal_points`` [N, G, 3] and ``seen_points`` [N, S, 3] [m], to ``rotation`` [N, 3, 3]
-    and ``offset`` [N, 3] [m] of :class:`vd.vision.alignment.Residual`. N, G and S vary.
+    The layers of a teacher, or of that of a camera policy, take ``observation`` [N, O], which they
+    normalise, to the mean ``action`` [N, D]. The network of a vision policy goes to
+    NAME-alignment.onnx: clouds about their means, ``goal_points`` [N, G, 3] and ``seen_points`` [N,
+    S, 3] [m], to ``rotation`` [N, 3, 3] and ``offset`` [N, 3] [m] of
+    :class:`vd.vision.alignment.Residual`. N, G and S vary.
 
     Raises:
         ModuleNotFoundError: What the export needs is not installed.
@@ -120,12 +131,19 @@ def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path) -> None:
 
     interrupt.need("onnx", "onnxscript")
     teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
-    drawn = torch.randn(CHECKED, teacher.num_observations, generator=torch.Generator().manual_seed(0))
+    drawn = torch.randn(
+        CHECKED, teacher.num_observations, generator=torch.Generator().manual_seed(0)
+    )
     _export(teacher.network, {"observation": drawn}, ["action"], path, onnx_metadata(policy))
     if not isinstance(policy, TrainedPolicy) and policy.alignment is not None:
         _have_exported(Residual)
-        clouds = CLOUD_M * torch.randn(2, CHECKED, POINTS, 3, generator=torch.Generator().manual_seed(0))
-        named = {"goal_points": clouds[0], "seen_points": clouds[1, :, : POINTS - 1]}  # of another number
+        clouds = CLOUD_M * torch.randn(
+            2, CHECKED, POINTS, 3, generator=torch.Generator().manual_seed(0)
+        )
+        named = {
+            "goal_points": clouds[0],
+            "seen_points": clouds[1, :, : POINTS - 1],
+        }  # of another number
         outputs = [one.name for one in fields(Residual)]
         _export(policy.alignment, named, outputs, path.with_stem(f"{path.stem}-alignment"))
 
@@ -161,7 +179,9 @@ def _export(
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,
-            tuple(value[:2] for value in inputs.values()),  # of one it would take the number for fixed
+            tuple(
+                value[:2] for value in inputs.values()
+            ),  # of one it would take the number for fixed
             temporary,
             input_names=list(inputs),
             output_names=outputs,
@@ -174,15 +194,25 @@ def _export(
         onnx.helper.set_model_props(model, metadata or {})
         onnx.save(model, temporary)
         if find_spec("onnxruntime") is None:
-            print(f"{path}: onnxruntime is not installed: not checked ({interrupt.remedy('onnxruntime')})")
+            print(
+                f"{path}: onnxruntime is not installed: not checked "
+                f"({interrupt.remedy('onnxruntime')})"
+            )
             return
         worst, ours, theirs = _compared(network, inputs, temporary)
         if not worst <= TOLERANCE:
-            raise RuntimeError(f"{path}: onnxruntime's outputs differ by {worst:.2g}; it is not written")
-        print(f"{path}: onnxruntime gives the same within {worst:.1e}, in {theirs:.2f} ms (torch {ours:.2f})")
+            raise RuntimeError(
+                f"{path}: onnxruntime's outputs differ by {worst:.2g}; it is not written"
+            )
+        print(
+            f"{path}: onnxruntime gives the same within {worst:.1e}, in {theirs:.2f} ms (torch "
+            f"{ours:.2f})"
+        )
 
 
-def _compared(network: "Module", inputs: dict[str, "Tensor"], path: Path) -> tuple[float, float, float]:
+def _compared(
+    network: "Module", inputs: dict[str, "Tensor"], path: Path
+) -> tuple[float, float, float]:
     """Largest difference of an output, and times of torch and onnxruntime for one environment [ms]."""
     import onnxruntime
     import torch

@@ -38,15 +38,20 @@ _RARE = {
     "env.curriculum.tightening": "joint_speed_rad_s object_speed_m_s object_spin_rad_s action_norm",
     "env.randomisation": "stiffness_scale damping_scale link_mass_scale friction table_friction "
     "object_scale object_scale_count object_mass_kg action_noise_std action_offset_std "
-    "observation_noise_mean observation_noise_std observation_offset_std force_probability force_n_per_kg "
+    "observation_noise_mean observation_noise_std observation_offset_std force_probability "
+    "force_n_per_kg "
     "force_decay",
 }
-OF_HELP_ALL = frozenset(f"{group}.{name}" for group, names in _RARE.items() for name in names.split())
-"""Settings that few runs change: ``--help`` leaves them out, ``--help-all`` does not, and all are flags."""
+OF_HELP_ALL = frozenset(
+    f"{group}.{name}" for group, names in _RARE.items() for name in names.split()
+)
+"""Settings that few runs change: ``--help`` leaves them out, ``--help-all`` does not, and all are
+flags.
+"""
 
-SHORT_FORMS = {name: f"env.{name}" for name in ("hand", "hand-layer", "objects", "num-envs", "seed")} | {
-    "randomise": "env.randomisation.enabled"
-}
+SHORT_FORMS = {
+    name: f"env.{name}" for name in ("hand", "hand-layer", "objects", "num-envs", "seed")
+} | {"randomise": "env.randomisation.enabled"}
 """Flags that are short for others: fields of the environment that are common enough."""
 STARTS = {
     **{name: f"--{name}" for name in ("preset", "init", "resume", "smoke", "stage")},
@@ -56,20 +61,26 @@ STARTS = {
 """What decides from where a configuration starts, by its place in a file."""
 
 
-def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | None = None) -> TeacherCfg:
-    """The configuration that command-line flags ask for; ``say`` is told which preset the machine decided.
+def parse_teacher(
+    arguments: Sequence[str], *, say: Callable[[str], object] | None = None
+) -> TeacherCfg:
+    """The configuration that command-line flags ask for.
 
-    The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins from, or the
-    run's own configuration with ``--resume``), as flags and ``--config`` say; the second reads every flag
-    with those values, and over them those of the file, as defaults.
+    ``say`` is told which preset the machine decided.
+
+    The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins
+    from, or the run's own configuration with ``--resume``), as flags and ``--config`` say; the
+    second reads every flag with those values, and over them those of the file, as defaults.
 
     Raises:
         FileNotFoundError: ``--resume`` names a run without a configuration.
-        ValueError: There is no such preset, the run's configuration is not one of this version, or ``--init``
-            is no teacher.
+        ValueError: There is no such preset, the run's configuration is not one of this version, or
+            ``--init`` is no teacher.
     """
     arguments, file = starting(normalise(arguments, SHORT_FORMS), GONE)
-    preset, init, resume = (value_of(arguments, flag) for flag in ("--preset", "--init", "--resume"))
+    preset, init, resume = (
+        value_of(arguments, flag) for flag in ("--preset", "--init", "--resume")
+    )
     out = value_of(arguments, "--out")
     saved = resume is not None and out is not None and (Path(out) / CONFIG_NAME).is_file()
     if preset is not None and preset not in PRESETS:
@@ -96,7 +107,9 @@ def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | No
     return cfg
 
 
-def starting(arguments: list[str], gone: Collection[str] = ()) -> tuple[list[str], ConfigFile | None]:
+def starting(
+    arguments: list[str], gone: Collection[str] = ()
+) -> tuple[list[str], ConfigFile | None]:
     """A command line with what a ``--config`` says of where to start from before it, and that file.
 
     A file of a preset that is ``gone`` was written by an earlier version, and has all settings.
@@ -122,7 +135,8 @@ def machine_preset(device: str | None) -> tuple[str, str]:
     """The preset that learns on this machine, or on what ``--device`` asks for, and why it is that."""
     if resolve_device(device or "auto") == "cpu":
         return "cpu-demo", (
-            "there is no GPU. It learns an easier task, turns of one object about the vertical, in minutes; "
+            "there is no GPU. It learns an easier task, turns of one object about the vertical, in "
+            "minutes; "
             "the whole task is --preset gpu"
         )
     return "gpu", "the recipe that learns; Ctrl-C or --max-minutes ends it"
@@ -143,7 +157,9 @@ def normalise(arguments: Sequence[str], short_forms: Mapping[str, str]) -> list[
             name = f"{group}.{'no-' if off else ''}{field}"
         result += [f"--{name}", value] if equals else [f"--{name}"]
     for index, argument in enumerate(result):
-        if argument == "--resume" and (index + 1 == len(result) or result[index + 1].startswith("--")):
+        if argument == "--resume" and (
+            index + 1 == len(result) or result[index + 1].startswith("--")
+        ):
             result[index + 1 : index + 1] = ["latest"]
             break
     return result
@@ -156,7 +172,10 @@ def value_of(arguments: list[str], flag: str) -> str | None:
 
 
 def _parsed(arguments: list[str], default: TeacherCfg, file: ConfigFile | None) -> TeacherCfg:
-    """Every flag, with the values of ``file`` and ``default`` for the others; wrong names are refused."""
+    """Every flag, with the values of ``file`` and ``default`` for the others.
+
+    Wrong names are refused.
+    """
     kind: Any = TeacherCfg
     default = default if file is None else file.over(default)
     if "--help-all" in arguments:
@@ -171,7 +190,9 @@ def _parsed(arguments: list[str], default: TeacherCfg, file: ConfigFile | None) 
     drawn, before = cfg.env.randomisation, default.env.randomisation
     given = [name for name, value in vars(before).items() if getattr(drawn, name) != value]
     if given and not drawn.enabled and given != ["enabled"]:
-        raise ValueError(f"--env.randomisation.{given[-1].replace('_', '-')} draws nothing; add --randomise")
+        raise ValueError(
+            f"--env.randomisation.{given[-1].replace('_', '-')} draws nothing; add --randomise"
+        )
     return cfg
 
 

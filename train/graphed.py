@@ -7,22 +7,27 @@ import torch
 from torch import nn
 
 WARMUP_RUNS = 3
-"""Runs before the recording, on a stream of their own, in which libraries allocate what they need."""
+"""Runs before the recording, on a stream of their own, in which libraries allocate what they
+need.
+"""
 
 
 class Recorded:
     """A function that computes gradients, recorded at its first call and replayed from a CUDA graph.
 
-    A graph repeats launches with the addresses that it was recorded with, so the function has to read inputs
-    and weights that stay where they are, has to change nothing but the gradients, and must not wait for the
-    device. The gradients lie in the graph's memory and are overwritten by the next call.
+    A graph repeats launches with the addresses that it was recorded with, so the function has to
+    read inputs and weights that stay where they are, has to change nothing but the gradients, and
+    must not wait for the device. The gradients lie in the graph's memory and are overwritten by the
+    next call.
 
     Args:
         function: Computes ``grad`` of ``parameters``, which it has emptied, and returns a tensor.
         parameters: What gets gradients.
     """
 
-    def __init__(self, function: Callable[[], torch.Tensor], parameters: Sequence[nn.Parameter]) -> None:
+    def __init__(
+        self, function: Callable[[], torch.Tensor], parameters: Sequence[nn.Parameter]
+    ) -> None:
         self._function, self._parameters = function, parameters
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -44,7 +49,8 @@ class Recorded:
                 self._function()
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
-        # Whatever the collector frees meanwhile could be of the simulator, whose freeing is no part of this.
+        # Whatever the collector frees meanwhile could be of the simulator, whose freeing is no part
+        # of this.
         gc.collect()
         gc.disable()
         try:

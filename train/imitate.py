@@ -1,7 +1,7 @@
 """Imitation before PPO: an actor that sees late learns from what it was when it saw the present state.
 
-While the critic learns alone, the actor repeats what the policy that it began from would do in the present
-state, in the states that it comes to itself (DAgger, Ross et al. 2011).
+While the critic learns alone, the actor repeats what the policy that it began from would do in the
+present state, in the states that it comes to itself (DAgger, Ross et al. 2011).
 """
 
 from copy import deepcopy
@@ -23,9 +23,9 @@ IMITATED = "imitated_state_dict"
 class Imitation:
     """Lets the actor of a learner imitate itself as it is now.
 
-    rsl-rl's Distillation has a loop and a storage of its own and no critic; its loss is repeated here. Adam
-    begins fresh, and that of PPO sees none of these gradients. The last that the learner's critic is told is
-    what the actor observes, of the present state.
+    rsl-rl's Distillation has a loop and a storage of its own and no critic; its loss is repeated
+    here. Adam begins fresh, and that of PPO sees none of these gradients. The last that the
+    learner's critic is told is what the actor observes, of the present state.
 
     Attributes:
         teacher: The policy to imitate.
@@ -34,7 +34,9 @@ class Imitation:
     def __init__(self, learner: TeacherPPO) -> None:
         self._learner = learner
         self.teacher: MLPModel = deepcopy(learner.actor).requires_grad_(False)
-        if hasattr(self.teacher.distribution, "log_floor"):  # it falls for both as stillness tightens
+        if hasattr(
+            self.teacher.distribution, "log_floor"
+        ):  # it falls for both as stillness tightens
             self.teacher.distribution.log_floor = learner.actor.distribution.log_floor
         self._optimizer = torch.optim.Adam(learner.actor.parameters())
 
@@ -53,7 +55,8 @@ class Imitation:
         for rows in learner.minibatches():
             found = _distribution(learner.actor, seen[rows])
             loss = sum(
-                nn.functional.mse_loss(own, goal[rows]) for own, goal in zip(found, wanted, strict=True)
+                nn.functional.mse_loss(own, goal[rows])
+                for own, goal in zip(found, wanted, strict=True)
             )
             self._optimizer.zero_grad()
             loss.backward()

@@ -1,4 +1,7 @@
-"""The training loop of teachers and students: iterations, curves, checkpoints, and all ways to end."""
+"""The training loop of teachers and students.
+
+Iterations, curves, checkpoints, and all ways to end.
+"""
 
 import contextlib
 import math
@@ -47,7 +50,9 @@ def check_update(losses: Mapping[str, float], networks: nn.Module, remedy: str) 
     """
     bad = [name for name, value in losses.items() if not math.isfinite(value)]
     # A sum is finite only if all its terms are.
-    if not math.isfinite(float(torch.stack([p.detach().sum() for p in networks.parameters()]).sum())):
+    if not math.isfinite(
+        float(torch.stack([p.detach().sum() for p in networks.parameters()]).sum())
+    ):
         bad.append("parameters")
     if bad:
         raise TrainingDivergedError(f"{', '.join(bad)} not finite after the update; {remedy}")
@@ -56,9 +61,9 @@ def check_update(losses: Mapping[str, float], networks: nn.Module, remedy: str) 
 class TrainingLoop:
     """Iterates until steps, time or the user end the run; goes on exactly where it stopped.
 
-    Under ``torchrun`` every process simulates its own environments and gradients are averaged. The first
-    process logs and saves, with the random and environment state of all. What an iteration does, and what a
-    checkpoint holds of it, is in the subclasses.
+    Under ``torchrun`` every process simulates its own environments and gradients are averaged. The
+    first process logs and saves, with the random and environment state of all. What an iteration
+    does, and what a checkpoint holds of it, is in the subclasses.
 
     Args:
         run: Run settings.
@@ -68,8 +73,10 @@ class TrainingLoop:
 
     Attributes:
         iteration: Iterations completed, over all resumed runs.
-        env_steps: Control steps (of a student clouds) completed, over all environments and processes.
-        new_episodes: Why the checkpoint that was loaded could not restore the environments; empty if it did.
+        env_steps: Control steps (of a student clouds) completed, over all environments and
+            processes.
+        new_episodes: Why the checkpoint that was loaded could not restore the environments; empty
+            if it did.
     """
 
     def __init__(
@@ -115,7 +122,8 @@ class TrainingLoop:
 
         Raises:
             Interrupted: Ctrl-C or SIGTERM, after saving.
-            TrainingDivergedError: Something is not finite any more. The last checkpoint is from before.
+            TrainingDivergedError: Something is not finite any more. The last checkpoint is from
+                before.
         """
         first = saved = self.iteration
         total = self.total_iterations if iterations is None else first + iterations
@@ -154,7 +162,10 @@ class TrainingLoop:
         prune_checkpoints(self.run.out, self.iteration)
 
     def run_to_end(self) -> bool:
-        """Train, and release everything; whether it came to its own end, rather than being interrupted."""
+        """Train, and release everything.
+
+        Whether it came to its own end, rather than being interrupted.
+        """
         whole = True
         try:
             with ending_together(Interrupted) if self.is_distributed else contextlib.nullcontext():
@@ -203,7 +214,10 @@ class TrainingLoop:
 
     @contextlib.contextmanager
     def _signals(self, lines: ProgressLines) -> Iterator[None]:
-        """Turn Ctrl-C and SIGTERM into a request to stop; a second one stops at once, without saving."""
+        """Turn Ctrl-C and SIGTERM into a request to stop.
+
+        A second one stops at once, without saving.
+        """
 
         def request(number: int, _frame: FrameType | None) -> None:
             if self._signal:
@@ -230,7 +244,10 @@ class TrainingLoop:
         return most if self._deadline is None else min(most, self._deadline - time.monotonic())
 
     def _stopping(self) -> bool:
-        """Whether to cut a rollout short: not with other processes, which all do the same collectives."""
+        """Whether to cut a rollout short.
+
+        Not with other processes, which all do the same collectives.
+        """
         return bool(self._signal) and not self.is_distributed
 
     def _state(self) -> dict[str, Any]:
@@ -242,7 +259,11 @@ class TrainingLoop:
         if self.is_distributed:
             ranks = [None] * self.world_size
             torch.distributed.all_gather_object(ranks, mine)
-        counters = {"iter": self.iteration, "env_steps": self.env_steps, "elapsed_s": self._elapsed_s}
+        counters = {
+            "iter": self.iteration,
+            "env_steps": self.env_steps,
+            "elapsed_s": self._elapsed_s,
+        }
         return self._shared_state() | counters | {"ranks": ranks}
 
     def _restore(self, state: dict[str, Any]) -> None:
@@ -262,7 +283,9 @@ class TrainingLoop:
         """Why processes and environments of a checkpoint cannot be restored; empty if they can."""
         if len(ranks) != self.world_size:
             return f"it is of {len(ranks)} processes, this run has {self.world_size}"
-        if self.env is None or (saved := {saved_worlds(rank) for rank in ranks}) == {self.env.num_envs}:
+        if self.env is None or (saved := {saved_worlds(rank) for rank in ranks}) == {
+            self.env.num_envs
+        }:
             return ""
         if saved == {0}:
             return "it holds no environments"

@@ -51,9 +51,9 @@ class StepMeans:
 class GoalWindow:
     """How goals ended over the last episode's worth of iterations.
 
-    Success per goal is a ratio of rare events; a window as long as an episode holds about one ended goal
-    of every environment, and weighs early and late steps of an episode alike. ``success_ends``: a goal that
-    is reached ends its episode.
+    Success per goal is a ratio of rare events; a window as long as an episode holds about one ended
+    goal of every environment, and weighs early and late steps of an episode alike.
+    ``success_ends``: a goal that is reached ends its episode.
     """
 
     def __init__(self, length: int, *, success_ends: bool = False) -> None:
@@ -64,13 +64,21 @@ class GoalWindow:
         """Take an iteration's means and give the window's ratios.
 
         Returns:
-            ``success_per_goal``, ``goals_per_episode``, ``drop_rate`` (episodes that ended in a fall), each
-            ``None`` until a goal or episode has ended, and ``mean_reward`` per control step.
+            ``success_per_goal``, ``goals_per_episode``, ``drop_rate`` (episodes that ended in a
+            fall), each ``None`` until a goal or episode has ended, and ``mean_reward`` per control
+            step.
         """
         self._rows.append(
-            (means["task/reached"], means["task/dropped"], means["task/timed_out"], means["reward/total"])
+            (
+                means["task/reached"],
+                means["task/dropped"],
+                means["task/timed_out"],
+                means["reward/total"],
+            )
         )
-        reached, dropped, timed_out, reward = (math.fsum(column) for column in zip(*self._rows, strict=True))
+        reached, dropped, timed_out, reward = (
+            math.fsum(column) for column in zip(*self._rows, strict=True)
+        )
         goals = reached + dropped + timed_out
         episodes = goals if self._success_ends else dropped + timed_out
         return {
@@ -98,13 +106,18 @@ class GoalWindow:
 class ProgressFile:
     """One JSON object per iteration in ``progress.jsonl``, and the same numbers for ``logger`` (``RunCfg``).
 
-    Of an earlier run of this folder ``done`` iterations are kept; a resumed run writes later ones anew.
+    Of an earlier run of this folder ``done`` iterations are kept; a resumed run writes later ones
+    anew.
     """
 
     def __init__(self, run_dir: Path, logger: str = "tensorboard", *, done: int = 0) -> None:
         make_folder(run_dir)
         path = self._path = run_dir / PROGRESS_FILE
-        kept = [row for row in read_progress(path) if row["iteration"] <= done] if path.is_file() else []
+        kept = (
+            [row for row in read_progress(path) if row["iteration"] <= done]
+            if path.is_file()
+            else []
+        )
         write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
         with writing(path):
             self._file = path.open("ab", buffering=0)
@@ -116,7 +129,10 @@ class ProgressFile:
         Raises:
             OutputError: The disk is full; the file is as it was.
         """
-        row = {key: None if isinstance(v, float) and not math.isfinite(v) else v for key, v in row.items()}
+        row = {
+            key: None if isinstance(v, float) and not math.isfinite(v) else v
+            for key, v in row.items()
+        }
         size = self._file.tell()
         try:
             with writing(self._path):
@@ -160,8 +176,14 @@ def _board(run_dir: Path, logger: str, done: int) -> Any:
 
 
 def _report_thread(args: threading.ExceptHookArgs) -> None:
-    """Report what ended a thread, but for the ``OSError`` of TensorBoard's: its caller is told anyway."""
-    if not (issubclass(args.exc_type, OSError) and type(args.thread).__module__.startswith("tensorboard")):
+    """Report what ended a thread, but for the ``OSError`` of TensorBoard's.
+
+    Its caller is told anyway.
+    """
+    if not (
+        issubclass(args.exc_type, OSError)
+        and type(args.thread).__module__.startswith("tensorboard")
+    ):
         threading.__excepthook__(args)
 
 

@@ -22,17 +22,23 @@ KL_STEP = 1.5
 KL_BAND = 2.0
 """The rate is left alone while the KL divergence is within this factor of the wanted one."""
 RUNAWAY_KL = 4.0
-"""An update ends with the epoch whose KL divergence passes this many times the wanted one (ours): the rate is
-lowered from twice on, and takes three updates for as much; an update that diverged by 13 undid a training."""
+"""An update ends with the epoch whose KL divergence passes this many times the wanted one (ours):
+the rate is lowered from twice on, and takes three updates for as much; an update that diverged by
+13 undid a training.
+"""
 
 ACTION_BOUND = 1.0
-"""The environment clips actions to this; a mean beyond it changes nothing but how far it is to come back."""
+"""The environment clips actions to this; a mean beyond it changes nothing but how far it is to come
+back.
+"""
 STATISTICS = ("surrogate", "value", "entropy", "kl", "clip_fraction", "beyond_bound", "grad_norm")
 """What every minibatch reports."""
 OBSERVED = "observed "
 """How the names of samples begin that are observations, before that of their group."""
 ACTOR_GROUP, CRITIC_GROUP = 0, 1
-"""Optimiser groups. rsl-rl reads the learning rate it reports from group 0, so the actor is first."""
+"""Optimiser groups. rsl-rl reads the learning rate it reports from group 0, so the actor is
+first.
+"""
 
 
 class TeacherPPO(PPO):
@@ -40,29 +46,34 @@ class TeacherPPO(PPO):
 
     What differs from rsl-rl's PPO, and why:
 
-    * actor and critic have their own learning rates (Table S1: 3e-4 and 1e-3) in one optimiser. rsl-rl's
-      adaptive schedule writes one rate into every group; here it moves the actor's only, since the KL
-      divergence it follows says nothing about the critic. It moves once an update, by the divergence of
-      the last epoch: rsl-rl moves it in every minibatch, and since the divergence within an update only
-      accumulates, one large first step there sends the rate to its lower bound for the rest of it. An update
-      that runs away (:data:`RUNAWAY_KL`) ends early;
-    * the gradient is clipped by the joint norm of actor and critic, as in the paper's code. The value
-      coefficient acts through that norm alone, because Adam ignores the scale of a gradient;
-    * samples are permuted in every epoch (rsl-rl repeats the same minibatches), and statistics stay on
-      the device until the end of the update (rsl-rl waits for the device after each minibatch);
-    * forward and backward pass of a minibatch can be a CUDA graph (:mod:`vd.train.graphed`). Outside stay
-      what several GPUs exchange, and the optimiser's step: its rates are numbers that change, and its state
-      is that of any checkpoint.
+    * actor and critic have their own learning rates (Table S1: 3e-4 and 1e-3) in one optimiser.
+      rsl-rl's adaptive schedule writes one rate into every group; here it moves the actor's only,
+      since the KL divergence it follows says nothing about the critic. It moves once an update, by
+      the divergence of
+      the last epoch: rsl-rl moves it in every minibatch, and since the divergence within an update
+      only accumulates, one large first step there sends the rate to its lower bound for the rest of
+      it. An update that runs away (:data:`RUNAWAY_KL`) ends early;
+    * the gradient is clipped by the joint norm of actor and critic, as in the paper's code. The
+      value coefficient acts through that norm alone, because Adam ignores the scale of a gradient;
+    * samples are permuted in every epoch (rsl-rl repeats the same minibatches), and statistics stay
+      on the device until the end of the update (rsl-rl waits for the device after each minibatch);
+    * forward and backward pass of a minibatch can be a CUDA graph (:mod:`vd.train.graphed`).
+      Outside stay what several GPUs exchange, and the optimiser's step: its rates are numbers that
+      change, and its state is that of any checkpoint.
 
-    Time-outs: rsl-rl adds ``gamma * V(s_t)`` to the reward of a step that timed out and treats it as
-    terminal. The value belongs to the stored observation *before* the step, because the observation
-    returned after it is already the new episode's. That stands in for ``V(s_{t+1})`` of the state that was
-    cut off, one control step later: a small error in one step of an episode, and no bias towards zero.
+    Time-outs: rsl-rl adds ``gamma * V(s_t)`` to the reward of a step that timed out and treats it
+    as terminal. The value belongs to the stored observation *before* the step, because the
+    observation returned after it is already the new episode's. That stands in for ``V(s_{t+1})`` of
+    the state that was
+    cut off, one control step later: a small error in one step of an episode, and no bias towards
+    zero.
 
     Attributes:
         actor_learns: Whether updates change the actor. A critic that knows nothing yet gives random
-            advantages, which would unlearn an actor that has learned; so it learns alone first. The actor's
-            gradients go through Adam meanwhile, at a rate of zero: its first step then has moments to go by,
+            advantages, which would unlearn an actor that has learned; so it learns alone first. The
+            actor's
+            gradients go through Adam meanwhile, at a rate of zero: its first step then has moments
+                to go by,
             where one without would move every weight by the whole rate, whatever its gradient.
         samples: The latest rollout as rows, by name; observations begin with :data:`OBSERVED`.
     """
@@ -98,7 +109,8 @@ class TeacherPPO(PPO):
         self.bound_coef = cfg.bound_coefficient
         self.actor_learns = True
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        # The rollout as rows of samples, in the same memory in every update, and the rows of a minibatch.
+        # The rollout as rows of samples, in the same memory in every update, and the rows of a
+        # minibatch.
         self.samples: dict[str, torch.Tensor] = {}
         self._rows = torch.zeros(self._minibatch_size, dtype=torch.long, device=self.device)
         self._gradients: Callable[[], torch.Tensor] = self._compute_gradients
@@ -126,9 +138,11 @@ class TeacherPPO(PPO):
         """Run all epochs over the rollout, or those until the adaptive schedule sees the actor run away.
 
         Returns:
-            Means over the minibatches that were run: ``surrogate``, ``value``, ``entropy``, ``kl`` (old to
-            new policy), ``clip_fraction``, ``grad_norm`` (before clipping), ``beyond_bound`` (share of mean
-            actions), and ``explained_variance`` of the returns by the values of the rollout.
+            Means over the minibatches that were run: ``surrogate``, ``value``, ``entropy``, ``kl``
+                (old to
+            new policy), ``clip_fraction``, ``grad_norm`` (before clipping), ``beyond_bound`` (share
+            of mean actions), and ``explained_variance`` of the returns by the values of the
+            rollout.
         """
         group = self.optimizer.param_groups[ACTOR_GROUP]
         group["lr"] = self.learning_rate if self.actor_learns else 0.0
@@ -152,7 +166,11 @@ class TeacherPPO(PPO):
         self.storage.clear()
         names = (*STATISTICS, "explained_variance")
         return dict(
-            zip(names, torch.cat((torch.stack(steps).mean(dim=0), explained[None])).tolist(), strict=True)
+            zip(
+                names,
+                torch.cat((torch.stack(steps).mean(dim=0), explained[None])).tolist(),
+                strict=True,
+            )
         )
 
     @property
@@ -170,8 +188,12 @@ class TeacherPPO(PPO):
             "advantages": storage.advantages.flatten(),
             "returns": storage.returns.flatten(),
         }
-        rollout |= {OBSERVED + key: value.flatten(0, 1) for key, value in storage.observations.items()}
-        rollout |= {f"old {i}": value.flatten(0, 1) for i, value in enumerate(storage.distribution_params)}
+        rollout |= {
+            OBSERVED + key: value.flatten(0, 1) for key, value in storage.observations.items()
+        }
+        rollout |= {
+            f"old {i}": value.flatten(0, 1) for i, value in enumerate(storage.distribution_params)
+        }
         if not self.samples:
             self.samples = {name: torch.empty_like(tensor) for name, tensor in rollout.items()}
         for name, tensor in rollout.items():
@@ -179,7 +201,10 @@ class TeacherPPO(PPO):
 
     def minibatches(self) -> Iterator[torch.Tensor]:
         """Rows of samples, permuted anew in every epoch; a remainder is left out at random."""
-        samples, size = self.storage.num_envs * self.storage.num_transitions_per_env, self._minibatch_size
+        samples, size = (
+            self.storage.num_envs * self.storage.num_transitions_per_env,
+            self._minibatch_size,
+        )
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(samples, device=self.device)
             yield from order[: size * self.num_mini_batches].split(size)
@@ -201,7 +226,8 @@ class TeacherPPO(PPO):
     def _compute_gradients(self) -> torch.Tensor:
         """Gradients of the loss over the samples in ``_rows``; nothing else changes.
 
-        All it reads stays where it is in memory, and nothing waits for the device: it can be recorded.
+        All it reads stays where it is in memory, and nothing waits for the device: it can be
+        recorded.
 
         Returns:
             :data:`STATISTICS` but the last, shape [6], on the device.
@@ -209,7 +235,9 @@ class TeacherPPO(PPO):
         for parameter in self._parameters:
             parameter.grad = None
         batch = {name: tensor[self._rows] for name, tensor in self.samples.items()}
-        observed = {name.removeprefix(OBSERVED): t for name, t in batch.items() if name.startswith(OBSERVED)}
+        observed = {
+            name.removeprefix(OBSERVED): t for name, t in batch.items() if name.startswith(OBSERVED)
+        }
         observations = TensorDict(observed, batch_size=[len(self._rows)])
         old = tuple(tensor for name, tensor in batch.items() if name.startswith("old "))
         # Without the sample that the actor's own forward pass would draw.
@@ -220,7 +248,9 @@ class TeacherPPO(PPO):
             kl = self.actor.get_kl_divergence(old, self.actor.output_distribution_params).mean()
         ratio = torch.exp(log_ratio)
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        surrogate = -torch.minimum(batch["advantages"] * ratio, batch["advantages"] * clipped).mean()
+        surrogate = -torch.minimum(
+            batch["advantages"] * ratio, batch["advantages"] * clipped
+        ).mean()
         value = (batch["returns"] - self.critic(observations).squeeze(-1)).square().mean()
         excess = (self.actor.output_mean.abs() - ACTION_BOUND).clamp_min(0.0)
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
@@ -228,18 +258,25 @@ class TeacherPPO(PPO):
             loss = loss + self.bound_coef * excess.square().sum(dim=-1).mean()
 
         loss.backward()
-        self.actor.distribution._distribution = None  # or this pass would outlive itself, and a recording
+        self.actor.distribution._distribution = (
+            None  # or this pass would outlive itself, and a recording
+        )
         with torch.no_grad():
             clip_fraction = ((ratio - 1.0).abs() > self.clip_param).float().mean()
             beyond = (excess > 0.0).float().mean()
             return torch.stack((surrogate, value, entropy, kl, clip_fraction, beyond)).detach()
 
     def _update_normalisation(self, network: MLPModel) -> None:
-        """Let a network's normaliser learn from the rollout; its numbers stay where they are in memory."""
+        """Let a network's normaliser learn from the rollout.
+
+        Its numbers stay where they are in memory.
+        """
         normaliser = network.obs_normalizer
         std = getattr(normaliser, "_std", None)
         network.update_normalization(self.storage.observations.flatten(0, 1))
-        if std is not None:  # rsl-rl makes a new tensor of it, which a recorded graph would not read
+        if (
+            std is not None
+        ):  # rsl-rl makes a new tensor of it, which a recorded graph would not read
             std.copy_(normaliser._std)
             normaliser._std = std
 
@@ -290,7 +327,9 @@ def make_learner(
             **shape,
         ),
         MLPModel(observations, {"critic": groups}, "critic", 1, **shape),
-        RolloutStorage("rl", env.num_envs, ppo.rollout_steps, observations, [env.num_actions], device),
+        RolloutStorage(
+            "rl", env.num_envs, ppo.rollout_steps, observations, [env.num_actions], device
+        ),
         ppo,
         device=device,
         multi_gpu_cfg={"global_rank": rank, "world_size": world_size} if world_size > 1 else None,

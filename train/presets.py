@@ -36,22 +36,22 @@ class TeacherCfg:
     preset: Annotated[
         str, tyro.conf.arg(metavar="{paper,gpu,cpu-demo,leap-cube,leap-objects,allegro-cube}")
     ] = "paper"
-    """Settings to start from; every other flag overrides one of them. By default what learns on this
-    machine."""
+    """Settings to start from; every other flag overrides one of them. By default what learns on
+    this machine."""
     resume: str | None = None
-    """Go on from a checkpoint of --out: latest (a bare --resume), best, a file, or auto: the latest, and
-    a new run where there is none."""
+    """Go on from a checkpoint of --out: latest (a bare --resume), best, a file, or auto: the
+    latest, and a new run where there is none."""
     init: str | None = None
-    """Begin a new run with networks, curriculum and counters of another: the name of an installed policy
-    (dclaw3), a policy, a checkpoint or a run's folder. Of a policy without a critic or an optimiser the
-    critic learns alone first. Without --preset its task and its networks are
+    """Begin a new run with networks, curriculum and counters of another: the name of an installed
+    policy (dclaw3), a policy, a checkpoint or a run's folder. Of a policy without a critic or an
+    optimiser the critic learns alone first. Without --preset its task and its networks are
     this run's defaults. It may have observed less: what is new starts without effect."""
     init_stage: tuple[float, float] | None = None
-    """Difficulty and tightness of the curriculum at which a run with --init begins. None: those of what it
-    begins from; 1 and 1 for a policy that does not say, which is the task as configured."""
+    """Difficulty and tightness of the curriculum at which a run with --init begins. None: those of
+    what it begins from; 1 and 1 for a policy that does not say, which is the task as configured."""
     smoke: bool = False
-    """Check the installation: the preset, cpu-demo if none is named, tiny, on the CPU, for at most a minute.
-    It learns nothing, and keeps nothing unless --out is given."""
+    """Check the installation: the preset, cpu-demo if none is named, tiny, on the CPU, for at most
+    a minute. It learns nothing, and keeps nothing unless --out is given."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     ppo: PpoCfg = field(default_factory=PpoCfg)
     policy: PolicyCfg = field(default_factory=PolicyCfg)
@@ -82,8 +82,8 @@ TOWARDS_GOAL = RewardCfg(
     progress=300.0,
     scale=0.01,
 )
-"""Forms of the released code, and ours: a reward for turning towards the goal, dear falls, and cheap energy
-and table contact."""
+"""Forms of the released code, and ours: a reward for turning towards the goal, dear falls, and
+cheap energy and table contact."""
 
 SHORT_ROLLOUTS = PpoCfg(
     rollout_steps=8,
@@ -102,8 +102,8 @@ SHORT_ROLLOUTS = PpoCfg(
 def gpu() -> TeacherCfg:
     """One GPU or each of several: the paper's task, by the recipe that learns.
 
-    What measurements chose, beside the paper's value where that differs (docs/lessons.md). Four fingers did
-    better with ``--ppo.desired-kl 0.03``.
+    What measurements chose, beside the paper's value where that differs (docs/lessons.md). Four
+    fingers did better with ``--ppo.desired-kl 0.03``.
     """
     return TeacherCfg(
         preset="gpu",
@@ -136,8 +136,8 @@ def gpu() -> TeacherCfg:
             # A third of the goals is left to learn; paper: neither shape nor views.
             observation=ObservationCfg(shape="full", view="goal", canonical=True),
             reward=TOWARDS_GOAL,
-            # The tightest: what fingers at a std of 0.08 can keep; without noise they then pass the paper's
-            # test, which evaluation asks for. Goals end more exactly than there: what is
+            # The tightest: what fingers at a std of 0.08 can keep; without noise they then pass the
+            # paper's test, which evaluation asks for. Goals end more exactly than there: what is
             # pressed from 0.4 rad on would never be turned the rest of the way.
             success=SuccessCfg(
                 rotation_rad=0.15,
@@ -177,11 +177,13 @@ def in_palm(preset: str, hand: str, objects: tuple[str, ...] = ("cube",)) -> Tea
         num_envs=8192,  # hands of many colliders fill a GPU sooner
         episode_s=10.0,  # what falls ends it; what is held meets many goals
         failures_per_million=20.0,
-        # Room for the contacts of LEAP's 71 colliders: none was lost in 252 M steps. Too little stops a run.
+        # Room for the contacts of LEAP's 71 colliders: none was lost in 252 M steps. Too little
+        # stops a run.
         sim=SimCfg(njmax=320, nconmax=48, nccdmax=12),
         observation=ObservationCfg(shape="full", canonical=True),  # such hands have no symmetry
-        # Lost is also every goal to come, so a fall costs half of what it does over a table. Chosen once,
-        # as are the thresholds of success; tried with LEAP's cube alone, half and twice are not known.
+        # Lost is also every goal to come, so a fall costs half of what it does over a table. Chosen
+        # once, as are the thresholds of success; tried with LEAP's cube alone, half and twice are
+        # not known.
         reward=replace(TOWARDS_GOAL, fall=-150.0),
         success=replace(base.env.success, rotation_rad=0.2, joint_speed_rad_s=0.8, fall_m=None),
     )
@@ -189,7 +191,10 @@ def in_palm(preset: str, hand: str, objects: tuple[str, ...] = ("cube",)) -> Tea
 
 
 def cpu_demo() -> TeacherCfg:
-    """Minutes on two cores, on an easier task: from rest, goals about the vertical, no stillness test."""
+    """Minutes on two cores, on an easier task.
+
+    From rest, goals about the vertical, no stillness test.
+    """
     return TeacherCfg(
         preset="cpu-demo",
         run=RunCfg(out=Path("runs/cpu-demo"), device="cpu", max_steps=200_000, save_every=10),
@@ -237,7 +242,10 @@ PRESETS: dict[str, Callable[[], TeacherCfg]] = {
 }
 """Presets by name."""
 
-GONE = {"multi-gpu": "gpu is the same, under torchrun too", "cube": "give --preset gpu --objects cube"}
+GONE = {
+    "multi-gpu": "gpu is the same, under torchrun too",
+    "cube": "give --preset gpu --objects cube",
+}
 """Presets of earlier versions, and what to take; their runs go on by their own configuration."""
 
 
@@ -246,14 +254,20 @@ SMOKE_RUN = Path("runs/smoke")
 
 
 def for_hand(cfg: TeacherCfg, hand: str | None) -> TeacherCfg:
-    """``cfg``, seen as ``hand`` can see it: a preset knows of its own hand that it is its mirror image."""
+    """``cfg``, seen as ``hand`` can see it.
+
+    A preset knows of its own hand that it is its mirror image.
+    """
     if hand in (None, cfg.env.hand) or cfg.env.observation.view != "mirrored":
         return cfg
     return replace(cfg, env=replace(cfg.env, observation=replace(cfg.env.observation, view="goal")))
 
 
 def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
-    """A preset, cpu-demo by default, shrunk to run all parts in at most a minute. It learns nothing."""
+    """A preset, cpu-demo by default, shrunk to run all parts in at most a minute.
+
+    It learns nothing.
+    """
     cfg = cfg or cpu_demo()
     return replace(
         cfg,
@@ -268,5 +282,7 @@ def smoke(cfg: TeacherCfg | None = None) -> TeacherCfg:
             logger="none",
         ),
         ppo=replace(cfg.ppo, minibatch_size=128, epochs=2),
-        env=replace(cfg.env, num_envs=16, start=replace(cfg.env.start, poses=1)),  # finding them takes long
+        env=replace(
+            cfg.env, num_envs=16, start=replace(cfg.env.start, poses=1)
+        ),  # finding them takes long
     )

@@ -60,8 +60,14 @@ class ProgressLines:
 def _terms(row: Mapping[str, Any]) -> str:
     """The terms of the reward of an iteration, mean per control step, or else its losses."""
     for group in ("reward/", "loss/"):
-        terms = {k.removeprefix(group): v for k, v in row.items() if k.startswith(group) and v is not None}
+        terms = {
+            k.removeprefix(group): v
+            for k, v in row.items()
+            if k.startswith(group) and v is not None
+        }
         terms.pop("total", None)
         if terms:
-            return f"{group[:-1]}: " + "  ".join(f"{name} {value:+.3f}" for name, value in terms.items())
+            return f"{group[:-1]}: " + "  ".join(
+                f"{name} {value:+.3f}" for name, value in terms.items()
+            )
     return ""

@@ -1,4 +1,7 @@
-"""The teacher's training: rollouts and updates of PPO, its checkpoints, and beginning from another run."""
+"""The teacher's training.
+
+Rollouts and updates of PPO, its checkpoints, and beginning from another run.
+"""
 
 import math
 import time
@@ -42,7 +45,8 @@ class TeacherRunner(TrainingLoop):
         critic_warmup: Iterations left in which the critic learns alone.
         imitation: What the actor does meanwhile, if anything (``PpoCfg.imitation_iterations``).
         begun: Whether this run began from another one's networks, in this process.
-        unlike: What observations and actions mean otherwise than to the policy that the run began from.
+        unlike: What observations and actions mean otherwise than to the policy that the run began
+            from.
     """
 
     env: ReorientVecEnv
@@ -82,23 +86,27 @@ class TeacherRunner(TrainingLoop):
     def load(self, path: str | Path) -> None:
         """Go on from a checkpoint: networks, optimiser, iteration, curriculum and random states.
 
-        With the processes and environments of the checkpoint the run goes on exactly. With others, or from a
-        checkpoint without environments, all but these and random states is restored, and episodes start anew.
+        With the processes and environments of the checkpoint the run goes on exactly. With others,
+        or from a checkpoint without environments, all but these and random states is restored, and
+        episodes start anew.
 
         Raises:
             ValueError: The file is damaged, a policy only, or of another network.
         """
         state = load_checkpoint(Path(path), self.device)
         if "optimizer_state_dict" not in state:
-            raise ValueError(f"{path} is a policy, which nothing can resume; --init begins a new run from it")
+            raise ValueError(
+                f"{path} is a policy, which nothing can resume; --init begins a new run from it"
+            )
         self._take(state, path)
 
     def begin_from(self, path: str | Path, stage: tuple[float, float] | None = None) -> None:
         """Begin with networks, optimiser, curriculum and counters of another run's checkpoint or policy.
 
-        Environments, random states, learning rates and the choice of the best checkpoint are this run's own,
-        and so are a critic and an optimiser that the file lacks; then the critic learns alone first. Networks
-        that read less than this run observes are widened. With ``stage`` difficulty and tightness are these.
+        Environments, random states, learning rates and the choice of the best checkpoint are this
+        run's own, and so are a critic and an optimiser that the file lacks; then the critic learns
+        alone first. Networks that read less than this run observes are widened. With ``stage``
+        difficulty and tightness are these.
 
         Raises:
             ValueError: The file is damaged, of another hand or of another network.
@@ -108,8 +116,10 @@ class TeacherRunner(TrainingLoop):
         present, read = self.env.env.num_present, found["policy"]["num_observations"]
         if self.ppo.imitation_iterations and present != read:
             raise ValueError(
-                f"--ppo.imitation-iterations: {path} reads {read} values, and the critic is told {present} "
-                "of the present; give --env.observation.dynamics critic, and --init a policy of state and "
+                f"--ppo.imitation-iterations: {path} reads {read} values, and the critic is told "
+                f"{present} "
+                "of the present; give --env.observation.dynamics critic, and --init a policy of "
+                "state and "
                 "shape"
             )
         self.unlike = unlike(found["task"], self.task)
@@ -127,8 +137,10 @@ class TeacherRunner(TrainingLoop):
         """Write checkpoint and policy; the policy is that of the best checkpoint.
 
         The best is chosen by the curriculum's stage, then success per goal over the last two
-        episodes, then mean reward, in that order: while nothing succeeds the reward decides. Until two
-        episodes are over the latest takes its place: near goals are reached first, so that early rates are
+        episodes, then mean reward, in that order: while nothing succeeds the reward decides. Until
+            two
+        episodes are over the latest takes its place: near goals are reached first, so that early
+            rates are
         too high and no later one would beat them.
         """
         self._better = self.iteration > 0 and (self._best is None or self._score > self._best)
@@ -146,9 +158,13 @@ class TeacherRunner(TrainingLoop):
         return self.ppo.rollout_steps * self.env.num_envs
 
     def _begin(self) -> None:
-        if self._stagger_due:  # new environments begin within their episode, or all would time out at once
+        if (
+            self._stagger_due
+        ):  # new environments begin within their episode, or all would time out at once
             steps = self.env.episode_length_buf
-            self.env.episode_length_buf = torch.randint_like(steps, high=int(self.env.max_episode_length))
+            self.env.episode_length_buf = torch.randint_like(
+                steps, high=int(self.env.max_episode_length)
+            )
         self._stagger_due = False
         if self.is_distributed:
             self.alg.broadcast_parameters()
@@ -179,7 +195,9 @@ class TeacherRunner(TrainingLoop):
             **self.env.end_iteration(),
             **{f"loss/{name}": value for name, value in losses.items()},
         }
-        stage = figures["task/difficulty"] + figures["task/tightness"] - 1.0  # 1: the configured task
+        stage = (
+            figures["task/difficulty"] + figures["task/tightness"] - 1.0
+        )  # 1: the configured task
         self._score = (stage, figures["success_per_goal"] or 0.0, figures["mean_reward"])
         return figures
 
@@ -201,17 +219,25 @@ class TeacherRunner(TrainingLoop):
         return True
 
     def _update(self) -> dict[str, float]:
-        """All epochs of PPO, or of the critic alone, beside which the actor may imitate; its losses."""
+        """All epochs of PPO, or of the critic alone, beside which the actor may imitate.
+
+        Its losses.
+        """
         self.alg.actor_learns = self.critic_warmup == 0
         losses = self.alg.update()
         if self.imitation is not None and self.critic_warmup:
-            losses |= self.imitation.update(min(1.0, self.critic_warmup / self.ppo.imitation_iterations))
+            losses |= self.imitation.update(
+                min(1.0, self.critic_warmup / self.ppo.imitation_iterations)
+            )
         self.critic_warmup = max(0, self.critic_warmup - 1)
-        check_update(losses, self._networks, f"{LOWER_RATES}, or raise the lower end of --policy.std-range")
+        check_update(
+            losses, self._networks, f"{LOWER_RATES}, or raise the lower end of --policy.std-range"
+        )
         return losses
 
     def _new_window(self) -> GoalWindow:
-        # Two episodes, so that a window never misses the time-outs of environments that run in step.
+        # Two episodes, so that a window never misses the time-outs of environments that run in
+        # step.
         length = math.ceil(2 * self.env.max_episode_length / self.ppo.rollout_steps)
         return GoalWindow(length, success_ends=bool(self.task.get("success_ends_episode", False)))
 
@@ -246,7 +272,8 @@ class TeacherRunner(TrainingLoop):
             self.alg.load(state, None, True)
         except (RuntimeError, ValueError, KeyError) as error:
             raise ValueError(
-                f"{path} does not fit this run's networks or hand; resume with the configuration it was "
+                f"{path} does not fit this run's networks or hand; resume with the configuration "
+                f"it was "
                 f"trained with (its run folder's config.json), or start anew ({error})"
             ) from error
         self.critic_warmup = state.get("critic_warmup", 0)

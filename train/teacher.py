@@ -48,11 +48,18 @@ def build_teacher(
     if init is not None:
         load_checkpoint(init, flag="--init")  # a damaged one is refused before anything is built
     if cfg.init is None and cfg.init_stage is not None:
-        raise ValueError("--init-stage says where a run with --init begins; leave it out, or give --init")
+        raise ValueError(
+            "--init-stage says where a run with --init begins; leave it out, or give --init"
+        )
     if cfg.init is None and cfg.ppo.imitation_iterations:
-        raise ValueError("--ppo.imitation-iterations imitates the policy that --init names; give --init too")
+        raise ValueError(
+            "--ppo.imitation-iterations imitates the policy that --init names; give --init too"
+        )
     if device == "cpu" and cfg.env.num_envs > CPU_ENVS:
-        say(f"{cfg.env.num_envs} environments take a CPU minutes an iteration; --num-envs asks for fewer")
+        say(
+            f"{cfg.env.num_envs} environments take a CPU minutes an iteration; --num-envs asks for "
+            f"fewer"
+        )
     say(BUILDING)
 
     import torch
@@ -87,7 +94,8 @@ def build_teacher(
     elif init is not None:
         runner.begin_from(init, cfg.init_stage)
     if rank == 0:
-        # After all that can refuse: settings that a run cannot have must not take the place of its own.
+        # After all that can refuse: settings that a run cannot have must not take the place of its
+        # own.
         write_config(cfg)
     return runner
 
@@ -98,7 +106,9 @@ def teacher_command(arguments: list[str], started: float) -> int:
     cfg = parse_teacher(arguments, say=say)
     if not cfg.smoke or cfg.run.out != SMOKE_RUN:
         return train(cfg, say, started)
-    with TemporaryDirectory(prefix="vd-smoke-") as folder:  # nobody needs what is in it, twice least of all
+    with TemporaryDirectory(
+        prefix="vd-smoke-"
+    ) as folder:  # nobody needs what is in it, twice least of all
         return train(replace(cfg, run=replace(cfg.run, out=Path(folder))), say, started)
 
 
@@ -108,7 +118,10 @@ def say_of_main() -> Callable[[str], None]:
 
 
 def train(cfg: TeacherCfg, say: Callable[[str], None], started: float) -> int:
-    """Train as ``cfg`` says; the exit status. ``say`` and ``started`` as of :func:`build_teacher`."""
+    """Train as ``cfg`` says; the exit status.
+
+    ``say`` and ``started`` as of :func:`build_teacher`.
+    """
     folder = cfg.run.out
     runner = build_teacher(cfg, started=started, say=say)
     for line in _beginning(cfg, runner) if runner.iteration else []:
@@ -116,20 +129,30 @@ def train(cfg: TeacherCfg, say: Callable[[str], None], started: float) -> int:
     if not runner.run_to_end():
         if not cfg.smoke:
             again = f"vd-train teacher --out {folder} --resume"
-            say(f"saved in {folder}; go on with: {'the same command' if cfg.resume == 'auto' else again}")
+            say(
+                f"saved in {folder}; go on with: "
+                f"{'the same command' if cfg.resume == 'auto' else again}"
+            )
         return interrupt.INTERRUPTED
-    from vd.train.runner import POLICY_NAME  # loads torch, which the first message should not wait for
+    from vd.train.runner import (
+        POLICY_NAME,
+    )  # loads torch, which the first message should not wait for
 
     if cfg.smoke:
-        say(f"done: everything runs. {runner.env_steps} steps are a test, and the policy is of no use")
+        say(
+            f"done: everything runs. {runner.env_steps} steps are a test, and the policy is of no "
+            f"use"
+        )
     elif not (folder / POLICY_NAME).exists():
         say(
-            f"done: nothing was trained, so {folder} has no {POLICY_NAME}: the {runner.env_steps} steps "
+            f"done: nothing was trained, so {folder} has no {POLICY_NAME}: the {runner.env_steps} "
+            f"steps "
             f"done before are more than --max-steps {cfg.run.max_steps}; raise it"
         )
     else:
         say(
-            f"done: {folder}/{POLICY_NAME} is the best policy, tensorboard --logdir {folder} draws the curves"
+            f"done: {folder}/{POLICY_NAME} is the best policy, tensorboard --logdir {folder} draws "
+            f"the curves"
         )
     return 0
 

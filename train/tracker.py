@@ -1,4 +1,7 @@
-"""``vd-train tracker``: let a teacher act by a camera, and choose when it stops; its layers stay."""
+"""``vd-train tracker``: let a teacher act by a camera, and choose when it stops.
+
+Its layers stay.
+"""
 
 import math
 from collections.abc import Sequence
@@ -26,11 +29,12 @@ if TYPE_CHECKING:
 class TrackerCfg(EpisodeFlags):
     """Write a tracking policy: a teacher that acts by a depth camera, on objects of known shape.
 
-    With --alignment it is a vision policy: of the shape it knows no more than the points of the goal.
+    With --alignment it is a vision policy: of the shape it knows no more than the points of the
+    goal.
 
     It finds the object among the camera's points. Nothing is learned; its stopping rules, for
-    --stop-tolerance and for 0.1 rad, are chosen on episodes with objects of validation, those of vd-eval with
-    the same flags.
+    --stop-tolerance and for 0.1 rad, are chosen on episodes with objects of validation, those of
+    vd-eval with the same flags.
     """
 
     teacher: Annotated[str, tyro.conf.Positional]
@@ -38,13 +42,13 @@ class TrackerCfg(EpisodeFlags):
     objects: tuple[str, ...] = field()
     """Object sets to choose the stopping rules on, not those of the training."""
     alignment: str | None = None
-    """Network that finds objects by their goals' points: the alignment.pt of vd-train student, or the name of
-    an installed vision policy, for that of it."""
+    """Network that finds objects by their goals' points: the alignment.pt of vd-train student, or
+    the name of an installed vision policy, for that of it."""
     out: Path = Path("tracking.pt")
     """File to write."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
-    """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m] and
-    quaternion xyzw; that of the network's training or the hand's own camera by default."""
+    """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m]
+    and quaternion xyzw; that of the network's training or the hand's own camera by default."""
     episodes: int = 256
     """Episodes; rounded up to as many of each object."""
     goals: Goals = "points"
@@ -54,11 +58,12 @@ class TrackerCfg(EpisodeFlags):
 def tracker_command(arguments: Sequence[str], _started: float) -> int:
     """``vd-train tracker``; the exit status.
 
-    One rule is for the tolerance, one for that of the paper's precise variant, from the same episodes.
+    One rule is for the tolerance, one for that of the paper's precise variant, from the same
+    episodes.
 
     Raises:
-        ValueError: The teacher is none, or observes what no camera shows, or no rule stops any episode within
-            the tolerance.
+        ValueError: The teacher is none, or observes what no camera shows, or no rule stops any
+            episode within the tolerance.
     """
     cfg: TrackerCfg = parse(TrackerCfg, arguments, prog="vd-train tracker")
     cfg.validate()
@@ -79,7 +84,9 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     if teacher is None:
         raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
     if own := teacher.task["observation"].get("terms"):
-        raise ValueError(f"{cfg.teacher} observes {', '.join(own)}, which no camera shows; give another")
+        raise ValueError(
+            f"{cfg.teacher} observes {', '.join(own)}, which no camera shows; give another"
+        )
     spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
     policy = TrackingPolicy(teacher, spec)
     if cfg.alignment is not None:
@@ -89,7 +96,8 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     trace = _episodes(cfg, policy, device)
     assert trace.predicted is not None
     predicted, norm, true = (
-        values.reshape(trace.steps.size, -1) for values in (trace.predicted, trace.action_norm, trace.error)
+        values.reshape(trace.steps.size, -1)
+        for values in (trace.predicted, trace.action_norm, trace.error)
     )
     chosen = partial(calibrate, predicted, norm, true, trace.steps.ravel())
     found = chosen(tolerance_rad=cfg.stop_tolerance)
@@ -107,19 +115,29 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     save_checkpoint(cfg.out, tracking_export(replace(policy, spec=spec)))
     for result in (found, precise):
         if result is None:
-            print(f"{cfg.out}: no rule stops any within {PAPER.success.precise_rad:g} rad: none for it")
+            print(
+                f"{cfg.out}: no rule stops any within {PAPER.success.precise_rad:g} rad: none for "
+                f"it"
+            )
             continue
         rule = result.rule
         print(
             f"{cfg.out}: stop below {rule.distance_rad:.3f} rad and an action norm of "
-            f"{rule.action_norm:.3f}. Of {result.episodes} episodes {result.success:.1%} stop within "
-            f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} came that near"
+            f"{rule.action_norm:.3f}. Of {result.episodes} episodes {result.success:.1%} stop "
+            f"within "
+            f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} "
+            f"came that near"
         )
     return 0
 
 
-def _network(name: str, device: str) -> "tuple[AlignmentNetwork, AlignmentCfg, tuple[float, ...] | None]":
-    """A network of alignment, its sizes, and the camera of its training: of a policy, or of a file."""
+def _network(
+    name: str, device: str
+) -> "tuple[AlignmentNetwork, AlignmentCfg, tuple[float, ...] | None]":
+    """A network of alignment, its sizes, and the camera of its training.
+
+    Of a policy, or of a file.
+    """
     from vd.evaluate.agents import installed_policies, open_policy
     from vd.tracking.policy import TrackingPolicy
     from vd.vision.saved import load_alignment
@@ -128,8 +146,14 @@ def _network(name: str, device: str) -> "tuple[AlignmentNetwork, AlignmentCfg, t
         network, learned = load_alignment(name, device)
         return network, learned.network, learned.camera
     policy = open_policy(name, device)
-    if not isinstance(policy, TrackingPolicy) or policy.alignment is None or policy.spec.alignment is None:
-        raise ValueError(f"--alignment: {name} finds nothing by its goal's points; name a vision policy")
+    if (
+        not isinstance(policy, TrackingPolicy)
+        or policy.alignment is None
+        or policy.spec.alignment is None
+    ):
+        raise ValueError(
+            f"--alignment: {name} finds nothing by its goal's points; name a vision policy"
+        )
     return policy.alignment, policy.spec.alignment, policy.spec.camera
 
 

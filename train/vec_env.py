@@ -1,4 +1,7 @@
-"""The environment as rsl-rl sees it: a vectorised environment of torch tensors on the simulator's device."""
+"""The environment as rsl-rl sees it.
+
+A vectorised environment of torch tensors on the simulator's device.
+"""
 
 from typing import Any
 
@@ -21,17 +24,17 @@ class ReorientVecEnv(VecEnv):
     """N environments of a :class:`vd.envs.reorient.ReorientEnv` behind rsl-rl's interface.
 
     Rewards and flags are torch views of the environment's Warp arrays, without a copy. Observations
-    are copied once, on the device: rsl-rl stores the observation of a step only *after* the next step has
-    overwritten the environment's array, so a view would silently pair each action with the observation
-    that followed it.
+    are copied once, on the device: rsl-rl stores the observation of a step only *after* the next
+    step has overwritten the environment's array, so a view would silently pair each action with the
+    observation that followed it.
 
-    Warp and torch work on different CUDA streams. Warp's are ordered against torch's default stream by
-    CUDA itself, so torch has to stay on that stream, and nothing waits on the host.
+    Warp and torch work on different CUDA streams. Warp's are ordered against torch's default stream
+    by CUDA itself, so torch has to stay on that stream, and nothing waits on the host.
 
     ``done`` for PPO is success, fall or time-out. A success gives a new goal and no reset, but ends
     the goal's return: it is not bootstrapped. Only a time-out without success or fall is
-    (``extras["time_outs"]``). The observation returned is always that of the next action, after a reset
-    or with the new goal.
+    (``extras["time_outs"]``). The observation returned is always that of the next action, after a
+    reset or with the new goal.
     """
 
     def __init__(self, env: Any) -> None:
@@ -66,7 +69,10 @@ class ReorientVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Control steps since the last reset of every environment [N], a view; assigning copies into it."""
+        """Control steps since the last reset of every environment [N], a view.
+
+        Assigning copies into it.
+        """
         return self._step_count
 
     @episode_length_buf.setter
@@ -81,7 +87,9 @@ class ReorientVecEnv(VecEnv):
         copies = {group: values.clone() for group, values in self._observed.items()}
         return TensorDict(copies, batch_size=[self.num_envs])
 
-    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Simulate one control step.
 
         Args:
@@ -89,10 +97,11 @@ class ReorientVecEnv(VecEnv):
 
         Returns:
             Observation for the next action; reward [N] (view); done [N] (int64); and extras with
-            ``time_outs`` [N] (float) and ``log``: scalars on the device, the same keys from the first step.
-            ``reward/*`` and ``task/rotation_error`` [rad] are means over environments, ``task/reached``,
-            ``task/dropped``, ``task/timed_out`` the share of environments whose goal ended that way in this
-            step, ``task/within_tolerance`` the share within the paper's success tolerance, moving or not.
+            ``time_outs`` [N] (float) and ``log``: scalars on the device, the same keys from the
+            first step. ``reward/*`` and ``task/rotation_error`` [rad] are means over environments,
+            ``task/reached``, ``task/dropped``, ``task/timed_out`` the share of environments whose
+            goal ended that way in this step, ``task/within_tolerance`` the share within the paper's
+            success tolerance, moving or not.
         """
         self._action.copy_(actions)
         self.env.step(self.env.action)
@@ -123,9 +132,10 @@ class ReorientVecEnv(VecEnv):
         """Once an iteration: move the curriculum.
 
         Returns:
-            ``task/difficulty`` and ``task/tightness``: the stage of the curriculum, 1 and 1 is the configured
-            task; ``task/failed_steps``: those of environments here that were put back since the begin
-            (``ReorientCfg.failures_per_million``).
+            ``task/difficulty`` and ``task/tightness``: the stage of the curriculum, 1 and 1 is the
+                configured
+            task; ``task/failed_steps``: those of environments here that were put back since the
+            begin (``ReorientCfg.failures_per_million``).
         """
         if torch.distributed.is_initialized():
             # Every process counts all goals, and so moves to the same difficulty.

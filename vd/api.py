@@ -20,14 +20,17 @@ def load_policy(name: str | Path, env: "ReorientEnv | None" = None, device: str 
     """A policy from a file, to look at, or to act in an environment.
 
     Args:
-        name: An installed policy such as ``dclaw4``, a ``policy.pt``, a bundle's or a run's folder; with an
-            environment also ``zero`` and ``random``.
-        env: Where it acts. A policy that sees by a camera opens its eyes in there, and acts there alone.
+        name: An installed policy such as ``dclaw4``, a ``policy.pt``, a bundle's or a run's folder;
+            with an environment also ``zero`` and ``random``.
+        env: Where it acts. A policy that sees by a camera opens its eyes in there, and acts there
+            alone.
         device: Of the policy, without an environment: auto, cpu or cuda:N.
 
     Returns:
-        A policy: ``act(observation)`` gives actions [N, A] for observations [N, O], torch tensors. Without an
-        environment it has ``task``, for :meth:`ReorientCfg.of`, and a policy by camera does not act.
+        A policy: ``act(observation)`` gives actions [N, A] for observations [N, O], torch tensors.
+            Without an
+        environment it has ``task``, for :meth:`ReorientCfg.of`, and a policy by camera does not
+        act.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -67,13 +70,18 @@ def evaluate_policies(*policies: str, **settings: Any) -> "Result":
     cfg = from_dict(EvalCfg, {"policies": policies, **settings})
     cfg.validate()
     check_names(
-        cfg.agent_names, [s for sets in parse_groups(cfg.object_sets).values() for s in sets], cfg.hand
+        cfg.agent_names,
+        [s for sets in parse_groups(cfg.object_sets).values() for s in sets],
+        cfg.hand,
     )
     return compare(cfg)
 
 
 class ObjectTracker:
-    """Finds an object of known shape in depth images beside the hand; :meth:`look` takes the next."""
+    """Finds an object of known shape in depth images beside the hand.
+
+    :meth:`look` takes the next.
+    """
 
     def __init__(
         self,
@@ -122,8 +130,9 @@ class ObjectTracker:
             fresh: Forget where it was.
 
         Returns:
-            Position [m] and quaternion xyzw in the world frame, shape [7]; of a symmetric object one of the
-            orientations in which it looks like this. As before where nothing is seen of it.
+            Position [m] and quaternion xyzw in the world frame, shape [7]; of a symmetric object
+            one of the orientations in which it looks like this. As before where nothing is seen of
+            it.
 
         Raises:
             ValueError: The image has another size than the camera.
@@ -144,22 +153,32 @@ class ObjectTracker:
 
 
 def analyse_gap(recording: str | Path, out: str | Path, **settings: Any) -> "Report":
-    """Find, explain and close the gap of a recording, as ``vd-gap run`` does; finished steps are kept.
+    """Find, explain and close the gap of a recording, as ``vd-gap run`` does.
+
+    Finished steps are kept.
 
     Args:
         recording: Folder of the recording.
-        out: Folder for ``report.json``, ``report.html`` and the identified model, ``identified.usda``.
-        settings: ``hand``, ``hand_layer``, ``effects``, ``seed``, ``device``, as the flags of ``vd-gap run``.
+        out: Folder for ``report.json``, ``report.html`` and the identified model,
+            ``identified.usda``.
+        settings: ``hand``, ``hand_layer``, ``effects``, ``seed``, ``device``, as the flags of
+            ``vd-gap run``.
 
     Returns:
-        The report: ``verdict``, ``effects`` and how much closer the identified model is, ``closing``.
+        The report: ``verdict``, ``effects`` and how much closer the identified model is,
+            ``closing``.
 
     Raises:
-        RuntimeError: A script calls it without ``if __name__ == "__main__":``; worker processes import it.
+        RuntimeError: A script calls it without ``if __name__ == "__main__":``; worker processes
+            import it.
         ValueError: The recording or a setting cannot be used.
     """
-    if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker that imports the script
-        raise RuntimeError('analyse_gap() starts processes: call it under if __name__ == "__main__":')
+    if getattr(
+        multiprocessing.current_process(), "_inheriting", False
+    ):  # a worker that imports the script
+        raise RuntimeError(
+            'analyse_gap() starts processes: call it under if __name__ == "__main__":'
+        )
     from vd.gap.result import Report
     from vd.gap.steps import Analysis, Settings
 
@@ -205,13 +224,17 @@ def read(path: str | Path) -> Any:
         if found.startswith(start):
             return kind.read(path)
     raise ValueError(
-        f"{path} has {f'the format {found!r}' if found else 'no format'}; give the folder of a recording, "
-        "bundle or log, report.json or eval.json (load_policy reads policies, load_hand and load_objects USD)"
+        f"{path} has {f'the format {found!r}' if found else 'no format'}; give the folder of a "
+        f"recording, "
+        "bundle or log, report.json or eval.json (load_policy reads policies, load_hand and "
+        "load_objects USD)"
     )
 
 
 def write(value: Any, path: str | Path) -> None:
-    """Write what :func:`read` reads: a recording or a policy into a folder, a report or result into a file.
+    """Write what :func:`read` reads.
+
+    A recording or a policy into a folder, a report or result into a file.
 
     Raises:
         FileExistsError: The folder for a bundle holds something else.

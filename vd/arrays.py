@@ -31,7 +31,10 @@ def library_on(device: str) -> Any:
 
 
 def as_warp(array: Array, dtype: Any = None) -> wp.array:
-    """The memory of an array for Warp, of ``dtype``, such as ``wp.vec3``; where it has gaps, a copy's."""
+    """The memory of an array for Warp, of ``dtype``, such as ``wp.vec3``.
+
+    Where it has gaps, a copy's.
+    """
     if isinstance(array, np.ndarray):
         return wp.array(np.ascontiguousarray(array), dtype=dtype or Any, copy=False, device="cpu")
     return wp.from_torch(array.contiguous(), dtype=dtype)

@@ -1,4 +1,7 @@
-"""What all commands do with their words: flags over a file of settings, ``--config``, over defaults."""
+"""What all commands do with their words.
+
+Flags over a file of settings, ``--config``, over defaults.
+"""
 
 import dataclasses
 import inspect
@@ -98,7 +101,10 @@ def parse(
 
 
 def behind_command(words: Sequence[str]) -> list[str]:
-    """A command line that begins with ``--config FILE`` or ``--print-config``: these behind the rest."""
+    """A command line that begins with ``--config FILE`` or ``--print-config``.
+
+    These behind the rest.
+    """
     left, moved = list(words), list[str]()
     while left and left[0].partition("=")[0] in (CONFIG, PRINT):
         count = 2 if left[0] == CONFIG else 1
@@ -173,6 +179,8 @@ def _subcommands(kind: Any) -> dict[str, Any]:
 def _set_already(default: Any, words: Sequence[str]) -> set[str]:
     """Switches that are on already: tyro knows some of these by their opposite alone."""
     names = [
-        f.name.replace("_", "-") for f in dataclasses.fields(default) if getattr(default, f.name) is True
+        f.name.replace("_", "-")
+        for f in dataclasses.fields(default)
+        if getattr(default, f.name) is True
     ]
     return {f"--{name}" for name in names if f"--no-{name}" not in words}

@@ -37,7 +37,9 @@ def to_dict(value: Any) -> Any:
         TypeError: A field holds something that a JSON file cannot.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_dict(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {
+            field.name: to_dict(getattr(value, field.name)) for field in dataclasses.fields(value)
+        }
     if isinstance(value, Mapping):
         return {str(key): to_dict(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -51,18 +53,22 @@ def to_dict(value: Any) -> Any:
     raise TypeError(f"a configuration cannot hold a {type(value).__name__}: {value!r}")
 
 
-def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "", over: T | None = None) -> T:
-    """Build the dataclass ``cls`` from what :func:`to_dict` wrote. Fields that are absent keep their default.
+def from_dict(
+    cls: type[T], values: Mapping[str, Any], *, where: str = "", over: T | None = None
+) -> T:
+    """Build the dataclass ``cls`` from what :func:`to_dict` wrote.
+
+    Fields that are absent keep their default.
 
     With ``over`` they are as in that one, in groups too.
 
-    A class that lost a field says so in ``RETIRED``: by name the value that means what is now always so, of a
-    group that went the values of those fields that say so. Others are refused, but for :class:`Dropped`.
-    A field that has another name is :class:`Renamed`.
+    A class that lost a field says so in ``RETIRED``: by name the value that means what is now
+    always so, of a group that went the values of those fields that say so. Others are refused, but
+    for :class:`Dropped`. A field that has another name is :class:`Renamed`.
 
     Raises:
-        ValueError: A field that ``cls`` does not have, one that is needed and absent, or a value of the wrong
-            type, named by its path, which begins with ``where``.
+        ValueError: A field that ``cls`` does not have, one that is needed and absent, or a value of
+            the wrong type, named by its path, which begins with ``where``.
     """
     values = without_retired(values, getattr(cls, "RETIRED", {}), where or cls.__name__)
     hints = typing.get_type_hints(cls)
@@ -89,21 +95,30 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "", over:
 def needed(cls: type) -> set[str]:
     """Names of the fields of a dataclass that have no default."""
     missing = dataclasses.MISSING
-    return {one.name for one in dataclasses.fields(cls) if one.default is one.default_factory is missing}
+    return {
+        one.name for one in dataclasses.fields(cls) if one.default is one.default_factory is missing
+    }
 
 
 def _meant(name: str, names: set[str], hints: Mapping[str, Any]) -> str:
     """Asks for the field that ``name`` is likely meant to be, one of a group or one that is spelled alike."""
     groups = {one: hints[one] for one in sorted(names) if dataclasses.is_dataclass(hints[one])}
     inside = [
-        f"{one}.{name}" for one, kind in groups.items() if name in {f.name for f in dataclasses.fields(kind)}
+        f"{one}.{name}"
+        for one, kind in groups.items()
+        if name in {f.name for f in dataclasses.fields(kind)}
     ]
     found = inside + difflib.get_close_matches(name, sorted(names), 1)
     return f"is it {found[0]}? " if found else ""
 
 
-def without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """``values`` without fields that are no more, and with today's names; ``retired`` is as ``RETIRED``."""
+def without_retired(
+    values: Mapping[str, Any], retired: Mapping[str, Any], where: str
+) -> dict[str, Any]:
+    """``values`` without fields that are no more, and with today's names.
+
+    ``retired`` is as ``RETIRED``.
+    """
     new = {old: to for old, to in retired.items() if isinstance(to, Renamed) and old in values}
     values = {name: value for name, value in values.items() if name not in new} | {
         to.name: to.values.get(values[old], values[old]) if to.values else values[old]
@@ -118,14 +133,17 @@ def without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], where
                 warnings.warn(f"{where}.{name} is {value!r}; this version ignores it", stacklevel=2)
         elif to_dict(value) != wanted:
             raise ValueError(
-                f"{where}.{name} is {value!r}, and this version has only {wanted!r}; take the version that "
+                f"{where}.{name} is {value!r}, and this version has only {wanted!r}; take the "
+                f"version that "
                 "wrote it"
             )
     return {name: value for name, value in values.items() if name not in retired}
 
 
 def _convert(hint: Any, value: Any, where: str, over: Any = None) -> Any:
-    """``value`` as the type ``hint`` asks for: nested dataclasses, tuples, paths and unions of them.
+    """``value`` as the type ``hint`` asks for.
+
+    Nested dataclasses, tuples, paths and unions of them.
 
     Of a dataclass ``over`` has what is left out.
     """
@@ -214,7 +232,10 @@ def leaves(values: Any, where: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def require(
-    cfg: Any, prefix: str, what: typing.Literal["positive", "zero or positive", "in [0, 1]"], names: str
+    cfg: Any,
+    prefix: str,
+    what: typing.Literal["positive", "zero or positive", "in [0, 1]"],
+    names: str,
 ) -> None:
     """Refuse fields that are not ``what``; those that are ``None`` are not set.
 

@@ -16,11 +16,15 @@ def warp_device(name: str | None) -> str:
         return str(wp.get_device(None if name == "auto" else name))
     except (ValueError, RuntimeError) as error:
         here = ", ".join(map(str, wp.get_devices()))
-        raise ValueError(f"device is {name!r}; it has to be auto, or of those here: {here}") from error
+        raise ValueError(
+            f"device is {name!r}; it has to be auto, or of those here: {here}"
+        ) from error
 
 
 def resolve_device(name: str) -> str:
-    """The device for Warp and torch: ``auto`` is this process's GPU (torchrun), the first, or the CPU.
+    """The device for Warp and torch.
+
+    ``auto`` is this process's GPU (torchrun), the first, or the CPU.
 
     Raises:
         ValueError: The device does not exist here.
@@ -39,13 +43,17 @@ def resolve_device(name: str) -> str:
         raise ValueError(f"--device is '{name}'; it has to be auto, cpu, or cuda:N")
     if int(index) >= torch.cuda.device_count():
         raise ValueError(
-            f"--device is '{name}', but torch finds {torch.cuda.device_count()} GPUs; use auto or cpu"
+            f"--device is '{name}', but torch finds {torch.cuda.device_count()} GPUs; use auto or "
+            f"cpu"
         )
     return name
 
 
 def _keep_to_warnings() -> None:
-    """Have Warp keep to warnings, unless it was told otherwise: it tells of every kernel that it loads."""
+    """Have Warp keep to warnings, unless it was told otherwise.
+
+    It tells of every kernel that it loads.
+    """
     import warp as wp
 
     if wp.config.log_level == wp.LOG_INFO:

@@ -1,4 +1,7 @@
-"""Writing files: a reader sees the old file or the whole new one; what cannot be written is said."""
+"""Writing files: a reader sees the old file or the whole new one.
+
+What cannot be written is said.
+"""
 
 import errno
 import json
@@ -13,7 +16,9 @@ from uuid import uuid4
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 """What can go wrong while a file grows."""
 PROBE_BYTES = 1 << 20
-"""What is written to ask whether a disk still takes something. Writers give up within a block of the end."""
+"""What is written to ask whether a disk still takes something. Writers give up within a block of
+the end.
+"""
 
 
 class OutputError(OSError):
@@ -59,7 +64,10 @@ def check_folder(folder: Path) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file that cannot be written to, as :func:`check_folder` does; say if one is there already."""
+    """Refuse a file that cannot be written to, as :func:`check_folder` does.
+
+    Say if one is there already.
+    """
     if Path(path).is_dir():
         raise output_error(path, OSError(errno.EISDIR, ""))
     try:

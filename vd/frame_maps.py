@@ -1,7 +1,9 @@
 """The symmetry frames of a teacher that sees its goals in them, for those without a simulator.
 
-The simulator keeps a frame as long as a goal (:mod:`vd.envs.symmetry`). Here it is chosen anew in every step,
-from the rotation as it is known: a teacher acts as well so, and nothing has to be remembered. N hands, O
+The simulator keeps a frame as long as a goal (:mod:`vd.envs.symmetry`). Here it is chosen anew in
+every step,
+from the rotation as it is known: a teacher acts as well so, and nothing has to be remembered. N
+hands, O
 values of the observation, D actions. World frame: z up; quaternions xyzw.
 """
 
@@ -22,17 +24,24 @@ class FrameMaps:
     Args:
         hand: The hand.
         seen: How its teacher observes.
-        array: Makes arrays of the library and device in which observations are given, of a dtype by name.
+        array: Makes arrays of the library and device in which observations are given, of a dtype by
+            name.
     """
 
-    def __init__(self, hand: HandModel, seen: ObservationCfg, array: Callable[[Any, str], Array]) -> None:
-        actors = replace(seen, dynamics="none", critic_terms={})  # what else is told, only simulators know
+    def __init__(
+        self, hand: HandModel, seen: ObservationCfg, array: Callable[[Any, str], Array]
+    ) -> None:
+        actors = replace(
+            seen, dynamics="none", critic_terms={}
+        )  # what else is told, only simulators know
         tables = symmetry_frames(hand, actors, seen.view)
         self._source, self._joints = (array(v, "int64") for v in (tables.source, tables.joints))
         self._factor, self._offset, self._sign, self._sector = (
             array(v, "float32") for v in (tables.factor, tables.offset, tables.sign, tables.sector)
         )
-        self._turn = teacher_observation_slices(hand.num_fingers, hand.num_joints)["relative_orientation"]
+        self._turn = teacher_observation_slices(hand.num_fingers, hand.num_joints)[
+            "relative_orientation"
+        ]
 
     def choose(self, observation: Array) -> Array:
         """Frames [N] of observations [N, O]: the axis of the wanted rotation is in their sector."""

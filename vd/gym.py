@@ -1,4 +1,6 @@
-"""The environment for Gymnasium: ``gymnasium.make_vec("vd.gym:VisualDexterity-v0", num_envs=4096)``.
+"""The environment for Gymnasium.
+
+``gymnasium.make_vec("vd.gym:VisualDexterity-v0", num_envs=4096)``.
 
 Needs the extra ``gym``: pip install 'visual-dexterity[gym]'.
 """
@@ -28,11 +30,14 @@ ID = "VisualDexterity-v0"
 
 
 class ReorientVectorEnv(VectorEnv):
-    """N environments of a :class:`ReorientEnv`; all values are torch tensors on its device, and copies.
+    """N environments of a :class:`ReorientEnv`.
 
-    An episode terminates where the object falls, and at a success if ``success_ends_episode``; its time limit
-    truncates it. Another success gives a new goal. ``info`` has ``success`` [N], ``rotation_error`` [rad] [N]
-    and with SAME_STEP ``final_obs`` [N, O], which means something where ``_final_obs`` [N] is true.
+    All values are torch tensors on its device, and copies.
+
+    An episode terminates where the object falls, and at a success if ``success_ends_episode``; its
+    time limit truncates it. Another success gives a new goal. ``info`` has ``success`` [N],
+    ``rotation_error`` [rad] [N] and with SAME_STEP ``final_obs`` [N, O], which means something
+    where ``_final_obs`` [N] is true.
 
     Attributes:
         env: The environment itself.
@@ -53,7 +58,8 @@ class ReorientVectorEnv(VectorEnv):
             num_envs: N.
             cfg: The task; the paper's by default.
             device: As of :class:`ReorientEnv`.
-            autoreset_mode: SAME_STEP is the fastest. DISABLED: ``reset(options={"reset_mask": ..})`` resets.
+            autoreset_mode: SAME_STEP is the fastest. DISABLED: ``reset(options={"reset_mask":
+                ..})`` resets.
             settings: Fields of the task to replace, such as ``objects``; of a group some, by name.
 
         Raises:
@@ -90,7 +96,8 @@ class ReorientVectorEnv(VectorEnv):
             chosen = torch.as_tensor(mask, device=self._over.device)
             if chosen.dtype != torch.bool or chosen.shape != self._over.shape:
                 raise ValueError(
-                    f"reset_mask is {chosen.dtype} {tuple(chosen.shape)}; give booleans, ({self.num_envs},)"
+                    f"reset_mask is {chosen.dtype} {tuple(chosen.shape)}; give booleans, "
+                    f"({self.num_envs},)"
                 )
             self.env.renew(wp.from_torch(chosen.int()))
             self._over &= ~chosen
@@ -106,10 +113,14 @@ class ReorientVectorEnv(VectorEnv):
             gymnasium.error.ClosedEnvironmentError: After :meth:`close`.
         """
         if self.closed:
-            raise gymnasium.error.ClosedEnvironmentError("step() after close(); make the environment anew")
+            raise gymnasium.error.ClosedEnvironmentError(
+                "step() after close(); make the environment anew"
+            )
         given = torch.as_tensor(actions)
         if given.shape != self._action.shape:
-            raise ValueError(f"actions have shape {tuple(given.shape)}, not {tuple(self._action.shape)}")
+            raise ValueError(
+                f"actions have shape {tuple(given.shape)}, not {tuple(self._action.shape)}"
+            )
         self._action.copy_(given)
         self._bad |= ~self._action.isfinite().all()
         if (not self._bad.is_cuda or self.env.steps % CHECKED == 0) and self._bad:

@@ -1,10 +1,13 @@
-"""The log of a policy on a hand: written by vd-deploy as it goes, replayed by vd-play, read by vd-gap.
+"""The log of a policy on a hand.
 
-A folder. ``steps.csv`` has a row for every control step, appended whole, so that a log cut short by a crash
-is a log. ``recording.json`` beside it makes the folder a recording (:mod:`vd.gap.recording`). ``run.json``
-says what ran, and at the end how it ended; ``events.jsonl`` has goals, stops and faults. SI units, radians,
-world frame, quaternions xyzw; times are seconds since the start. A row is a state, read at ``t``, and the
-goals that were sent after it, at ``t_command``.
+Written by vd-deploy as it goes, replayed by vd-play, read by vd-gap.
+
+A folder. ``steps.csv`` has a row for every control step, appended whole, so that a log cut short by
+a crash is a log. ``recording.json`` beside it makes the folder a recording
+(:mod:`vd.gap.recording`). ``run.json`` says what ran, and at the end how it ended; ``events.jsonl``
+has goals, stops and faults. SI units, radians, world frame, quaternions xyzw; times are seconds
+since the start. A row is a state, read at ``t``, and the goals that were sent after it, at
+``t_command``.
 """
 
 import csv
@@ -93,11 +96,16 @@ class HandLog:
     def channel(self, name: str) -> np.ndarray:
         """One of JOINT_CHANNELS [T, D]; NaN where it was not logged."""
         blank = np.full(len(self.columns["t"]), np.nan)
-        return np.stack([self.columns.get(f"{name}.{joint}", blank) for joint in self.joints], axis=1)
+        return np.stack(
+            [self.columns.get(f"{name}.{joint}", blank) for joint in self.joints], axis=1
+        )
 
     @property
     def object_pose(self) -> np.ndarray | None:
-        """Pose of the object [T, 7]: the true one, or else as it was found; None where neither is known."""
+        """Pose of the object [T, 7]: the true one, or else as it was found.
+
+        None where neither is known.
+        """
         for names in (TRUTH_COLUMNS[:7], FOUND_COLUMNS):
             if names[0] in self.columns:
                 pose = np.stack([self.columns[name] for name in names], axis=1)
@@ -128,7 +136,9 @@ def read_log(path: str | Path) -> HandLog:
             f"{path} is no log: there is no {RUN_FILE}; give a folder that vd-deploy wrote"
         ) from None
     except ValueError as error:
-        raise LogError(f"{path / RUN_FILE} is damaged ({error}); copy the whole folder again") from error
+        raise LogError(
+            f"{path / RUN_FILE} is damaged ({error}); copy the whole folder again"
+        ) from error
     found = run.get("format") if isinstance(run, dict) else None
     if found != LOG_FORMAT:
         raise LogError(f"{path / RUN_FILE}: format is {found!r}; this version reads {LOG_FORMAT!r}")

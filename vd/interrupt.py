@@ -1,7 +1,7 @@
 """What all commands do: say at once that they start, report an error in a line, and end by a signal.
 
-The exit status is then 128 and the signal's number: 130 after Ctrl-C, 143 after SIGTERM, and 129 once the
-terminal is gone.
+The exit status is then 128 and the signal's number: 130 after Ctrl-C, 143 after SIGTERM, and 129
+once the terminal is gone.
 """
 
 import functools
@@ -95,7 +95,9 @@ def need(*packages: str) -> None:
     """
     for package in packages:
         if importlib.util.find_spec(package) is None:
-            raise ModuleNotFoundError(f"{package} is not installed: {remedy(package)}", name=package)
+            raise ModuleNotFoundError(
+                f"{package} is not installed: {remedy(package)}", name=package
+            )
 
 
 def remedy(package: str) -> str:
@@ -107,7 +109,8 @@ def remedy(package: str) -> str:
 def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
     """Have the entry point of a command start and end as all commands do.
 
-    ``VD_DEBUG=1`` in the environment adds to an error where in the code it arose. ``name`` is the command's.
+    ``VD_DEBUG=1`` in the environment adds to an error where in the code it arose. ``name`` is the
+    command's.
     """
 
     def format_warning(message: Warning | str, *_: Any, **__: Any) -> str:
@@ -122,7 +125,9 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
                 print(f"{name}: {renamed}", file=sys.stderr)
                 return USAGE_ERROR
             if given and not {"-h", "--help", "--help-all"} & set(given):
-                print(f"{name}: starting", file=sys.stderr, flush=True)  # what it imports takes seconds
+                print(
+                    f"{name}: starting", file=sys.stderr, flush=True
+                )  # what it imports takes seconds
             warnings.formatwarning = format_warning
             with _terminated():
                 try:
@@ -168,10 +173,14 @@ def _status(status: Any) -> Any:
 
 
 @contextmanager
-def handled(handler: Callable[[int, FrameType | None], None], *numbers: signal.Signals) -> Iterator[None]:
+def handled(
+    handler: Callable[[int, FrameType | None], None], *numbers: signal.Signals
+) -> Iterator[None]:
     """Have signals call ``handler``, but for a SIGHUP that is ignored (nohup)."""
     before = {}
-    if threading.current_thread() is threading.main_thread():  # signals belong to it; elsewhere are none
+    if (
+        threading.current_thread() is threading.main_thread()
+    ):  # signals belong to it; elsewhere are none
         for number in numbers:
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 before[number] = signal.signal(number, handler)
@@ -184,7 +193,10 @@ def handled(handler: Callable[[int, FrameType | None], None], *numbers: signal.S
 
 @contextmanager
 def _terminated() -> Iterator[None]:
-    """Have SIGTERM and SIGHUP raise :class:`Terminated`; what this process forks ends at once, as without."""
+    """Have SIGTERM and SIGHUP raise :class:`Terminated`.
+
+    What this process forks ends at once, as without.
+    """
     owner = os.getpid()
 
     def terminate(number: int, _: FrameType | None) -> None:
@@ -212,7 +224,9 @@ def _come_again(lost: Any) -> None:
 
 
 def end_with_parent(parent: int) -> None:
-    """Have SIGTERM end this process once its parent is gone: one that is killed cannot tell its children.
+    """Have SIGTERM end this process once its parent is gone.
+
+    One that is killed cannot tell its children.
 
     The parent tells its process ID itself: it may be gone already.
     """

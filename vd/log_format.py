@@ -2,10 +2,15 @@
 
 LOG_FORMAT = "vd-hand-log/1"
 MCAP = ".mcap"
-RUN_FILE, STEPS_FILE, EVENTS_FILE, RECORDING_FILE = "run.json", "steps.csv", "events.jsonl", "recording.json"
+RUN_FILE, STEPS_FILE, EVENTS_FILE, RECORDING_FILE = (
+    "run.json",
+    "steps.csv",
+    "events.jsonl",
+    "recording.json",
+)
 JOINT_CHANNELS = ("command", "position", "velocity", "current", "temperature", "action", "smoothed")
-"""Columns ``channel.joint``: goal sent [rad], measured [rad], [rad/s], [A], [deg C]; the policy's action, and
-its moving average as it was before that action."""
+"""Columns ``channel.joint``: goal sent [rad], measured [rad], [rad/s], [A], [deg C]; the policy's
+action, and its moving average as it was before that action."""
 STEP_COLUMNS = (
     "goal",
     "acting",
@@ -17,10 +22,10 @@ STEP_COLUMNS = (
     "cpu_s",
     "missed",
 )
-"""Number of the goal; whether the policy acts, or the hand holds still after a stop; distance to the goal
-that the stopping rule sees [rad]; how late the step began, and from its due time, the image's exposure, the
-state's reading and the sending of goals [s]; processor time of the process for this step [s]; deadlines
-missed so far."""
+"""Number of the goal; whether the policy acts, or the hand holds still after a stop; distance to
+the goal that the stopping rule sees [rad]; how late the step began, and from its due time, the
+image's exposure, the state's reading and the sending of goals [s]; processor time of the process
+for this step [s]; deadlines missed so far."""
 TRUTH_COLUMNS = (*(f"object.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")), "error")
 """Pose of the object and its angle to the goal, up to symmetry: a twin's only."""
 

@@ -1,8 +1,9 @@
 """The log of a run in one MCAP file of ROS 2 messages, which Foxglove, PlotJuggler and ``ros2 bag`` read too.
 
-For them are ``/joint_states``, ``/joint_commands``, ``/object_pose`` (a twin's), ``/found_pose`` (as the
-policy finds it), ``/goal_pose`` and ``/depth`` [mm]. :func:`vd.hand_log.read_log` reads ``/step``, each row
-of steps.csv whole, ``/events``, and the metadata ``run``, which is run.json. Needs the extra ``log``.
+For them are ``/joint_states``, ``/joint_commands``, ``/object_pose`` (a twin's), ``/found_pose``
+(as the policy finds it), ``/goal_pose`` and ``/depth`` [mm]. :func:`vd.hand_log.read_log` reads
+``/step``, each row of steps.csv whole, ``/events``, and the metadata ``run``, which is run.json.
+Needs the extra ``log``.
 """
 
 import json
@@ -48,11 +49,15 @@ _TYPES = {
         + [f"float64[] {name}" for name in (*JOINT_CHANNELS, "object", "found")]
     ),
 }
-"""Definitions of the messages; the file has them, so that a reader needs no package with the last one."""
+"""Definitions of the messages; the file has them, so that a reader needs no package with the last
+one.
+"""
 
 
 class McapLog:
-    """A log being written, beside the folder; methods are those of :class:`vd.deploy.loop.log.Sink`.
+    """A log being written, beside the folder.
+
+    Methods are those of :class:`vd.deploy.loop.log.Sink`.
 
     Args:
         path: The file; it must not be there.
@@ -69,7 +74,8 @@ class McapLog:
         self._file: IO[bytes] = path.open("xb")
         self._writer = Writer(self._file)
         self._schemas = {
-            name: self._writer.register_msgdef(name, _definition(text)) for name, text in _TYPES.items()
+            name: self._writer.register_msgdef(name, _definition(text))
+            for name, text in _TYPES.items()
         }
         self._run, self._place, self._joints = dict(run), place, list(run["joints"])
         self._note()
@@ -83,7 +89,11 @@ class McapLog:
         truth = [row[name] for name in TRUTH_COLUMNS if name in row]
         found = [row[name] for name in FOUND_COLUMNS]
         t, goals = row["t"], self._run["goals"]
-        state = {"name": self._joints, "position": joints["position"], "velocity": joints["velocity"]}
+        state = {
+            "name": self._joints,
+            "position": joints["position"],
+            "velocity": joints["velocity"],
+        }
         self._write(t, "/joint_states", "sensor_msgs/msg/JointState", **state, effort=[])
         sent = {"name": self._joints, "position": joints["command"], "velocity": [], "effort": []}
         self._write(row["t_command"], "/joint_commands", "sensor_msgs/msg/JointState", **sent)
@@ -145,7 +155,9 @@ def read_mcap(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[d
             for one in reader.iter_metadata():
                 run = json.loads(one.metadata["json"]) if one.name == "run" else run
             if not isinstance(run, dict) or run.get("format") != LOG_FORMAT:
-                raise LogError(f"{path} is no log of vd-deploy; vd-deploy --log NAME.mcap writes one")
+                raise LogError(
+                    f"{path} is no log of vd-deploy; vd-deploy --log NAME.mcap writes one"
+                )
             for _, channel, _, message in reader.iter_decoded_messages(topics=["/step", "/events"]):
                 if channel.topic == "/step":
                     steps.append(message)

@@ -96,14 +96,20 @@ def read_onnx(path: Path) -> "OnnxTeacher | TrackingPolicy":
         network = OnnxNetwork(path)
         told = network.told
         if told["format"] != ONNX_FORMAT:
-            raise ValueError(f"its format is {told['format']!r}, this version reads {ONNX_FORMAT!r}")
+            raise ValueError(
+                f"its format is {told['format']!r}, this version reads {ONNX_FORMAT!r}"
+            )
         names = ("task", "trained_hand", "num_observations", "num_actions")
         teacher = OnnxTeacher(network, **{name: told[name] for name in names})
         spec = from_dict(TrackingSpec, told["tracking"]) if "tracking" in told else None
     except Exception as error:  # onnxruntime has many of its own
-        raise ValueError(f"{path} cannot be read ({error}); write it anew with vd-train export") from error
+        raise ValueError(
+            f"{path} cannot be read ({error}); write it anew with vd-train export"
+        ) from error
     if spec is None:
         return teacher
     if spec.alignment is not None:
-        raise ValueError(f"{path} is of a vision policy, whose search computes with torch; give policy.pt")
+        raise ValueError(
+            f"{path} is of a vision policy, whose search computes with torch; give policy.pt"
+        )
     return TrackingPolicy(cast(Any, teacher), spec)

@@ -58,7 +58,9 @@ def _cell(value: object) -> Markup:
     if found is None:
         return escape(value)
     number, interval = found.groups()
-    return Markup("{} <small>{}</small>").format(number.replace(" ", "\N{NO-BREAK SPACE}"), interval)
+    return Markup("{} <small>{}</small>").format(
+        number.replace(" ", "\N{NO-BREAK SPACE}"), interval
+    )
 
 
 def _embed(image: "Figure | bytes | Path") -> str:

@@ -10,8 +10,8 @@ Tags used in ``source(...)``:
 * ``U``: the public four-finger URDF of that code,
 * ``D``: derived from the above; the derivation is in the text.
 
-Dimensions, limits, masses and gains of the hands are not here, nor their mount, start pose and workspace:
-they live in their USD files, ``assets_usd/usd``, with their sources.
+Dimensions, limits, masses and gains of the hands are not here, nor their mount, start pose and
+workspace: they live in their USD files, ``assets_usd/usd``, with their sources.
 """
 
 from dataclasses import dataclass, field, fields
@@ -37,7 +37,9 @@ class SceneConstants:
     control_hz: float = source(12.0, "P", "position controllers at 12 Hz (Methods, action space)")
     episode_s: float = source(10.0, "C", "resetTime: 120 control steps")
     air_episode_s: float = source(15.0, "P", "in-air test: 180 control steps")
-    air_table_s: float = source(2.0, "P", "in-air test: the table is taken away after 24 control steps")
+    air_table_s: float = source(
+        2.0, "P", "in-air test: the table is taken away after 24 control steps"
+    )
     table_size_m: tuple[float, float, float] = source((0.6, 0.6, 0.1), "C", "fixed box")
     table_top_m: float = source(0.0, "C", "table box centred at z = -0.05")
     object_start_noise_m: float = source(0.01, "C", "uniform, per axis")
@@ -48,14 +50,18 @@ class ActionConstants:
     """Smoothed relative joint increments (paper, Methods, action space)."""
 
     ema_alpha: float = source(0.8, "P", "abar = alpha a + (1 - alpha) abar_prev")
-    scale_rad_s: float = source(3.5, "C", "target = q + abar * 3.5 rad/s / 12 Hz; nowhere in the paper")
+    scale_rad_s: float = source(
+        3.5, "C", "target = q + abar * 3.5 rad/s / 12 Hz; nowhere in the paper"
+    )
 
 
 @dataclass(frozen=True)
 class ObservationConstants:
     """Scales of the teacher observation (19G + 21 values, plus the previous action)."""
 
-    velocity_scale: float = source(0.2, "C", "joint and object angular velocity are multiplied by it")
+    velocity_scale: float = source(
+        0.2, "C", "joint and object angular velocity are multiplied by it"
+    )
     noise_mean: float = source(-0.002, "P", "Table S3, state observation N(-0.002, 0.002)")
     noise_std: float = source(0.002, "P", "Table S3")
     noise_offset_std_code: float = source(0.001, "C", "offset fixed between re-draws")
@@ -71,7 +77,9 @@ class RewardConstants:
     rotation_epsilon_rad_code: float = source(0.1, "C", "0.4 is the success tolerance in the code")
     fingertip: float = source(-1.0, "P", "c3, eq. 3: summed squared distances; code: mean distance")
     energy: float = source(-20.0, "P", "c4, eq. 4")
-    energy_clip_w_code: float = source(10.0, "C", "the code clips sum |qd tau| at 10 W; the paper does not")
+    energy_clip_w_code: float = source(
+        10.0, "C", "the code clips sum |qd tau| at 10 W; the paper does not"
+    )
     fall: float = source(-100.0, "P", "c5, eq. 5")
     table_contact: float = source(-1.0, "P", "c6, eq. 7; off by default in the code")
     fingertip_height: float = source(-2.0, "P", "c7, eq. 8; absent from the code")
@@ -89,7 +97,9 @@ class SuccessConstants:
     object_speed_m_s: float = source(0.04, "P", "norm of v")
     object_spin_rad_s: float = source(0.5, "P", "norm of omega")
     action_norm: float = source(1.0, "C", "norm of the smoothed action; threshold only in the code")
-    fall_m: float = source(0.15, "P", "p-bar, eq. 5; distance from where objects are handled, not squared")
+    fall_m: float = source(
+        0.15, "P", "p-bar, eq. 5; distance from where objects are handled, not squared"
+    )
 
 
 @dataclass(frozen=True)
@@ -110,7 +120,9 @@ class RandomisationConstants:
     force_s_code: float = source(
         1.0 / 60.0, "C", "set once a control step, so one of 5 steps of 1/60 s has it"
     )
-    redraw_s: float = source(100.0, "C", "dynamics are drawn anew at a reset after 1200 control steps")
+    redraw_s: float = source(
+        100.0, "C", "dynamics are drawn anew at a reset after 1200 control steps"
+    )
 
 
 @dataclass(frozen=True)
@@ -119,7 +131,9 @@ class NominalMaterials:
 
     friction: float = source(0.8, "C", "hand and object")
     table_friction: float = source(0.5, "C", "table")
-    object_mass_kg: float = source(0.1, "D", "middle of the paper's base range U(0.03, 0.18) kg, rounded")
+    object_mass_kg: float = source(
+        0.1, "D", "middle of the paper's base range U(0.03, 0.18) kg, rounded"
+    )
 
 
 @dataclass(frozen=True)
@@ -145,8 +159,12 @@ class TeacherConstants:
 class CameraConstants:
     """Depth camera and its cloud; pose, size and focal length are the hand's (its USD)."""
 
-    points: int = source(6000, "C", "camera points of a cloud, drawn with replacement after the crop")
-    crop_m: tuple[float, float] = source((0.005, 0.2), "C", "world z that is kept: no table, no palm")
+    points: int = source(
+        6000, "C", "camera points of a cloud, drawn with replacement after the crop"
+    )
+    crop_m: tuple[float, float] = source(
+        (0.005, 0.2), "C", "world z that is kept: no table, no palm"
+    )
 
 
 @dataclass(frozen=True)
@@ -165,19 +183,35 @@ class ResultConstants:
 
     Each is ``(value,)``, value and 95 % interval, or, of medians, the interval alone.
 
-    Rates are shares of episodes. On the table the policy is the three-finger student of stage 2, on seven
-    objects of the training set and five of the test set; in the air the four-finger one, on these twelve, 100
-    episodes each.
+    Rates are shares of episodes. On the table the policy is the three-finger student of stage 2, on
+    seven objects of the training set and five of the test set; in the air the four-finger one, on
+    these twelve, 100 episodes each.
     """
 
-    table_training: tuple[float, ...] = source((0.96, 0.94, 0.97), "P", "Table 1: error at most 0.4 rad")
-    table_training_rad08: tuple[float, ...] = source((0.98, 0.97, 0.99), "P", "Table 1: at most 0.8 rad")
-    table_training_median_rad: tuple[float, ...] = source((0.12, 0.13), "P", "Table 1: interval alone")
-    table_held_out: tuple[float, ...] = source((0.85, 0.82, 0.88), "P", "Table 1: error at most 0.4 rad")
-    table_held_out_rad08: tuple[float, ...] = source((0.87, 0.84, 0.90), "P", "Table 1: at most 0.8 rad")
-    table_held_out_median_rad: tuple[float, ...] = source((0.15, 0.18), "P", "Table 1: interval alone")
-    air_by_prediction: tuple[float, ...] = source((0.723,), "P", "precise manipulation: within 0.4 rad")
-    air_by_prediction_rad01: tuple[float, ...] = source((0.259,), "P", "precise manipulation: 0.1 rad")
+    table_training: tuple[float, ...] = source(
+        (0.96, 0.94, 0.97), "P", "Table 1: error at most 0.4 rad"
+    )
+    table_training_rad08: tuple[float, ...] = source(
+        (0.98, 0.97, 0.99), "P", "Table 1: at most 0.8 rad"
+    )
+    table_training_median_rad: tuple[float, ...] = source(
+        (0.12, 0.13), "P", "Table 1: interval alone"
+    )
+    table_held_out: tuple[float, ...] = source(
+        (0.85, 0.82, 0.88), "P", "Table 1: error at most 0.4 rad"
+    )
+    table_held_out_rad08: tuple[float, ...] = source(
+        (0.87, 0.84, 0.90), "P", "Table 1: at most 0.8 rad"
+    )
+    table_held_out_median_rad: tuple[float, ...] = source(
+        (0.15, 0.18), "P", "Table 1: interval alone"
+    )
+    air_by_prediction: tuple[float, ...] = source(
+        (0.723,), "P", "precise manipulation: within 0.4 rad"
+    )
+    air_by_prediction_rad01: tuple[float, ...] = source(
+        (0.259,), "P", "precise manipulation: 0.1 rad"
+    )
     air_by_truth: tuple[float, ...] = source((0.809,), "P", "precise manipulation: within 0.4 rad")
     air_by_truth_rad01: tuple[float, ...] = source((0.674,), "P", "precise manipulation: 0.1 rad")
     air_dropped: tuple[float, ...] = source((0.10,), "P", "Figure S12b: around 90 % not dropped")
@@ -215,5 +249,7 @@ def provenance() -> list[tuple[str, Any, str, str]]:
         constants = getattr(PAPER, group.name)
         for item in fields(constants):
             value = getattr(constants, item.name)
-            rows.append((f"{group.name}.{item.name}", value, item.metadata["tag"], item.metadata["note"]))
+            rows.append(
+                (f"{group.name}.{item.name}", value, item.metadata["tag"], item.metadata["note"])
+            )
     return rows

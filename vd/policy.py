@@ -1,4 +1,6 @@
-"""Policies for evaluation, the viewer and the robot: a trained actor from a file, zero or random actions.
+"""Policies for evaluation, the viewer and the robot.
+
+A trained actor from a file, zero or random actions.
 
 Reading a policy needs torch only, no simulator and no rsl-rl, and executes nothing in the file.
 """
@@ -22,7 +24,9 @@ _WEIGHTS = "_state_dict"
 REMEDY = "copy it again, or give another file of its run"
 """What to do about a policy that cannot be read."""
 _NORMALISER_EPSILON = 1e-2
-"""Added to the running std by the normaliser that trained the actor (rsl-rl's EmpiricalNormalization)."""
+"""Added to the running std by the normaliser that trained the actor (rsl-rl's
+EmpiricalNormalization).
+"""
 
 
 class Policy(Protocol):
@@ -63,7 +67,11 @@ class MeanAction(nn.Module):
         self.register_buffer("offset", offset)
         self.register_buffer("scale", scale)
         self.layers = perceptron(spec)
-        inside = {key.removeprefix("mlp."): value for key, value in weights.items() if key.startswith("mlp.")}
+        inside = {
+            key.removeprefix("mlp."): value
+            for key, value in weights.items()
+            if key.startswith("mlp.")
+        }
         self.layers.load_state_dict(inside)
         self.eval().requires_grad_(False)
 
@@ -77,13 +85,14 @@ class MeanAction(nn.Module):
 class TrainedPolicy:
     """The deterministic policy of a trained actor: the mean of its action distribution.
 
-    ``weights`` are the state of rsl-rl's actor: ``mlp.*`` and, if it normalises, ``obs_normalizer.*``;
-    ``task`` is the configuration of the environment it was trained in, as a dictionary.
+    ``weights`` are the state of rsl-rl's actor: ``mlp.*`` and, if it normalises,
+    ``obs_normalizer.*``; ``task`` is the configuration of the environment it was trained in, as a
+    dictionary.
 
     Attributes:
         hand: Name of the hand it moves, as ``task`` says ("" if it does not).
-        trained_hand: What that was in training (:func:`vd.bundle.contract.trained_hand`); empty in files of
-            earlier versions.
+        trained_hand: What that was in training (:func:`vd.bundle.contract.trained_hand`); empty in
+            files of earlier versions.
         network: From observations [N, O] to mean actions [N, D]; what an exporter needs.
     """
 
@@ -116,7 +125,8 @@ class TrainedPolicy:
         if observation.ndim != 2 or observation.shape[1] != self.num_observations:
             raise ValueError(
                 f"the policy was trained on observations [N, {self.num_observations}] of hand "
-                f"'{self.hand}', but got {tuple(observation.shape)}; use the hand it was trained for"
+                f"'{self.hand}', but got {tuple(observation.shape)}; use the hand it was trained "
+                f"for"
             )
         with torch.no_grad():
             return self.network(observation)
@@ -196,7 +206,8 @@ def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedP
     """The same from what was read of ``path``."""
     if "student_state_dict" in state and "spec" in state:
         raise ValueError(
-            f"{path} is a student or its checkpoint, which does not act by itself; vd-train tracker TEACHER "
+            f"{path} is a student or its checkpoint, which does not act by itself; vd-train "
+            f"tracker TEACHER "
             "--alignment alignment.pt makes a policy of a student that vd-train student trained"
         )
     if not {"policy", "actor_state_dict", "task"} <= state.keys():
@@ -204,7 +215,9 @@ def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedP
     try:
         return policy_of(state, device)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: the weights do not fit the network it describes ({error})") from error
+        raise ValueError(
+            f"{path}: the weights do not fit the network it describes ({error})"
+        ) from error
 
 
 def policy_of(state: dict[str, Any], device: str) -> TrainedPolicy:
@@ -223,9 +236,10 @@ def policy_of(state: dict[str, Any], device: str) -> TrainedPolicy:
 def policy_export(state: dict[str, Any]) -> dict[str, Any]:
     """The part of a checkpoint that others need: networks, task, how it was trained; no optimiser.
 
-    :func:`load_policy` reads the actor. The rest is for a run that begins from it (``vd-train teacher
-    --init``): the critic, unless it is still warming up and so worth nothing, the stage of the curriculum and
-    the settings of the learner. ``state`` is a checkpoint, or what this function gave.
+    :func:`load_policy` reads the actor. The rest is for a run that begins from it (``vd-train
+    teacher --init``): the critic, unless it is still warming up and so worth nothing, the stage of
+    the curriculum and the settings of the learner. ``state`` is a checkpoint, or what this function
+    gave.
     """
     exported = {"format": POLICY_FORMAT} | {
         key: state[key] for key in ("policy", "task", "iter", "env_steps")
@@ -236,7 +250,9 @@ def policy_export(state: dict[str, Any]) -> dict[str, Any]:
     if "ranks" in state:
         environment = state["ranks"][0]["env"]
         exported["stage"] = {key: environment[key] for key in _STAGE if key in environment}
-    return exported | {key: state[key] for key in ("stage", "learner", "trained_hand") if key in state}
+    return exported | {
+        key: state[key] for key in ("stage", "learner", "trained_hand") if key in state
+    }
 
 
 def perceptron(spec: PolicySpec) -> nn.Sequential:

@@ -108,7 +108,8 @@ def check_name(name: str) -> None:
     """
     if not _NAME.fullmatch(name) or name in BUILT_IN or name.endswith(".pt"):
         raise ValueError(
-            f"{name!r} is no name of a policy: letters, digits, and . _ - between them; no .pt at its end"
+            f"{name!r} is no name of a policy: letters, digits, and . _ - between them; no .pt at "
+            f"its end"
         )
 
 
@@ -153,14 +154,18 @@ def push(path: Path, name: str, place: str, entry: Entry, *, replace: bool = Fal
     """
     check_name(name)
     if "://" in place and not place.startswith(HUB):
-        raise ValueError(f"--at {place}: a URL can only be read; push to the folder it serves, or to hf://")
+        raise ValueError(
+            f"--at {place}: a URL can only be read; push to the folder it serves, or to hf://"
+        )
     try:
         there = read_store(place)
     except FileNotFoundError:
         there = Store()
     before = there.policies.get(name, entry)
     if before.sha256 != entry.sha256 and not replace:
-        raise FileExistsError(f"{name} at {place} is another policy; give another --name, or --replace")
+        raise FileExistsError(
+            f"{name} at {place} is another policy; give another --name, or --replace"
+        )
     if name in there.policies and before == entry:
         return False
     if place.startswith(HUB):
@@ -192,7 +197,9 @@ def _tell(folder: Path, name: str, entry: Entry) -> None:
         store = read_store(folder)
     except FileNotFoundError:
         store = Store()
-    write_json(folder / POLICY_LIST, to_dict(Store(dict(sorted((store.policies | {name: entry}).items())))))
+    write_json(
+        folder / POLICY_LIST, to_dict(Store(dict(sorted((store.policies | {name: entry}).items()))))
+    )
 
 
 def _commit(repository: str, path: Path, name: str, store: Store) -> None:
@@ -201,7 +208,8 @@ def _commit(repository: str, path: Path, name: str, store: Store) -> None:
         from huggingface_hub import CommitOperationAdd, HfApi
     except ImportError as error:
         raise ValueError(
-            "pushing to Hugging Face needs huggingface_hub: pip install huggingface_hub, then hf auth login"
+            "pushing to Hugging Face needs huggingface_hub: pip install huggingface_hub, then hf "
+            "auth login"
         ) from error
     text = json.dumps(to_dict(store), indent=1) + "\n"
     HfApi().create_commit(
@@ -283,7 +291,9 @@ class Push:
     policy: Annotated[str, tyro.conf.Positional]
     """A policy.pt or tracking.pt, a run's folder, or the name of an installed policy."""
     at: str
-    """Folder, made if it is not there, or hf://OWNER/NAME, a repository of Hugging Face that is there."""
+    """Folder, made if it is not there, or hf://OWNER/NAME, a repository of Hugging Face that is
+    there.
+    """
     name: str | None = None
     """Name under which others find it; that of an installed policy by default."""
     replace: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

@@ -5,7 +5,13 @@ from vd.arrays import Array, library_of
 
 def product(first: Array, second: Array) -> Array:
     """``first * second``, quaternions xyzw [..., 4]: turns by the second, then by the first."""
-    xp, a, aw, b, bw = library_of(first), first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
+    xp, a, aw, b, bw = (
+        library_of(first),
+        first[..., :3],
+        first[..., 3:],
+        second[..., :3],
+        second[..., 3:],
+    )
     vector = aw * b + bw * a + xp.linalg.cross(a, b)
     return xp.concatenate([vector, aw * bw - (a * b).sum(axis=-1, keepdims=True)], axis=-1)
 

@@ -1,8 +1,11 @@
-"""Pictures of the scene without a display or a GPU: Newton's ray-traced camera on a model of its own.
+"""Pictures of the scene without a display or a GPU.
 
-The picture model is separate from the simulated one: it has the visual shapes, one *cell* for every world
-that is shown (hand, table, object), and for every cell a second world with the object alone in the goal's
-orientation. Joint positions are all it needs, so a recording can be drawn later, or elsewhere.
+Newton's ray-traced camera on a model of its own.
+
+The picture model is separate from the simulated one: it has the visual shapes, one *cell* for every
+world that is shown (hand, table, object), and for every cell a second world with the object alone
+in the goal's orientation. Joint positions are all it needs, so a recording can be drawn later, or
+elsewhere.
 
 World frame (z up, table top at z = 0), metres, radians, quaternions xyzw.
 """
@@ -28,12 +31,12 @@ from vd.sim.scene import TABLE_LABEL, add_object, build_hand, new_builder, show_
 BACKGROUND = 0xFFEBE1D8 - (1 << 32)
 GOAL_COLOR = (0.35, 0.68, 0.42)
 GHOST_OPACITY = 0.7
-# Light direction in the camera's right, forward (level) and up: from the upper left behind the viewer, and
-# low enough to reach under the palm.
+# Light direction in the camera's right, forward (level) and up: from the upper left behind the
+# viewer, and low enough to reach under the palm.
 LIGHT_DIRECTION = (0.35, 0.9, -0.8)
 IN_PLACE, OUT_OF_SIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -100.0, 0.0, 0.0, 0.0, 1.0)
-"""Poses, [m] and xyzw, of what is shown at the origin and of what is hidden far below: viewers have no
-cheaper way to hide one shape."""
+"""Poses, [m] and xyzw, of what is shown at the origin and of what is hidden far below: viewers have
+no cheaper way to hide one shape."""
 BALL_SHARE = 0.8
 """Share of the picture's height that the ball takes at which a camera is aimed."""
 GOAL_SHARE = 0.36
@@ -80,7 +83,9 @@ class Camera:
     @property
     def transform(self) -> wp.transform:
         """Pose in the world."""
-        return wp.transform(wp.vec3(*self.eye), wp.quat(*Rotation.from_matrix(self.rotation).as_quat()))
+        return wp.transform(
+            wp.vec3(*self.eye), wp.quat(*Rotation.from_matrix(self.rotation).as_quat())
+        )
 
     def aimed_at(self, point: Sequence[float], radius: float) -> "Camera":
         """A camera that looks in the same direction at a ball about ``point`` [m], filling the picture."""
@@ -97,14 +102,16 @@ class Picture(NamedTuple):
 
 
 class PictureModel:
-    """The model of what is shown: C cells, each with a hand (or none), a table and an object, and C goals.
+    """The model of what is shown.
+
+    C cells, each with a hand (or none), a table and an object, and C goals.
 
     Args:
         hand: The hand; None shows objects alone.
         objects: The object of each cell, length C.
         device: Warp device.
-        ghost_in_scene: Put the goal's object, translucent, into the cell rather than in a world of its own
-            (for viewers that show one world).
+        ghost_in_scene: Put the goal's object, translucent, into the cell rather than in a world of
+            its own (for viewers that show one world).
     """
 
     def __init__(
@@ -174,8 +181,8 @@ class PictureModel:
 class Renderer:
     """Draws cells of hand and object, ``width`` by ``height`` pixels, with the goal beside each.
 
-    Hand, objects and device are as of :class:`PictureModel`; the CPU is quick enough for video. The picture
-    of the goal is a square with sides of ``goal_size`` pixels, or GOAL_SHARE of the height.
+    Hand, objects and device are as of :class:`PictureModel`; the CPU is quick enough for video. The
+    picture of the goal is a square with sides of ``goal_size`` pixels, or GOAL_SHARE of the height.
     """
 
     def __init__(
@@ -203,7 +210,9 @@ class Renderer:
             """What the sensor wants to know, and its buffers, to draw one world for each cell."""
             worlds = list(range(first_world, first_world + cells))
             return {
-                "camera_transforms": wp.array([camera.transform] * cells, dtype=wp.transformf, device=device),
+                "camera_transforms": wp.array(
+                    [camera.transform] * cells, dtype=wp.transformf, device=device
+                ),
                 "camera_rays": SensorCamera.compute_camera_rays_pinhole(
                     *size, camera_fov=camera.fov, device=device
                 ),

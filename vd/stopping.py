@@ -1,4 +1,7 @@
-"""When a camera policy stops: the distance that it predicts is small, and so is its action (Methods)."""
+"""When a camera policy stops.
+
+The distance that it predicts is small, and so is its action (Methods).
+"""
 
 from dataclasses import dataclass, field
 
@@ -14,8 +17,8 @@ CANDIDATES = 24
 class StoppingRule:
     """Stop at the first step at which the predicted distance and the norm of the action are below bounds.
 
-    Both are of the same moment: the prediction from what is seen, and the smoothed action that led there.
-    Before the first action there is none, and nothing to stop.
+    Both are of the same moment: the prediction from what is seen, and the smoothed action that led
+    there. Before the first action there is none, and nothing to stop.
     """
 
     distance_rad: float = PAPER.success.rotation_rad
@@ -42,7 +45,10 @@ class StoppingRules:
     """Objects and episodes on which the stopping rules were calibrated; empty if they were not."""
 
     def rule_for(self, tolerance_rad: float) -> StoppingRule:
-        """When to stop within a tolerance [rad]: the rule for it, else the tolerance itself as bound."""
+        """When to stop within a tolerance [rad].
+
+        The rule for it, else the tolerance itself as bound.
+        """
         if tolerance_rad == self.tolerance_rad:
             return self.stopping
         if tolerance_rad == PAPER.success.precise_rad and self.precise is not None:
@@ -67,7 +73,9 @@ class Calibration:
     wrong: float
     """Share of episodes that stop outside of it."""
     reachable: float
-    """Share of episodes in which some step would have been right to stop at by the true distance."""
+    """Share of episodes in which some step would have been right to stop at by the true
+    distance.
+    """
     episodes: int
     """Number of episodes."""
 
@@ -82,11 +90,12 @@ def calibrate(
 ) -> Calibration:
     """Choose the bounds so that most of M recorded episodes stop within the tolerance.
 
-    First that of the distance, with the paper's bound of the action norm, as headline figures have it; then
-    one of the norm beside it. Only where nothing near is as still as the paper asks are both chosen together.
-    Bounds are tried on a grid: distances up to twice the tolerance, and quantiles of the action norms while
-    the object is within it. Among equal success the rule that stops wrongly less often wins, then the
-    stricter one.
+    First that of the distance, with the paper's bound of the action norm, as headline figures have
+    it; then one of the norm beside it. Only where nothing near is as still as the paper asks are
+    both chosen together.
+    Bounds are tried on a grid: distances up to twice the tolerance, and quantiles of the action
+    norms while the object is within it. Among equal success the rule that stops wrongly less often
+    wins, then the stricter one.
 
     Args:
         predicted: Predicted distances after t steps [rad] [M, T + 1].
@@ -96,12 +105,15 @@ def calibrate(
         tolerance_rad: Largest true distance that counts as right [rad].
 
     Raises:
-        ValueError: There is no step to choose from, or no episode that any rule stops within the tolerance.
+        ValueError: There is no step to choose from, or no episode that any rule stops within the
+            tolerance.
     """
     after = np.arange(true.shape[1])
     alive = (after > 0) & (after < steps[:, None])
     if not alive.any():
-        raise ValueError("no episode has a step to calibrate the stopping rule on; give more episodes")
+        raise ValueError(
+            "no episode has a step to calibrate the stopping rule on; give more episodes"
+        )
     right = (true <= tolerance_rad) & alive
     norms = action_norm[right] if right.any() else action_norm[alive]
     limits = np.unique(np.quantile(norms, np.linspace(1.0 / CANDIDATES, 1.0, CANDIDATES)))
@@ -112,7 +124,12 @@ def calibrate(
         ends = stop.any(axis=1)
         error = true[np.arange(len(true)), stop.argmax(axis=1)]
         success = float(np.mean(ends & (error <= tolerance_rad)))
-        return success, -float(np.mean(ends & (error > tolerance_rad))), -float(distance), -float(limit)
+        return (
+            success,
+            -float(np.mean(ends & (error > tolerance_rad))),
+            -float(distance),
+            -float(limit),
+        )
 
     best = max(score(distance, PAPER.success.action_norm) for distance in distances)
     if best[0] > 0.0:
@@ -121,7 +138,8 @@ def calibrate(
     if best[0] == 0.0:
         near = int(right.any(axis=1).sum())
         raise ValueError(
-            f"no rule stops any of {len(true)} episodes within {tolerance_rad:g} rad ({near} came near); "
+            f"no rule stops any of {len(true)} episodes within {tolerance_rad:g} rad ({near} came "
+            f"near); "
             "train longer, or choose on more episodes (--episodes)"
         )
     return Calibration(

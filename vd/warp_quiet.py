@@ -7,14 +7,16 @@ from contextlib import suppress
 
 
 def quiet_warp() -> None:
-    """Keep Warp to warnings and forward kernels; without a GPU driver, start it without its warning of that.
+    """Keep Warp to warnings and forward kernels.
 
-    Backward kernels are a fifth of a first start's compilation. Modules take the setting when they are
-    imported, so this comes before Newton.
+    Without a GPU driver, start it without its warning of that.
 
-    Without a driver there is no CUDA context that an early start could spoil. With one Warp starts when it
-    is first used, as ever. Its library writes the warning past Python, so standard error itself is turned
-    away meanwhile.
+    Backward kernels are a fifth of a first start's compilation. Modules take the setting when they
+    are imported, so this comes before Newton.
+
+    Without a driver there is no CUDA context that an early start could spoil. With one Warp starts
+    when it is first used, as ever. Its library writes the warning past Python, so standard error
+    itself is turned away meanwhile.
     """
     import warp as wp
 

@@ -1,4 +1,7 @@
-"""Processes for many long tasks of unequal length: one that hangs or dies costs its own task only."""
+"""Processes for many long tasks of unequal length.
+
+One that hangs or dies costs its own task only.
+"""
 
 import os
 import signal
@@ -14,13 +17,17 @@ from unittest.mock import patch
 from vd.interrupt import end_with_parent
 
 SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-"""Variables that keep the linear algebra of a worker to one thread; it reads them when it starts."""
+"""Variables that keep the linear algebra of a worker to one thread; it reads them when it
+starts.
+"""
 LONGEST_WAIT_S = 1.0
 """Between two looks at the clock [s]."""
 
 
 def shard(tasks: Sequence[Any], part: str | None) -> list[Any]:
-    """Every N-th of the tasks from the I-th on, counted from 0, for a ``part`` ``I/N``; all without.
+    """Every N-th of the tasks from the I-th on, counted from 0, for a ``part`` ``I/N``.
+
+    All without.
 
     Raises:
         ValueError: It is no such part.
@@ -29,14 +36,17 @@ def shard(tasks: Sequence[Any], part: str | None) -> list[Any]:
         return list(tasks)
     index, _, count = part.partition("/")
     if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
-        raise ValueError(f"--shard is {part!r}; it has to be I/N, with I from 0 to N - 1, such as 0/8")
+        raise ValueError(
+            f"--shard is {part!r}; it has to be I/N, with I from 0 to N - 1, such as 0/8"
+        )
     return list(tasks[int(index) :: int(count)])
 
 
 def one_thread_without_gpu(device: str) -> None:
     """Keep torch to one thread where it computes on a CPU, unless OMP_NUM_THREADS says how many.
 
-    A second thread gains networks as small as ours little. Where cores are shared it costs them up to
+    A second thread gains networks as small as ours little. Where cores are shared it costs them up
+    to
     tenfold: all threads wait for the one that has no core.
     """
     import torch
@@ -60,8 +70,8 @@ def run_tasks(
     Args:
         work: Function that can be pickled; it should not raise.
         tasks: Its arguments.
-        finished: Called with a task, its result and ``""``, or with None and what became of the task:
-            it took longer than ``limit_s``, or its process died.
+        finished: Called with a task, its result and ``""``, or with None and what became of the
+            task: it took longer than ``limit_s``, or its process died.
         jobs: Processes.
         limit_s: Longest time of a task [s].
         gpu: Whether the workers may see a GPU; a context each would fill it.
@@ -91,7 +101,9 @@ def run_tasks(
 def _worker() -> ProcessPoolExecutor:
     """One process, which starts with its first task."""
     context = get_context("spawn")  # Warp and a CUDA context do not survive a fork
-    return ProcessPoolExecutor(1, mp_context=context, initializer=begin_worker, initargs=(os.getpid(),))
+    return ProcessPoolExecutor(
+        1, mp_context=context, initializer=begin_worker, initargs=(os.getpid(),)
+    )
 
 
 def begin_worker(parent: int) -> None:
@@ -107,7 +119,10 @@ def _end(
     finished: Callable[[Any, Any, str], None],
     limit_s: float,
 ) -> ProcessPoolExecutor:
-    """Tell what became of a task that is done or too slow; returns the worker, or one in its place."""
+    """Tell what became of a task that is done or too slow.
+
+    Returns the worker, or one in its place.
+    """
     why = f"it took longer than {limit_s:.0f} s"
     if future.done():
         try:

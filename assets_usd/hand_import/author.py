@@ -17,7 +17,12 @@ from vd.assets_usd.hand_import.guess import Stance
 from vd.assets_usd.hand_import.source import Joint, Link, Shape
 from vd.assets_usd.hand_import.tree import Tree, shape_box
 from vd.assets_usd.objects.decompose import decompose
-from vd.assets_usd.objects.geometry import convex_hull, principal_axes, simplify_hull, surface_points
+from vd.assets_usd.objects.geometry import (
+    convex_hull,
+    principal_axes,
+    simplify_hull,
+    surface_points,
+)
 from vd.assets_usd.objects.settings import ImportSettings
 
 HULL_VERTICES = 32
@@ -105,7 +110,9 @@ class Author:
 
     def _materials(self) -> None:
         for name, (stiffness, damping) in SURFACES.items():
-            material = UsdShade.Material.Define(self.stage, f"{self.root}/materials/{name}").GetPrim()
+            material = UsdShade.Material.Define(
+                self.stage, f"{self.root}/materials/{name}"
+            ).GetPrim()
             api = UsdPhysics.MaterialAPI.Apply(material)
             api.CreateDynamicFrictionAttr(self.said.friction)
             api.CreateStaticFrictionAttr(self.said.friction)
@@ -127,8 +134,12 @@ class Author:
         mass.CreateCenterOfMassAttr(Gf.Vec3f(*link.com))
         mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*moments))
         mass.CreatePrincipalAxesAttr(Gf.Quatf(_quat(quaternion)))
-        UsdGeom.Scope.Define(self.stage, f"{path}/collision").CreatePurposeAttr(UsdGeom.Tokens.guide)
-        colliders = [part for shape in link.shapes if shape.collides for part in convex_parts(shape)]
+        UsdGeom.Scope.Define(self.stage, f"{path}/collision").CreatePurposeAttr(
+            UsdGeom.Tokens.guide
+        )
+        colliders = [
+            part for shape in link.shapes if shape.collides for part in convex_parts(shape)
+        ]
         for i, shape in enumerate(colliders):
             self._collider(f"{path}/collision/c{i}", shape, self._is_tip(number, shape, colliders))
         drawings = [shape for shape in link.shapes if not shape.collides] or colliders
@@ -188,7 +199,9 @@ class Author:
             mesh.CreatePointsAttr(vertices.astype(np.float32))
             mesh.CreateFaceVertexIndicesAttr(faces.astype(np.int32).ravel())
             mesh.CreateFaceVertexCountsAttr(np.full(len(faces), 3, dtype=np.int32))
-            mesh.CreateExtentAttr(np.stack([vertices.min(axis=0), vertices.max(axis=0)]).astype(np.float32))
+            mesh.CreateExtentAttr(
+                np.stack([vertices.min(axis=0), vertices.max(axis=0)]).astype(np.float32)
+            )
         return mesh
 
     def _points(self, path: str, meshes: list[tuple[np.ndarray, np.ndarray]]) -> None:
@@ -237,7 +250,9 @@ class Author:
             _float(prim, "newton:mimicCoef1", factor)
         kinds = Sdf.ValueTypeNames
         prim.CreateAttribute("vd:source", kinds.String, custom=True).Set(joint.name)
-        prim.CreateAttribute("vd:start", kinds.Double, custom=True).Set(float(self.stance.start[number]))
+        prim.CreateAttribute("vd:start", kinds.Double, custom=True).Set(
+            float(self.stance.start[number])
+        )
         if motor := self.said.motors.get(joint.name):
             self._motor(prim, motor)
 

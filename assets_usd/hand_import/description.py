@@ -100,12 +100,16 @@ def read_description(name: str | Path | None) -> Description:
         return Description()
     path = Path(__file__).parent / f"{name}.yaml" if str(name) in BUILT_IN else Path(name)
     if not path.is_file():
-        raise HandError(f"--describe {name}: no such file; give a YAML, or one of {', '.join(BUILT_IN)}")
+        raise HandError(
+            f"--describe {name}: no such file; give a YAML, or one of {', '.join(BUILT_IN)}"
+        )
     try:
         values = yaml.safe_load(path.read_text()) or {}
         if not isinstance(values, dict):
             raise ValueError("it has no fields")
-        values = {key: _named(item) if isinstance(item, dict) else item for key, item in values.items()}
+        values = {
+            key: _named(item) if isinstance(item, dict) else item for key, item in values.items()
+        }
         return from_dict(Description, values, where="the description")
     except (yaml.YAMLError, ValueError, TypeError, UnicodeDecodeError) as error:
         raise HandError(f"{path}: {error}") from error

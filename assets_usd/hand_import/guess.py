@@ -1,6 +1,9 @@
-"""What a source does not say and a hand has: fingertips, palm, gains, start pose, mount and workspace.
+"""What a source does not say and a hand has.
 
-Every guess is a note that begins with "guess:" and names the entry of the description that overrides it.
+Fingertips, palm, gains, start pose, mount and workspace.
+
+Every guess is a note that begins with "guess:" and names the entry of the description that
+overrides it.
 """
 
 import math
@@ -91,7 +94,11 @@ def _complete_drives(tree: Tree) -> None:
                 setattr(joint, name, value)
                 guessed.setdefault(name, []).append(f"{value:.3g}")
     for name, found in guessed.items():
-        span = found[0] if len(set(found)) == 1 else f"{min(found, key=float)} to {max(found, key=float)}"
+        span = (
+            found[0]
+            if len(set(found)) == 1
+            else f"{min(found, key=float)} to {max(found, key=float)}"
+        )
         tree.notes.append(f"guess: {name} = {span} of {len(found)} joints (drive, drives)")
 
 
@@ -103,7 +110,9 @@ def _tips(tree: Tree) -> list[np.ndarray]:
         if marked is None:
             marked = np.array([*_farthest(link, joint), 0.0, 0.0, 0.0, 1.0])
             where = _text(marked[:3])
-            tree.notes.append(f"guess: the tip of {link.name} is at {where}, what is farthest (tips)")
+            tree.notes.append(
+                f"guess: the tip of {link.name} is at {where}, what is farthest (tips)"
+            )
         tips.append(marked)
     return tips
 
@@ -137,7 +146,9 @@ def _start(tree: Tree, said: Description) -> np.ndarray:
     """The pose that is described; elsewhere open: zero, or the limit nearest to it."""
     angles = [said.start.get(j.name, float(np.clip(0.0, j.lower, j.upper))) for j in tree.joints]
     if not said.start:
-        tree.notes.append("guess: starts with all joints at zero, or their limit nearest to it (start)")
+        tree.notes.append(
+            "guess: starts with all joints at zero, or their limit nearest to it (start)"
+        )
     q = followed(tree, np.array(angles))
     return np.clip(q, [j.lower for j in tree.joints], [j.upper for j in tree.joints])
 
@@ -155,7 +166,10 @@ def _roots(tree: Tree) -> np.ndarray:
 
 
 def _palm(tree: Tree, tips: list[np.ndarray], said: Description) -> np.ndarray:
-    """Where the palm looks: where the fingertips go when fingers bend; of a claw, where fingers point."""
+    """Where the palm looks: where the fingertips go when fingers bend.
+
+    Of a claw, where fingers point.
+    """
     if said.palm is not None:
         return np.array(said.palm) / np.linalg.norm(said.palm)
     lower, upper = np.array([[j.lower, j.upper] for j in tree.joints]).T
@@ -173,7 +187,11 @@ def _palm(tree: Tree, tips: list[np.ndarray], said: Description) -> np.ndarray:
     palm = along.mean(axis=0) if claw else ways.mean(axis=0)
     palm /= np.linalg.norm(palm)
     palm = _snapped(palm)
-    reason = "where the fingers point, as of a claw" if claw else "where the tips go when the fingers bend"
+    reason = (
+        "where the fingers point, as of a claw"
+        if claw
+        else "where the tips go when the fingers bend"
+    )
     tree.notes.append(f"guess: the palm looks along {_text(palm)} of the base, {reason} (palm)")
     return palm
 
@@ -215,7 +233,9 @@ def _middle(ends: Ends) -> np.ndarray:
     return np.asarray((ends[0].mean(axis=0) + ends[1].mean(axis=0)) / 2.0)
 
 
-def _workspace(tree: Tree, ends: Ends, palm: np.ndarray, mount: np.ndarray, said: Place) -> Workspace:
+def _workspace(
+    tree: Tree, ends: Ends, palm: np.ndarray, mount: np.ndarray, said: Place
+) -> Workspace:
     """Over the palm, in the middle of roots and tips, half an object away from what collides there."""
     reach = float(np.linalg.norm(ends[1] - ends[0], axis=1).mean())
     size = said.size or (SIZES[0] * reach, SIZES[1] * reach)

@@ -24,7 +24,9 @@ from vd.files import make_folder
 DEEP_M = 0.0005
 """Colliders that are less than this in each other touch."""
 REACH_M = (0.03, 0.5)
-"""Least and largest distance from the root of a finger to its tip: what is beyond is in another unit."""
+"""Least and largest distance from the root of a finger to its tip: what is beyond is in another
+unit.
+"""
 BEYOND_RAD = 0.02
 """By which a joint may be led beyond its limits before it is said."""
 MOST_EFFORT_NM, MOST_MASS_KG = 5.0, 5.0
@@ -49,9 +51,10 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
 
     Args:
         path: URDF or MJCF.
-        out: Folder to write ``<name>.usda`` and its meshes to; by default one of the asset cache, from which
-            commands take the hand by its name.
-        describe: YAML, or the name of a built-in one (:mod:`vd.assets_usd.hand_import.description`).
+        out: Folder to write ``<name>.usda`` and its meshes to; by default one of the asset cache,
+            from which commands take the hand by its name.
+        describe: YAML, or the name of a built-in one
+            (:mod:`vd.assets_usd.hand_import.description`).
 
     Raises:
         HandError: The file cannot be imported; says why and what to do.
@@ -71,7 +74,8 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
         deep = overlaps(read_hand(author.write(Path(scratch), near)), near)
         target = author.write(Path(scratch), near | deep.keys())
         warnings += [
-            f"{tree.links[one].name} and {tree.links[other].name} are {1e3 * depth:.1f} mm in each other at "
+            f"{tree.links[one].name} and {tree.links[other].name} are {1e3 * depth:.1f} mm in each "
+            f"other at "
             "the start; their contact is off, unless another start keeps them apart"
             for (one, other), depth in sorted(deep.items())
         ]
@@ -91,7 +95,10 @@ def _replaced(path: Path, source: Source) -> list[str]:
     before = stage.GetDefaultPrim().GetDocumentation().rpartition("imported from ")[2]
     if before == source.path.name:
         return []
-    return [f"{path.stem} was imported from {before}; this replaces it, unless it gets another name (name)"]
+    return [
+        f"{path.stem} was imported from {before}; this replaces it, unless it gets another name "
+        f"(name)"
+    ]
 
 
 def _check_units(source: Source, tree: Tree, stance: Stance) -> None:
@@ -102,8 +109,10 @@ def _check_units(source: Source, tree: Tree, stance: Stance) -> None:
         reach = float(np.linalg.norm(compose(poses[joints[-1] + 1], tip)[:3] - root))
         if not REACH_M[0] <= reach <= REACH_M[1]:
             raise HandError(
-                f"{source.path}: the finger of {tree.joints[joints[0]].name} is {reach:.3g} m long, not "
-                f"{REACH_M[0]:g} to {REACH_M[1]:g} m: convert the file to metres, or describe its tip (tips)"
+                f"{source.path}: the finger of {tree.joints[joints[0]].name} is {reach:.3g} m "
+                f"long, not "
+                f"{REACH_M[0]:g} to {REACH_M[1]:g} m: convert the file to metres, or describe its "
+                f"tip (tips)"
             )
 
 
@@ -114,7 +123,8 @@ def _suspicious(tree: Tree) -> list[str]:
     if strong:
         most = max(joint.effort for joint in strong)
         said.append(
-            f"{len(strong)} joints are as strong as {most:g} N m; is that the motor's torque? (drive)"
+            f"{len(strong)} joints are as strong as {most:g} N m; is that the motor's torque? "
+            f"(drive)"
         )
     mass = sum(link.mass for link in tree.links)
     if mass > MOST_MASS_KG:
@@ -122,15 +132,20 @@ def _suspicious(tree: Tree) -> list[str]:
     for link in tree.links[1:]:
         radius = math.sqrt(np.linalg.eigvalsh(link.inertia)[-1] / link.mass)
         if radius > REACH_M[1]:
-            said.append(f"{link.name} turns like a body of {radius:.2g} m; is its inertia in kg m2?")
+            said.append(
+                f"{link.name} turns like a body of {radius:.2g} m; is its inertia in kg m2?"
+            )
     by_name = {joint.name: joint for joint in tree.joints}
     for joint in tree.joints:
         if joint.mimic is not None:
             leader, factor, offset = joint.mimic
-            ends = sorted(factor * end + offset for end in (by_name[leader].lower, by_name[leader].upper))
+            ends = sorted(
+                factor * end + offset for end in (by_name[leader].lower, by_name[leader].upper)
+            )
             if ends[0] < joint.lower - BEYOND_RAD or ends[1] > joint.upper + BEYOND_RAD:
                 said.append(
-                    f"{joint.name} follows {leader} to {ends[0]:.2f} and {ends[1]:.2f} rad, beyond its "
+                    f"{joint.name} follows {leader} to {ends[0]:.2f} and {ends[1]:.2f} rad, beyond "
+                    f"its "
                     f"limits {joint.lower:.2f} and {joint.upper:.2f}, which hold both back (limits)"
                 )
     return said + [
@@ -141,12 +156,17 @@ def _suspicious(tree: Tree) -> list[str]:
 
 
 def _untouched(source: Source, tree: Tree) -> set[tuple[int, int]]:
-    """Pairs of links whose contact is off: of one finger, the base and first links, and those of the source.
+    """Pairs of links whose contact is off.
 
-    Each pair of links apart costs MuJoCo, which has 32 bits for who meets whom, so a finger is one in this.
+    Of one finger, the base and first links, and those of the source.
+
+    Each pair of links apart costs MuJoCo, which has 32 bits for who meets whom, so a finger is one
+    in this.
     """
     number = {link.name: i for i, link in enumerate(tree.links)}
-    number |= {name: i for i, link in enumerate(tree.links) for name in link.sites if name not in number}
+    number |= {
+        name: i for i, link in enumerate(tree.links) for name in link.sites if name not in number
+    }
     pairs = {(0, joint.child) for joint in tree.joints if joint.parent == 0}
     for joints in tree.finger_joints():
         pairs |= set(combinations([joint + 1 for joint in joints], 2))

@@ -1,4 +1,7 @@
-"""A picture of an imported hand: links and colliders, axes, tips, and the joints with their limits."""
+"""A picture of an imported hand.
+
+Links and colliders, axes, tips, and the joints with their limits.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +28,9 @@ def _collider(shape: Any) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of a collider in its link."""
     if shape.kind == "hull":
         hull = convex_hull(shape.vertices)
-        return shape.frame[:3] + Rotation.from_quat(shape.frame[3:]).apply(hull.vertices), hull.faces
+        return shape.frame[:3] + Rotation.from_quat(shape.frame[3:]).apply(
+            hull.vertices
+        ), hull.faces
     return shape_mesh(Shape(shape.kind, shape.size, shape.frame, collides=True))
 
 
@@ -38,7 +43,9 @@ def _draw(axes: Any, hand: HandModel, links: np.ndarray, joints: np.ndarray) -> 
         corners.append((pose[:3] + Rotation.from_quat(pose[3:]).apply(vertices))[faces])
         hue = part_colour(shape.link, 0.5 if shape.link else 0.0, 0.85)
         axes.add_collection3d(
-            Poly3DCollection(corners[-1], facecolors=[hue], edgecolors=[hue], linewidths=0.2, alpha=0.45)
+            Poly3DCollection(
+                corners[-1], facecolors=[hue], edgecolors=[hue], linewidths=0.2, alpha=0.45
+            )
         )
     for joint, frame in enumerate(joints):
         along = Rotation.from_quat(frame[3:]).apply(hand.joint_axis[joint]) * AXIS_M
@@ -48,14 +55,21 @@ def _draw(axes: Any, hand: HandModel, links: np.ndarray, joints: np.ndarray) -> 
     tips = compose(links[hand.tip_link], hand.tip_frame)[:, :3]
     axes.scatter(*tips.T, color=TIP, s=12, depthshade=False)
     axes.scatter(*np.array(hand.workspace.drop_m)[:, None], color="#20a040", s=25, marker="x")
-    points = np.concatenate([*(corner.reshape(-1, 3) for corner in corners), [hand.workspace.drop_m]])
+    points = np.concatenate(
+        [*(corner.reshape(-1, 3) for corner in corners), [hand.workspace.drop_m]]
+    )
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     look_at(axes, middle, np.abs(points - middle).max(), 1.35)
 
 
 def joint_table(hand: HandModel, sources: list[str]) -> str:
-    """A line for each joint: name, the source's, limits, start, drive, motor or the joint that it follows."""
-    lines = ["joint  source                     limits [rad]    start  N m    kp     kd    moves by"]
+    """A line for each joint.
+
+    Name, the source's, limits, start, drive, motor or the joint that it follows.
+    """
+    lines = [
+        "joint  source                     limits [rad]    start  N m    kp     kd    moves by"
+    ]
     for i, name in enumerate(hand.joint_names):
         motor, leader = hand.motors[i], hand.mimic[i]
         if leader >= 0:
@@ -63,7 +77,8 @@ def joint_table(hand: HandModel, sources: list[str]) -> str:
         else:
             moves = f"{motor.model} {motor.id}" if motor else "a motor"
         lines.append(
-            f"{name:6} {sources[i][:24]:24} {hand.lower[i]:7.3f} {hand.upper[i]:7.3f} {hand.start[i]:8.3f} "
+            f"{name:6} {sources[i][:24]:24} {hand.lower[i]:7.3f} {hand.upper[i]:7.3f} "
+            f"{hand.start[i]:8.3f} "
             f"{hand.effort[i]:5.2f} {hand.kp[i]:6.2f} {hand.kd[i]:6.3f}  {moves}"
         )
     return "\n".join(lines)
@@ -88,9 +103,11 @@ def hand_sheet(hand: HandModel, sources: list[str], path: Path) -> Path:
         axes.set_title(name, fontsize=8)
     place = hand.workspace
     title = (
-        f"{hand.name}: {hand.num_fingers} fingers, {hand.num_joints} joints, {len(hand.shapes)} colliders, "
+        f"{hand.name}: {hand.num_fingers} fingers, {hand.num_joints} joints, {len(hand.shapes)} "
+        f"colliders, "
         f"{hand.link_mass.sum():.3f} kg, palm {'up' if hand.palm_up else 'down'}; objects of "
-        f"{1e3 * place.size_m[0]:.0f} to {1e3 * place.size_m[1]:.0f} mm; red: fingertips, green: drop point"
+        f"{1e3 * place.size_m[0]:.0f} to {1e3 * place.size_m[1]:.0f} mm; red: fingertips, green: "
+        f"drop point"
     )
     figure.text(0.01, 0.97, title, fontsize=9, va="top")
     figure.text(0.03, text, joint_table(hand, sources), fontsize=6.5, va="top", family="monospace")

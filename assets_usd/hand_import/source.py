@@ -31,7 +31,9 @@ class Shape:
     """A collider or a drawing."""
 
     kind: str
-    """``box``, ``sphere``, ``capsule``, ``cylinder``, ``mesh``, or what else the parser calls it."""
+    """``box``, ``sphere``, ``capsule``, ``cylinder``, ``mesh``, or what else the parser calls
+    it.
+    """
     size: tuple[float, ...]
     """As in :class:`vd.assets_usd.hand_data.CollisionShape`; empty for a mesh."""
     frame: np.ndarray
@@ -114,7 +116,9 @@ def read_source(path: Path) -> Source:
     elif "<mujoco" in text:
         read = _read_mjcf
     else:
-        raise HandError(f"{path}: neither a URDF nor an MJCF; expand a xacro first, export others to URDF")
+        raise HandError(
+            f"{path}: neither a URDF nor an MJCF; expand a xacro first, export others to URDF"
+        )
     quiet_warp()
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -124,12 +128,16 @@ def read_source(path: Path) -> Source:
             xacro = "<xacro:" in text or "${" in str(error)
             remedy = f"; expand it first: xacro {path.name} > hand.urdf" if xacro else ""
             raise HandError(f"{path}: cannot be parsed: {error}{remedy}") from error
-    for heard, kind in dict.fromkeys((" ".join(str(one.message).split()), one.category) for one in said):
+    for heard, kind in dict.fromkeys(
+        (" ".join(str(one.message).split()), one.category) for one in said
+    ):
         if any(word in heard for word in HARMLESS) or issubclass(kind, DeprecationWarning):
             source.notes.append(f"the parser says: {heard}")
         elif "package" in heard:
             heard = heard.partition(" For robust")[0]
-            source.problems.append(f"{heard} Name a folder above {path.name} so, or write relative paths")
+            source.problems.append(
+                f"{heard} Name a folder above {path.name} so, or write relative paths"
+            )
         else:
             file = "; put the file there" if "exist" in heard or "found" in heard else ""
             source.problems.append(f"the parser says: {heard}{file}")
@@ -193,7 +201,8 @@ def _read_urdf(path: Path) -> Source:
             continue
         joint.axis = axis / np.linalg.norm(axis)
         joint.lower, joint.upper = (
-            _bounded(values[dof]) for values in (builder.joint_limit_lower, builder.joint_limit_upper)
+            _bounded(values[dof])
+            for values in (builder.joint_limit_lower, builder.joint_limit_upper)
         )
         joint.effort = _bounded(builder.joint_effort_limit[dof]) or math.nan
         joint.velocity = _bounded(builder.joint_velocity_limit[dof]) or math.nan
@@ -212,10 +221,14 @@ def _check_urdf_names(source: Source) -> None:
     for kind in ("link", "joint"):
         counts = Counter(str(element.get("name")) for element in root.findall(kind))
         twice = [name for name, count in counts.items() if count > 1]
-        source.problems += [f"{name} is the name of more than one {kind}; rename them" for name in twice]
+        source.problems += [
+            f"{name} is the name of more than one {kind}; rename them" for name in twice
+        ]
         if kind == "link":
             alone = counts.keys() - {link.name for link in source.links}
-            source.notes += [f"{name} is joined to nothing and is left out" for name in sorted(alone)]
+            source.notes += [
+                f"{name} is joined to nothing and is left out" for name in sorted(alone)
+            ]
 
 
 def _leave_out(source: Source, what: str, values: dict[str, float]) -> None:
@@ -280,7 +293,10 @@ def _joint_name(model: Any, joint: int) -> str:
 def _mjcf_joints(model: Any, body: int, source: Source) -> None:
     """The joint of a body: none is a fixed one, more than one are none that a hand has."""
     first, count = model.body_jntadr[body], model.body_jntnum[body]
-    parent, place = model.body_parentid[body] - 1, _pose(model.body_pos[body], model.body_quat[body])
+    parent, place = (
+        model.body_parentid[body] - 1,
+        _pose(model.body_pos[body], model.body_quat[body]),
+    )
     link = source.links[body - 1].name
     names = [_joint_name(model, i) for i in range(first, first + count)]
     if parent < 0:
@@ -290,10 +306,14 @@ def _mjcf_joints(model: Any, body: int, source: Source) -> None:
             )
         return
     if count == 0:
-        source.joints.append(Joint(f"weld of {link}", "fixed", parent, body - 1, parent_frame=place))
+        source.joints.append(
+            Joint(f"weld of {link}", "fixed", parent, body - 1, parent_frame=place)
+        )
         return
     if count > 1:
-        source.problems.append(f"{link} has {count} joints, {', '.join(names)}; put a body between them")
+        source.problems.append(
+            f"{link} has {count} joints, {', '.join(names)}; put a body between them"
+        )
     kind = mujoco.mjtJoint(model.jnt_type[first])
     joint = Joint(names[0], kind.name[6:].lower(), parent, body - 1)
     joint.child_frame = np.concatenate([model.jnt_pos[first], [0.0, 0.0, 0.0, 1.0]])
@@ -317,7 +337,9 @@ def _mjcf_shape(model: Any, geom: int) -> Shape:
     kind = mujoco.mjtGeom(model.geom_type[geom]).name[7:].lower()
     shape = Shape(
         kind,
-        tuple(model.geom_size[geom][: {"box": 3, "ellipsoid": 3, "sphere": 1}.get(kind, 2)].tolist()),
+        tuple(
+            model.geom_size[geom][: {"box": 3, "ellipsoid": 3, "sphere": 1}.get(kind, 2)].tolist()
+        ),
         _pose(model.geom_pos[geom], model.geom_quat[geom]),
         bool(model.geom_contype[geom] or model.geom_conaffinity[geom]),
         colour=tuple(model.geom_rgba[geom][:3].tolist()),
@@ -345,7 +367,9 @@ def _mjcf_equalities(model: Any, source: Source) -> None:
                 f"{name} ({text}) couples more than a line; remove it and use hold or mimic"
             )
             continue
-        one, other = (_joint_name(model, number[i]) for number in (model.eq_obj1id, model.eq_obj2id))
+        one, other = (
+            _joint_name(model, number[i]) for number in (model.eq_obj1id, model.eq_obj2id)
+        )
         if one in joints:
             joints[one].mimic = other, float(data[1]), float(data[0])
 
@@ -359,12 +383,20 @@ def _mjcf_actuators(model: Any, source: Source) -> None:
         names = ", ".join(model.tendon(i).name for i in idle)
         source.notes.append(f"tendons without a motor are left out: {names}")
     for i in range(model.nu):
-        gear, affine = abs(float(model.actuator_gear[i, 0])) or 1.0, int(mujoco.mjtBias.mjBIAS_AFFINE)
+        gear, affine = (
+            abs(float(model.actuator_gear[i, 0])) or 1.0,
+            int(mujoco.mjtBias.mjBIAS_AFFINE),
+        )
         strongest = math.nan
         if model.actuator_forcelimited[i]:
             strongest = float(np.abs(model.actuator_forcerange[i]).max())
-        elif model.actuator_ctrllimited[i] and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE:
-            strongest = float(np.abs(model.actuator_gainprm[i, 0] * model.actuator_ctrlrange[i]).max())
+        elif (
+            model.actuator_ctrllimited[i]
+            and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+        ):
+            strongest = float(
+                np.abs(model.actuator_gainprm[i, 0] * model.actuator_ctrlrange[i]).max()
+            )
         for joint in (joints[name] for name in _moved(model, i, source) if name in joints):
             if model.actuator_biastype[i] == affine:
                 stiffness, damping = (-float(b) * gear**2 for b in model.actuator_biasprm[i, 1:3])

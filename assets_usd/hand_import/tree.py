@@ -32,7 +32,10 @@ DENSITY_KG_M3 = 1000.0
 
 @dataclass
 class Tree:
-    """A hand in its own order: ``base`` first, then the fingers from the palm; D joints, D + 1 links."""
+    """A hand in its own order: ``base`` first, then the fingers from the palm.
+
+    D joints, D + 1 links.
+    """
 
     source: str
     """File that it was read from, for people."""
@@ -127,7 +130,8 @@ class _Grower:
         self.fail()
         if self.raised:
             self.notes.append(
-                f"no body has the moments of inertia of {', '.join(self.raised)}; the smaller are raised"
+                f"no body has the moments of inertia of {', '.join(self.raised)}; the smaller are "
+                f"raised"
             )
         if self.hollow:
             self.notes.append(
@@ -193,7 +197,8 @@ class _Grower:
                 first, *rest = free
                 lines = ", ".join(f"{name}: {{joint: {first}}}" for name in rest)
                 self.problems.append(
-                    f"the tendon {tendon} moves {', '.join(free)} together, which no drive of a joint does; "
+                    f"the tendon {tendon} moves {', '.join(free)} together, which no drive of a "
+                    f"joint does; "
                     f"say mimic: {{{lines}}}, or hold: {{{rest[0]}: 0}}"
                 )
 
@@ -231,7 +236,9 @@ class _Grower:
         base = max(roots, key=self._moving)
         for root in roots:
             if root != base:
-                self.notes.append(f"{self.source.links[root].name} is no part of the hand and is left out")
+                self.notes.append(
+                    f"{self.source.links[root].name} is no part of the hand and is left out"
+                )
         wrist: list[str] = []
         starts = self._leaving(base)
         while len(starts) == 1 and self._branches(starts[0].child):
@@ -245,7 +252,9 @@ class _Grower:
                 f"hold: {{{names}}}"
             )
         elif wrist:
-            self.notes.append(f"{', '.join(wrist)} come before the fingers and are held at 0 (hold)")
+            self.notes.append(
+                f"{', '.join(wrist)} come before the fingers and are held at 0 (hold)"
+            )
         if not starts:
             self.problems.append("no joint moves; a hand has fingers")
         return base, starts
@@ -253,7 +262,9 @@ class _Grower:
     def _moving(self, link: int) -> int:
         """Joints that move below a link."""
         below = [self.source.joints[n] for n in self.out.get(link, ())]
-        return sum(not self._is_welded(joint) for joint in below) + sum(self._moving(j.child) for j in below)
+        return sum(not self._is_welded(joint) for joint in below) + sum(
+            self._moving(j.child) for j in below
+        )
 
     def _branches(self, link: int) -> bool:
         """Whether more than one joint leaves a link or what it carries."""
@@ -276,7 +287,8 @@ class _Grower:
         for joint in chain:
             if joint.kind != "revolute":
                 self.problems.append(
-                    f"{joint.name} is {joint.kind}; only revolute joints move: hold: {{{joint.name}: 0}}"
+                    f"{joint.name} is {joint.kind}; only revolute joints move: hold: "
+                    f"{{{joint.name}: 0}}"
                 )
         return chain
 
@@ -289,13 +301,16 @@ class _Grower:
             split = link.name in self.said.parts
             for shape in link.shapes:
                 self._check_shape(link, shape, split=split)
-            whole.shapes += [replace(s, frame=compose(pose, s.frame), split=split) for s in link.shapes]
+            whole.shapes += [
+                replace(s, frame=compose(pose, s.frame), split=split) for s in link.shapes
+            ]
             whole.sites |= {name: compose(pose, site) for name, site in link.sites.items()}
             whole.sites |= {link.name: pose} if link is not parts[0][0] else {}
         for link, _ in parts:
             if not 0.0 <= link.mass < math.inf:
                 self.problems.append(
-                    f"{link.name} weighs {link.mass:g} kg in the file; say mass: {{{link.name}: 0.02}}"
+                    f"{link.name} weighs {link.mass:g} kg in the file; say mass: "
+                    f"{{{link.name}: 0.02}}"
                 )
         if not sum(link.mass for link, _ in parts) > 0.0:
             return self._weighed(whole)
@@ -318,16 +333,23 @@ class _Grower:
         boxes = [shape_box(shape) for shape in link.shapes if shape.collides]
         if not boxes:
             self.problems.append(
-                f"{link.name} has neither mass nor collider; give it one: mass: {{{link.name}: 0.02}}"
+                f"{link.name} has neither mass nor collider; give it one: mass: "
+                f"{{{link.name}: 0.02}}"
             )
             return link
         parts = []
         for pose, half in boxes:
-            mass, turn = float(8.0 * np.prod(half) * DENSITY_KG_M3), Rotation.from_quat(pose[3:]).as_matrix()
-            parts.append((mass, pose[:3], turn @ np.diag(mass / 3.0 * (half @ half - half**2)) @ turn.T))
+            mass, turn = (
+                float(8.0 * np.prod(half) * DENSITY_KG_M3),
+                Rotation.from_quat(pose[3:]).as_matrix(),
+            )
+            parts.append(
+                (mass, pose[:3], turn @ np.diag(mass / 3.0 * (half @ half - half**2)) @ turn.T)
+            )
         combine(link, parts)
         self.notes.append(
-            f"guess: {link.name} has no mass in the file; {link.mass:.3f} kg by its colliders (mass)"
+            f"guess: {link.name} has no mass in the file; {link.mass:.3f} kg by its colliders "
+            f"(mass)"
         )
         return link
 
@@ -388,28 +410,35 @@ class _Grower:
                 self.problems.append(f"{joint.name} and {leader} follow each other; say mimic")
             else:
                 how = "as described" if joint.name in self.said.mimic else "as in the file"
-                self.notes.append(f"{joint.name} follows {leader}: {factor:g} q + {offset:g} rad, {how}")
+                self.notes.append(
+                    f"{joint.name} follows {leader}: {factor:g} q + {offset:g} rad, {how}"
+                )
 
     def _check_numbers(self, tree: Tree) -> None:
         """Limits and torque limits, which are never guessed."""
         for joint in tree.joints:
             if not (joint.lower < joint.upper and max(-joint.lower, joint.upper) < MOST_RAD):
                 self.problems.append(
-                    f"{joint.name} has the limits {joint.lower:g} and {joint.upper:g} rad; give it some in "
+                    f"{joint.name} has the limits {joint.lower:g} and {joint.upper:g} rad; give it "
+                    f"some in "
                     f"radians: limits: {{{joint.name}: [-1.6, 1.6]}}"
                 )
             elif joint.name in self.said.start:
                 self._check_angle("start", joint, self.said.start[joint.name])
-        weak = [joint.name for joint in tree.joints if not joint.effort > 0.0 and joint.mimic is None]
+        weak = [
+            joint.name for joint in tree.joints if not joint.effort > 0.0 and joint.mimic is None
+        ]
         if weak:
             self.problems.append(
-                f"{', '.join(weak)}: no torque limit in the file; say drive: {{effort: 1.0}} (N m) or "
+                f"{', '.join(weak)}: no torque limit in the file; say drive: {{effort: 1.0}} (N m) "
+                f"or "
                 f"drives: {{{weak[0]}: {{effort: 1.0}}}}; or mimic or hold, where there is no motor"
             )
         for end in np.cumsum(tree.counts):
             if not any(shape.collides for shape in tree.links[end].shapes):
                 self.problems.append(
-                    f"nothing collides of {tree.links[end].name}, which has a fingertip; add a collision"
+                    f"nothing collides of {tree.links[end].name}, which has a fingertip; add a "
+                    f"collision"
                 )
 
     def _check_shape(self, link: Link, shape: Shape, *, split: bool) -> None:
@@ -422,14 +451,17 @@ class _Grower:
         half = shape_box(shape)[1]
         if not LEAST_M < 2.0 * half.max() < MOST_M:
             self.problems.append(
-                f"{what} is {2.0 * half.max():.3g} m long; give it its size in metres, a mesh by its scale, "
+                f"{what} is {2.0 * half.max():.3g} m long; give it its size in metres, a mesh by "
+                f"its scale, "
                 "such as 0.001"
             )
         elif shape.collides and shape.kind == "mesh":
             hull = hull_volume(shape.vertices)
             volume = abs(float(trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume))
             if not hull > 0.0:
-                self.problems.append(f"{what} is flat and collides; give it a thickness, or make it a box")
+                self.problems.append(
+                    f"{what} is flat and collides; give it a thickness, or make it a box"
+                )
             elif hull > HOLLOW * volume > 0.0 and not split:
                 self.hollow[link.name] = max(hull / volume, self.hollow.get(link.name, 0.0))
         elif shape.collides and not half.min() > 0.0:
@@ -437,7 +469,10 @@ class _Grower:
 
 
 def combine(link: Link, parts: list[tuple[float, np.ndarray, np.ndarray]]) -> None:
-    """Give a link the mass of parts: mass, centre [3], inertia about it in the link's axes [3, 3] each."""
+    """Give a link the mass of parts.
+
+    Mass, centre [3], inertia about it in the link's axes [3, 3] each.
+    """
     link.mass = sum(mass for mass, _, _ in parts)
     link.com = np.asarray(sum(mass * at for mass, at, _ in parts)) / link.mass
     for mass, at, inertia in parts:
@@ -451,7 +486,9 @@ def shape_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         case "sphere":
             return shape.frame, np.full(3, shape.size[0])
         case "capsule":
-            return shape.frame, np.array([shape.size[0], shape.size[0], shape.size[0] + shape.size[1]])
+            return shape.frame, np.array(
+                [shape.size[0], shape.size[0], shape.size[0] + shape.size[1]]
+            )
         case "cylinder":
             return shape.frame, np.array([shape.size[0], shape.size[0], shape.size[1]])
         case "mesh":

@@ -24,15 +24,19 @@ from vd.assets_usd.objects.geometry import (
 from vd.assets_usd.objects.repair import RepairedMesh
 
 SAMPLES = 2**16
-"""Points by which parts and mesh are compared: of an object that fills 1 % of its box 650 are inside, which
-gives an error of 15 % to within 2 %."""
+"""Points by which parts and mesh are compared: of an object that fills 1 % of its box 650 are
+inside, which gives an error of 15 % to within 2 %."""
 
 MARGIN = 0.1
-"""The points reach this share of the object's sides beyond it: parts of few vertices stick out by less."""
+"""The points reach this share of the object's sides beyond it: parts of few vertices stick out by
+less.
+"""
 
 OPEN_SHARE = 0.1
-"""A mesh encloses something if its winding number is between ``OPEN_LEVELS`` in less than this share of what
-it encloses. Scans with holes have 0.0 %, surfaces without an inside 100 % and more."""
+"""A mesh encloses something if its winding number is between ``OPEN_LEVELS`` in less than this
+share of what it encloses. Scans with holes have 0.0 %, surfaces without an inside 100 % and
+more.
+"""
 
 OPEN_LEVELS = 0.2, 0.8
 """Winding numbers that belong neither to an inside nor to an outside."""
@@ -63,7 +67,8 @@ class Body:
 def body_of(mesh: RepairedMesh) -> Body:
     """The solid that a mesh bounds: exact if it is closed, by winding numbers if it has holes.
 
-    A surface that has no inside is a sheet: the solid is its voxels, below 1 % of the longest side thick.
+    A surface that has no inside is a sheet: the solid is its voxels, below 1 % of the longest side
+    thick.
     """
     body = _outer_body(mesh)
     if not len(mesh.cavity_faces):
@@ -90,7 +95,8 @@ def _outer_body(mesh: RepairedMesh) -> Body:
     solid = solid_of_voxels(*grid)
     thickness = solid.volume / float(triangle_areas(vertices, faces).sum())
     warning = (
-        f"open: the surface encloses nothing, and is taken as a sheet {1e3 * thickness:.1f} mm thick, empty "
+        f"open: the surface encloses nothing, and is taken as a sheet {1e3 * thickness:.1f} mm "
+        f"thick, empty "
         "inside; close it, or give it thickness"
     )
     return Body(partial(_in_voxels, *grid), solid.volume, solid, "voxelised sheet", (warning,))
@@ -100,7 +106,9 @@ def _in_hulls(hulls: Sequence[Hull], points: np.ndarray) -> np.ndarray:
     return union_depth(hulls, points) <= 0.0
 
 
-def _in_voxels(mask: np.ndarray, origin: np.ndarray, pitch: float, points: np.ndarray) -> np.ndarray:
+def _in_voxels(
+    mask: np.ndarray, origin: np.ndarray, pitch: float, points: np.ndarray
+) -> np.ndarray:
     cell = np.rint((points - origin) / pitch).astype(int)
     there = ((cell >= 0) & (cell < mask.shape)).all(axis=1)
     there[there] = mask[tuple(cell[there].T)]

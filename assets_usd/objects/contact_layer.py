@@ -1,8 +1,9 @@
 """Identified contact of an object as a layer over its USD file: ``identified.usda``.
 
-The layer has the object's file as sublayer, so commands take it wherever they take the file. The root prim
-has what was identified, ``vd:contact:<parameter>``, with ``vd:contact:<parameter>:ci95`` (low ends, high
-ends; SI units) for the 95 % interval, and mass and centre of mass in USD's own attributes besides.
+The layer has the object's file as sublayer, so commands take it wherever they take the file. The
+root prim has what was identified, ``vd:contact:<parameter>``, with ``vd:contact:<parameter>:ci95``
+(low ends, high ends; SI units) for the 95 % interval, and mass and centre of mass in USD's own
+attributes besides.
 """
 
 from collections.abc import Mapping
@@ -26,7 +27,8 @@ class ContactParameter(NamedTuple):
         meaning: In words.
         unit: SI unit.
         nominal: Where the object's file has nothing; as many numbers as the parameter has.
-        resolution: Difference that matters to a policy (ours), in the unit or as a share of nominal.
+        resolution: Difference that matters to a policy (ours), in the unit or as a share of
+            nominal.
         record: What tells it.
         relative: Whether the resolution is a share.
     """
@@ -39,7 +41,10 @@ class ContactParameter(NamedTuple):
     relative: bool = False
 
     def of(self, item: Any) -> np.ndarray:
-        """As an object (:class:`vd.assets_usd.objects.model.ObjectModel`) has it: identified, or nominal."""
+        """As an object (:class:`vd.assets_usd.objects.model.ObjectModel`) has it.
+
+        Identified, or nominal.
+        """
         name = next(key for key, parameter in CONTACT.items() if parameter is self)
         told = {"mass": (item.mass_kg,), "centre_of_mass": item.centre_of_mass}
         return np.array(told.get(name, item.contact.get(name, (self.nominal,))[0]), dtype=float)
@@ -66,7 +71,8 @@ CONTACT: dict[str, ContactParameter] = {
         "kg",
         (_MATERIALS.object_mass_kg,),
         0.1,
-        "record slides, and pushes with the force of the pusher: free motion does not depend on the mass",
+        "record slides, and pushes with the force of the pusher: free motion does not depend on "
+        "the mass",
         relative=True,
     ),
     "centre_of_mass": ContactParameter(
@@ -87,7 +93,9 @@ CONTACT: dict[str, ContactParameter] = {
 """Parameters by name; names are a contract: USD attributes and keys of reports."""
 
 Identified = Mapping[str, tuple[tuple[float, ...], ...]]
-"""By parameter three tuples of as many numbers as it has: value, low and high end of the 95 % interval."""
+"""By parameter three tuples of as many numbers as it has: value, low and high end of the 95 %
+interval.
+"""
 
 
 def author_contact(prim: Any, found: Identified) -> None:
@@ -104,7 +112,9 @@ def author(prim: Any, name: str, kind: Any, value: Any) -> None:
     from pxr import Sdf
 
     custom = name.startswith(NAMESPACE)
-    Sdf.AttributeSpec(prim, name, kind, Sdf.VariabilityVarying, declaresCustom=custom).default = value
+    Sdf.AttributeSpec(
+        prim, name, kind, Sdf.VariabilityVarying, declaresCustom=custom
+    ).default = value
 
 
 def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ...]]:
@@ -115,7 +125,8 @@ def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ..
         where: The file to name in errors.
 
     Raises:
-        ValueError: An attribute is no parameter, or not as many ordered, finite numbers as it should be.
+        ValueError: An attribute is no parameter, or not as many ordered, finite numbers as it
+            should be.
     """
     found = {}
     for attribute in prim.GetAuthoredPropertiesInNamespace(NAMESPACE):
@@ -127,15 +138,16 @@ def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ..
             )
         size = len(CONTACT[name].nominal)
         parts = [prim.GetAttribute(f"{NAMESPACE}:{name}{end}").Get() for end in ("", ":ci95")]
-        numbers = np.concatenate([np.atleast_1d([] if part is None else part) for part in parts]).astype(
-            float
-        )
+        numbers = np.concatenate(
+            [np.atleast_1d([] if part is None else part) for part in parts]
+        ).astype(float)
         value, low, high = (numbers[i * size : (i + 1) * size] for i in range(3))
         if len(numbers) != 3 * size or not (
             np.isfinite(numbers).all() and np.all((low <= value) & (value <= high))
         ):
             raise ValueError(
-                f"{where}: {full!r}: give {size} numbers, and for its ci95 {size} low and {size} high"
+                f"{where}: {full!r}: give {size} numbers, and for its ci95 {size} low and {size} "
+                f"high"
             )
         found[name] = tuple(tuple(float(v) for v in part) for part in (value, low, high))
     return found

@@ -31,21 +31,25 @@ HULL_VERTICES = 32
 """Most vertices of a part."""
 
 SLIVER_VOLUME = 1e-3
-"""A part smaller than this share of all parts is dropped: it costs a collision shape and holds nothing."""
+"""A part smaller than this share of all parts is dropped: it costs a collision shape and holds
+nothing.
+"""
 
 GOOD_ERROR = 0.15
-"""Parts that differ from the mesh by at most this share of its volume are good: most shapes meet it with few
-parts, and simplifying each part to 32 vertices alone takes 5 %."""
+"""Parts that differ from the mesh by at most this share of its volume are good: most shapes meet it
+with few parts, and simplifying each part to 32 vertices alone takes 5 %."""
 
 USUAL_HULLS = 8
 """Parts tried first: enough for most shapes, and each part is a collision shape in every world."""
 
 FINE_THRESHOLD, FINE_HULLS = 0.4, 96
-"""Factor on the threshold, and most parts, of the fine decomposition from which parts are merged where the
-first is not good."""
+"""Factor on the threshold, and most parts, of the fine decomposition from which parts are merged
+where the first is not good."""
 
 MERGED_HULLS = (8, 12, 16, 24, 32)
-"""Numbers of parts to which a fine decomposition is merged. What is thin or a ring needs 16 and more."""
+"""Numbers of parts to which a fine decomposition is merged. What is thin or a ring needs 16 and
+more.
+"""
 
 NEARLY = 1.1
 """More parts are not taken for an error less than a tenth smaller, unless it becomes good."""
@@ -97,12 +101,17 @@ def _limited(parent: int, seconds: float) -> None:
     limit = int(time.process_time()) + max(1, round(seconds))
     resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    os.environ["OMP_WAIT_POLICY"] = "passive"  # threads that wait for each other take no processor time
+    os.environ["OMP_WAIT_POLICY"] = (
+        "passive"  # threads that wait for each other take no processor time
+    )
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def _parts_or_reason(seconds: float, *arguments: Any) -> list[np.ndarray] | str:
-    """CoACD's parts, or why there are none, from a child process: it may take too long, or crash."""
+    """CoACD's parts, or why there are none, from a child process.
+
+    It may take too long, or crash.
+    """
     child = ProcessPoolExecutor(1, get_context("fork"), _limited, (os.getpid(), seconds))
     try:
         return child.submit(_coacd_parts, *arguments).result() or "CoACD returned no part"
@@ -133,7 +142,10 @@ def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ..
 
 
 def decompose(
-    vertices: np.ndarray, faces: np.ndarray, settings: ImportSettings, max_vertices: int = HULL_VERTICES
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    settings: ImportSettings,
+    max_vertices: int = HULL_VERTICES,
 ) -> Decomposition:
     """Split a mesh into convex parts: by CoACD in a child process, or its convex hull alone.
 
@@ -187,7 +199,9 @@ def best_decomposition(
     settings: ImportSettings,
     error_of: Callable[[Sequence[Hull]], float],
 ) -> Decomposition:
-    """Few parts if these are good; else parts merged from a fine decomposition, as many as are needed.
+    """Few parts if these are good.
+
+    Else parts merged from a fine decomposition, as many as are needed.
 
     Args:
         vertices: [V, 3], m.
@@ -213,5 +227,6 @@ def best_decomposition(
         found.append(Decomposition(hulls, f"{fine.method}, merged", error=error_of(hulls)))
     enough = max(GOOD_ERROR, NEARLY * min(each.error for each in found))
     return min(
-        (each for each in found if each.error <= enough), key=lambda each: (len(each.hulls), each.error)
+        (each for each in found if each.error <= enough),
+        key=lambda each: (len(each.hulls), each.error),
     )

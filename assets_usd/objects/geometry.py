@@ -16,21 +16,27 @@ VOXELS = 96
 """Voxels along the longest side of a voxelised solid: about 1 % of volume error on thin shapes."""
 
 CANDIDATES_PER_POINT = 8
-"""Random candidates per surface point kept by farthest-point sampling: even cover at little cost."""
+"""Random candidates per surface point kept by farthest-point sampling: even cover at little
+cost.
+"""
 
 SIMPLIFY_TOLERANCE = 1e-3
 """Simplifying a hull stops once every vertex left out is this close to it, relative to its size."""
 
 
 GRID_TURN = Rotation.from_euler("xyz", [0.37, 0.61, 0.23])
-"""Orientation of the grid on which unions of hulls are measured: no plane a part is likely to have."""
+"""Orientation of the grid on which unions of hulls are measured: no plane a part is likely to
+have.
+"""
 
 FINEST_GRID, COARSEST_GRID, GRID_BISECTIONS = 512.0, 8.0, 12
 """Grids tried when a mesh is coarsened: cells along its longest side, and bisection steps."""
 
 
 SLIVER_THICKNESS = 2e-3
-"""A part thinner than this share of the longest side (0.25 mm of 12 cm) is no solid to collide with."""
+"""A part thinner than this share of the longest side (0.25 mm of 12 cm) is no solid to collide
+with.
+"""
 
 
 class Surface(NamedTuple):
@@ -45,7 +51,10 @@ Hull = Surface
 
 
 class Solid(NamedTuple):
-    """Mass properties of a solid of uniform density 1: volume, centroid [3], inertia about it [3, 3]."""
+    """Mass properties of a solid of uniform density 1.
+
+    Volume, centroid [3], inertia about it [3, 3].
+    """
 
     volume: float
     centroid: np.ndarray
@@ -86,7 +95,10 @@ def hull_volume(points: np.ndarray) -> float:
 
 
 def hull_planes(hull: Hull) -> tuple[np.ndarray, np.ndarray]:
-    """Half-spaces of a hull: unit outward normals [P, 3] and offsets [P]; inside is ``n.x <= d``."""
+    """Half-spaces of a hull: unit outward normals [P, 3] and offsets [P].
+
+    Inside is ``n.x <= d``.
+    """
     corner = hull.vertices[hull.faces].astype(np.float64)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     length = np.linalg.norm(normal, axis=1)
@@ -115,7 +127,9 @@ def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
 
 
-def inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, level: float = 0.5) -> np.ndarray:
+def inside(
+    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, level: float = 0.5
+) -> np.ndarray:
     """Whether the winding number of a mesh [V, 3], [T, 3] exceeds ``level`` at points [n, 3], bool [n]."""
     import warp as wp
 
@@ -191,7 +205,9 @@ def solid_of_mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     return Solid(float(volume), reference + centroid, inertia)
 
 
-def voxelise_hulls(hulls: Sequence[Hull], voxels: int = VOXELS) -> tuple[np.ndarray, np.ndarray, float]:
+def voxelise_hulls(
+    hulls: Sequence[Hull], voxels: int = VOXELS
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Voxels whose centre lies in the union of hulls.
 
     Returns:
@@ -205,7 +221,9 @@ def voxelise_hulls(hulls: Sequence[Hull], voxels: int = VOXELS) -> tuple[np.ndar
     mask = np.zeros(shape, dtype=bool)
     for hull in hulls:
         start = np.maximum(np.floor((hull.vertices.min(axis=0) - origin) / pitch).astype(int), 0)
-        stop = np.minimum(np.ceil((hull.vertices.max(axis=0) - origin) / pitch).astype(int) + 1, shape)
+        stop = np.minimum(
+            np.ceil((hull.vertices.max(axis=0) - origin) / pitch).astype(int) + 1, shape
+        )
         axes = [origin[i] + pitch * np.arange(start[i], stop[i]) for i in range(3)]
         inside = np.ones(tuple(len(a) for a in axes), dtype=bool)
         for normal, offset in zip(*hull_planes(hull), strict=True):
@@ -257,7 +275,8 @@ def solid_of_voxels(mask: np.ndarray, origin: np.ndarray, pitch: float) -> Solid
 def solid_of_hulls(hulls: Sequence[Hull]) -> Solid:
     """Mass properties of the union of hulls (density 1): exact for one hull, else from voxels.
 
-    The grid is turned against the object: a plate along a grid plane could gain or lose a whole layer.
+    The grid is turned against the object: a plate along a grid plane could gain or lose a whole
+    layer.
     """
     if len(hulls) == 1:
         return solid_of_mesh(*hulls[0])
@@ -270,7 +289,8 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Diagonalise an inertia tensor [3, 3].
 
     Returns:
-        Principal moments [3], ascending, and the quaternion xyzw of the principal frame in the body.
+        Principal moments [3], ascending, and the quaternion xyzw of the principal frame in the
+        body.
     """
     moments, axes = np.linalg.eigh((inertia + inertia.T) / 2.0)
     if np.linalg.det(axes) < 0.0:
@@ -331,7 +351,10 @@ def surface_points(
 
 
 def spread(points: np.ndarray, count: int) -> np.ndarray:
-    """Rows of ``count`` points [N, 3] far from each other: farthest-point sampling from the first one."""
+    """Rows of ``count`` points [N, 3] far from each other.
+
+    Farthest-point sampling from the first one.
+    """
     chosen = np.zeros(count, dtype=int)
     distance = np.full(len(points), np.inf)
     for i in range(1, count):
@@ -345,8 +368,9 @@ def cluster_vertices(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coarsen a mesh to at most ``max_faces`` triangles by merging the vertices of a grid cell.
 
-    The finest grid that meets the limit is found by bisection. A cell's vertex minimises the squared
-    distance to the planes of the triangles around it (quadric error), which keeps edges sharp; the
+    The finest grid that meets the limit is found by bisection. A cell's vertex minimises the
+    squared distance to the planes of the triangles around it (quadric error), which keeps edges
+    sharp; the
     bounding box is kept. For pictures only: the solid and the hulls are computed before.
     """
     if len(faces) <= max_faces:
@@ -365,11 +389,15 @@ def cluster_vertices(
     used, index = np.unique(merged, return_inverse=True)
     moved = _quadric_vertices(vertices, faces, cluster, float(side.max()) / coarse)[used]
     spread = np.ptp(moved, axis=0)
-    moved = low + (moved - moved.min(axis=0)) * np.where(spread > 0.0, side / np.maximum(spread, 1e-30), 1.0)
+    moved = low + (moved - moved.min(axis=0)) * np.where(
+        spread > 0.0, side / np.maximum(spread, 1e-30), 1.0
+    )
     return moved, index.reshape(-1, 3).astype(np.int32)
 
 
-def _clustered(vertices: np.ndarray, faces: np.ndarray, cells: float) -> tuple[np.ndarray, np.ndarray]:
+def _clustered(
+    vertices: np.ndarray, faces: np.ndarray, cells: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Cell of each vertex [V] on a grid of ``cells`` along the longest side, and the triangles left."""
     low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
     key = np.floor((vertices - low) / size * cells).astype(np.int64)
@@ -384,7 +412,10 @@ def _clustered(vertices: np.ndarray, faces: np.ndarray, cells: float) -> tuple[n
 def _quadric_vertices(
     vertices: np.ndarray, faces: np.ndarray, cluster: np.ndarray, cell: float
 ) -> np.ndarray:
-    """Vertex of each cluster: near its mean, on the planes of its triangles, at most a cell away."""
+    """Vertex of each cluster.
+
+    Near its mean, on the planes of its triangles, at most a cell away.
+    """
     count = int(cluster.max()) + 1
     total = np.stack([np.bincount(cluster, vertices[:, i], count) for i in range(3)], axis=1)
     mean = total / np.bincount(cluster, minlength=count)[:, None]

@@ -47,13 +47,17 @@ MAX_VISUAL_FACES = 3000
 """Faces of the visual mesh: files stay below 40 kB, and no picture here shows more."""
 
 MAX_ERROR, MAX_OFFSET = 1.0, 0.03
-"""Parts are refused if they differ from the mesh by more than its volume, and are farther from its surface,
-on average, than this share of the longest side: 4 mm of 13 cm, where fingertips have a radius of 10 mm. Of
-thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as parts differs by its volume."""
+"""Parts are refused if they differ from the mesh by more than its volume, and are farther from its
+surface,
+on average, than this share of the longest side: 4 mm of 13 cm, where fingertips have a radius of 10
+mm. Of
+thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as parts differs by its
+volume.
+"""
 
 HANG_S, OVERHEAD_S = 20.0, 600.0
-"""Wall-clock time after which a mesh is taken to hang: for each second of processor time that CoACD may take,
-of which a busy machine gives it a twentieth of a core at least, and beside its runs."""
+"""Wall-clock time after which a mesh is taken to hang: for each second of processor time that CoACD
+may take, of which a busy machine gives it a twentieth of a core at least, and beside its runs."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,10 @@ class ImportResult:
 
 
 def content_hash(job: Job, settings: ImportSettings) -> str:
-    """Hash of all that decides the object: bytes of the mesh, name, licence, settings and code version."""
+    """Hash of all that decides the object.
+
+    Bytes of the mesh, name, licence, settings and code version.
+    """
     files = [Path(job.source)]
     if mesh_kind(files[0]) == "usd":
         files = usd_files(files[0])
@@ -111,7 +118,8 @@ def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
     if parts.error > MAX_ERROR and offset > MAX_OFFSET:
         raise MeshError(
             f"{off}, {100 * offset:.0f} % of its length off its surface on average"
-            f"{f' ({words})' if words else ''}: thicken its walls, or allow finer parts (--threshold, "
+            f"{f' ({words})' if words else ''}: thicken its walls, or allow finer parts "
+            f"(--threshold, "
             "--max-hulls)"
         )
     warnings = [f"fall-back, tried again at the next import: {words}"] if words else []
@@ -119,7 +127,10 @@ def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
 
 
 def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
-    """Import one mesh in this process (CoACD runs in a child). A mesh that is refused is a result."""
+    """Import one mesh in this process (CoACD runs in a child).
+
+    A mesh that is refused is a result.
+    """
     quiet_warp()
     try:
         model = _object_of(job, settings)
@@ -181,10 +192,12 @@ def import_meshes(
     jobs: int = 0,
     progress: Callable[[ImportResult, int, int], None] | None = None,
 ) -> list[ImportResult]:
-    """Import meshes, several at a time, in processes of their own: none that hangs or crashes stops others.
+    """Import meshes, several at a time, in processes of their own.
 
-    An object file whose content hash still holds is left alone, so that an interrupted import goes on where
-    it stopped.
+    None that hangs or crashes stops others.
+
+    An object file whose content hash still holds is left alone, so that an interrupted import goes
+    on where it stopped.
 
     Args:
         paths: Files and folders.
@@ -197,8 +210,8 @@ def import_meshes(
         One result per mesh, in the order of the meshes.
 
     Raises:
-        MeshError: A path does not exist or holds no mesh, two meshes would have one name, or an object would
-            be written over something else. Nothing has been written then.
+        MeshError: A path does not exist or holds no mesh, two meshes would have one name, or an
+            object would be written over something else. Nothing has been written then.
         OutputError: The folder cannot be made.
     """
     settings = settings or ImportSettings()
@@ -222,7 +235,9 @@ def import_meshes(
     run_tasks(
         partial(import_mesh, settings=settings),
         todo,
-        lambda job, result, why: finish(result or ImportResult(job, "refused", f"no import: {why}")),
+        lambda job, result, why: finish(
+            result or ImportResult(job, "refused", f"no import: {why}")
+        ),
         jobs=workers,
         # A busy machine is no reason: processor time is limited, this only ends what hangs.
         limit_s=RUNS * HANG_S * settings.time_limit + OVERHEAD_S,

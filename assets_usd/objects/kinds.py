@@ -1,7 +1,10 @@
-"""Kinds of procedural objects: each draws the overlapping convex parts of one object, at most eight.
+"""Kinds of procedural objects.
 
-x points forward, y to the left, z up; units are arbitrary. A left-right mirror plane is welcome, as in real
-things. ``u(low, high)`` draws a number; the order of the draws is the shape of a seed: keep it.
+Each draws the overlapping convex parts of one object, at most eight.
+
+x points forward, y to the left, z up; units are arbitrary. A left-right mirror plane is welcome, as
+in real things. ``u(low, high)`` draws a number; the order of the draws is the shape of a seed: keep
+it.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -33,7 +36,9 @@ def car(u: Draw) -> Iterator[Hull]:
     yield box((0, 0, height / 2), (length, width, height), top=(0.95, 0.9))
     sill = height * 0.8
     yield prism(
-        [(back, sill), (front, sill), (front - 0.5, top), (back + 0.2, top)], -0.42 * width, 0.42 * width
+        [(back, sill), (front, sill), (front - 0.5, top), (back + 0.2, top)],
+        -0.42 * width,
+        0.42 * width,
     )
     yield box((-0.47 * length, 0, height + 0.35 * cabin), (0.3, width * u(0.7, 1.1), 0.5 * cabin))
     for x, side in product((-0.3 * length, 0.32 * length), SIDES):
@@ -63,7 +68,9 @@ def locomotive(u: Draw) -> Iterator[Hull]:
     yield cylinder((-0.2 * length, 0, 1.0), (front, 0, 1.0), radius)
     yield box((-front + cab / 2, 0, 1.15), (cab, 1.5, u(1.5, 2.0)))
     yield box((0, 0, 0.45), (length, 1.2, 0.35))
-    yield cylinder((front - 0.4, 0, 1.0), (front - 0.4, 0, 1.6 + radius), 0.16, u(0.16, 0.32), sides=8)
+    yield cylinder(
+        (front - 0.4, 0, 1.0), (front - 0.4, 0, 1.6 + radius), 0.16, u(0.16, 0.32), sides=8
+    )
     yield ellipsoid((u(-0.1, 0.1) * length, 0, 1.0 + radius), (0.3, 0.3, 0.35))
     yield prism([(front - 0.1, 0.1), (front + 0.5, 0.1), (front - 0.1, 0.7)], -0.5, 0.5)
     for x in (-0.28 * length, 0.25 * length):
@@ -92,7 +99,9 @@ def boat(u: Draw) -> Iterator[Hull]:
     deck = deck * (length / 2, width / 2)
     keel = deck * (0.8, 0.5)
     cabin, x = u(0.5, 0.8), u(-0.3, 0.0) * length
-    yield convex_hull(np.concatenate([np.insert(deck, 2, 0.6, axis=1), np.insert(keel, 2, 0.0, axis=1)]))
+    yield convex_hull(
+        np.concatenate([np.insert(deck, 2, 0.6, axis=1), np.insert(keel, 2, 0.0, axis=1)])
+    )
     yield box((x, 0, 0.55 + cabin / 2), (0.9, 0.7 * width, cabin), top=(0.8, 0.9))
     yield cylinder((x - 0.15, 0, 0.5 + cabin), (x - 0.3, 0, 0.9 + cabin), 0.2, 0.17, sides=10)
     yield rod((0.3 * length, 0, 0.5), (0.28 * length, 0, u(1.2, 1.7)), 0.09)
@@ -125,7 +134,9 @@ def bird(u: Draw) -> Iterator[Hull]:
     yield box((-body[0] - 0.2, 0, 0.15), (0.9, u(0.4, 0.8), 0.18), euler=(0, u(0.1, 0.5), 0))
     root = body[1] * 0.6
     for side in SIDES:
-        yield rod((0.2, side * root, 0.1), (-0.5, side * (root + wing * 0.7), 0.1 + lift), 0.28, 0.14)
+        yield rod(
+            (0.2, side * root, 0.1), (-0.5, side * (root + wing * 0.7), 0.1 + lift), 0.28, 0.14
+        )
     yield cylinder((0, 0, -0.3), (0.1, 0, -body[2] - u(0.2, 0.5)), 0.22, 0.4, sides=8)
 
 
@@ -138,12 +149,18 @@ def fish(u: Draw) -> Iterator[Hull]:
     for fin in (
         [(end + 0.3, -0.1), (end + 0.3, 0.15), (end - 0.6, u(0.7, 1.0)), (end - 0.2, 0.1)],
         [(end + 0.3, 0.1), (end + 0.3, -0.15), (end - u(0.2, 0.5), -0.6), (end - 0.1, 0.0)],
-        [(-0.5 * length, 0.5 * height), (0.3 * length, 0.6 * height), (-0.3 * length, height + u(0.3, 0.6))],
+        [
+            (-0.5 * length, 0.5 * height),
+            (0.3 * length, 0.6 * height),
+            (-0.3 * length, height + u(0.3, 0.6)),
+        ],
     ):
         yield prism(fin, -0.09, 0.09)
     droop = u(-0.5, 0.2)
     for side in SIDES:
-        yield rod((0.3, side * 0.5 * width, -0.2), (-0.2, side * (width + 0.5), -0.2 + droop), 0.2, 0.1)
+        yield rod(
+            (0.3, side * 0.5 * width, -0.2), (-0.2, side * (width + 0.5), -0.2 + droop), 0.2, 0.1
+        )
 
 
 def dinosaur(u: Draw) -> Iterator[Hull]:
@@ -190,7 +207,9 @@ def boot(u: Draw) -> Iterator[Hull]:
     yield box((0.15 * length, 0, 0.13), (0.3 * length, 0.7 * width, 0.3), top=(1.0, 1.1))
     yield rod((0.25 * length, 0, 0.7), (0.7 * length, 0, 0.6), 0.44 * width, 0.38 * width)
     yield ellipsoid((0.8 * length, 0, 0.55), (0.26 * length, 0.42 * width, u(0.28, 0.36)))
-    yield cylinder((ankle, 0, 0.4), (ankle + lean, 0, 0.4 + shaft), 0.4 * width, u(0.42, 0.52) * width)
+    yield cylinder(
+        (ankle, 0, 0.4), (ankle + lean, 0, 0.4 + shaft), 0.4 * width, u(0.42, 0.52) * width
+    )
     yield box((ankle + lean, 0, 0.3 + shaft), (1.1 * width, 1.1 * width, u(0.2, 0.4)))
 
 
@@ -198,7 +217,14 @@ def heel_shoe(u: Draw) -> Iterator[Hull]:
     """Sloped arch, sole, stiletto heel, toe box, counter."""
     length, width, lift = u(2.2, 2.7), u(0.7, 0.9), u(0.8, 1.3)
     ball = 0.65 * length
-    arch = [(0.0, lift), (0.6, lift), (ball, 0.1), (ball, 0.0), (0.5 * length, 0.0), (0.0, lift - 0.15)]
+    arch = [
+        (0.0, lift),
+        (0.6, lift),
+        (ball, 0.1),
+        (ball, 0.0),
+        (0.5 * length, 0.0),
+        (0.0, lift - 0.15),
+    ]
     yield prism(arch, -0.34 * width, 0.34 * width)
     yield prism(_sole(u, 0.55 * length, width) + vec(0.5 * length, 0.0), 0.0, 0.16, axis="z")
     yield rod((0.15, 0, lift - 0.1), (0.1, 0, 0.1), 0.2, 0.1)
@@ -247,7 +273,11 @@ def axe(u: Draw) -> Iterator[Hull]:
     yield rod((0, 0, 0.4), (0, 0, length), 0.17)
     yield rod((0, 0, 0.5), (u(0.2, 0.5), 0, 0), 0.19, 0.22)
     yield box((0, 0, length - 0.2), (0.7, 0.45, 0.55))
-    edge = [(blade + 0.3, length + 0.35), (blade + 0.4, length - 0.2), (blade + 0.2, length - u(0.8, 1.1))]
+    edge = [
+        (blade + 0.3, length + 0.35),
+        (blade + 0.4, length - 0.2),
+        (blade + 0.2, length - u(0.8, 1.1)),
+    ]
     yield prism([(0.2, length - 0.45), (0.2, length), *edge], -0.14, 0.14)
     yield cylinder((-0.25, 0, length - 0.2), (-u(0.6, 1.0), 0, length - 0.2), 0.24, 0.1, sides=8)
 
@@ -355,7 +385,9 @@ def mug(u: Draw) -> Iterator[Hull]:
     bottom = [(0.95 * radius * np.cos(t), 0.95 * radius * np.sin(t)) for t in angles[:5]]
     yield prism(bottom, 0.0, 1.4 * wall, axis="z")
     for start, end in pairwise(angles):
-        outline = [(r * np.cos(t), r * np.sin(t)) for r in (radius, radius - wall) for t in (start, end)]
+        outline = [
+            (r * np.cos(t), r * np.sin(t)) for r in (radius, radius - wall) for t in (start, end)
+        ]
         yield prism(outline, 0.0, height, axis="z")
     reach, low, high = u(0.5, 0.8), 0.2 * height, u(0.7, 0.9) * height
     corner = (-radius - reach, 0.0, u(0.4, 0.6) * height)
@@ -390,7 +422,10 @@ def robot(u: Draw) -> Iterator[Hull]:
     for side in SIDES:
         shoulder, swing = vec(0.0, side * width * 0.55, height - 0.15), u(-0.9, 2.2)
         yield rod(
-            shoulder, shoulder + vec(np.sin(swing), 0.3 * side, -np.cos(swing)) * u(0.8, 1.0), 0.2, 0.16
+            shoulder,
+            shoulder + vec(np.sin(swing), 0.3 * side, -np.cos(swing)) * u(0.8, 1.0),
+            0.2,
+            0.16,
         )
         step = u(-0.35, 0.35)
         foot = (step, side * 0.3 * width, -u(0.8, 1.0))
@@ -405,7 +440,9 @@ def camera(u: Draw) -> Iterator[Hull]:
     yield box((0, 0, 0), (depth, width, height))
     yield cylinder((0, offset, 0), (reach, offset, 0), lens)
     yield cylinder((reach - 0.1, offset, 0), (reach + 0.3, offset, 0), lens, 1.2 * lens)
-    yield rod((0.25, width / 2 - 0.15, -0.3 * height), (0.25, width / 2 - 0.15, 0.35 * height), 0.26)
+    yield rod(
+        (0.25, width / 2 - 0.15, -0.3 * height), (0.25, width / 2 - 0.15, 0.35 * height), 0.26
+    )
     yield box((0, offset, height / 2 + 0.1), (0.9 * depth, 0.6, 0.45), top=(0.8, 0.6))
     yield cylinder((0, dial, 0.4 * height), (0, dial, height / 2 + 0.2), 0.2, sides=10)
 

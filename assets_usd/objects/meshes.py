@@ -12,32 +12,33 @@ LONGEST_SIDE_M = (0.095, 0.165)
 """Range of an object's longest side: the objects of the paper."""
 
 MEAN_WIDTH_M = 0.13
-"""Most of the mean width, the side of the bounding box averaged over all its orientations (our choice).
+"""Most of the mean width, the side of the bounding box averaged over all its orientations (our
+choice).
 
-What is wider starts wedged between the fingers and stays there: of seven such objects (14.5 cm and more)
-a policy brought 22 % to their goals, of the others 92 %.
+What is wider starts wedged between the fingers and stays there: of seven such objects (14.5 cm and
+more) a policy brought 22 % to their goals, of the others 92 %.
 """
 
 THINNEST_M = 0.025
 """Least of the shortest side, as far as the other bounds let it be (our choice).
 
-What is thinner lies flat on the table, where no finger gets under it: of eight such objects the same policy
-brought 49 % to their goals.
+What is thinner lies flat on the table, where no finger gets under it: of eight such objects the
+same policy brought 49 % to their goals.
 """
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 """Units a mesh may be in."""
 
 GUESSED_UNITS = ("m", "mm", "cm")
-"""Units that are tried where none is known; the first that needs the least rescaling is taken. An inch is too
-near to others to be guessed."""
+"""Units that are tried where none is known; the first that needs the least rescaling is taken. An
+inch is too near to others to be guessed."""
 
 
 def mean_width(vertices: np.ndarray) -> float:
     """Mean distance of two parallel planes that enclose points, over all directions.
 
-    It is the integral of the mean curvature of their convex hull over 2 pi: 2 r of a sphere, half of the
-    sum of its sides for a box.
+    It is the integral of the mean curvature of their convex hull over 2 pi: 2 r of a sphere, half
+    of the sum of its sides for a box.
 
     Args:
         vertices: Points in any unit and frame, not all in a plane [V, 3].
@@ -51,8 +52,9 @@ def mean_width(vertices: np.ndarray) -> float:
 def scales_that_fit(sides: Sequence[float], width: float) -> tuple[float, float]:
     """Least and largest factor to metres by which a shape fits the hand.
 
-    Its longest side is then in ``LONGEST_SIDE_M``, its mean width at most ``MEAN_WIDTH_M`` and its shortest
-    side at least ``THINNEST_M``. A shape that fits at no size has a least factor above the largest.
+    Its longest side is then in ``LONGEST_SIDE_M``, its mean width at most ``MEAN_WIDTH_M`` and its
+    shortest side at least ``THINNEST_M``. A shape that fits at no size has a least factor above the
+    largest.
 
     Args:
         sides: Sides of the bounding box in the shape's units, in any order, none of them 0 [3].
@@ -66,7 +68,10 @@ def scales_that_fit(sides: Sequence[float], width: float) -> tuple[float, float]
 def scale_of(
     settings: ImportSettings, vertices: np.ndarray, declared: float | None
 ) -> tuple[float, list[str], list[str]]:
-    """Factor to metres for vertices [V, 3] in a file's unit (``declared``, m); notes and warnings."""
+    """Factor to metres for vertices [V, 3] in a file's unit (``declared``, m).
+
+    Notes and warnings.
+    """
     sides, width = np.ptp(vertices, axis=0), mean_width(vertices)
     unit = UNITS_M.get(settings.units, declared)
     if not settings.keep_size or unit is None:
@@ -74,8 +79,10 @@ def scale_of(
         return factor, [note] if note else [], []
     size, (least, most) = f"{sides.max() * unit:.3f} m", scales_that_fit(sides, width)
     misfit = (
-        f"does not fit the hand at its real size of {size}, mean width {width * unit:.3f} m: longest side "
-        f"{LONGEST_SIDE_M[0]:g} to {LONGEST_SIDE_M[1]:g} m, mean width at most {MEAN_WIDTH_M:g} m, shortest "
+        f"does not fit the hand at its real size of {size}, mean width {width * unit:.3f} m: "
+        f"longest side "
+        f"{LONGEST_SIDE_M[0]:g} to {LONGEST_SIDE_M[1]:g} m, mean width at most {MEAN_WIDTH_M:g} m, "
+        f"shortest "
         f"side at least {THINNEST_M:g} m"
     )
     notes = [f"taken as {unit_name(unit)}, real size kept: {size}"]
@@ -107,14 +114,17 @@ def unit_name(unit: float) -> str:
     return next((name for name, metres in UNITS_M.items() if metres == unit), f"{unit:g} m")
 
 
-def choose_scale(sides: Sequence[float], width: float, unit: float | None = None) -> tuple[float, str]:
+def choose_scale(
+    sides: Sequence[float], width: float, unit: float | None = None
+) -> tuple[float, str]:
     """Factor from a mesh's units to metres, so that it fits the hand.
 
-    The paper scales each mesh by hand, "to a proper size compared to the robot hand size", with its longest
-    side in ``LONGEST_SIDE_M`` (supplementary text on objects). Here a mesh stays as it is where that holds,
-    its mean width is at most ``MEAN_WIDTH_M`` and its shortest side at least ``THINNEST_M``; otherwise it is
-    scaled as little as possible. The range of the longest side is kept first, thickness gives way first. A
-    unit that is not known is the one of ``GUESSED_UNITS`` that needs the least rescaling.
+    The paper scales each mesh by hand, "to a proper size compared to the robot hand size", with its
+    longest side in ``LONGEST_SIDE_M`` (supplementary text on objects). Here a mesh stays as it is
+    where that holds, its mean width is at most ``MEAN_WIDTH_M`` and its shortest side at least
+    ``THINNEST_M``; otherwise it is scaled as little as possible. The range of the longest side is
+    kept first, thickness gives way first. A unit that is not known is the one of ``GUESSED_UNITS``
+    that needs the least rescaling.
 
     Args:
         sides: Sides of the bounding box in the mesh's units, in any order, none of them 0 [3].

@@ -9,7 +9,8 @@ Layout of a file (metres, kilograms, z up; the origin is the centre of mass)::
       material           physics material (nominal friction)
 
 Everything that is not geometry or physics (licence, source, errors, symmetries) is custom data of
-the root prim under ``visualDexterity``. Files are binary crates (``.usd``): 150 objects are a few MB.
+the root prim under ``visualDexterity``. Files are binary crates (``.usd``): 150 objects are a few
+MB.
 """
 
 import os
@@ -70,7 +71,8 @@ class ObjectModel:
         inertia: Principal moments about the centre of mass, [3], kg m^2.
         inertia_quat: Principal frame in the object frame, quaternion xyzw, [4].
         surface_points: Even samples of the surface, [500, 3] float32.
-        symmetry: Rotations that map the object to itself, quaternions xyzw [K, 4]; the identity first.
+        symmetry: Rotations that map the object to itself, quaternions xyzw [K, 4]; the identity
+            first.
         licence: Licence of the shape.
         source: Where the shape comes from.
         file: Mesh file it was imported from, absolute; empty if it was authored.
@@ -121,12 +123,17 @@ class ObjectModel:
         return float(np.ptp(self.vertices, axis=0).max())
 
     def fitted(self, sides: tuple[float, float]) -> "ObjectModel":
-        """The object, scaled as little as gives its longest side one of these lengths [m]; its mass stays."""
+        """The object, scaled as little as gives its longest side one of these lengths [m].
+
+        Its mass stays.
+        """
         factor = float(np.clip(self.longest_side, *sides)) / self.longest_side
         return replace(
             self,
             vertices=self.vertices * np.float32(factor),
-            hulls=tuple(hull._replace(vertices=hull.vertices * np.float32(factor)) for hull in self.hulls),
+            hulls=tuple(
+                hull._replace(vertices=hull.vertices * np.float32(factor)) for hull in self.hulls
+            ),
             inertia=self.inertia * factor**2,
             surface_points=self.surface_points * np.float32(factor),
             centre_of_mass=tuple(factor * c for c in self.centre_of_mass),
@@ -233,7 +240,9 @@ def write_object(path: Path, model: ObjectModel) -> Path:
         collision.CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
         UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material, materialPurpose="physics")
     points = UsdGeom.Points.Define(stage, f"{root}/surface_points")
-    points.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(model.surface_points, np.float32)))
+    points.CreatePointsAttr(
+        Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(model.surface_points, np.float32))
+    )
     points.CreatePurposeAttr(UsdGeom.Tokens.guide)
     prim.SetCustomDataByKey(
         _CUSTOM,
@@ -293,7 +302,10 @@ def is_object(stage: Any) -> bool:
 
 
 def stored_facts(path: Path) -> dict[str, Any]:
-    """Custom data of an object file of any version, by names in camel case; empty of any other file."""
+    """Custom data of an object file of any version, by names in camel case.
+
+    Empty of any other file.
+    """
     return _custom(_layer(path))
 
 
@@ -315,13 +327,16 @@ def read_object(path: Path) -> ObjectModel:
     layer = _layer(path)
     if layer is None:
         raise ObjectError(
-            f"{path}: not a USD file, or a damaged one; remove it, and import or author the object again"
+            f"{path}: not a USD file, or a damaged one; remove it, and import or author the object "
+            f"again"
         )
     data = _custom(layer)
     if data.get("formatVersion") != FORMAT_VERSION:
         raise ObjectError(
-            f"{path}: formatVersion is {data.get('formatVersion')}, this version reads {FORMAT_VERSION}; "
-            "write it again with vd-assets import or vd-assets objects; a hand's layer goes to --hand-layer"
+            f"{path}: formatVersion is {data.get('formatVersion')}, this version reads "
+            f"{FORMAT_VERSION}; "
+            "write it again with vd-assets import or vd-assets objects; a hand's layer goes to "
+            "--hand-layer"
         )
     stage = Usd.Stage.Open(layer)
     prim = stage.GetDefaultPrim()
@@ -344,7 +359,10 @@ def read_object(path: Path) -> ObjectModel:
         if child.HasAPI(UsdPhysics.CollisionAPI) and child.IsA(UsdGeom.Mesh):
             name = f"collision/{child.GetName()}"
             hulls.append(
-                Hull(array(name, "points", 3, np.float32), array(name, "faceVertexIndices", 3, np.int32))
+                Hull(
+                    array(name, "points", 3, np.float32),
+                    array(name, "faceVertexIndices", 3, np.int32),
+                )
             )
     if not hulls:
         raise ObjectError(f"{path}: collision has no hull; import the object again")
@@ -390,7 +408,8 @@ def write_contact_layer(path: Path, item_file: Path, found: Identified, recordin
     layer.defaultPrim = item.name
     layer.subLayerPaths.append(os.path.relpath(item_file.resolve(), path.resolve().parent))
     layer.documentation = (
-        f"Contact of {item.name}, identified by vd-gap contact from {recording}: pass it as --objects."
+        f"Contact of {item.name}, identified by vd-gap contact from {recording}: "
+        "pass it as --objects."
     )
     layer.customLayerData = {"format": LAYER_FORMAT, "recording": recording}
     prim = Sdf.PrimSpec(layer, item.name, Sdf.SpecifierOver)
@@ -409,4 +428,6 @@ def write_contact_layer(path: Path, item_file: Path, found: Identified, recordin
 
 def object_files(folder: Path) -> list[Path]:
     """The object files of a set's folder, sorted by name."""
-    return sorted(p for p in Path(folder).iterdir() if p.suffix in SUFFIXES and not p.name.startswith("."))
+    return sorted(
+        p for p in Path(folder).iterdir() if p.suffix in SUFFIXES and not p.name.startswith(".")
+    )

@@ -21,8 +21,10 @@ GENERIC_WORDS = frozenset(
         scan scene simple simplified stl textured tsdf untitled usd visual watertight""",
     )
 )
-"""Words that say what kind of file something is, not of what thing. Data sets have a folder for each object
-and call the files alike (``003_cracker_box/google_16k/textured.obj``, ``Mug/meshes/model.obj``)."""
+"""Words that say what kind of file something is, not of what thing. Data sets have a folder for
+each object and call the files alike (``003_cracker_box/google_16k/textured.obj``,
+``Mug/meshes/model.obj``).
+"""
 
 CLASHES_SHOWN = 3
 """Files with one name that an error shows."""
@@ -62,12 +64,17 @@ def says_nothing(word: str) -> bool:
 
 
 def absolute(path: Path) -> Path:
-    """The path without links to folders. A file keeps its name: downloads are links to nameless files."""
+    """The path without links to folders.
+
+    A file keeps its name: downloads are links to nameless files.
+    """
     return path.resolve() if path.is_dir() else path.parent.resolve() / path.name
 
 
 def object_name(path: Path) -> str:
-    """Name of the object in a mesh file: its stem, or the nearest folder above it that says something.
+    """Name of the object in a mesh file.
+
+    Its stem, or the nearest folder above it that says something.
 
     It depends on the file's path alone, so that it stays the same whatever else is imported.
     """
@@ -79,8 +86,9 @@ def object_name(path: Path) -> str:
 def find_meshes(paths: Iterable[Path]) -> list[Path]:
     """Mesh files among files and folders (searched in depth), each once, in a fixed order, absolute.
 
-    A file that was named is kept whatever it is, so that it is refused by name. In a folder files count that
-    have a mesh's suffix. Left out are what is hidden, our own objects, and parts of a USD that is found too.
+    A file that was named is kept whatever it is, so that it is refused by name. In a folder files
+    count that have a mesh's suffix. Left out are what is hidden, our own objects, and parts of a
+    USD that is found too.
 
     Raises:
         MeshError: A path does not exist, or nothing was found.
@@ -96,7 +104,8 @@ def find_meshes(paths: Iterable[Path]) -> list[Path]:
             raise MeshError(f"{path}: no such file or folder")
     if not found:
         raise MeshError(
-            f"no mesh in {', '.join(map(str, paths))}; supported: {', '.join(MESH_SUFFIXES)}; to be told "
+            f"no mesh in {', '.join(map(str, paths))}; supported: {', '.join(MESH_SUFFIXES)}; to "
+            f"be told "
             "what is wrong with a file, name it"
         )
     return list(dict.fromkeys(map(absolute, found)))
@@ -129,8 +138,8 @@ def _parts_of_usd(path: Path) -> set[Path]:
 def read_sidecar(folder: Path) -> dict[str, dict[str, str]]:
     """Rows by name of the ``objects.csv`` in a folder or its parent; empty where there is none.
 
-    Columns: ``name`` and ``source``; optionally ``licence`` and ``split``. Without a licence column,
-    the licence is what stands in brackets in the source.
+    Columns: ``name`` and ``source``; optionally ``licence`` and ``split``. Without a licence
+    column, the licence is what stands in brackets in the source.
     """
     for table in (folder / "objects.csv", folder.parent / "objects.csv"):
         if table.is_file():
@@ -153,7 +162,9 @@ def plan_jobs(meshes: Iterable[Path], out: Path, licence: str) -> list[Job]:
         if other != mesh:
             clashes.append(f"  {object_name(mesh)}: {other} and {mesh}")
     if clashes:
-        more = f"\n  and {len(clashes) - CLASHES_SHOWN} more" if len(clashes) > CLASHES_SHOWN else ""
+        more = (
+            f"\n  and {len(clashes) - CLASHES_SHOWN} more" if len(clashes) > CLASHES_SHOWN else ""
+        )
         raise MeshError(
             "two meshes would have one name in the set:\n"
             + "\n".join(clashes[:CLASHES_SHOWN])
@@ -191,7 +202,8 @@ def check_target(job: Job) -> None:
     facts = stored_facts(target)
     if not facts:
         raise MeshError(
-            f"{target} is there and no object of vd-assets, or a damaged one; remove it, or import into "
+            f"{target} is there and no object of vd-assets, or a damaged one; remove it, or import "
+            f"into "
             "another folder (--out)"
         )
     source, file = str(facts.get("source", "")), str(facts.get("file", ""))
@@ -207,7 +219,9 @@ def check_target(job: Job) -> None:
 
 
 def default_set(paths: Sequence[Path]) -> Path:
-    """Folder in the asset cache for the objects of these paths: named after the folder that holds them all.
+    """Folder in the asset cache for the objects of these paths.
+
+    Named after the folder that holds them all.
 
     Raises:
         MeshError: The name is that of a built-in set, or the set holds objects from elsewhere.

@@ -35,7 +35,9 @@ def _unit_sphere() -> np.ndarray:
     """The 12 vertices of an icosahedron and the 20 of its dual, on the unit sphere, [32, 3]."""
     points = [np.roll([0.0, i, j * GOLDEN], k) for i, j, k in product((-1, 1), (-1, 1), range(3))]
     points += [np.array(corner, dtype=float) for corner in product((-1, 1), repeat=3)]
-    points += [np.roll([0.0, i * GOLDEN, j / GOLDEN], k) for i, j, k in product((-1, 1), (-1, 1), range(3))]
+    points += [
+        np.roll([0.0, i * GOLDEN, j / GOLDEN], k) for i, j, k in product((-1, 1), (-1, 1), range(3))
+    ]
     sphere = np.array(points)
     return sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
 
@@ -81,7 +83,10 @@ def rod(start: Vector, end: Vector, radius: float, end_radius: float | None = No
     a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     axis, u, v = _frame(a, b)
     points = []
-    for centre, out, r in ((a, -axis, radius), (b, axis, radius if end_radius is None else end_radius)):
+    for centre, out, r in (
+        (a, -axis, radius),
+        (b, axis, radius if end_radius is None else end_radius),
+    ):
         ring = _ring(u, v, 8)
         cap = (_ring(u, v, 6, 0.3) + out) / 2.0**0.5
         points += [centre + r * ring, centre + r * cap, (centre + r * out)[None]]
@@ -96,7 +101,9 @@ def cylinder(
     _, u, v = _frame(a, b)
     ring = _ring(u, v, sides)
     return convex_hull(
-        np.concatenate([a + radius * ring, b + (radius if end_radius is None else end_radius) * ring])
+        np.concatenate(
+            [a + radius * ring, b + (radius if end_radius is None else end_radius) * ring]
+        )
     )
 
 

@@ -40,7 +40,9 @@ CUBOID_SIDES_M = (0.05, 0.07, 0.10)
 MAX_PARTS = 8
 
 MIN_ASYMMETRY = 0.012
-"""Least asymmetry (see :func:`asymmetry`) of a training object: 1.5 mm of mean surface distance at 12 cm."""
+"""Least asymmetry (see :func:`asymmetry`) of a training object: 1.5 mm of mean surface distance at
+12 cm.
+"""
 
 STRETCH, SHEAR = 0.35, 0.25
 """Spread of the random stretch of each axis (log scale) and of the shear of x by z: one kind then
@@ -66,7 +68,9 @@ def candidate_rotations(inertia: np.ndarray) -> np.ndarray:
     moments, quat = principal_axes(inertia)
     axes = Rotation.from_quat(quat).as_matrix().T
     angles = sorted({2.0 * np.pi * j / k for k in CANDIDATE_FOLDS for j in range(1, k // 2 + 1)})
-    rotations = [Rotation.from_rotvec(angle * axis).as_matrix() for axis in axes for angle in angles]
+    rotations = [
+        Rotation.from_rotvec(angle * axis).as_matrix() for axis in axes for angle in angles
+    ]
     if moments[2] < 1.1 * moments[0]:
         grid = Rotation.random(600, rng=np.random.default_rng(0))
         rotations += list(grid[grid.magnitude() > np.pi / 4].as_matrix())
@@ -89,7 +93,10 @@ def asymmetry(model: ObjectModel) -> float:
 
 
 def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of all parts, without those wholly inside another part: vertices [V, 3], faces [T, 3]."""
+    """Triangles of all parts, without those wholly inside another part.
+
+    Vertices [V, 3], faces [T, 3].
+    """
     vertices, faces = [], []
     for i, hull in enumerate(hulls):
         inside = np.zeros(len(hull.faces), dtype=bool)
@@ -141,8 +148,8 @@ def model_of_parts(
 def draw_object(name: str, make: Kind, seed: Sequence[int], **fields: Any) -> ObjectModel:
     """One object of a kind: the first draw that is one piece, fits the hand and has no rotational symmetry.
 
-    Its longest side is uniform in ``LONGEST_SIDE_M``, as far as the object fits the hand at that size
-    (:func:`.meshes.scales_that_fit`). What fits at none is drawn again.
+    Its longest side is uniform in ``LONGEST_SIDE_M``, as far as the object fits the hand at that
+    size (:func:`.meshes.scales_that_fit`). What fits at none is drawn again.
 
     Args:
         name: Object name.

@@ -17,8 +17,14 @@ HEAD_BYTES = 65536
 """Bytes in which a file says what it is."""
 
 _FOREIGN = (
-    (rb"version https://git-lfs", "a Git LFS pointer, not the mesh itself; fetch the mesh with git lfs pull"),
-    (rb"\s*(<!doctype html|<html)", "a web page, not a mesh: the download failed; download it again"),
+    (
+        rb"version https://git-lfs",
+        "a Git LFS pointer, not the mesh itself; fetch the mesh with git lfs pull",
+    ),
+    (
+        rb"\s*(<!doctype html|<html)",
+        "a web page, not a mesh: the download failed; download it again",
+    ),
     (rb"\x1f\x8b|BZh|\xfd7zXZ|\x28\xb5\x2f\xfd|7z\xbc\xaf|Rar!", "an archive; unpack it"),
 )
 """Beginnings of what has the name of a mesh and is none, and what to do with it."""
@@ -28,7 +34,8 @@ def mesh_kind(path: Path) -> str:
     """Kind of a mesh file: ``obj``, ``stl``, ``ply``, ``glb`` or ``usd``.
 
     Raises:
-        MeshError: The file is missing or empty, or something else, which the message names with a remedy.
+        MeshError: The file is missing or empty, or something else, which the message names with a
+            remedy.
     """
     path = Path(path)
     if not path.is_file():
@@ -43,7 +50,8 @@ def mesh_kind(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise MeshError(
-            f"unsupported type {suffix or '(no suffix)'}; use {', '.join(MESH_SUFFIXES)}: export a CAD or "
+            f"unsupported type {suffix or '(no suffix)'}; use {', '.join(MESH_SUFFIXES)}: export a "
+            f"CAD or "
             "scene file from the program that made it, and unpack an archive"
         )
     return suffix[1:4]  # usdz is a usd
@@ -64,12 +72,15 @@ def load_mesh(path: Path) -> Any:
     """Load a mesh file as one ``trimesh.Trimesh`` in the file's unit, unprocessed.
 
     Raises:
-        MeshError: Unsupported, unreadable, empty or cut short, without faces, or with non-finite vertices.
+        MeshError: Unsupported, unreadable, empty or cut short, without faces, or with non-finite
+            vertices.
     """
     mesh = load_points(path)
     if not len(mesh.faces):
         points = f"{len(mesh.vertices)} points and " if len(mesh.vertices) else ""
-        raise MeshError(f"not a mesh, or cut short: {points}no faces; get it again, or export it again")
+        raise MeshError(
+            f"not a mesh, or cut short: {points}no faces; get it again, or export it again"
+        )
     return mesh
 
 
@@ -95,7 +106,11 @@ def load_points(path: Path) -> Any:
 
 def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
     with path.open("rb") as stream:  # of a text of points fewer would be read without a word
-        said = re.search(rb"element\s+face\s+(\d+)", stream.read(HEAD_BYTES)) if kind == "ply" else None
+        said = (
+            re.search(rb"element\s+face\s+(\d+)", stream.read(HEAD_BYTES))
+            if kind == "ply"
+            else None
+        )
     try:
         # Textures and materials are not needed, and missing ones must not stop the import.
         loaded = trimesh.load(path, file_type=kind, process=False, skip_materials=True)
@@ -106,7 +121,8 @@ def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
         raise MeshError(f"neither mesh nor points: {type(error).__name__}: {error}") from error
     if said and len(faces) < int(said.group(1)):
         raise MeshError(
-            f"declares {int(said.group(1))} faces, of which {len(faces)} could be read: cut short or "
+            f"declares {int(said.group(1))} faces, of which {len(faces)} could be read: cut short "
+            f"or "
             "damaged; get it again, or export it again"
         )
     return vertices, faces
@@ -142,7 +158,9 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise MeshError(
             f"damaged: line {where} names vertex {furthest + 1} of {len(vertices)}; export it again"
         )
-    return np.array(vertices, dtype=float).reshape(-1, 3), np.array(faces, dtype=np.int64).reshape(-1, 3)
+    return np.array(vertices, dtype=float).reshape(-1, 3), np.array(faces, dtype=np.int64).reshape(
+        -1, 3
+    )
 
 
 def _corner(text: bytes, count: int) -> int:

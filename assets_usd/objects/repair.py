@@ -1,4 +1,7 @@
-"""What of a mesh is the object: strays and other bodies taken off, seams and holes closed, cavities found."""
+"""What of a mesh is the object.
+
+Strays and other bodies taken off, seams and holes closed, cavities found.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,25 +25,30 @@ CONVEX = 0.99
 """A closed piece that fills this share of its convex hull is taken as convex."""
 
 STRAY_AREA, STRAY_VOLUME = 0.01, 1e-3
-"""A piece with less of the surface, which encloses nothing or less of the volume, is a stray: scans have
-single triangles inside and beside them."""
+"""A piece with less of the surface, which encloses nothing or less of the volume, is a stray: scans
+have single triangles inside and beside them."""
 
 STRAYS_AREA = 0.05
 """Strays with more of the surface together are the surface itself, in pieces that do not join."""
 
 APART = 0.02
-"""Pieces whose boxes are farther from each other than this share of the longest side are apart: 2 mm of
-10 cm. Models put together from pieces touch or overlap."""
+"""Pieces whose boxes are farther from each other than this share of the longest side are apart: 2
+mm of 10 cm. Models put together from pieces touch or overlap."""
 
 MOST_PIECES = 5000
 """A surface of more pieces is torn, and no collection of bodies."""
 
 OTHER_BODIES = 0.05
-"""Bodies apart that hold less than this share of the volume are debris and are left out. With more there are
-several objects: which of them is meant cannot be known, and one rigid body cannot stand for them."""
+"""Bodies apart that hold less than this share of the volume are debris and are left out. With more
+there are
+several objects: which of them is meant cannot be known, and one rigid body cannot stand for
+them.
+"""
 
 FILLED_AREA = 0.1
-"""Holes are filled up to this share of the surface. A larger opening may be meant: a cup has one of 14 %."""
+"""Holes are filled up to this share of the surface. A larger opening may be meant: a cup has one of
+14 %.
+"""
 
 INSIDE_SAMPLES = 64
 """Corners of a piece, about, by which it is told that it lies in another."""
@@ -89,8 +97,9 @@ class RepairedMesh:
 def repair_mesh(mesh: Any) -> RepairedMesh:
     """Find the object in a mesh and close it.
 
-    Merges vertices, drops degenerate and duplicate faces, opens seams at which surfaces only touch, drops
-    strays and debris, fills small holes, turns the pieces outward and tells cavities from solids.
+    Merges vertices, drops degenerate and duplicate faces, opens seams at which surfaces only touch,
+    drops strays and debris, fills small holes, turns the pieces outward and tells cavities from
+    solids.
 
     Args:
         mesh: A ``trimesh.Trimesh`` in any unit.
@@ -107,7 +116,8 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
     mesh.remove_unreferenced_vertices()
     if not len(mesh.faces):
         raise MeshError(
-            f"degenerate: all {before} faces have no area; a GLB is to be exported without compression"
+            f"degenerate: all {before} faces have no area; a GLB is to be exported without "
+            f"compression"
         )
     if len(mesh.faces) < before:
         notes.append(f"removed {before - len(mesh.faces)} degenerate or duplicate faces")
@@ -115,7 +125,8 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
     sides = sides_along_axes(mesh.vertices)
     if sides.min() < SLIVER_THICKNESS * sides.max():
         raise MeshError(
-            f"degenerate: flat ({sides.min():.3g} thick for {sides.max():.3g} long); contacts need at "
+            f"degenerate: flat ({sides.min():.3g} thick for {sides.max():.3g} long); contacts need "
+            f"at "
             f"least {100 * SLIVER_THICKNESS:g} % of the length: give it thickness"
         )
     if not mesh.is_winding_consistent:
@@ -139,9 +150,12 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
 
 
 def _opened_seams(mesh: Any) -> Any:
-    """The mesh with edges of more than two faces opened: each sheet of faces gets vertices of its own.
+    """The mesh with edges of more than two faces opened.
 
-    Surfaces that only touch along an edge are closed, yet no manifold; apart from each other they are.
+    Each sheet of faces gets vertices of its own.
+
+    Surfaces that only touch along an edge are closed, yet no manifold; apart from each other they
+    are.
     """
     count = np.bincount(mesh.edges_unique_inverse)
     if count.max() <= 2:
@@ -157,7 +171,9 @@ def _opened_seams(mesh: Any) -> Any:
         vertex = faces[face[:, 0], first[:, 0]]
         other = np.argmax(faces[face[:, 1]] == vertex[:, None], axis=1)
         links.append(np.stack([3 * face[:, 0] + first[:, 0], 3 * face[:, 1] + other]))
-    corner = trimesh.graph.connected_component_labels(np.concatenate(links, axis=1).T, node_count=faces.size)
+    corner = trimesh.graph.connected_component_labels(
+        np.concatenate(links, axis=1).T, node_count=faces.size
+    )
     vertices = np.zeros((corner.max() + 1, 3))
     vertices[corner] = mesh.vertices[faces.ravel()]
     return trimesh.Trimesh(vertices, corner.reshape(-1, 3), process=False)
@@ -165,7 +181,9 @@ def _opened_seams(mesh: Any) -> Any:
 
 def _pieces(mesh: Any) -> tuple[np.ndarray, list[Any]]:
     """Piece of each face [T], and the connected pieces; a torn surface counts as one."""
-    of_face = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    of_face = trimesh.graph.connected_component_labels(
+        mesh.face_adjacency, node_count=len(mesh.faces)
+    )
     if of_face.max() >= MOST_PIECES:
         return np.zeros_like(of_face), [mesh]
     return of_face, mesh.split(only_watertight=False, repair=False)
@@ -213,15 +231,20 @@ def _largest_body(mesh: Any, warnings: list[str]) -> Any:
     low, high = np.stack([piece.bounds for piece in pieces], axis=1)
     high = high + APART * mesh.extents.max()
     near = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
-    of_face = trimesh.graph.connected_component_labels(np.argwhere(near), node_count=len(pieces))[of_face]
+    of_face = trimesh.graph.connected_component_labels(np.argwhere(near), node_count=len(pieces))[
+        of_face
+    ]
     number = of_face.max() + 1
     if number == 1:
         return mesh
-    volume = np.array([hull_volume(mesh.triangles[of_face == k].reshape(-1, 3)) for k in range(number)])
+    volume = np.array(
+        [hull_volume(mesh.triangles[of_face == k].reshape(-1, 3)) for k in range(number)]
+    )
     share = 1.0 - volume.max() / max(volume.sum(), 1e-300)
     if share > OTHER_BODIES:
         raise MeshError(
-            f"{number} bodies apart from each other, of which the largest has {100 * (1 - share):.0f} % of "
+            f"{number} bodies apart from each other, of which the largest has "
+            f"{100 * (1 - share):.0f} % of "
             "the volume: an object is one rigid body; import each alone, or join them"
         )
     warnings.append(
@@ -233,7 +256,10 @@ def _largest_body(mesh: Any, warnings: list[str]) -> Any:
 
 
 def _containers(pieces: list[Any], volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The largest and the smallest closed piece in which each lies wholly, [P] each; itself if in none."""
+    """The largest and the smallest closed piece in which each lies wholly, [P] each.
+
+    Itself if in none.
+    """
     largest, smallest = np.arange(len(pieces)), np.arange(len(pieces))
     low, high = np.stack([piece.bounds for piece in pieces], axis=1)
     for outer in np.argsort(np.abs(volume))[::-1]:
@@ -241,7 +267,9 @@ def _containers(pieces: list[Any], volume: np.ndarray) -> tuple[np.ndarray, np.n
             break
         faces = pieces[outer].faces
         surface = faces if volume[outer] > 0.0 else faces[:, ::-1]
-        for inner in np.flatnonzero((low > low[outer]).all(axis=1) & (high < high[outer]).all(axis=1)):
+        for inner in np.flatnonzero(
+            (low > low[outer]).all(axis=1) & (high < high[outer]).all(axis=1)
+        ):
             corners = pieces[inner].vertices
             some = corners[:: max(1, len(corners) // INSIDE_SAMPLES)]
             if inside(pieces[outer].vertices, surface, some).all():
@@ -283,8 +311,8 @@ def _turned_outward(
 ) -> tuple[Any, tuple[Hull, ...], np.ndarray]:
     """The outer surface with its closed pieces wound outward, its convex pieces, and the cavities' faces.
 
-    A closed piece in another is a cavity if it is wound the other way round, and else inside of the solid.
-    What is in a cavity is solid again.
+    A closed piece in another is a cavity if it is wound the other way round, and else inside of the
+    solid. What is in a cavity is solid again.
     """
     of_face, pieces = _pieces(mesh)
     volume = _volumes(pieces)
@@ -298,19 +326,23 @@ def _turned_outward(
     hollow = -(volume * np.sign(volume[largest]))[border].sum()
     if hollow > CAVITY * whole:
         warnings.append(
-            f"has a closed cavity of {100 * hollow / whole:.0f} % of its volume: mass and inertia are "
+            f"has a closed cavity of {100 * hollow / whole:.0f} % of its volume: mass and inertia "
+            f"are "
             "those of the hollow body, its convex parts are full"
         )
     if np.abs(volume[within & ~border]).sum() > CAVITY * whole:
         warnings.append(
-            "a closed surface inside of another is wound like it, and taken as solid: if it is a cavity, "
+            "a closed surface inside of another is wound like it, and taken as solid: if it is a "
+            "cavity, "
             "turn its faces round"
         )
     kept = trimesh.Trimesh(mesh.vertices, faces[~within[of_face]], process=False)
     kept.remove_unreferenced_vertices()
     hulls = _convex_hulls([piece for piece, inner in zip(pieces, within, strict=True) if not inner])
     if hulls:
-        notes.append(f"{len(hulls)} convex piece{'s' if len(hulls) > 1 else ''}: nothing to decompose")
+        notes.append(
+            f"{len(hulls)} convex piece{'s' if len(hulls) > 1 else ''}: nothing to decompose"
+        )
     return kept, hulls, faces[border[of_face]]
 
 

@@ -20,8 +20,8 @@ WIDTH_NEIGHBOURS = 12
 """What is nearer to a sample than the mean distance of so many neighbours is not told apart.
 8 found as many training objects by their scans, and is coarser where points are many and exact."""
 LOOSENESS = 3.0
-"""How much the surface may miss single samples, for the square of their noise as a share of that width.
-Half and twice of it found as many."""
+"""How much the surface may miss single samples, for the square of their noise as a share of that
+width. Half and twice of it found as many."""
 CELLS = 64
 """Cells of the grid along the longest side."""
 MARGIN_CELLS = 12
@@ -41,10 +41,10 @@ def smooth(points: np.ndarray) -> np.ndarray:
 def surface_of_scan(points: np.ndarray, device: str = "cpu") -> Surface:
     """The closed surface behind noisy points without normals, of which a side may be missing.
 
-    Points are smoothed. Then normals, as long as the pieces of surface that they stand for, are those by
-    which all points have a winding number of a half (Lin, Xiao, Shi, Wang 2022, Surface Reconstruction from
-    Point Clouds without Normals by Parametrizing the Gauss Formula), and the surface is where it is a half
-    elsewhere too. What hangs together with most of it is kept.
+    Points are smoothed. Then normals, as long as the pieces of surface that they stand for, are
+    those by which all points have a winding number of a half (Lin, Xiao, Shi, Wang 2022, Surface
+    Reconstruction from Point Clouds without Normals by Parametrizing the Gauss Formula), and the
+    surface is where it is a half elsewhere too. What hangs together with most of it is kept.
 
     Args:
         points: The points, shape [N, 3], N at least NEIGHBOURS.
@@ -74,7 +74,9 @@ def surface_of_scan(points: np.ndarray, device: str = "cpu") -> Surface:
     pitch = float((high - low).max()) / CELLS
     corner = low - MARGIN_CELLS * pitch
     x, y, z = (np.ceil((high - low) / pitch).astype(int) + 1 + 2 * MARGIN_CELLS).tolist()
-    winding = wp.zeros((x, y, z), dtype=float, device=device)  # the outermost stay zero, which closes it
+    winding = wp.zeros(
+        (x, y, z), dtype=float, device=device
+    )  # the outermost stay zero, which closes it
     inner = winding[1 : x - 1, 1 : y - 1, 1 : z - 1]
     wp.launch(
         winding_kernel,
@@ -90,7 +92,9 @@ def surface_of_scan(points: np.ndarray, device: str = "cpu") -> Surface:
         device=device,
     )
     cells, corners = IsoSurfaceMarchingCubes.extract(winding, level)
-    mesh = trimesh.Trimesh(corner + pitch * cells.numpy(), corners.numpy().reshape(-1, 3), process=False)
+    mesh = trimesh.Trimesh(
+        corner + pitch * cells.numpy(), corners.numpy().reshape(-1, 3), process=False
+    )
     piece = max(mesh.split(only_watertight=False), key=lambda part: len(part.faces), default=None)
     volume = 0.0 if piece is None else float(piece.volume)
     if piece is None or abs(volume) < pitch**3:

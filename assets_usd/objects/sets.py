@@ -20,8 +20,8 @@ HELD_OUT_COUNT = 30
 """Objects of ``procedural-heldout``: a dozen worlds each in an evaluation of a few hundred."""
 
 BUILT_IN = ("cube", "cuboid", "symmetric", "procedural-150-seed0", "procedural-heldout")
-"""Sets named in help texts; ``procedural-<count>-seed<seed>`` and ``procedural-heldout-<count>-seed<seed>``
-take any numbers."""
+"""Sets named in help texts; ``procedural-<count>-seed<seed>`` and
+``procedural-heldout-<count>-seed<seed>`` take any numbers."""
 
 _PROCEDURAL = re.compile(r"procedural-(heldout-)?([1-9]\d*)-seed(\d+)")
 
@@ -32,7 +32,10 @@ def objects_dir() -> Path:
 
 
 def built_in_folder(name: str) -> Path:
-    """Folder of a built-in set, apart from the sets of users; each version of our families has its own."""
+    """Folder of a built-in set, apart from the sets of users.
+
+    Each version of our families has its own.
+    """
     from vd.assets_usd.objects.procedural import PROCEDURAL_VERSION
 
     return assets_dir() / "built-in" / f"version-{PROCEDURAL_VERSION}" / name
@@ -62,9 +65,15 @@ def write_set(folder: Path, models: list[ObjectModel]) -> list[Path]:
     """
     targets = [Path(folder) / f"{model.name}.usd" for model in models]
     for target, model in zip(targets, models, strict=True):
-        there = stored_facts(target) if target.exists() else {"source": model.source, "file": model.file}
+        there = (
+            stored_facts(target)
+            if target.exists()
+            else {"source": model.source, "file": model.file}
+        )
         if (there.get("source"), there.get("file")) != (model.source, model.file):
-            raise ObjectError(f"{target} is there and another object; write to another folder (--out)")
+            raise ObjectError(
+                f"{target} is there and another object; write to another folder (--out)"
+            )
     return [write_object(target, model) for target, model in zip(targets, models, strict=True)]
 
 
@@ -83,7 +92,9 @@ def _holds_objects(place: Path) -> bool:
 
 
 def _place(entry: str | Path) -> Path:
-    """The file or folder of the objects that an entry names; that of a built-in set may not be there yet.
+    """The file or folder of the objects that an entry names.
+
+    That of a built-in set may not be there yet.
 
     Raises:
         ObjectError: There are none; the message lists the sets and the commands that make more.
@@ -92,11 +103,16 @@ def _place(entry: str | Path) -> Path:
     if isinstance(entry, str) and is_built_in(entry) and not path.is_file():
         return built_in_folder(entry)
     named = root / path.name if path.name == str(entry) else root
-    for place in (path, named):  # a folder of meshes does not hide the set that was imported from it
+    for place in (
+        path,
+        named,
+    ):  # a folder of meshes does not hide the set that was imported from it
         if _holds_objects(place):
             return place
     if path.is_dir():
-        raise ObjectError(f"{path}: no object file (*.usd); make some of its meshes: vd-assets import {path}")
+        raise ObjectError(
+            f"{path}: no object file (*.usd); make some of its meshes: vd-assets import {path}"
+        )
     there = sorted(each.name for each in root.glob("*/") if _holds_objects(each))
     raise ObjectError(
         f"no object set or path {str(entry)!r}.\n"
@@ -122,7 +138,10 @@ def _author(folder: Path) -> None:
 
 
 def set_files(names_or_paths: Iterable[str | Path]) -> list[Path]:
-    """The files of :func:`load_set`'s objects, each once; raises what that raises of entries and folders."""
+    """The files of :func:`load_set`'s objects, each once.
+
+    Raises what that raises of entries and folders.
+    """
     files: list[Path] = []
     for entry in names_or_paths:
         place = _place(entry)
@@ -130,7 +149,9 @@ def set_files(names_or_paths: Iterable[str | Path]) -> list[Path]:
             _author(place)
         files += [place] if place.is_file() else object_files(place)
     if not files:
-        raise ObjectError("no object set was named; for example: cube, procedural-150-seed0, or a folder")
+        raise ObjectError(
+            "no object set was named; for example: cube, procedural-150-seed0, or a folder"
+        )
     return list(dict.fromkeys(files))
 
 
@@ -138,18 +159,22 @@ def load_set(names_or_paths: str | Path | Iterable[str | Path]) -> list[ObjectMo
     """Load objects: files, folders of files, or names of sets, in the order given.
 
     Args:
-        names_or_paths: One entry or several. A name stands for a built-in set (``cube``, ``cuboid``,
-            ``symmetric``, ``procedural-150-seed0``, ``procedural-heldout``), authored into the asset
-            cache on first use, or for an imported set's folder there.
+        names_or_paths: One entry or several. A name stands for a built-in set (``cube``,
+            ``cuboid``, ``symmetric``, ``procedural-150-seed0``, ``procedural-heldout``), authored
+            into the asset cache on first use, or for an imported set's folder there.
 
     Raises:
         ObjectError: An entry is neither, a folder holds no object, or two objects share a name.
     """
-    files = set_files([names_or_paths] if isinstance(names_or_paths, str | Path) else names_or_paths)
+    files = set_files(
+        [names_or_paths] if isinstance(names_or_paths, str | Path) else names_or_paths
+    )
     models = [read_object(path) for path in files]
     seen: dict[str, Path] = {}
     for model, path in zip(models, files, strict=True):
         if model.name in seen:
-            raise ObjectError(f"{path}: object {model.name} is also in {seen[model.name]}; leave one out")
+            raise ObjectError(
+                f"{path}: object {model.name} is also in {seen[model.name]}; leave one out"
+            )
         seen[model.name] = path
     return models

@@ -9,7 +9,9 @@ LEAST_THRESHOLD = 0.01
 """CoACD takes no smaller one."""
 
 DENSITIES_KG_M3 = (10.0, 23000.0)
-"""Least and largest density of an object: from foam to osmium. What is beyond is a mistaken unit."""
+"""Least and largest density of an object: from foam to osmium. What is beyond is a mistaken
+unit.
+"""
 
 
 class MeshError(ValueError):
@@ -21,17 +23,21 @@ class ImportSettings:
     """What decides the objects that are made of meshes."""
 
     units: Literal["auto", "mm", "cm", "m", "in"] = "auto"
-    """Unit of the meshes. auto: what the file declares (GLB, USD), else m, mm or cm, whichever needs the
-    least rescaling. Inches are never guessed."""
+    """Unit of the meshes. auto: what the file declares (GLB, USD), else m, mm or cm, whichever
+    needs the least rescaling. Inches are never guessed."""
     keep_size: bool = False
     """Keep the real size, also of what does not fit the hand. The unit must be known."""
     density: float | None = None
-    """Density that gives each object its mass [kg/m3]; plastic has about 1000, aluminium 2700, steel 7850."""
+    """Density that gives each object its mass [kg/m3]; plastic has about 1000, aluminium 2700,
+    steel 7850.
+    """
     mass: float | None = None
-    """Mass of each object [kg]; without this and --density 0.1. Training draws masses of its own unless its
-    randomisation is off."""
+    """Mass of each object [kg]; without this and --density 0.1. Training draws masses of its own
+    unless its randomisation is off."""
     max_hulls: int = 32
-    """Most convex parts per object. Eight are tried first, and more where these are off by more than 15 %."""
+    """Most convex parts per object. Eight are tried first, and more where these are off by more
+    than 15 %.
+    """
     threshold: float = 0.08
     """CoACD's concavity threshold, 0.01-1: smaller is finer and slower."""
     mcts_iterations: int = 20
@@ -52,7 +58,8 @@ class ImportSettings:
         low, high = DENSITIES_KG_M3
         if self.density is not None and not low <= self.density <= high:
             raise MeshError(
-                f"--density {self.density:g}: {low:g} to {high:g} kg/m3 are possible; water has 1000"
+                f"--density {self.density:g}: {low:g} to {high:g} kg/m3 are possible; water has "
+                f"1000"
             )
         if not LEAST_THRESHOLD <= self.threshold <= 1.0:
             raise MeshError(f"--threshold {self.threshold:g}: give {LEAST_THRESHOLD:g} to 1")
@@ -66,5 +73,6 @@ class ImportSettings:
         """
         if self.keep_size and self.units == "auto" and declared is None:
             raise MeshError(
-                "its file declares no unit, so its real size is not known; add --units mm (cm, m, in)"
+                "its file declares no unit, so its real size is not known; add --units mm (cm, m, "
+                "in)"
             )

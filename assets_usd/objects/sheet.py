@@ -26,11 +26,15 @@ TILE_IN, CAPTION_IN = 1.7, 0.55
 """Side of a picture, and height of what is written below it [inch]; 100 pixels each."""
 
 
-def _draw(axes: Any, parts: Sequence[tuple[np.ndarray, np.ndarray]], colours: Sequence[Any]) -> None:
+def _draw(
+    axes: Any, parts: Sequence[tuple[np.ndarray, np.ndarray]], colours: Sequence[Any]
+) -> None:
     """Draw meshes so that they fill the axes."""
     corners = np.concatenate([vertices[faces] for vertices, faces in parts])
     colour = np.repeat(np.array(colours), [len(faces) for _, faces in parts], axis=0)
-    surface = Poly3DCollection(corners, facecolors=colour, edgecolors=colour, linewidths=0.3, shade=True)
+    surface = Poly3DCollection(
+        corners, facecolors=colour, edgecolors=colour, linewidths=0.3, shade=True
+    )
     axes.add_collection3d(surface)
     middle = (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))) / 2
     look_at(axes, middle, np.linalg.norm(corners - middle, axis=2).max(), ZOOM)
@@ -59,7 +63,9 @@ def save_figure(figure: Any, path: Path) -> Path:
 
 
 def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path:
-    """Write a picture with every object: mesh, parts, name, longest side, parts, volume error, warnings.
+    """Write a picture with every object.
+
+    Mesh, parts, name, longest side, parts, volume error, warnings.
 
     Args:
         models: Objects.
@@ -84,7 +90,9 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
         ):
             place = np.divide((left + k * TILE_IN, top - TILE_IN, TILE_IN, TILE_IN), (*size, *size))
             _draw(figure.add_axes(tuple(place), projection="3d"), drawn, colours)
-        said = [f"{model.longest_side * 1e3:.0f} mm, parts: {len(hulls)}, ±{model.volume_error:.1%}"]
+        said = [
+            f"{model.longest_side * 1e3:.0f} mm, parts: {len(hulls)}, ±{model.volume_error:.1%}"
+        ]
         said += ["; ".join(model.warnings)[:50]] if model.warnings else []
         at = ((left + 0.05) / size[0], (top - TILE_IN) / size[1])
         colour = WARNING_COLOUR if model.warnings else "black"

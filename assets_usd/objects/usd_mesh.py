@@ -10,7 +10,16 @@ from trimesh.util import append_faces
 from vd.assets_usd.objects.model import is_object
 from vd.assets_usd.objects.settings import MeshError
 
-_UNREAD = ("Cube", "Sphere", "Cylinder", "Capsule", "Cone", "PointInstancer", "NurbsPatch", "TetMesh")
+_UNREAD = (
+    "Cube",
+    "Sphere",
+    "Cylinder",
+    "Capsule",
+    "Cone",
+    "PointInstancer",
+    "NurbsPatch",
+    "TetMesh",
+)
 """Kinds of solid geometry that are not read."""
 
 Z_FROM_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -34,7 +43,9 @@ def opened(path: Path) -> Any:
         raise MeshError("an object of vd-assets already; name it, or its folder, as an object set")
     errors = stage.GetCompositionErrors()
     if errors:
-        raise MeshError(f"incomplete: {errors[0]}; put the file there, or export with everything in one file")
+        raise MeshError(
+            f"incomplete: {errors[0]}; put the file there, or export with everything in one file"
+        )
     return stage
 
 
@@ -57,8 +68,8 @@ def usd_files(path: Path) -> list[Path]:
 def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and triangles [T, 3] of all visible meshes below the default prim.
 
-    Meshes for rendering are taken; where there are none, stand-ins (purpose ``proxy``). Those of purpose
-    ``guide``, mostly colliders, are not. A surface to be subdivided is taken by its cage.
+    Meshes for rendering are taken; where there are none, stand-ins (purpose ``proxy``). Those of
+    purpose ``guide``, mostly colliders, are not. A surface to be subdivided is taken by its cage.
 
     Raises:
         MeshError: No USD, nothing to read in it, or geometry of a kind that is not read.
@@ -89,7 +100,10 @@ def _shown(stage: Any) -> list[Any]:
     purposes: dict[Any, str] = {}
     for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
         imageable = UsdGeom.Imageable(prim)
-        if prim.IsA(UsdGeom.Boundable) and imageable.ComputeVisibility() != UsdGeom.Tokens.invisible:
+        if (
+            prim.IsA(UsdGeom.Boundable)
+            and imageable.ComputeVisibility() != UsdGeom.Tokens.invisible
+        ):
             purposes[prim] = str(imageable.ComputePurpose())
     rendered = [prim for prim, purpose in purposes.items() if purpose in ("default", "render")]
     return rendered or [prim for prim, purpose in purposes.items() if purpose == "proxy"]
@@ -98,7 +112,11 @@ def _shown(stage: Any) -> list[Any]:
 def _triangles(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of a UsdGeomMesh: polygons become fans."""
     first = Usd.TimeCode.EarliestTime()
-    attributes = mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetFaceVertexCountsAttr()
+    attributes = (
+        mesh.GetPointsAttr(),
+        mesh.GetFaceVertexIndicesAttr(),
+        mesh.GetFaceVertexCountsAttr(),
+    )
     points, corners, counts = (attribute.Get(first) for attribute in attributes)
     sound, why = (
         UsdGeom.Mesh.ValidateTopology(corners, counts, len(points))
@@ -117,7 +135,14 @@ def _triangles(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.array(points, dtype=float), faces
 
 
-def _placed(matrix: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices moved into the stage by a transform of row vectors [4, 4]; a mirror turns the triangles."""
+def _placed(
+    matrix: np.ndarray, vertices: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices moved into the stage by a transform of row vectors [4, 4].
+
+    A mirror turns the triangles.
+    """
     linear = matrix[:3, :3]
-    return vertices @ linear + matrix[3, :3], faces[:, ::-1] if np.linalg.det(linear) < 0.0 else faces
+    return vertices @ linear + matrix[3, :3], faces[:, ::-1] if np.linalg.det(
+        linear
+    ) < 0.0 else faces

@@ -1,8 +1,9 @@
 """Find where the camera is: a person bends fingers with markers on their tips before it.
 
-Print markers (--print-markers), stick marker k flat to the last link of finger k so that it faces the camera
-at the start pose, and run. The torque goes off. A picture is taken whenever the fingers rest and show
-something new. The result is a layer over the hand's USD, for vd-deploy --camera-layer.
+Print markers (--print-markers), stick marker k flat to the last link of finger k so that it faces
+the camera at the start pose, and run. The torque goes off. A picture is taken whenever the fingers
+rest and show something new. The result is a layer over the hand's USD, for vd-deploy
+--camera-layer.
 """
 
 import json
@@ -39,7 +40,9 @@ SEAT_M = 0.012
 SAME_RAD = 0.05
 """Joints of a finger that differ by less show its marker once more, not anew."""
 LARGEST_ERROR_M = PAPER.cloud.voxel_m
-"""Uncertainty at the object above which the result is called ill-conditioned [m]: a voxel of what is seen."""
+"""Uncertainty at the object above which the result is called ill-conditioned [m]: a voxel of what
+is seen.
+"""
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,9 @@ def calibrate(cfg: CalibrateCfg) -> int:
     hand = motors_of(cfg).hand
     fingers = cfg.fingers or tuple(range(hand.num_fingers))
     if not all(0 <= f < hand.num_fingers for f in fingers) or len(set(fingers)) != len(fingers):
-        raise ValueError(f"--fingers {fingers}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")
+        raise ValueError(
+            f"--fingers {fingers}: {hand.name} has fingers 0 to {hand.num_fingers - 1}"
+        )
     if cfg.print_markers is not None:
         return _print_markers(cfg.print_markers, fingers, cfg.side_m)
     check_file(cfg.out)  # a person's work is not to be lost
@@ -82,9 +87,12 @@ def calibrate(cfg: CalibrateCfg) -> int:
     if error_m <= LARGEST_ERROR_M:
         return 0
     print(
-        f"WARNING: ill-conditioned: where objects are, the cloud may be off by {1e3 * error_m:.1f} mm, more "
-        f"than a voxel ({1e3 * LARGEST_ERROR_M:.0f} mm). The fingers turn too little for these pictures: "
-        "take more views (--count), put markers on more fingers, larger ones, or move the camera nearer"
+        f"WARNING: ill-conditioned: where objects are, the cloud may be off by {1e3 * error_m:.1f} "
+        f"mm, more "
+        f"than a voxel ({1e3 * LARGEST_ERROR_M:.0f} mm). The fingers turn too little for these "
+        f"pictures: "
+        "take more views (--count), put markers on more fingers, larger ones, or move the camera "
+        "nearer"
     )
     return 1
 
@@ -94,14 +102,17 @@ def _print_markers(folder: Path, fingers: tuple[int, ...], side_m: float) -> int
         save_marker(folder / f"marker-{finger}.png", finger, side_m)
     border = 1e3 * side_m * MARGIN_CELLS / CELLS
     print(
-        f"{len(fingers)} markers in {folder}: print them at true size (600 dots per inch), keep their white"
+        f"{len(fingers)} markers in {folder}: print them at true size (600 dots per inch), keep "
+        f"their white"
     )
     print(f"border of {border:.1f} mm, check that the black square is {1e3 * side_m:.1f} mm wide")
     return 0
 
 
 def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
-    """The markers in pictures of fingers that a person moves; of a finger that waits only the first.
+    """The markers in pictures of fingers that a person moves.
+
+    Of a finger that waits only the first.
 
     Raises:
         BusError: A motor does not answer.
@@ -117,7 +128,10 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
         confirm("The torque goes off, and the hand lets go.", yes=cfg.yes)
         if failed := bus.torque(False):
             raise BusError(next(iter(failed.values())))
-        print("Bend one finger after the other, its marker to the camera; turn it all ways, hold it still.")
+        print(
+            "Bend one finger after the other, its marker to the camera; turn it all ways, hold it "
+            "still."
+        )
         poses: dict[int, list[np.ndarray]] = {number: [] for number in fingers}
         tip, finger, corners = [], [], []
         while min(map(len, poses.values())) < cfg.count:
@@ -129,15 +143,21 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
             joint_q = 0.5 * (before + after)
             for number, square in find_markers(image).items():
                 own = joint_q[3 * number : 3 * number + 3]
-                if number in poses and all(np.abs(own - other).max() > SAME_RAD for other in poses[number]):
+                if number in poses and all(
+                    np.abs(own - other).max() > SAME_RAD for other in poses[number]
+                ):
                     poses[number].append(own)
                     tip.append(hand.tip_poses(joint_q)[number])
                     finger.append(number)
                     corners.append(square)
             said = ", ".join(str(len(kept)) for kept in poses.values())
-            print(f"\r{said} of {cfg.count} views of each finger", end="", file=sys.stderr, flush=True)
+            print(
+                f"\r{said} of {cfg.count} views of each finger", end="", file=sys.stderr, flush=True
+            )
         print(file=sys.stderr)
-        return Views(np.array(tip), np.array(finger), np.array(corners), camera.intrinsics, cfg.side_m)
+        return Views(
+            np.array(tip), np.array(finger), np.array(corners), camera.intrinsics, cfg.side_m
+        )
 
 
 def seat(hand: HandModel, finger: int, camera: np.ndarray) -> np.ndarray:

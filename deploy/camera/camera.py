@@ -21,7 +21,9 @@ class Frame:
     """One image."""
 
     image: np.ndarray
-    """Depth along the optical axis [m], 0 for none, float32 [H, W]; of infrared brightness, uint8 [H, W]."""
+    """Depth along the optical axis [m], 0 for none, float32 [H, W]; of infrared brightness, uint8
+    [H, W].
+    """
     time_s: float
     """When it was exposed [s], on the clock of :func:`time.monotonic`."""
 

@@ -1,4 +1,7 @@
-"""The depth camera's part of the preflight: images come, in time, with depth, and the object is in view."""
+"""The depth camera's part of the preflight.
+
+Images come, in time, with depth, and the object is in view.
+"""
 
 import math
 from collections.abc import Iterator
@@ -19,9 +22,13 @@ WAIT_S = 0.5
 RATE_SHARE = 0.8
 """Share of the rate that was asked for: a camera that sends fewer is on USB 2, or has no light."""
 AGE_S = 0.1
-"""An image as old as this when it comes is about one control period late before anything is done with it."""
+"""An image as old as this when it comes is about one control period late before anything is done
+with it.
+"""
 AROUND_M = 0.06
-"""Half a side of the square around the object's place in which depth is counted: hand and object fill it."""
+"""Half a side of the square around the object's place in which depth is counted: hand and object
+fill it.
+"""
 DEPTH_SHARE = 0.5
 """Share of its pixels that must have depth: rendered with the errors of a D415, 78 to 85 % do."""
 
@@ -64,10 +71,16 @@ def _rate(times: np.ndarray, age: float, fps: float) -> Finding:
     rate = 1.0 / float(gaps.mean())
     wrong = []
     if rate < RATE_SHARE * fps:
-        wrong.append(f"{rate:.1f} images a second, not {fps:g}: use a USB 3 cable and port, and more light")
+        wrong.append(
+            f"{rate:.1f} images a second, not {fps:g}: use a USB 3 cable and port, and more light"
+        )
     if age > AGE_S:
-        wrong.append(f"images come {1e3 * age:.0f} ms old, more than {1e3 * AGE_S:.0f}: use a USB 3 port")
-    right = f"{rate:.1f} images a second, longest gap {1e3 * gaps.max():.0f} ms, {1e3 * age:.0f} ms old"
+        wrong.append(
+            f"images come {1e3 * age:.0f} ms old, more than {1e3 * AGE_S:.0f}: use a USB 3 port"
+        )
+    right = (
+        f"{rate:.1f} images a second, longest gap {1e3 * gaps.max():.0f} ms, {1e3 * age:.0f} ms old"
+    )
     return finding("camera rate", wrong, right)
 
 

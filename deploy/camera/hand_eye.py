@@ -1,11 +1,13 @@
 """Where a camera is, from markers on the fingertips of a hand that it looks at (hand-eye calibration).
 
-With the fingertip's pose t_i in the hand's base (forward kinematics), a marker stuck to it at M, and the
-wanted pose X of the camera in the base, view i shows the marker at ``X^-1 t_i M``. Least squares over the
-corners in the images find X and every M together, from where the camera is thought to be; a robust loss keeps
-wrong views out. Their curvature and the scatter from view to view give the intervals.
+With the fingertip's pose t_i in the hand's base (forward kinematics), a marker stuck to it at M,
+and the wanted pose X of the camera in the base, view i shows the marker at ``X^-1 t_i M``. Least
+squares over the corners in the images find X and every M together, from where the camera is thought
+to be; a robust loss keeps wrong views out. Their curvature and the scatter from view to view give
+the intervals.
 
-Poses are [7], position [m] and quaternion xyzw; pixels as in :class:`vd.assets_usd.hand_data.Intrinsics`.
+Poses are [7], position [m] and quaternion xyzw; pixels as in
+:class:`vd.assets_usd.hand_data.Intrinsics`.
 """
 
 from collections.abc import Mapping
@@ -24,8 +26,8 @@ LEAST_VIEWS = 6
 LEAST_OF_FINGER = 4
 """Views of one finger below which its marker only costs unknowns."""
 INLIER_PX = 6.0
-"""Mean distance of a view's corners from where the others put them, from which it is an outlier [px]: joints
-off by a degree make less."""
+"""Mean distance of a view's corners from where the others put them, from which it is an outlier
+[px]: joints off by a degree make less."""
 ROBUST_PX = 2.0
 """Distance in the image from which the robust loss grows with its first power [px]."""
 BEHIND_PX = 1e4
@@ -45,7 +47,9 @@ class Views:
     finger: np.ndarray
     """Finger that has the marker, [N]."""
     corners: np.ndarray
-    """Corners of the marker in the image, from the top left on clockwise as printed [px], shape [N, 4, 2]."""
+    """Corners of the marker in the image, from the top left on clockwise as printed [px], shape [N,
+    4, 2].
+    """
     lens: Intrinsics
     side_m: float
     """Side of the markers [m]."""
@@ -55,7 +59,9 @@ class Views:
 
     def chosen(self, rows: np.ndarray) -> "Views":
         """Some of the views."""
-        return replace(self, tip=self.tip[rows], finger=self.finger[rows], corners=self.corners[rows])
+        return replace(
+            self, tip=self.tip[rows], finger=self.finger[rows], corners=self.corners[rows]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +77,9 @@ class HandEye:
     residual_px: np.ndarray
     """Differences in the image, those views' [n, 4, 2]."""
     covariance: np.ndarray
-    """Of the camera: position in the base [m], then turn about the camera's own axes [rad], [6, 6]."""
+    """Of the camera: position in the base [m], then turn about the camera's own axes [rad], [6,
+    6].
+    """
     freedom: int
     """Degrees of freedom of the intervals: views less what they determine."""
 
@@ -99,7 +107,9 @@ class HandEye:
         x, y, z = turn.inv().apply(np.asarray(point) - self.camera[:3])
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         jacobian = np.hstack([np.eye(3), -turn.as_matrix() @ cross])
-        return self.factor * float(np.sqrt(np.linalg.eigvalsh(jacobian @ self.covariance @ jacobian.T)[-1]))
+        return self.factor * float(
+            np.sqrt(np.linalg.eigvalsh(jacobian @ self.covariance @ jacobian.T)[-1])
+        )
 
 
 def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -> HandEye:
@@ -107,9 +117,10 @@ def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -
 
     Args:
         views: What was seen.
-        camera: Where the camera is thought to be [7]: some centimetres and ten degrees off do no harm.
-        markers: Where each finger's marker is thought to be in its tip's frame [7]; it may have been stuck
-            on turned in its plane.
+        camera: Where the camera is thought to be [7]: some centimetres and ten degrees off do no
+            harm.
+        markers: Where each finger's marker is thought to be in its tip's frame [7]; it may have
+            been stuck on turned in its plane.
 
     Raises:
         HandEyeError: Too few views agree, or the fingers turned about too few directions.
@@ -128,8 +139,10 @@ def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -
         rows = _enough(views.finger, np.flatnonzero(off < INLIER_PX))
         if len(rows) < max(LEAST_VIEWS, len(views) / 2):
             raise HandEyeError(
-                f"only {len(rows)} of {len(views)} views agree with each other; check the marker's side, "
-                "that it sits firmly, that fingers and motors are numbered as in the calibration, light, and "
+                f"only {len(rows)} of {len(views)} views agree with each other; check the marker's "
+                f"side, "
+                "that it sits firmly, that fingers and motors are numbered as in the calibration, "
+                "light, and "
                 "that the camera is roughly where the hand's file has it"
             )
         again = refine(views.chosen(rows), found.camera, found.markers)
@@ -187,8 +200,10 @@ def refine(
 def _scatter(jacobian: np.ndarray, residual: np.ndarray, views: int) -> tuple[np.ndarray, int]:
     """Covariance of all parameters and its degrees of freedom, from the scatter between views.
 
-    The four corners of a view err together (joints, the marker's seat, light), so the views are what is
-    independent: the sandwich of Bell and McCaffrey (2002) with residuals as if their view had been left out.
+    The four corners of a view err together (joints, the marker's seat, light), so the views are
+    what is
+    independent: the sandwich of Bell and McCaffrey (2002) with residuals as if their view had been
+    left out.
     """
     rows = jacobian.shape[0] // views
     normal = jacobian.T @ jacobian
@@ -217,7 +232,9 @@ def _turned(marker: np.ndarray, quarters: int) -> np.ndarray:
 def square(side_m: float) -> np.ndarray:
     """Corners of a marker in its own frame (x right, y up, z out of the print) [m], shape [4, 3]."""
     half = side_m / 2
-    return np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
+    return np.array(
+        [[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]]
+    )
 
 
 def marker_corners(pose: np.ndarray, lens: Intrinsics, side_m: float) -> np.ndarray:
@@ -232,9 +249,14 @@ def marker_corners(pose: np.ndarray, lens: Intrinsics, side_m: float) -> np.ndar
 
 
 def _differences(views: Views, camera: np.ndarray, marker: np.ndarray) -> np.ndarray:
-    """Where corners should be less where they are [px] [N, 4, 2]; markers are in the tips' frames [7]."""
+    """Where corners should be less where they are [px] [N, 4, 2].
+
+    Markers are in the tips' frames [7].
+    """
     pose = compose(invert(camera), compose(views.tip, marker))
-    return np.nan_to_num(marker_corners(pose, views.lens, views.side_m) - views.corners, nan=BEHIND_PX)
+    return np.nan_to_num(
+        marker_corners(pose, views.lens, views.side_m) - views.corners, nan=BEHIND_PX
+    )
 
 
 def _off(views: Views, camera: np.ndarray, marker: np.ndarray) -> np.ndarray:

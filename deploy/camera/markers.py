@@ -1,7 +1,7 @@
 """ArUco markers: printed, and found in images.
 
-Pixels are those of :class:`vd.assets_usd.hand_data.Intrinsics`: the first one's centre is at (0.5, 0.5), not
-at 0 as OpenCV has it.
+Pixels are those of :class:`vd.assets_usd.hand_data.Intrinsics`: the first one's centre is at (0.5,
+0.5), not at 0 as OpenCV has it.
 """
 
 from pathlib import Path
@@ -34,7 +34,9 @@ def opencv() -> ModuleType:
     try:
         import cv2
     except ImportError as error:
-        raise CameraError(f"OpenCV cannot be imported ({error}); {interrupt.remedy('cv2')}") from error
+        raise CameraError(
+            f"OpenCV cannot be imported ({error}); {interrupt.remedy('cv2')}"
+        ) from error
     return cv2
 
 

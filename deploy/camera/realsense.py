@@ -33,8 +33,8 @@ class RealSenseCfg:
     fps: int = 30
     """Images a second."""
     decimation: int = 2
-    """Pixels a side that become one, in the SDK: from 640 x 360 the 320 x 180 of training. It takes the
-    median of 2 or 3 a side, the mean of more, which puts points between near and far things."""
+    """Pixels a side that become one, in the SDK: from 640 x 360 the 320 x 180 of training. It takes
+    the median of 2 or 3 a side, the mean of more, which puts points between near and far things."""
     record: Path | None = None
     """Record what the camera sends, before it is decimated, to this file (.db3)."""
 
@@ -44,7 +44,9 @@ class RealSenseCfg:
         if not 1 <= self.decimation <= 8:
             raise ValueError(f"camera.decimation = {self.decimation}; choose 1 (off) to 8")
         if self.record is not None and self.record.suffix != ".db3":
-            raise ValueError(f"camera.record = {self.record}; the SDK records to .db3, give it that suffix")
+            raise ValueError(
+                f"camera.record = {self.record}; the SDK records to .db3, give it that suffix"
+            )
 
 
 def sdk() -> ModuleType:
@@ -57,7 +59,11 @@ def sdk() -> ModuleType:
         import pyrealsense2
     except ImportError as error:
         # Its wheel takes one library from the system.
-        remedy = "apt install libusb-1.0-0" if "libusb" in str(error) else interrupt.remedy("pyrealsense2")
+        remedy = (
+            "apt install libusb-1.0-0"
+            if "libusb" in str(error)
+            else interrupt.remedy("pyrealsense2")
+        )
         raise CameraError(f"the RealSense SDK cannot be imported ({error}); {remedy}") from error
     return pyrealsense2
 
@@ -72,11 +78,14 @@ def find_device(serial: str = "") -> Any:
     devices = {d.get_info(rs.camera_info.serial_number): d for d in rs.context().query_devices()}
     if not devices:
         raise CameraError(
-            "no RealSense camera answers; check its cable and port (USB 3), the udev rules of librealsense, "
+            "no RealSense camera answers; check its cable and port (USB 3), the udev rules of "
+            "librealsense, "
             "and that no other program holds it"
         )
     if serial not in devices and (serial or len(devices) > 1):
-        raise CameraError(f"no RealSense {serial!r}; connected: {', '.join(devices)}. Name one with serial")
+        raise CameraError(
+            f"no RealSense {serial!r}; connected: {', '.join(devices)}. Name one with serial"
+        )
     return devices[serial] if serial else next(iter(devices.values()))
 
 
@@ -91,8 +100,8 @@ class RealSense:
         infrared: The left infrared imager in place of depth.
 
     Attributes:
-        intrinsics: Of the images. Those that the SDK gives for a decimated image are off by up to half a
-            pixel, since it scales the principal point as if pixels had no width.
+        intrinsics: Of the images. Those that the SDK gives for a decimated image are off by up to
+            half a pixel, since it scales the principal point as if pixels had no width.
 
     Raises:
         CameraError: The camera has no such images.
@@ -144,12 +153,14 @@ class RealSense:
         with self._arrived:
             if not self._arrived.wait_for(lambda: self._newest is not None, timeout_s):
                 raise StaleCamera(
-                    f"no image from the camera within {timeout_s:.2f} s; check its cable (USB 3) and power"
+                    f"no image from the camera within {timeout_s:.2f} s; check its cable (USB 3) "
+                    f"and power"
                 )
             frame, self._newest = self._newest, None
         if frame.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock:
             raise CameraError(
-                "the camera stamps its images by a clock of its own, so nobody knows their age: switch its "
+                "the camera stamps its images by a clock of its own, so nobody knows their age: "
+                "switch its "
                 "option global_time_enabled on (realsense-viewer)"
             )
         time_s = frame.get_timestamp() * MILLISECOND + time.monotonic() - time.time()

@@ -43,9 +43,13 @@ class RosCamera:
                 where = node.resolve_topic_name(LENS)
                 raise CameraError(f"no camera_info on {where}: start the camera, or remap {LENS}")
         if any(abs(c) > 0.0 for c in self._lens.d):
-            raise CameraError(f"the images are distorted ({list(self._lens.d)}); remap to rectified ones")
+            raise CameraError(
+                f"the images are distorted ({list(self._lens.d)}); remap to rectified ones"
+            )
         k = self._lens.k  # centres of pixels are at whole numbers there
-        self.intrinsics = Intrinsics(self._lens.width, self._lens.height, k[0], k[4], k[2] + 0.5, k[5] + 0.5)
+        self.intrinsics = Intrinsics(
+            self._lens.width, self._lens.height, k[0], k[4], k[2] + 0.5, k[5] + 0.5
+        )
 
     def _see_by(self, lens: Any) -> None:
         with self._arrived:
@@ -70,11 +74,15 @@ class RosCamera:
                 raise StaleCamera(f"no image on {where} within {timeout_s:.2f} s")
             image, self._newest = self._newest, None
         if image.encoding not in DEPTHS:
-            raise CameraError(f"images are {image.encoding}; depth is {' or '.join(DEPTHS)}: remap {IMAGES}")
+            raise CameraError(
+                f"images are {image.encoding}; depth is {' or '.join(DEPTHS)}: remap {IMAGES}"
+            )
         kind, unit = DEPTHS[image.encoding]
         order = ">" if image.is_bigendian else "<"
         rows = np.frombuffer(image.data, dtype=order + kind).reshape(image.height, -1)
-        depth = np.nan_to_num(rows[:, : image.width].astype(np.float32) * np.float32(unit), posinf=0.0)
+        depth = np.nan_to_num(
+            rows[:, : image.width].astype(np.float32) * np.float32(unit), posinf=0.0
+        )
         return Frame(depth, monotonic(image.header.stamp))
 
     def close(self) -> None:

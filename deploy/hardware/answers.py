@@ -1,7 +1,8 @@
 """What motors answer, and which of their states are accepted.
 
-A state counts only whole and fresh: right motor, right length, no error number, angles that a motor can
-count, a clock that went on as ours did, and no farther from the last one than the motor can turn. A checksum
+A state counts only whole and fresh: right motor, right length, no error number, angles that a motor
+can count, a clock that went on as ours did, and no farther from the last one than the motor can
+turn. A checksum
 alone is not enough: its 16 bits pass one of 65536 broken packets.
 """
 
@@ -25,10 +26,12 @@ from vd.deploy.hardware.packets import ALERT, Failure
 STATE_ADDRESS, STATE_BYTES = 120, 27
 """From the realtime tick to the temperature: one read for the whole state."""
 OTHER_BYTES = STATE_BYTES + 1
-"""Asked for after a question that was given up, whose answer is then known by its length when it comes."""
+"""Asked for after a question that was given up, whose answer is then known by its length when it
+comes.
+"""
 CLOCK_TOLERANCE_S = 0.04
-"""A state whose clock went on by so much more or less than ours is an old one, or from after a restart; the
-packet's own time on the line and in the driver is within it."""
+"""A state whose clock went on by so much more or less than ours is an old one, or from after a
+restart; the packet's own time on the line and in the driver is within it."""
 JUMP_RAD = 0.1
 """Beyond what the largest speed explains, a position that changed by more was not measured."""
 SPEED_MARGIN = 1.5
@@ -44,7 +47,10 @@ class SilentError(BusError):
 
 
 class LateError(BusError):
-    """This program did not run in time to hear the motors: no fault of theirs, or of their cables."""
+    """This program did not run in time to hear the motors.
+
+    No fault of theirs, or of their cables.
+    """
 
 
 class GarbledError(BusError):
@@ -99,8 +105,8 @@ class Answer:
 def read_answer(frame: bytes) -> Answer | None:
     """A status packet whose stuffing the SDK has removed; None if it is not whole.
 
-    The SDK has checked the CRC of what came before it removed the stuffing; length and instruction it leaves
-    to us.
+    The SDK has checked the CRC of what came before it removed the stuffing; length and instruction
+    it leaves to us.
     """
     length = int.from_bytes(frame[5:7], "little")
     if len(frame) < 7 + length or length < 4 or frame[7] != 0x55:
@@ -142,7 +148,9 @@ class StateCheck:
         counts = column("present_position")
         for answer, count in zip(answers, counts, strict=True):
             if abs(count) > FARTHEST_COUNTS:
-                raise BusError(f"motor {answer.id}: its position came as {count} counts, beyond reach")
+                raise BusError(
+                    f"motor {answer.id}: its position came as {count} counts, beyond reach"
+                )
         state = HandState(
             time_s=time_s,
             position=np.array([to_angle(int(count)) for count in counts]),
@@ -167,12 +175,17 @@ class StateCheck:
         difference = (gone - elapsed + 0.5 * span) % span - 0.5 * span
         for id, late in zip(self._ids, difference, strict=True):
             if abs(late) > CLOCK_TOLERANCE_S:
-                # A motor that restarted is not heard again before configure(): its gains and limits are gone.
+                # A motor that restarted is not heard again before configure(): its gains and limits
+                # are gone.
                 raise BusError(
-                    f"motor {id}: its clock differs from ours by {late:.3f} s since the last state: that "
-                    "state was an old one; if this goes on, the motor restarted and has to be configured"
+                    f"motor {id}: its clock differs from ours by {late:.3f} s since the last "
+                    f"state: that "
+                    "state was an old one; if this goes on, the motor restarted and has to be "
+                    "configured"
                 )
         for axis, id in enumerate(self._ids):
             moved = abs(state.position[axis] - last.position[axis])
             if moved > SPEED_MARGIN * self.fastest[axis] * elapsed + JUMP_RAD:
-                raise BusError(f"motor {id}: moved {moved:.2f} rad in {elapsed:.3f} s, which it cannot")
+                raise BusError(
+                    f"motor {id}: moved {moved:.2f} rad in {elapsed:.3f} s, which it cannot"
+                )

@@ -1,4 +1,7 @@
-"""Where the other fingers stand while one moves through its range: out of its way, and of each other's."""
+"""Where the other fingers stand while one moves through its range.
+
+Out of its way, and of each other's.
+"""
 
 import functools
 
@@ -7,7 +10,9 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 
 ASIDE = 0.8
-"""How far a finger swings one of its joints aside, and how far motions go, as a share of half the range."""
+"""How far a finger swings one of its joints aside, and how far motions go, as a share of half the
+range.
+"""
 CLEARANCE_M = 0.01
 """Gap below which fingers count as touching [m]: gravity bends joints by 0.1 rad."""
 STEPS = 13
@@ -18,8 +23,8 @@ STEPS = 13
 def aside(hand: HandModel, moving: int) -> np.ndarray:
     """Joint angles [D] [rad] with a finger at the middle of its range and the others out of its way.
 
-    Each of the others has one joint aside, the first outward if that will do; it is where it touches nothing,
-    or least often.
+    Each of the others has one joint aside, the first outward if that will do; it is where it
+    touches nothing, or least often.
     """
     touching, joints = _Touching(hand), np.arange(hand.num_joints)
     middle, half = 0.5 * (hand.lower + hand.upper), 0.5 * (hand.upper - hand.lower)
@@ -32,7 +37,9 @@ def aside(hand: HandModel, moving: int) -> np.ndarray:
         columns = joints[hand.fingers[finger]]
         swings = [share * half * (joints == j) for j in columns for share in (ASIDE, -ASIDE)]
         candidates = [pose + swing for swing in (swings[0], np.zeros_like(pose), *swings[1:])]
-        often = [sum(touching(np.where(own, q, other), placed) for q in swept) for other in candidates]
+        often = [
+            sum(touching(np.where(own, q, other), placed) for q in swept) for other in candidates
+        ]
         pose = candidates[int(np.argmin(often))]
     return pose
 

@@ -1,7 +1,9 @@
-"""The motors of a hand through dynamixel-sdk: goals out, states in, gains and limits written and read back.
+"""The motors of a hand through dynamixel-sdk.
 
-Angles in radians with zero in the middle of a motor's range, velocities in rad/s, currents in A. Which states
-are accepted, :mod:`vd.deploy.hardware.answers` says. Everything goes through one lock.
+Goals out, states in, gains and limits written and read back.
+
+Angles in radians with zero in the middle of a motor's range, velocities in rad/s, currents in A.
+Which states are accepted, :mod:`vd.deploy.hardware.answers` says. Everything goes through one lock.
 """
 
 import contextlib
@@ -44,16 +46,21 @@ from vd.deploy.hardware.registers import MotorSettings, different
 
 T = TypeVar("T")
 STARVED_S = 0.02
-"""A read of the port that returns so much too late may have missed an answer: motors answer within 5 ms, and
-the SDK, once it runs again, finds that its 34 ms are over."""
-BUSY = "this computer is busy; end other programs, or give this one real-time priority (ulimit -r 1)"
+"""A read of the port that returns so much too late may have missed an answer: motors answer within
+5 ms, and the SDK, once it runs again, finds that its 34 ms are over."""
+BUSY = (
+    "this computer is busy; end other programs, or give this one real-time priority (ulimit -r 1)"
+)
 TWICE = (
-    "its answers are garbled: two motors have the ID {id} (unplug one, and give the other a new one with "
+    "its answers are garbled: two motors have the ID {id} (unplug one, and give the other a new "
+    "one with "
     "ROBOTIS' DYNAMIXEL Wizard 2.0), or a cable is bad"
 )
 """What garbled answers mean."""
 RETRIES, TWIN_RETRIES = 1, 3
-"""The twin is a process among others, which may not run for longer than the SDK waits for an answer."""
+"""The twin is a process among others, which may not run for longer than the SDK waits for an
+answer.
+"""
 LATE_S = 0.02
 """Pause after a question that was asked in vain or again; what arrives meanwhile is dropped."""
 
@@ -61,8 +68,8 @@ LATE_S = 0.02
 class MotorBus:
     """Motors on one serial port.
 
-    Every exchange raises :class:`BusError` where a packet could not be sent, a motor refused, or no sound
-    answer came, also not when asked again.
+    Every exchange raises :class:`BusError` where a packet could not be sent, a motor refused, or no
+    sound answer came, also not when asked again.
 
     Args:
         port: Device, such as /dev/ttyUSB0, or an open port of the SDK's kind.
@@ -88,7 +95,9 @@ class MotorBus:
     ):
         """Open the port."""
         self.ids, self.clock = tuple(ids), clock
-        self.models = (motor_model(models),) * len(self.ids) if isinstance(models, str) else tuple(models)
+        self.models = (
+            (motor_model(models),) * len(self.ids) if isinstance(models, str) else tuple(models)
+        )
         """Model of each motor."""
         self._model = dict(zip(self.ids, self.models, strict=True))
         self._items = {id: table(model) for id, model in self._model.items()}
@@ -140,14 +149,21 @@ class MotorBus:
             try:
                 yield
             except (OSError, termios.error, TypeError) as error:  # a closed port raises TypeError
-                raise BusError(f"{self.port} is lost: {error}; is its adapter still there?") from error
+                raise BusError(
+                    f"{self.port} is lost: {error}; is its adapter still there?"
+                ) from error
             finally:
-                self._port.is_using = False  # else no packet could follow an exchange that was interrupted
+                self._port.is_using = (
+                    False  # else no packet could follow an exchange that was interrupted
+                )
 
     def _ask(
         self, id: int, what: str, instruction: Instruction, parameters: bytes = b"", size: int = 0
     ) -> bytes:
-        """One exchange with one motor, again if no sound answer came: the ``size`` bytes of its answer."""
+        """One exchange with one motor, again if no sound answer came.
+
+        The ``size`` bytes of its answer.
+        """
         first = self.clock.now()
         for attempt in range(self.retries + 1):
             last = self.clock.now()
@@ -259,7 +275,9 @@ class MotorBus:
         self._write_all("torque_enable", [0] * len(self.ids))
 
     def watch(self, seconds: float) -> None:
-        """Have the motors stop where they are once the line was silent for so long; 0 switches that off.
+        """Have the motors stop where they are once the line was silent for so long.
+
+        0 switches that off.
 
         A motor that has stopped so refuses goals until this is called again.
         """
@@ -286,8 +304,8 @@ class MotorBus:
 
         Args:
             goals: Angles [rad], shape [D]; clipped to the limits that were configured.
-            with_state: Send them in one piece with the question of the next :meth:`read_state`, so that both
-                arrive at the same moment; others that are sent before take their place.
+            with_state: Send them in one piece with the question of the next :meth:`read_state`, so
+                that both arrive at the same moment; others that are sent before take their place.
 
         Raises:
             ValueError: A goal that is no number; nothing is sent.
@@ -306,7 +324,9 @@ class MotorBus:
     def _write_all(self, name: str, values: Sequence[int], *, later: bool = False) -> None:
         """Write one item of every motor in one packet, now or with the question for their state."""
         item = self._items[self.ids[0]][name]
-        rows = [bytes([id]) + item.to_bytes(value) for id, value in zip(self.ids, values, strict=True)]
+        rows = [
+            bytes([id]) + item.to_bytes(value) for id, value in zip(self.ids, values, strict=True)
+        ]
         parameters = numbers(item.address, item.size) + b"".join(rows)
         packet = encode(Packet(BROADCAST, Instruction.SYNC_WRITE, parameters))
         with self._line():
@@ -321,7 +341,8 @@ class MotorBus:
             retries: How often to ask again; the bus' own by default.
 
         Raises:
-            BusError: No whole, fresh and possible state came, also not when asked again; names the motor.
+            BusError: No whole, fresh and possible state came, also not when asked again; names the
+                motor.
         """
         return self._again(self._read_state, self.retries if retries is None else retries)
 
@@ -340,10 +361,12 @@ class MotorBus:
                 heard, answers = self._ask_all(STATE_ADDRESS, self._length, before=goals)
                 took = self.clock.now() - asked
                 if took > CLOCK_TOLERANCE_S:
-                    # This process did not run: whose time is not known is nothing to compare later ones with.
+                    # This process did not run: whose time is not known is nothing to compare later
+                    # ones with.
                     raise LateError(f"the state took {took:.3f} s: {BUSY}")
-                # Motors measure when they have heard it, or not before they answer. A later time than theirs
-                # would look like a delay of the goals, which has a name; an earlier one does not.
+                # Motors measure when they have heard it, or not before they answer. A later time
+                # than theirs would look like a delay of the goals, which has a name; an earlier one
+                # does not.
                 return self._states.accept(heard, answers)
         except BusError:
             self.rejected += 1
@@ -360,8 +383,12 @@ class MotorBus:
             _, answers = self._ask_all(item.address, item.size)
         return np.array([bool(item.from_bytes(answer.data)) for answer in answers])
 
-    def _ask_all(self, address: int, length: int, before: bytes = b"") -> tuple[float, list[Answer]]:
-        """Ask all motors for the same bytes with one packet: when they heard it [s], and what each answers.
+    def _ask_all(
+        self, address: int, length: int, before: bytes = b""
+    ) -> tuple[float, list[Answer]]:
+        """Ask all motors for the same bytes with one packet.
+
+        When they heard it [s], and what each answers.
 
         Args:
             address: First byte.
@@ -380,7 +407,10 @@ class MotorBus:
         return heard, answers
 
     def _send(self, packets: bytes, answer_bytes: int = 0) -> float:
-        """Send packets in one piece, and wait from then on for so many bytes: when they were sent [s]."""
+        """Send packets in one piece, and wait from then on for so many bytes.
+
+        When they were sent [s].
+        """
         self._port.clearPort()
         if self._port.writePort(packets) != len(packets):
             raise BusError(f"{self.port} did not take what was to be sent")
@@ -398,7 +428,11 @@ class MotorBus:
             if result != self._sdk.COMM_SUCCESS:
                 break
             answer = read_answer(bytes(frame))
-            if answer is not None and answer.id == id and (answer.refused or len(answer.data) == size):
+            if (
+                answer is not None
+                and answer.id == id
+                and (answer.refused or len(answer.data) == size)
+            ):
                 return answer
         if result == self._sdk.COMM_RX_TIMEOUT or self._late_s > STARVED_S:
             raise self._silence(f"{what}motor {id} does not answer")
@@ -408,10 +442,14 @@ class MotorBus:
     def _silence(self, what: str) -> BusError:
         """Nobody was heard in the last exchange: by this program's own fault, or the motor's."""
         if self._late_s > STARVED_S:
-            return LateError(f"{what}: this program was {self._late_s:.3f} s late to listen: {BUSY}")
+            return LateError(
+                f"{what}: this program was {self._late_s:.3f} s late to listen: {BUSY}"
+            )
         if pseudo(self.port):  # a twin has no cable, but this computer's processors
             load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
-            return SilentError(f"{what}: others may keep the twin from answering ({load}), or its options")
+            return SilentError(
+                f"{what}: others may keep the twin from answering ({load}), or its options"
+            )
         return SilentError(
             f"{what}: check its cable, power, baud rate and ID, which may be that of another motor"
         )

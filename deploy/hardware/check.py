@@ -1,4 +1,7 @@
-"""Preflight: everything that must be right before a hand moves. With --range it moves, after asking."""
+"""Preflight: everything that must be right before a hand moves.
+
+With --range it moves, after asking.
+"""
 
 import contextlib
 import itertools
@@ -32,8 +35,8 @@ if TYPE_CHECKING:
 USB_SERIAL = Path("/sys/bus/usb-serial/devices")
 """Where the kernel tells of adapters of the FTDI kind, the U2D2 among them."""
 LATENCY_MS = 1
-"""The shortest latency timer. The kernel's 16 ms leave a recording 54 of its 100 samples a second, and a
-policy sees every state that much later."""
+"""The shortest latency timer. The kernel's 16 ms leave a recording 54 of its 100 samples a second,
+and a policy sees every state that much later."""
 CYCLES = 24
 """Control cycles whose times are measured: two seconds."""
 BUS_SHARE = 0.5
@@ -57,12 +60,17 @@ Tables = Mapping[int, Mapping[str, int]]
 
 @dataclass(frozen=True)
 class CheckCfg(HandOptions):
-    """Look at everything that must be right before the hand moves; without --range nothing is written."""
+    """Look at everything that must be right before the hand moves.
+
+    Without --range nothing is written.
+    """
 
     camera: RealSenseCfg = field(default_factory=RealSenseCfg)
     """The depth camera."""
     camera_layer: Path | None = None
-    """Where it was found to be (camera.usda of vd-deploy calibrate); where the hand has it by default."""
+    """Where it was found to be (camera.usda of vd-deploy calibrate); where the hand has it by
+    default.
+    """
     no_camera: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Leave the camera out: homing and recording need none."""
     range: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -74,7 +82,9 @@ class CheckCfg(HandOptions):
 
 
 def preflight(connection: Connection) -> Iterator[Finding]:
-    """Look at motors, items, state and bus. Nothing is written: a motor that holds something goes on to.
+    """Look at motors, items, state and bus.
+
+    Nothing is written: a motor that holds something goes on to.
 
     What could not be looked at because of what came before is not in the findings.
     """
@@ -88,11 +98,16 @@ def preflight(connection: Connection) -> Iterator[Finding]:
         tables, deaf = _read_tables(bus, [id for id in bus.ids if id not in missing])
         wrong = [*missing.values(), *deaf]
         if strangers := sorted(set(bus.ping_all()) - set(bus.ids)) if missing else []:
-            wrong.insert(0, f"ID {', '.join(map(str, strangers))} answers, and is none of the hand's")
+            wrong.insert(
+                0, f"ID {', '.join(map(str, strangers))} answers, and is none of the hand's"
+            )
         yield finding("motors answer", wrong, f"all {len(bus.ids)}")
         if wrong:
             return
-        errors = [f"motor {id}: {why}; mend it, then {RESTART}" for id, why in bus.hardware_errors().items()]
+        errors = [
+            f"motor {id}: {why}; mend it, then {RESTART}"
+            for id, why in bus.hardware_errors().items()
+        ]
         yield finding("no hardware error", errors, "none")
         yield from register_findings(connection, tables)
         yield Finding("torque", True, _holding(bus) or "off")
@@ -118,7 +133,9 @@ def adapter_findings(port: str) -> Iterator[Finding]:
     yield Finding("USB latency timer", right, f"{latency} ms" + ("" if right else remedy))
 
 
-def _read_tables(bus: "MotorBus", ids: Sequence[int]) -> tuple[dict[int, dict[str, int]], list[str]]:
+def _read_tables(
+    bus: "MotorBus", ids: Sequence[int]
+) -> tuple[dict[int, dict[str, int]], list[str]]:
     """Control tables of motors that answer a ping, and what is wrong with those that answer nothing else."""
     tables, wrong = {}, []
     for id in ids:
@@ -127,12 +144,17 @@ def _read_tables(bus: "MotorBus", ids: Sequence[int]) -> tuple[dict[int, dict[st
         except (GarbledError, LateError) as error:
             wrong.append(str(error))
         except BusError:
-            wrong.append(f"motor {id} answers pings, but no reads: its status_return_level is 0; {RESTART}")
+            wrong.append(
+                f"motor {id} answers pings, but no reads: its status_return_level is 0; {RESTART}"
+            )
     return tables, wrong
 
 
 def register_findings(connection: Connection, tables: Tables) -> Iterator[Finding]:
-    """Compare control tables with what is wanted of them: a finding for each register that differs."""
+    """Compare control tables with what is wanted of them.
+
+    A finding for each register that differs.
+    """
     bus = connection.bus
     try:
         settings = connection.joints.settings()
@@ -170,7 +192,8 @@ def _holding(bus: "MotorBus") -> str:
     ids = ", ".join(str(id) for id, one in zip(bus.ids, on, strict=True) if one)
     current = float(np.abs(bus.read_state().current[on]).max())
     return (
-        f"motors {ids} hold, with up to {current:.2f} A: they let go when their settings are written; "
+        f"motors {ids} hold, with up to {current:.2f} A: they let go when their settings are "
+        f"written; "
         "support what the hand carries"
     )
 
@@ -208,7 +231,9 @@ def _state(connection: Connection) -> Iterator[Finding]:
     for axis in np.flatnonzero(out > OUTSIDE_RAD):
         # Turned by hand without torque a motor counts on; one that starts counts within one turn.
         mend = (
-            f"it was turned round: {RESTART}" if turns[axis] else "move it by hand, or mend its calibration"
+            f"it was turned round: {RESTART}"
+            if turns[axis]
+            else "move it by hand, or mend its calibration"
         )
         where = f"{q[axis]:.2f} rad, out of {hand.lower[axis]:.2f} to {hand.upper[axis]:.2f}"
         outside.append(f"{joints.names[axis]}: {where}: {mend}")
@@ -244,7 +269,9 @@ def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
         StoppedError: A limit was passed.
     """
     hand = connection.hand
-    poses = [aside(hand, finger) for finger in hand.joint_finger]  # before the hand has to be told to hold
+    poses = [
+        aside(hand, finger) for finger in hand.joint_finger
+    ]  # before the hand has to be told to hold
     home = safe.arm().position
     lower, upper = safe.limits.lower, safe.limits.upper
     centre, half = 0.5 * (lower + upper), 0.5 * RANGE_SHARE * (upper - lower)
@@ -263,12 +290,18 @@ def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
 
 
 def ready(
-    connection: Connection, question: str, *, yes: bool, quiet: bool = False, more: Iterable[Finding] = ()
+    connection: Connection,
+    question: str,
+    *,
+    yes: bool,
+    quiet: bool = False,
+    more: Iterable[Finding] = (),
 ) -> None:
     """Preflight, and ``more`` of it, have the person confirm, and only then write the settings.
 
     Raises:
-        RuntimeError: Something is wrong, the person did not say yes, or a motor does not keep a setting.
+        RuntimeError: Something is wrong, the person did not say yes, or a motor does not keep a
+            setting.
     """
     _stop_at_wrong(show(itertools.chain(preflight(connection), more), quiet=quiet))
     confirm(question, yes=yes)
@@ -291,7 +324,9 @@ def confirm(question: str, *, yes: bool) -> None:
     if yes:
         return
     if not sys.stdin.isatty():
-        raise RuntimeError(f"nothing moves: {question} Nobody is there to ask; --yes says so at once")
+        raise RuntimeError(
+            f"nothing moves: {question} Nobody is there to ask; --yes says so at once"
+        )
     print(f"{question} Keep hands and cables clear. [y/N] ", end="", file=sys.stderr, flush=True)
     if input().strip().lower() not in ("y", "yes"):
         raise RuntimeError("nothing moves: not confirmed")

@@ -1,4 +1,7 @@
-"""From options to a hand: its model, its motors' calibration, and the bus, to real motors or to a twin."""
+"""From options to a hand.
+
+Its model, its motors' calibration, and the bus, to real motors or to a twin.
+"""
 
 import contextlib
 import sys
@@ -31,9 +34,13 @@ class HandOptions:
     twin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Simulate the motors and the hand in place of --port."""
     twin_args: str = ""
-    """More options of the twin: --twin-args="--lose 0.01"; see python -m vd.deploy.twin.twin --help."""
+    """More options of the twin: --twin-args="--lose 0.01"; see python -m vd.deploy.twin.twin
+    --help.
+    """
     calibration: Path | None = None
-    """Calibration file of the joints' motors; by default IDs, directions and zeros are the USD's."""
+    """Calibration file of the joints' motors; by default IDs, directions and zeros are the
+    USD's.
+    """
     motor: str | None = None
     """Model of all motors, in place of what the hand's USD says."""
     baud_rate: int = BAUD_RATE
@@ -74,7 +81,9 @@ def motors_of(options: HandOptions) -> "Joints":
 
 @contextlib.contextmanager
 def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
-    """Open the bus to the hand of the options; a twin behind it is started, and ended with the block.
+    """Open the bus to the hand of the options.
+
+    A twin behind it is started, and ended with the block.
 
     Args:
         options: The options.
@@ -103,7 +112,9 @@ def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
                 model=options.motor,
                 **twin_options,
             )
-            command = parse(TwinCommand, options.twin_args.split(), default=default, prog="--twin-args")
+            command = parse(
+                TwinCommand, options.twin_args.split(), default=default, prog="--twin-args"
+            )
             print(
                 "starting the twin (the first start compiles its kernels for minutes) ...",
                 file=sys.stderr,

@@ -1,7 +1,7 @@
 """Control tables of DYNAMIXEL X motors (ROBOTIS e-manual, one page a model), as typed data, and their units.
 
-The models share addresses and differ in units and limits. Angles in radians with zero in the middle of the
-range, velocities in rad/s, currents in A.
+The models share addresses and differ in units and limits. Angles in radians with zero in the middle
+of the range, velocities in rad/s, currents in A.
 """
 
 import math
@@ -23,7 +23,9 @@ EEPROM_END = 64
 """Items below are kept without power, and cannot be written while torque is on."""
 POSITION_MODE = 3
 CURRENT_POSITION_MODE = 5
-"""Position control under a largest current, over 256 turns either way: position limits do not act."""
+"""Position control under a largest current, over 256 turns either way: position limits do not
+act.
+"""
 FULL_PWM = 885.0
 """Counts of the whole supply voltage."""
 WATCHDOG_UNIT_S = 0.02
@@ -74,19 +76,21 @@ class Model:
     """Least and largest voltage limit [0.1 V]."""
     supply_v: float
     torque_nm_per_a: float
-    """Stall torque over stall current, at the supply's voltage. XL330 and XC330 measure the supply's current,
-    so their torque is a guess."""
+    """Stall torque over stall current, at the supply's voltage. XL330 and XC330 measure the
+    supply's current, so their torque is a guess."""
     temperature_limit: int = 80
     """Initial limit [deg C]."""
     velocity_most: int = 1023
     """Largest limit, counts of 0.229 rev/min."""
     senses_current: bool = True
-    """Whether it measures and limits its current. Others tell a load, in 0.1 % of the largest, by which
-    the current is guessed, and have no current-based mode."""
+    """Whether it measures and limits its current. Others tell a load, in 0.1 % of the largest, by
+    which the current is guessed, and have no current-based mode."""
 
     def current_of(self, torque_nm: np.ndarray) -> np.ndarray:
         """Currents for torques [A], no larger than the motor's largest."""
-        return np.minimum(torque_nm / self.torque_nm_per_a, self.current_limit * self.current_unit_a)
+        return np.minimum(
+            torque_nm / self.torque_nm_per_a, self.current_limit * self.current_unit_a
+        )
 
 
 MODELS = {
@@ -98,9 +102,24 @@ MODELS = {
         Model("XC330-T288", 1220, 1e-3, 910, 320, (55, 140), 12.0, 1.00 / 0.88, 70, 2047),
         Model("XC330-M181", 1230, 1e-3, 2352, 545, (35, 70), 5.0, 0.60 / 1.80, 70, 2047),
         Model("XC330-M288", 1240, 1e-3, 2352, 350, (35, 70), 5.0, 0.93 / 1.80, 70, 2047),
-        Model("XL430-W250", 1060, 1.4e-3, 1000, 265, (60, 140), 12.0, 1.5 / 1.4, 72, senses_current=False),
-        Model("XC430-W150", 1070, 1.4e-3, 1000, 460, (60, 160), 12.0, 1.6 / 1.4, senses_current=False),
-        Model("XC430-W240", 1080, 1.4e-3, 1000, 306, (60, 160), 12.0, 1.9 / 1.4, senses_current=False),
+        Model(
+            "XL430-W250",
+            1060,
+            1.4e-3,
+            1000,
+            265,
+            (60, 140),
+            12.0,
+            1.5 / 1.4,
+            72,
+            senses_current=False,
+        ),
+        Model(
+            "XC430-W150", 1070, 1.4e-3, 1000, 460, (60, 160), 12.0, 1.6 / 1.4, senses_current=False
+        ),
+        Model(
+            "XC430-W240", 1080, 1.4e-3, 1000, 306, (60, 160), 12.0, 1.9 / 1.4, senses_current=False
+        ),
         Model("XM430-W210", 1030, 2.69e-3, 1193, 330, (95, 160), 12.0, 3.0 / 2.3),
         Model("XM430-W350", 1020, 2.69e-3, 1193, 200, (95, 160), 12.0, 4.1 / 2.3),
         Model("XM540-W150", 1130, 2.69e-3, 2047, 230, (95, 160), 12.0, 7.3 / 4.4),

@@ -15,7 +15,9 @@ from vd.deploy.safety.safety import SafeHand
 SPEED_RAD_S = 0.5
 """A tenth of what the joints can: time to reach the switch."""
 CLOSE_RAD = 0.15
-"""Distance from the pose that counts as there: gravity bends the joints by 0.1 rad at the paper's gain."""
+"""Distance from the pose that counts as there: gravity bends the joints by 0.1 rad at the paper's
+gain.
+"""
 
 
 @dataclass(frozen=True)

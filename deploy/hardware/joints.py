@@ -1,4 +1,6 @@
-"""Which motor turns which joint, which way round, and from where: a hand's USD, and a calibration over it.
+"""Which motor turns which joint, which way round, and from where.
+
+A hand's USD, and a calibration over it.
 
 A motor's angle is ``sign * gear * q + offset`` of its joint's angle q [rad].
 """
@@ -68,7 +70,8 @@ class Joints:
         for name, model, capped in zip(self.names, self.models, self.capped, strict=True):
             if capped and not model.senses_current:
                 raise CalibrationError(
-                    f"{hand.name}: {name} has a largest current, which {model.name} does not measure; "
+                    f"{hand.name}: {name} has a largest current, which {model.name} does not "
+                    f"measure; "
                     "take vd:motor:current away"
                 )
 
@@ -91,7 +94,10 @@ class Joints:
         )
 
     def currents(self) -> np.ndarray:
-        """Largest current of each motor [A] [D]: what it is said to have, or needs for its joint's torque."""
+        """Largest current of each motor [A] [D].
+
+        What it is said to have, or needs for its joint's torque.
+        """
         torque = self.hand.effort / self.gear
         needed = [float(model.current_of(t)) for model, t in zip(self.models, torque, strict=True)]
         return np.where(self.capped, [motor.current for motor in self.motors], needed)
@@ -104,7 +110,11 @@ class Joints:
     def servo(self) -> dict[str, str | int]:
         """What a log says of the motors."""
         models = ", ".join(dict.fromkeys(model.name for model in self.models))
-        return {"model": models, "p_gain": self.p_gain, "d_gain": max(motor.d_gain for motor in self.motors)}
+        return {
+            "model": models,
+            "p_gain": self.p_gain,
+            "d_gain": max(motor.d_gain for motor in self.motors),
+        }
 
     def settings(self) -> dict[int, MotorSettings]:
         """Limits and gains of every motor, by ID: the hand's, as far as the motor has them.
@@ -112,15 +122,19 @@ class Joints:
         Raises:
             CalibrationError: A joint's range leaves the motor's one turn.
         """
-        ends = np.sort(np.stack([self.to_motor(self.hand.lower), self.to_motor(self.hand.upper)]), axis=0)
+        ends = np.sort(
+            np.stack([self.to_motor(self.hand.lower), self.to_motor(self.hand.upper)]), axis=0
+        )
         first, last, currents = to_angle(0), to_angle(4095), self.currents()
         result = {}
         for axis, (motor, model) in enumerate(zip(self.motors, self.models, strict=True)):
             low, high = float(ends[0, axis]), float(ends[1, axis])
             if low < first or high > last:
                 raise CalibrationError(
-                    f"{self.names[axis]}, motor {motor.id}: its range is {low:.2f} to {high:.2f} rad of the "
-                    f"motor, which turns from {first:.2f} to {last:.2f}; mount it nearer its middle, or mend "
+                    f"{self.names[axis]}, motor {motor.id}: its range is {low:.2f} to {high:.2f} "
+                    f"rad of the "
+                    f"motor, which turns from {first:.2f} to {last:.2f}; mount it nearer its "
+                    f"middle, or mend "
                     "its offset"
                 )
             fastest = float(self.hand.velocity_limit[axis]) * motor.gear
@@ -136,7 +150,9 @@ class Joints:
         return result
 
 
-def read_joints(hand: HandModel, calibration: Path | None = None, model: str | None = None) -> Joints:
+def read_joints(
+    hand: HandModel, calibration: Path | None = None, model: str | None = None
+) -> Joints:
     """The motors of a hand.
 
     Args:
@@ -157,10 +173,13 @@ def read_joints(hand: HandModel, calibration: Path | None = None, model: str | N
     for name, leader, said in zip(hand.joint_names, hand.mimic, hand.motors, strict=True):
         entry = entries.get(name)
         if leader >= 0:
-            raise CalibrationError(f"{hand.name}: {name} follows another joint; each needs a motor here")
+            raise CalibrationError(
+                f"{hand.name}: {name} follows another joint; each needs a motor here"
+            )
         if said is None and (entry is None or model is None):
             raise CalibrationError(
-                f"{hand.path} does not say which motor turns {name}: describe motors when it is imported "
+                f"{hand.path} does not say which motor turns {name}: describe motors when it is "
+                f"imported "
                 "(vd:motor), or give --motor and --calibration"
             )
         motor = said or MotorModel(str(model), 0)
@@ -177,7 +196,8 @@ def _read_calibration(path: Path, hand: HandModel) -> dict[str, _Motor]:
     except OSError as error:
         raise CalibrationError(
             f"--calibration {path}: {error.strerror}; give a file with an entry for each joint of "
-            f"{hand.name}, or leave it out where IDs, zeros and directions are those of the hand's USD"
+            f"{hand.name}, or leave it out where IDs, zeros and directions are those of the hand's "
+            f"USD"
         ) from error
     except (TypeError, ValueError) as error:  # of JSON, text and fields too
         raise CalibrationError(f"{path} is not a calibration of {hand.name}: {error}") from error
@@ -203,5 +223,7 @@ def _by_joint(file: _File, hand: HandModel) -> dict[str, _Motor]:
         if motor.sign not in (-1.0, 1.0):
             raise ValueError(f"motors.sign of {motor.joint} is {motor.sign:g}; it is 1, or -1")
         if not np.isfinite(motor.offset_rad):
-            raise ValueError(f"motors.offset_rad of {motor.joint} is {motor.offset_rad}; give an angle [rad]")
+            raise ValueError(
+                f"motors.offset_rad of {motor.joint} is {motor.offset_rad}; give an angle [rad]"
+            )
     return {motor.joint: motor for motor in file.motors}

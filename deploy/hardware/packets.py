@@ -1,7 +1,10 @@
-"""Dynamixel protocol 2.0 as bytes: packets, their check, byte stuffing, and finding packets in a stream.
+"""Dynamixel protocol 2.0 as bytes.
 
-A packet is FF FF FD 00, ID, length (2 bytes, little-endian, of all that follows), instruction, parameters and
-CRC-16. Within instruction and parameters FF FF FD is followed by one more FD, so that no header appears.
+Packets, their check, byte stuffing, and finding packets in a stream.
+
+A packet is FF FF FD 00, ID, length (2 bytes, little-endian, of all that follows), instruction,
+parameters and CRC-16. Within instruction and parameters FF FF FD is followed by one more FD, so
+that no header appears.
 """
 
 from collections.abc import Iterator
@@ -14,7 +17,9 @@ STUFFED, STUFFING = b"\xff\xff\xfd", b"\xfd"
 BROADCAST = 0xFE
 MAX_ID = 0xFC
 SHORTEST, LONGEST = 3, 1024
-"""Values of the length field: instruction and CRC at least; the largest buffer of an X motor at most."""
+"""Values of the length field: instruction and CRC at least; the largest buffer of an X motor at
+most.
+"""
 STATUS_BYTES = 11
 """Bytes of a status packet without data."""
 POLYNOMIAL = 0x8005
@@ -92,7 +97,10 @@ def status(id: int, error: int, data: bytes = b"") -> Packet:
 
 
 class PacketReader:
-    """Finds whole, sound packets in a stream of bytes, whatever is between them. Its buffer is bounded."""
+    """Finds whole, sound packets in a stream of bytes, whatever is between them.
+
+    Its buffer is bounded.
+    """
 
     def __init__(self) -> None:
         """Begin with nothing read."""
@@ -109,7 +117,10 @@ class PacketReader:
         return list(self._packets())
 
     def give_up(self) -> list[Packet]:
-        """The line has fallen silent: drop the packet that has begun; returns what was behind its start."""
+        """The line has fallen silent: drop the packet that has begun.
+
+        Returns what was behind its start.
+        """
         del self._buffer[:1]
         return list(self._packets())
 

@@ -1,4 +1,7 @@
-"""The serial port of the motors, for one program at a time: two on one line undo what the other does."""
+"""The serial port of the motors, for one program at a time.
+
+Two on one line undo what the other does.
+"""
 
 import errno
 import fcntl
@@ -14,8 +17,8 @@ from vd.deploy.hardware.answers import BusError
 BAUD_RATE = 1_000_000
 """Of the port, where the options name none."""
 WAIT_S = 0.002
-"""How long a read of the port sleeps at most until its bytes are there. The SDK's own does not sleep but asks
-again and again, which takes a core, and keeps whatever shares it from answering."""
+"""How long a read of the port sleeps at most until its bytes are there. The SDK's own does not
+sleep but asks again and again, which takes a core, and keeps whatever shares it from answering."""
 PSEUDO_TERMINALS = "/dev/pts/"
 """A twin holds its own end of these open, so exclusive use by one program is for the lock alone."""
 
@@ -60,7 +63,10 @@ def open_port(path: str, baud_rate: int = BAUD_RATE) -> Any:
 
 
 def pseudo(path: str) -> bool:
-    """Whether a port is a pseudo-terminal, as a twin's is: it has no baud rate, so motors answer at each."""
+    """Whether a port is a pseudo-terminal, as a twin's is.
+
+    It has no baud rate, so motors answer at each.
+    """
     return os.path.realpath(path).startswith(PSEUDO_TERMINALS)
 
 
@@ -75,6 +81,8 @@ def _why(path: str, error: OSError) -> str:
             f"`sudo usermod -aG {group} $USER`, then log out and in again"
         )
     if error.errno == errno.ENOENT:
-        there = sorted(str(one) for kind in ("ttyUSB*", "ttyACM*") for one in Path("/dev").glob(kind))
+        there = sorted(
+            str(one) for kind in ("ttyUSB*", "ttyACM*") for one in Path("/dev").glob(kind)
+        )
         return f"there is no such device; is the adapter plugged in? There are: {', '.join(there) or 'none'}"
     return f"{error}; is it the motors' adapter?"

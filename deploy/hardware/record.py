@@ -1,4 +1,7 @@
-"""Record motions for vd-gap: the paper's steps and sines, or a plan of vd-gap's, finger by finger."""
+"""Record motions for vd-gap.
+
+The paper's steps and sines, or a plan of vd-gap's, finger by finger.
+"""
 
 import itertools
 import json
@@ -41,9 +44,9 @@ SPEED_RAD_S = 1.0
 WIDE = SafetyCfg(step_rad=4.0)
 """Steps go through most of a joint's range at once, which a policy must not."""
 TWIN_JOINT_HZ = 9 * 3840.0
-"""Steps of the twin a second, times its joints: half of what a core does. At 3840 Hz its integrator is as
-exact as vd-gap's; at 960 it is off by 0.3 mrad (median of a moving hand; up to 0.9), two thirds of what the
-encoders round."""
+"""Steps of the twin a second, times its joints: half of what a core does. At 3840 Hz its integrator
+is as exact as vd-gap's; at 960 it is off by 0.3 mrad (median of a moving hand; up to 0.9), two
+thirds of what the encoders round."""
 RATE_SHARE = 0.95
 """Share of the rate that is wanted below which a recording says that it missed it."""
 AGAIN_S = 0.01
@@ -61,7 +64,8 @@ class RecordError(ValueError):
 class RecordCfg(HandOptions):
     """Record motions for vd-gap. Started again with the same options, it goes on where it stopped.
 
-    One joint moves at a time, the others hold; nothing may be in the way, and no object in the hand.
+    One joint moves at a time, the others hold; nothing may be in the way, and no object in the
+    hand.
     """
 
     out: Path = Path("recording")
@@ -71,7 +75,9 @@ class RecordCfg(HandOptions):
     excitations: tuple[str, ...] = ("steps_and_sines",)
     """Sets of motions, as vd-gap names them."""
     plan: Path | None = None
-    """Plan of vd-gap (next_experiment.json) in place of --excitations; its motions are added to --out."""
+    """Plan of vd-gap (next_experiment.json) in place of --excitations; its motions are added to
+    --out.
+    """
     rate_hz: float = RATE_HZ
     """Samples a second, as far as the bus allows."""
     safety: SafetyCfg = field(default_factory=lambda: WIDE)
@@ -140,7 +146,9 @@ def read_plan(path: Path, motors: "Joints") -> list["Trajectory"]:
     file = path / "next_experiment.json" if path.is_dir() else path
     try:
         plan: dict[str, Any] = json.loads(file.read_text())
-        return [_planned(file.parent, entry, plan["joints"], motors) for entry in plan["trajectories"]]
+        return [
+            _planned(file.parent, entry, plan["joints"], motors) for entry in plan["trajectories"]
+        ]
     except RecordError:
         raise
     except (OSError, KeyError, TypeError, ValueError) as error:
@@ -149,7 +157,9 @@ def read_plan(path: Path, motors: "Joints") -> list["Trajectory"]:
         ) from error
 
 
-def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], motors: "Joints") -> "Trajectory":
+def _planned(
+    folder: Path, entry: Mapping[str, Any], joints: Sequence[str], motors: "Joints"
+) -> "Trajectory":
     """The motion of a plan's entry, whose file is in ``folder``."""
     from vd.gap.recording import Trajectory
 
@@ -162,8 +172,14 @@ def _planned(folder: Path, entry: Mapping[str, Any], joints: Sequence[str], moto
         column = hand.joint_names.index(name)
         command[:, column] = columns[f"command.{name}"]
         enabled[:, column] = columns.get(f"enabled.{name}", np.ones(len(command))) > 0.0
-    file, kind, joints = "plan_" + Path(entry["file"]).name, entry["excitation"], tuple(entry["joints"])
-    motion = Trajectory(file, kind, joints, entry["conditions"], columns["t"], command, command, enabled)
+    file, kind, joints = (
+        "plan_" + Path(entry["file"]).name,
+        entry["excitation"],
+        tuple(entry["joints"]),
+    )
+    motion = Trajectory(
+        file, kind, joints, entry["conditions"], columns["t"], command, command, enabled
+    )
     return _of_hand(motion, motors)
 
 
@@ -175,7 +191,9 @@ def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
     """
     wrong = [finger for finger in fingers if not 0 <= finger < hand.num_fingers]
     if wrong:
-        raise ValueError(f"--fingers {wrong[0]}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")
+        raise ValueError(
+            f"--fingers {wrong[0]}: {hand.name} has fingers 0 to {hand.num_fingers - 1}"
+        )
     chosen = sorted(set(fingers)) or range(hand.num_fingers)
     return tuple(name for f in chosen for name in hand.joint_names[hand.fingers[f]])
 
@@ -183,27 +201,30 @@ def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
 def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
     """Times of states on this computer's clock, by those of the motors.
 
-    Between a program and its motors lie an adapter, a driver and a scheduler, which pass a packet on
-    milliseconds later on a busy machine. The motors have a clock of their own in their state.
+    Between a program and its motors lie an adapter, a driver and a scheduler, which pass a packet
+    on milliseconds later on a busy machine. The motors have a clock of their own in their state.
 
     Args:
         asked_s: When each was asked for [T] [s].
         ticks: What the motors' clocks said [T, D] [ms], which start again at their modulus: whole
-            milliseconds, each from a moment of its own, so that the mean of nine is as good as 0.1 ms.
+            milliseconds, each from a moment of its own, so that the mean of nine is as good as 0.1
+            ms.
 
     Returns:
         When each was measured [T] [s]: as long after it was asked for as most of them were.
     """
     gone = np.diff(ticks, axis=0) % TICK_MODULUS
     own = np.concatenate([[0.0], 1e-3 * gone.mean(axis=1).cumsum()])
-    # The rates of two clocks differ; a share of the packets that comes late must not count. All pairs of some
-    # samples: those of all take longer than a hand may wait for its loop.
+    # The rates of two clocks differ; a share of the packets that comes late must not count. All
+    # pairs of some samples: those of all take longer than a hand may wait for its loop.
     some = np.unique(np.linspace(0, len(own) - 1, CLOCK_SAMPLES).astype(int))
     rate, begin, *_ = theilslopes((asked_s - own)[some], own[some])
     return np.asarray(own * (1.0 + rate) + begin)
 
 
-def play(safe: SafeHand, motion: "Trajectory", columns: Sequence[int], rate_hz: float) -> "Trajectory":
+def play(
+    safe: SafeHand, motion: "Trajectory", columns: Sequence[int], rate_hz: float
+) -> "Trajectory":
     """Go to where a motion starts, play it on an armed hand, and give what was measured of some joints.
 
     Raises:
@@ -245,7 +266,9 @@ def _set_gains(bus: MotorBus, gains: Mapping[int, int]) -> None:
             bus.write(id, "position_p_gain", gain)
 
 
-def _trajectory(motion: "Trajectory", columns: Sequence[int], samples: Sequence[Sample]) -> "Trajectory":
+def _trajectory(
+    motion: "Trajectory", columns: Sequence[int], samples: Sequence[Sample]
+) -> "Trajectory":
     """What was measured, of some joints, at the times of the motors' clocks."""
 
     def of(name: str) -> np.ndarray:
@@ -282,13 +305,17 @@ def record(cfg: RecordCfg) -> int:
     else:
         motions = read_plan(cfg.plan, motors)
     with (
-        connect(cfg, physics_hz=TWIN_JOINT_HZ / motors.hand.num_joints, realtime=cfg.realtime) as connection,
+        connect(
+            cfg, physics_hz=TWIN_JOINT_HZ / motors.hand.num_joints, realtime=cfg.realtime
+        ) as connection,
         undisturbed(cfg.realtime),
     ):
         recording = _begun(cfg, connection, joints)
         done = {trajectory.file for trajectory in recording.trajectories}
         left = [motion for motion in motions if motion.file not in done]
-        print(f"{len(motions)} motions, {len(motions) - len(left)} of them recorded", file=sys.stderr)
+        print(
+            f"{len(motions)} motions, {len(motions) - len(left)} of them recorded", file=sys.stderr
+        )
         written: list[Future[Path]] = []
         # Beside the loop: a hand that holds has to be told so all the time.
         with ThreadPoolExecutor(1) as writer:
@@ -322,7 +349,9 @@ def _session(
     question = f"The hand will move for about {seconds:.0f} s, one joint at a time and quickly."
     if payload_kg > 0.0:
         if cfg.yes or cfg.twin:
-            raise RecordError(f"{motions[0].file}: somebody has to hang {payload_kg:g} kg at the fingertip")
+            raise RecordError(
+                f"{motions[0].file}: somebody has to hang {payload_kg:g} kg at the fingertip"
+            )
         question = f"Hang {payload_kg:g} kg at the fingertip of {finger}. {question}"
     ready(connection, question, yes=cfg.yes)
     columns = [connection.joints.names.index(name) for name in joints]

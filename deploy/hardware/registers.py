@@ -1,7 +1,10 @@
-"""The registers of a motor that matter: what is wanted of each, whether we set it or refuse, and why.
+"""The registers of a motor that matter.
 
-One table for the preflight, which compares, and for :meth:`vd.deploy.hardware.bus.MotorBus.configure`, which
-writes. What is wanted is the hand's own value, and else the factory's. The other registers tell, or act in
+What is wanted of each, whether we set it or refuse, and why.
+
+One table for the preflight, which compares, and for
+:meth:`vd.deploy.hardware.bus.MotorBus.configure`, which writes. What is wanted is the hand's own
+value, and else the factory's. The other registers tell, or act in
 other operating modes alone: velocity gains, goal velocity.
 """
 
@@ -44,16 +47,21 @@ class Register:
 
 REGISTERS = (
     Register(
-        "drive_mode", "angles, profiles or the torque follow other rules", f"{WIZARD}, and calibrate again"
+        "drive_mode",
+        "angles, profiles or the torque follow other rules",
+        f"{WIZARD}, and calibrate again",
     ),
     Register("homing_offset", "angles begin elsewhere", f"{WIZARD}, and calibrate again"),
     Register("status_return_level", "writes or reads stay unanswered", RESTART),
-    # In the order to write them: the mode resets gains and profiles, a watchdog that acted locks the goals.
+    # In the order to write them: the mode resets gains and profiles, a watchdog that acted locks
+    # the goals.
     Register("operating_mode", "goals are no positions"),
     Register("bus_watchdog", "goals are refused, or it stops too early"),
     Register("secondary_id", "it obeys what is sent to another motor, too"),
     Register("return_delay_time", "its answers come late"),
-    Register("startup_configuration", "it switches itself on, or restores other settings, at a start"),
+    Register(
+        "startup_configuration", "it switches itself on, or restores other settings, at a start"
+    ),
     Register("temperature_limit", "it shuts down too hot, or too early"),
     Register("max_voltage_limit", "it takes another supply for right"),
     Register("min_voltage_limit", "it takes another supply for right"),

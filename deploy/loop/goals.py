@@ -1,11 +1,11 @@
 """What to reach: the shape of an object, from its USD or any scan, and the orientations it shall take.
 
-A scan is a mesh or a cloud of points, with noise, holes and what floats about it. A closed surface is laid
-through it, by which a tracking policy finds the object; it need not be closed before, as for a simulation
-(vd-assets import).
+A scan is a mesh or a cloud of points, with noise, holes and what floats about it. A closed surface
+is laid through it, by which a tracking policy finds the object; it need not be closed before, as
+for a simulation (vd-assets import).
 
-Orientations are quaternions ``x,y,z,w`` or turns ``x,y,z@degrees`` about an axis, from how the object is in
-its file, in the world frame; or a file with one on each line.
+Orientations are quaternions ``x,y,z,w`` or turns ``x,y,z@degrees`` about an axis, from how the
+object is in its file, in the world frame; or a file with one on each line.
 """
 
 from collections.abc import Sequence
@@ -107,7 +107,8 @@ def make_goals(
     """Goals as they were typed, in their order, or drawn ones, each within an angle of the one before.
 
     Args:
-        texts: ``x,y,z,w``, ``x,y,z@degrees``, or a file (.txt, .csv) with one on each line, # for comments.
+        texts: ``x,y,z,w``, ``x,y,z@degrees``, or a file (.txt, .csv) with one on each line, # for
+            comments.
         drawn: How many to draw where there are none.
         max_angle: Largest angle between two drawn goals [rad]; the first from no rotation.
         seed: Of the draw.
@@ -129,7 +130,9 @@ def make_goals(
             raise GoalError(f"--goal {text} cannot be read ({error})") from error
         found = [_goal(row, f"{text}, line {i + 1}: {row}") for i, row in enumerate(rows) if row]
         if not found:
-            raise GoalError(f"--goal {text} holds no orientation; write one on each line, such as 0,0,1@90")
+            raise GoalError(
+                f"--goal {text} holds no orientation; write one on each line, such as 0,0,1@90"
+            )
         goals += found
     rng, last = np.random.default_rng(seed), np.array([0.0, 0.0, 0.0, 1.0])
     for _ in range(0 if goals else drawn):
@@ -148,14 +151,19 @@ def _goal(text: str, where: str) -> np.ndarray:
     wanted = 4 if "@" not in text else 3
     length = float(np.linalg.norm(numbers))
     if len(numbers) != wanted or not (np.isfinite(length + angle) and length > 0.0):
-        raise GoalError(f"{where}: give a quaternion x,y,z,w or a turn x,y,z@degrees, such as 0,0,1@90")
+        raise GoalError(
+            f"{where}: give a quaternion x,y,z,w or a turn x,y,z@degrees, such as 0,0,1@90"
+        )
     if wanted == 4:
         return canonical_quat(numbers / length)
     return canonical_quat(Rotation.from_rotvec(angle * numbers / length).as_quat())
 
 
 def _surface(path: Path, generator: np.random.Generator) -> Surface:
-    """Closed surface of a scan, in its own unit: a closed mesh as it is, else one through its samples."""
+    """Closed surface of a scan, in its own unit.
+
+    A closed mesh as it is, else one through its samples.
+    """
     loaded = load_points(path)
     vertices = np.asarray(loaded.vertices)
     if not len(vertices):
@@ -185,7 +193,8 @@ def _unit(path: Path, longest: float) -> float:
     fitting = [UNITS_M[name] for name in GUESSED_UNITS if low <= longest * UNITS_M[name] <= high]
     if not fitting:
         raise GoalError(
-            f"{path}: its longest side is {longest:.4g} units, which in {' or '.join(GUESSED_UNITS)} is not "
+            f"{path}: its longest side is {longest:.4g} units, which in "
+            f"{' or '.join(GUESSED_UNITS)} is not "
             f"within {100 * low:.0f} to {100 * high:.0f} cm; cut away what is not the object, or "
             "scale the file to metres"
         )

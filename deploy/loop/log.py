@@ -98,7 +98,9 @@ class LogWriter:
             "joints": list(hand.joint_names),
             "servo": dict(servo),
             "encoder_resolution_rad": RAD_PER_COUNT,
-            "trajectories": [{"file": STEPS_FILE, "excitation": "policy", "joints": list(hand.joint_names)}],
+            "trajectories": [
+                {"file": STEPS_FILE, "excitation": "policy", "joints": list(hand.joint_names)}
+            ],
         }
         self._sinks: list[Sink] = []
         self._count = 0

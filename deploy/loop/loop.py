@@ -45,7 +45,9 @@ class StepTimes:
 
 
 class ControlLoop:
-    """Pursues goals, one after the other: acts until the policy says it has arrived, holds, and goes on.
+    """Pursues goals, one after the other.
+
+    Acts until the policy says it has arrived, holds, and goes on.
 
     Args:
         safe: The hand, armed, at its start.
@@ -72,7 +74,13 @@ class ControlLoop:
         symmetry: np.ndarray = NO_SYMMETRY,
         more: Callable[[], bool] = lambda: False,
     ):
-        self._safe, self._runner, self._actions, self._pacer, self._log = safe, runner, actions, pacer, log
+        self._safe, self._runner, self._actions, self._pacer, self._log = (
+            safe,
+            runner,
+            actions,
+            pacer,
+            log,
+        )
         self._episode_s, self._hold_s = episode_s, hold_s
         self._camera, self._twin, self._symmetry = camera, twin, symmetry
         self._more = more
@@ -115,7 +123,10 @@ class ControlLoop:
             self.step(number, goal, acting=False)
 
     def _pursue(self, number: int, goal: np.ndarray) -> tuple[str, float | None]:
-        """Act until one goal is reached or given up: outcome, and the distance that was known then [rad]."""
+        """Act until one goal is reached or given up.
+
+        Outcome, and the distance that was known then [rad].
+        """
         self._runner.new_goal()
         self._actions.reset()
         self._log.goal(number, goal)
@@ -140,7 +151,8 @@ class ControlLoop:
             first: Whether it is the first of its goal: before an action there is nothing to stop.
 
         Returns:
-            What ends the pursuit, if anything does, and the distance to the goal [rad], NaN for none.
+            What ends the pursuit, if anything does, and the distance to the goal [rad], NaN for
+            none.
         """
         late_s, busy_s, due_s = self._pacer.wait(), time.process_time(), self._pacer.due_s
         sensed, state, image_s = self._sense(goal)
@@ -161,7 +173,9 @@ class ControlLoop:
         return ended, decision.distance
 
     def _sense(self, goal: np.ndarray) -> tuple[Sensed, HandState, float]:
-        """Read the camera, then the joints: what the policy is told, all that was measured, the image's time.
+        """Read the camera, then the joints.
+
+        What the policy is told, all that was measured, the image's time.
 
         Raises:
             StoppedError: The hand was stopped.
@@ -234,11 +248,13 @@ class ControlLoop:
 def summary(times: Sequence[StepTimes]) -> dict[str, dict[str, float]]:
     """Median, 99th percentile and most of each of the times [ms], and of the two latencies of training.
 
-    ``observation_latency_ms`` is how old the image is when the joints are read, ``command_delay_ms`` how much
-    later goals are sent (``randomisation.observation_latency_s``; ``command_delay.delay_s`` has the motors'
-    own delay besides). What no step has is left out.
+    ``observation_latency_ms`` is how old the image is when the joints are read,
+    ``command_delay_ms`` how much later goals are sent (``randomisation.observation_latency_s``;
+    ``command_delay.delay_s`` has the motors' own delay besides). What no step has is left out.
     """
-    values = {name: np.array([getattr(one, name) for one in times]) for name in StepTimes.__annotations__}
+    values = {
+        name: np.array([getattr(one, name) for one in times]) for name in StepTimes.__annotations__
+    }
     values["observation_latency_s"] = values["sensed_s"] - values["image_s"]
     values["command_delay_s"] = values["sent_s"] - values["sensed_s"]
     found = {}
@@ -246,5 +262,7 @@ def summary(times: Sequence[StepTimes]) -> dict[str, dict[str, float]]:
         ms = 1e3 * seconds[np.isfinite(seconds)]
         if len(ms):
             figures = {"median": np.median(ms), "p99": np.percentile(ms, 99), "max": ms.max()}
-            found[name.replace("_s", "_ms")] = {key: round(float(value), 3) for key, value in figures.items()}
+            found[name.replace("_s", "_ms")] = {
+                key: round(float(value), 3) for key, value in figures.items()
+            }
     return found

@@ -1,8 +1,9 @@
 """Exports of motion capture: where an object was, beside what the policy thought.
 
-Two layouts of CSV. The plain one has the columns ``time, x, y, z, qx, qy, qz, qw`` and, if it likes,
-``tracked`` (1 or 0); seconds, metres, xyzw. OptiTrack's Motive exports a head of several rows and, for every
-rigid body, columns of its rotation and position by name; where markers were lost, the cells are empty.
+Two layouts of CSV. The plain one has the columns ``time, x, y, z, qx, qy, qz, qw`` and, if it
+likes, ``tracked`` (1 or 0); seconds, metres, xyzw. OptiTrack's Motive exports a head of several
+rows and, for every rigid body, columns of its rotation and position by name; where markers were
+lost, the cells are empty.
 """
 
 import csv
@@ -57,12 +58,16 @@ def read_mocap(path: Path, body: str | None = None) -> Mocap:
         values = _optitrack(rows, body) if of_optitrack else _plain(rows)
         mocap = Mocap(path, values[:, 0], values[:, 1:])
         if len(values) < 2 or not (np.diff(mocap.time_s) > 0.0).all():  # NaN does not rise
-            raise ValueError("there must be at least two samples, and times must rise; export it again")
+            raise ValueError(
+                "there must be at least two samples, and times must rise; export it again"
+            )
         length = np.linalg.norm(mocap.pose[mocap.tracked, 3:], axis=1)
         if (np.abs(length - 1.0) > UNIT_TOLERANCE).any():
             raise ValueError("a quaternion's length is not 1; export rotations as quaternions")
     except OSError as error:
-        raise MocapError(f"{path}: {error.strerror}; name the export of the motion capture") from error
+        raise MocapError(
+            f"{path}: {error.strerror}; name the export of the motion capture"
+        ) from error
     except (ValueError, csv.Error) as error:  # of text and numbers too
         raise MocapError(f"{path}: {error}") from error
     return mocap
@@ -90,7 +95,9 @@ def _plain(rows: list[list[str]]) -> np.ndarray:
 
 def _optitrack(rows: list[list[str]], body: str | None) -> np.ndarray:
     """Times and poses [T, 8] of OptiTrack's layout."""
-    head = {key.lower(): value.lower() for key, value in zip(rows[0][::2], rows[0][1::2], strict=False)}
+    head = {
+        key.lower(): value.lower() for key, value in zip(rows[0][::2], rows[0][1::2], strict=False)
+    }
     turns, unit = head.get("rotation type", "quaternion"), head.get("length units", "meters")
     if turns != "quaternion":
         raise ValueError(f"rotations are {turns}; export them as quaternions")
@@ -101,10 +108,14 @@ def _optitrack(rows: list[list[str]], body: str | None) -> np.ndarray:
     if names is None or start == 0:
         raise ValueError("no rows Name and Frame in the head; export it from Motive again")
     found: dict[str, dict[tuple[str, str], int]] = {}
-    for column, (name, kind, axis) in enumerate(zip(names, rows[start - 1], rows[start], strict=False)):
+    for column, (name, kind, axis) in enumerate(
+        zip(names, rows[start - 1], rows[start], strict=False)
+    ):
         found.setdefault(name, {}).setdefault((kind.lower(), axis.lower()), column)
     wanted = [("position", axis) for axis in "xyz"] + [("rotation", axis) for axis in "xyzw"]
-    bodies = {name: columns for name, columns in found.items() if all(key in columns for key in wanted)}
+    bodies = {
+        name: columns for name, columns in found.items() if all(key in columns for key in wanted)
+    }
     if body is None and len(bodies) == 1:
         body = next(iter(bodies))
     if body not in bodies:

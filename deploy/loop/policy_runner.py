@@ -41,8 +41,8 @@ class Sensed:
     depth: np.ndarray | None = None
     """Depth image [m], 0 for none [H, W]."""
     truth: np.ndarray | None = None
-    """True position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] of the object [13], which a twin
-    tells, and of the policies a teacher is told."""
+    """True position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] of the object [13], which
+    a twin tells, and of the policies a teacher is told."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,9 @@ class PolicyRunner:
 
 
 class TeacherRunner(PolicyRunner):
-    """A teacher before a twin, which tells the object's true state: an environment makes its observation.
+    """A teacher before a twin, which tells the object's true state.
+
+    An environment makes its observation.
 
     Args:
         policy: The teacher.
@@ -151,7 +153,9 @@ class TeacherRunner(PolicyRunner):
 
 
 class TrackingRunner(PolicyRunner):
-    """A tracking or vision policy: finds the object in the camera's images, and lets its teacher act.
+    """A tracking or vision policy.
+
+    Finds the object in the camera's images, and lets its teacher act.
 
     Arguments are those of :func:`load_runner`.
 
@@ -225,7 +229,9 @@ def load_runner(
         ValueError: It is for another hand, or a teacher for a real one.
     """
     onnx = Path(name).suffix == ONNX
-    policy: Any = None if name == ZERO else read_onnx(Path(name)) if onnx else open_policy(name, "cpu")
+    policy: Any = (
+        None if name == ZERO else read_onnx(Path(name)) if onnx else open_policy(name, "cpu")
+    )
     if policy is None:
         if name != ZERO:
             raise ValueError(f"{name} is not for a hand; give a bundle, a policy's file, or {ZERO}")
@@ -236,13 +242,16 @@ def load_runner(
     if object is not None:
         return TeacherRunner(policy, hand_name, object, tolerance_rad)
     raise ValueError(
-        f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train tracker "
+        f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train "
+        f"tracker "
         "makes a tracking policy of it"
     )
 
 
 def seen_points(cloud: CameraCloud, depth: np.ndarray | None) -> wp.array:
-    """What a camera sees in an image, base frame [m], NaN for none [1, K]; overwritten by the next call.
+    """What a camera sees in an image, base frame [m], NaN for none [1, K].
+
+    Overwritten by the next call.
 
     Raises:
         ValueError: There is no image.

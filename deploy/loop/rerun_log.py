@@ -1,4 +1,6 @@
-"""The log of a run as a recording of Rerun (.rrd): curves, object, goal, and the camera's depth in 3D.
+"""The log of a run as a recording of Rerun (.rrd).
+
+Curves, object, goal, and the camera's depth in 3D.
 
 Needs the extra ``log``.
 """
@@ -53,9 +55,13 @@ class RerunLog:
             base = Rotation.from_quat(hand.mount[3:])
             place = base.apply(camera.position) + hand.mount[:3]
             self._pose(
-                "camera", [*place, *(base * Rotation.from_quat(camera.quaternion)).as_quat()], static=True
+                "camera",
+                [*place, *(base * Rotation.from_quat(camera.quaternion)).as_quat()],
+                static=True,
             )
-            lens = rerun.Pinhole(image_from_camera=camera.matrix, width=camera.width, height=camera.height)
+            lens = rerun.Pinhole(
+                image_from_camera=camera.matrix, width=camera.width, height=camera.height
+            )
             self._to.log("world/camera", lens, static=True)
 
     def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:
@@ -83,17 +89,24 @@ class RerunLog:
     def event(self, line: Mapping[str, Any]) -> None:
         """Write an event, as of events.jsonl."""
         self._to.set_time("run", duration=line["t"])
-        self._to.log("events", self._rr.TextLog(", ".join(f"{name} {value}" for name, value in line.items())))
+        self._to.log(
+            "events", self._rr.TextLog(", ".join(f"{name} {value}" for name, value in line.items()))
+        )
 
     def close(self, run: Mapping[str, Any]) -> None:
         """End the file."""
         self._to.disconnect()
 
     def _pose(self, name: str, pose: Any, *, static: bool = False) -> None:
-        """Where something is: position and quaternion [7], world frame; not shown where that is not known."""
+        """Where something is: position and quaternion [7], world frame.
+
+        Not shown where that is not known.
+        """
         known = bool(np.isfinite(pose).all())
         if known:
-            at = self._rr.Transform3D(translation=pose[:3], quaternion=self._rr.Quaternion(xyzw=pose[3:]))
+            at = self._rr.Transform3D(
+                translation=pose[:3], quaternion=self._rr.Quaternion(xyzw=pose[3:])
+            )
         else:
             at = self._rr.Transform3D(scale=0.0)
         self._to.log(f"world/{name}", at, static=static)

@@ -1,6 +1,9 @@
-"""Drive a hand with a policy: pursue goals one after the other, in one process at 12 Hz, and log every step.
+"""Drive a hand with a policy.
 
-The policy sees joints and a depth camera: a tracking or vision policy. A twin tells a teacher the truth.
+Pursue goals one after the other, in one process at 12 Hz, and log every step.
+
+The policy sees joints and a depth camera: a tracking or vision policy. A twin tells a teacher the
+truth.
 """
 
 import contextlib
@@ -49,7 +52,9 @@ HOME_RAD_S = 0.5
 SETTLE_S = 1.5
 """Time that an object of a twin has to come to rest between the fingers [s]."""
 LATEST = 0.25
-"""Share of a control period by which a step may begin late: to find the object takes much of one."""
+"""Share of a control period by which a step may begin late: to find the object takes much of
+one.
+"""
 WARM_UP = 3
 """Decisions before the hand is switched on: kernels are loaded, allocators have grown."""
 FIRST_IMAGE_S = 5.0
@@ -61,13 +66,15 @@ class RunCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """Bundle, file or name of a policy that sees by camera, with --twin a teacher too, and by default the
-    installed tracking policy of the hand. "zero" is the zero-action baseline."""
+    """Bundle, file or name of a policy that sees by camera, with --twin a teacher too, and by
+    default the installed tracking policy of the hand. "zero" is the zero-action baseline."""
     object: str = "cube"
-    """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj, .glb)."""
+    """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj,
+    .glb).
+    """
     goal: tuple[str, ...] = ()
-    """Orientations of the object to reach, one after the other, in the world frame: quaternions x,y,z,w,
-    turns x,y,z@degrees about an axis, or files (.txt, .csv) with one on each line."""
+    """Orientations of the object to reach, one after the other, in the world frame: quaternions
+    x,y,z,w, turns x,y,z@degrees about an axis, or files (.txt, .csv) with one on each line."""
     random_goals: int | None = None
     """How many goals to draw, 1 by default, in place of --goal; with --ros2 none are drawn."""
     max_goal_angle: float = np.pi
@@ -77,20 +84,26 @@ class RunCfg(HandOptions):
     hold_s: float = 1.0
     """How long the hand holds still between goals [s]."""
     precise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Stop within 0.1 rad rather than 0.4, as the paper's precise variant does: fewer goals, nearer."""
+    """Stop within 0.1 rad rather than 0.4, as the paper's precise variant does: fewer goals,
+    nearer.
+    """
     realistic: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Give the twin's depth images the errors of a real camera."""
     camera: RealSenseCfg = field(default_factory=RealSenseCfg)
     """The depth camera."""
     camera_layer: Path | None = None
-    """Where it was found to be (camera.usda of vd-deploy calibrate); where it was in training by default."""
+    """Where it was found to be (camera.usda of vd-deploy calibrate); where it was in training by
+    default.
+    """
     safety: SafetyCfg = field(default_factory=SafetyCfg)
     """Limits."""
     log: Path | None = None
-    """Folder of the log; runs/deploy/ and the time by default. NAME.mcap (ROS 2 messages) or NAME.rrd (Rerun)
-    is written beside the folder NAME."""
+    """Folder of the log; runs/deploy/ and the time by default. NAME.mcap (ROS 2 messages) or
+    NAME.rrd (Rerun) is written beside the folder NAME."""
     ros2: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Drive a hand behind ROS 2 in place of --port. Goals come from a service too (vd.deploy.ros)."""
+    """Drive a hand behind ROS 2 in place of --port. Goals come from a service too
+    (vd.deploy.ros).
+    """
     ros2_args: str = ""
     """Arguments of ROS: --ros2-args="-r commands:=/forward_position_controller/commands"."""
     seed: int = 0
@@ -124,7 +137,9 @@ class RunCfg(HandOptions):
         if self.realistic and not self.twin:
             raise ValueError("--realistic is for --twin")
         if self.twin and Path(self.object).suffix.lower() in SCAN_SUFFIXES:
-            raise ValueError(f"--object {self.object}: a twin cannot hold a scan; vd-assets import it first")
+            raise ValueError(
+                f"--object {self.object}: a twin cannot hold a scan; vd-assets import it first"
+            )
         if self.log is not None and (package := LOG_FILES.get(self.log.suffix)):
             if self.log.exists():
                 raise FileExistsError(f"--log {self.log} is there; choose another name")
@@ -137,7 +152,8 @@ def run(cfg: RunCfg) -> int:
     """Run the policy; 0 if all goals were pursued, 1 if the object was lost.
 
     Raises:
-        StoppedError: A limit or a fault stopped the hand; the page of what it did is written before.
+        StoppedError: A limit or a fault stopped the hand; the page of what it did is written
+            before.
     """
     cfg.validate()
     folder = LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
@@ -159,19 +175,24 @@ def run(cfg: RunCfg) -> int:
     item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
     tolerance = cfg.tolerance_rad
     told = cfg.object if cfg.twin else None
-    runner = load_runner(name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told)
+    runner = load_runner(
+        name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told
+    )
     if "torch" in sys.modules:  # of several threads, some would wait for one that has no core
         sys.modules["torch"].set_num_threads(1)
     if not runner.calibrated:
         print(
-            f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that distance; "
+            f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that "
+            f"distance; "
             "vd-train tracker finds a better one",
             file=sys.stderr,
         )
     fault: StoppedError | None = None
     status = 0
     camera = runner.camera or hand.mounted_camera
-    camera_pose = None if camera is None else (*map(float, camera.position), *map(float, camera.quaternion))
+    camera_pose = (
+        None if camera is None else (*map(float, camera.position), *map(float, camera.quaternion))
+    )
     twin: dict[str, Any] = {"object": cfg.object, "camera": camera_pose}
     twin |= {"realistic": cfg.realistic, "realtime": cfg.realtime}
     with connect_ros(cfg, cfg.ros2_args) if cfg.ros2 else connect(cfg, **twin) as connection:
@@ -221,7 +242,9 @@ def _pursue(
         if runner.camera is not None:
             camera = open_camera(cfg.camera, connection, runner.camera)
             stack.callback(camera.close)
-            where = runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
+            where = (
+                runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
+            )
             runner.look_by(camera.intrinsics.seen_from(where))
             seen = camera_findings(
                 camera, runner.camera, hand.goal_in_base, fps=cfg.camera.fps if twin is None else hz
@@ -243,7 +266,8 @@ def _pursue(
         reason, outcomes = "aborted", list[str]()
         loop: ControlLoop | None = None
         try:
-            safety = replace(cfg.safety, then="hold") if cfg.ros2 else cfg.safety  # torque is the driver's
+            # With ROS 2 torque is the driver's.
+            safety = replace(cfg.safety, then="hold") if cfg.ros2 else cfg.safety
             with SafeHand(connection.bus, connection.joints, safety) as safe:
                 safe.arm()
                 safe.move(pose, HOME_RAD_S)
@@ -275,7 +299,11 @@ def _pursue(
 
 
 def _sink(
-    file: Path, run: Mapping[str, Any], hand: "HandModel", item: "ObjectModel", camera: "CameraModel | None"
+    file: Path,
+    run: Mapping[str, Any],
+    hand: "HandModel",
+    item: "ObjectModel",
+    camera: "CameraModel | None",
 ) -> "Sink":
     """What writes the file of a log."""
     if file.suffix == MCAP:
@@ -287,7 +315,9 @@ def _sink(
     return RerunLog(file, run, hand, item, camera)
 
 
-def warm_up(runner: "PolicyRunner", pose: np.ndarray, goal: np.ndarray, camera: Camera | None) -> None:
+def warm_up(
+    runner: "PolicyRunner", pose: np.ndarray, goal: np.ndarray, camera: Camera | None
+) -> None:
     """Let the policy decide a few times on what is seen now; the run begins without that.
 
     The object may not be between the fingers yet.
@@ -327,7 +357,12 @@ def place(safe: SafeHand, pose: np.ndarray, twin: "TwinChild | None", *, yes: bo
     if twin is not None:
         twin.place_object()
     elif asked:
-        print("Put the object between the fingers, then press Enter. ", end="", file=sys.stderr, flush=True)
+        print(
+            "Put the object between the fingers, then press Enter. ",
+            end="",
+            file=sys.stderr,
+            flush=True,
+        )
     clock = safe.bus.clock
     end = clock.now() + SETTLE_S
     while clock.now() < end or (asked and not select.select([sys.stdin], [], [], 0.0)[0]):

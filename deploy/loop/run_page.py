@@ -29,7 +29,9 @@ class GoalResult:
     predicted_rad: float | None
     """Distance to the goal that the policy stopped by [rad]; None where it has none."""
     error_rad: float | None
-    """True angle to the goal at the end, up to symmetry [rad]; None where nobody knows: on a real hand."""
+    """True angle to the goal at the end, up to symmetry [rad]; None where nobody knows: on a real
+    hand.
+    """
     success: bool | None
     """Whether the policy stopped within the tolerance; None where nobody knows."""
 
@@ -38,7 +40,9 @@ class GoalResult:
         words = {True: "reached", False: "not reached", None: "error not known"}[self.success]
         far = "" if self.error_rad is None else f", {self.error_rad:.2f} rad from it"
         said = "" if self.predicted_rad is None else f", predicted {self.predicted_rad:.2f}"
-        return f"goal {self.goal + 1}: {words}: {self.outcome} after {self.seconds:.1f} s{far}{said}"
+        return (
+            f"goal {self.goal + 1}: {words}: {self.outcome} after {self.seconds:.1f} s{far}{said}"
+        )
 
 
 def goal_results(log: HandLog) -> list[GoalResult]:
@@ -57,7 +61,9 @@ def goal_results(log: HandLog) -> list[GoalResult]:
                 seconds=float(columns["t"][rows[-1]] - columns["t"][rows[0]]),
                 predicted_rad=None if np.isnan(predicted) else predicted,
                 error_rad=error,
-                success=None if error is None else outcome == "stopped" and error <= log.tolerance_rad,
+                success=None
+                if error is None
+                else outcome == "stopped" and error <= log.tolerance_rad,
             )
         )
     return results

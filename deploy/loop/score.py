@@ -1,8 +1,8 @@
 """Score a run by motion capture: the object's error at each stop, as the paper measures it.
 
-An error is the angle between the goal and the object when the policy has said that it arrived, up to the
-object's symmetry. Trials whose markers were lost at the stop are discarded; trials without a stop have no
-error, and count as failures in the shares.
+An error is the angle between the goal and the object when the policy has said that it arrived, up
+to the object's symmetry. Trials whose markers were lost at the stop are discarded; trials without a
+stop have no error, and count as failures in the shares.
 """
 
 import json
@@ -16,11 +16,19 @@ from scipy.spatial.transform import Rotation
 
 from vd.config import to_dict
 from vd.deploy.loop.mocap import Mocap, MocapError, read_mocap
-from vd.evaluate.statistics import TOLERANCES_RAD, Interval, median_interval, rate_intervals, symmetric_error
+from vd.evaluate.statistics import (
+    TOLERANCES_RAD,
+    Interval,
+    median_interval,
+    rate_intervals,
+    symmetric_error,
+)
 from vd.hand_log import HandLog, read_log
 
 NEAR_S = 0.1
-"""Farthest sample [s] from a stop that counts for it: the object rests, and lost markers come back late."""
+"""Farthest sample [s] from a stop that counts for it: the object rests, and lost markers come back
+late.
+"""
 
 
 @dataclass(frozen=True)
@@ -30,18 +38,26 @@ class ScoreCfg:
     log: Annotated[Path, tyro.conf.Positional]
     """Folder that vd-deploy wrote."""
     mocap: Path
-    """Export of the motion capture: CSV with time, x, y, z, qx, qy, qz, qw, tracked; or OptiTrack's."""
+    """Export of the motion capture: CSV with time, x, y, z, qx, qy, qz, qw, tracked; or
+    OptiTrack's.
+    """
     body: str | None = None
     """Rigid body, of an export with several."""
     offset_s: float | None = None
-    """Time of the motion capture at the log's beginning [s], to 0.3 s: the object rests at a stop. By default
-    times are seconds since 1970."""
+    """Time of the motion capture at the log's beginning [s], to 0.3 s: the object rests at a stop.
+    By default times are seconds since 1970."""
     up: Literal["z", "y"] = "z"
-    """Axis of the motion capture that points up; OptiTrack's is y unless it is exported otherwise."""
+    """Axis of the motion capture that points up; OptiTrack's is y unless it is exported
+    otherwise.
+    """
     world: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """Turn from the motion capture's frame, made z up, to the hand's world frame, quaternion xyzw."""
+    """Turn from the motion capture's frame, made z up, to the hand's world frame, quaternion
+    xyzw.
+    """
     marker: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """The object's frame in that of its rigid body, quaternion xyzw: how the markers were defined on it."""
+    """The object's frame in that of its rigid body, quaternion xyzw: how the markers were defined
+    on it.
+    """
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print JSON."""
 
@@ -59,7 +75,9 @@ class Trial:
     tracked: bool
     """Whether the object was tracked at its end."""
     error_rad: float | None
-    """Angle to the goal at the stop [rad]; None without a stop, or if the object was not tracked."""
+    """Angle to the goal at the stop [rad]; None without a stop, or if the object was not
+    tracked.
+    """
     predicted_rad: float | None
     """What the policy predicted [rad]."""
 
@@ -104,7 +122,9 @@ def score(cfg: ScoreCfg) -> int:
     return 0 if result.scored else 1
 
 
-def in_world(mocap: Mocap, *, up: str, world: tuple[float, ...], marker: tuple[float, ...]) -> Mocap:
+def in_world(
+    mocap: Mocap, *, up: str, world: tuple[float, ...], marker: tuple[float, ...]
+) -> Mocap:
     """The object's track in the hand's world frame (z up).
 
     Raises:
@@ -122,14 +142,17 @@ def in_world(mocap: Mocap, *, up: str, world: tuple[float, ...], marker: tuple[f
     return replace(mocap, pose=pose)
 
 
-def score_run(log: HandLog, mocap: Mocap, symmetry: np.ndarray, *, offset_s: float | None = None) -> Score:
+def score_run(
+    log: HandLog, mocap: Mocap, symmetry: np.ndarray, *, offset_s: float | None = None
+) -> Score:
     """Score a run.
 
     Args:
         log: The run.
         mocap: The object's track in the hand's world frame.
         symmetry: Rotations of the object onto itself, xyzw [S, 4].
-        offset_s: Time of the export at the log's beginning [s]; None: its times are seconds since 1970.
+        offset_s: Time of the export at the log's beginning [s]; None: its times are seconds since
+            1970.
 
     Raises:
         MocapError: The export does not cover the run.
@@ -140,8 +163,10 @@ def score_run(log: HandLog, mocap: Mocap, symmetry: np.ndarray, *, offset_s: flo
     end = log.columns["t"][-1]
     if mocap.time_s[-1] < 0.0 or mocap.time_s[0] > end:
         raise MocapError(
-            f"{mocap.path} covers {mocap.time_s[0]:.1f} to {mocap.time_s[-1]:.1f} s of the log's time, "
-            f"the log 0 to {end:.1f} s; name the clocks' offset with --offset-s, or export the right take"
+            f"{mocap.path} covers {mocap.time_s[0]:.1f} to {mocap.time_s[-1]:.1f} s of the log's "
+            f"time, "
+            f"the log 0 to {end:.1f} s; name the clocks' offset with --offset-s, or export the "
+            f"right take"
         )
     trials = []
     for stop in log.stops:
@@ -177,7 +202,8 @@ def lines(result: Score) -> list[str]:
         )
     discarded = len(result.trials) - result.scored
     rows.append(
-        f"{result.scored} trials scored, {discarded} discarded since the markers were lost at the stop"
+        f"{result.scored} trials scored, {discarded} discarded since the markers were lost at the "
+        f"stop"
     )
     if result.median is not None:
         m, stops = result.median, sum(trial.error_rad is not None for trial in result.trials)
@@ -187,7 +213,8 @@ def lines(result: Score) -> list[str]:
         )
     for tolerance, share in result.within:
         rows.append(
-            f"within {tolerance:.1f} rad: {100 * share.value:3.0f} %, 95 % {100 * share.low:.0f} to "
+            f"within {tolerance:.1f} rad: {100 * share.value:3.0f} %, 95 % {100 * share.low:.0f} "
+            f"to "
             f"{100 * share.high:.0f} % of all that were scored"
         )
     return rows

@@ -1,4 +1,6 @@
-"""Limits of a hand that hold whatever decides on its goals: which goals are sent, and which states end it.
+"""Limits of a hand that hold whatever decides on its goals.
+
+Which goals are sent, and which states end it.
 
 Angles [rad] and speeds [rad/s] are the joints'.
 """
@@ -26,26 +28,36 @@ class SafetyCfg:
     margin_rad: float = 0.0
     """Distance that goals keep from the ends of the joints' ranges [rad]."""
     step_rad: float = 0.35
-    """Farthest goal from where a joint is [rad]: the policy asks for 3.5 rad/s / 12 Hz = 0.29 at most. It
-    limits the torque as well, to stiffness times this."""
+    """Farthest goal from where a joint is [rad]: the policy asks for 3.5 rad/s / 12 Hz = 0.29 at
+    most. It limits the torque as well, to stiffness times this."""
     velocity_share: float = 1.5
-    """Speed over the joints' own limit at which the hand is stopped; it turns faster only when something
-    else moves it."""
+    """Speed over the joints' own limit at which the hand is stopped; it turns faster only when
+    something else moves it."""
     current_share: float = 0.8
-    """Current over the one for the joints' largest torque at which the hand is stopped, if it lasts; motors
-    shut down by themselves near 1. Motors whose mode limits their current may go on at that limit."""
+    """Current over the one for the joints' largest torque at which the hand is stopped, if it
+    lasts; motors shut down by themselves near 1. Motors whose mode limits their current may go on
+    at that limit.
+    """
     current_s: float = 0.5
     """How long [s] a current may be above that."""
     temperature_c: float = 70.0
-    """Temperature [deg C] at which the hand is stopped, or 10 below that at which a motor shuts down."""
+    """Temperature [deg C] at which the hand is stopped, or 10 below that at which a motor shuts
+    down.
+    """
     lost_s: float = 3.0 * PERIOD_S
-    """Time [s] without a sound state after which the bus is lost; shorter gaps repeat the last state."""
+    """Time [s] without a sound state after which the bus is lost; shorter gaps repeat the last
+    state.
+    """
     misses: int = 3
-    """Deadlines missed in a row at which the hand is stopped; also this many periods without a beat."""
+    """Deadlines missed in a row at which the hand is stopped; also this many periods without a
+    beat.
+    """
     stale_s: float = 3.0 * PERIOD_S
     """Age [s] of the newest image at which the hand is stopped, once there was one."""
     watchdog_s: float = 0.3
-    """Silence [s] after which the motors stop by themselves; 0 for never. Above three control periods."""
+    """Silence [s] after which the motors stop by themselves; 0 for never. Above three control
+    periods.
+    """
     then: Literal["off", "hold"] = "off"
     """After the hold: torque off, or leave the hand holding."""
     hold_s: float = 1.0
@@ -53,7 +65,9 @@ class SafetyCfg:
 
     def __post_init__(self) -> None:
         """Refuse numbers that would switch a limit off by accident."""
-        limits = "step_rad velocity_share current_share current_s temperature_c lost_s misses stale_s"
+        limits = (
+            "step_rad velocity_share current_share current_s temperature_c lost_s misses stale_s"
+        )
         require(self, "safety.", "positive", limits)
         require(self, "safety.", "zero or positive", "margin_rad watchdog_s hold_s")
 
@@ -69,7 +83,9 @@ class Limits:
         hand, self._names, self._cfg = joints.hand, tuple(names), cfg
         self.lower, self.upper = hand.lower + cfg.margin_rad, hand.upper - cfg.margin_rad
         if (self.lower >= self.upper).any():
-            raise ValueError(f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider")
+            raise ValueError(
+                f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider"
+            )
         self._current = np.where(joints.capped, np.inf, cfg.current_share * joints.currents())
         most = [model.temperature_limit - SHUTDOWN_C for model in joints.models]
         self._temperature = np.minimum(cfg.temperature_c, most)
@@ -86,13 +102,17 @@ class Limits:
         fast = np.abs(state.velocity) > self._velocity
         hot = state.temperature > self._temperature
         strained = np.abs(state.current) > self._current
-        self._strained_since = np.where(strained, np.minimum(self._strained_since, state.time_s), np.inf)
+        self._strained_since = np.where(
+            strained, np.minimum(self._strained_since, state.time_s), np.inf
+        )
         long = state.time_s - self._strained_since > self._cfg.current_s
         for axis, name in enumerate(self._names):
             if fast[axis]:
                 return f"{name}: {state.velocity[axis]:.1f} rad/s, over {self._velocity[axis]:.1f}"
             if hot[axis]:
-                return f"{name}: {state.temperature[axis]:.0f} deg C, over {self._temperature[axis]:g}"
+                return (
+                    f"{name}: {state.temperature[axis]:.0f} deg C, over {self._temperature[axis]:g}"
+                )
             if long[axis]:
                 return f"{name}: {state.current[axis]:.2f} A for {self._cfg.current_s:g} s; is it blocked?"
         return ""

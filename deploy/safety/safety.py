@@ -1,17 +1,23 @@
-"""Limits and a watchdog between whatever decides on goals and the motors; they hold whatever it decides.
+"""Limits and a watchdog between whatever decides on goals and the motors.
 
-    with SafeHand(bus, joints, cfg) as safe:           # preflight has passed, the person has confirmed
-        safe.arm()                                     # torque on where the hand is; watchdogs run from here
+They hold whatever it decides.
+
+    with SafeHand(bus, joints, cfg) as safe:           # preflight has passed, the person has
+    confirmed
+        safe.arm()                                     # torque on where the hand is; watchdogs run
+        from here
         while not done:
             state = safe.read()                        # joints' frame [rad]; checked
             goal = safe.command(target)                # limited, sent; what was sent
-            safe.image_at(time_s)                      # of the newest image, where there is a camera
-            safe.beat(missed=late)                     # once per control step, after its work
+            safe.image_at(time_s)                      # of the newest image, where there is a
+            camera safe.beat(missed=late)                     # once per control step, after its
+            work
 
-Whatever ends the block, the hand is brought to a hold where it is, and then, as configured, its torque is
-switched off. A limit that is passed, a lost bus, a stale image, missed deadlines, Ctrl-C or the end of the
-terminal raise :class:`StoppedError` with the reason at the next call; a thread has stopped the hand by then,
-also if no call ever comes. Where the driver itself dies, the motors' bus watchdog stops them.
+Whatever ends the block, the hand is brought to a hold where it is, and then, as configured, its
+torque is switched off. A limit that is passed, a lost bus, a stale image, missed deadlines, Ctrl-C
+or the end of the terminal raise :class:`StoppedError` with the reason at the next call; a thread
+has stopped the hand by then, also if no call ever comes. Where the driver itself dies, the motors'
+bus watchdog stops them.
 
 Angles and speeds are the joints', rad and rad/s; times of the monotonic clock.
 """
@@ -41,17 +47,25 @@ SETTLE_STEPS = 10
 WATCH_S = 0.01
 """How often the watchdog looks."""
 TORQUE_S = PERIOD_S / 3.0
-"""Age of what is known of the motors' torque from which it is asked for again, in a packet of its own, since
-its register lies far from the state's: with each reading of a control loop, each third of a recording."""
+"""Age of what is known of the motors' torque from which it is asked for again, in a packet of its
+own, since its register lies far from the state's: with each reading of a control loop, each third
+of a recording.
+"""
 DEFAULTS = SafetyCfg()
 TORQUE_GONE = "another program on the line switched it off, or it restarted"
 AHEAD_S = 0.02
-"""An image cannot be newer than the moment it came [s]; what the SDK makes of its clock is off by some ms."""
+"""An image cannot be newer than the moment it came [s]; what the SDK makes of its clock is off by
+some ms.
+"""
 OFF_S = 1.0
 """How long switching off is tried on a bus that does not answer soundly."""
 FINISHED = "finished"
 """Reason of the stop at the end of what was to be done."""
-SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "asked to end", signal.SIGHUP: "the terminal is gone"}
+SIGNALS = {
+    signal.SIGINT: "Ctrl-C",
+    signal.SIGTERM: "asked to end",
+    signal.SIGHUP: "the terminal is gone",
+}
 """Signals that stop the hand; a second one ends at once."""
 
 
@@ -100,7 +114,9 @@ class SafeHand:
     ):
         """Nothing is sent before :meth:`arm`."""
         self.bus, self.joints, self.hand, self.cfg, self._say = bus, joints, joints.hand, cfg, say
-        self._names = [f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)]
+        self._names = [
+            f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)
+        ]
         self.limits = Limits(joints, self._names, self.cfg)
         self.repeated = 0
         """Readings without a sound answer, for which the last state stood in."""
@@ -122,10 +138,14 @@ class SafeHand:
         self._unwatch = self.bus.clock.every(WATCH_S, self._watch)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: object
+    ) -> None:
         try:
             if self._armed:
-                self._hold(FINISHED if error is None else f"{kind.__name__ if kind else ''}: {error}")
+                self._hold(
+                    FINISHED if error is None else f"{kind.__name__ if kind else ''}: {error}"
+                )
                 self._off()
         finally:
             self._unwatch()
@@ -246,7 +266,8 @@ class SafeHand:
         ahead = time_s - self.bus.clock.now()
         if ahead > AHEAD_S:
             raise self._stop(
-                f"the newest image is {ahead:.2f} s from the future: wait until the computer's clock is set "
+                f"the newest image is {ahead:.2f} s from the future: wait until the computer's "
+                f"clock is set "
                 "(NTP), then plug the camera in again"
             )
         self._image_s = time_s
@@ -268,7 +289,10 @@ class SafeHand:
         return state
 
     def _check_torque(self) -> None:
-        """Stop where a motor that was switched on is so no more; every TORQUE_S once the hand is armed."""
+        """Stop where a motor that was switched on is so no more.
+
+        Every TORQUE_S once the hand is armed.
+        """
         now = self.bus.clock.now()
         if not self._armed or now - self._torque_s < TORQUE_S:
             return
@@ -378,7 +402,9 @@ class SafeHand:
             left = self.bus.torque(False, left)
             if not left:
                 with contextlib.suppress(BusError):
-                    self.bus.watch(0.0)  # what it guarded is off; other programs would find it in their way
+                    self.bus.watch(
+                        0.0
+                    )  # what it guarded is off; other programs would find it in their way
             if not left or self.bus.clock.now() > end:
                 return left
 

@@ -93,7 +93,8 @@ class TwinChild:
         """The device of its bus, once it serves."""
         if not self._pipe.poll(START_S):
             raise TwinError(
-                f"the twin did not start within {START_S:g} s; what it has compiled is kept, so try again, "
+                f"the twin did not start within {START_S:g} s; what it has compiled is kept, so "
+                f"try again, "
                 "or with fewer other programs"
             )
         try:

@@ -1,7 +1,10 @@
-"""What happens when something goes wrong: each fault injected into a moving hand's twin, and how it ended.
+"""What happens when something goes wrong.
+
+Each fault injected into a moving hand's twin, and how it ended.
 
 ``python -m vd.deploy.twin.faults`` prints a row for every fault. The twin runs in this process,
-behind its pseudo-terminal, so that what its motors really did is known: who had torque, and who pushed.
+behind its pseudo-terminal, so that what its motors really did is known: who had torque, and who
+pushed.
 """
 
 import contextlib
@@ -40,12 +43,16 @@ TURN_S = 0.5
 BEFORE_S, AFTER_S = 1.0, 3.0
 """Time that the hand moves before the fault, and longest time after it."""
 SAFE_RAD = 0.15
-"""A motor this near to its goal carries its finger and pushes no more: gravity bends joints by 0.1 rad."""
+"""A motor this near to its goal carries its finger and pushes no more: gravity bends joints by 0.1
+rad.
+"""
 REST_S = 0.6
 """Time after the end in which even a motor that hears nothing has to have stopped by itself."""
 
 SETUP_RETRIES = 20
-"""On a busy machine a twin may not run for longer than the SDK waits; before the start that is no matter."""
+"""On a busy machine a twin may not run for longer than the SDK waits; before the start that is no
+matter.
+"""
 START_S = 60.0
 """Longest start of a command."""
 
@@ -202,7 +209,10 @@ MOVING = (
     Fault("every packet corrupted", _line(corrupt=1.0)),
     Fault("every packet 0.1 s late", _line(late=1.0)),
     Fault("cable of one motor loose", lambda s: s.twin.faults.cut_off.add(s.motor(1).id)),
-    Fault("cable of all motors loose", lambda s: s.twin.faults.cut_off.update(m.id for m in s.twin.motors)),
+    Fault(
+        "cable of all motors loose",
+        lambda s: s.twin.faults.cut_off.update(m.id for m in s.twin.motors),
+    ),
     Fault("adapter unplugged", lambda s: s.bus.close()),
     Fault("a motor warms by 50 deg C/s", lambda s: setattr(s.motor(4), "heat_c_per_s", 50.0)),
     Fault("a motor shuts down, too hot", lambda s: setattr(s.motor(4), "heat_c_per_s", 5000.0)),
@@ -249,9 +259,13 @@ class Outcome:
     detected_s: float | None = None
     """From the fault to its detection [s]; None if it was not to stop the hand."""
     safe_s: float | None = None
-    """From its detection until the hand was told to hold, and no motor that heard it pushed any more [s]."""
+    """From its detection until the hand was told to hold, and no motor that heard it pushed any
+    more [s].
+    """
     own_s: float | None = None
-    """From the fault until the last motor that could not be told had stopped by its own watchdog [s]."""
+    """From the fault until the last motor that could not be told had stopped by its own watchdog
+    [s].
+    """
     energised: tuple[int, ...] = ()
     """Motors with torque at the end."""
     pushing: tuple[int, ...] = ()
@@ -261,8 +275,14 @@ class Outcome:
 
     def __str__(self) -> str:
         """In one line."""
-        times = {"found after": self.detected_s, "safe after that": self.safe_s, "by themselves": self.own_s}
-        words = [f"{what} {1e3 * time_s:.0f} ms" for what, time_s in times.items() if time_s is not None]
+        times = {
+            "found after": self.detected_s,
+            "safe after that": self.safe_s,
+            "by themselves": self.own_s,
+        }
+        words = [
+            f"{what} {1e3 * time_s:.0f} ms" for what, time_s in times.items() if time_s is not None
+        ]
         left = f"{len(self.energised)} on, {len(self.pushing)} of them pushing"
         mark = "ok   " if self.right else "WRONG"
         return f"{mark}  {self.fault}: {self.happened} ({', '.join([*words, left])})"
@@ -271,10 +291,15 @@ class Outcome:
 @contextlib.contextmanager
 def scene_of(joints: Joints, *, blockable: bool = False) -> Iterator[Scene]:
     """A twin that serves, and a configured bus to it."""
-    plant: Plant = FirstOrderPlant(len(joints.ids)) if blockable else NewtonHand(joints.hand, joints)
+    plant: Plant = (
+        FirstOrderPlant(len(joints.ids)) if blockable else NewtonHand(joints.hand, joints)
+    )
     motors = make_motors(joints)
     witness = Witness(plant, motors)
-    with Twin(motors, witness, Faults(seed=1)) as twin, MotorBus(twin.path, joints.ids, joints.models) as bus:
+    with (
+        Twin(motors, witness, Faults(seed=1)) as twin,
+        MotorBus(twin.path, joints.ids, joints.models) as bus,
+    ):
         bus.retries = SETUP_RETRIES
         bus.configure(joints.settings())
         bus.retries = 1
@@ -293,7 +318,9 @@ def _outcome(
 ) -> Outcome:
     """How it ended: a motor with torque at the end is right only where it has stopped by itself."""
     left, pushing = scene.witness.left(), np.flatnonzero(scene.witness.pushes[-1] > SAFE_RAD)
-    own_s = max((scene.witness.own.get(axis, float("inf")) - since_s for axis in left), default=None)
+    own_s = max(
+        (scene.witness.own.get(axis, float("inf")) - since_s for axis in left), default=None
+    )
     return Outcome(
         name,
         happened,
@@ -329,7 +356,9 @@ def try_fault(fault: Fault, joints: Joints) -> Outcome:
             fault.name,
             report.reason + left,
             joints,
-            right=report.reason != FINISHED and report.detected_s >= scene.injected_s and safe_s <= PERIOD_S,
+            right=report.reason != FINISHED
+            and report.detected_s >= scene.injected_s
+            and safe_s <= PERIOD_S,
             since_s=scene.injected_s,
             detected_s=report.detected_s - scene.injected_s,
             safe_s=None if report.held_s is None else safe_s,
@@ -381,12 +410,24 @@ def try_process(name: str, joints: Joints) -> Outcome:
     """Send a signal to `vd-deploy home` while it moves the twin."""
     with scene_of(joints) as scene:
         scene.bus.close()  # one program at a time has the port
-        command = [sys.executable, "-m", "vd.deploy.cli", "home", "--port", scene.twin.path, "--yes"]
+        command = [
+            sys.executable,
+            "-m",
+            "vd.deploy.cli",
+            "home",
+            "--port",
+            scene.twin.path,
+            "--yes",
+        ]
         command += ["--hand", called(joints.hand), "--speed", "0.2"]
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
         end = time.monotonic() + START_S
         while (
-            len(scene.witness.left()) < len(joints.ids) and process.poll() is None and time.monotonic() < end
+            len(scene.witness.left()) < len(joints.ids)
+            and process.poll() is None
+            and time.monotonic() < end
         ):
             time.sleep(0.01)
         time.sleep(0.5)

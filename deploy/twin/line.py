@@ -1,6 +1,9 @@
-"""A line of simulated motors: bytes of a program in, bytes of the motors out, and what they move goes on.
+"""A line of simulated motors.
 
-:mod:`vd.deploy.twin.twin` puts a pseudo-terminal and the computer's clock around it. Faults can be injected.
+Bytes of a program in, bytes of the motors out, and what they move goes on.
+
+:mod:`vd.deploy.twin.twin` puts a pseudo-terminal and the computer's clock around it. Faults can be
+injected.
 """
 
 import functools
@@ -11,7 +14,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from vd.deploy.clock import MONOTONIC, Clock
-from vd.deploy.hardware.packets import BROADCAST, Failure, Instruction, Packet, PacketReader, encode, status
+from vd.deploy.hardware.packets import (
+    BROADCAST,
+    Failure,
+    Instruction,
+    Packet,
+    PacketReader,
+    encode,
+    status,
+)
 from vd.deploy.twin.motor import Motor
 from vd.deploy.twin.plant import FirstOrderPlant, Plant
 
@@ -98,8 +109,13 @@ class MotorLine:
         named = list(packet.parameters[4:]) if packet.instruction == Instruction.SYNC_READ else []
         # Motors that a packet names answer in its order; each waits for the one before.
         answers: dict[int, list[bytes]] = {}
-        for motor in sorted(self.motors, key=lambda m: named.index(m.id) if m.id in named else len(named)):
-            if motor.id not in self.faults.cut_off and (answer := _answer(motor, packet)) is not None:
+        for motor in sorted(
+            self.motors, key=lambda m: named.index(m.id) if m.id in named else len(named)
+        ):
+            if (
+                motor.id not in self.faults.cut_off
+                and (answer := _answer(motor, packet)) is not None
+            ):
                 answers.setdefault(motor.id, []).append(encode(answer))
         for id, at_once in answers.items():
             delay = next(motor for motor in self.motors if motor.id == id).get("return_delay_time")
@@ -126,12 +142,15 @@ class MotorLine:
 
 
 def collide(frames: Sequence[bytes]) -> bytes:
-    """What is on the line when motors of one ID answer at once: a zero of any of them pulls it down.
+    """What is on the line when motors of one ID answer at once.
+
+    A zero of any of them pulls it down.
 
     Equal answers, such as those to a ping, are not told from one.
     """
     return bytes(
-        functools.reduce(operator.and_, column) for column in itertools.zip_longest(*frames, fillvalue=0xFF)
+        functools.reduce(operator.and_, column)
+        for column in itertools.zip_longest(*frames, fillvalue=0xFF)
     )
 
 

@@ -1,4 +1,7 @@
-"""One motor of the twin: its control table, what can be written when, how it drives and protects itself."""
+"""One motor of the twin.
+
+Its control table, what can be written when, how it drives and protects itself.
+"""
 
 import math
 
@@ -22,8 +25,8 @@ from vd.deploy.hardware.packets import ALERT, Failure
 from vd.deploy.twin.plant import Drive
 
 OVERLOAD_SHARE, OVERLOAD_S = 0.9, 1.0
-"""A motor that gives this share of its largest torque for this long has an overload; the real rule is not
-published."""
+"""A motor that gives this share of its largest torque for this long has an overload; the real rule
+is not published."""
 AMBIENT_C, HEATING_C_PER_S, COOLING_S = 30.0, 0.5, 120.0
 """Case temperature: rise at full torque, and time constant of cooling."""
 TICK_S = 1e-3
@@ -62,7 +65,10 @@ class Motor:
         self.reboot()
 
     def reboot(self) -> None:
-        """Start anew: torque off, errors cleared, RAM at its initial values; what is kept in EEPROM stays."""
+        """Start anew: torque off, errors cleared, RAM at its initial values.
+
+        What is kept in EEPROM stays.
+        """
         for name, item in self.items.items():
             if item.address >= EEPROM_END and item.writable:
                 self.put(name, item.initial)
@@ -101,7 +107,10 @@ class Motor:
             self.put("goal_current", self.get("current_limit"))
 
     def _count_one_turn(self) -> None:
-        """Count angles anew within one turn, as when switched on: turned by hand it has counted on."""
+        """Count angles anew within one turn, as when switched on.
+
+        Turned by hand it has counted on.
+        """
         self._turns = to_counts(self._where) // COUNTS_PER_TURN
         self.put("present_position", to_counts(self._where) % COUNTS_PER_TURN)
 
@@ -137,7 +146,9 @@ class Motor:
         torque = self.get("torque_enable")
         if not item.writable or (item.address < EEPROM_END and torque):
             return Failure.ACCESS
-        if (item.low is not None and value < item.low) or (item.high is not None and value > item.high):
+        if (item.low is not None and value < item.low) or (
+            item.high is not None and value > item.high
+        ):
             return Failure.RANGE
         if name == "torque_enable" and value and self.shut_down:
             return Failure.ACCESS
@@ -146,7 +157,11 @@ class Motor:
         if name == "goal_position" and self.get("operating_mode") == POSITION_MODE:
             low, high = self.get("min_position_limit"), self.get("max_position_limit")
             return Failure.NONE if low <= value <= high else Failure.LIMIT
-        limits = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
+        limits = {
+            "goal_pwm": "pwm_limit",
+            "goal_current": "current_limit",
+            "goal_velocity": "velocity_limit",
+        }
         if name in limits and abs(value) > self.get(limits[name]):
             return Failure.LIMIT
         return Failure.NONE
@@ -155,7 +170,9 @@ class Motor:
         if name == "torque_enable" and value and not self.get("torque_enable"):
             if self.get("operating_mode") == POSITION_MODE:
                 self._count_one_turn()
-            self.put("goal_position", self.get("present_position"))  # a motor does not jump when switched on
+            self.put(
+                "goal_position", self.get("present_position")
+            )  # a motor does not jump when switched on
         if name == "operating_mode" and value != self.get(name):
             for item in MODE_ITEMS:
                 self.put(item, self.items[item].initial)
@@ -169,8 +186,13 @@ class Motor:
         self._silence = 0.0
 
     def drive(self) -> Drive:
-        """What the motor does with its axis; profiles, I gain and feed-forward are not simulated."""
-        counts = self.get("current_limit") if self.model.senses_current else self.model.current_limit
+        """What the motor does with its axis.
+
+        Profiles, I gain and feed-forward are not simulated.
+        """
+        counts = (
+            self.get("current_limit") if self.model.senses_current else self.model.current_limit
+        )
         if self.get("operating_mode") == CURRENT_POSITION_MODE:
             counts = min(counts, self.get("goal_current"))
         goal: float | None = None
@@ -193,7 +215,10 @@ class Motor:
         speed = round(velocity / RAD_S_PER_COUNT)
         self.put("present_position", counts)
         self.put("present_velocity", speed)
-        self.put("present_current", round(torque / self.model.torque_nm_per_a / self.model.current_unit_a))
+        self.put(
+            "present_current",
+            round(torque / self.model.torque_nm_per_a / self.model.current_unit_a),
+        )
         self.put("moving", int(abs(speed) > self.get("moving_threshold")))
         self._protect(seconds, torque)
         self._watch(seconds)
@@ -201,7 +226,11 @@ class Motor:
     def _protect(self, seconds: float, torque: float) -> None:
         full = self.model.current_limit * self.model.current_unit_a * self.model.torque_nm_per_a
         load = abs(torque) / full
-        warming = HEATING_C_PER_S * load**2 - (self.temperature - AMBIENT_C) / COOLING_S + self.heat_c_per_s
+        warming = (
+            HEATING_C_PER_S * load**2
+            - (self.temperature - AMBIENT_C) / COOLING_S
+            + self.heat_c_per_s
+        )
         self.temperature += seconds * warming
         self.put("present_temperature", min(255, round(self.temperature)))
         self._strained = self._strained + seconds if load >= OVERLOAD_SHARE else 0.0

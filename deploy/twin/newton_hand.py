@@ -1,7 +1,8 @@
 """The hand in Newton as the plant behind the twin's motors, on the CPU, over a table with an object or none.
 
-One world, stepped at the simulator's physics rate. Steps do not end when somebody asks: a goal that arrives
-within a step counts for the rest of it, and the joints are told where they have got to since the last one.
+One world, stepped at the simulator's physics rate. Steps do not end when somebody asks: a goal that
+arrives within a step counts for the rest of it, and the joints are told where they have got to
+since the last one.
 """
 
 from collections.abc import Sequence
@@ -23,24 +24,32 @@ from vd.sim.joint_servo import JointServo, has_effects
 from vd.sim.scene import Scene, add_table, build_hand, build_scene, new_builder
 
 SHORTEST_COMMAND_S = 0.0025
-"""Commands do not come more often, or some of those that are delayed are lost: two for each goal."""
+"""Commands do not come more often, or some of those that are delayed are lost: two for each
+goal.
+"""
 LONGEST_S = 0.3
-"""Time that is simulated at once at most, longer than a gap at which the hand is stopped: after a longer one
-it is where it was."""
+"""Time that is simulated at once at most, longer than a gap at which the hand is stopped: after a
+longer one it is where it was."""
 ROOM = 4
-"""Times as many contacts as a world of many has on average, for there is no other world to take them from."""
+"""Times as many contacts as a world of many has on average, for there is no other world to take
+them from.
+"""
 
 
 class NewtonHand:
     """A simulated hand; its axes are the motors', in the joints' order.
 
-    A motor at the position gain of the hand's USD has the hand's stiffness and damping; its stiffness grows
-    with the gain. In current-based mode its current limits the torque. With its torque off a joint has
-    neither. Effects of the hand's layer act as in training.
+    A motor at the position gain of the hand's USD has the hand's stiffness and damping; its
+    stiffness grows with the gain. In current-based mode its current limits the torque. With its
+    torque off a joint has neither. Effects of the hand's layer act as in training.
     """
 
     def __init__(
-        self, hand: HandModel, joints: Joints, cfg: SimCfg | None = None, item: ObjectModel | None = None
+        self,
+        hand: HandModel,
+        joints: Joints,
+        cfg: SimCfg | None = None,
+        item: ObjectModel | None = None,
     ):
         """Build the world, with the hand in the task's reset pose and the object above the table."""
         self.hand, self.joints = hand, joints
@@ -107,7 +116,10 @@ class NewtonHand:
         return self._state.body_q.reshape((1, -1))
 
     def place_object(self, quat: Sequence[float]) -> None:
-        """Put the object where an episode starts, at rest, turned as wanted (xyzw); it falls from there."""
+        """Put the object where an episode starts, at rest, turned as wanted (xyzw).
+
+        It falls from there.
+        """
         self._write(self._state.joint_q, [*self.hand.workspace.drop_m, *quat], self._axes)
         self._write(self._state.joint_qd, np.zeros(6), self._axes)
         # The solver warm-starts from the last accelerations, which mean nothing after a jump.
@@ -123,8 +135,9 @@ class NewtonHand:
     def _capture(self) -> Any:
         """Two physics steps as one recorded launch, which takes a tenth of the time.
 
-        The launches of a step one by one would take most of its time, and hold the interpreter, which the
-        thread that answers packets needs. Two, because states swap; they end where they began.
+        The launches of a step one by one would take most of its time, and hold the interpreter,
+        which the thread that answers packets needs. Two, because states swap; they end where they
+        began.
         """
         q, qd = wp.clone(self._state.joint_q), wp.clone(self._state.joint_qd)
         self._two_steps()  # loads kernels and allocates
@@ -137,7 +150,9 @@ class NewtonHand:
     def _two_steps(self) -> None:
         here, there = self._state, self._next
         for _ in range(2):
-            before, q, qd = (a.reshape((1, -1)) for a in (here.joint_q, there.joint_q, there.joint_qd))
+            before, q, qd = (
+                a.reshape((1, -1)) for a in (here.joint_q, there.joint_q, there.joint_qd)
+            )
             if self._servo is not None:
                 self._servo.receive()
                 self._servo.drive(before, here.joint_qd.reshape((1, -1)))
@@ -187,8 +202,8 @@ class NewtonHand:
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions [rad], velocities [rad/s] and torques [N m] of the motors, each of shape [D].
 
-        Without an object positions are those of now, else of the last step, as is what the object and the
-        camera tell.
+        Without an object positions are those of now, else of the last step, as is what the object
+        and the camera tell.
         """
         q, qd = self.joint_q[: self._axes].astype(float), self.joint_qd[: self._axes].astype(float)
         reference = self._held if self._servo is None else self._servo.reference.numpy()[0]
@@ -204,7 +219,9 @@ class NewtonHand:
 
     def _set_gains(self, drives: Sequence[Drive]) -> None:
         """Tell the solver of gains that changed, and of torque switched on or off."""
-        gains = tuple((one.p_gain, float(one.goal_rad is not None), one.torque_limit) for one in drives)
+        gains = tuple(
+            (one.p_gain, float(one.goal_rad is not None), one.torque_limit) for one in drives
+        )
         if gains == self._gains:
             return
         self._gains = gains

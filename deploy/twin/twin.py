@@ -1,8 +1,11 @@
-"""A simulated motor bus behind a pseudo-terminal: programs talk to it as to a serial port with motors on it.
+"""A simulated motor bus behind a pseudo-terminal.
+
+Programs talk to it as to a serial port with motors on it.
 
 ``python -m vd.deploy.twin.twin`` owns such a port and prints its path. The motors of
-:mod:`vd.deploy.twin.line` answer byte by byte; behind them stands any :class:`vd.deploy.twin.plant.Plant`.
-Motors hear what arrives when it arrives, however long the plant takes: they have processors of their own.
+:mod:`vd.deploy.twin.line` answer byte by byte; behind them stands any
+:class:`vd.deploy.twin.plant.Plant`. Motors hear what arrives when it arrives, however long the
+plant takes: they have processors of their own.
 """
 
 import contextlib
@@ -48,7 +51,8 @@ class Twin(MotorLine):
 
     Args:
         motors: As of :class:`MotorLine`, as are ``plant`` and ``faults``.
-        pipe: To the program that started it, if one did: requests come by it, and it ends with its other end.
+        pipe: To the program that started it, if one did: requests come by it, and it ends with its
+            other end.
         answer: To each request.
     """
 
@@ -118,7 +122,10 @@ class Twin(MotorLine):
                 self._pipe.send(self._answer(heard))
 
     def _listen(self) -> None:
-        """Pass on what arrives, with the time at which it did: meanwhile the plant may be in a step."""
+        """Pass on what arrives, with the time at which it did.
+
+        Meanwhile the plant may be in a step.
+        """
         sources: list[Any] = [self._near] if self._pipe is None else [self._near, self._pipe]
         while not self._end.is_set():
             for source in select.select(sources, [], [], IDLE_S)[0]:
@@ -143,7 +150,9 @@ class TwinCommand:
     """Serve a bus of simulated motors on a pseudo-terminal until interrupted."""
 
     hand: str = "dclaw3"
-    """Hand that its motors move, simulated in Newton: dclaw3, dclaw4, an imported hand or a hand's USD."""
+    """Hand that its motors move, simulated in Newton: dclaw3, dclaw4, an imported hand or a hand's
+    USD.
+    """
     hand_layer: Path | None = None
     """Identified servo model over it (identified.usda), whose effects act."""
     physics_hz: float = PAPER.scene.physics_hz
@@ -153,7 +162,9 @@ class TwinCommand:
     object: str | None = None
     """Object on the table or in the hand: name of a built-in set, or a file."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
-    """Pose of the depth camera in the hand's base frame, position [m] and quaternion xyzw; the hand's own."""
+    """Pose of the depth camera in the hand's base frame, position [m] and quaternion xyzw; the
+    hand's own.
+    """
     realistic: bool = False
     """Give the depth images the errors of a real camera."""
     model: str | None = None
@@ -166,9 +177,10 @@ class TwinCommand:
         """Serve until interrupted, or until a pipe's other end is gone.
 
         Args:
-            pipe: Takes the path of the port, which is printed without one. Answers ``object`` with its
-                position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] [13], ``depth`` with an image
-                [m] [H, W] and its time [s], and ``place``, by which the object is where an episode starts.
+            pipe: Takes the path of the port, which is printed without one. Answers ``object`` with
+                its position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] [13], ``depth``
+                with an image [m] [H, W] and its time [s], and ``place``, by which the object is
+                where an episode starts.
 
         Raises:
             ValueError: Options that cannot be.
@@ -199,7 +211,10 @@ class TwinCommand:
         return NewtonHand(hand, joints, SimCfg(physics_hz=self.physics_hz), item=item)
 
     def _beside(self, hand: "NewtonHand") -> Callable[[str], Any] | None:
-        """What answers requests, of a hand with an object: eyes and a helping hand, which no real one has."""
+        """What answers requests, of a hand with an object.
+
+        Eyes and a helping hand, which no real one has.
+        """
         if hand.scene is None:
             return None
         from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
@@ -209,7 +224,9 @@ class TwinCommand:
         if hand.hand.mounted_camera is not None:
             sensor = DepthSensorCfg.realistic() if self.realistic else DepthSensorCfg()
             cfg, place = DepthCameraCfg(points=0, sensor=sensor), hand.hand.camera.at(self.camera)
-            camera = DepthCamera.of_scene(hand.scene, hand.body_q, cfg, place, seed=self.faults.seed)
+            camera = DepthCamera.of_scene(
+                hand.scene, hand.body_q, cfg, place, seed=self.faults.seed
+            )
             camera.capture()  # loads kernels
 
         def answer(request: str) -> Any:

@@ -1,4 +1,6 @@
-"""From a depth image to a point cloud: crop by height, choose a fixed number of points, carry to the base.
+"""From a depth image to a point cloud.
+
+Crop by height, choose a fixed number of points, carry to the base.
 
 Pixels are gathered in tiles, which have a bit of a word for each of theirs.
 Launch order: ``crop_pixels_kernel``, ``count_points_kernel``, ``choose_points_kernel``.
@@ -42,11 +44,16 @@ def crop_pixels_kernel(
     camera_q_in: wp.array[wp.transform],  # [N] optical frames in the world frame
     depth_in: wp.array3d[float],  # [N, H, W] depth [m], 0 for none
     # Out:
-    tile_pixels_out: wp.array2d[wp.uint32],  # [N, T] bit k is set if the tile's pixel k is within the crop
+    tile_pixels_out: wp.array2d[
+        wp.uint32
+    ],  # [N, T] bit k is set if the tile's pixel k is within the crop
     tile_first_out: wp.array2d[int],  # [N, T] points before each tile in its row of tiles
     row_count_out: wp.array2d[int],  # [N, T / tile_columns] points of each row of tiles
 ):
-    """Mark the pixels whose point lies within the crop. Launch: [N, T / tile_columns], the rows of tiles."""
+    """Mark the pixels whose point lies within the crop.
+
+    Launch: [N, T / tile_columns], the rows of tiles.
+    """
     world, tile_row = wp.tid()
     view = views[world]
     camera_q = camera_q_in[world]
@@ -113,8 +120,8 @@ def choose_points_kernel(
 ):
     """Choose points at random, evenly over the image and each at most once. Launch: [N, K].
 
-    With V points and room for K < V, thread k takes a random one of those from k V / K to (k + 1) V / K. With
-    V <= K all are taken, in order, and the rows beyond are NaN.
+    With V points and room for K < V, thread k takes a random one of those from k V / K to (k + 1) V
+    / K. With V <= K all are taken, in order, and the rows beyond are NaN.
     """
     world, k = wp.tid()
     capacity = points_out.shape[1]

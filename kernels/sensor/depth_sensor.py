@@ -1,8 +1,8 @@
 """What a stereo depth camera makes of the true depth, and when: noise, gaps, late frames.
 
-Such a camera measures disparity, focal length * baseline / depth, in pixels of its imagers. Noise and
-rounding are even in disparity, hence grow with the square of the distance in depth. At the edge of a surface
-the matched patch covers near and far, which gives no value or one in between.
+Such a camera measures disparity, focal length * baseline / depth, in pixels of its imagers. Noise
+and rounding are even in disparity, hence grow with the square of the distance in depth. At the edge
+of a surface the matched patch covers near and far, which gives no value or one in between.
 """
 
 import warp as wp
@@ -12,7 +12,9 @@ from vd.kernels.sensor.raycast import EMPTY
 wp.set_module_options({"enable_backward": False})
 
 SHADOW_NEAREST = wp.constant(0.2)
-"""Nothing nearer than this hides others from the second imager [m]: it bounds the length of a shadow."""
+"""Nothing nearer than this hides others from the second imager [m]: it bounds the length of a
+shadow.
+"""
 
 
 @wp.struct
@@ -23,7 +25,9 @@ class DepthSensorParams:
     disparity_std: float  # standard deviation of the disparity [pixel]
     disparity_step: float  # rounding of the disparity [pixel]
     shadow: float  # as depth_disparity, in pixels of the image: what :func:`is_hidden` has no value
-    edge_jump: float  # difference of depth to one of the four neighbours that makes a pixel an edge [m]
+    edge_jump: (
+        float  # difference of depth to one of the four neighbours that makes a pixel an edge [m]
+    )
     edge_dropout: float  # probability that an edge pixel has no value
     flying: float  # probability that an edge pixel lies somewhere between both surfaces
     dropout: float  # probability that any pixel has no value
@@ -33,7 +37,10 @@ class DepthSensorParams:
 
 @wp.func
 def depth_behind(depth: wp.array3d[float], world: int, row: int, column: int, far: float) -> float:
-    """Depth of a pixel, ``far`` where it has none; rows and columns beyond the image repeat its border."""
+    """Depth of a pixel, ``far`` where it has none.
+
+    Rows and columns beyond the image repeat its border.
+    """
     r = wp.clamp(row, 0, depth.shape[1] - 1)
     c = wp.clamp(column, 0, depth.shape[2] - 1)
     value = depth[world, r, c]
@@ -46,8 +53,8 @@ def depth_behind(depth: wp.array3d[float], world: int, row: int, column: int, fa
 def is_hidden(depth: wp.array3d[float], world: int, row: int, column: int, shadow: float) -> bool:
     """Whether the second imager, to the right, does not see what a pixel shows.
 
-    It sees a pixel moved to the left by its disparity. Something nearer moves further, and hides what it
-    lands on or passes.
+    It sees a pixel moved to the left by its disparity. Something nearer moves further, and hides
+    what it lands on or passes.
     """
     mine = shadow / depth[world, row, column]
     if float(column) + 0.5 < mine:
@@ -87,7 +94,11 @@ def measure_depth_kernel(
         for side in range(4):
             step = 1 - 2 * (side % 2)
             neighbour = depth_behind(
-                depth_in, world, row + step * (side // 2), column + step * (1 - side // 2), sensor.max_range
+                depth_in,
+                world,
+                row + step * (side // 2),
+                column + step * (1 - side // 2),
+                sensor.max_range,
             )
             if wp.abs(neighbour - depth) > wp.abs(other - depth):
                 other = neighbour
@@ -134,13 +145,18 @@ def delay_poses_kernel(
     delay_in: wp.array[float],  # [N] age of the poses that are wanted [frame], 0 to L - 1
     body_q_in: wp.array2d[wp.transform],  # [N, B] body poses in the world frame
     # In/Out:
-    history: wp.array3d[wp.transform],  # [L, N, B] poses of the last L frames, frame k in slot k mod L
+    history: wp.array3d[
+        wp.transform
+    ],  # [L, N, B] poses of the last L frames, frame k in slot k mod L
     # Out:
     late_q_out: wp.array2d[wp.transform],  # [N, B] body poses in the world frame at that time
 ):
-    """Record the present poses and give those of some frames ago, interpolated in between. Launch: [N, B].
+    """Record the present poses and give those of some frames ago, interpolated in between.
 
-    An image drawn from the poses of a past frame is that frame's image, and poses take far less memory.
+    Launch: [N, B].
+
+    An image drawn from the poses of a past frame is that frame's image, and poses take far less
+    memory.
     """
     world, body = wp.tid()
     slots = history.shape[0]
@@ -151,10 +167,13 @@ def delay_poses_kernel(
     newer = history[(frame + slots - whole) % slots, world, body]
     older = history[(frame + slots - wp.min(whole + 1, slots - 1)) % slots, world, body]
     share = delay - float(whole)
-    position = wp.lerp(wp.transform_get_translation(newer), wp.transform_get_translation(older), share)
+    position = wp.lerp(
+        wp.transform_get_translation(newer), wp.transform_get_translation(older), share
+    )
     q = wp.transform_get_rotation(newer)
     p = wp.transform_get_rotation(older)
     if wp.dot(q, p) < 0.0:
         p = p * -1.0
-    # Along the chord: between two control steps a link turns 0.65 rad at most, and the arc is 1 mrad away.
+    # Along the chord: between two control steps a link turns 0.65 rad at most, and the arc is 1
+    # mrad away.
     late_q_out[world, body] = wp.transform(position, wp.normalize(q * (1.0 - share) + p * share))

@@ -34,9 +34,12 @@ def forward_kinematics_kernel(
     row = wp.tid()
     body_q_out[row, base_body] = base
     for joint in range(joints.parent.shape[0]):
-        turn = wp.transform(wp.vec3(0.0), wp.quat_from_axis_angle(joints.axis[joint], joint_q_in[row, joint]))
+        turn = wp.transform(
+            wp.vec3(0.0), wp.quat_from_axis_angle(joints.axis[joint], joint_q_in[row, joint])
+        )
         pose = wp.transform_multiply(
-            body_q_out[row, joints.parent[joint]], wp.transform_multiply(joints.parent_frame[joint], turn)
+            body_q_out[row, joints.parent[joint]],
+            wp.transform_multiply(joints.parent_frame[joint], turn),
         )
         body_q_out[row, joints.child[joint]] = wp.transform_multiply(
             pose, wp.transform_inverse(joints.child_frame[joint])

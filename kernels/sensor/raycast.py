@@ -1,12 +1,15 @@
-"""Depth images by ray casting: one thread a triangle, which tests the rays of the pixels it can cover.
+"""Depth images by ray casting.
 
-Frames: *optical* is the camera's (x right, y down, z forward); depth is z of that frame, along the optical
-axis, not along the ray. Pixel (column, row) is seen along its centre, (column + 0.5, row + 0.5); the
-principal point is measured from the top left corner of the image. Metres, quaternions xyzw.
+One thread a triangle, which tests the rays of the pixels it can cover.
 
-A mesh of the size of these covers few pixels with each triangle. A pixel is covered if the ray through its
-centre meets the triangle, tested without dividing by depth, so that triangles beside and behind the camera
-need no clipping.
+Frames: *optical* is the camera's (x right, y down, z forward); depth is z of that frame, along the
+optical axis, not along the ray. Pixel (column, row) is seen along its centre, (column + 0.5, row +
+0.5); the principal point is measured from the top left corner of the image. Metres, quaternions
+xyzw.
+
+A mesh of the size of these covers few pixels with each triangle. A pixel is covered if the ray
+through its centre meets the triangle, tested without dividing by depth, so that triangles beside
+and behind the camera need no clipping.
 
 Launch order: ``place_camera_kernel``, ``place_meshes_kernel``, then ``depth.fill_(NO_HIT)``,
 ``cast_rays_kernel`` and ``finish_depth_kernel``.
@@ -46,7 +49,10 @@ class View:
 
 @wp.func
 def pixel_direction(view: View, column: int, row: int) -> wp.vec3:
-    """Direction through the centre of a pixel in the optical frame, z = 1: times depth it is the point."""
+    """Direction through the centre of a pixel in the optical frame, z = 1.
+
+    Times depth it is the point.
+    """
     return wp.vec3(
         (float(column) + 0.5 - view.cx) / view.fx,
         (float(row) + 0.5 - view.cy) / view.fy,
@@ -56,7 +62,10 @@ def pixel_direction(view: View, column: int, row: int) -> wp.vec3:
 
 @wp.func
 def box_depth(origin: wp.vec3, direction: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> float:
-    """Multiple of ``direction`` at which a ray enters a box; NO_HIT if it misses or starts inside."""
+    """Multiple of ``direction`` at which a ray enters a box.
+
+    NO_HIT if it misses or starts inside.
+    """
     enter = wp.float32(0.0)
     leave = wp.float32(NO_HIT)
     for axis in range(3):
@@ -93,7 +102,9 @@ def place_camera_kernel(
 @wp.kernel
 def place_meshes_kernel(
     # Model:
-    shape_body: wp.array[int],  # [S] body of each shape, an index within a world; negative for the world
+    shape_body: wp.array[
+        int
+    ],  # [S] body of each shape, an index within a world; negative for the world
     # In:
     camera_q_in: wp.array[wp.transform],  # [N] optical frames in the world frame
     body_q_in: wp.array2d[wp.transform],  # [N, B] body poses in the world frame
@@ -113,10 +124,13 @@ def place_meshes_kernel(
 
 @wp.func
 def edge_normal(a: wp.vec3, b: wp.vec3, index_a: int, index_b: int) -> wp.vec3:
-    """Normal of the plane through the camera and an edge; exactly opposite for the edge turned around.
+    """Normal of the plane through the camera and an edge.
 
-    The two triangles at an edge must agree on which side a ray passes, or rays slip between them; the
-    rounding of a cross product depends on the order of its factors, so the indices choose the order.
+    Exactly opposite for the edge turned around.
+
+    The two triangles at an edge must agree on which side a ray passes, or rays slip between them;
+    the rounding of a cross product depends on the order of its factors, so the indices choose the
+    order.
     """
     if index_a < index_b:
         first, second, sign = a, b, 1.0
@@ -133,7 +147,9 @@ def cast_rays_kernel(
     triangles: wp.array[wp.vec3i],  # [F] vertices of all triangles, mesh after mesh
     mesh_first: wp.array[int],  # [M + 1] first triangle of each mesh, and the end of the last
     slot_shape: wp.array[int],  # [K] shape of each thread
-    slot_index: wp.array[int],  # [K] each thread's triangle within the shape's mesh; there may be fewer
+    slot_index: wp.array[
+        int
+    ],  # [K] each thread's triangle within the shape's mesh; there may be fewer
     shape_mesh: wp.array2d[int],  # [N, S] mesh of each shape
     shape_scale: wp.array2d[float],  # [N, S] size factor of each shape
     # In:
@@ -174,18 +190,32 @@ def cast_rays_kernel(
         pc = wp.vec2(c[0] / c[2], c[1] / c[2])
         least = wp.min(pa, wp.min(pb, pc))
         largest = wp.max(pa, wp.max(pb, pc))
-        # Pixel k is seen along k + 0.5. Clamped before the cast: a far column need not fit an integer.
+        # Pixel k is seen along k + 0.5. Clamped before the cast: a far column need not fit an
+        # integer.
         last_column, last_row = float(width) - 1.0, float(height) - 1.0
-        left = int(wp.ceil(wp.clamp(view.cx + view.fx * least[0] - MARGIN - 0.5, 0.0, last_column + 1.0)))
-        top = int(wp.ceil(wp.clamp(view.cy + view.fy * least[1] - MARGIN - 0.5, 0.0, last_row + 1.0)))
-        right = int(wp.floor(wp.clamp(view.cx + view.fx * largest[0] + MARGIN - 0.5, -1.0, last_column))) + 1
-        bottom = int(wp.floor(wp.clamp(view.cy + view.fy * largest[1] + MARGIN - 0.5, -1.0, last_row))) + 1
+        left = int(
+            wp.ceil(wp.clamp(view.cx + view.fx * least[0] - MARGIN - 0.5, 0.0, last_column + 1.0))
+        )
+        top = int(
+            wp.ceil(wp.clamp(view.cy + view.fy * least[1] - MARGIN - 0.5, 0.0, last_row + 1.0))
+        )
+        right = (
+            int(
+                wp.floor(wp.clamp(view.cx + view.fx * largest[0] + MARGIN - 0.5, -1.0, last_column))
+            )
+            + 1
+        )
+        bottom = (
+            int(wp.floor(wp.clamp(view.cy + view.fy * largest[1] + MARGIN - 0.5, -1.0, last_row)))
+            + 1
+        )
     if left >= right or top >= bottom:
         return
 
-    # A ray d meets the plane of abc at u a + v b + w c with u : v : w = d.(b x c) : d.(c x a) : d.(a x b),
-    # and the triangle where none of the three has the other sign. The depth comes from the plane's normal, a
-    # product of short vectors and hence exact where these products of long ones are not.
+    # A ray d meets the plane of abc at u a + v b + w c with u : v : w = d.(b x c) : d.(c x a) :
+    # d.(a x b), and the triangle where none of the three has the other sign. The depth comes from
+    # the plane's normal, a product of short vectors and hence exact where these products of long
+    # ones are not.
     na = edge_normal(b, c, corner[1], corner[2])
     nb = edge_normal(c, a, corner[2], corner[0])
     nc = edge_normal(a, b, corner[0], corner[1])
@@ -226,7 +256,10 @@ def finish_depth_kernel(
     # In/Out:
     depth: wp.array3d[float],  # [N, H, W] depth of the nearest mesh [m], then of anything
 ):
-    """Add the table, and write 0 where nothing is within the camera's range. Launch: [N, H, lanes]."""
+    """Add the table, and write 0 where nothing is within the camera's range.
+
+    Launch: [N, H, lanes].
+    """
     world, row, lane = wp.tid()
     view = views[world]
     camera_q = camera_q_in[world]

@@ -1,13 +1,16 @@
-"""Where a known shape is, from points seen of it: poses are fitted, many at once, and the best kept.
+"""Where a known shape is, from points seen of it.
 
-A shape is a grid of distances to its surface, so that a point costs one look-up whatever the shape is. Each
-pose is improved by steps of Gauss and Newton on the distances of the seen points, of which far ones count
-less. How badly it fits is the mean square of two lengths, both cut off at ``far``: how far the seen points
-are from the shape, and how far the shape stands out before what a camera saw.
+Poses are fitted, many at once, and the best kept.
 
-Frames: *base* is that of the points and poses, *object* that of the samples. Metres, quaternions xyzw.
-N worlds, P seen points at most, O shapes of S samples, grids of E^3 distances; M rows, each of one world,
-with C poses each.
+A shape is a grid of distances to its surface, so that a point costs one look-up whatever the shape
+is. Each pose is improved by steps of Gauss and Newton on the distances of the seen points, of which
+far ones count less. How badly it fits is the mean square of two lengths, both cut off at ``far``:
+how far the seen points are from the shape, and how far the shape stands out before what a camera
+saw.
+
+Frames: *base* is that of the points and poses, *object* that of the samples. Metres, quaternions
+xyzw. N worlds, P seen points at most, O shapes of S samples, grids of E^3 distances; M rows, each
+of one world, with C poses each.
 """
 
 import warp as wp
@@ -58,7 +61,9 @@ def nearness_kernel(
     # In:
     points_in: wp.array2d[wp.vec3],  # [N, K] what it saw, base frame [m], NaN for none
     # In/Out:
-    nearness: wp.array3d[float],  # [N, Y, X] one over depth [1/m], zeros before; 0 where nothing was seen
+    nearness: wp.array3d[
+        float
+    ],  # [N, Y, X] one over depth [1/m], zeros before; 0 where nothing was seen
 ):
     """How near the nearest is that was seen in each cell of the image. Launch: [N, K]."""
     world, k = wp.tid()
@@ -70,10 +75,13 @@ def nearness_kernel(
 
 
 @wp.func
-def standing_out(eye: Eye, place: wp.vec3, world: int, nearness: wp.array3d[float], far: float) -> float:
+def standing_out(
+    eye: Eye, place: wp.vec3, world: int, nearness: wp.array3d[float], far: float
+) -> float:
     """How far a point of the base frame lies before all that was seen in its cell [m], at most ``far``.
 
-    Where nothing was seen, not even the hand, there is nothing for a long way. Beyond the image all may be.
+    Where nothing was seen, not even the hand, there is nothing for a long way. Beyond the image all
+    may be.
     """
     seen = wp.transform_point(wp.transform_inverse(eye.pose), place)
     row, column = cell_of(eye, seen)
@@ -101,10 +109,12 @@ def place_poses_kernel(
     # Out:
     pose_out: wp.array2d[wp.transform],  # [M, C] object frame in the base frame
 ):
-    """Place the shape in given rotations, what would be seen of it where points are. Launch: [M, C].
+    """Place the shape in given rotations, what would be seen of it where points are.
 
-    The mean of the samples that lie nearer to the camera than their mean, of all without a camera, comes to
-    the mean of the seen points.
+    Launch: [M, C].
+
+    The mean of the samples that lie nearer to the camera than their mean, of all without a camera,
+    comes to the mean of the seen points.
     """
     row, c = wp.tid()
     world = world_in[row]
@@ -132,7 +142,9 @@ def place_poses_kernel(
                 total += sample
                 near += 1.0
         part = total / wp.max(near, 1.0)
-    pose_out[row, c] = wp.transform(middle - wp.quat_rotate(turn, shapes.world_scale[world] * part), turn)
+    pose_out[row, c] = wp.transform(
+        middle - wp.quat_rotate(turn, shapes.world_scale[world] * part), turn
+    )
 
 
 @wp.func
@@ -199,10 +211,14 @@ def fit_poses_kernel(
     world_in: wp.array[int],  # [M] world of each row; a row of -1 is left out
     seen_in: wp.array2d[wp.vec3],  # [N, P] points seen of the object, base frame [m]
     count_in: wp.array[int],  # [N] how many there are
-    nearness_in: wp.array3d[float],  # [N, Y, X] from ``nearness_kernel``; [N, 0, 0] without a camera
+    nearness_in: wp.array3d[
+        float
+    ],  # [N, Y, X] from ``nearness_kernel``; [N, 0, 0] without a camera
     # In/Out:
     pose: wp.array2d[wp.transform],  # [M, C] object frame in the base frame
-    misfit: wp.array2d[float],  # [M, C] both mean squares added [m^2]; NEVER where nothing is to be done
+    misfit: wp.array2d[
+        float
+    ],  # [M, C] both mean squares added [m^2]; NEVER where nothing is to be done
 ):
     """Improve poses until they stay, and say how badly they fit. Launch: [M, C]."""
     row, c = wp.tid()
@@ -214,7 +230,9 @@ def fit_poses_kernel(
         before = best
         best = improved(shapes, world, before, far, every, seen_in, count_in)
         shift = wp.transform_get_translation(best) - wp.transform_get_translation(before)
-        turn = wp.transform_get_rotation(best) - wp.transform_get_rotation(before)  # half the angle, if small
+        turn = wp.transform_get_rotation(best) - wp.transform_get_rotation(
+            before
+        )  # half the angle, if small
         if wp.length(shift) < SETTLED_M and 2.0 * wp.length(turn) < SETTLED_RAD:
             break
     pose[row, c] = best
@@ -258,10 +276,10 @@ def keep_poses_kernel(
 ):
     """Keep the best poses of each world that are not nearly the same. Launch: [M].
 
-    The first of the found poses may be those kept before, improved: their misfits are averaged over time.
-    The very first stays so unless another is better by a good deal: of a shape that looks the same from
-    several sides any is as good, but not another one in each step. The kept poses are in the order of their
-    misfits.
+    The first of the found poses may be those kept before, improved: their misfits are averaged over
+    time. The very first stays so unless another is better by a good deal: of a shape that looks the
+    same from several sides any is as good, but not another one in each step. The kept poses are in
+    the order of their misfits.
     """
     row = wp.tid()
     world = world_in[row]

@@ -1,6 +1,7 @@
 """Shapes as grids of distances to their surfaces, so that a point costs one look-up whatever the shape is.
 
-Frames: *object* is that of the samples. Metres. N worlds, O shapes of S samples, grids of E^3 distances.
+Frames: *object* is that of the samples. Metres. N worlds, O shapes of S samples, grids of E^3
+distances.
 """
 
 import warp as wp
@@ -70,14 +71,17 @@ def shape_distance_kernel(
 def surface_distance(shapes: Shapes, shape: int, place: wp.vec3):
     """Distance of a point of the object frame (unscaled) from the surface, as in the grid, and its gradient.
 
-    Between grid points it is interpolated; outside of the grid it grows by the distance from the grid.
+    Between grid points it is interpolated; outside of the grid it grows by the distance from the
+    grid.
     """
     last = shapes.distance.shape[1] - 1
     half = shapes.half[shape]
     per_metre = float(last) / (2.0 * half)
     grid = (place + wp.vec3(half, half, half)) * per_metre
     top = float(last) - 1.0e-3
-    inside = wp.vec3(wp.clamp(grid[0], 0.0, top), wp.clamp(grid[1], 0.0, top), wp.clamp(grid[2], 0.0, top))
+    inside = wp.vec3(
+        wp.clamp(grid[0], 0.0, top), wp.clamp(grid[1], 0.0, top), wp.clamp(grid[2], 0.0, top)
+    )
     i = int(inside[0])
     j = int(inside[1])
     k = int(inside[2])

@@ -1,8 +1,8 @@
 """Voxels of point clouds as keys, and which voxels touch others.
 
-A voxel is one 63-bit key: the cloud in the high bits, then the bits of x, y and z interleaved (Morton
-order, x highest). Keys sort by cloud and then along a curve on which the eight voxels of every cube of
-side 2, 4, 8 ... are neighbours.
+A voxel is one 63-bit key: the cloud in the high bits, then the bits of x, y and z interleaved
+(Morton order, x highest). Keys sort by cloud and then along a curve on which the eight voxels of
+every cube of side 2, 4, 8 ... are neighbours.
 """
 
 import warp as wp
@@ -50,7 +50,9 @@ def gather_bits(value: wp.int64) -> int:
 @wp.func
 def key_coordinates(key: wp.int64) -> wp.vec3i:
     """Coordinates in [0, 2^12) of a key, counted from the corner of the grid."""
-    return wp.vec3i(gather_bits(key >> wp.int64(2)), gather_bits(key >> wp.int64(1)), gather_bits(key))
+    return wp.vec3i(
+        gather_bits(key >> wp.int64(2)), gather_bits(key >> wp.int64(1)), gather_bits(key)
+    )
 
 
 @wp.func
@@ -65,10 +67,14 @@ def voxel_key(cloud: wp.int64, x: int, y: int, z: int) -> wp.int64:
 @wp.kernel
 def voxel_key_kernel(
     # In:
-    points_in: wp.array2d[wp.vec3],  # [B, P] points [m]; what is not finite or out of the grid is no voxel
+    points_in: wp.array2d[
+        wp.vec3
+    ],  # [B, P] points [m]; what is not finite or out of the grid is no voxel
     voxel_size: float,  # side of a voxel [m]
     # Out:
-    key_out: wp.array2d[wp.int64],  # [B, P] keys; those of points that count for nothing name cloud B
+    key_out: wp.array2d[
+        wp.int64
+    ],  # [B, P] keys; those of points that count for nothing name cloud B
 ):
     """Key of the voxel of each point. Launch: [B, P]."""
     cloud, point = wp.tid()
@@ -93,7 +99,9 @@ def beside_kernel(
     key_in: wp.array[wp.int64],  # [M] keys of voxels, each once, ascending
     other_in: wp.array[wp.bool],  # [M] which are the others
     # Out:
-    beside_out: wp.array[wp.bool],  # [M] which are among the others or touch one, by a corner at least
+    beside_out: wp.array[
+        wp.bool
+    ],  # [M] which are among the others or touch one, by a corner at least
 ):
     """Tell of each voxel whether any of the 3x3x3 about it is one of the others. Launch: [M]."""
     row = wp.tid()

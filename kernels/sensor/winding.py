@@ -1,4 +1,7 @@
-"""Winding numbers of a surface that is known by samples: what is inside of it, and what is outside."""
+"""Winding numbers of a surface that is known by samples.
+
+What is inside of it, and what is outside.
+"""
 
 import warp as wp
 
@@ -8,7 +11,9 @@ FAR = wp.constant(1e6)
 """Distance within which a mesh of size 1 has a nearest point: any."""
 
 ACCURACY = wp.constant(2.0)
-"""Clusters of triangles farther than so many of their radii count by their moment: Warp's default."""
+"""Clusters of triangles farther than so many of their radii count by their moment: Warp's
+default.
+"""
 
 
 @wp.kernel
@@ -24,9 +29,9 @@ def winding_kernel(
 ):
     """Winding numbers of a surface at the points of a grid. Launch: [X, Y, Z].
 
-    The solid angles of its pieces as a share of the full one: about 1 inside, 0 outside and a half on the
-    surface (Gauss). A piece nearer than ``width`` counts as if it were that far away, where its solid angle
-    would go to infinity.
+    The solid angles of its pieces as a share of the full one: about 1 inside, 0 outside and a half
+    on the surface (Gauss). A piece nearer than ``width`` counts as if it were that far away, where
+    its solid angle would go to infinity.
     """
     i, j, k = wp.tid()
     place = corner + pitch * wp.vec3(float(i), float(j), float(k))
@@ -50,8 +55,8 @@ def inside_kernel(
 ):
     """Whether the generalised winding number of a mesh exceeds a level at points. Launch: [K].
 
-    Far triangles count by clusters of the mesh's tree (Barill et al. 2018, Fast Winding Numbers for Soups and
-    Clouds), as in Warp's query, which wants a mesh made with ``support_winding_number``.
+    Far triangles count by clusters of the mesh's tree (Barill et al. 2018, Fast Winding Numbers for
+    Soups and Clouds), as in Warp's query, which wants a mesh made with ``support_winding_number``.
     """
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], FAR, ACCURACY, level)

@@ -1,15 +1,16 @@
 """The servo of one joint and everything that can be missing from its model, one function per stage.
 
 The plain model is the paper's: torque = kp (command - q) - kd qd, a velocity limit, the drive's
-armature. Every effect of :data:`vd.kernels.servo.effects.EFFECTS` changes one stage of it and is off at its
-neutral value; with all off, the command itself is the reference, with kp, kd, no friction and no torque,
-bit for bit. The same functions run in the gap workflow's rollouts and in the simulator: both
-apply ``stiffness (reference - q) - damping qd + torque`` with the damping treated implicitly, and
-``friction`` as the bound of a dry friction force, so that a light joint holds still at coarse steps.
-Filter and profile give their mean over the step, as does a command that arrives within it.
+armature. Every effect of :data:`vd.kernels.servo.effects.EFFECTS` changes one stage of it and is
+off at its neutral value; with all off, the command itself is the reference, with kp, kd, no
+friction and no torque, bit for bit. The same functions run in the gap workflow's rollouts and in
+the simulator: both apply ``stiffness (reference - q) - damping qd + torque`` with the damping
+treated implicitly, and ``friction`` as the bound of a dry friction force, so that a light joint
+holds still at coarse steps. Filter and profile give their mean over the step, as does a command
+that arrives within it.
 
-Parameters and states are rows of columns (``PARAMETER_*``, ``STATE_*``) of one joint in one world; the
-parameters' are in an array, or in a matrix that a kernel has read once.
+Parameters and states are rows of columns (``PARAMETER_*``, ``STATE_*``) of one joint in one world;
+the parameters' are in an array, or in a matrix that a kernel has read once.
 SI units, radians; time in seconds since the joint was switched on.
 """
 
@@ -74,7 +75,9 @@ STATE_COLUMNS = 8
 NO_EFFORT_LIMIT = wp.constant(1.0e9)
 """A torque [N m] that no drive reaches."""
 LEAST_SLOPE = 0.02
-"""Least share of the stiffness that a motor at its limit keeps: it keeps the reference within reach."""
+"""Least share of the stiffness that a motor at its limit keeps: it keeps the reference within
+reach.
+"""
 SMALLEST_SPEED = 1.0e-3
 """Least speed scale [rad/s] of a parameter that divides, far below the bounds of any."""
 
@@ -94,7 +97,9 @@ class Servo:
 
 @wp.func
 def low_pass(value: float, target: float, tau: float, dt: float) -> wp.vec2:
-    """First-order low-pass, exact over a step in which ``target`` is constant; tau = 0 passes through.
+    """First-order low-pass, exact over a step in which ``target`` is constant.
+
+    Tau = 0 passes through.
 
     Returns its value at the end of the step and its mean over the step.
     """
@@ -141,12 +146,14 @@ def motor_torque(
 ) -> wp.vec3:
     """What the motor gives when the controller wants ``wanted`` [N m] at ``speed`` [rad/s].
 
-    In the order of the signal: supply sag (tau / (1 + r |tau|): voltage falls with current), warming
-    (exp(-rate t)), soft loss (tau_s tanh(tau / tau_s)), hard limit, and the torque-speed line
-    tau_stall (1 - |speed| / omega_0), which bounds driving, not braking; beyond omega_0 nothing drives.
+    In the order of the signal: supply sag (tau / (1 + r |tau|): voltage falls with current),
+    warming (exp(-rate t)), soft loss (tau_s tanh(tau / tau_s)), hard limit, and the torque-speed
+    line tau_stall (1 - |speed| / omega_0), which bounds driving, not braking; beyond omega_0
+    nothing drives.
 
-    Returns the torque [N m], its slope by the torque wanted, and how much of it the torque-speed line takes
-    per speed [N m s/rad]. ``effort`` is the largest torque of the drive [N m], ``time`` [s] since it is on.
+    Returns the torque [N m], its slope by the torque wanted, and how much of it the torque-speed
+    line takes per speed [N m s/rad]. ``effort`` is the largest torque of the drive [N m], ``time``
+    [s] since it is on.
     """
     torque = wanted
     slope = wp.float32(1.0)
@@ -195,8 +202,9 @@ def dry_friction(motor: float, speed: float, parameters: Any, row: int) -> wp.ve
     """Friction torque [N m]: Coulomb, Stribeck, load-dependent and asymmetric, added up.
 
     Friction F+ against positive motion and F- against negative motion is, in motion and at rest, a
-    bound of (F+ + F-) / 2 and a constant torque of -(F+ - F-) / 2; so no direction has to be guessed. Returns
-    both. Of the ``motor`` torque [N m], which the transmission carries, the size counts.
+    bound of (F+ + F-) / 2 and a constant torque of -(F+ - F-) / 2; so no direction has to be
+    guessed. Returns both. Of the ``motor`` torque [N m], which the transmission carries, the size
+    counts.
     """
     friction = parameters[row, COULOMB_TORQUE] + parameters[row, LOAD_FRICTION] * wp.abs(motor)
     sliding = parameters[row, STRIBECK_SLIDING]
@@ -220,8 +228,10 @@ def elastic_load(
 ) -> wp.vec2:
     """Advance the second mass behind its spring by one step.
 
-    A leapfrog step, which has no damping of its own, with the mass increased as average acceleration
-    asks: stable with any spring. The joint's side gets the same as a damping that acts on the change of
+    A leapfrog step, which has no damping of its own, with the mass increased as average
+    acceleration
+    asks: stable with any spring. The joint's side gets the same as a damping that acts on the
+    change of
     its velocity only: ``dt k / 2`` implicitly, less its torque at the present velocity.
 
     Returns:
@@ -245,7 +255,10 @@ def elastic_load(
 
 @wp.func
 def start_servo(command: float, position: float, row: int, state: wp.array2d[float]):
-    """Reset a joint's state: profile and filter at the command, the second mass at rest on the joint."""
+    """Reset a joint's state.
+
+    Profile and filter at the command, the second mass at rest on the joint.
+    """
     state[row, STATE_FILTERED] = command
     state[row, STATE_PROFILE] = command
     state[row, STATE_PROFILE_SPEED] = 0.0
@@ -264,12 +277,14 @@ def rest_play(
     power: float,  # as in :func:`drive_joint`; with the torque off the play stays at the command
     parameters: Any,  # [R, PARAMETER_COLUMNS] parameter rows
     row: int,  # the joint's row
-    state: wp.array2d[float],  # [R, STATE_COLUMNS] state rows; the play of the joint's row is written
+    state: wp.array2d[
+        float
+    ],  # [R, STATE_COLUMNS] state rows; the play of the joint's row is written
 ):
     """Put the play where a joint at rest has it, which depends on how it came there.
 
-    Dry friction aside, a joint rests where its drive carries its load; without friction and dead zone
-    nothing but the play says how far that is from the command.
+    Dry friction aside, a joint rests where its drive carries its load; without friction and dead
+    zone nothing but the play says how far that is from the command.
     """
     stiffness = power * parameters[row, KP]
     if stiffness > 0.0:
@@ -279,11 +294,13 @@ def rest_play(
 
 
 @wp.func
-def shape_command(command: float, dt: float, parameters: Any, row: int, state: wp.array2d[float]) -> float:
+def shape_command(
+    command: float, dt: float, parameters: Any, row: int, state: wp.array2d[float]
+) -> float:
     """The reference that firmware and transmission make of a command: filter, profile, backlash.
 
-    Returns its mean over ``dt`` [rad], for which the command is constant; a step in which a command arrives
-    can be taken in two parts. The joint's row of the state is advanced.
+    Returns its mean over ``dt`` [rad], for which the command is constant; a step in which a command
+    arrives can be taken in two parts. The joint's row of the state is advanced.
     """
     filtered = low_pass(state[row, STATE_FILTERED], command, parameters[row, FILTER_TAU], dt)
     state[row, STATE_FILTERED] = filtered[0]
@@ -316,9 +333,10 @@ def drive_joint(
 ) -> Servo:
     """One time step of the control loop, the motor and the load of a joint.
 
-    What limits the motor sees the jump of ``before``: the limit of a mean would let it act a part of a step
-    early. ``power`` leaves the damping as it is, but with the torque off the damping, mostly back-EMF, goes
-    too, since the terminals are open; friction stays, and of the damping the gears' (``OFF_DAMPING``).
+    What limits the motor sees the jump of ``before``: the limit of a mean would let it act a part
+    of a step early. ``power`` leaves the damping as it is, but with the torque off the damping,
+    mostly back-EMF, goes too, since the terminals are open; friction stays, and of the damping the
+    gears' (``OFF_DAMPING``).
     """
     result = Servo()
     time = state[row, STATE_TIME]
@@ -360,8 +378,9 @@ def drive_joint(
             motor = share * motor_early + (1.0 - share) * motor_late
         carried = share * wp.abs(motor_early[0]) + (1.0 - share) * wp.abs(motor_late[0])
     if motor[0] != wanted:
-        # Stiffness and damping are the slopes at this torque, so that an implicit step takes nothing of a
-        # torque at its limit, which no motion changes; the reference is where they pull that torque from.
+        # Stiffness and damping are the slopes at this torque, so that an implicit step takes
+        # nothing of a torque at its limit, which no motion changes; the reference is where they
+        # pull that torque from.
         damping = motor[1] * damping + motor[2]
         kp *= wp.max(motor[1], LEAST_SLOPE)
         steady = motor[0] + damping * speed

@@ -1,7 +1,7 @@
 """Bodies of a chain of revolute joints: mass matrix and bias forces in 3-D.
 
-All vectors are in the frame of the chain's base with every joint at zero, so that link frames differ
-by offsets only. SI units, radians.
+All vectors are in the frame of the chain's base with every joint at zero, so that link frames
+differ by offsets only. SI units, radians.
 """
 
 import functools
@@ -12,7 +12,9 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 FEWEST = 3
-"""Joints that a kernel has room for at least: compiling takes long, and one serves all short chains."""
+"""Joints that a kernel has room for at least: compiling takes long, and one serves all short
+chains.
+"""
 
 
 def room_for(joints: int) -> int:
@@ -29,7 +31,10 @@ def links_of_size(size: int) -> Any:
 
     @wp.struct
     class Links:
-        """Bodies of a chain, in the base frame with all joints at zero; rows beyond its joints are zero."""
+        """Bodies of a chain, in the base frame with all joints at zero.
+
+        Rows beyond its joints are zero.
+        """
 
         axis: rows  # unit joint axes, one a row
         offset: rows  # from the joint before (the base, for the first) to the joint, one a row [m]
@@ -45,8 +50,9 @@ def links_of_size(size: int) -> Any:
 def chain_dynamics(q: Any, speed: Any, links: Any):
     """Mass matrix and bias torques (Coriolis, centrifugal, gravity) of the bodies.
 
-    Outwards, each link in its own frame: the joints' axes and the velocities that they give to the link's
-    joint are turned along, so that no inertia has to be. Loops are unrolled and the arrays in registers.
+    Outwards, each link in its own frame: the joints' axes and the velocities that they give to the
+    link's joint are turned along, so that no inertia has to be. Loops are unrolled and the arrays
+    in registers.
 
     Returns:
         ``(mass, bias)`` [n, n] and [n]; zero for links without mass.
@@ -61,7 +67,11 @@ def chain_dynamics(q: Any, speed: Any, links: Any):
     for i in range(len(q)):
         axis = links.axis[i]
         cosine = wp.cos(q[i])
-        turn = wp.diag(wp.vec3(cosine)) - wp.sin(q[i]) * wp.skew(axis) + (1.0 - cosine) * wp.outer(axis, axis)
+        turn = (
+            wp.diag(wp.vec3(cosine))
+            - wp.sin(q[i]) * wp.skew(axis)
+            + (1.0 - cosine) * wp.outer(axis, axis)
+        )
         if i > 0:
             offset = links.offset[i]
             acceleration += wp.cross(alpha, offset) + wp.cross(omega, wp.cross(omega, offset))

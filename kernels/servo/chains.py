@@ -1,14 +1,14 @@
 """Rollouts of one chain of revolute joints, one thread per trajectory and parameter set.
 
-The joints carry the servos of :mod:`vd.kernels.servo.actuators`. Without bodies a joint is its own inertia
-(a bare servo, a pendulum); with bodies the chain is a finger: mass matrix and bias forces in 3-D
-(:mod:`vd.kernels.servo.chain_bodies`).
+The joints carry the servos of :mod:`vd.kernels.servo.actuators`. Without bodies a joint is its own
+inertia (a bare servo, a pendulum); with bodies the chain is a finger: mass matrix and bias forces
+in 3-D (:mod:`vd.kernels.servo.chain_bodies`).
 
 Each step ``dt`` is a leapfrog step: positions at whole steps, velocities half-way between, so the
 error of smooth motion falls with dt^2. What makes a servo stiff is implicit: damping by
 Crank-Nicolson as far as that does not ring, stiffness by average acceleration. Dry friction is an
-impulse bounded by the friction torque, found by projected Gauss-Seidel sweeps: a joint that friction
-can hold stands still exactly.
+impulse bounded by the friction torque, found by projected Gauss-Seidel sweeps: a joint that
+friction can hold stands still exactly.
 
 A command takes the share of a step that remains when it arrives, so the motion is a smooth function
 of its delay. SI units, radians; times are whole steps and a fraction, exact over any duration.
@@ -41,7 +41,9 @@ from vd.kernels.servo.actuators import (
 from vd.kernels.servo.chain_bodies import chain_dynamics, links_of_size
 
 SMALLEST_INERTIA = 1.0e-8
-"""Least inertia on the diagonal [kg m^2], so that a search that asks for none divides by something."""
+"""Least inertia on the diagonal [kg m^2], so that a search that asks for none divides by
+something.
+"""
 FRICTION_SWEEPS = 3
 """Gauss-Seidel sweeps a step, started from the impulses of the step before."""
 CENTRED = 0.5
@@ -81,7 +83,8 @@ class Samples:
 def implicitness(ratio: float) -> float:
     """Weight of the new velocity in the damping torque of a step, for dt damping / inertia = ``ratio``.
 
-    One half is exact to second order; above a ratio of 2 more is needed for the velocity not to ring.
+    One half is exact to second order; above a ratio of 2 more is needed for the velocity not to
+    ring.
     """
     return wp.max(0.5, 1.0 - 1.0 / wp.max(ratio, 1.0))
 
@@ -105,8 +108,8 @@ def arrival(
 ):
     """When a command acts, and whether it does: ``(step, fraction, kept)``.
 
-    The random numbers belong to the write, whatever the parameters. Joints share them: the commands of
-    a hand go out together.
+    The random numbers belong to the write, whatever the parameters. Joints share them: the commands
+    of a hand go out together.
     """
     delay = parameters[row, COMMAND_DELAY]
     sigma = parameters[row, JITTER_SIGMA]
@@ -117,16 +120,20 @@ def arrival(
         if wp.randf(rng) < drop:
             kept = 0
         delay += sigma * wp.abs(wp.randn(rng))
-    step, fraction = split_steps(samples.sent_step[write], samples.sent_fraction[write], CENTRED + delay / dt)
+    step, fraction = split_steps(
+        samples.sent_step[write], samples.sent_fraction[write], CENTRED + delay / dt
+    )
     return step, fraction, kept
 
 
 @wp.func
 def friction_impulses(wanted: Any, inverse: Any, bound: Any, before: Any, count: int):
-    """Velocities under dry friction: ``(speed, impulse)`` of ``wanted`` ones [rad/s] and ``bound`` [N m s].
+    """Velocities under dry friction.
 
-    ``inverse`` is that of the effective mass matrix; the search starts from the impulses ``before``. Joints
-    whose impulse is within its bound stand still exactly.
+    ``(speed, impulse)`` of ``wanted`` ones [rad/s] and ``bound`` [N m s].
+
+    ``inverse`` is that of the effective mass matrix; the search starts from the impulses
+    ``before``. Joints whose impulse is within its bound stand still exactly.
     """
     impulse = type(wanted)(0.0)
     for i in range(len(wanted)):
@@ -162,8 +169,8 @@ def slip(speed: float, change: float):
 def load_bounds(bound: Any, kick: float, motor: Any, loaded: Any, gained: Any):
     """Friction impulses [N m s] at the middle of a step, where ``bound`` has those of its beginning.
 
-    Of the load friction ``motor`` [N m] in them, which falls by ``loaded`` [N m s/rad] with the speed
-    ``gained`` [rad/s] over the ``kick`` [s].
+    Of the load friction ``motor`` [N m] in them, which falls by ``loaded`` [N m s/rad] with the
+    speed ``gained`` [rad/s] over the ``kick`` [s].
     """
     result = bound
     for j in range(len(bound)):
@@ -208,23 +215,35 @@ def rollout_kernel(size: int) -> wp.Kernel:
     def rollout(
         # In:
         samples: Samples,  # what was recorded
-        first_sample: wp.array[int],  # [R] row of ``samples`` where each rollout's trajectory begins
+        first_sample: wp.array[
+            int
+        ],  # [R] row of ``samples`` where each rollout's trajectory begins
         sample_count: wp.array[int],  # [R] rows of each trajectory
         first_output: wp.array[int],  # [R] row of ``predicted`` where each rollout begins
         stream: wp.array[int],  # [R] number of each trajectory's random stream
-        start: wp.array2d[float],  # [R, n] positions measured at the start, where the joints rest [rad]
-        wanted: wp.array[int],  # [R] joint whose positions are kept, in column 0; -1 for all, each in its own
-        slot: wp.array[int],  # [n] place of each joint in the finger, which is its column of the coupling
+        start: wp.array2d[
+            float
+        ],  # [R, n] positions measured at the start, where the joints rest [rad]
+        wanted: wp.array[
+            int
+        ],  # [R] joint whose positions are kept, in column 0; -1 for all, each in its own
+        slot: wp.array[
+            int
+        ],  # [n] place of each joint in the finger, which is its column of the coupling
         lower: wp.array[float],  # [n] lower stops [rad]
         upper: wp.array[float],  # [n] upper stops [rad]
         effort: wp.array[float],  # [n] largest torques of the drives [N m]
         bodies: int,  # 1 if the links have mass, 0 if each joint is its own inertia
         links: links_of_size(size),  # the links, if they have mass
-        parameters: wp.array2d[float],  # [R n, PARAMETER_COLUMNS] parameter rows by rollout and joint
+        parameters: wp.array2d[
+            float
+        ],  # [R n, PARAMETER_COLUMNS] parameter rows by rollout and joint
         dt: float,  # time step [s]
         # Out:
         state: wp.array3d[float],  # [R, n, STATE_COLUMNS] working memory
-        predicted: wp.array2d[float],  # [S', n] positions as the servo reports them, or [S', 1] [rad]
+        predicted: wp.array2d[
+            float
+        ],  # [S', n] positions as the servo reports them, or [S', 1] [rad]
     ):
         """Simulate trajectories with parameter sets. Launch: [R]."""
         run = wp.tid()
@@ -249,7 +268,8 @@ def rollout_kernel(size: int) -> wp.Kernel:
         q_start = Vector(0.0)
         speed = Vector(0.0)
         impulse = Vector(0.0)
-        # Per joint: the command in force, the write that comes next and when, the next sample and when.
+        # Per joint: the command in force, the write that comes next and when, the next sample and
+        # when.
         held = Vector(0.0)
         held_power = Vector(0.0)
         write = Integers(begin)
@@ -303,7 +323,8 @@ def rollout_kernel(size: int) -> wp.Kernel:
             loaded = Vector(0.0)
             for j in range(size):
                 if j < count:
-                    # Commands that arrive within the step divide it; the reference is the mean over it.
+                    # Commands that arrive within the step divide it; the reference is the mean over
+                    # it.
                     reference = wp.float32(0.0)
                     power = held_power[j]
                     done = wp.float32(0.0)
@@ -313,16 +334,22 @@ def rollout_kernel(size: int) -> wp.Kernel:
                             if due_step[j] == k:
                                 part = due_fraction[j] - done
                             if part > 0.0:
-                                reference += part * shape_command(held[j], part * dt, rows, j, memory)
+                                reference += part * shape_command(
+                                    held[j], part * dt, rows, j, memory
+                                )
                                 done += part
                             power += (1.0 - done) * (samples.power[write[j], j] - held_power[j])
                             held[j] = samples.command[write[j], j]
                             held_power[j] = samples.power[write[j], j]
                         write[j] = write[j] + 1
                         if write[j] < end:
-                            step, fraction, kept = arrival(samples, write[j], stream[run], rows, j, dt)
+                            step, fraction, kept = arrival(
+                                samples, write[j], stream[run], rows, j, dt
+                            )
                             # In order: no command overtakes the one before.
-                            if step < due_step[j] or (step == due_step[j] and fraction < due_fraction[j]):
+                            if step < due_step[j] or (
+                                step == due_step[j] and fraction < due_fraction[j]
+                            ):
                                 step = due_step[j]
                                 fraction = due_fraction[j]
                             due_step[j] = step
@@ -341,10 +368,22 @@ def rollout_kernel(size: int) -> wp.Kernel:
                     part = 1.0 - done
                     reference += part * shape_command(held[j], part * dt, rows, j, memory) + coupled
                     drive = drive_joint(
-                        reference, before, done, q[j], speed[j], power, dt, effort[j], rows, j, memory
+                        reference,
+                        before,
+                        done,
+                        q[j],
+                        speed[j],
+                        power,
+                        dt,
+                        effort[j],
+                        rows,
+                        j,
+                        memory,
                     )
                     torque[j] = (
-                        drive.stiffness * (drive.reference - q[j]) - drive.damping * speed[j] + drive.torque
+                        drive.stiffness * (drive.reference - q[j])
+                        - drive.damping * speed[j]
+                        + drive.torque
                     )
                     damping[j] = drive.damping
                     stiffness[j] = drive.stiffness
@@ -378,10 +417,14 @@ def rollout_kernel(size: int) -> wp.Kernel:
                 free_speed = speed + inverse * (kick * torque)
                 new_speed = free_speed
                 if dry == 1:
-                    new_speed, impulse = friction_impulses(free_speed, inverse, bound, impulse, count)
+                    new_speed, impulse = friction_impulses(
+                        free_speed, inverse, bound, impulse, count
+                    )
                     if wp.dot(loaded, loaded) != 0.0:
                         bound = load_bounds(bound, kick, motor, loaded, new_speed - speed)
-                        new_speed, impulse = friction_impulses(free_speed, inverse, bound, impulse, count)
+                        new_speed, impulse = friction_impulses(
+                            free_speed, inverse, bound, impulse, count
+                        )
             for j in range(size):
                 if j < count:
                     limit = rows[j, VELOCITY_LIMIT]
@@ -389,7 +432,8 @@ def rollout_kernel(size: int) -> wp.Kernel:
                     last = q[j]
                     after = last + dt * v
                     if after < lower[j] or after > upper[j]:
-                        # A start beyond a stop, as an encoder's bias makes it, is no reason to jump.
+                        # A start beyond a stop, as an encoder's bias makes it, is no reason to
+                        # jump.
                         after = wp.clamp(after, wp.min(lower[j], last), wp.max(upper[j], last))
                         v = 0.0
                     if not (wp.abs(after - q_start[j]) < DIVERGED):

@@ -40,8 +40,8 @@ BASELINE = (
     Parameter("inertia", "kg m^2", servo.INERTIA, 1e-6, 10.0, 1e-3),
     Parameter("kd_off", "N m s/rad", servo.OFF_DAMPING, 0.0, 1e2, 0.0),
 )
-"""The paper's identification; the inertia (the drive's armature) is fitted for bare servos only, as is
-``kd_off``, the damping that is left with the torque off, where a recording has such motion."""
+"""The paper's identification; the inertia (the drive's armature) is fitted for bare servos only, as
+is ``kd_off``, the damping that is left with the torque off, where a recording has such motion."""
 
 EFFECTS: dict[str, Effect] = {
     effect.name: effect
@@ -175,7 +175,9 @@ EFFECTS: dict[str, Effect] = {
             "joint_coupling",
             "the motion of another joint of the chain drives this one",
             tuple(
-                Parameter(f"from_{i + 1}", "rad/rad", servo.COUPLING_0 + i, 0.0, 1.0, 0.05, signed=True)
+                Parameter(
+                    f"from_{i + 1}", "rad/rad", servo.COUPLING_0 + i, 0.0, 1.0, 0.05, signed=True
+                )
                 for i in range(servo.MAX_JOINTS)
             ),
         ),
@@ -187,19 +189,23 @@ EFFECTS: dict[str, Effect] = {
 EQUIVALENT: dict[str, tuple[str, ...]] = {"command_delay": ("read_delay",)}
 """Effects that stand for others which leave the same positions, whatever the motion.
 
-A servo that does not change with time, and is commanded rather than steered by what it reports, shifts
-its whole motion in time either way. By convention the shift is one of the command.
+A servo that does not change with time, and is commanded rather than steered by what it reports,
+shifts its whole motion in time either way. By convention the shift is one of the command.
 """
 
 ON_A_PENDULUM: dict[str, tuple[str, ...]] = {"encoder_bias": ("gravity_load",)}
-"""Nearly the same on a pendulum, whose own load is part of the plain model: whether its zero is not where the
-arm hangs, or a further load hangs off the arm, moves it alike but for how the load changes with the angle."""
+"""Nearly the same on a pendulum, whose own load is part of the plain model: whether its zero is not
+where the arm hangs, or a further load hangs off the arm, moves it alike but for how the load
+changes with the angle.
+"""
 
 BESIDE: dict[str, dict[str, tuple[str, ...]]] = {
     "stribeck_friction": {"encoder_bias": ("asymmetric_friction",)}
 }
-"""Effects that stand for others beside a certain one: Stribeck friction and friction with a direction are
-Stribeck friction, higher by the mean of both sides, and an offset that pulls by half their difference."""
+"""Effects that stand for others beside a certain one: Stribeck friction and friction with a
+direction are Stribeck friction, higher by the mean of both sides, and an offset that pulls by half
+their difference.
+"""
 
 
 def equivalent(model: str, beside: Iterable[str] = ()) -> dict[str, tuple[str, ...]]:
@@ -214,8 +220,8 @@ def equivalent(model: str, beside: Iterable[str] = ()) -> dict[str, tuple[str, .
 TOGETHER: dict[str, tuple[str, ...]] = {
     "asymmetric_friction": ("coulomb_friction", "dead_zone", "encoder_bias"),
 }
-"""Effects that are the same as two others together, of those listed: friction that differs between the
-directions is friction that does not, or a dead zone, and an offset."""
+"""Effects that are the same as two others together, of those listed: friction that differs between
+the directions is friction that does not, or a dead zone, and an offset."""
 
 
 def neutral_row() -> list[float]:

@@ -1,14 +1,21 @@
 """Replay recorded commands in the simulator, and sample its positions where the recording has them.
 
 Order in a physics step: :func:`replay_command_kernel`, the servo and the solver's step, then
-:func:`sample_position_kernel`, and the step is counted. Every world follows a trajectory: a track. W worlds,
-D joints; samples of all trajectories one after the other. Times, delays and lost commands are those of
-:mod:`vd.kernels.servo.chains`.
+:func:`sample_position_kernel`, and the step is counted. Every world follows a trajectory: a track.
+W worlds, D joints; samples of all trajectories one after the other. Times, delays and lost commands
+are those of :mod:`vd.kernels.servo.chains`.
 """
 
 import warp as wp
 
-from vd.kernels.servo.actuators import COUPLING_0, ENCODER_BIAS, KP, READ_DELAY, rest_play, shape_command
+from vd.kernels.servo.actuators import (
+    COUPLING_0,
+    ENCODER_BIAS,
+    KP,
+    READ_DELAY,
+    rest_play,
+    shape_command,
+)
 from vd.kernels.servo.chains import Samples, arrival, split_steps
 from vd.kernels.servo.joint_servo import coupled
 
@@ -45,7 +52,9 @@ def rest_play_kernel(
     pulled = coupled(joint, first, parameters, row, joint_q_in[world])
     own = parameters[row, COUPLING_0 + joint - first[joint]] * joint_q_in[world, joint]
     load = load_in[world, joint] + power * parameters[row, KP] * (pulled - own)
-    rest_play(held_in[world, joint], joint_q_in[world, joint], load, power, parameters, row, state_out)
+    rest_play(
+        held_in[world, joint], joint_q_in[world, joint], load, power, parameters, row, state_out
+    )
 
 
 @wp.kernel
@@ -70,7 +79,8 @@ def replay_command_kernel(
 ):
     """The mean reference of each servo over the coming physics step. Launch: [W, D].
 
-    As in :func:`vd.kernels.servo.joint_servo.receive_command_kernel`, commands that arrive divide the step.
+    As in :func:`vd.kernels.servo.joint_servo.receive_command_kernel`, commands that arrive divide
+    the step.
     """
     world, joint = wp.tid()
     column = tracks.column[joint]

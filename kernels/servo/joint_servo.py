@@ -1,14 +1,16 @@
-"""The servo of every hand joint inside the simulator: commands in transit, the drive, what is measured.
+"""The servo of every hand joint inside the simulator.
+
+Commands in transit, the drive, what is measured.
 
 Order in a control step: :func:`send_command_kernel` once; before every physics step
 :func:`receive_command_kernel` and :func:`drive_joint_kernel`; after it :func:`finish_joint_kernel`;
 :func:`measure_joint_kernel` once at the end. The model of a joint is that of
-:mod:`vd.kernels.servo.actuators`; here its result goes where MuJoCo Warp reads it, per world and physics
-step.
+:mod:`vd.kernels.servo.actuators`; here its result goes where MuJoCo Warp reads it, per world and
+physics step.
 
 N worlds, D hand joints, which couple within their finger; joint ``j`` of world ``w`` has row
-``w D + j`` of the parameters and states. Arrays ``[N, *]`` hold at least D columns, the hand joints first. A
-world's clock is ``STATE_TIME``, zero at its reset.
+``w D + j`` of the parameters and states. Arrays ``[N, *]`` hold at least D columns, the hand joints
+first. A world's clock is ``STATE_TIME``, zero at its reset.
 """
 
 import warp as wp
@@ -39,8 +41,10 @@ wp.set_module_options({"enable_backward": False})
 MAX_JITTER_SIGMAS = 4.0
 """Longest extra delay of a command in standard deviations: it bounds the commands in transit."""
 FRICTION_IMPEDANCE = wp.constant(0.999)
-"""Impedance of the dry friction constraint. At MuJoCo's default of 0.9 a joint that friction holds creeps
-by many milliradians a second, at 0.99 by one; at 0.9999 the solver does not converge in ten iterations."""
+"""Impedance of the dry friction constraint. At MuJoCo's default of 0.9 a joint that friction holds
+creeps by many milliradians a second, at 0.99 by one; at 0.9999 the solver does not converge in ten
+iterations.
+"""
 
 vec5 = wp.types.vector(length=5, dtype=float)
 vec10 = wp.types.vector(length=10, dtype=float)
@@ -61,10 +65,13 @@ def send_command_kernel(
     transit_value: wp.array3d[float],  # [N, D, K] commands in transit [rad], a ring
     transit_time: wp.array3d[float],  # [N, D, K] when each arrives on the world's clock [s]
 ):
-    """Send a command to every joint: it arrives after the delay and |N(0, sigma)| more, or never. Launch [N].
+    """Send a command to every joint: it arrives after the delay and |N(0, sigma)| more, or never.
 
-    The commands of a hand go out together, so its joints share one draw of the jitter and one of the
-    loss. Commands arrive in the order in which they were sent. What a joint is told at a time acts from
+    Launch [N].
+
+    The commands of a hand go out together, so its joints share one draw of the jitter and one of
+    the loss. Commands arrive in the order in which they were sent. What a joint is told at a time
+    acts from
     there on, which is the middle of a physics step: velocities are those between two positions.
     """
     world = wp.tid()
@@ -110,8 +117,8 @@ def receive_command_kernel(
 ):
     """The reference that a joint has during the coming physics step. Launch: [N, D].
 
-    A command that arrives within the step divides it, so that the motion is a smooth function of the
-    delay; the reference is the mean over the step.
+    A command that arrives within the step divides it, so that the motion is a smooth function of
+    the delay; the reference is the mean over the step.
     """
     world, joint = wp.tid()
     row = world * held.shape[1] + joint
@@ -134,7 +141,9 @@ def receive_command_kernel(
     transit_count[world, joint] = count
     held[world, joint] = value
     rest = 1.0 - done
-    reference_out[world, joint] = reference + rest * shape_command(value, rest * dt, parameters, row, state)
+    reference_out[world, joint] = reference + rest * shape_command(
+        value, rest * dt, parameters, row, state
+    )
 
 
 @wp.func
@@ -159,7 +168,9 @@ def drive_joint_kernel(
     # Model:
     parameters: wp.array2d[float],  # [N D, PARAMETER_COLUMNS] parameter rows
     first: wp.array[int],  # [D] first joint of each joint's finger
-    inverse_inertia: wp.array2d[float],  # [N, *] diagonal of the inverse inertia matrix [1/(kg m^2)]
+    inverse_inertia: wp.array2d[
+        float
+    ],  # [N, *] diagonal of the inverse inertia matrix [1/(kg m^2)]
     effort: wp.array2d[float],  # [N, *] largest torques of the drives [N m], which the solver keeps
     # In:
     dt: float,  # physics time step [s]
@@ -181,9 +192,9 @@ def drive_joint_kernel(
     """One time step of every servo, written to the solver's inputs. Launch: [N, D].
 
     The drive is MuJoCo's affine actuator. Its damping is integrated implicitly, an error of half a
-    physics step; as in :mod:`vd.kernels.servo.chains` only the share of it that stability needs is left
-    there, and the rest acts at the present velocity, through the reference, so that the effort limit sees it.
-    With this a model identified at small steps moves the same at the simulator's.
+    physics step; as in :mod:`vd.kernels.servo.chains` only the share of it that stability needs is
+    left there, and the rest acts at the present velocity, through the reference, so that the effort
+    limit sees it. With this a model identified at small steps moves the same at the simulator's.
 
     Dry friction is the solver's friction loss. That constraint asks for the acceleration -b v; with
     b = 1/dt + kd/m a joint within the bound of its friction stops in one step, the implicit damping
@@ -221,10 +232,14 @@ def drive_joint_kernel(
     bias_out[world, joint][2] = -damping
     # The load of load friction is what the drive can give, not what the controller wants of it.
     beyond = wp.max(drive.motor - effort[world, joint], 0.0)
-    friction_out[world, joint] = wp.max(drive.friction - parameters[row, LOAD_FRICTION] * beyond, 0.0)
+    friction_out[world, joint] = wp.max(
+        drive.friction - parameters[row, LOAD_FRICTION] * beyond, 0.0
+    )
     stop = 1.0 / dt + damping * mobility
     friction_solref_out[world, joint] = wp.vec2(-1.0, -stop * FRICTION_IMPEDANCE)
-    friction_solimp_out[world, joint] = vec5(FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0)
+    friction_solimp_out[world, joint] = vec5(
+        FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0
+    )
 
 
 @wp.kernel
@@ -242,9 +257,12 @@ def finish_joint_kernel(
     history: wp.array3d[float],  # [N, D, R] past positions [rad], one a physics step, a ring
     speed_history: wp.array3d[float],  # [N, D, R] past velocities [rad/s] likewise
 ):
-    """Hold a joint to its velocity limit after a physics step, and remember its motion. Launch: [N, D].
+    """Hold a joint to its velocity limit after a physics step, and remember its motion.
 
-    The limit acts as in :func:`vd.kernels.task.actions.limit_joint_velocity_kernel`, here per world.
+    Launch: [N, D].
+
+    The limit acts as in :func:`vd.kernels.task.actions.limit_joint_velocity_kernel`, here per
+    world.
     """
     world, joint = wp.tid()
     speed = joint_qd[world, joint]
@@ -272,7 +290,10 @@ def measure_joint_kernel(
     measured_q_out: wp.array2d[float],  # [N, D] measured positions [rad]
     measured_qd_out: wp.array2d[float],  # [N, D] measured velocities [rad/s]
 ):
-    """What the servo reports: old by the read delay, positions off by the encoder's bias. Launch: [N, D]."""
+    """What the servo reports: old by the read delay, positions off by the encoder's bias.
+
+    Launch: [N, D].
+    """
     world, joint = wp.tid()
     row = world * measured_q_out.shape[1] + joint
     length = history_in.shape[2]
@@ -309,7 +330,10 @@ def reset_joint_kernel(
     measured_q_out: wp.array2d[float],  # [N, D] measured positions [rad]
     measured_qd_out: wp.array2d[float],  # [N, D] measured velocities [rad/s]
 ):
-    """Start the servos of chosen worlds: at rest, with one command since long ago. Launch: [N, D]."""
+    """Start the servos of chosen worlds: at rest, with one command since long ago.
+
+    Launch: [N, D].
+    """
     world, joint = wp.tid()
     if mask_in[world] == 0:
         return

@@ -53,7 +53,9 @@ def apply_action_kernel(
         average = settings.alpha * action + (1.0 - settings.alpha) * smoothed[world, joint]
         smoothed[world, joint] = average
         joint_target_out[world, joint] = wp.clamp(
-            joint_q_in[world, joint] + average * settings.step_rad, joint_lower[joint], joint_upper[joint]
+            joint_q_in[world, joint] + average * settings.step_rad,
+            joint_lower[joint],
+            joint_upper[joint],
         )
     rng[world] = next_stream(state, world)
 

@@ -40,7 +40,9 @@ def dynamics_kernel(
     # In:
     kp_in: wp.array2d[float],  # [N, D] stiffness [N m/rad]
     kd_in: wp.array2d[float],  # [N, D] damping [N m s/rad]
-    servo_in: wp.array2d[float],  # [N D, P] rows of servo parameters; no rows where there is no servo
+    servo_in: wp.array2d[
+        float
+    ],  # [N D, P] rows of servo parameters; no rows where there is no servo
     hand_friction_in: wp.array[float],  # [N] friction coefficient of the hand
     object_friction_in: wp.array[float],  # [N] that of the object
     table_friction_in: wp.array[float],  # [N] that of the table
@@ -49,7 +51,10 @@ def dynamics_kernel(
     # Out:
     observation_out: wp.array2d[float],  # [N, *] observation in the world frame
 ):
-    """Write the drawn dynamics, channel by channel over the joints, then the scalars. Launch: [N]."""
+    """Write the drawn dynamics, channel by channel over the joints, then the scalars.
+
+    Launch: [N].
+    """
     world = wp.tid()
     joints = nominal_kp.shape[0]
     for joint in range(joints):

@@ -1,4 +1,7 @@
-"""Bookkeeping over worlds: masks, statistics, and randomised values written into the simulator's model."""
+"""Bookkeeping over worlds.
+
+Masks, statistics, and randomised values written into the simulator's model.
+"""
 
 import warp as wp
 
@@ -13,7 +16,9 @@ def redraw_mask_kernel(
     reset_in: wp.array[wp.int32],  # [N] 1 where a world resets in this step
     interval: int,  # control steps for which drawn dynamics are kept at least
     # In/Out:
-    age: wp.array[wp.int32],  # [N] control steps since the last draw; counted here, zeroed where selected
+    age: wp.array[
+        wp.int32
+    ],  # [N] control steps since the last draw; counted here, zeroed where selected
     # Out:
     mask_out: wp.array[wp.int32],  # [N] 1 where dynamics are to be drawn anew
 ):
@@ -32,7 +37,9 @@ def write_friction_kernel(
     shape_world: wp.array[wp.int32],  # [S] world of each shape
     shape_kind: wp.array[wp.int32],  # [S] kind of each shape
     nominal: wp.array[float],  # [S] friction of each shape before randomisation
-    table_share: wp.array[float],  # [N] share of the table's friction in the pair's; 1: it is the pair's
+    table_share: wp.array[
+        float
+    ],  # [N] share of the table's friction in the pair's; 1: it is the pair's
     nominal_hand: float,  # friction of the hand that ``hand_friction`` replaces
     kind_table: int,  # kind of the table
     kind_object: int,  # kind of the object's parts
@@ -47,9 +54,9 @@ def write_friction_kernel(
     """Write each shape's friction so that the solver's pair value is the average of the two bodies'.
 
     The solver takes the friction of the geom with the higher priority: table over hand over object.
-    So the table carries the average of table and object, unless the pair's was measured, a hand shape that
-    of hand and object; a fingertip whose material differs from the nominal hand's keeps its ratio to it.
-    Launch [S].
+    So the table carries the average of table and object, unless the pair's was measured, a hand
+    shape that of hand and object; a fingertip whose material differs from the nominal hand's keeps
+    its ratio to it. Launch [S].
     """
     shape = wp.tid()
     world = shape_world[shape]
@@ -77,9 +84,14 @@ def write_object_force_kernel(
     # In:
     force_in: wp.array[wp.vec3],  # [N] force on the object, world frame [N]
     # Out:
-    body_force_out: wp.array2d[wp.spatial_vector],  # [N, B] force and torque [N, N m], the object's alone
+    body_force_out: wp.array2d[
+        wp.spatial_vector
+    ],  # [N, B] force and torque [N, N m], the object's alone
 ):
-    """Write a force at the object's centre of mass, and what carries a part of its weight. Launch: [N]."""
+    """Write a force at the object's centre of mass, and what carries a part of its weight.
+
+    Launch: [N].
+    """
     world = wp.tid()
     force = force_in[world]
     if lightened[world] != 0:

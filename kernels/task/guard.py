@@ -1,8 +1,8 @@
 """Detect, on the device, what would silently spoil a run: dropped contacts and non-finite states.
 
 Launch order per control step: ``collect_overflow_kernel`` after every physics step,
-``guard_kernel`` once at the end. Where a run may go on without the worlds that failed, ``put_back_kernel``
-follows, and ``void_step_kernel`` after the reward.
+``guard_kernel`` once at the end. Where a run may go on without the worlds that failed,
+``put_back_kernel`` follows, and ``void_step_kernel`` after the reward.
 """
 
 import warp as wp

@@ -1,8 +1,9 @@
 """What a policy sees late: the state after every physics step, kept in a ring, and read at an age.
 
-A row of the ring holds what observations are made of, in this order: joints as the encoders report them,
-their velocities, all positions, all velocities, and of each fingertip's link pose 7, velocity 6.
-The object comes from a camera, joints and fingertips from encoders: each have an age of their own.
+A row of the ring holds what observations are made of, in this order: joints as the encoders report
+them, their velocities, all positions, all velocities, and of each fingertip's link pose 7, velocity
+6. The object comes from a camera, joints and fingertips from encoders: each have an age of their
+own.
 """
 
 import warp as wp
@@ -20,13 +21,17 @@ class StateArrays:
     measured_q: wp.array2d[float]  # [N, *] hand joints as their encoders report them [rad]
     measured_qd: wp.array2d[float]  # [N, *] velocities likewise [rad/s]
     joint_q: wp.array2d[float]  # [N, D + 7] hand joints [rad], object position [m] and quaternion
-    joint_qd: wp.array2d[float]  # [N, D + 6] hand joints [rad/s], object linear and angular velocity
+    joint_qd: wp.array2d[
+        float
+    ]  # [N, D + 6] hand joints [rad/s], object linear and angular velocity
     body_q: wp.array2d[wp.transform]  # [N, B] link poses in the world frame
     body_qd: wp.array2d[wp.spatial_vector]  # [N, B] link velocities in the world frame
 
 
 LINK_VALUES = 13
-"""Values of a fingertip's link in a row: position 3, quaternion 4, linear 3 and angular velocity 3."""
+"""Values of a fingertip's link in a row: position 3, quaternion 4, linear 3 and angular velocity
+3.
+"""
 
 
 def ring_columns(joints: int, positions: int, velocities: int, fingers: int) -> int:
@@ -132,8 +137,12 @@ def recall_state_kernel(
     physics_dt: float,  # time between two rows [s]
     jitter: float,  # most that the object is seen later still, drawn in each call [s]
     # In:
-    latency_in: wp.array[float],  # [N] how late each object is seen [s], with jitter at most (L - 1) steps
-    encoder_latency_in: wp.array[float],  # [N] how late joints and fingertips are seen [s], likewise
+    latency_in: wp.array[
+        float
+    ],  # [N] how late each object is seen [s], with jitter at most (L - 1) steps
+    encoder_latency_in: wp.array[
+        float
+    ],  # [N] how late joints and fingertips are seen [s], likewise
     head_in: wp.array[int],  # [N] slot written last
     ring_in: wp.array2d[float],  # [N L, C] past states
     # In/Out:

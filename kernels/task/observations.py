@@ -1,7 +1,7 @@
 """The teacher's observation: state of hand and object, goal, previous action, with sensor noise.
 
-World frame (z up), metres, radians, quaternions xyzw. G fingers, D joints; O = 3 D + 13 G + 21 values: of the
-paper's hands, with three joints a finger, 19 G + 21 and the previous action.
+World frame (z up), metres, radians, quaternions xyzw. G fingers, D joints; O = 3 D + 13 G + 21
+values: of the paper's hands, with three joints a finger, 19 G + 21 and the previous action.
 """
 
 import warp as wp
@@ -45,7 +45,9 @@ class ObservationParams:
     velocity_scale: float  # factor on joint velocities and on the object's angular velocity
     noise_mean: float  # mean of the noise on measured values, in their units
     noise_std: float  # standard deviation of that noise, independent in every value and step
-    file_axes: float  # whether orientations in the axes of the object's file are seen: 1, or 0 for zeros
+    file_axes: (
+        float  # whether orientations in the axes of the object's file are seen: 1, or 0 for zeros
+    )
     canonical: float  # whether orientations and the rotation between them are canonical: 1 or 0
 
 
@@ -83,10 +85,14 @@ def teacher_observation_kernel(
     # In:
     measured_q_in: wp.array2d[float],  # [N, *] positions of the hand's joints as reported [rad]
     measured_qd_in: wp.array2d[float],  # [N, *] velocities of the hand's joints likewise [rad/s]
-    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[
+        float
+    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
     joint_qd_in: wp.array2d[float],  # [N, D + 6] velocities: joints, object [m/s], its spin [rad/s]
     body_q_in: wp.array2d[wp.transform],  # [N, B] link poses in the world frame
-    body_qd_in: wp.array2d[wp.spatial_vector],  # [N, B] link velocities: of the centre of mass, angular
+    body_qd_in: wp.array2d[
+        wp.spatial_vector
+    ],  # [N, B] link velocities: of the centre of mass, angular
     goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
     smoothed_in: wp.array2d[float],  # [N, D] previous (smoothed) action
     observation_offset_in: wp.array2d[float],  # [N, O] constant error of each measured value
@@ -98,10 +104,11 @@ def teacher_observation_kernel(
     """Observation of the teacher, columns as in :func:`teacher_observation_slices`. Launch: [N].
 
     Joint positions are mapped from [lower, upper] to [-1, 1]; the relative orientation is
-    q_object * conj(q_goal). Every measured value gets N(noise_mean, noise_std) + offset; the goal and
-    the previous action are known exactly and get neither. Without ``file_axes`` the orientations of object
-    and goal are zeros, without noise. With ``canonical`` the three do not tell a quaternion q from -q, the
-    same rotation (:func:`vd.kernels.transforms.canonical`, before noise).
+    q_object * conj(q_goal). Every measured value gets N(noise_mean, noise_std) + offset; the goal
+    and the previous action are known exactly and get neither. Without ``file_axes`` the
+    orientations of object and goal are zeros, without noise. With ``canonical`` the three do not
+    tell a quaternion q from -q, the same rotation (:func:`vd.kernels.transforms.canonical`, before
+    noise).
     """
     world = wp.tid()
     settings = params[0]
@@ -111,7 +118,9 @@ def teacher_observation_kernel(
         span = joint_upper[joint] - joint_lower[joint]
         above = measured_q_in[world, joint] - joint_lower[joint]
         observation_out[world, joint] = 2.0 * above / span - 1.0
-        observation_out[world, joints + joint] = settings.velocity_scale * measured_qd_in[world, joint]
+        observation_out[world, joints + joint] = (
+            settings.velocity_scale * measured_qd_in[world, joint]
+        )
 
     position = read_vec3(world, joints, joint_q_in)
     orientation = read_quat(world, joints + 3, joint_q_in)

@@ -1,4 +1,7 @@
-"""An object that is believed to lie where it does not, all through an episode: what tracking is wrong by."""
+"""An object that is believed to lie where it does not, all through an episode.
+
+What tracking is wrong by.
+"""
 
 import warp as wp
 
@@ -17,7 +20,9 @@ def draw_pose_error_kernel(
     # In/Out:
     rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    error_out: wp.array[wp.transform],  # [N] displacement, rotation about the object's origin, world frame
+    error_out: wp.array[
+        wp.transform
+    ],  # [N] displacement, rotation about the object's origin, world frame
 ):
     """Draw the error of the masked worlds, of uniform direction and axis. Launch: [N]."""
     world = wp.tid()
@@ -33,8 +38,12 @@ def draw_pose_error_kernel(
 @wp.kernel
 def mistake_pose_kernel(
     # In:
-    error_in: wp.array[wp.transform],  # [N] displacement d and rotation r of each object, world frame
-    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position p [m] and quaternion q
+    error_in: wp.array[
+        wp.transform
+    ],  # [N] displacement d and rotation r of each object, world frame
+    joint_q_in: wp.array2d[
+        float
+    ],  # [N, D + 7] hand joints [rad], object position p [m] and quaternion q
     # Out:
     joint_q_out: wp.array2d[float],  # [N, D + 7] the same as it is believed
 ):

@@ -79,7 +79,9 @@ def draw_dynamics_kernel(
 @wp.kernel
 def draw_servo_kernel(
     # Model:
-    ranges: wp.array2d[wp.vec2],  # [D, P] range of each parameter of each joint; equal ends draw nothing
+    ranges: wp.array2d[
+        wp.vec2
+    ],  # [D, P] range of each parameter of each joint; equal ends draw nothing
     # In:
     mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
     kp_in: wp.array2d[float],  # [N, D] stiffness drawn for the world [N m/rad]
@@ -87,12 +89,14 @@ def draw_servo_kernel(
     # In/Out:
     rng: wp.array[wp.uint32],  # [N] random stream of each world
     # Out:
-    parameters_out: wp.array2d[float],  # [N D, P] rows of parameters (:mod:`vd.kernels.servo.actuators`)
+    parameters_out: wp.array2d[
+        float
+    ],  # [N D, P] rows of parameters (:mod:`vd.kernels.servo.actuators`)
 ):
     """Draw the servo model of the joints of the masked worlds, each number for itself. Launch: [N].
 
-    But the delays of commands and of readings are of the bus that all joints share: each is drawn once, as
-    the same share of every joint's range.
+    But the delays of commands and of readings are of the bus that all joints share: each is drawn
+    once, as the same share of every joint's range.
     """
     world = wp.tid()
     if mask_in[world] == 0:
@@ -157,8 +161,8 @@ def disturbance_force_kernel(
 ):
     """Disturbance force on the object for one control step (Supplementary Methods). Launch: [N].
 
-    With the given probability a new force of magnitude c_d m in a uniform random direction; otherwise
-    the old one times ``decay``.
+    With the given probability a new force of magnitude c_d m in a uniform random direction;
+    otherwise the old one times ``decay``.
     """
     world = wp.tid()
     settings = params[0]

@@ -1,7 +1,7 @@
 """End of episodes, resets of the state and new goals.
 
-Order in a control step: after the reward, :func:`episode_kernel` decides what ends, then :func:`reset_kernel`
-acts on the masks. Masks are int32, 0 or 1; worlds outside them keep every bit.
+Order in a control step: after the reward, :func:`episode_kernel` decides what ends, then
+:func:`reset_kernel` acts on the masks. Masks are int32, 0 or 1; worlds outside them keep every bit.
 """
 
 import warp as wp
@@ -33,7 +33,9 @@ class GoalParams:
     """How goals are drawn; an array of length 1 in device memory."""
 
     max_angle: float  # largest angle between object and goal [rad]; all of SO(3) at >= pi
-    about_vertical: int  # 1 if goals only turn it about the vertical, uniform in the angle; 0: any axis
+    about_vertical: (
+        int  # 1 if goals only turn it about the vertical, uniform in the angle; 0: any axis
+    )
 
 
 @wp.kernel
@@ -46,10 +48,14 @@ def episode_kernel(
     # In/Out:
     step_count: wp.array[int],  # [N] control steps since the reset
     goal_steps: wp.array[int],  # [N] control steps since the goal was given
-    counts: wp.array[float],  # [3] goals ended, goals reached, objects lost, of all worlds; added to
+    counts: wp.array[
+        float
+    ],  # [3] goals ended, goals reached, objects lost, of all worlds; added to
     # Out:
     timed_out_out: wp.array[int],  # [N] 1 where the episode ends only by its length
-    done_out: wp.array[int],  # [N] 1 where the return ends for the learner: success, fall or time-out
+    done_out: wp.array[
+        int
+    ],  # [N] 1 where the return ends for the learner: success, fall or time-out
     reset_out: wp.array[int],  # [N] 1 where the world is to be reset
     new_goal_out: wp.array[int],  # [N] 1 where only the goal is to be drawn anew
 ):
@@ -85,7 +91,9 @@ def reset_kernel(
     reset_q: wp.array[float],  # [D] hand joints after a reset [rad]
     start_params: wp.array[StartParams],  # [1] start of the object
     goal_params: wp.array[GoalParams],  # [1] draw of the goal
-    rest_poses: wp.array2d[wp.transform],  # [N, K] poses at rest of each world's object; K = 0: none
+    rest_poses: wp.array2d[
+        wp.transform
+    ],  # [N, K] poses at rest of each world's object; K = 0: none
     # In:
     reset_in: wp.array[int],  # [N] 1 where the world is reset
     new_goal_in: wp.array[int],  # [N] 1 where only the goal is drawn anew
@@ -103,17 +111,19 @@ def reset_kernel(
     goal_steps_out: wp.array[int],  # [N] control steps since the goal was given
     goal_quat_out: wp.array[wp.quat],  # [N] goal orientation
     previous_error_out: wp.array[float],  # [N] rotation error to the new goal [rad]
-    env_mask_out: wp.array[wp.bool],  # [N + 1] who is reset, for Newton; the last, of no world, stays
+    env_mask_out: wp.array[
+        wp.bool
+    ],  # [N + 1] who is reset, for Newton; the last, of no world, stays
 ):
     """Reset the worlds of one mask; draw a goal for those of either mask. Launch: [N].
 
-    A reset puts the hand to ``reset_q``, the object to position + U(-noise, noise) on each axis with a
-    uniform random orientation, all velocities and counters to zero. Where poses at rest are given, the
-    object starts in one of them instead, turned by a random angle about the vertical through its origin.
-    A goal is uniform among the orientations within max_angle of the object's (or turns it about the
-    vertical only); the smoothed action starts at zero with each goal. A goal that is drawn is less than half
-    a turn from the object's quaternion, not from the other one of its orientation; of a given one the sign is
-    chosen so.
+    A reset puts the hand to ``reset_q``, the object to position + U(-noise, noise) on each axis
+    with a uniform random orientation, all velocities and counters to zero. Where poses at rest are
+    given, the object starts in one of them instead, turned by a random angle about the vertical
+    through its origin. A goal is uniform among the orientations within max_angle of the object's
+    (or turns it about the vertical only); the smoothed action starts at zero with each goal. A goal
+    that is drawn is less than half a turn from the object's quaternion, not from the other one of
+    its orientation; of a given one the sign is chosen so.
     """
     world = wp.tid()
     reset = reset_in[world] != 0

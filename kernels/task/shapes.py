@@ -1,7 +1,8 @@
 """What the teacher is told about the object's shape: where its surface is, and how far it extends.
 
-Privileged and exact: no sensor gives these values, and they get no noise. World frame (z up), metres inside,
-quaternions xyzw. The values are written behind the state in the observation, scaled to about one.
+Privileged and exact: no sensor gives these values, and they get no noise. World frame (z up),
+metres inside, quaternions xyzw. The values are written behind the state in the observation, scaled
+to about one.
 """
 
 from math import cos, pi, sin
@@ -28,10 +29,13 @@ ORIENTATIONS = 2
 def extent_directions(fingers: int) -> list[tuple[float, float, float]]:
     """Directions in which extents are taken for a hand of G ``fingers``: 9 G + 2 unit vectors.
 
-    Up, down, then rings of 3 G directions each, 45 degrees below the horizontal, level, and 45 above. A
-    turn of the world from one finger to the next moves every direction to another one of its ring.
+    Up, down, then rings of 3 G directions each, 45 degrees below the horizontal, level, and 45
+    above. A turn of the world from one finger to the next moves every direction to another one of
+    its ring.
     """
-    azimuths = [2.0 * pi * i / (AZIMUTHS_PER_FINGER * fingers) for i in range(AZIMUTHS_PER_FINGER * fingers)]
+    azimuths = [
+        2.0 * pi * i / (AZIMUTHS_PER_FINGER * fingers) for i in range(AZIMUTHS_PER_FINGER * fingers)
+    ]
     rings = [(cos(a) * cos(e), sin(a) * cos(e), sin(e)) for e in RING_ELEVATIONS for a in azimuths]
     return [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), *rings]
 
@@ -58,18 +62,25 @@ def surface_kernel(
     object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
     first_column: int,  # column of the first value
     # In:
-    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[
+        float
+    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
     body_q_in: wp.array2d[wp.transform],  # [N, B] link poses in the world frame
     # Out:
-    observation_out: wp.array2d[float],  # [N, O] world vectors [SHAPE_UNIT_M], three columns a finger
+    observation_out: wp.array2d[
+        float
+    ],  # [N, O] world vectors [SHAPE_UNIT_M], three columns a finger
 ):
     """Vector from each fingertip to the nearest point of the object's surface. Launch: [N, G]."""
     world, finger = wp.tid()
     shape = world_object[world]
     scale = world_scale[world]
     orientation = read_quat(world, object_column + 3, joint_q_in)
-    tip = wp.transform_get_translation(fingertip_pose(body_q_in[world, tip_body[finger]], tip_offset[finger]))
-    # The search is in the object's frame: one rotation of the fingertip instead of one of every point.
+    tip = wp.transform_get_translation(
+        fingertip_pose(body_q_in[world, tip_body[finger]], tip_offset[finger])
+    )
+    # The search is in the object's frame: one rotation of the fingertip instead of one of every
+    # point.
     local = wp.quat_rotate_inv(orientation, tip - read_vec3(world, object_column, joint_q_in))
     nearest = scale * points[shape, 0] - local
     for i in range(1, points.shape[1]):
@@ -102,15 +113,17 @@ def extent_kernel(
     object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
     first_column: int,  # column of the first value
     # In:
-    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[
+        float
+    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
     goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
     # Out:
     observation_out: wp.array2d[float],  # [N, O] E columns now and E at the goal
 ):
     """How far the object extends from its origin along world directions. Launch: [N, 2, E].
 
-    The support function max_p direction . (q p) of the surface points, once with the present orientation q
-    and once with the goal's; written as (extent - EXTENT_CENTRE_M) / SHAPE_UNIT_M.
+    The support function max_p direction . (q p) of the surface points, once with the present
+    orientation q and once with the goal's; written as (extent - EXTENT_CENTRE_M) / SHAPE_UNIT_M.
     """
     world, goal, index = wp.tid()
     shape = world_object[world]
@@ -131,11 +144,16 @@ def clearance_kernel(
     object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
     table_top: float,  # height of the table's top, world frame [m]
     # In:
-    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[
+        float
+    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
     # Out:
     clearance_out: wp.array[float],  # [N] height [m], negative below the top
 ):
-    """Height of the object's lowest point above the table's top, whether it is there or not. Launch: [N]."""
+    """Height of the object's lowest point above the table's top, whether it is there or not.
+
+    Launch: [N].
+    """
     world = wp.tid()
     orientation = read_quat(world, object_column + 3, joint_q_in)
     down = wp.vec3(0.0, 0.0, -1.0)

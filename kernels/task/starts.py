@@ -1,7 +1,10 @@
-"""Starts of the object in which no finger is inside it: the nearest of a few places beside the one drawn.
+"""Starts of the object in which no finger is inside it.
 
-The orientation stays. Places are tried side by side, each by how deep the samples of the object's surface are
-in the shapes of the hand as it stands after a reset. World frame (z up), metres, quaternions xyzw.
+The nearest of a few places beside the one drawn.
+
+The orientation stays. Places are tried side by side, each by how deep the samples of the object's
+surface are in the shapes of the hand as it stands after a reset. World frame (z up), metres,
+quaternions xyzw.
 """
 
 from math import cos, pi, sin
@@ -13,12 +16,14 @@ from vd.kernels.columns import read_quat, read_vec3, write_vec3
 wp.set_module_options({"enable_backward": False})
 
 PLACE_STEP_M = 0.015
-"""Distance of places from each other [m]: smaller ones need more of them to come out of a finger."""
+"""Distance of places from each other [m]: smaller ones need more of them to come out of a
+finger.
+"""
 RINGS, RING_PLACES, LEVELS = 2, 6, 4
 """Places of a level: the start, and rings of six around; levels go away from the palm."""
 APART_M = 0.004
-"""Distance from the hand at which a sample counts as outside [m]: half of that between samples. Of 13 meshes
-none of 325 starts is then more than 1 mm inside, at 3 mm one in a hundred is."""
+"""Distance from the hand at which a sample counts as outside [m]: half of that between samples. Of
+13 meshes none of 325 starts is then more than 1 mm inside, at 3 mm one in a hundred is."""
 IN_TABLE_M = 0.001
 """How deep a sample may be in the table [m]: objects at rest sink in a little."""
 CHUNKS = 8
@@ -43,12 +48,17 @@ def start_places(*, up: bool = False) -> list[tuple[float, float, float]]:
 
 @wp.struct
 class OpenHand:
-    """S shapes of the hand as it stands after a reset: boxes with rounded edges, which capsules are too."""
+    """S shapes of the hand as it stands after a reset.
+
+    Boxes with rounded edges, which capsules are too.
+    """
 
     pose: wp.array[wp.transform]  # [S] pose of each shape
     half: wp.array[wp.vec3]  # [S] half extents without the rounding [m]
     radius: wp.array[float]  # [S] radius of the rounding [m]
-    reach: wp.array[float]  # [S] distance from its centre within which a sample counts as inside, at most [m]
+    reach: wp.array[
+        float
+    ]  # [S] distance from its centre within which a sample counts as inside, at most [m]
 
 
 @wp.func
@@ -71,9 +81,13 @@ def start_depth_kernel(
     object_column: int,  # column of the object's position in ``joint_q_in``; its quaternion follows
     # In:
     reset_in: wp.array[int],  # [N] 1 where the world is reset; others are left as they are
-    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[
+        float
+    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
     # In/Out:
-    depth: wp.array2d[float],  # [N, C] depth beyond what is allowed [m], 0 before; raised to the deepest
+    depth: wp.array2d[
+        float
+    ],  # [N, C] depth beyond what is allowed [m], 0 before; raised to the deepest
 ):
     """How deep the object would start in hand or table at each place. Launch: [N, C, CHUNKS]."""
     world, place, chunk = wp.tid()
@@ -118,4 +132,6 @@ def move_start_kernel(
             best = place
     for place in range(places.shape[0]):
         depth[world, place] = 0.0
-    write_vec3(world, object_column, read_vec3(world, object_column, joint_q) + places[best], joint_q)
+    write_vec3(
+        world, object_column, read_vec3(world, object_column, joint_q) + places[best], joint_q
+    )

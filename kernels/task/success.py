@@ -15,8 +15,8 @@ wp.set_module_options({"enable_backward": False})
 class SuccessParams:
     """Thresholds of success and fall; an array of length 1 in device memory.
 
-    A stillness threshold (joint_speed to action_norm) or fall_distance that is <= 0 asks for nothing;
-    infinity does so too.
+    A stillness threshold (joint_speed to action_norm) or fall_distance that is <= 0 asks for
+    nothing; infinity does so too.
     """
 
     rotation: float  # largest rotation error [rad]; always asked for
@@ -40,7 +40,9 @@ def success_kernel(
     # Model:
     params: wp.array[SuccessParams],  # [1] thresholds
     # In:
-    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[
+        float
+    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
     joint_qd_in: wp.array2d[float],  # [N, D + 6] velocities: joints, object [m/s], its spin [rad/s]
     goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
     smoothed_in: wp.array2d[float],  # [N, D] smoothed action
@@ -54,7 +56,8 @@ def success_kernel(
 ):
     """Success and fall of the state after a control step. Launch: [N].
 
-    Success: the rotation error and all speeds are at most their thresholds, without contact with the table
+    Success: the rotation error and all speeds are at most their thresholds, without contact with
+    the table
     where that is asked for. Fall: the object's distance from fall_center is at least fall_distance.
     """
     world = wp.tid()
@@ -81,7 +84,10 @@ def success_kernel(
         and not (must_lift_in[world] != 0 and table_force_in[world] > limits.table_contact_force)
     )
     success = still and error <= limits.rotation
-    fell = limits.fall_distance > 0.0 and wp.length(position - limits.fall_center) >= limits.fall_distance
+    fell = (
+        limits.fall_distance > 0.0
+        and wp.length(position - limits.fall_center) >= limits.fall_distance
+    )
 
     rotation_error_out[world] = error
     still_out[world] = wp.where(still, 1, 0)

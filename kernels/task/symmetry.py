@@ -1,8 +1,9 @@
 """Symmetry frames: a hand with evenly spaced fingers looks the same after a turn from finger to finger.
 
-World frame (z up), quaternions xyzw. V frames: frame k < F is the environment turned about the vertical by
-k / F of a full turn, with the F fingers renamed. A policy that always takes the frame in which the axis of
-the wanted rotation lies in the same sector has an F-th of the goals to learn. A hand that is its own mirror
+World frame (z up), quaternions xyzw. V frames: frame k < F is the environment turned about the
+vertical by k / F of a full turn, with the F fingers renamed. A policy that always takes the frame
+in which the axis of the wanted rotation lies in the same sector has an F-th of the goals to learn.
+A hand that is its own mirror
 image has as many frames in the mirror: half of that.
 """
 
@@ -22,15 +23,21 @@ def choose_frame_kernel(
     # In:
     reset_in: wp.array[int],  # [N] 1 where the world was reset
     new_goal_in: wp.array[int],  # [N] 1 where only the goal is new
-    joint_q_in: wp.array2d[float],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
+    joint_q_in: wp.array2d[
+        float
+    ],  # [N, D + 7] hand joints [rad], object position [m] and quaternion
     goal_quat_in: wp.array[wp.quat],  # [N] wanted orientation of the object
     # In/Out:
     frame: wp.array[int],  # [N] symmetry frame of each environment
 ):
-    """Choose the frame of every environment that has a new goal, and keep it until the next. Launch: [N].
+    """Choose the frame of every environment that has a new goal, and keep it until the next.
 
-    It is the frame that turns the axis of the rotation to the goal nearest to one fixed direction. Chosen
-    once for a goal: an axis of small rotations wanders, and fingers would change their parts with it.
+    Launch: [N].
+
+    It is the frame that turns the axis of the rotation to the goal nearest to one fixed direction.
+    Chosen
+    once for a goal: an axis of small rotations wanders, and fingers would change their parts with
+    it.
     """
     world = wp.tid()
     if reset_in[world] == 0 and new_goal_in[world] == 0:

@@ -1,4 +1,6 @@
-"""What the kernel tests share: arrays that show unwritten cells, hypothesis strategies, NumPy oracles.
+"""What the kernel tests share.
+
+Arrays that show unwritten cells, hypothesis strategies, NumPy oracles.
 
 The oracles compute in float64 with SciPy and import nothing from the kernels.
 """
@@ -35,7 +37,10 @@ def unwritten(shape: int | tuple[int, ...], dtype: object, device: str) -> wp.ar
 
 
 def on_device(value: object, declared: object, device: str) -> object:
-    """A value as its declared type: an array, a struct given as a dict with every field, or some of these."""
+    """A value as its declared type.
+
+    An array, a struct given as a dict with every field, or some of these.
+    """
     array = wp.types.is_array(declared) and not isinstance(value, wp.array)
     if array and hasattr(declared.dtype, "vars"):  # type: ignore[attr-defined]
         given = [value] if isinstance(value, dict) else value
@@ -72,7 +77,9 @@ def streams(worlds: int, seed: int, device: str) -> wp.array:
     return rng
 
 
-def floats(shape: tuple[int, ...], low: float = -2.0, high: float = 2.0) -> st.SearchStrategy[np.ndarray]:
+def floats(
+    shape: tuple[int, ...], low: float = -2.0, high: float = 2.0
+) -> st.SearchStrategy[np.ndarray]:
     """Arrays of float32 in [low, high]."""
     low, high = float(np.float32(low)), float(np.float32(high))
     # Subnormal numbers are flushed to zero on some devices and mean nothing here.
@@ -87,7 +94,10 @@ def indices(shape: int | tuple[int, ...], count: int) -> st.SearchStrategy[np.nd
 
 @st.composite
 def quaternions(draw: st.DrawFn, shape: tuple[int, ...]) -> np.ndarray:
-    """Unit quaternions xyzw, float32, shape ``shape`` + (4,): anywhere on the sphere, with special ones."""
+    """Unit quaternions xyzw, float32, shape ``shape`` + (4,).
+
+    Anywhere on the sphere, with special ones.
+    """
     raw = draw(floats((*shape, 4), -1.0, 1.0)).astype(np.float64)
     norm = np.linalg.norm(raw, axis=-1, keepdims=True)
     identity = np.array([0.0, 0.0, 0.0, 1.0])
@@ -102,7 +112,10 @@ def transforms(draw: st.DrawFn, shape: tuple[int, ...]) -> np.ndarray:
 
 @st.composite
 def goals(draw: st.DrawFn, orientation: np.ndarray) -> np.ndarray:
-    """Goals for orientations of the same shape: random, equal, opposite in sign, or half a turn away."""
+    """Goals for orientations of the same shape.
+
+    Random, equal, opposite in sign, or half a turn away.
+    """
     goal = draw(quaternions(orientation.shape[:-1]))
     kind = draw(hnp.arrays(np.int8, orientation.shape[:-1], elements=st.integers(0, 4)))[..., None]
     x, y, z, w = np.moveaxis(orientation, -1, 0)

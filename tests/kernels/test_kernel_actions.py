@@ -5,7 +5,11 @@ from hypothesis import strategies as st
 from kernel_oracle import ALPHA, EXAMPLES, device_array, floats, launch, streams
 from scipy import stats
 
-from vd.kernels.task.actions import apply_action_kernel, joint_effort_kernel, limit_joint_velocity_kernel
+from vd.kernels.task.actions import (
+    apply_action_kernel,
+    joint_effort_kernel,
+    limit_joint_velocity_kernel,
+)
 from vd.paper import PAPER
 
 EXTRA = 7
@@ -14,7 +18,9 @@ EXTRA = 7
 STEP_RAD = PAPER.action.scale_rad_s / PAPER.scene.control_hz
 
 
-def apply_action(device, action, offset, q, smoothed, lower, upper, *, noise_std=0.0, seed=0, alpha=0.8):
+def apply_action(
+    device, action, offset, q, smoothed, lower, upper, *, noise_std=0.0, seed=0, alpha=0.8
+):
     """One launch; returns the smoothed action and the targets (with the EXTRA columns) and the streams."""
     worlds = len(action)
     average, rng = device_array(smoothed, float, device), streams(worlds, seed, device)
@@ -37,11 +43,15 @@ def test_targets_match_the_paper(device, data, fingers, worlds, alpha):
     action, offset = data.draw(floats(shape)), data.draw(floats(shape, -0.1, 0.1))
     q, smoothed = data.draw(floats(shape)), data.draw(floats(shape, -1.0, 1.0))
     lower, upper = data.draw(floats(shape[1:], -2.0, -0.4)), data.draw(floats(shape[1:], 0.4, 2.0))
-    average, target, _ = apply_action(device, action, offset, q, smoothed, lower, upper, alpha=alpha)
+    average, target, _ = apply_action(
+        device, action, offset, q, smoothed, lower, upper, alpha=alpha
+    )
     expected = alpha * np.clip(action + offset, -1, 1) + (1 - alpha) * smoothed
     np.testing.assert_allclose(average, expected, atol=1e-6)
     joints = shape[1]
-    np.testing.assert_allclose(target[:, :joints], np.clip(q + expected * STEP_RAD, lower, upper), atol=1e-6)
+    np.testing.assert_allclose(
+        target[:, :joints], np.clip(q + expected * STEP_RAD, lower, upper), atol=1e-6
+    )
     assert np.isnan(target[:, joints:]).all(), "the object's columns are not the kernel's to write"
 
 
@@ -57,8 +67,12 @@ def test_action_noise_has_the_moments_of_table_s3(device):
     assert stats.kstest(np.ravel(noise) / std, stats.norm.cdf).pvalue > ALPHA
     correlation = np.corrcoef(noise.T)
     assert np.abs(correlation - np.eye(9)).max() < 0.05, "joints share noise"
-    assert np.abs(np.corrcoef(noise[:-1, 0], noise[1:, 0])[0, 1]) < 0.05, "neighbouring worlds share noise"
-    again = apply_action(device, zero, zero, zero, zero, -limits, limits, noise_std=std, seed=3, alpha=1.0)
+    assert np.abs(np.corrcoef(noise[:-1, 0], noise[1:, 0])[0, 1]) < 0.05, (
+        "neighbouring worlds share noise"
+    )
+    again = apply_action(
+        device, zero, zero, zero, zero, -limits, limits, noise_std=std, seed=3, alpha=1.0
+    )
     np.testing.assert_array_equal(noise, again[0])
     assert not np.any(rng == streams(len(zero), 3, device).numpy()), "the streams did not advance"
 
@@ -72,7 +86,12 @@ def test_velocity_limit_shortens_the_step(device, data, fingers, worlds):
     limit = data.draw(floats((joints,), 1.0, 8.0))
     q = (q_prev + dt * qd).astype(np.float32)
     q_array, qd_array = device_array(q, float, device), device_array(qd, float, device)
-    launch(limit_joint_velocity_kernel, (worlds, joints), [limit, dt, q_prev, q_array, qd_array], device)
+    launch(
+        limit_joint_velocity_kernel,
+        (worlds, joints),
+        [limit, dt, q_prev, q_array, qd_array],
+        device,
+    )
     over = np.zeros(q.shape, bool)
     over[:, :joints] = np.abs(qd[:, :joints]) > limit
     expected_qd = qd.copy()

@@ -34,7 +34,10 @@ def step_kernel(
     state: wp.array2d[float],
     out: wp.array3d[float],
 ):
-    """Steps of servos whose joints do not move. Launch: [R]; command [R, steps], out [R, steps, 5]."""
+    """Steps of servos whose joints do not move. Launch: [R].
+
+    Command [R, steps], out [R, steps, 5].
+    """
     row = wp.tid()
     servo.start_servo(command[row, 0], position[row], row, state)
     for k in range(steps):
@@ -67,7 +70,12 @@ def steps_of(device, rows, command, position=0.0, speed=0.0, *, power=1.0):
     rows = np.atleast_2d(rows)
     count = len(rows)
     command = np.broadcast_to(np.atleast_1d(command), (count, np.shape(np.atleast_1d(command))[-1]))
-    inputs = [command, *(np.broadcast_to(v, count) for v in (position, speed, power)), command.shape[1], DT]
+    inputs = [
+        command,
+        *(np.broadcast_to(v, count) for v in (position, speed, power)),
+        command.shape[1],
+        DT,
+    ]
     shapes = [(count, servo.STATE_COLUMNS), (count, command.shape[1], 5)]
     state, out = launch(step_kernel, count, [*inputs, rows], device, *shapes)
     assert np.isfinite(out).all() and np.isfinite(state).all(), "not written, or no number"

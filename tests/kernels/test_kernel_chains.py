@@ -46,7 +46,9 @@ def rows_of(*settings, n=1):
     return rows
 
 
-def roll(device, rows, time, command, start, *, bodies=None, dt=DT, power=None, stops=1e6, effort=1e6):
+def roll(
+    device, rows, time, command, start, *, bodies=None, dt=DT, power=None, stops=1e6, effort=1e6
+):
     """Roll trajectories out; time [T], command [R, T, n], start [R, n]. Returns [C, R, T, n]."""
     runs, count, n = command.shape
     sets = len(rows)
@@ -59,7 +61,13 @@ def roll(device, rows, time, command, start, *, bodies=None, dt=DT, power=None, 
     run = np.tile(np.arange(runs), sets)
     inputs = [samples, run * count, np.full(rolls, count), np.arange(rolls) * count, run]
     inputs += [np.tile(start, (sets, 1))]
-    inputs += [np.full(rolls, -1), np.arange(n), np.full(n, -stops), np.full(n, stops), np.full(n, effort)]
+    inputs += [
+        np.full(rolls, -1),
+        np.arange(n),
+        np.full(n, -stops),
+        np.full(n, stops),
+        np.full(n, effort),
+    ]
     links = links_of_size(room_for(n))() if bodies is None else links_of(**bodies, gravity=GRAVITY)
     inputs += [int(bodies is not None), links]
     inputs += [np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS), dt]
@@ -72,7 +80,9 @@ def roll(device, rows, time, command, start, *, bodies=None, dt=DT, power=None, 
 
 def one_joint(device, rows, time, command, start=0.0, **options):
     """One joint, one trajectory: [C, T]."""
-    return roll(device, rows, time, command[None, :, None], np.full((1, 1), start), **options)[:, 0, :, 0]
+    return roll(device, rows, time, command[None, :, None], np.full((1, 1), start), **options)[
+        :, 0, :, 0
+    ]
 
 
 def excitation(rng, seconds=2.0):
@@ -144,7 +154,9 @@ def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
         data.qpos[:], data.qvel[:] = q[i, :n], speed[i, :n]
         mujoco.mj_forward(model, data)
         full = np.zeros((n, n))
-        mujoco.mj_fullM(model, full, data.qM) if hasattr(data, "qM") else mujoco.mj_fullM(model, data, full)
+        mujoco.mj_fullM(model, full, data.qM) if hasattr(data, "qM") else mujoco.mj_fullM(
+            model, data, full
+        )
         scale = np.abs(full).max()
         np.testing.assert_allclose(mass[i, :n, :n], full, atol=1e-5 * scale)
         np.testing.assert_allclose(bias[i, :n], data.qfrc_bias, atol=2e-6)
@@ -157,7 +169,9 @@ def test_finger_follows_mujoco(device, n, friction):
     rng = np.random.default_rng(n)
     bodies = random_bodies(rng, n)
     time, _ = excitation(rng)
-    command = np.stack([excitation(np.random.default_rng(10 + i))[1][: len(time)] for i in range(n)], axis=1)
+    command = np.stack(
+        [excitation(np.random.default_rng(10 + i))[1][: len(time)] for i in range(n)], axis=1
+    )
     time = time[: len(command)]
     rows = rows_of({servo.INERTIA: 1e-3, servo.COULOMB_TORQUE: friction}, n=n)
     start = rng.uniform(-0.3, 0.3, n)
@@ -184,7 +198,9 @@ def test_finger_follows_mujoco(device, n, friction):
 
 def integrate(rows, time, command, start, dt, stops=np.inf):
     """Semi-implicit Euler in float64, C joints [C, P] at once; positions [C, T] at the stamps."""
-    names = [name for name, value in vars(servo).items() if type(value) is int and "STATE" not in name]
+    names = [
+        name for name, value in vars(servo).items() if type(value) is int and "STATE" not in name
+    ]
     p = {name: rows[:, getattr(servo, name)] for name in names if name != "PARAMETER_COLUMNS"}
     q = start - p["ENCODER_BIAS"]
     v, work = np.zeros_like(q), np.zeros_like(q)
@@ -205,11 +221,15 @@ def integrate(rows, time, command, start, dt, stops=np.inf):
         reference = np.where(on["FILTER_TAU"], smooth, reference)
         a = np.where(on["ACCELERATION_LIMIT"], p["ACCELERATION_LIMIT"], 1.0)
         to_go = reference - profile
-        target_speed = np.sign(to_go) * np.minimum(np.sqrt(2 * a * np.abs(to_go)), np.abs(to_go) / dt)
+        target_speed = np.sign(to_go) * np.minimum(
+            np.sqrt(2 * a * np.abs(to_go)), np.abs(to_go) / dt
+        )
         profile_speed = profile_speed + np.clip(target_speed - profile_speed, -a * dt, a * dt)
         profile = profile + dt * profile_speed
         reference = np.where(on["ACCELERATION_LIMIT"], profile, reference)
-        played = np.clip(played, reference - p["BACKLASH_WIDTH"] / 2, reference + p["BACKLASH_WIDTH"] / 2)
+        played = np.clip(
+            played, reference - p["BACKLASH_WIDTH"] / 2, reference + p["BACKLASH_WIDTH"] / 2
+        )
         error = played - q
         half = p["DEAD_ZONE_WIDTH"] / 2
         error = np.sign(error) * np.maximum(np.abs(error) - half, 0.0)
@@ -221,7 +241,9 @@ def integrate(rows, time, command, start, dt, stops=np.inf):
         hard = np.where(on["TORQUE_LIMIT"], p["TORQUE_LIMIT"], np.inf)
         torque = np.clip(torque, -hard, hard)
         no_load = np.where(on["STALL_TORQUE"], p["NO_LOAD_SPEED"], 1.0)
-        line = p["STALL_TORQUE"] * np.maximum(1 - np.where(torque * v > 0, np.abs(v), 0) / no_load, 0)
+        line = p["STALL_TORQUE"] * np.maximum(
+            1 - np.where(torque * v > 0, np.abs(v), 0) / no_load, 0
+        )
         line = np.where(on["STALL_TORQUE"], line, np.inf)
         torque = np.clip(torque, -line, line)
         stribeck = p["STRIBECK_SLIDING"] + (p["STRIBECK_STATIC"] - p["STRIBECK_SLIDING"]) * np.exp(
@@ -245,7 +267,8 @@ def integrate(rows, time, command, start, dt, stops=np.inf):
     past = np.array(history)
     return np.stack(
         [
-            np.interp(time - rows[c, servo.READ_DELAY], grid, past[:, c]) + rows[c, servo.ENCODER_BIAS]
+            np.interp(time - rows[c, servo.READ_DELAY], grid, past[:, c])
+            + rows[c, servo.ENCODER_BIAS]
             for c in range(len(rows))
         ]
     )
@@ -259,7 +282,10 @@ SIZES = {"thermal_drift.rate_per_s": 0.2, "gravity_load.phase_rad": 0.5}
 
 @pytest.fixture(scope="module")
 def effects_reference():
-    """Rows with each effect at random sizes, the motion, and the oracle's answer; plain rows first."""
+    """Rows with each effect at random sizes, the motion, and the oracle's answer.
+
+    Plain rows first.
+    """
     rng = np.random.default_rng(5)
     rows = np.tile(rows_of({})[:, 0], ((1 + len(DETERMINISTIC)) * DRAWS, 1))
     rows[:, servo.KP] *= rng.uniform(0.5, 2.0, len(rows))
@@ -293,16 +319,21 @@ def test_an_effect_follows_a_finer_integration(device, effects_reference, effect
         for parameter in EFFECTS[effect].parameters:
             plain[:, parameter.column] = parameter.neutral
         without = one_joint(device, plain[:, None], time, command, 0.1)
-        assert np.sqrt(np.mean((got - without) ** 2, axis=1)).max() > 3e-3, "the effect does nothing"
+        assert np.sqrt(np.mean((got - without) ** 2, axis=1)).max() > 3e-3, (
+            "the effect does nothing"
+        )
 
 
 def test_the_error_falls_with_the_square_of_the_step(device):
     time = np.arange(0, 1.5, 0.05)
     command = 0.3 * np.sin(2 * np.pi * np.arange(0, 1.5, 0.05))
-    rows = rows_of({servo.ELASTIC_STIFFNESS: 3.0, servo.ELASTIC_DAMPING: 5e-3, servo.ELASTIC_INERTIA: 2e-3})
+    rows = rows_of(
+        {servo.ELASTIC_STIFFNESS: 3.0, servo.ELASTIC_DAMPING: 5e-3, servo.ELASTIC_INERTIA: 2e-3}
+    )
     truth = one_joint(device, rows, time, command, dt=1 / 7680)
     errors = [
-        np.abs(one_joint(device, rows, time, command, dt=dt) - truth).max() for dt in (1 / 240, 1 / 480)
+        np.abs(one_joint(device, rows, time, command, dt=dt) - truth).max()
+        for dt in (1 / 240, 1 / 480)
     ]
     assert errors[1] < 1e-3 and errors[0] / errors[1] > 3.0, errors
 
@@ -315,12 +346,16 @@ def test_a_drive_gives_no_more_than_its_effort(device):
     got = one_joint(device, plain, time, command, effort=limit)
     expected = one_joint(device, rows_of({servo.TORQUE_LIMIT: limit}), time, command)
     np.testing.assert_array_equal(got, expected)
-    fine = integrate(rows_of({servo.TORQUE_LIMIT: limit})[:, 0], time, command, np.zeros(1), DT / FINE)
+    fine = integrate(
+        rows_of({servo.TORQUE_LIMIT: limit})[:, 0], time, command, np.zeros(1), DT / FINE
+    )
     assert np.sqrt(np.mean((got - fine) ** 2)) < 1.5e-3
     free = one_joint(device, plain, time, command)
     assert np.abs(free - got).max() > 0.02, "the limit does nothing"
     # The smaller of the two counts.
-    both = one_joint(device, rows_of({servo.TORQUE_LIMIT: 4.0 * limit}), time, command, effort=limit)
+    both = one_joint(
+        device, rows_of({servo.TORQUE_LIMIT: 4.0 * limit}), time, command, effort=limit
+    )
     np.testing.assert_array_equal(both, got)
 
 
@@ -354,7 +389,9 @@ def test_a_joint_that_is_switched_off_swings_out_by_what_damping_is_left(device)
     for swing, c in zip(got, (damping, 0.0), strict=True):
         rate = c / (2.0 * inertia)
         turn = np.sqrt(weight / inertia - rate**2)
-        expected = 0.02 * np.exp(-rate * time) * (np.cos(turn * time) + rate / turn * np.sin(turn * time))
+        expected = (
+            0.02 * np.exp(-rate * time) * (np.cos(turn * time) + rate / turn * np.sin(turn * time))
+        )
         np.testing.assert_allclose(swing, expected, atol=2e-4)
     # With the torque on, the drive's damping is all there is.
     on = roll(device, rows, time, off, np.array([[0.02]]))[:, 0, :, 0]
@@ -386,10 +423,14 @@ def test_jitter_delays_by_half_a_normal_on_average_and_is_smooth_in_its_size(dev
     command = np.where(np.arange(len(time)) % 2 == 0, 0.0, 1.0)
     sigma = 0.03
     rows = rows_of({}, {servo.JITTER_SIGMA: sigma}, {servo.JITTER_SIGMA: 1.001 * sigma})
-    many = roll(device, rows, time, np.tile(command[None, :, None], (50, 1, 1)), np.zeros((50, 1)))[..., 0]
+    many = roll(device, rows, time, np.tile(command[None, :, None], (50, 1, 1)), np.zeros((50, 1)))[
+        ..., 0
+    ]
     plain, jittered, nudged = many
     # Mean position at the next stamp, linearised: the delay of each command moves the answer back.
-    shifted = one_joint(device, rows_of({servo.COMMAND_DELAY: sigma * np.sqrt(2 / np.pi)}), time, command)[0]
+    shifted = one_joint(
+        device, rows_of({servo.COMMAND_DELAY: sigma * np.sqrt(2 / np.pi)}), time, command
+    )[0]
     np.testing.assert_allclose(jittered.mean(axis=0)[10:], shifted[10:], atol=0.015)
     assert np.abs(jittered - plain).max() > 0.03
     assert not np.allclose(jittered[0], jittered[1], atol=1e-3), "trajectories share their draws"

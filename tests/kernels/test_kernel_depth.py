@@ -1,8 +1,8 @@
 """Depth by ray casting against closed forms; against Newton's camera see test_depth_camera.py.
 
-Rule of the silhouette: a pixel is left out of a comparison if the oracle, cast through four points a
-hundredth of a pixel around its centre, does not see one flat surface, or sees it at the very end of the
-camera's range. Single precision cannot say there.
+Rule of the silhouette: a pixel is left out of a comparison if the oracle, cast through four points
+a hundredth of a pixel around its centre, does not see one flat surface, or sees it at the very end
+of the camera's range. Single precision cannot say there.
 """
 
 import numpy as np
@@ -44,12 +44,19 @@ def camera(width=WIDTH, height=HEIGHT, focal=30.0, near=NEAR, far=FAR):
 
 def directions(model, shift=(0.0, 0.0)):
     """Directions through the pixels (moved by ``shift`` pixels), z = 1, shape [H, W, 3]."""
-    u, v = np.meshgrid(np.arange(model.width) + 0.5 + shift[0], np.arange(model.height) + 0.5 + shift[1])
-    return np.stack([(u - model.cx) / model.fx, (v - model.cy) / model.fy, np.ones_like(u)], axis=-1)
+    u, v = np.meshgrid(
+        np.arange(model.width) + 0.5 + shift[0], np.arange(model.height) + 0.5 + shift[1]
+    )
+    return np.stack(
+        [(u - model.cx) / model.fx, (v - model.cy) / model.fy, np.ones_like(u)], axis=-1
+    )
 
 
 def shoot(device, meshes, poses, scales, *, model=None, eye=None, table=False):
-    """Depth image [H, W] of meshes at ``poses`` [S, 7]; the camera's pose ``eye`` [7] in the world."""
+    """Depth image [H, W] of meshes at ``poses`` [S, 7].
+
+    The camera's pose ``eye`` [7] in the world.
+    """
     count = len(meshes)
     surfaces = SurfaceSet(
         meshes, np.arange(count), np.arange(count)[None], np.asarray(scales)[None], device=device
@@ -95,11 +102,16 @@ BOX = trimesh.creation.box(extents=(0.2, 0.12, 0.3))
 def placements(draw, count=1):
     """Poses [count, 7] of things of 0.3 m in front of the camera, some around it, and scales [count]."""
     position = draw(floats((count, 3), -0.3, 0.3)) + np.array([0.0, 0.0, draw(st.floats(0.0, 1.2))])
-    return np.concatenate([position, draw(quaternions((count,)))], axis=1), draw(floats((count,), 0.5, 1.5))
+    return np.concatenate([position, draw(quaternions((count,)))], axis=1), draw(
+        floats((count,), 0.5, 1.5)
+    )
 
 
 def box_oracle(pose, scale, half):
-    """Depth of a box's surface along each direction, by slabs in float64; inf where it is missed."""
+    """Depth of a box's surface along each direction, by slabs in float64.
+
+    Inf where it is missed.
+    """
 
     def depth(rays):
         turn = Rotation.from_quat(pose[3:])
@@ -139,7 +151,8 @@ def test_table_is_a_box_seen_from_above(device, height, tilt):
 
 
 def test_closed_surfaces_have_no_cracks(device):
-    # The inside of a sphere of 5120 triangles around the camera: a ray between two of them would show.
+    # The inside of a sphere of 5120 triangles around the camera: a ray between two of them would
+    # show.
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
     model = camera(width=301, height=203, focal=150.0)
     for seed in range(3):

@@ -1,4 +1,7 @@
-"""The stereo sensor's errors: exact where they are exact, by their statistics where they are random."""
+"""The stereo sensor's errors.
+
+Exact where they are exact, by their statistics where they are random.
+"""
 
 import numpy as np
 import pytest
@@ -85,8 +88,14 @@ def test_noise_is_normal_in_disparity_and_grows_with_the_square_of_depth(device,
     # First order: z^2 / (f b) times the disparity's.
     axial = distance**2 / FB * std
     np.testing.assert_allclose((measured - distance).std(), axial, rtol=0.05)
-    for a, b in [(error[0], error[1]), (error[:, 1:], error[:, :-1]), (error[:, :, 1:], error[:, :, :-1])]:
-        assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 5 / np.sqrt(a.size), "pixels share noise"
+    for a, b in [
+        (error[0], error[1]),
+        (error[:, 1:], error[:, :-1]),
+        (error[:, :, 1:], error[:, :, :-1]),
+    ]:
+        assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 5 / np.sqrt(a.size), (
+            "pixels share noise"
+        )
     again = measure(device, depth, disparity_std=std, max_range=10.0)
     np.testing.assert_array_equal(again, measured)
     other = measure(device, depth, disparity_std=std, max_range=10.0, seed=1)
@@ -151,7 +160,8 @@ def test_near_things_throw_a_shadow_to_their_left(device, near, gap, left, width
     depth[:, :, left : left + width] = near
     measured = measure(device, depth, shadow=scale)
     lost = measured[0, 0] == 0
-    # Seen from the right, the near thing covers what lies behind it and up to this many pixels beside it.
+    # Seen from the right, the near thing covers what lies behind it and up to this many pixels
+    # beside it.
     parallax = scale / near - scale / far
     # Where it is a tie, single precision cannot say which pixel is the last.
     assume(abs(parallax - round(parallax)) > 1e-3 and abs(scale / far % 1 - 0.5) > 1e-3)
@@ -172,7 +182,9 @@ def test_dropout_takes_its_share_of_all_pixels(device):
 @EXAMPLES
 @given(poses=quaternions((4,)), delay=st.floats(0.0, 2.0))
 def test_late_poses_are_interpolated_between_frames(device, poses, delay):
-    frames = [np.concatenate([[0.1 * k, -0.2 * k, k * k], q])[None, None] for k, q in enumerate(poses)]
+    frames = [
+        np.concatenate([[0.1 * k, -0.2 * k, k * k], q])[None, None] for k, q in enumerate(poses)
+    ]
     history = unwritten((3, 1, 1), wp.transform, device)
     late = unwritten((1, 1), wp.transform, device)
     for k, frame in enumerate(frames):

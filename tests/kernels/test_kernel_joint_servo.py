@@ -119,7 +119,9 @@ def test_what_is_measured_is_old_limited_and_biased(device, positions, delay, bi
         past.append(before)
         past_speed.append(float(qd.numpy()[0, 0]))
         inputs = [rows, DT, index, history, speed_history]
-        measured, measured_speed = launch(measure_joint_kernel, (1, 1), inputs, device, (1, 1), (1, 1))
+        measured, measured_speed = launch(
+            measure_joint_kernel, (1, 1), inputs, device, (1, 1), (1, 1)
+        )
         when = np.arange(-len(past) + 1, 1) * DT
         assert np.allclose(measured, np.interp(-delay, when, past) + bias, atol=1e-3)
         assert np.allclose(measured_speed, np.interp(-delay, when, past_speed), atol=1e-2)

@@ -26,7 +26,9 @@ def expected_points(scene):
     clouds = []
     for poses in pose_matrix(scene["body_q"]):
         to_base = np.linalg.inv(poses[scene["base"]])
-        clouds.append([(to_base @ poses[b] @ p)[:3] for b, p in zip(scene["body"], samples, strict=True)])
+        clouds.append(
+            [(to_base @ poses[b] @ p)[:3] for b, p in zip(scene["body"], samples, strict=True)]
+        )
     return np.array(clouds)
 
 

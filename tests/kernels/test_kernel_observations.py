@@ -45,11 +45,15 @@ def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
         "body_qd": draw(floats((worlds, bodies, 6), -3, 3)),
         "goal": draw(goals(orientation)),
         "smoothed": draw(floats((worlds, joints), -1, 1)),
-        "offset": draw(floats((worlds, teacher_observation_size(fingers, 3 * fingers)), -0.01, 0.01)),
+        "offset": draw(
+            floats((worlds, teacher_observation_size(fingers, 3 * fingers)), -0.01, 0.01)
+        ),
     }
 
 
-def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=True, canonical=False):
+def observe(
+    device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=True, canonical=False
+):
     """Launch the kernel on a scene; returns observation and streams."""
     worlds = len(scene["q"])
     params = {
@@ -61,7 +65,17 @@ def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=T
     }
     rng = streams(worlds, seed, device)
     model = [scene[name] for name in ("lower", "upper", "tip_body", "tip_offset", "body_com")]
-    names = ["measured_q", "measured_qd", "q", "qd", "body_q", "body_qd", "goal", "smoothed", "offset"]
+    names = [
+        "measured_q",
+        "measured_qd",
+        "q",
+        "qd",
+        "body_q",
+        "body_qd",
+        "goal",
+        "smoothed",
+        "offset",
+    ]
     inputs = [*model, params, *(scene[name] for name in names), rng]
     shape = (worlds, teacher_observation_size(len(scene["tip_body"]), 3 * len(scene["tip_body"])))
     return launch(teacher_observation_kernel, worlds, inputs, device, shape)[0], rng.numpy()
@@ -76,15 +90,21 @@ def expected_observation(scene):
     body = pose_matrix(scene["body_q"])[:, scene["tip_body"]]
     tip = body @ pose_matrix(scene["tip_offset"])
     com = (
-        np.einsum("nfij,fj->nfi", body[..., :3, :3], scene["body_com"][scene["tip_body"]]) + body[..., :3, 3]
+        np.einsum("nfij,fj->nfi", body[..., :3, :3], scene["body_com"][scene["tip_body"]])
+        + body[..., :3, 3]
     )
-    linear, angular = np.split(scene["body_qd"][:, scene["tip_body"]].astype(np.float64), 2, axis=-1)
+    linear, angular = np.split(
+        scene["body_qd"][:, scene["tip_body"]].astype(np.float64), 2, axis=-1
+    )
     tip_quat = np.empty((worlds, fingers, 4))
     for f in range(fingers):  # the sign of the product quaternion is part of the observation
         inverse_offset = scene["tip_offset"][f, 3:] * [-1, -1, -1, 1]
-        tip_quat[:, f] = relative_quaternion(scene["body_q"][:, scene["tip_body"][f], 3:], inverse_offset)
+        tip_quat[:, f] = relative_quaternion(
+            scene["body_q"][:, scene["tip_body"][f], 3:], inverse_offset
+        )
     tips = np.concatenate(
-        [tip[..., :3, 3], tip_quat, linear + np.cross(angular, tip[..., :3, 3] - com), angular], axis=-1
+        [tip[..., :3, 3], tip_quat, linear + np.cross(angular, tip[..., :3, 3] - com), angular],
+        axis=-1,
     )
     return np.concatenate(
         [
@@ -145,7 +165,9 @@ def test_canonical_orientations_do_not_tell_which_quaternion_they_came_from(devi
         for goal_sign in (1.0, -1.0):
             q = scene["q"].copy()
             q[:, joints + 3 :] *= object_sign
-            same, _ = observe(device, scene | {"q": q, "goal": goal_sign * scene["goal"]}, canonical=True)
+            same, _ = observe(
+                device, scene | {"q": q, "goal": goal_sign * scene["goal"]}, canonical=True
+            )
             np.testing.assert_array_equal(same, out)
 
 
@@ -172,9 +194,15 @@ def uniform_scene(fingers, worlds):
         "offset": np.zeros(teacher_observation_size(fingers, 3 * fingers)),
         **dict.fromkeys(("measured_q", "measured_qd", "smoothed"), np.zeros(joints)),
     }
-    hand = {"lower": np.full(joints, -2.0), "upper": np.full(joints, 2.0), "tip_body": np.arange(fingers)}
+    hand = {
+        "lower": np.full(joints, -2.0),
+        "upper": np.full(joints, 2.0),
+        "tip_body": np.arange(fingers),
+    }
     hand |= {"tip_offset": np.tile(pose, (fingers, 1)), "body_com": np.zeros((joints, 3))}
-    return hand | {name: np.broadcast_to(value, (worlds, *value.shape)) for name, value in still.items()}
+    return hand | {
+        name: np.broadcast_to(value, (worlds, *value.shape)) for name, value in still.items()
+    }
 
 
 @pytest.mark.parametrize("fingers", [3, 4])

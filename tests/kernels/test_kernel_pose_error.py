@@ -27,7 +27,9 @@ def test_the_object_alone_is_displaced_and_turned_about_its_origin(device, data,
     np.testing.assert_array_equal(believed[:, :joints], q[:, :joints])
     np.testing.assert_allclose(believed[:, joints : joints + 3], pose[0] + error[:, :3], atol=1e-6)
     turned = pose_matrix(error)[:, :3, :3] @ Rotation.from_quat(pose[1]).as_matrix()
-    np.testing.assert_allclose(Rotation.from_quat(believed[:, joints + 3 :]).as_matrix(), turned, atol=1e-5)
+    np.testing.assert_allclose(
+        Rotation.from_quat(believed[:, joints + 3 :]).as_matrix(), turned, atol=1e-5
+    )
 
 
 def test_errors_have_their_size_and_every_direction_and_others_stay(device):

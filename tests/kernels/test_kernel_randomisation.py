@@ -40,7 +40,9 @@ def draw_dynamics(device, mask, fingers=3, seed=0, observation_size=87):
     worlds, joints = len(mask), 3 * fingers
     shapes = [(worlds, joints)] * 2 + [worlds] * 3 + [(worlds, joints), (worlds, observation_size)]
     inputs = [np.tile(KP, fingers), np.tile(KD, fingers)]
-    inputs += [np.broadcast_to(scale, (joints, 2)) for scale in (DR.stiffness_scale, DR.damping_scale)]
+    inputs += [
+        np.broadcast_to(scale, (joints, 2)) for scale in (DR.stiffness_scale, DR.damping_scale)
+    ]
     inputs += [
         np.broadcast_to(DR.table_friction, (worlds, 2)),
         RANGES,
@@ -87,7 +89,9 @@ def test_dynamics_have_the_ranges_of_table_s3(device):
         ("observation_offset", PAPER.observation.noise_offset_std_code),
     ):
         assert stats.kstest(np.ravel(drawn[name]) / std, stats.norm.cdf).pvalue > ALPHA
-    frictions = np.stack([drawn["hand_friction"], drawn["object_friction"], drawn["table_friction"]], axis=1)
+    frictions = np.stack(
+        [drawn["hand_friction"], drawn["object_friction"], drawn["table_friction"]], axis=1
+    )
     offset = drawn["action_offset"]
     # Squares too: a normal made from a number drawn before hides that from linear correlation.
     assert_uncorrelated(np.hstack([kp_scale, kd_scale, frictions, offset, offset**2]), 0.05)
@@ -105,7 +109,9 @@ def test_servos_are_drawn_from_their_ranges_and_carry_the_gains_of_their_world(d
     rng = np.random.default_rng(0)
     worlds, joints = 4000, 3
     mask = np.arange(worlds) % 2
-    ranges = np.repeat(rng.uniform(0.1, 1.0, (joints, PARAMETER_COLUMNS, 1)), 2, axis=2).astype(np.float32)
+    ranges = np.repeat(rng.uniform(0.1, 1.0, (joints, PARAMETER_COLUMNS, 1)), 2, axis=2).astype(
+        np.float32
+    )
     drawn = [(0, 4), (0, 23), (2, 16)]
     for joint, column in drawn:
         ranges[joint, column] = (0.01 * column, 0.02 * column)
@@ -172,7 +178,9 @@ def walk_kernel(rng: wp.array[wp.uint32], out: wp.array[float]):
 
 def walk(device, rng, steps):
     """Draw one number per world and step; returns [steps, N]."""
-    return np.array([launch(walk_kernel, len(rng), [rng], device, len(rng))[0] for _ in range(steps)])
+    return np.array(
+        [launch(walk_kernel, len(rng), [rng], device, len(rng))[0] for _ in range(steps)]
+    )
 
 
 def test_streams_of_different_worlds_never_walk_together(device):
@@ -189,7 +197,11 @@ def test_streams_of_different_worlds_never_walk_together(device):
 
 def force_array(device, force, mass, seed, **changes):
     """Launch one step; returns forces."""
-    values = {"probability": DR.force_probability, "force_per_mass": DR.force_n_per_kg, "decay": 0.0}
+    values = {
+        "probability": DR.force_probability,
+        "force_per_mass": DR.force_n_per_kg,
+        "decay": 0.0,
+    }
     inputs = [mass, values | changes, array := device_array(force, wp.vec3, device)]
     launch(disturbance_force_kernel, len(mass), [*inputs, streams(len(mass), seed, device)], device)
     return array.numpy().astype(float)

@@ -22,7 +22,9 @@ GRID, SAMPLES, SEEN = 5, 9, 7
 FAR, CELL, MARGIN = 0.02, 8.0, 0.004
 CELLS = (6, 9)
 seeds = st.integers(0, 2**31 - 1)
-"""Scenes come from generators: numbers that hypothesis likes lie on borders, where rounding decides."""
+"""Scenes come from generators: numbers that hypothesis likes lie on borders, where rounding
+decides.
+"""
 
 
 class Scene:
@@ -30,7 +32,11 @@ class Scene:
 
     def __init__(self, seed: int):
         rng = self.rng = np.random.default_rng(seed)
-        self.worlds, self.shapes, self.poses = rng.integers(1, 4), rng.integers(1, 3), rng.integers(1, 5)
+        self.worlds, self.shapes, self.poses = (
+            rng.integers(1, 4),
+            rng.integers(1, 3),
+            rng.integers(1, 5),
+        )
         self.samples = rng.uniform(-0.05, 0.05, (self.shapes, SAMPLES, 3))
         self.half = rng.uniform(0.05, 0.08, self.shapes)
         self.world_shape = rng.integers(0, self.shapes, self.worlds)
@@ -40,7 +46,10 @@ class Scene:
         places = self.half[:, None, None, None, None] * grid
         apart = places[..., None, :] - self.samples[:, None, None, None]
         self.from_samples = np.linalg.norm(apart, axis=-1).min(axis=-1)
-        self.places, self.distance = places, self.from_samples - 0.02  # negative inside, as of a mesh
+        self.places, self.distance = (
+            places,
+            self.from_samples - 0.02,
+        )  # negative inside, as of a mesh
         self.seen = rng.uniform(-0.1, 0.1, (self.worlds, SEEN, 3))
         self.count = rng.integers(0, SEEN + 1, self.worlds)
         self.row_world = rng.permutation(self.worlds)[: rng.integers(1, self.worlds + 1)]
@@ -48,7 +57,10 @@ class Scene:
         self.eye = np.concatenate([[0.0, 0.0, -0.6], Rotation.random(rng=rng).as_quat() * 0.02])
         self.eye[6] += 1.0
         self.eye[3:] /= np.linalg.norm(self.eye[3:])
-        depth, shown = rng.uniform(0.55, 0.65, (self.worlds, *CELLS)), rng.random((self.worlds, *CELLS)) < 0.7
+        depth, shown = (
+            rng.uniform(0.55, 0.65, (self.worlds, *CELLS)),
+            rng.random((self.worlds, *CELLS)) < 0.7,
+        )
         self.nearness = shown / depth
 
     def random_poses(self, *shape: int) -> np.ndarray:
@@ -90,7 +102,11 @@ class Scene:
     def pixel(self, place: np.ndarray) -> tuple[int, int, float]:
         """Row and column of the cell that shows a point, and its depth."""
         x, y, z = Rotation.from_quat(self.eye[3:]).inv().apply(place - self.eye[:3])
-        return int(np.floor((250.0 * y / z + 24.0) / CELL)), int(np.floor((250.0 * x / z + 36.0) / CELL)), z
+        return (
+            int(np.floor((250.0 * y / z + 24.0) / CELL)),
+            int(np.floor((250.0 * x / z + 36.0) / CELL)),
+            z,
+        )
 
     def placed(self, world: int, turn: Rotation, every: int, *, rendered: bool) -> np.ndarray:
         """Where the near side of the shape in this rotation comes to the points."""
@@ -121,15 +137,21 @@ class Scene:
         step = np.linalg.solve(curvature, (weight[:, None] * jacobian).T @ np.array(rest))
         vector = step[3:] / LEVER_M
         vector *= min(1.0, LARGEST_TURN / max(np.linalg.norm(vector), 1e-12))
-        return np.concatenate([pose[:3] + step[:3], (Rotation.from_rotvec(vector) * turn).as_quat()])
+        return np.concatenate(
+            [pose[:3] + step[:3], (Rotation.from_rotvec(vector) * turn).as_quat()]
+        )
 
-    def misfit(self, world: int, pose: np.ndarray, every: int, every_sample: int, *, rendered: bool) -> float:
+    def misfit(
+        self, world: int, pose: np.ndarray, every: int, every_sample: int, *, rendered: bool
+    ) -> float:
         """Mean squares of distances and of what stands out."""
         shape, scale = self.world_shape[world], self.world_scale[world]
         turn = Rotation.from_quat(pose[3:])
         points = self.seen[world, : self.count[world] : every]
         places = [turn.inv().apply(point - pose[:3]) / scale for point in points]
-        off = [min(abs(scale * self.surface_distance(shape, place)[0]), FAR) ** 2 for place in places]
+        off = [
+            min(abs(scale * self.surface_distance(shape, place)[0]), FAR) ** 2 for place in places
+        ]
         total = float(np.mean(off)) if off else 0.0
         if rendered:
             out = []
@@ -154,7 +176,10 @@ def box_distance(extent: np.ndarray, place: np.ndarray) -> np.ndarray:
 @EXAMPLES
 def test_distances_are_those_to_the_mesh_or_to_the_nearest_sample(device, seed):
     scene = Scene(seed)
-    extents, meshed = scene.rng.uniform(0.01, 0.06, (scene.shapes, 3)), scene.rng.integers(0, 2, scene.shapes)
+    extents, meshed = (
+        scene.rng.uniform(0.01, 0.06, (scene.shapes, 3)),
+        scene.rng.integers(0, 2, scene.shapes),
+    )
     boxes = [trimesh.creation.box(2.0 * extent) for extent in extents]
     meshes = [
         wp.Mesh(
@@ -248,7 +273,10 @@ def test_the_best_poses_that_differ_are_kept(device, seed, known):
     found = scene.random_poses(rows, candidates)
     found[:, 5] = found[:, 1]  # one twice
     misfit = scene.rng.uniform(0.1, 1.0, (rows, candidates))
-    pose, average = scene.random_poses(scene.worlds, kept), scene.rng.uniform(0.1, 1.0, (scene.worlds, kept))
+    pose, average = (
+        scene.random_poses(scene.worlds, kept),
+        scene.rng.uniform(0.1, 1.0, (scene.worlds, kept)),
+    )
     average[:, 2] = NEVER
     expected_pose, expected = pose.copy(), average.copy()
     for row, world in enumerate(scene.row_world):

@@ -31,7 +31,10 @@ NOISE = PAPER.scene.object_start_noise_m
 
 
 def end_episodes(device, success, fell, before, *, age, ends):
-    """Launch; returns every array by name. Steps and age of the goal are ``before`` and ``age`` before it."""
+    """Launch; returns every array by name.
+
+    Steps and age of the goal are ``before`` and ``age`` before it.
+    """
     count = len(before)
     state = [device_array(before, int, device), device_array(age, int, device)]
     state.append(device_array([1.0, 2.0, 3.0], float, device))
@@ -42,13 +45,17 @@ def end_episodes(device, success, fell, before, *, age, ends):
 
 @pytest.mark.parametrize("ends", [0, 1])
 def test_episode_ends_as_stated_in_every_case(device, ends):
-    cases = list(itertools.product([0, 1], [0, 1], [3, 8, 9, 20]))  # success, fell, steps before; limit 10
+    cases = list(
+        itertools.product([0, 1], [0, 1], [3, 8, 9, 20])
+    )  # success, fell, steps before; limit 10
     success, fell, before = (np.array(column) for column in zip(*cases, strict=True))
     count = len(cases)
     out = end_episodes(device, success, fell, before, age=np.full(count, 8), ends=ends)
     np.testing.assert_array_equal(out["steps"], before + 1)
     np.testing.assert_array_equal(out["age"], 9)
-    np.testing.assert_array_equal(out["counts"] - [1, 2, 3], [out["done"].sum(), success.sum(), fell.sum()])
+    np.testing.assert_array_equal(
+        out["counts"] - [1, 2, 3], [out["done"].sum(), success.sum(), fell.sum()]
+    )
     for i, (s, f, b) in enumerate(cases):
         end = b + 1 >= 10
         assert out["timed_out"][i] == int(end and not s and not f)
@@ -59,7 +66,10 @@ def test_episode_ends_as_stated_in_every_case(device, ends):
 
 
 def goal_beside(goal, orientation, found):
-    """Goals with the sign by which the rotation from them is the shorter; half a turn has either."""
+    """Goals with the sign by which the rotation from them is the shorter.
+
+    Half a turn has either.
+    """
     shortest = relative_quaternion(orientation, goal)[:, 3:]
     either = np.sign((goal * found).sum(axis=1, keepdims=True))
     return np.where(np.abs(shortest) < 1e-6, either, np.sign(shortest)) * goal
@@ -87,10 +97,14 @@ class World:
             "error": np.full(worlds, np.nan, np.float32),
         }
 
-    def reset(self, mask, new_goal, max_angle=np.pi, noise=NOISE, *, vertical=0, rest=None, **given):
+    def reset(
+        self, mask, new_goal, max_angle=np.pi, noise=NOISE, *, vertical=0, rest=None, **given
+    ):
         """Launch; returns every array by name."""
         types = {"rng": wp.uint32, "steps": int, "age": int, "goal": wp.quat}
-        state = {n: device_array(a, types.get(n, float), self.device) for n, a in self.before.items()}
+        state = {
+            n: device_array(a, types.get(n, float), self.device) for n, a in self.before.items()
+        }
         env_mask = wp.zeros(len(mask) + 1, wp.bool, device=self.device)
         start = {"position": wp.vec3(*START), "noise": noise}
         goal = {"max_angle": max_angle, "about_vertical": vertical}
@@ -104,8 +118,15 @@ class World:
 
 
 @EXAMPLES
-@given(data=st.data(), fingers=st.sampled_from([3, 4]), worlds=st.integers(1, 6), given_quats=st.booleans())
-def test_only_masked_worlds_change_and_only_in_what_is_theirs(device, data, fingers, worlds, given_quats):
+@given(
+    data=st.data(),
+    fingers=st.sampled_from([3, 4]),
+    worlds=st.integers(1, 6),
+    given_quats=st.booleans(),
+)
+def test_only_masked_worlds_change_and_only_in_what_is_theirs(
+    device, data, fingers, worlds, given_quats
+):
     mask, new_goal = data.draw(indices(worlds, 2)), data.draw(indices(worlds, 2))
     start = data.draw(quaternions((worlds,))) if given_quats else None
     goal = data.draw(quaternions((worlds,))) if given_quats else None
@@ -121,10 +142,14 @@ def test_only_masked_worlds_change_and_only_in_what_is_theirs(device, data, fing
         )
     for name in ("q", "qd", "steps"):
         kept = mask == 0
-        assert after[name][kept].tobytes() == world.before[name][kept].tobytes(), f"{name} at a new goal"
+        assert after[name][kept].tobytes() == world.before[name][kept].tobytes(), (
+            f"{name} at a new goal"
+        )
 
     reset = mask == 1
-    np.testing.assert_array_equal(after["q"][reset, :joints], np.tile(world.reset_q, (reset.sum(), 1)))
+    np.testing.assert_array_equal(
+        after["q"][reset, :joints], np.tile(world.reset_q, (reset.sum(), 1))
+    )
     assert np.abs(after["q"][reset, joints : joints + 3] - START).max(initial=0.0) <= NOISE + 1e-6
     for name in ("qd", "steps"):
         assert not after[name][reset].any(), name
@@ -158,10 +183,14 @@ def test_starts_and_goals_are_uniform_and_independent(device):
         assert stats.kstest(rotation_angles(q), lambda a: ball_cdf(a, np.pi)).pvalue > ALPHA
     assert after["error"].mean() == pytest.approx(np.pi / 2 + 2 / np.pi, abs=0.015)
     assert stats.kstest(after["error"], lambda a: ball_cdf(a, np.pi)).pvalue > ALPHA
-    cross = np.corrcoef(np.hstack([start * np.sign(start[:, 3:]), goal * np.sign(goal[:, 3:])]).T)[:4, 4:]
+    cross = np.corrcoef(np.hstack([start * np.sign(start[:, 3:]), goal * np.sign(goal[:, 3:])]).T)[
+        :4, 4:
+    ]
     assert np.abs(cross).max() < 0.03, "goals depend on starts"
     place_and_error = np.column_stack([after["q"][:, joints : joints + 3], after["error"]])
-    assert np.abs(np.corrcoef(place_and_error.T) - np.eye(4)).max() < 0.03, "the goal reuses numbers"
+    assert np.abs(np.corrcoef(place_and_error.T) - np.eye(4)).max() < 0.03, (
+        "the goal reuses numbers"
+    )
 
     again = World(device, worlds, seed=7).reset(everywhere, 0 * everywhere)
     assert all(after[name].tobytes() == again[name].tobytes() for name in after), (
@@ -206,7 +235,10 @@ def test_starts_at_rest_keep_place_and_tilt(device):
     picked = rest[np.arange(worlds), chosen]
     np.testing.assert_array_equal(position, picked[:, :3])
     assert np.bincount(chosen, minlength=poses).min() > 0.8 * worlds / poses
-    turn = Rotation.from_quat(after["q"][:, world.joints + 3 :]) * Rotation.from_quat(picked[:, 3:]).inv()
+    turn = (
+        Rotation.from_quat(after["q"][:, world.joints + 3 :])
+        * Rotation.from_quat(picked[:, 3:]).inv()
+    )
     assert np.abs(turn.as_rotvec()[:, :2]).max() < 1e-5
     assert stats.kstest(turn.as_rotvec()[:, 2], stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > ALPHA
 

@@ -3,9 +3,23 @@ import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, angle_between, device_array, floats, goals, indices, launch, quaternions
+from kernel_oracle import (
+    EXAMPLES,
+    angle_between,
+    device_array,
+    floats,
+    goals,
+    indices,
+    launch,
+    quaternions,
+)
 
-from vd.kernels.task.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, REWARD_TERMS, reward_kernel
+from vd.kernels.task.rewards import (
+    FINGERTIP_MEAN,
+    FINGERTIP_SQUARED_SUM,
+    REWARD_TERMS,
+    reward_kernel,
+)
 from vd.kernels.task.success import success_kernel
 from vd.paper import PAPER
 
@@ -70,12 +84,17 @@ def evaluate(device, state, reward=None, success=None):
     seen = [state[name] for name in ("q", "qd", "tips", "effort", "table_force", "clearance")]
     seen += [*(out[name] for name in ("error", "success", "fell")), previous_error]
     inputs = [REWARD | (reward or {}), *seen]
-    out["reward"], out["terms"] = launch(reward_kernel, envs, inputs, device, envs, (envs, len(REWARD_TERMS)))
+    out["reward"], out["terms"] = launch(
+        reward_kernel, envs, inputs, device, envs, (envs, len(REWARD_TERMS))
+    )
     return out | {"previous_error": previous_error.numpy()}
 
 
 def oracle(state, reward, success):
-    """Terms, error, stillness, success and fall by the equations; how near each world is to a threshold."""
+    """Terms, error, stillness, success and fall by the equations.
+
+    How near each world is to a threshold.
+    """
     s = {name: np.asarray(value, np.float64) for name, value in state.items()}
     joints = s["effort"].shape[1]
     position, orientation = s["q"][:, joints : joints + 3], s["q"][:, joints + 3 :]
@@ -117,7 +136,9 @@ def oracle(state, reward, success):
         ],
         axis=1,
     )
-    near = np.abs(np.stack([*margins.values(), contact_margin, fall_distance - success["fall_distance"]]))
+    near = np.abs(
+        np.stack([*margins.values(), contact_margin, fall_distance - success["fall_distance"]])
+    )
     # The float32 asin is good to 1e-3 rad near pi, far from any tolerance used here.
     decided = (near.min(axis=0) > 1e-5) & (np.abs(height_margin).min(axis=1) > 1e-6)
     return terms, error, still, reached, fell, decided
@@ -157,8 +178,16 @@ def states(draw: st.DrawFn) -> dict[str, np.ndarray]:
     tolerance=st.sampled_from([0.4, 0.1, 2.0]),
     disabled=st.sets(st.sampled_from([*STILLNESS, "fall_distance"])),
 )
-def test_terms_match_the_equations(device, state, form, clip, progress, lift, scale, tolerance, disabled):
-    reward = {**REWARD, "fingertip_form": form, "energy_clip": clip, "progress": progress, "scale": scale}
+def test_terms_match_the_equations(
+    device, state, form, clip, progress, lift, scale, tolerance, disabled
+):
+    reward = {
+        **REWARD,
+        "fingertip_form": form,
+        "energy_clip": clip,
+        "progress": progress,
+        "scale": scale,
+    }
     reward |= {"lift": lift[0], "lift_height": lift[1]}
     success = {**SUCCESS, "rotation": tolerance, **dict.fromkeys(disabled, 0.0)}
     out = evaluate(device, state, reward, success)
@@ -169,8 +198,12 @@ def test_terms_match_the_equations(device, state, form, clip, progress, lift, sc
     np.testing.assert_array_equal(out["success"][decided], reached[decided])
     np.testing.assert_array_equal(out["fell"][decided], fell[decided])
     tolerances = np.array([0, 3e-3, 1e-5, 1e-3, 0, 0, 0, 20 * 2e-3, 1e-5])
-    assert np.all(np.abs(out["terms"] - terms)[decided] <= tolerances + 1e-5 * np.abs(terms)[decided])
-    np.testing.assert_allclose(out["reward"], scale * out["terms"].sum(axis=1), rtol=1e-5, atol=1e-3)
+    assert np.all(
+        np.abs(out["terms"] - terms)[decided] <= tolerances + 1e-5 * np.abs(terms)[decided]
+    )
+    np.testing.assert_allclose(
+        out["reward"], scale * out["terms"].sum(axis=1), rtol=1e-5, atol=1e-3
+    )
 
 
 def test_all_coefficients_of_table_s1(device):
@@ -192,7 +225,9 @@ def test_all_coefficients_of_table_s1(device):
 AT = {"joint_speed": 0.25, "object_speed": 0.0625, "object_spin": 0.5, "action_norm": 1.0}
 
 
-@pytest.mark.parametrize(("offset", "succeeds"), [(-1, 1), (0, 1), (1, 0)], ids=["below", "at", "above"])
+@pytest.mark.parametrize(
+    ("offset", "succeeds"), [(-1, 1), (0, 1), (1, 0)], ids=["below", "at", "above"]
+)
 @pytest.mark.parametrize("name", STILLNESS)
 def test_success_includes_its_thresholds_of_stillness(device, name, offset, succeeds):
     state = rest()
@@ -210,7 +245,9 @@ def test_success_includes_its_thresholds_of_stillness(device, name, offset, succ
         assert evaluate(device, state, success={**AT, name: off})["success"][0] == 1
 
 
-@pytest.mark.parametrize(("offset", "succeeds"), [(-1, 0), (0, 1), (1, 1)], ids=["below", "at", "above"])
+@pytest.mark.parametrize(
+    ("offset", "succeeds"), [(-1, 0), (0, 1), (1, 1)], ids=["below", "at", "above"]
+)
 def test_success_includes_its_rotation_threshold(device, offset, succeeds):
     state = rest()
     state["goal"][:] = [1.0, 0.0, 0.0, 0.0]

@@ -42,7 +42,9 @@ def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
         "scale": draw(floats((worlds,), 0.5, 2.0)),
         "tip_body": np.array(draw(st.permutations(range(bodies)))[:fingers]),
         "tip_offset": draw(transforms((fingers,))),
-        "q": np.concatenate([draw(floats((worlds, joints))), draw(floats((worlds, 3))), orientation], axis=1),
+        "q": np.concatenate(
+            [draw(floats((worlds, joints))), draw(floats((worlds, 3))), orientation], axis=1
+        ),
         "body_q": draw(transforms((worlds, bodies))),
         "goal": draw(goals(orientation)),
     }
@@ -64,7 +66,9 @@ def observe(device, scene, *, first=2):
 
 def placed(scene, world, quat):
     """The world's surface points turned by ``quat``, about the object's origin [m], float64."""
-    points = scene["points"][scene["object"][world]].astype(np.float64) * float(scene["scale"][world])
+    points = scene["points"][scene["object"][world]].astype(np.float64) * float(
+        scene["scale"][world]
+    )
     return Rotation.from_quat(quat).apply(points)
 
 
@@ -81,8 +85,11 @@ def test_fingertips_are_told_the_nearest_point_of_the_surface(device, scene):
         tip = tips[world, :, :3, 3]
         ends = tip + SHAPE_UNIT_M * vectors
         distance, _ = cKDTree(cloud).query(tip)
-        # Two points may be equally near: the length is the nearest, and the end is a point of the cloud.
-        np.testing.assert_allclose(SHAPE_UNIT_M * np.linalg.norm(vectors, axis=1), distance, atol=2e-6)
+        # Two points may be equally near: the length is the nearest, and the end is a point of the
+        # cloud.
+        np.testing.assert_allclose(
+            SHAPE_UNIT_M * np.linalg.norm(vectors, axis=1), distance, atol=2e-6
+        )
         np.testing.assert_allclose(cKDTree(cloud).query(ends)[0], 0.0, atol=2e-6)
 
 
@@ -97,7 +104,9 @@ def test_extents_are_the_support_function_now_and_at_the_goal(device, scene):
             ("extent", scene["q"][world, 3 * fingers + 3 :]),
             ("goal_extent", scene["goal"][world]),
         ):
-            support = (placed(scene, world, quat) @ np.array(extent_directions(fingers)).T).max(axis=0)
+            support = (placed(scene, world, quat) @ np.array(extent_directions(fingers)).T).max(
+                axis=0
+            )
             values = EXTENT_CENTRE_M + SHAPE_UNIT_M * out[world, first:][slices[name]]
             np.testing.assert_allclose(values, support, atol=2e-6)
 
@@ -109,6 +118,8 @@ def test_clearance_is_the_lowest_point_above_the_table(device, scene, table_top)
     inputs = [scene["points"], scene["object"], scene["scale"], joints, table_top, scene["q"]]
     (out,) = launch(clearance_kernel, worlds, inputs, device, worlds)
     for world, q in enumerate(np.asarray(scene["q"], np.float64)):
-        cloud = scene["scale"][world] * np.asarray(scene["points"][scene["object"][world]], np.float64)
+        cloud = scene["scale"][world] * np.asarray(
+            scene["points"][scene["object"][world]], np.float64
+        )
         heights = q[joints + 2] + Rotation.from_quat(q[joints + 3 :]).apply(cloud)[:, 2]
         assert out[world] == pytest.approx(heights.min() - table_top, abs=1e-5)

@@ -18,7 +18,11 @@ TABLE = 0.01
 @st.composite
 def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
     """N worlds with one of K clouds each near a hand of S rounded boxes, and C places."""
-    worlds, shapes, count = draw(st.integers(1, 3)), draw(st.integers(1, 4)), draw(st.integers(1, 20))
+    worlds, shapes, count = (
+        draw(st.integers(1, 3)),
+        draw(st.integers(1, 4)),
+        draw(st.integers(1, 20)),
+    )
     joints, orientation = 9, draw(quaternions((worlds,)))
     position = draw(floats((worlds, 3), -0.05, 0.15))
     return {

@@ -5,13 +5,21 @@ from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, SENTINEL, floats, indices, launch, quaternions
 from scipy.spatial.transform import Rotation
 
-from vd.kernels.task.symmetry import choose_frame_kernel, frame_observation_kernel, world_action_kernel
+from vd.kernels.task.symmetry import (
+    choose_frame_kernel,
+    frame_observation_kernel,
+    world_action_kernel,
+)
 
 
 @st.composite
 def worlds(draw: st.DrawFn) -> dict[str, np.ndarray]:
     """N worlds with new goals or old ones, and F directions."""
-    count, frames, joints = draw(st.integers(1, 6)), draw(st.integers(1, 4)), draw(st.integers(0, 4))
+    count, frames, joints = (
+        draw(st.integers(1, 6)),
+        draw(st.integers(1, 4)),
+        draw(st.integers(0, 4)),
+    )
     orientation = draw(quaternions((count,)))
     return {
         "sector": draw(floats((frames, 3), -1.0, 1.0)),
@@ -27,7 +35,11 @@ def worlds(draw: st.DrawFn) -> dict[str, np.ndarray]:
 def test_a_new_goal_gets_the_view_that_turns_its_axis_nearest(device, scene):
     count, joints = len(scene["reset"]), scene["q"].shape[1] - 7
     frame = wp.full(count, SENTINEL, dtype=wp.int32, device=device)
-    inputs = [scene["sector"], joints, *(scene[name] for name in ("reset", "new_goal", "q", "goal"))]
+    inputs = [
+        scene["sector"],
+        joints,
+        *(scene[name] for name in ("reset", "new_goal", "q", "goal")),
+    ]
     launch(choose_frame_kernel, count, [*inputs, frame], device)
     turn = Rotation.from_quat(scene["goal"]) * Rotation.from_quat(scene["q"][:, -4:]).inv()
     half = np.sin(turn.magnitude() / 2.0)[:, None]
@@ -52,7 +64,9 @@ def test_views_take_observations_apart_and_put_actions_together(device, data):
     frame = data.draw(indices(count, frames))
     values = data.draw(floats((count, width)))
     dim = (count, width)
-    (seen,) = launch(frame_observation_kernel, dim, [source, factor, offset, frame, values], device, dim)
+    (seen,) = launch(
+        frame_observation_kernel, dim, [source, factor, offset, frame, values], device, dim
+    )
     (done,) = launch(world_action_kernel, dim, [source[:, :, 0], sign, frame, values], device, dim)
     for world, k in enumerate(frame):
         expected = (factor[k].astype(float) * values[world][source[k]]).sum(axis=1) + offset[k]

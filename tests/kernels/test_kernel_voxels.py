@@ -8,7 +8,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from kernel_oracle import EXAMPLES, device_array, launch, unwritten
 
-from vd.kernels.sensor.voxels import CLOUD_SHIFT, beside_kernel, coordinates_kernel, voxel_key_kernel
+from vd.kernels.sensor.voxels import (
+    CLOUD_SHIFT,
+    beside_kernel,
+    coordinates_kernel,
+    voxel_key_kernel,
+)
 from vd.tracking.object_points import object_points
 
 HALF = 2048
@@ -23,7 +28,9 @@ def clouds(draw):
     part = draw(hnp.arrays(np.float32, shape, elements=st.sampled_from([0.0, 0.25, 0.5, 0.875])))
     points = (whole + part).astype(np.float32)
     odd = draw(hnp.arrays(np.int8, shape[:2], elements=st.integers(0, 9)))
-    for kind, (axis, value) in enumerate([(1, np.nan), (2, np.inf), (0, HALF), (0, -HALF), (1, HALF - 0.5)]):
+    for kind, (axis, value) in enumerate(
+        [(1, np.nan), (2, np.inf), (0, HALF), (0, -HALF), (1, HALF - 0.5)]
+    ):
         points[odd == kind, axis] = value
     return points
 

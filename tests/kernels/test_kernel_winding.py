@@ -13,7 +13,9 @@ SHAPE = (5, 4, 3)
 
 
 def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Generalised winding numbers [n] of a mesh at points [n, 3]: 1 inside, 0 outside of a closed one.
+    """Generalised winding numbers [n] of a mesh at points [n, 3].
+
+    1 inside, 0 outside of a closed one.
 
     The solid angles of all triangles over 4 pi (van Oosterom and Strackee 1983).
     """
@@ -23,13 +25,17 @@ def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray)
         la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
         dots = [np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (b, c), (c, a))]
         spread = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
-        total[i] = np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), spread).sum() / (2.0 * np.pi)
+        total[i] = np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), spread).sum() / (
+            2.0 * np.pi
+        )
     return total
 
 
 def run(device, samples, areas, *, width, corner, pitch, shape=SHAPE):
     """Winding numbers of the kernel, [X, Y, Z]."""
-    return launch(winding_kernel, shape, [samples, areas, width, wp.vec3(*corner), pitch], device, shape)[0]
+    return launch(
+        winding_kernel, shape, [samples, areas, width, wp.vec3(*corner), pitch], device, shape
+    )[0]
 
 
 def grid(corner, pitch, shape=SHAPE):

@@ -1,7 +1,8 @@
 """A network learns to turn a goal's cloud onto what a camera sees of an object, on ever new shapes.
 
-Clouds are made from shapes (:mod:`.shapes`) and from what hides them (:mod:`.views`), without simulation. In
-stage 1 others are what a camera saw in simulation while the policy acted (:mod:`.looks`).
+Clouds are made from shapes (:mod:`.shapes`) and from what hides them (:mod:`.views`), without
+simulation. In stage 1 others are what a camera saw in simulation while the policy acted
+(:mod:`.looks`).
 """
 
 import math
@@ -45,8 +46,8 @@ LEAST_RATE = 0.02
 WITHIN_RAD = (PAPER.success.rotation_rad, PAPER.success.precise_rad)
 """Errors within which the paper counts a goal as reached."""
 SAME_SURFACE_M = 0.004
-"""Mean distance of the turned goal to the wanted surface within which both look alike: of a symmetric object
-they do in several orientations."""
+"""Mean distance of the turned goal to the wanted surface within which both look alike: of a
+symmetric object they do in several orientations."""
 UNSEEN_SHAPES = 64
 """Made shapes that are never trained on."""
 LOWER_RATES = "lower --align.learning-rate, or take --align.precision fp32"
@@ -71,7 +72,9 @@ def centred(shapes: torch.Tensor) -> torch.Tensor:
 
 
 class ShapeBank:
-    """Shapes in memory, half of them made, half of them meshes deformed; some are replaced every so often.
+    """Shapes in memory, half of them made, half of them meshes deformed.
+
+    Some are replaced every so often.
 
     Args:
         meshes: Points and normals of objects [O, P', 6].
@@ -135,7 +138,8 @@ def make_scenes(
 def alignment_losses(found: Residual, pairs: Pairs) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
     """Losses by name, means over the batch, and the angles by which rotations are wrong [rad] [B].
 
-    The chord between rotations is robust: of goals that look alike it chooses one, and gives no mean of them.
+    The chord between rotations is robust: of goals that look alike it chooses one, and gives no
+    mean of them.
     """
     wrong = found.rotation.detach().transpose(-1, -2) @ pairs.rotation
     error = turn_angle(wrong)
@@ -150,8 +154,8 @@ def alignment_losses(found: Residual, pairs: Pairs) -> tuple[dict[str, torch.Ten
 class AlignTrainer(TrainingLoop):
     """Trains the network of alignment.
 
-    A run that goes on has its weights, optimiser and random state; its shapes, episodes and looks are begun
-    anew.
+    A run that goes on has its weights, optimiser and random state; its shapes, episodes and looks
+    are begun anew.
 
     Args:
         scenes: Where made pairs come from.
@@ -208,7 +212,8 @@ class AlignTrainer(TrainingLoop):
             self._restore(state)
         except (RuntimeError, ValueError, KeyError) as error:
             raise ValueError(
-                f"{path} does not fit this run's network; resume with the configuration it was trained with "
+                f"{path} does not fit this run's network; resume with the configuration it was "
+                f"trained with "
                 f"(its run folder's config.json), or start anew ({error})"
             ) from error
 
@@ -255,12 +260,16 @@ class AlignTrainer(TrainingLoop):
 
     @torch.no_grad()
     def searched(self, pairs: Pairs, near: Sequence[torch.Tensor]) -> Pairs:
-        """Pairs of which some goals are turned as the network says, once or twice: as a search meets them.
+        """Pairs of which some goals are turned as the network says, once or twice.
+
+        As a search meets them.
 
         The neighbours of both clouds, ``near``, stay.
         """
         goal, rotation, surface = pairs.goal.clone(), pairs.rotation.clone(), pairs.surface.clone()
-        rows = torch.randperm(len(goal), device=goal.device)[: round(self.cfg.searched_share * len(goal))]
+        rows = torch.randperm(len(goal), device=goal.device)[
+            : round(self.cfg.searched_share * len(goal))
+        ]
         most = math.ceil(0.75 * len(rows))  # of both passes: half of the rows take both
         for some in (rows[:most], rows[len(rows) - most :]):
             with self._half:
@@ -279,7 +288,9 @@ class AlignTrainer(TrainingLoop):
             found = self._compare(pairs.goal, pairs.seen, near)
         losses, error = alignment_losses(found, pairs)
         warm = min(1.0, (self._steps_done + 1) / max(1, self.cfg.warmup_steps))
-        rate = self.cfg.learning_rate * warm * max(LEAST_RATE, 0.5 * (1.0 + math.cos(math.pi * done)))
+        rate = (
+            self.cfg.learning_rate * warm * max(LEAST_RATE, 0.5 * (1.0 + math.cos(math.pi * done)))
+        )
         norm = self._descend(torch.stack(tuple(losses.values())).sum(), rate)
         logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
         return logged | {"loss/grad_norm": norm, "student/rotation_error": error.median()}
@@ -296,7 +307,8 @@ class AlignTrainer(TrainingLoop):
         loss.backward()
         parameters = list(self.network.parameters())
         if self.is_distributed:
-            # Every process has to take part with every weight, also one whose loss does not reach it.
+            # Every process has to take part with every weight, also one whose loss does not reach
+            # it.
             gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
             flat = nn.utils.parameters_to_vector(gradients)
             torch.distributed.all_reduce(flat)
@@ -314,7 +326,10 @@ class AlignTrainer(TrainingLoop):
         return dict(zip(figures, values.tolist(), strict=True))
 
     def _done(self) -> float:
-        """Share of the run that is done, by clouds or by time, whichever is more; all processes agree."""
+        """Share of the run that is done, by clouds or by time, whichever is more.
+
+        All processes agree.
+        """
         share = self.env_steps / max(1, self.run.max_steps)
         if self._deadline is not None:
             length = max(1e-3, self._deadline - self._started)
@@ -327,14 +342,18 @@ class AlignTrainer(TrainingLoop):
 
     @torch.no_grad()
     def measure(self) -> dict[str, torch.Tensor]:
-        """Figures of first looks at shapes not learned from, whole goals and scans; processes share them.
+        """Figures of first looks at shapes not learned from, whole goals and scans.
+
+        Processes share them.
 
         Medians are means of the processes' medians.
         """
         figures = {}
         for (name, shapes), kind in product(self.scenes.held_out.items(), ("", "_scans")):
             views = max(1, self.cfg.views // (self.world_size * (4 if name == "made" else 1)))
-            error, offset, surface = self._errors(shapes.repeat(views, 1, 1), scans=float(kind != ""))
+            error, offset, surface = self._errors(
+                shapes.repeat(views, 1, 1), scans=float(kind != "")
+            )
             name += kind
             figures[f"{name}/rotation_error"] = error.median()
             for bound in WITHIN_RAD:
@@ -346,7 +365,10 @@ class AlignTrainer(TrainingLoop):
     def _errors(
         self, shapes: torch.Tensor, *, scans: float
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Errors of a first look: rotation [rad], place [m], distance of the surfaces [m], [B] each."""
+        """Errors of a first look.
+
+        Rotation [rad], place [m], distance of the surfaces [m], [B] each.
+        """
         parts = []
         for some in shapes.split(max(1, self.cfg.batch // 8)):
             pairs = draw_pairs(self.scenes.hands, some, self.cfg.points, scans=scans)

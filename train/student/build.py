@@ -63,10 +63,13 @@ def build_student(
     checkpoint = find_checkpoint(cfg.run.out, cfg.resume, "student")
     if cfg.teacher is None:
         raise ValueError(
-            "--teacher is missing; give the policy that acts: a policy.pt, a run's folder, or a name"
+            "--teacher is missing; give the policy that acts: a policy.pt, a run's folder, or a "
+            "name"
         )
     if cfg.stage == SIMULATED and cfg.init is None and checkpoint is None:
-        raise ValueError("--stage 1 begins from a network of stage 0; give its alignment.pt as --init")
+        raise ValueError(
+            "--stage 1 begins from a network of stage 0; give its alignment.pt as --init"
+        )
     say(BUILDING)
 
     import torch
@@ -96,7 +99,8 @@ def build_student(
     if checkpoint is not None:
         runner.load(checkpoint)
     if rank == 0:
-        # After all that can refuse: settings that a run cannot have must not take the place of its own.
+        # After all that can refuse: settings that a run cannot have must not take the place of its
+        # own.
         write_config(cfg)
     return runner
 
@@ -119,7 +123,9 @@ def _trainer(
     hands = Hands(hand, chosen.hands, camera=cfg.camera, device=device)
     held_out = load_set(list(chosen.validation)) if chosen.validation else []
     scenes = make_scenes(load_set(list(task.objects)), held_out, hands, chosen)
-    spec = AlignmentSpec(network=chosen.network, points=chosen.points, hand=task.hand, camera=cfg.camera)
+    spec = AlignmentSpec(
+        network=chosen.network, points=chosen.points, hand=task.hand, camera=cfg.camera
+    )
     looks = _looks(cfg, task, teacher, network, device) if cfg.stage == SIMULATED else None
     return AlignTrainer(scenes, network, chosen, cfg.run, spec=spec, looks=looks, **kept)
 
@@ -144,6 +150,8 @@ def _looks(
     env = ReorientVecEnv(simulation)
     # Or all episodes would time out at once.
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, env.max_episode_length)
-    policy = TrackingPolicy(teacher, TrackingSpec(camera=cfg.camera, alignment=network.cfg), network)
+    policy = TrackingPolicy(
+        teacher, TrackingSpec(camera=cfg.camera, alignment=network.cfg), network
+    )
     surfaces = mesh_points(simulation.objects, CLOUDS * cfg.align.points, network.summary.device)
     return SimulatedLooks(env, policy, surfaces[..., :3].contiguous(), cfg.looks, task.seed)

@@ -29,9 +29,9 @@ SHORT_FORMS = {name: f"task.{name}" for name in ("objects", "num-envs", "seed")}
 def parse_student(flags: Sequence[str]) -> StudentTrainCfg:
     """The configuration that command-line flags ask for.
 
-    The first pass finds where to start from (``--preset`` and ``--stage``, the run's own configuration with
-    ``--resume``, the network of ``--init``), as flags and ``--config`` say; the second reads every flag with
-    those values, and over them those of the file, as defaults.
+    The first pass finds where to start from (``--preset`` and ``--stage``, the run's own
+    configuration with ``--resume``, the network of ``--init``), as flags and ``--config`` say; the
+    second reads every flag with those values, and over them those of the file, as defaults.
 
     Raises:
         FileNotFoundError: ``--resume`` or ``--init`` name what is not there.
@@ -59,7 +59,9 @@ def student_command(arguments: list[str], started: float) -> int:
 
     from vd.evaluate.agents import check_names
 
-    check_names([] if cfg.teacher is None else [cfg.teacher], (*cfg.task.objects, *cfg.align.validation))
+    check_names(
+        [] if cfg.teacher is None else [cfg.teacher], (*cfg.task.objects, *cfg.align.validation)
+    )
     folder, say = cfg.run.out, say_of_main()
     runner = build_student(cfg, started=started, say=say)
     if runner.iteration:
@@ -69,7 +71,10 @@ def student_command(arguments: list[str], started: float) -> int:
     if not runner.run_to_end():
         say(f"saved in {folder}; go on with: vd-train student --out {folder} --resume")
         return interrupt.INTERRUPTED
-    say(f"done: {folder}/{ALIGNMENT_NAME} is the network, tensorboard --logdir {folder} draws the curves")
+    say(
+        f"done: {folder}/{ALIGNMENT_NAME} is the network, tensorboard --logdir {folder} draws the "
+        f"curves"
+    )
     return 0
 
 

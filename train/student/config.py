@@ -36,7 +36,9 @@ class AlignCfg:
     steps: int = 50
     """Optimiser steps of an iteration."""
     learning_rate: float = 6e-4
-    """Of AdamW, after the warm-up; it falls to nearly 0 along a cosine until --max-steps or --max-minutes."""
+    """Of AdamW, after the warm-up; it falls to nearly 0 along a cosine until --max-steps or
+    --max-minutes.
+    """
     warmup_steps: int = 300
     """Optimiser steps over which the learning rate rises from 0, linearly."""
     precision: Literal["fp32", "bf16"] = "fp32"
@@ -44,8 +46,8 @@ class AlignCfg:
     compile: bool = False
     """Compile the network first, which takes a minute and a C compiler; then steps are shorter."""
     shapes: int = 40_000
-    """Shapes in memory, half made and half deformed objects; 0.6 GB. With 159 the errors of shapes that were
-    not learned from are half as large again."""
+    """Shapes in memory, half made and half deformed objects; 0.6 GB. With 159 the errors of shapes
+    that were not learned from are half as large again."""
     fresh_shapes: int = 256
     """Of these, how many are replaced in each iteration."""
     hands: int = 1024
@@ -55,13 +57,15 @@ class AlignCfg:
     near_share: float = 0.5
     """Share of pairs that are less than 0.9 rad apart, as in later passes; others are anywhere."""
     searched_share: float = 0.5
-    """Share of pairs whose goals are first turned as the network says, half of them twice, as later passes
-    meet them. Without, 1.8 M pairs after the same start, first looks within 0.4 rad were 57.5 instead of
-    61.8 % (difference 1.0 to 7.3), when the network chose among ends itself."""
+    """Share of pairs whose goals are first turned as the network says, half of them twice, as later
+    passes meet them. Without, 1.8 M pairs after the same start, first looks within 0.4 rad were
+    57.5 instead of 61.8 % (difference 1.0 to 7.3), when the network chose among ends itself."""
     scan_share: float = 0.25
     """Share of goals as from scans: 4 mm of noise, and a fifth of the surface missing."""
     validation: tuple[str, ...] = ()
-    """Object sets to measure on, names or folders, that are not learned from; besides made shapes."""
+    """Object sets to measure on, names or folders, that are not learned from; besides made
+    shapes.
+    """
     validate_every: int = 20
     """Iterations from one measurement to the next."""
     views: int = 64
@@ -81,7 +85,8 @@ class AlignCfg:
         self.network.validate()
         if self.points < max(self.network.tokens, self.network.neighbours):
             raise ValueError(
-                f"--align.points is {self.points}; it has to be at least the tokens and neighbours of "
+                f"--align.points is {self.points}; it has to be at least the tokens and neighbours "
+                f"of "
                 "--align.network"
             )
 
@@ -93,7 +98,9 @@ class LooksCfg:
     steps: int = 8
     """Control steps of every environment before an iteration's optimiser steps."""
     kept: int = 400_000
-    """Latest looks in memory, to learn from: those of the last 25 iterations of 2048 environments; 1.3 GB."""
+    """Latest looks in memory, to learn from: those of the last 25 iterations of 2048 environments;
+    1.3 GB.
+    """
     share: float = 0.5
     """Share of pairs that are of these; others are made."""
 
@@ -140,19 +147,19 @@ class StudentTrainCfg:
     preset: PresetName = "gpu"
     """Settings to start from; every other flag overrides one of them."""
     stage: Stage = 0
-    """0: learn to turn a goal's cloud onto a seen one, without simulation; 1: also from what a depth camera
-    sees while the teacher acts by the network of --init."""
+    """0: learn to turn a goal's cloud onto a seen one, without simulation; 1: also from what a
+    depth camera sees while the teacher acts by the network of --init."""
     teacher: str | None = None
-    """Policy that acts, also the source of hand and task: a policy.pt, a run's folder, or the name of an
-    installed one."""
+    """Policy that acts, also the source of hand and task: a policy.pt, a run's folder, or the name
+    of an installed one."""
     init: Path | None = None
     """Network to begin from, the alignment.pt of a run; stage 1 needs one."""
     resume: str | None = None
-    """Go on from a checkpoint of --out: latest (a bare --resume), a file, or auto: the latest, and a new
-    run where there is none."""
+    """Go on from a checkpoint of --out: latest (a bare --resume), a file, or auto: the latest, and
+    a new run where there is none."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
-    """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m] and
-    quaternion xyzw; the hand's own camera by default."""
+    """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m]
+    and quaternion xyzw; the hand's own camera by default."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     align: AlignCfg = field(default_factory=AlignCfg)
     looks: LooksCfg = field(default_factory=LooksCfg)
@@ -190,10 +197,21 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
         stage=stage,
         teacher="dclaw4-cube",
         run=RunCfg(
-            out=RUNS / f"cpu-stage{stage}", device="cpu", save_every=5, max_minutes=7.0, max_steps=16_000
+            out=RUNS / f"cpu-stage{stage}",
+            device="cpu",
+            save_every=5,
+            max_minutes=7.0,
+            max_steps=16_000,
         ),
         align=AlignCfg(
-            batch=64, steps=5, shapes=256, fresh_shapes=8, hands=32, points=256, validate_every=10, views=4
+            batch=64,
+            steps=5,
+            shapes=256,
+            fresh_shapes=8,
+            hands=32,
+            points=256,
+            validate_every=10,
+            views=4,
         ),
         looks=LooksCfg(kept=2000),
         task=StudentTaskCfg(num_envs=16),

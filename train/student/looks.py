@@ -1,7 +1,8 @@
 """What a camera sees in simulation while a policy acts by the network that learns from it (DAgger).
 
-The simulator knows how each object lies: whatever the network believes, and wherever that leads, is labelled
-by the truth (Ross et al. 2011). N environments, K looks kept, P points of a look. Base frame, metres.
+The simulator knows how each object lies: whatever the network believes, and wherever that leads, is
+labelled by the truth (Ross et al. 2011). N environments, K looks kept, P points of a look. Base
+frame, metres.
 """
 
 from collections.abc import Callable
@@ -36,11 +37,18 @@ class SimulatedLooks:
     """
 
     def __init__(
-        self, env: ReorientVecEnv, policy: TrackingPolicy, surfaces: torch.Tensor, cfg: LooksCfg, seed: int
+        self,
+        env: ReorientVecEnv,
+        policy: TrackingPolicy,
+        surfaces: torch.Tensor,
+        cfg: LooksCfg,
+        seed: int,
     ):
         self.cfg, self._env, self._surfaces = cfg, env, surfaces
         simulation, place = env.env, surfaces.device
-        self._actor = TrackingActor(simulation, policy, goals="points", sensor_errors=True, seed=seed)
+        self._actor = TrackingActor(
+            simulation, policy, goals="points", sensor_errors=True, seed=seed
+        )
         self._pose = wp.to_torch(simulation.sim.body_q)[:, simulation.scene.object_body]
         self._base = torch.tensor(simulation.hand.mount, dtype=torch.float32, device=place)
         self._object = torch.tensor(np.asarray(simulation.scene.world_object), device=place)
@@ -74,7 +82,10 @@ class SimulatedLooks:
         }
 
     def pairs(self, count: int, points: int, *, near: float, scans: float) -> Pairs:
-        """Pairs of looks, drawn from those kept, with goals of the same shapes; clouds of ``points``."""
+        """Pairs of looks, drawn from those kept, with goals of the same shapes.
+
+        Clouds of ``points``.
+        """
         device, known = self._surfaces.device, len(self._seen) if self._full else self._next
         drawn = torch.randint(known, (count,), device=device)
         envs, pose = self._envs[drawn], self._poses[drawn]
@@ -98,5 +109,6 @@ class SimulatedLooks:
         """True poses of the objects in the base frame [N, 7]."""
         back = torch.cat([-self._base[3:6], self._base[6:]]).expand(len(self._pose), 4)
         return torch.cat(
-            [rotated(back, self._pose[:, :3] - self._base[:3]), product(back, self._pose[:, 3:])], dim=1
+            [rotated(back, self._pose[:, :3] - self._base[:3]), product(back, self._pose[:, 3:])],
+            dim=1,
         )

@@ -1,7 +1,9 @@
-"""Shapes without end for the training of vision, made on the device: clouds of points with outward normals.
+"""Shapes without end for the training of vision, made on the device.
 
-A shape is a union of bodies, superquadrics and tori, some of them hollowed, and then deformed; or the mesh of
-an object, deformed. Bodies are made at the size of 1 and brought to metres at the end.
+Clouds of points with outward normals.
+
+A shape is a union of bodies, superquadrics and tori, some of them hollowed, and then deformed; or
+the mesh of an object, deformed. Bodies are made at the size of 1 and brought to metres at the end.
 
 K shapes, P points. Points and normals lie in the shape's own axes; normals have unit length.
 """
@@ -15,9 +17,13 @@ from torch.nn.functional import normalize
 from vd.vision.rotations import matrices, random_rotations, two_columns
 
 BODIES = 5
-"""Bodies of a shape at most: cups, tools and figures of a few parts are among the unions of so many."""
+"""Bodies of a shape at most: cups, tools and figures of a few parts are among the unions of so
+many.
+"""
 CANDIDATES = 3072
-"""Points of each body, of which those on the union's surface are drawn: more than a shape has in all."""
+"""Points of each body, of which those on the union's surface are drawn: more than a shape has in
+all.
+"""
 LENGTH_M = (0.085, 0.165)
 """Longest side of a shape along its axes [m]: what the hand turns."""
 HALF_AXES = (0.06, 0.56)
@@ -25,7 +31,9 @@ HALF_AXES = (0.06, 0.56)
 FIRST_GROWN = 1.5
 """How much larger the first body is, which the others are parts of."""
 BOX_EXPONENT = 0.2
-"""Exponent of flat faces and sharp edges; half of the superquadrics' are this one, as of things made."""
+"""Exponent of flat faces and sharp edges; half of the superquadrics' are this one, as of things
+made.
+"""
 ROUND_EXPONENTS = (0.2, 1.4)
 """Range of the others: 1 is round, more is pointed."""
 TORI = (0.05, 0.12)
@@ -35,9 +43,13 @@ RING_RADII, TUBE_RADII = (0.2, 0.5), (0.04, 0.12)
 HOLLOWS = 0.25
 """Share of shapes whose first body is hollowed, as cups are."""
 WALL, DEPTH = 0.85, 0.35
-"""The hollow is the body, this much narrower, and moved along its axis by this part of its half axis."""
+"""The hollow is the body, this much narrower, and moved along its axis by this part of its half
+axis.
+"""
 MESH_UNIT_M = 1.0 / 6.0
-"""Length of a mesh that is deformed as if it was 1: of the objects the longest sides are about as long."""
+"""Length of a mesh that is deformed as if it was 1: of the objects the longest sides are about as
+long.
+"""
 MESH_STRENGTH = 0.8
 """How strongly meshes are deformed, of how strongly bodies are: what they are stays to be seen."""
 TANGENT = 1e-3
@@ -84,9 +96,14 @@ class Bodies:
     """In the shape's axes [K, 3]."""
 
     def level(self, points: torch.Tensor) -> torch.Tensor:
-        """How far out points [K, P, 3] of the shape's axes are: 0 on the surface, -1 in the middle [K, P]."""
+        """How far out points [K, P, 3] of the shape's axes are.
+
+        0 on the surface, -1 in the middle [K, P].
+        """
         own = (points - self.centre[:, None]) @ self.turn
-        radius = ((own[..., :2].norm(dim=-1) - self.radii[:, :1]).square() + own[..., 2].square()).sqrt()
+        radius = (
+            (own[..., :2].norm(dim=-1) - self.radii[:, :1]).square() + own[..., 2].square()
+        ).sqrt()
         value, _ = _superquadric(own / self.half[:, None], self.exponents)
         quadric = value ** (0.5 * self.exponents[:, :1])
         return torch.where(self.ring[:, None], radius / self.radii[:, 1:], quadric) - 1.0
@@ -120,7 +137,9 @@ class Bodies:
         """Points at angles about the ring and the tube."""
         ring, tube = self.radii[:, :1], self.radii[:, 1:]
         about, around = uniform(0.0, 2.0 * math.pi, 2, len(ring), count, device=ring.device)
-        out = torch.stack((around.cos() * about.cos(), around.cos() * about.sin(), around.sin()), dim=-1)
+        out = torch.stack(
+            (around.cos() * about.cos(), around.cos() * about.sin(), around.sin()), dim=-1
+        )
         middle = torch.stack((about.cos(), about.sin(), torch.zeros_like(about)), dim=-1)
         points = ring[..., None] * middle + tube[..., None] * out
         return points, out, 4.0 * math.pi**2 * tube * (ring + tube * around.cos())
@@ -129,7 +148,8 @@ class Bodies:
 def _superquadric(x: torch.Tensor, exponents: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """The implicit function of points in units of half axes [K, P, 3], and the direction of its gradient.
 
-    It is 1 on the surface. Of x and y the larger is taken out of powers, which would leave single precision.
+    It is 1 on the surface. Of x and y the larger is taken out of powers, which would leave single
+    precision.
     """
     along, around = 2.0 / exponents[:, :1], 2.0 / exponents[:, 1:]
     size = x.abs().clamp_min(1e-6)
@@ -167,10 +187,13 @@ def random_bodies(count: int, place: int, device: torch.device) -> Bodies:
     )
 
 
-def _parts(count: int, device: torch.device) -> tuple[list[Bodies], list[torch.Tensor], torch.Tensor]:
+def _parts(
+    count: int, device: torch.device
+) -> tuple[list[Bodies], list[torch.Tensor], torch.Tensor]:
     """The bodies of shapes, their points, normals and areas [K, P, 3 + 3 + 1], and how many count [K].
 
-    Each body is about a point of one before it. Half have the first one's axes, as things that are made.
+    Each body is about a point of one before it. Half have the first one's axes, as things that are
+    made.
     """
     number = torch.randint(1, BODIES + 1, (count,), device=device)
     bodies: list[Bodies] = []
@@ -203,7 +226,11 @@ def unions(count: int, points: int, device: torch.device) -> torch.Tensor:
     outside = []
     for place, sample in enumerate(samples):
         at = sample[..., :3]
-        free = (number > place)[:, None] if place < BODIES else hollowed[:, None] & (first.level(at) < 0.0)
+        free = (
+            (number > place)[:, None]
+            if place < BODIES
+            else hollowed[:, None] & (first.level(at) < 0.0)
+        )
         for other, body in enumerate(bodies):
             if other != place and not (place == BODIES and other == 0):
                 free = free & ~((body.level(at) < -TINY) & (number > other)[:, None])
@@ -267,15 +294,22 @@ class Deformation:
         across = 0.5 * x * angle * torch.sinc(0.5 * angle / math.pi).square() + y * angle.cos()
         bent = torch.stack((along, across, z), dim=-1)
         amplitude, number, phase = self.waves.unbind(1)
-        height = torch.sin(bent @ number.transpose(-1, -2) + phase[:, None, :, 0])  # [K, P, 3 waves]
+        height = torch.sin(
+            bent @ number.transpose(-1, -2) + phase[:, None, :, 0]
+        )  # [K, P, 3 waves]
         return bent + height @ amplitude
 
 
 def deformed(shapes: torch.Tensor, deformation: Deformation) -> torch.Tensor:
-    """Points and normals [K, P, 6] after a deformation; the tangents at each point are deformed with it."""
+    """Points and normals [K, P, 6] after a deformation.
+
+    The tangents at each point are deformed with it.
+    """
     points, normals = shapes[..., :3], shapes[..., 3:]
     x, y = torch.eye(3, device=shapes.device)[:2]
-    across = normalize(torch.linalg.cross(normals, torch.where(normals[..., :1].abs() < 0.7, x, y)), dim=-1)
+    across = normalize(
+        torch.linalg.cross(normals, torch.where(normals[..., :1].abs() < 0.7, x, y)), dim=-1
+    )
     at = deformation(points)
     tangents = [
         deformation(points + TANGENT * tangent) - at
@@ -285,7 +319,10 @@ def deformed(shapes: torch.Tensor, deformation: Deformation) -> torch.Tensor:
 
 
 def sized(shapes: torch.Tensor) -> torch.Tensor:
-    """Shapes about the mean of their points [m] and of a random size; points and normals [K, P, 6]."""
+    """Shapes about the mean of their points [m] and of a random size.
+
+    Points and normals [K, P, 6].
+    """
     points = shapes[..., :3] - shapes[..., :3].mean(dim=1, keepdim=True)
     longest = (points.amax(dim=1) - points.amin(dim=1)).amax(dim=-1)
     wanted = uniform(*LENGTH_M, len(points), device=points.device)

@@ -1,7 +1,9 @@
-"""What a depth camera sees of shapes in a hand, and the clouds of goals: pairs to learn alignment from.
+"""What a depth camera sees of shapes in a hand, and the clouds of goals.
 
-Visibility is looked up in small depth maps and voxels. Those of hands are made once, of many postures: in a
-batch nothing of a hand is left to do but a look into its tables.
+Pairs to learn alignment from.
+
+Visibility is looked up in small depth maps and voxels. Those of hands are made once, of many
+postures: in a batch nothing of a hand is left to do but a look into its tables.
 
 B pairs, P points of a shape, M postures of the hand. All is in the hand's base frame, in metres.
 """
@@ -25,26 +27,36 @@ OBJECT_RANGE_M = ((-0.06, 0.06), (-0.06, 0.06), (0.02, 0.16))
 WINDOW_M = 0.2
 """Half the width of depth maps at the middle of that range: objects at its border fit in."""
 CELL_M = 0.007
-"""Width of a cell there: about the distance of points on a shape, so that few are seen through it."""
+"""Width of a cell there: about the distance of points on a shape, so that few are seen through
+it.
+"""
 SLACK_M = 0.012
 """How far a point may lie behind the nearest of its cell: as deep as a cell is on a steep face."""
 TOUCH_M = 0.008
-"""Side of voxels; points in one with a point of the hand are taken for the hand's. What tells a camera's
-points apart drops voxels of 5 mm that touch the hand's, which reaches about as far."""
+"""Side of voxels; points in one with a point of the hand are taken for the hand's. What tells a
+camera's points apart drops voxels of 5 mm that touch the hand's, which reaches about as far."""
 REACH_M = 0.14
 """How far voxels go beyond where objects are: longer than half an object."""
 FACING = -0.05
 """Cosine between ray and normal from which a camera sees a surface: not along it."""
 LEAST_SEEN = 32
-"""Of a shape with fewer points in view the hand is left out: there would be nothing to learn from."""
+"""Of a shape with fewer points in view the hand is left out: there would be nothing to learn
+from.
+"""
 DEPTH_STD_M, POINT_STD_M = 0.003, 0.001
-"""Noise along the ray, of each view up to this much, and of points: stereo depth at half a metre."""
+"""Noise along the ray, of each view up to this much, and of points: stereo depth at half a
+metre.
+"""
 LOST_PATCHES, LOST_RADIUS_M = 2, 0.025
 """Patches in which stereo finds no depth, and up to how large they are."""
 NEAR_RAD = 0.9
-"""Near starts are up to this far off: nearer than the rotations of a cube leave gaps, as later passes are."""
+"""Near starts are up to this far off: nearer than the rotations of a cube leave gaps, as later
+passes are.
+"""
 TRIED_HANDS, TRIED_POINTS = 8, 64
-"""Of so many hands the one that touches most of so many points holds a shape: few random ones are near it."""
+"""Of so many hands the one that touches most of so many points holds a shape: few random ones are
+near it.
+"""
 POSTURES_AT_ONCE = 128
 """Hands whose points are made at a time."""
 
@@ -70,7 +82,8 @@ class Hands:
 
     Args:
         hand: The hand, with its camera.
-        camera: Pose of the optical frame, position [m] and quaternion xyzw [7]; the hand's by default.
+        camera: Pose of the optical frame, position [m] and quaternion xyzw [7]; the hand's by
+            default.
         count: M.
         device: Warp device.
     """
@@ -90,15 +103,22 @@ class Hands:
         self.box = tensor(box)
         """Corners of where objects are [2, 3]."""
         self.count = count
-        self.eye, self._optical = tensor(eye.position), tensor(Rotation.from_quat(eye.quaternion).as_matrix())
+        self.eye, self._optical = (
+            tensor(eye.position),
+            tensor(Rotation.from_quat(eye.quaternion).as_matrix()),
+        )
         middle = (self.box.mean(dim=0) - self.eye) @ self._optical
         self._side = int(2 * WINDOW_M / CELL_M)
         self._cell = CELL_M / middle[2]
         self._corner = middle[:2] / middle[2] - 0.5 * self._side * self._cell
         self._low = self.box[0] - REACH_M
-        self._voxels = [int(size) for size in ((self.box[1] - self.box[0] + 2 * REACH_M) / TOUCH_M).ceil()]
+        self._voxels = [
+            int(size) for size in ((self.box[1] - self.box[0] + 2 * REACH_M) / TOUCH_M).ceil()
+        ]
         self._depth = torch.empty((count, self.cells), device=place)
-        self._near = torch.zeros((count, int(np.prod(self._voxels)) + 1), dtype=torch.bool, device=place)
+        self._near = torch.zeros(
+            (count, int(np.prod(self._voxels)) + 1), dtype=torch.bool, device=place
+        )
         for rows in torch.arange(count, device=place).split(POSTURES_AT_ONCE):
             points = posture_points(hand, len(rows), device)
             cell, depth = self.project(points)
@@ -120,7 +140,13 @@ class Hands:
             ((v / depth - low) / self._cell).floor().long()
             for v, low in zip((x, y), self._corner, strict=True)
         )
-        inside = (across >= 0) & (across < self._side) & (down >= 0) & (down < self._side) & (depth > 0.0)
+        inside = (
+            (across >= 0)
+            & (across < self._side)
+            & (down >= 0)
+            & (down < self._side)
+            & (depth > 0.0)
+        )
         return torch.where(inside, down * self._side + across, self.cells - 1), depth
 
     def free(
@@ -133,14 +159,18 @@ class Hands:
     def holding(self, points: torch.Tensor) -> torch.Tensor:
         """For shapes with points [B, P, 3] hands that are about them, at random [B]."""
         rows = torch.randint(self.count, (len(points), TRIED_HANDS), device=points.device)
-        touched = self._near[rows[:, :, None], self._voxel(points[:, None, :TRIED_POINTS])].sum(dim=-1)
+        touched = self._near[rows[:, :, None], self._voxel(points[:, None, :TRIED_POINTS])].sum(
+            dim=-1
+        )
         return rows.take_along_dim(touched.argmax(dim=1, keepdim=True), dim=1).squeeze(1)
 
     def _voxel(self, points: torch.Tensor) -> torch.Tensor:
         """Voxels of points [B, P]; the last is outside."""
         at = ((points - self._low) / TOUCH_M).floor().long()
         x, y, z = self._voxels
-        inside = (at >= 0).all(dim=-1) & (at < torch.tensor(self._voxels, device=at.device)).all(dim=-1)
+        inside = (at >= 0).all(dim=-1) & (at < torch.tensor(self._voxels, device=at.device)).all(
+            dim=-1
+        )
         return torch.where(inside, (at[..., 0] * y + at[..., 1]) * z + at[..., 2], x * y * z)
 
 
@@ -148,7 +178,9 @@ def posture_points(hand: HandModel, count: int, device: str) -> torch.Tensor:
     """The hand's own points at random joint positions within their limits, base frame [m] [count, P, 3]."""
     links = np.arange(len(hand.link_names))
     place = wp.device_to_torch(device)
-    lower, upper = torch.tensor(np.stack([hand.lower, hand.upper]), dtype=torch.float32, device=place)
+    lower, upper = torch.tensor(
+        np.stack([hand.lower, hand.upper]), dtype=torch.float32, device=place
+    )
     joints = lower + (upper - lower) * torch.rand((count, len(lower)), device=place)
     poses = wp.empty((count, len(links)), dtype=wp.transform, device=device)
     cloud = HandCloud(hand, link_body=links, device=device)
@@ -157,7 +189,10 @@ def posture_points(hand: HandModel, count: int, device: str) -> torch.Tensor:
 
 
 def nearest(cell: torch.Tensor, depth: torch.Tensor, cells: int) -> torch.Tensor:
-    """Depth maps [m] [B, cells] of points in cells at depths, [B, P] each; infinite where there are none."""
+    """Depth maps [m] [B, cells] of points in cells at depths, [B, P] each.
+
+    Infinite where there are none.
+    """
     empty = torch.full((len(cell), cells), torch.inf, device=cell.device)
     return empty.scatter_reduce_(1, cell, depth, "amin")
 
@@ -181,13 +216,20 @@ def visible(hands: Hands, rows: torch.Tensor, shapes: torch.Tensor) -> torch.Ten
     return torch.where(enough, free, facing)
 
 
-def camera_points(hands: Hands, rows: torch.Tensor, shapes: torch.Tensor, count: int) -> torch.Tensor:
-    """Points [m] [B, count, 3] that a camera has of shapes, with errors; arguments as of :func:`visible`."""
+def camera_points(
+    hands: Hands, rows: torch.Tensor, shapes: torch.Tensor, count: int
+) -> torch.Tensor:
+    """Points [m] [B, count, 3] that a camera has of shapes, with errors.
+
+    Arguments as of :func:`visible`.
+    """
     points, device = shapes[..., :3], shapes.device
     batch = len(points)
     shown = visible(hands, rows, shapes)
     kept = shown
-    middles = points[torch.arange(batch, device=device)[:, None], drawn(shown.float(), LOST_PATCHES)]
+    middles = points[
+        torch.arange(batch, device=device)[:, None], drawn(shown.float(), LOST_PATCHES)
+    ]
     for middle in middles.unbind(1):
         radius = LOST_RADIUS_M * torch.rand((batch, 1), device=device)
         kept = kept & ((points - middle[:, None]).norm(dim=-1) > radius)
@@ -202,8 +244,8 @@ def camera_points(hands: Hands, rows: torch.Tensor, shapes: torch.Tensor, count:
 def goal_points(points: torch.Tensor, count: int, scans: float) -> torch.Tensor:
     """Clouds of goals [m] [B, count, 3], the first points of whole shapes [m] [B, P, 3], in no order.
 
-    A share ``scans`` is as :func:`vd.evaluate.scanned.scan` has them: a side is missing, others stand for it,
-    and points are noisy.
+    A share ``scans`` is as :func:`vd.evaluate.scanned.scan` has them: a side is missing, others
+    stand for it, and points are noisy.
     """
     goal, device = points[:, :count], points.device
     scan = torch.rand((len(goal), 1), device=device) < scans
@@ -211,7 +253,9 @@ def goal_points(points: torch.Tensor, count: int, scans: float) -> torch.Tensor:
     there = height <= height.kthvalue(round((1.0 - MISSING) * count), dim=1, keepdim=True).values
     index = torch.arange(count, device=device).expand(len(goal), -1)
     index = torch.where(scan & ~there, drawn(there.float(), count), index)
-    return goal.take_along_dim(index[..., None], dim=1) + NOISE_M * scan[..., None] * torch.randn_like(goal)
+    return goal.take_along_dim(index[..., None], dim=1) + NOISE_M * scan[
+        ..., None
+    ] * torch.randn_like(goal)
 
 
 def draw_pairs(
@@ -221,7 +265,8 @@ def draw_pairs(
 
     Args:
         hands: What hides shapes.
-        shapes: Points [m] and normals of shapes about their middles [B, P, 6], P of at least 3 ``count``.
+        shapes: Points [m] and normals of shapes about their middles [B, P, 6], P of at least 3
+            ``count``.
         count: G, points of a cloud.
         near: Share of pairs that are less than ``NEAR_RAD`` apart; others are uniform on SO(3).
         scans: Share of goals as from scans.
@@ -230,7 +275,9 @@ def draw_pairs(
     shapes = shapes[:, torch.randperm(shapes.shape[1], device=device)].float()
     orientation = random_matrices(batch, device)
     held = orientation.transpose(-1, -2)
-    place = hands.box[0] + (hands.box[1] - hands.box[0]) * uniform(0.0, 1.0, batch, 3, device=device)
+    place = hands.box[0] + (hands.box[1] - hands.box[0]) * uniform(
+        0.0, 1.0, batch, 3, device=device
+    )
     rest = shapes[:, count:]
     posed = torch.cat([rest[..., :3] @ held + place[:, None], rest[..., 3:] @ held], dim=-1)
     seen = camera_points(hands, hands.holding(posed[..., :3]), posed, count)
@@ -275,4 +322,6 @@ def with_goals(
 
 def joined(first: Pairs, second: Pairs) -> Pairs:
     """Pairs of both, one after the other."""
-    return Pairs(*(torch.cat([getattr(pairs, f.name) for pairs in (first, second)]) for f in fields(Pairs)))
+    return Pairs(
+        *(torch.cat([getattr(pairs, f.name) for pairs in (first, second)]) for f in fields(Pairs))
+    )

@@ -1,4 +1,7 @@
-"""vd-bench: measure speed, physics, depth camera and gap workflow; rates are ratios within one run."""
+"""vd-bench: measure speed, physics, depth camera and gap workflow.
+
+Rates are ratios within one run.
+"""
 
 import dataclasses
 import json
@@ -24,7 +27,10 @@ GONE = {
 
 
 def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> None:
-    """Print rows as they come, a line of JSON each, and write a file after each: the next may fail."""
+    """Print rows as they come, a line of JSON each, and write a file after each.
+
+    The next may fail.
+    """
     import warp as wp
 
     from vd.files import write_json
@@ -123,14 +129,18 @@ class DepthCommand(Measurement):
         from vd.bench.depth import measure
 
         device, objects = resolve_device(self.device), load_set(list(self.objects))
-        rows = (measure(objects, envs, device, hand=self.hand, seed=self.seed) for envs in self.envs)
+        rows = (
+            measure(objects, envs, device, hand=self.hand, seed=self.seed) for envs in self.envs
+        )
         report(rows, device, self.json)
         return 0
 
 
 @dataclass(frozen=True)
 class GapCommand:
-    """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
+    """The battery of vd-gap.
+
+    Effects hidden in recordings, found or not, and the figures of the goals.
 
     One result file per case: run it again to go on.
     """
@@ -139,25 +149,30 @@ class GapCommand:
     """Folder of the results and their tables (summary.md)."""
     model: Literal["dclaw3", "dclaw4", "servo"] = "dclaw3"
     """A hand, of which it takes one finger, or servo, which is quick."""
-    kinds: tuple[Literal["single", "none", "pair", "outside"], ...] = ("single", "none", "pair", "outside")
+    kinds: tuple[Literal["single", "none", "pair", "outside"], ...] = (
+        "single",
+        "none",
+        "pair",
+        "outside",
+    )
     """Kinds of cases."""
     effects: tuple[str, ...] = ()
     """Effects to hide; all that show on the model by default."""
     sizes: tuple[Literal[0, 1, 2, 3], ...] = (0, 1, 2, 3)
     """Sizes of single effects: gaps of about 1.5, 3, 6 and 12 noise floors."""
     seeds: int = 5
-    """Recordings of each effect and size; 40 times as many with nothing hidden, or only another stiffness,
-    damping or mass."""
+    """Recordings of each effect and size; 40 times as many with nothing hidden, or only another
+    stiffness, damping or mass."""
     first_seed: int = 0
     """Seed of the first recording: others than those that the method was tuned on."""
     battery: Literal["tuned", "development", "closed"] = "tuned"
-    """Plants and seeds: as the rules were tuned on, others to develop on, or those that judge a finished
-    method once."""
+    """Plants and seeds: as the rules were tuned on, others to develop on, or those that judge a
+    finished method once."""
     jobs: int = 1
     """Cases at a time, one process and one thread each."""
     shard: str | None = None
-    """I/N: every N-th case from the I-th, from 0, for arrays of jobs. The same command without it runs what
-    is missing in --out and writes the tables."""
+    """I/N: every N-th case from the I-th, from 0, for arrays of jobs. The same command without it
+    runs what is missing in --out and writes the tables."""
     device: str = "cpu"
     """Warp device."""
 
@@ -190,7 +205,10 @@ class GapCommand:
 
 @dataclass(frozen=True)
 class ContactCommand:
-    """The battery of vd-gap contact: parameters hidden in MuJoCo, named or not. Run it again to go on."""
+    """The battery of vd-gap contact: parameters hidden in MuJoCo, named or not.
+
+    Run it again to go on.
+    """
 
     out: Path = Path("runs/contact-battery")
     """Folder of the results and their tables (summary.md)."""

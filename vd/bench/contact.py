@@ -1,4 +1,7 @@
-"""The battery of ``vd-gap contact``: does it name what is hidden in a plant of MuJoCo, and nothing else?"""
+"""The battery of ``vd-gap contact``.
+
+Does it name what is hidden in a plant of MuJoCo, and nothing else?
+"""
 
 import itertools
 import json
@@ -34,7 +37,8 @@ SIZES: Mapping[str, tuple[tuple[float, float], ...]] = {
     "stiffening_tip": ((200.0, 500.0),),
     "tilted_table": ((0.03, 0.08),),
 }
-"""Ranges of what is hidden (ours): from twice what matters to a policy on, beside the nominal value. Outside
+"""Ranges of what is hidden (ours): from twice what matters to a policy on, beside the nominal
+value. Outside
 the table: growth with the speed [s/m], growth with the depth [1/m], angle [rad]."""
 
 
@@ -96,7 +100,9 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
                 "true": true[each.name],
                 "value": [v if math.isfinite(v) else None for v in each.value.tolist()],
                 "verdict": each.verdict,
-                "covered": ((each.low <= true[each.name]) & (true[each.name] <= each.high)).tolist(),
+                "covered": (
+                    (each.low <= true[each.name]) & (true[each.name] <= each.high)
+                ).tolist(),
             }
             for each in found
         },
@@ -123,7 +129,10 @@ def run_battery(cases: Sequence[Case], folder: Path, jobs: int) -> list[dict[str
 
 
 def summary(results: Sequence[Mapping[str, Any]]) -> str:
-    """The goals' figures as a table, failed cases counted against them; then what was not named as hidden."""
+    """The goals' figures as a table, failed cases counted against them.
+
+    Then what was not named as hidden.
+    """
 
     def of(kind: str) -> list[Mapping[str, Any]]:
         return [result for result in results if result["case"]["kind"] == kind]
@@ -137,18 +146,31 @@ def summary(results: Sequence[Mapping[str, Any]]) -> str:
     def clean(among: Sequence[Mapping[str, Any]]) -> list[bool]:
         return [set(named(r)) <= set(hidden(r)) for r in among]
 
-    told = [p for r in results if r["case"]["kind"] != "outside" for p in r.get("parameters", {}).values()]
+    told = [
+        p
+        for r in results
+        if r["case"]["kind"] != "outside"
+        for p in r.get("parameters", {}).values()
+    ]
     covers = [c for p in told if p["verdict"] != "unknown" for c in p["covered"]]
     figures = [
         Figure("first name right", [named(r)[:1] == hidden(r) for r in of("single")], least=0.9),
         Figure("one hidden: no false name", clean(of("single")), least=0.98),
         Figure("nothing hidden: no false name", clean(of("none")), least=0.98),
-        Figure("two hidden: both named, nothing else", [set(named(r)) == set(hidden(r)) for r in of("pair")]),
+        Figure(
+            "two hidden: both named, nothing else",
+            [set(named(r)) == set(hidden(r)) for r in of("pair")],
+        ),
         Figure("outside the table: nothing or the nearest", clean(of("outside"))),
         Figure("95 % intervals that cover", covers),
         Figure("parameters told", [p["verdict"] != "unknown" for p in told]),
     ]
-    wrong = [r for r in results if set(named(r)) != set(hidden(r)) and r["case"]["kind"] != "outside"]
+    wrong = [
+        r for r in results if set(named(r)) != set(hidden(r)) and r["case"]["kind"] != "outside"
+    ]
     lines = [f"- {Case(**r['case']).name}: {', '.join(named(r)) or 'nothing'}" for r in wrong]
     head = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
-    return "\n".join([*head, *(figure.row() for figure in figures), "", "Not as hidden:", "", *lines]) + "\n"
+    return (
+        "\n".join([*head, *(figure.row() for figure in figures), "", "Not as hidden:", "", *lines])
+        + "\n"
+    )

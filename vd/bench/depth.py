@@ -1,7 +1,7 @@
 """``vd-bench depth``: depth images and clouds per second.
 
-Hands in random poses around the reset, a different object in each block of environments near the table. Rates
-count images, each with the placing of meshes.
+Hands in random poses around the reset, a different object in each block of environments near the
+table. Rates count images, each with the placing of meshes.
 """
 
 from typing import Any
@@ -37,7 +37,13 @@ def captured(function: Any, device: str) -> Any:
 
 
 def bench_scene(
-    objects: list[ObjectModel], envs: int, hand: str, device: str, seed: int, *, visuals: bool = False
+    objects: list[ObjectModel],
+    envs: int,
+    hand: str,
+    device: str,
+    seed: int,
+    *,
+    visuals: bool = False,
 ) -> tuple[Scene, Any]:
     """A scene, and a Newton state with random poses; of few environments fewer objects."""
     scene = build_scene(
@@ -60,7 +66,9 @@ def pose(scene: Scene, state: Any, generator: np.random.Generator) -> None:
     position = OBJECT_SPREAD_M * generator.standard_normal((n, 3)) + [0.0, 0.0, OBJECT_HEIGHT_M]
     quat = Rotation.random(n, random_state=generator).as_quat()
     joints = np.clip(joints, scene.hand.lower, scene.hand.upper)
-    state.joint_q.assign(np.concatenate([joints, position, quat], axis=1).astype(np.float32).ravel())
+    state.joint_q.assign(
+        np.concatenate([joints, position, quat], axis=1).astype(np.float32).ravel()
+    )
     newton.eval_fk(scene.model, state.joint_q, state.joint_qd, state)
 
 
@@ -72,12 +80,14 @@ def rate(envs: int, function: Any, device: str) -> float:
     return envs / seconds_per_call(function, calls, device)
 
 
-def measure(objects: list[ObjectModel], envs: int, device: str, *, hand: str, seed: int) -> dict[str, Any]:
+def measure(
+    objects: list[ObjectModel], envs: int, device: str, *, hand: str, seed: int
+) -> dict[str, Any]:
     """Images per second of so many environments.
 
     Returns:
-        ``envs``; ``images``: depth alone; ``clouds``: with a cloud of each image; ``points`` of a cloud, mean
-        over environments.
+        ``envs``; ``images``: depth alone; ``clouds``: with a cloud of each image; ``points`` of a
+        cloud, mean over environments.
     """
     scene, state = bench_scene(objects, envs, hand, device, seed)
     body_q = state.body_q.reshape((envs, -1))

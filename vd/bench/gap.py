@@ -1,9 +1,10 @@
 """The battery of the gap workflow: does it name what is hidden, and nothing else?
 
-Every case is a recording from :mod:`vd.bench.hide`, analysed by :mod:`vd.gap.workflow` from the recording
-alone, and compared with the truth: every effect of the table at four sizes, all pairs at one, nothing
-hidden, and effects outside the table. Results are one JSON file per case, so that a run can be
-interrupted, resumed and split over machines.
+Every case is a recording from :mod:`vd.bench.hide`, analysed by :mod:`vd.gap.workflow` from the
+recording
+alone, and compared with the truth: every effect of the table at four sizes, all pairs at one,
+nothing hidden, and effects outside the table. Results are one JSON file per case, so that a run can
+be interrupted, resumed and split over machines.
 """
 
 import itertools
@@ -31,7 +32,9 @@ from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
 
 PAIR_SIZE = 2
-"""Size of both effects of a pair, some six noise floors each: from there on single effects are told apart."""
+"""Size of both effects of a pair, some six noise floors each: from there on single effects are told
+apart.
+"""
 NOTHING_A_SEED = 40
 """Recordings with nothing hidden, for each recording of an effect and size."""
 CASE_LIMIT_S = 1800.0
@@ -83,8 +86,8 @@ def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
     """Make the recording, analyse it on a Warp device, and compare; writes ``folder/CASE.json``.
 
     Returns:
-        What :func:`score` returns, or the traceback under ``error``; with the commit and the processor time
-        of this process ``cpu_s`` [s].
+        What :func:`score` returns, or the traceback under ``error``; with the commit and the
+        processor time of this process ``cpu_s`` [s].
     """
     quiet_warp()
     begin = time.process_time()
@@ -107,7 +110,9 @@ def run_case(case: Case, folder: Path, device: str = "cpu") -> dict[str, Any]:
 def run_battery(
     cases: Sequence[Case], folder: Path, *, jobs: int = 1, device: str = "cpu"
 ) -> list[dict[str, Any]]:
-    """Run the cases that have no result in the folder yet, with a line for each; returns the results of all.
+    """Run the cases that have no result in the folder yet, with a line for each.
+
+    Returns the results of all.
 
     What failed before comes last.
     """
@@ -116,7 +121,8 @@ def run_battery(
     failed = [case for case in cases if "error" in (done[case] or {})]
     waiting = [*(case for case in cases if done[case] is None), *failed]
     print(
-        f"{len(cases) - len(waiting)} of {len(cases)} cases have results; {len(waiting)} to run", flush=True
+        f"{len(cases) - len(waiting)} of {len(cases)} cases have results; {len(waiting)} to run",
+        flush=True,
     )
     numbers = itertools.count(1)
 
@@ -131,7 +137,9 @@ def run_battery(
     if waiting:
         _prepare(device, {case.model for case in waiting})
     work = partial(run_case, folder=folder, device=device)
-    run_tasks(work, waiting, finished, jobs=jobs, limit_s=CASE_LIMIT_S, gpu=device.startswith("cuda"))
+    run_tasks(
+        work, waiting, finished, jobs=jobs, limit_s=CASE_LIMIT_S, gpu=device.startswith("cuda")
+    )
     return [result for result in done.values() if result is not None]
 
 

@@ -24,9 +24,9 @@ NEIGHBOURS: Mapping[str, tuple[str, ...]] = {
     CABLE: ("gravity_load",),
     WARMING: ("coulomb_friction", "stribeck_friction", "asymmetric_friction", "load_friction"),
 }
-"""Effects of the table that are of the kind of one outside, so that naming them is no error: a cable pulls
-with the position, as only gravity does in the table; friction that falls as the joint warms is friction, of
-one form or another; torque ripple is like nothing in it."""
+"""Effects of the table that are of the kind of one outside, so that naming them is no error: a
+cable pulls with the position, as only gravity does in the table; friction that falls as the joint
+warms is friction, of one form or another; torque ripple is like nothing in it."""
 SUMS: Mapping[frozenset[str], str] = {
     frozenset({"coulomb_friction", "stribeck_friction"}): "stribeck_friction",
     frozenset({"coulomb_friction", "asymmetric_friction"}): "asymmetric_friction",
@@ -54,24 +54,40 @@ BATTERIES: Mapping[str, Battery] = {
     "development": Battery(
         20000,
         (
-            Physics(5.0e-4, presliding_rad=1.0e-3, noise_s=0.006, ripple_nm=5.0e-4, ripple_per_turn=31.0),
-            Physics(2.5e-4, presliding_rad=2.5e-3, noise_s=0.003, ripple_nm=1.0e-3, ripple_per_turn=11.0),
-            Physics(3.3e-4, presliding_rad=5.0e-4, noise_s=0.012, ripple_nm=3.0e-4, ripple_per_turn=53.0),
+            Physics(
+                5.0e-4, presliding_rad=1.0e-3, noise_s=0.006, ripple_nm=5.0e-4, ripple_per_turn=31.0
+            ),
+            Physics(
+                2.5e-4, presliding_rad=2.5e-3, noise_s=0.003, ripple_nm=1.0e-3, ripple_per_turn=11.0
+            ),
+            Physics(
+                3.3e-4, presliding_rad=5.0e-4, noise_s=0.012, ripple_nm=3.0e-4, ripple_per_turn=53.0
+            ),
         ),
     ),
     "closed": Battery(
         40000,
         (
-            Physics(2.8e-4, presliding_rad=1.7e-3, noise_s=0.008, ripple_nm=4.0e-4, ripple_per_turn=19.0),
-            Physics(4.5e-4, presliding_rad=7.0e-4, noise_s=0.004, ripple_nm=8.0e-4, ripple_per_turn=41.0),
-            Physics(3.7e-4, presliding_rad=3.0e-3, noise_s=0.002, ripple_nm=6.0e-4, ripple_per_turn=73.0),
-            Physics(2.3e-4, presliding_rad=4.0e-4, noise_s=0.015, ripple_nm=1.0e-3, ripple_per_turn=8.0),
+            Physics(
+                2.8e-4, presliding_rad=1.7e-3, noise_s=0.008, ripple_nm=4.0e-4, ripple_per_turn=19.0
+            ),
+            Physics(
+                4.5e-4, presliding_rad=7.0e-4, noise_s=0.004, ripple_nm=8.0e-4, ripple_per_turn=41.0
+            ),
+            Physics(
+                3.7e-4, presliding_rad=3.0e-3, noise_s=0.002, ripple_nm=6.0e-4, ripple_per_turn=73.0
+            ),
+            Physics(
+                2.3e-4, presliding_rad=4.0e-4, noise_s=0.015, ripple_nm=1.0e-3, ripple_per_turn=8.0
+            ),
         ),
     ),
 }
-"""The one that the rules of the search were tuned on; one whose plants solve, stick, read and turn otherwise,
-to develop on; and one that stays closed until a method is finished, and is then run once. A gear's ripple is
-below the noise floor on its own; a tooth bends by less than two encoder counts."""
+"""The one that the rules of the search were tuned on; one whose plants solve, stick, read and turn
+otherwise, to develop on; and one that stays closed until a method is finished, and is then run
+once. A gear's ripple is below the noise floor on its own; a tooth bends by less than two encoder
+counts.
+"""
 
 
 @dataclass(frozen=True)
@@ -84,8 +100,8 @@ class Case:
         effects: What is hidden.
         size: Index of the size, 0 .. 3.
         seed: Of base parameters and noise.
-        change: With nothing hidden: ``exact`` (the model's own base), ``base`` (other stiffness, damping,
-            speed limit) or ``mass`` (other masses as well).
+        change: With nothing hidden: ``exact`` (the model's own base), ``base`` (other stiffness,
+            damping, speed limit) or ``mass`` (other masses as well).
         battery: One of :data:`BATTERIES`.
     """
 
@@ -121,9 +137,9 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
     """Compare a report (``vd-gap-report/1``), in the truth's unit of torque, with the truth.
 
     Returns:
-        The case; verdict; names and sets given; hidden effects that are named, by an effect that stands for
-        them too; names that are wrong; gaps in noise floors; relative errors and interval coverage of the
-        parameters of effects named rightly.
+        The case; verdict; names and sets given; hidden effects that are named, by an effect that
+        stands for them too; names that are wrong; gaps in noise floors; relative errors and
+        interval coverage of the parameters of effects named rightly.
     """
     floor = truth["noise_floor_rad"]
     named = list(dict.fromkeys(effect["name"] for effect in report["effects"]))
@@ -171,7 +187,9 @@ def _parameters(report: Mapping[str, Any], truth: Mapping[str, Any]) -> list[dic
         hidden = truth["effects"].get(effect["name"])
         if hidden is None or effect["name"] not in EFFECTS:
             continue
-        for joint, (key, estimate) in itertools.product(effect["joints"], effect["parameters"].items()):
+        for joint, (key, estimate) in itertools.product(
+            effect["joints"], effect["parameters"].items()
+        ):
             true = hidden["parameters"][key][joint]
             low, high = estimate["ci95"]
             if not true or estimate["value"] is None:
@@ -217,7 +235,9 @@ class Figure:
         """Share of hits, in [0, 1], or the median; NaN without cases."""
         if not self.values:
             return math.nan
-        return float(np.mean(self.values) if isinstance(self.values[0], bool) else np.median(self.values))
+        return float(
+            np.mean(self.values) if isinstance(self.values[0], bool) else np.median(self.values)
+        )
 
     @property
     def reached(self) -> bool:
@@ -227,17 +247,25 @@ class Figure:
     def row(self) -> str:
         """A row of a table."""
         bounds = {">=": self.least, "<=": self.most}
-        goal = ", ".join(f"{sign} {bound:.3g}" for sign, bound in bounds.items() if math.isfinite(bound))
-        answer = (f"{self.value:.3f}", "yes" if self.reached else "no") if self.values else ("-", "")
+        goal = ", ".join(
+            f"{sign} {bound:.3g}" for sign, bound in bounds.items() if math.isfinite(bound)
+        )
+        answer = (
+            (f"{self.value:.3f}", "yes" if self.reached else "no") if self.values else ("-", "")
+        )
         return f"| {self.what} | {goal} | {answer[0]} | {len(self.values)} | {answer[1]} |"
 
 
 def figures(results: Results) -> list[Figure]:
     """The goals' figures over all results, failed cases counted against them."""
-    single, none, pair, outside = ([r for r in results if r["case"]["kind"] == kind] for kind in KINDS)
+    single, none, pair, outside = (
+        [r for r in results if r["case"]["kind"] == kind] for kind in KINDS
+    )
     single = [r for r in single if "error" in r or (r["gap"] or 0.0) >= CLEAR_GAP]
     good = [r for r in single if "error" not in r]
-    parameters = [row for r in good if r["case"]["effects"][0] in r["named"] for row in r["parameters"]]
+    parameters = [
+        row for r in good if r["case"]["effects"][0] in r["named"] for row in r["parameters"]
+    ]
 
     def hits(among: Results, says: Callable[[Mapping[str, Any]], bool]) -> list[bool]:
         return ["error" not in r and says(r) for r in among]
@@ -253,8 +281,15 @@ def figures(results: Results) -> list[Figure]:
         Figure("nothing hidden: no false name", hits(none, lambda r: not r["false"]), least=0.98),
         Figure("outside: unknown or neighbours", hits(outside, _unknown_or_near), least=0.9),
         Figure("relative error of parameters", [row["error"] for row in parameters], most=0.1),
-        Figure("95 % intervals that cover", [row["covered"] for row in parameters], least=0.9, most=0.98),
-        Figure("held-out gap: times smaller", [r["shrunk"] for r in good if r["shrunk"]], least=5.0),
+        Figure(
+            "95 % intervals that cover",
+            [row["covered"] for row in parameters],
+            least=0.9,
+            most=0.98,
+        ),
+        Figure(
+            "held-out gap: times smaller", [r["shrunk"] for r in good if r["shrunk"]], least=5.0
+        ),
         Figure("held-out gap: noise floors left", [r["left"] for r in good if r["left"]], most=1.3),
     ]
 
@@ -274,14 +309,20 @@ def _unknown_or_near(result: Mapping[str, Any]) -> bool:
     """Abstains, or names and sets hold neighbours only."""
     near = NEIGHBOURS.get(result["case"]["effects"][0], ())
     sets_near = all(any(name in near for name in group) for group in result["sets"])
-    return not result["false"] and (result["verdict"] in ("unknown", "no_gap", "under_excited") or sets_near)
+    return not result["false"] and (
+        result["verdict"] in ("unknown", "no_gap", "under_excited") or sets_near
+    )
 
 
 def markdown(results: Results) -> str:
     """The figures as tables: the goals first, then what came of every effect at each size."""
     lines = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
     lines += [figure.row() for figure in figures(results)]
-    lines += ["", "| hidden | size | gap / floor | cases | named | answers |", "|---|---|---|---|---|---|"]
+    lines += [
+        "",
+        "| hidden | size | gap / floor | cases | named | answers |",
+        "|---|---|---|---|---|---|",
+    ]
     groups: dict[tuple[str, int], list[Mapping[str, Any]]] = {}
     for result in results:
         case = result["case"]

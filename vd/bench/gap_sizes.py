@@ -1,7 +1,7 @@
 """Hidden effects at four sizes: parameters at which the gap is a given multiple of the noise floor.
 
-The gap is what remains after the base parameters have done their best under the paper's excitation: 1.5, 3, 6
-and 12 noise floors, root mean square.
+The gap is what remains after the base parameters have done their best under the paper's excitation:
+1.5, 3, 6 and 12 noise floors, root mean square.
 """
 
 from collections.abc import Mapping
@@ -83,9 +83,11 @@ SCALES: dict[str, dict[str, tuple[float, ...]]] = {
         "temperature_friction": (0.03941, 0.09998, 0.20998, 0.42718),
     },
 }
-"""Model and effect to strengths of the four sizes, as multiples of typical parameters; an effect that cannot
-show on a model is absent. Measured to first order against the base parameters' own sensitivities. An
-acceleration limit shows at every size that a firmware would have: its are 600, 200, 67 and 22 rad/s^2."""
+"""Model and effect to strengths of the four sizes, as multiples of typical parameters; an effect
+that cannot show on a model is absent. Measured to first order against the base parameters' own
+sensitivities. An acceleration limit shows at every size that a firmware would have: its are 600,
+200, 67 and 22 rad/s^2.
+"""
 
 
 def effect_at(name: str, strength: float) -> dict[str, float]:
@@ -95,7 +97,9 @@ def effect_at(name: str, strength: float) -> dict[str, float]:
         values["phase_rad"] = PHASE_RAD
     if name == "elastic_transmission":
         values["k_nm_rad"] = SPRING_NM_RAD
-    bounds = {p.name: (p.lower, p.upper) for p in EFFECTS[name].parameters} if name in EFFECTS else {}
+    bounds = (
+        {p.name: (p.lower, p.upper) for p in EFFECTS[name].parameters} if name in EFFECTS else {}
+    )
     for key, value in values.items():
         scaled = value * strength ** WEAKER.get((name, key), 1.0)
         values[key] = float(np.clip(scaled, *bounds.get(key, (-np.inf, np.inf))))
@@ -107,7 +111,8 @@ def sized_effect(name: str, size: int, model: str = "dclaw3") -> dict[str, float
 
     Args:
         name: Effect, of the table or outside.
-        size: 0 .. 3, a gap of about 1.5, 3, 6, 12 noise floors; less where the effect cannot do more.
+        size: 0 .. 3, a gap of about 1.5, 3, 6, 12 noise floors; less where the effect cannot do
+            more.
         model: ``dclaw3`` (also for ``dclaw4``) or ``servo``.
 
     Raises:

@@ -1,7 +1,9 @@
-"""An object on a table in MuJoCo's own engine: slid, pushed, pressed, dropped, seen by an imperfect tracker.
+"""An object on a table in MuJoCo's own engine.
 
-It shares nothing with the analysis (:mod:`vd.gap.contact`), which simulates nothing. World frame: z up, the
-table's top at z = 0; SI units, quaternions xyzw.
+Slid, pushed, pressed, dropped, seen by an imperfect tracker.
+
+It shares nothing with the analysis (:mod:`vd.gap.contact`), which simulates nothing. World frame: z
+up, the table's top at z = 0; SI units, quaternions xyzw.
 """
 
 import math
@@ -27,8 +29,8 @@ OUTSIDE = {
     "stiffening_tip": "tip_compliance",
     "tilted_table": "table_friction",
 }
-"""Causes that no parameter describes, and the parameter that is nearest: friction that grows with the speed,
-a tip that stiffens, a table that is not level."""
+"""Causes that no parameter describes, and the parameter that is nearest: friction that grows with
+the speed, a tip that stiffens, a table that is not level."""
 CONTACT_RATE = 800.0
 """Natural frequency of the table's contact [rad/s]: an impact lasts 4 ms."""
 TIP_KG, TIP_RADIUS_M, TIP_DAMPING = 0.01, 0.008, 0.3
@@ -80,11 +82,15 @@ class World:
         self.stiffening = outside.get("stiffening_tip", 0.0)
         self.stiffness = 1.0 / plant.value("tip_compliance")
         self.damping = 2.0 * TIP_DAMPING * math.sqrt(self.stiffness * TIP_KG)
-        self.corners = np.unique(np.concatenate([vertices for vertices, _ in plant.item.hulls]), axis=0)
+        self.corners = np.unique(
+            np.concatenate([vertices for vertices, _ in plant.item.hulls]), axis=0
+        )
         spec, tilt = mujoco.MjSpec(), outside.get("tilted_table", 0.0)
         spec.option.gravity = [GRAVITY_M_S2 * math.sin(tilt), 0.0, -GRAVITY_M_S2 * math.cos(tilt)]
         spec.option.timestep = self.step = rng.choice([4.0e-4, 5.0e-4])
-        spec.option.integrator = rng.choice([int(mujoco.mjtIntegrator.mjINT_EULER), 3])  # or implicitfast
+        spec.option.integrator = rng.choice(
+            [int(mujoco.mjtIntegrator.mjINT_EULER), 3]
+        )  # or implicitfast
         self._add_object(spec, plant)
         if finger:
             tip = spec.worldbody.add_body(name="tip", gravcomp=1.0)
@@ -95,7 +101,12 @@ class World:
                 {"solref": [0.002, 1.0], "solimp": [0.99, 0.999, 1e-3, 0.5, 2.0]},
             )
             tip.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, mass=TIP_KG, contype=0, priority=2, **stiff
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=size,
+                mass=TIP_KG,
+                contype=0,
+                priority=2,
+                **stiff,
             )
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
@@ -103,7 +114,9 @@ class World:
         self.carriage = np.zeros(3)
 
     def _add_object(self, spec: Any, plant: ContactPlant) -> None:
-        """The object on the table: hulls for the finger, a small sphere at each corner for the table.
+        """The object on the table.
+
+        Hulls for the finger, a small sphere at each corner for the table.
 
         Between a mesh and a plane MuJoCo finds three contacts, on which a cube rocks.
         """
@@ -120,7 +133,10 @@ class World:
             spec.add_mesh(name=f"hull_{i}", uservert=vertices.flatten(), userface=faces.flatten())
             body.add_geom(type=kinds.mjGEOM_MESH, meshname=f"hull_{i}", contype=1, conaffinity=0)
         ratio = damping_ratio(plant.value("restitution"))
-        bounce = {"solref": [1.0 / (ratio * CONTACT_RATE), ratio], "solimp": [0.999, 0.999, 1e-3, 0.5, 2.0]}
+        bounce = {
+            "solref": [1.0 / (ratio * CONTACT_RATE), ratio],
+            "solimp": [0.999, 0.999, 1e-3, 0.5, 2.0],
+        }
         for i, corner in enumerate(self.corners):
             name, size = f"corner_{i}", [CORNER_M, 0.0, 0.0]
             body.add_geom(
@@ -128,7 +144,9 @@ class World:
             )
             spec.add_pair(geomname1="table", geomname2=name, condim=1, **bounce)
 
-    def place(self, position: np.ndarray, rotation: Rotation, velocity: np.ndarray, spin: np.ndarray) -> None:
+    def place(
+        self, position: np.ndarray, rotation: Rotation, velocity: np.ndarray, spin: np.ndarray
+    ) -> None:
         """Put the object; velocity of its frame and spin in the world frame."""
         x, y, z, w = rotation.as_quat()
         self.data.qpos[:7] = [*position, w, x, y, z]
@@ -147,7 +165,14 @@ class World:
             self._slip()
             force = np.zeros(3) if way is None else self._pull(way(i * self.step))
             rows.append(
-                [i * self.step, *data.qpos[:3], *data.qpos[4:7], data.qpos[3], *self.carriage, *force]
+                [
+                    i * self.step,
+                    *data.qpos[:3],
+                    *data.qpos[4:7],
+                    data.qpos[3],
+                    *self.carriage,
+                    *force,
+                ]
             )
             mujoco.mj_step(self.model, data)
         table = np.array(rows)
@@ -165,7 +190,8 @@ class World:
     def _slip(self) -> None:
         """Coulomb friction of the table at every corner that touches it, from the last step's normal forces.
 
-        MuJoCo's own couples slip and gap: what slides fast hops, and slows down by up to a third less.
+        MuJoCo's own couples slip and gap: what slides fast hops, and slows down by up to a third
+        less.
         """
         data = self.data
         touching = data.contact.geom1 == 0
@@ -196,12 +222,21 @@ def _motion(plant: ContactPlant, kind: Kind, number: int, rng: np.random.Generat
     world.place(np.array([0.0, 0.0, -low]), upright, none, none)
     ahead = upright.apply([1.0, 0.0, 0.0])
     if kind == "slide":
-        speed, mass, inertia = rng.uniform(0.8, 1.6), world.model.body_mass[1], world.model.body_inertia[1, 2]
+        speed, mass, inertia = (
+            rng.uniform(0.8, 1.6),
+            world.model.body_mass[1],
+            world.model.body_inertia[1, 2],
+        )
         ahead = Rotation.from_euler("z", rng.uniform(-math.pi, math.pi)).apply(ahead)
         push = mass * (speed / PUSH_OFF_S + world.friction * GRAVITY_M_S2) * ahead
-        return world.run(0.6, hand=np.array([*push, 0.0, 0.0, inertia * rng.normal(0.0, 0.5) / PUSH_OFF_S]))
+        return world.run(
+            0.6, hand=np.array([*push, 0.0, 0.0, inertia * rng.normal(0.0, 0.5) / PUSH_OFF_S])
+        )
     if kind == "press":
-        above, force = np.array([0.0, 0.0, high - low + TIP_RADIUS_M + 0.004]), rng.uniform(3.0, 8.0)
+        above, force = (
+            np.array([0.0, 0.0, high - low + TIP_RADIUS_M + 0.004]),
+            rng.uniform(3.0, 8.0),
+        )
         down = np.array([0.0, 0.0, 0.004 + force * plant.value("tip_compliance")])
         return world.run(0.6, lambda t: above - down * math.sin(math.pi * t / 0.6) ** 2)
     reach = float(np.linalg.norm(world.corners[:, :2], axis=1).max()) + TIP_RADIUS_M + 0.01
@@ -211,7 +246,10 @@ def _motion(plant: ContactPlant, kind: Kind, number: int, rng: np.random.Generat
 
 
 def _drop(world: World, upright: Rotation, rng: np.random.Generator, *, flat: bool) -> Truth:
-    """Let go flat, or tossed with a spin; before that a hand holds it, or brings it to its speed."""
+    """Let go flat, or tossed with a spin.
+
+    Before that a hand holds it, or brings it to its speed.
+    """
     tilt = Rotation.from_rotvec(rng.normal(0.0, 0.02 if flat else 1.0, 3)) * upright
     place = np.array([0.0, 0.0, rng.uniform(0.15, 0.3) - tilt.apply(world.corners)[:, 2].min()])
     velocity = np.array([*rng.normal(0.0, 0.1, 2), 0.0 if flat else rng.uniform(0.8, 1.6)])
@@ -221,14 +259,20 @@ def _drop(world: World, upright: Rotation, rng: np.random.Generator, *, flat: bo
     before = np.arange(0.0, PUSH_OFF_S, world.step)
     way = 0.5 * before**2 / PUSH_OFF_S - 0.5 * PUSH_OFF_S
     turned = Rotation.from_rotvec(np.outer(way, spin)) * tilt
-    held, nothing = np.hstack([place + np.outer(way, velocity), turned.as_quat()]), np.zeros((len(before), 3))
+    held, nothing = (
+        np.hstack([place + np.outer(way, velocity), turned.as_quat()]),
+        np.zeros((len(before), 3)),
+    )
     parts = (held, pose), (nothing, pusher), (nothing, force)
     pose, pusher, force = (np.concatenate(part) for part in parts)
     return np.concatenate([before, time + PUSH_OFF_S]), pose, pusher, force
 
 
 class Tracker:
-    """What is recorded of a motion, by one of the trackers that there are: motion capture or a camera."""
+    """What is recorded of a motion, by one of the trackers that there are.
+
+    Motion capture or a camera.
+    """
 
     def __init__(self, rng: np.random.Generator):
         self._rng, self.rate = rng, rng.uniform(100.0, 240.0)
@@ -236,11 +280,17 @@ class Tracker:
         self.late_s, self.force_n = rng.uniform(0.0, 1e-3), rng.uniform(0.005, 0.02)
 
     def see(self, truth: Truth, kind: Kind, file: str) -> ContactMotion:
-        """States are late, some by a frame, and stamped with when they were asked for; some are missing."""
+        """States are late, some by a frame, and stamped with when they were asked for.
+
+        Some are missing.
+        """
         rng, (time, pose, pusher, force) = self._rng, truth
         asked = np.arange(0.0, time[-1], 1.0 / self.rate)
         asked = asked[rng.uniform(size=len(asked)) > 0.02]
-        late = rng.exponential(self.late_s, len(asked)) + (rng.uniform(size=len(asked)) < 1 / 30) / self.rate
+        late = (
+            rng.exponential(self.late_s, len(asked))
+            + (rng.uniform(size=len(asked)) < 1 / 30) / self.rate
+        )
         at = np.searchsorted(time, asked - late).clip(0, len(time) - 1)
 
         def noisy(values: np.ndarray, deviation: float) -> np.ndarray:
@@ -256,7 +306,9 @@ class Tracker:
         )
 
 
-def hide_contact(plant: ContactPlant, out: Path, counts: Mapping[Kind, int] = COUNTS) -> dict[str, Any]:
+def hide_contact(
+    plant: ContactPlant, out: Path, counts: Mapping[Kind, int] = COUNTS
+) -> dict[str, Any]:
     """Write a recording of a plant, and beside the folder what is hidden; returns that.
 
     Args:

@@ -1,4 +1,7 @@
-"""A finger for the hidden plant: mass matrix and bias by MuJoCo's engine in C, dry friction of our own."""
+"""A finger for the hidden plant.
+
+Mass matrix and bias by MuJoCo's engine in C, dry friction of our own.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import HandModel
 
 FRICTION_SWEEPS = 8
-"""Gauss-Seidel sweeps over the joints: their coupling is one part in ten, of a LEAP hand one in three."""
+"""Gauss-Seidel sweeps over the joints: their coupling is one part in ten, of a LEAP hand one in
+three.
+"""
 GRAVITY_M_S2 = 9.81
 
 
@@ -106,11 +111,18 @@ class Finger:
         new = v.copy()
         for _ in range(FRICTION_SWEEPS):
             for i in range(n):
-                left = momentum[:, i] - np.einsum("bj,bj->b", system[:, i], new) + system[:, i, i] * new[:, i]
+                left = (
+                    momentum[:, i]
+                    - np.einsum("bj,bj->b", system[:, i], new)
+                    + system[:, i, i] * new[:, i]
+                )
                 new[:, i] = slip(left, minus[:, i], plus[:, i]) / system[:, i, i]
         return new
 
 
 def slip(momentum: np.ndarray, minus: np.ndarray, plus: np.ndarray) -> np.ndarray:
-    """What dry friction leaves of a push: nothing within its bounds (stick), else the rest (slip)."""
+    """What dry friction leaves of a push.
+
+    Nothing within its bounds (stick), else the rest (slip).
+    """
     return momentum - np.minimum(np.maximum(momentum, -minus), plus)

@@ -5,7 +5,8 @@ finger in closed form), another integrator (leapfrog, linearly implicit), anothe
 friction (stick and slip as a complementarity), float64, and a step several times finer. All
 trajectories, of several plants too, advance together, one array operation for all.
 
-Effects: those of :data:`vd.kernels.servo.effects.EFFECTS`, and :data:`OUTSIDE` the table. SI units, radians.
+Effects: those of :data:`vd.kernels.servo.effects.EFFECTS`, and :data:`OUTSIDE` the table. SI units,
+radians.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,12 +19,14 @@ from scipy.signal import lfilter
 from vd.bench.hidden_finger import Finger, slip
 
 STEP_S = 4.0e-4
-"""Time step [s]: five times finer than the fitted model's, second order where the motion is smooth."""
+"""Time step [s]: five times finer than the fitted model's, second order where the motion is
+smooth.
+"""
 FULL_DUTY_RAD = 1.2
 """Error at full P gain that asks for all of the supply [rad], as of a soft X-series servo."""
 PARTS = 8
-"""Parts of a step in which the reference is kept: a motor at its limit must not act before the command
-arrives, nor a profile stop late."""
+"""Parts of a step in which the reference is kept: a motor at its limit must not act before the
+command arrives, nor a profile stop late."""
 EQUILIBRIUM_SWEEPS = 60
 """Fixed-point sweeps for the droop under gravity at the start; each gains a digit or more."""
 CABLE = "cable_spring"
@@ -35,8 +38,10 @@ OUTSIDE: dict[str, dict[str, float]] = {
     CABLE: {"k_nm_rad": 0.5, "slack_rad": 0.2},
     WARMING: {"cold_nm": 0.12, "warm_nm": 0.03, "time_s": 60.0},
 }
-"""Effects that are not in the table, with typical sizes: torque ripple amplitude sin(n q); a cable that
-pulls back once its slack is used up; friction that falls as the joint warms over the session."""
+"""Effects that are not in the table, with typical sizes: torque ripple amplitude sin(n q); a cable
+that pulls back once its slack is used up; friction that falls as the joint warms over the
+session.
+"""
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,8 @@ class Physics:
 
     Attributes:
         step_s: Time step [s].
-        presliding_rad: Travel over which dry friction builds up, as the teeth of a gear bend [rad]; 0: none.
+        presliding_rad: Travel over which dry friction builds up, as the teeth of a gear bend [rad];
+            0: none.
         noise_s: Correlation time of the reading's noise [s]; 0: white.
         ripple_nm: Amplitude of a torque that the gears of every joint add [N m].
         ripple_per_turn: Its periods in a radian of travel.
@@ -73,7 +79,8 @@ class Plant:
         velocity_limit: Largest speed [rad/s].
         inertia: Inertia about each axis that is no link's: rotor, or the whole load [kg m^2].
         gravity_torque: Gravity load -g sin(q) of a pendulum [N m].
-        body: Of a finger, MuJoCo's model with a payload [kg] at its tip; None for joints on their own.
+        body: Of a finger, MuJoCo's model with a payload [kg] at its tip; None for joints on their
+            own.
         effects: Name to parameter to values [J].
         full_gain: P gain, as recordings name it, at which ``kp`` holds.
         effort: Largest torque of the drives [N m]; None: no limit.
@@ -122,9 +129,9 @@ class Motion:
 
     Attributes:
         position: With the effects on reading [T, J] [rad].
-        duty: Duty cycle in [-1, 1] [T, J]: a position servo's controller's output, of the error that it sees,
-            less what it ignores, plus what it has integrated. The damping is the motor's own, and a late
-            reading is one of position.
+        duty: Duty cycle in [-1, 1] [T, J]: a position servo's controller's output, of the error
+            that it sees, less what it ignores, plus what it has integrated. The damping is the
+            motor's own, and a late reading is one of position.
     """
 
     position: np.ndarray
@@ -135,7 +142,8 @@ def simulate(runs: Sequence[Run], *, dt: float | None = None) -> list[Motion]:
     """Simulate runs together.
 
     Args:
-        runs: Trajectories; all plants have the same number of joints, and all have a finger or none.
+        runs: Trajectories; all plants have the same number of joints, and all have a finger or
+            none.
         dt: Time step [s]; that of the first plant by default.
 
     Raises:
@@ -148,7 +156,9 @@ def simulate(runs: Sequence[Run], *, dt: float | None = None) -> list[Motion]:
     delay, bias = batch.of("read_delay", "delay_s"), batch.of("encoder_bias", "bias_rad")
     recorded = []
     for b, run in enumerate(runs):
-        columns = [np.interp(run.time - delay[b, j], grid, path[:, b, j]) for j in range(batch.count)]
+        columns = [
+            np.interp(run.time - delay[b, j], grid, path[:, b, j]) for j in range(batch.count)
+        ]
         # The step after the stamp: a command is written before the servo is read.
         step = np.minimum(np.ceil(run.time / dt).astype(int), batch.steps - 1)
         duty = np.clip(asked[step, b] / FULL_DUTY_RAD, -1.0, 1.0)
@@ -178,16 +188,24 @@ class _Batch:
         """A parameter of an effect for every run and joint [B, J]; 0 where the effect is absent."""
         zero = np.zeros(self.count)
         return np.stack(
-            [np.broadcast_to(p.effects.get(effect, {}).get(parameter, zero), zero.shape) for p in self.plants]
+            [
+                np.broadcast_to(p.effects.get(effect, {}).get(parameter, zero), zero.shape)
+                for p in self.plants
+            ]
         )
 
     def _finger(self) -> Finger | None:
         loads = [float(run.conditions.get("payload_kg", 0.0)) for run in self.runs]
-        bodies = [plant.body(kg) for plant, kg in zip(self.plants, loads, strict=True) if plant.body]
+        bodies = [
+            plant.body(kg) for plant, kg in zip(self.plants, loads, strict=True) if plant.body
+        ]
         return Finger(bodies) if bodies else None
 
     def references(self) -> np.ndarray:
-        """What the servos pull to, before the joint has a say: the command's path [K, PARTS, B, J] [rad]."""
+        """What the servos pull to, before the joint has a say.
+
+        The command's path [K, PARTS, B, J] [rad].
+        """
         dt = self.dt / PARTS
         edges = np.arange(self.steps * PARTS + 1) * dt
         delay, sigma = self.of("command_delay", "delay_s"), self.of("command_jitter", "sigma_s")
@@ -196,8 +214,11 @@ class _Batch:
         for b, run in enumerate(self.runs):
             rng = np.random.default_rng(run.seed)
             for j in range(self.count):
-                arrival, command = _arrivals(run.time, run.command[:, j], sigma[b, j], drop[b, j], rng)
-                # The mean of the held command over each step, so that a delay need not be whole steps.
+                arrival, command = _arrivals(
+                    run.time, run.command[:, j], sigma[b, j], drop[b, j], rng
+                )
+                # The mean of the held command over each step, so that a delay need not be whole
+                # steps.
                 held = _hold_mean(arrival + delay[b, j], command, edges)
                 if tau[b, j] > 0.0:
                     keep = np.exp(-dt / tau[b, j])
@@ -209,7 +230,10 @@ class _Batch:
         return result.reshape(self.steps, PARTS, len(self.runs), self.count)
 
     def _profile(self, reference: np.ndarray, limit: np.ndarray) -> None:
-        """Follow the reference with bounded acceleration, braking in time to stop on it; in place."""
+        """Follow the reference with bounded acceleration, braking in time to stop on it.
+
+        In place.
+        """
         on = limit > 0.0
         if not on.any():
             return
@@ -254,7 +278,9 @@ class _Batch:
         loads, motor, switch = _Loads(self, dt), _Motor(self), self._switch()
         dead = 0.5 * self.of("dead_zone", "width_rad")
         integral_gain = self.of("integral_action", "k_i")
-        coupling = np.stack([self.of("joint_coupling", f"from_{i + 1}") for i in range(self.count)], axis=2)
+        coupling = np.stack(
+            [self.of("joint_coupling", f"from_{i + 1}") for i in range(self.count)], axis=2
+        )
         coupling *= 1.0 - np.eye(self.count)
         q = self._equilibrium(reference[0, 0], switch[0], coupling)
         v, wound = np.zeros_like(q), np.zeros_like(q)
@@ -263,7 +289,8 @@ class _Batch:
         loads.start(q)
         for k, on in enumerate(switch):
             gain = self.gain * on
-            # Open terminals carry no current: the damping of a servo that is off, mostly back-EMF, is gone.
+            # Open terminals carry no current: the damping of a servo that is off, mostly back-EMF,
+            # is gone.
             damping = self.kd * (on > 0.0)
             middle = q + half * v
             error = reference[k] - middle + np.einsum("bij,bj->bi", coupling, middle)
@@ -273,7 +300,9 @@ class _Batch:
             asked[k] = _mean(wanted) / self.kp
             torque, slope, carried = motor(wanted - damping * v, v, k * dt)
             load = loads(middle, v)
-            new = self._speed(middle, v, torque + load, 0.5 * slope * damping, loads, carried, v, k * dt)
+            new = self._speed(
+                middle, v, torque + load, 0.5 * slope * damping, loads, carried, v, k * dt
+            )
             if loads.loads or motor.stalls:
                 # Both follow the speed: once more with that of the middle of the step.
                 mean = 0.5 * (v + new)
@@ -303,12 +332,19 @@ class _Batch:
         minus, plus = np.where(elastic, 0.0, minus), np.where(elastic, 0.0, plus)
         if self.body is not None:
             zero = np.zeros_like(v)
-            return self.body.velocity(middle, v, push, resisting + zero, minus, plus, self.inertia, self.dt)
+            return self.body.velocity(
+                middle, v, push, resisting + zero, minus, plus, self.inertia, self.dt
+            )
         mass = self.inertia / self.dt + resisting
         return slip(mass * v + push, minus, plus) / mass
 
-    def _equilibrium(self, reference: np.ndarray, on: np.ndarray, coupling: np.ndarray) -> np.ndarray:
-        """Where the joints hang at rest on their springs [B, J]; one that is off starts at the reference."""
+    def _equilibrium(
+        self, reference: np.ndarray, on: np.ndarray, coupling: np.ndarray
+    ) -> np.ndarray:
+        """Where the joints hang at rest on their springs [B, J].
+
+        One that is off starts at the reference.
+        """
         tau, phase = self.of("gravity_load", "tau_g_nm"), self.of("gravity_load", "phase_rad")
         stiffness = np.maximum(self.kp * self.gain, 1e-9)
         q = reference.copy()
@@ -335,7 +371,9 @@ def _arrivals(
 
 def _hold_mean(arrival: np.ndarray, command: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Means over [edges_k, edges_k+1] of a command held from each arrival on (the first also before)."""
-    knots = np.concatenate([[min(arrival[0], 0.0) - 1.0], arrival, [max(edges[-1], arrival[-1]) + 1.0]])
+    knots = np.concatenate(
+        [[min(arrival[0], 0.0) - 1.0], arrival, [max(edges[-1], arrival[-1]) + 1.0]]
+    )
     held = np.concatenate([command[:1], command])
     area = np.concatenate([[0.0], np.cumsum(held * np.diff(knots))])
     return np.diff(np.interp(edges, knots, area)) / np.diff(edges)
@@ -403,9 +441,13 @@ class _Loads:
         self.spring, self.loss = of(spring, "k_nm_rad"), of(spring, "c_nms_rad")
         self.mass = np.where(self.spring > 0.0, of(spring, "j_kgm2"), 1.0)
         if (self.spring * dt * dt + self.loss * dt >= self.mass).any():
-            raise ValueError(f"{spring} is too stiff for a step of {dt:g} s: raise j_kgm2, or lower k_nm_rad")
+            raise ValueError(
+                f"{spring} is too stiff for a step of {dt:g} s: raise j_kgm2, or lower k_nm_rad"
+            )
         self.load, self.static = of("load_friction", "k_load"), of("stribeck_friction", "tau_s_nm")
-        self.sliding, self.scale = (of("stribeck_friction", name) for name in ("tau_c_nm", "v_s_rad_s"))
+        self.sliding, self.scale = (
+            of("stribeck_friction", name) for name in ("tau_c_nm", "v_s_rad_s")
+        )
         self.sides = [of("asymmetric_friction", name) for name in ("tau_minus_nm", "tau_plus_nm")]
         self.constant = of("coulomb_friction", "tau_c_nm") + self.sliding
         self.cold, self.warm = of(WARMING, "cold_nm"), of(WARMING, "warm_nm")

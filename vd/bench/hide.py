@@ -43,11 +43,23 @@ CHUNK = 48
 """Trajectories simulated together: enough to amortise Python, few enough for memory."""
 
 BARE = {
-    "servo": {"kp": 3.0, "kd": 0.3, "velocity_limit": 7.0, "inertia": 2.0e-3, "gravity_torque": 0.0},
-    "pendulum": {"kp": 3.0, "kd": 0.2, "velocity_limit": 8.0, "inertia": 6.0e-3, "gravity_torque": 0.4},
+    "servo": {
+        "kp": 3.0,
+        "kd": 0.3,
+        "velocity_limit": 7.0,
+        "inertia": 2.0e-3,
+        "gravity_torque": 0.0,
+    },
+    "pendulum": {
+        "kp": 3.0,
+        "kd": 0.2,
+        "velocity_limit": 8.0,
+        "inertia": 6.0e-3,
+        "gravity_torque": 0.4,
+    },
 }
-"""A hobby servo that turns a small load about a vertical axis; the rig of the XL330 recordings, some 0.4 kg
-on an arm of 0.1 m."""
+"""A hobby servo that turns a small load about a vertical axis; the rig of the XL330 recordings,
+some 0.4 kg on an arm of 0.1 m."""
 BARE_REACH_RAD = 1.5
 """Range of a bare servo about its centre [rad]."""
 INERTIA_SPREAD = math.log(2.0)
@@ -71,7 +83,8 @@ class Hiding:
         joints: Joints recorded; empty: the first finger, or the one joint of a bare model.
         effect_joints: Joints that have the effect; absent or empty: all.
         excitations: Sets of :data:`vd.gap.excitations.MENU`.
-        base_spread: Spread of stiffness, damping and speed limit about the hand's; 0: exactly the hand's.
+        base_spread: Spread of stiffness, damping and speed limit about the hand's; 0: exactly the
+            hand's.
         mass_spread: Spread of the finger's masses and inertias about the hand's.
         pwm: Record the duty cycle as well.
         physics: Of the plant, and of its sensor.
@@ -95,7 +108,8 @@ class Hidden:
 
     Attributes:
         recording: The recording, not yet written.
-        truth: Model, seed, base parameters per joint, effects with their parameters and joints, noise.
+        truth: Model, seed, base parameters per joint, effects with their parameters and joints,
+            noise.
     """
 
     recording: Recording
@@ -191,7 +205,15 @@ class _Session:
             time = self._stamps(motion)
             seed = int(self.rng.integers(2**31))
             self.runs.append(
-                Run(self.plant, time, motion.command, motion.enabled, motion.conditions, session_s, seed)
+                Run(
+                    self.plant,
+                    time,
+                    motion.command,
+                    motion.enabled,
+                    motion.conditions,
+                    session_s,
+                    seed,
+                )
             )
             session_s += motion.duration + PAUSE_S
 
@@ -199,7 +221,8 @@ class _Session:
         """The instants at which commands are written and positions read [T] [s], from 0."""
         time = motion.time + self.rng.normal(0.0, STAMP_JITTER_S, len(motion.time))
         time[0] = 0.0
-        # Late ones push the next; as many digits as are written, so that readers see the same stamps.
+        # Late ones push the next; as many digits as are written, so that readers see the same
+        # stamps.
         for i in range(1, len(time)):
             time[i] = max(time[i], time[i - 1] + SHORTEST_PERIOD_S)
         return np.round(time, 6)
@@ -253,7 +276,9 @@ class _Session:
             "effects": {
                 name: {
                     "joints": list(_effect_joints(hiding, name, plant.joints)),
-                    "parameters": {key: _by_joint(plant, values) for key, values in parameters.items()},
+                    "parameters": {
+                        key: _by_joint(plant, values) for key, values in parameters.items()
+                    },
                 }
                 for name, parameters in plant.effects.items()
             },
@@ -280,7 +305,9 @@ def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
                 raise ValueError(f"{name}: {key} is {value}; it cannot be negative")
         having = _effect_joints(hiding, name, plant.joints)
         if name == COUPLING and len(plant.joints) == 1:
-            raise ValueError(f"{name}: {hiding.model} has one joint, which nothing can drive; take a hand")
+            raise ValueError(
+                f"{name}: {hiding.model} has one joint, which nothing can drive; take a hand"
+            )
         on = np.array([joint in having for joint in plant.joints], dtype=float)
         effects[name] = {key: on * given.get(key, value) for key, value in typical.items()}
     return reach, replace(plant, effects=effects, physics=hiding.physics)
@@ -290,7 +317,9 @@ def _effect_joints(hiding: Hiding, name: str, joints: tuple[str, ...]) -> tuple[
     having = tuple(hiding.effect_joints.get(name, ())) or joints
     for joint in having:
         if joint not in joints:
-            raise ValueError(f"effect {name}: unknown joint {joint!r}; recorded are {', '.join(joints)}")
+            raise ValueError(
+                f"effect {name}: unknown joint {joint!r}; recorded are {', '.join(joints)}"
+            )
     return having
 
 
@@ -300,7 +329,9 @@ def _bare(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
     count = len(joints)
     near = _spread(rng, hiding.base_spread, (3, count))
     far = np.exp(_spread(rng, INERTIA_SPREAD if hiding.base_spread else 0.0, (2, count)) - 1.0)
-    reach = JointRange(joints, np.full(count, -BARE_REACH_RAD), np.full(count, BARE_REACH_RAD), FULL_P_GAIN)
+    reach = JointRange(
+        joints, np.full(count, -BARE_REACH_RAD), np.full(count, BARE_REACH_RAD), FULL_P_GAIN
+    )
     base = {name: nominal[name] * factor for name, factor in zip(BASE, [*near, *far], strict=True)}
     return reach, Plant(joints=joints, **base, full_gain=FULL_P_GAIN)
 
@@ -314,13 +345,17 @@ def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
     try:
         hand = load_hand(hiding.model)
     except ValueError as error:
-        raise ValueError(f"model {hiding.model!r}: {error}; or take {' or '.join(BARE_MODELS)}") from error
+        raise ValueError(
+            f"model {hiding.model!r}: {error}; or take {' or '.join(BARE_MODELS)}"
+        ) from error
     fingers = [tuple(hand.joint_names[finger]) for finger in hand.fingers]
     joints = tuple(hiding.joints or fingers[0])
     if joints not in fingers:
         raise ValueError(f"joints {', '.join(joints)}: name the joints of one finger, in order")
     if (hand.mimic >= 0).any():
-        raise ValueError(f"{hand.name}: some joints follow others, which the gap workflow does not model")
+        raise ValueError(
+            f"{hand.name}: some joints follow others, which the gap workflow does not model"
+        )
     finger, n = fingers.index(joints), len(joints)
     index = hand.fingers[finger]
     near = _spread(rng, hiding.base_spread, (3, n))

@@ -1,7 +1,7 @@
 """``vd-bench physics``: does the simulated contact behave as the world does?
 
-Small scenes with the project's contact settings and nothing else: objects dropped on the table, a cube held
-between fingertips. SI units, world frame, z up.
+Small scenes with the project's contact settings and nothing else: objects dropped on the table, a
+cube held between fingertips. SI units, world frame, z up.
 """
 
 from collections.abc import Sequence
@@ -105,7 +105,9 @@ def rest(
         world = new_builder()
         add_table(world, cfg, visible=False)
         body = add_object(world, item, cfg, scale=1.0, visuals=False)
-        lowest = Rotation.from_quat(turn).apply(np.concatenate([v for v, _ in item.hulls]))[:, 2].min()
+        lowest = (
+            Rotation.from_quat(turn).apply(np.concatenate([v for v, _ in item.hulls]))[:, 2].min()
+        )
         start = world.joint_q_start[world.joint_child.index(body)]
         world.joint_q[start : start + 7] = [0.0, 0.0, 0.01 - lowest, *turn]
         builder.add_world(world)
@@ -118,7 +120,10 @@ def rest(
         velocity = scene.body(0)[1].reshape(-1, 2, 3)
         fastest = np.maximum(fastest, np.linalg.norm(velocity, axis=2).T)
     (speed, spin), deepest = fastest.tolist(), scene.deepest().tolist()
-    return [RestResult(item.name, *row) for item, *row in zip(objects, spin, speed, deepest, strict=True)]
+    return [
+        RestResult(item.name, *row)
+        for item, *row in zip(objects, spin, speed, deepest, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -133,7 +138,9 @@ class PinchResult:
     """Deepest contact at the end [m]."""
 
 
-def pinch(item: ObjectModel, cfg: SimCfg, *, force: float = 10.0, device: str = "cpu") -> PinchResult:
+def pinch(
+    item: ObjectModel, cfg: SimCfg, *, force: float = 10.0, device: str = "cpu"
+) -> PinchResult:
     """Hold an object by four fingertips around it on horizontal rails, each pushed with a constant force.
 
     Args:
@@ -147,7 +154,9 @@ def pinch(item: ObjectModel, cfg: SimCfg, *, force: float = 10.0, device: str = 
     rails = []
     for angle in 0.5 * np.pi * np.arange(4):
         outward = np.array([np.cos(angle), np.sin(angle), 0.0])
-        tip = world.add_link(mass=FINGER_MASS_KG, inertia=wp.mat33(np.eye(3) * 1e-5), lock_inertia=True)
+        tip = world.add_link(
+            mass=FINGER_MASS_KG, inertia=wp.mat33(np.eye(3) * 1e-5), lock_inertia=True
+        )
         position = wp.vec3(*(outward * (half + FINGERTIP_RADIUS_M) + [0.0, 0.0, 0.3]))
         joint = world.add_joint_prismatic(
             parent=-1,

@@ -1,7 +1,8 @@
 """``vd-bench sim``: control steps per second, memory and start-up, all measured in one run.
 
-The whole step has physics, actions, observations, rewards, resets and randomisation; with a policy adds its
-network. States come from a teacher's mean actions, in contact, in the task of its training.
+The whole step has physics, actions, observations, rewards, resets and randomisation; with a policy
+adds its network. States come from a teacher's mean actions, in contact, in the task of its
+training.
 """
 
 import gc
@@ -28,7 +29,10 @@ WARM_UP_STEPS = 36
 def seconds_per_call(
     function: Any, calls: int, device: str, *, before: Callable[[], object] = lambda: None
 ) -> float:
-    """Mean wall time of ``calls`` calls [s], device work included; ``before`` each of them is not timed."""
+    """Mean wall time of ``calls`` calls [s], device work included.
+
+    ``before`` each of them is not timed.
+    """
     elapsed = 0.0
     for _ in range(calls):
         before()
@@ -43,15 +47,21 @@ def seconds_per_call(
 def own_share(env: ReorientEnv) -> float:
     """Share of our kernels in the device time of one control step on a GPU, by a timer around every launch.
 
-    Launched without the graph, in which the passes of a solver's loop cannot be told apart; idle gaps do not
-    count.
+    Launched without the graph, in which the passes of a solver's loop cannot be told apart; idle
+    gaps do not count.
     """
-    with wp.ScopedTimer("step", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True) as timer:
+    with wp.ScopedTimer(
+        "step", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True
+    ) as timer:
         env.launch_step()
     own = tuple(f"{name}_" for name in own_kernel_names())
     # Warp reports "forward kernel NAME_HASH".
-    times = [(result.name.split()[-1].startswith(own), result.elapsed) for result in timer.timing_results]
-    return float(sum(elapsed for ours, elapsed in times if ours) / sum(elapsed for _, elapsed in times))
+    times = [
+        (result.name.split()[-1].startswith(own), result.elapsed) for result in timer.timing_results
+    ]
+    return float(
+        sum(elapsed for ours, elapsed in times if ours) / sum(elapsed for _, elapsed in times)
+    )
 
 
 def own_kernel_names() -> set[str]:
@@ -63,7 +73,9 @@ def own_kernel_names() -> set[str]:
     return names
 
 
-def measure(cfg: ReorientCfg, device: str, *, teacher: TrainedPolicy, calls: int = 24) -> dict[str, float]:
+def measure(
+    cfg: ReorientCfg, device: str, *, teacher: TrainedPolicy, calls: int = 24
+) -> dict[str, float]:
     """Measure one configuration; raises if any contact was lost.
 
     Args:
@@ -74,9 +86,10 @@ def measure(cfg: ReorientCfg, device: str, *, teacher: TrainedPolicy, calls: int
 
     Returns:
         ``envs``; control steps/s over all of them: ``whole_step`` of the environment, and
-        ``with_policy``; ``own_kernels``: share of our kernels in the device time of a step, in [0, 1], and
-        ``memory_gb`` of simulation and environment, both 0 on the CPU; ``start_s`` from an empty process to
-        the first finished step, kernels included; ``contacts_mean`` of an environment at the end;
+        ``with_policy``; ``own_kernels``: share of our kernels in the device time of a step, in [0,
+        1], and ``memory_gb`` of simulation and environment, both 0 on the CPU; ``start_s`` from an
+        empty process to the first finished step, kernels included; ``contacts_mean`` of an
+        environment at the end;
         ``rows_max``: most constraint rows in any.
     """
     begin = time.perf_counter()

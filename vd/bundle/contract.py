@@ -1,7 +1,8 @@
 """What a policy was made for, in words and numbers, and whether a hand is that.
 
-A contract's ``interface`` follows from the policy's training and a hand's USD alone, so that a check derives
-it again from the hand at hand and compares field by field. SI units, radians; quaternions are xyzw.
+A contract's ``interface`` follows from the policy's training and a hand's USD alone, so that a
+check derives it again from the hand at hand and compares field by field. SI units, radians;
+quaternions are xyzw.
 """
 
 import math
@@ -33,12 +34,17 @@ CONVENTIONS = {
 BEFORE: dict[str, dict[str, Any]] = {
     "observation": {"view": "world", "file_axes": True},
 }
-"""By part of the interface the fields that bundles of earlier versions lack, with what is so there."""
+"""By part of the interface the fields that bundles of earlier versions lack, with what is so
+there.
+"""
 Kind = Literal["teacher", "tracking", "vision"]
 
 
 class ContractError(ValueError):
-    """A bundle that does not fit the hand or this version; names field, found, expected and remedy."""
+    """A bundle that does not fit the hand or this version.
+
+    Names field, found, expected and remedy.
+    """
 
 
 @dataclass(frozen=True)
@@ -66,8 +72,8 @@ class Contract:
     interface: dict[str, Any]
     """As :func:`derive_interface` gives it."""
     network: dict[str, Any]
-    """What rebuilds the network: PolicySpec; of a tracking or vision policy as ``policy``, and of a vision
-    policy AlignmentCfg beside it, as ``alignment``."""
+    """What rebuilds the network: PolicySpec; of a tracking or vision policy as ``policy``, and of a
+    vision policy AlignmentCfg beside it, as ``alignment``."""
     stopping: StoppingRules | None
     """When a policy that sees clouds stops."""
     provenance: Provenance
@@ -84,7 +90,10 @@ class Contract:
 
     @property
     def own_camera(self) -> tuple[float, ...] | None:
-        """Where the training put the camera, optical frame in the base frame [7]; None: the hand's own."""
+        """Where the training put the camera, optical frame in the base frame [7].
+
+        None: the hand's own.
+        """
         camera = self.interface.get("camera")
         return tuple(camera["pose_in_base"]) if camera and camera["source"] == "policy" else None
 
@@ -97,10 +106,13 @@ def derive_interface(
     Args:
         hand: The hand.
         source: Where it comes from; ``depth`` is empty for one that sees by no camera.
-        camera: Where the training put that, optical frame in the base frame [7]; None: the hand's own.
+        camera: Where the training put that, optical frame in the base frame [7]; None: the hand's
+            own.
     """
     task = from_dict(ReorientCfg, source.task, where="provenance.task")
-    depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth") if source.depth else None
+    depth = (
+        from_dict(DepthCameraCfg, source.depth, where="provenance.depth") if source.depth else None
+    )
     parts = {
         "conventions": CONVENTIONS,
         "hand": _hand(hand),
@@ -146,7 +158,10 @@ def trained_hand(hand: HandModel) -> dict[str, Any]:
 
 
 def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
-    """The vector that a teacher's layers see; tracking and vision policies make it of joints and camera."""
+    """The vector that a teacher's layers see.
+
+    Tracking and vision policies make it of joints and camera.
+    """
     seen = task.observation
     slices = teacher_observation_slices(hand.num_fingers, hand.num_joints)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}
@@ -164,7 +179,9 @@ def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
     }
 
 
-def _camera(hand: HandModel, depth: DepthCameraCfg, pose: tuple[float, ...] | None) -> dict[str, Any]:
+def _camera(
+    hand: HandModel, depth: DepthCameraCfg, pose: tuple[float, ...] | None
+) -> dict[str, Any]:
     """The depth camera: the one of the hand's USD, or one that the training placed elsewhere."""
     camera = hand.camera.at(pose)
     return {
@@ -194,7 +211,8 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
     """Refuse a hand that is not the one of the contract of the bundle at ``where``.
 
     Raises:
-        ContractError: The first field that differs, what the hand has, what the bundle wants, what to do.
+        ContractError: The first field that differs, what the hand has, what the bundle wants, what
+            to do.
     """
     found = derive_interface(hand, contract.provenance, contract.own_camera)
     wanted = {
@@ -214,7 +232,8 @@ def check_trained_hand(wanted: dict[str, Any], hand: HandModel, where: str | Pat
         where: The policy.
 
     Raises:
-        ContractError: The first field that differs, what the hand has, what the policy wants, what to do.
+        ContractError: The first field that differs, what the hand has, what the policy wants, what
+            to do.
     """
     if wanted and wanted["name"] == hand.name:
         _check_same({"hand": trained_hand(hand)}, {"hand": wanted}, hand, where, "in its training")
@@ -229,7 +248,8 @@ def _check_same(
         here, there = have.get(name), want.get(name)
         if not _same(here, there):
             raise ContractError(
-                f"{where} does not fit the hand {hand.name} ({hand.path}): {name} is {_short(here)} here, "
+                f"{where} does not fit the hand {hand.name} ({hand.path}): {name} is "
+                f"{_short(here)} here, "
                 f"but {_short(there)} {said}; {_REMEDY[name.split('.')[0]]}"
             )
 

@@ -1,4 +1,7 @@
-"""Bundles on disk: a folder with weights, contract and golden values. Reading one executes nothing in it."""
+"""Bundles on disk: a folder with weights, contract and golden values.
+
+Reading one executes nothing in it.
+"""
 
 import hashlib
 import json
@@ -29,10 +32,12 @@ WEIGHTS_FILE, GOLDEN_FILE = "weights.safetensors", "golden.safetensors"
 STATES, GOLDEN_POINTS = 8, 500
 """Golden observations of a teacher or pairs of clouds, and points of each cloud."""
 GOLDEN_M = 0.03
-"""Standard deviation of the golden points of a network of alignment [m]: about that of an object's."""
+"""Standard deviation of the golden points of a network of alignment [m]: about that of an
+object's.
+"""
 TOLERANCE = 5e-3
-"""Largest difference of an output from the golden one. Actions are of size 1; processors, GPUs and other
-versions of torch differ by 1e-6 to 1e-3."""
+"""Largest difference of an output from the golden one. Actions are of size 1; processors, GPUs and
+other versions of torch differ by 1e-6 to 1e-3."""
 _PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
 _RULES = [one.name for one in fields(StoppingRules)]
 _AGAIN = "write the bundle again with vd-train bundle"
@@ -59,7 +64,9 @@ def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
         if policy.alignment is not None:
             network["alignment"] = to_dict(policy.spec.alignment)
             parts["alignment"] = policy.alignment.state_dict()
-        weights = {f"{part}.{name}": value for part, own in parts.items() for name, value in own.items()}
+        weights = {
+            f"{part}.{name}": value for part, own in parts.items() for name, value in own.items()
+        }
     else:
         source = _provenance(policy, "", {})
         network, camera, weights = to_dict(policy.spec), None, policy.weights
@@ -85,7 +92,9 @@ def read_contract(folder: str | Path) -> Contract:
     """
     path = Path(folder) / CONTRACT_FILE
     if not path.is_file():
-        raise FileNotFoundError(f"no bundle at {folder}: there is no {path}; vd-train bundle writes one")
+        raise FileNotFoundError(
+            f"no bundle at {folder}: there is no {path}; vd-train bundle writes one"
+        )
     try:
         values = json.loads(path.read_text())
         found = values.get("format") if isinstance(values, dict) else None
@@ -94,7 +103,8 @@ def read_contract(folder: str | Path) -> Contract:
         if (rules := values.get("stopping")) and "distance_rad" in rules:  # of an earlier version
             pairs = (rules.pop("distance_rad"), rules.pop("action_norm")), rules.get("precise")
             rules["stopping"], rules["precise"] = (
-                pair and dict(zip(("distance_rad", "action_norm"), pair, strict=True)) for pair in pairs
+                pair and dict(zip(("distance_rad", "action_norm"), pair, strict=True))
+                for pair in pairs
             )
         return from_dict(Contract, values)
     except (ValueError, TypeError, KeyError) as error:
@@ -106,8 +116,8 @@ def read_bundle(folder: str | Path, device: str = "cpu") -> AnyPolicy:
 
     Raises:
         FileNotFoundError: A file is missing.
-        ContractError: A file is damaged or changed, the weights do not fit the network, or the policy answers
-            otherwise.
+        ContractError: A file is damaged or changed, the weights do not fit the network, or the
+            policy answers otherwise.
     """
     folder = Path(folder)
     contract = read_contract(folder)
@@ -119,14 +129,16 @@ def read_bundle(folder: str | Path, device: str = "cpu") -> AnyPolicy:
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         first = " ".join(str(error).split("\n\t")[:2])  # of torch's list of what does not fit
         raise ContractError(
-            f"{folder}: policy and {CONTRACT_FILE} do not fit this version ({first}); another one wrote "
+            f"{folder}: policy and {CONTRACT_FILE} do not fit this version ({first}); another one "
+            f"wrote "
             f"them: {_AGAIN}"
         ) from error
     answers = _answers(policy, {name: value.to(device) for name, value in golden.items()})
     worst = max(float((value - golden[name]).abs().max()) for name, value in answers.items())
     if not worst <= TOLERANCE:  # NaN is wrong too
         raise ContractError(
-            f"{folder}: the policy's outputs differ by {worst:.2g} from those in {GOLDEN_FILE} (at most "
+            f"{folder}: the policy's outputs differ by {worst:.2g} from those in {GOLDEN_FILE} (at "
+            f"most "
             f"{TOLERANCE:g}); it was written by other software ({contract.software}): {_AGAIN}"
         )
     return policy
@@ -135,15 +147,17 @@ def read_bundle(folder: str | Path, device: str = "cpu") -> AnyPolicy:
 def _golden_inputs(policy: AnyPolicy) -> Tensors:
     """Inputs, and the outputs that have to come back.
 
-    Of a teacher's layers ``observation`` [S, O] of size 1. Of a network of alignment ``goal_points`` and
-    ``seen_points`` [S, G, 3] about their means [m].
+    Of a teacher's layers ``observation`` [S, O] of size 1. Of a network of alignment
+    ``goal_points`` and ``seen_points`` [S, G, 3] about their means [m].
     """
     rng = np.random.default_rng(0)
     teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
     drawn = {"observation": rng.normal(size=(STATES, teacher.num_observations))}
     if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
         shape = (STATES, GOLDEN_POINTS, 3)
-        drawn |= {name: rng.normal(scale=GOLDEN_M, size=shape) for name in ("goal_points", "seen_points")}
+        drawn |= {
+            name: rng.normal(scale=GOLDEN_M, size=shape) for name in ("goal_points", "seen_points")
+        }
     return {name: torch.tensor(value, dtype=torch.float32) for name, value in drawn.items()}
 
 
@@ -177,9 +191,16 @@ def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     return TrackingPolicy(teacher, replace(spec, depth=depth, **settings), alignment)
 
 
-def _teacher(spec: dict[str, Any], source: Provenance, weights: Tensors, device: str) -> TrainedPolicy:
+def _teacher(
+    spec: dict[str, Any], source: Provenance, weights: Tensors, device: str
+) -> TrainedPolicy:
     """A teacher; of a camera policy names of weights say which are its actor's."""
-    trained = {"policy": spec, "task": source.task, "iter": source.iterations, "env_steps": source.env_steps}
+    trained = {
+        "policy": spec,
+        "task": source.task,
+        "iter": source.iterations,
+        "env_steps": source.env_steps,
+    }
     return policy_of(trained | {"actor_state_dict": _part(weights, "actor.") or weights}, device)
 
 
@@ -208,11 +229,16 @@ def _write(folder: Path, contract: Contract, weights: Tensors, golden: Tensors) 
     if folder.exists() and not is_bundle(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} exists and is no bundle; choose another name")
     make_folder(folder.parent)
-    with writing(folder), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
+    with (
+        writing(folder),
+        tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name,
+    ):
         made = Path(name) / folder.name
         made.mkdir()
         for file, tensors in ((WEIGHTS_FILE, weights), (GOLDEN_FILE, golden)):
-            (made / file).write_bytes(save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}))
+            (made / file).write_bytes(
+                save({k: v.detach().cpu().contiguous() for k, v in tensors.items()})
+            )
         digests = {file: _digest(made / file) for file in (WEIGHTS_FILE, GOLDEN_FILE)}
         write_json(made / CONTRACT_FILE, to_dict(replace(contract, files=digests)))
         if folder.exists():

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from vd.assets_usd.hand_data import Workspace
 
 MAX_LATENCY_S = 0.5
-"""Largest latency of what is seen that can be drawn [s] (ours): environments keep all of it in memory."""
+"""Largest latency of what is seen that can be drawn [s] (ours): environments keep all of it in
+memory.
+"""
 View = Literal["world", "goal", "mirrored"]
 """What a policy sees its goals in, see :attr:`ObservationCfg.view`."""
 
@@ -32,7 +34,10 @@ class ActionCfg:
 class RewardCfg:
     """Coefficients of equations 1-5, 7 and 8, and of our own shaping (off by default)."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"fingertip_height": PAPER.reward.fingertip_height, "lift_m": 0.02}
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "fingertip_height": PAPER.reward.fingertip_height,
+        "lift_m": 0.02,
+    }
     success: float = PAPER.reward.success
     """c1: once for each goal reached."""
     rotation: float = PAPER.reward.rotation
@@ -54,11 +59,15 @@ class RewardCfg:
     progress: float = 0.0
     """Ours: per radian by which the error fell since the last step."""
     lift: float = 0.0
-    """Ours: times the height of the object's lowest point above the table (there or not), 1 from 2 cm on."""
+    """Ours: times the height of the object's lowest point above the table (there or not), 1 from 2
+    cm on.
+    """
     scale: float = 1.0
     """Ours: factor on the sum; changes no optimum, keeps value targets near 1."""
     terms: MutableMapping[str, float] = field(default_factory=dict)
-    """Your own terms: functions (module:function) with their coefficients (docs/tutorials/terms.md)."""
+    """Your own terms: functions (module:function) with their coefficients
+    (docs/tutorials/terms.md).
+    """
 
 
 @dataclass(frozen=True)
@@ -66,7 +75,9 @@ class SuccessCfg:
     """When a goal counts as reached, and when the object counts as lost."""
 
     RETIRED: ClassVar[dict[str, Any]] = {"no_table_contact": False}
-    """Fields of older files (:func:`vd.config.from_dict`); table.lift_share 1 asks the same everywhere."""
+    """Fields of older files (:func:`vd.config.from_dict`); table.lift_share 1 asks the same
+    everywhere.
+    """
     rotation_rad: float = PAPER.success.rotation_rad
     """Largest rotation error [rad]."""
     joint_speed_rad_s: float = PAPER.success.joint_speed_rad_s
@@ -91,28 +102,34 @@ class ObservationCfg:
 
     RETIRED: ClassVar[dict[str, Any]] = {"goal_time": False, "history": 0}
     shape: Literal["none", "full"] = "none"
-    """none: nothing of the object's shape, as in the paper. full: the vector from each fingertip to the
-    nearest point of the surface, and how far the object extends in 9 directions for each finger, up and
-    down, now and at the goal; exact, privileged."""
+    """none: nothing of the object's shape, as in the paper. full: the vector from each fingertip to
+    the nearest point of the surface, and how far the object extends in 9 directions for each
+    finger, up and down, now and at the goal; exact, privileged."""
     view: View = "world"
-    """world: one frame for all goals, as in the paper. goal: for each goal the scene is seen turned about the
-    vertical from finger to finger, and the fingers renamed, so that the axis of the wanted rotation lies in
-    one sector: an F-th of the goals to learn. The fingers must be spaced evenly. mirrored: in the mirror too,
-    where the wanted rotation would be clockwise from above: half of that. The hand must be its own mirror
-    image, as dclaw3 is; of dclaw4 all fingers lean the same way round."""
+    """world: one frame for all goals, as in the paper. goal: for each goal the scene is seen turned
+    about the vertical from finger to finger, and the fingers renamed, so that the axis of the
+    wanted rotation lies in
+    one sector: an F-th of the goals to learn. The fingers must be spaced evenly. mirrored: in the
+    mirror too,
+    where the wanted rotation would be clockwise from above: half of that. The hand must be its own
+    mirror image, as dclaw3 is; of dclaw4 all fingers lean the same way round."""
     file_axes: bool = True
-    """See how the axes of the object's file lie, now and at the goal, as in the paper. No cloud shows which
-    they are; a camera shows the rotation from one to the other alone. Ours: without them a teacher sees zeros
-    in their place, and knows no more of them than a camera shows."""
+    """See how the axes of the object's file lie, now and at the goal, as in the paper. No cloud
+    shows which they are; a camera shows the rotation from one to the other alone. Ours: without
+    them a teacher sees zeros in their place, and knows no more of them than a camera shows."""
     canonical: bool = False
-    """Of the two quaternions of a rotation see always the same, of object, goal and the rotation between
-    them. On in all presets; off where a policy's file does not say: those policies have learned the signs."""
+    """Of the two quaternions of a rotation see always the same, of object, goal and the rotation
+    between them. On in all presets; off where a policy's file does not say: those policies have
+    learned the signs.
+    """
     dynamics: Literal["none", "critic"] = "none"
-    """Ours, privileged: whether the critic is told what was drawn (gains, delay, friction and backlash of
-    joints, frictions, mass, latency), and the present state and shape, without noise."""
+    """Ours, privileged: whether the critic is told what was drawn (gains, delay, friction and
+    backlash of joints, frictions, mass, latency), and the present state and shape, without
+    noise.
+    """
     terms: MutableMapping[str, int] = field(default_factory=dict)
-    """Your own values: functions (module:function), and how many values each gives. Symmetry frames show
-    them as they are, without latency and noise."""
+    """Your own values: functions (module:function), and how many values each gives. Symmetry frames
+    show them as they are, without latency and noise."""
     critic_terms: MutableMapping[str, int] = field(default_factory=dict)
     """The same, for the critic alone."""
 
@@ -131,7 +148,9 @@ class GoalCfg:
     """Which goals are drawn."""
 
     max_angle_rad: float = pi
-    """Goals lie within this angle of the object's present orientation, uniform (Haar); pi is all of SO(3)."""
+    """Goals lie within this angle of the object's present orientation, uniform (Haar); pi is all of
+    SO(3).
+    """
     about_vertical: bool = False
     """Goals only turn the object about the vertical, uniform in the angle (an easier task)."""
 
@@ -142,15 +161,20 @@ class StartCfg:
 
     RETIRED: ClassVar[dict[str, Any]] = {"settle_s": 1.5}
     at_rest: bool = False
-    """Start at rest on the table, turned about the vertical at random, rather than falling (paper). Goals
-    near the start are then near a pose that lasts."""
+    """Start at rest on the table, turned about the vertical at random, rather than falling (paper).
+    Goals near the start are then near a pose that lasts."""
     poses: int = 4
-    """Poses at rest of each environment, to choose from; found by dropping the object at the beginning."""
+    """Poses at rest of each environment, to choose from; found by dropping the object at the
+    beginning.
+    """
 
 
 @dataclass(frozen=True)
 class TableCfg:
-    """Ours: environments whose table is taken away, as in in-air tests, or does not help; none by default."""
+    """Ours: environments whose table is taken away, as in in-air tests, or does not help.
+
+    None by default.
+    """
 
     RETIRED: ClassVar[dict[str, Any]] = {"handed_share": Dropped(0.0, 0.25)}
     away_share: float = 0.0
@@ -158,32 +182,38 @@ class TableCfg:
     away_s: tuple[float, float] = (PAPER.scene.air_table_s, PAPER.scene.air_table_s)
     """Times in the episode at which it goes, uniform over these environments [s]."""
     lift_share: float = 0.0
-    """Share of the environments in which success asks that the object does not touch the table: those that
-    lose it first, then others."""
+    """Share of the environments in which success asks that the object does not touch the table:
+    those that lose it first, then others."""
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         require(self, "table.", "in [0, 1]", "away_share lift_share")
         if not 0.0 < self.away_s[0] <= self.away_s[1]:
             raise ValueError(
-                f"table.away_s is {self.away_s[0]:g} {self.away_s[1]:g}; it has to rise, and be positive"
+                f"table.away_s is {self.away_s[0]:g} {self.away_s[1]:g}; it has to rise, and be "
+                f"positive"
             )
 
 
 @dataclass(frozen=True)
 class TighteningCfg:
-    """Ours: ask for little at first, later for the stillness and nearness of ``success``. Off by default.
+    """Ours: ask for little at first, later for the stillness and nearness of ``success``.
 
-    Noise in the actions moves the fingers more than the paper's success allows, and without noise nothing
-    is learned, so both have to fall together (``policy.quiet_std``). Where the difficulty is 1, the tightness
-    grows by ``rate`` per update while the success rate of goals is above ``raise_at``, and shrinks while it
-    is below ``lower_at``. At 0 the thresholds are these, at 1 those of ``success``, geometric in between.
+    Off by default.
+
+    Noise in the actions moves the fingers more than the paper's success allows, and without noise
+    nothing is learned, so both have to fall together (``policy.quiet_std``). Where the difficulty
+    is 1, the tightness grows by ``rate`` per update while the success rate of goals is above
+    ``raise_at``, and shrinks while it is below ``lower_at``. At 0 the thresholds are these, at 1
+    those of ``success``, geometric in between.
     """
 
     enabled: bool = False
     """Whether tightness starts at 0 rather than 1."""
     joint_speed_rad_s: float = 3.0
-    """Largest norm of the joint velocities at tightness 0 [rad/s]; fingers at a std of 0.2 have about 1."""
+    """Largest norm of the joint velocities at tightness 0 [rad/s]; fingers at a std of 0.2 have
+    about 1.
+    """
     object_speed_m_s: float = 0.16
     """Largest speed of the object at tightness 0 [m/s]."""
     object_spin_rad_s: float = 2.0
@@ -191,10 +221,12 @@ class TighteningCfg:
     action_norm: float = 3.5
     """Largest norm of the smoothed action at tightness 0; that of twelve actions of 1 is 3.46."""
     rotation_rad: float = PAPER.success.rotation_rad
-    """Largest rotation error at tightness 0 [rad]; a smaller success.rotation_rad makes it finer."""
+    """Largest rotation error at tightness 0 [rad]; a smaller success.rotation_rad makes it
+    finer.
+    """
     object_weight: float = 1.0
-    """Share of its weight that the object has at tightness 0 in the environments of table.lift_share: what
-    is light is easily held, and not lost before it is."""
+    """Share of its weight that the object has at tightness 0 in the environments of
+    table.lift_share: what is light is easily held, and not lost before it is."""
     raise_at: float = 0.5
     """Success rate of goals above which stillness tightens."""
     lower_at: float = 0.3
@@ -208,7 +240,8 @@ class TighteningCfg:
         require(self, "curriculum.tightening.", "positive", f"{thresholds} object_weight")
         if not 0.0 <= self.lower_at <= self.raise_at <= 1.0:
             raise ValueError(
-                f"curriculum.tightening.lower_at is {self.lower_at:g} and raise_at {self.raise_at:g}; "
+                f"curriculum.tightening.lower_at is {self.lower_at:g} and raise_at "
+                f"{self.raise_at:g}; "
                 "they have to rise within 0 and 1"
             )
 
@@ -217,9 +250,10 @@ class TighteningCfg:
 class CurriculumCfg:
     """Ours: make the task harder as the success rate allows. Off by default.
 
-    While the success rate of goals is above ``raise_at`` the difficulty grows by ``rate`` per update,
-    while it is below ``lower_at`` it shrinks; in between it stays. Difficulty 0 is loose stillness, near
-    goals and free energy (:mod:`vd.envs.parameters`), difficulty 1 the configured task.
+    While the success rate of goals is above ``raise_at`` the difficulty grows by ``rate`` per
+    update, while it is below ``lower_at`` it shrinks; in between it stays. Difficulty 0 is loose
+    stillness, near goals and free energy (:mod:`vd.envs.parameters`), difficulty 1 the configured
+    task.
     """
 
     RETIRED: ClassVar[dict[str, Any]] = {
@@ -269,11 +303,15 @@ class RandomisationCfg:
     object_scale: tuple[float, float] = PAPER.randomisation.object_scale
     """Factors on the size of the object."""
     object_scale_count: int = 3
-    """Object sizes are this many even steps of ``object_scale``: every size is a set of compiled meshes."""
+    """Object sizes are this many even steps of ``object_scale``: every size is a set of compiled
+    meshes.
+    """
     object_mass_kg: tuple[float, float] = PAPER.randomisation.object_mass_kg
     """Masses of the object [kg]."""
     object_com_m: float = 0.0
-    """Ours: how far the object's centre of mass is from where its file has it [m], to a side drawn once."""
+    """Ours: how far the object's centre of mass is from where its file has it [m], to a side drawn
+    once.
+    """
     action_noise_std: float = PAPER.randomisation.action_noise_std
     """Standard deviation of the noise of each action, drawn anew in every control step; 1 is
     action.scale_rad_s."""
@@ -290,29 +328,39 @@ class RandomisationCfg:
     force_n_per_kg: float = PAPER.randomisation.force_n_per_kg
     """Size of that force [N per kg of the object]; its direction is uniform."""
     force_s: float = PAPER.randomisation.force_s_code
-    """How long a new force acts in its control step [s]. The default is one of five simulation steps, as in
-    the released code; a whole control step, 1/12, gives five times the impulse (condition ``hard``)."""
+    """How long a new force acts in its control step [s]. The default is one of five simulation
+    steps, as in the released code; a whole control step, 1/12, gives five times the impulse
+    (condition ``hard``).
+    """
     force_decay: float = 0.0
-    """What remains of a force in the next control step: 0 in the paper, 0.998 in the released code."""
+    """What remains of a force in the next control step: 0 in the paper, 0.998 in the released
+    code.
+    """
     effects: MutableMapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Effects of servos to draw for every joint in each episode, by name and parameter: command_delay.delay_s
-    0 0.04 draws a delay of up to 40 ms. Those given are all: others of --init or a preset go. They replace
-    what a hand layer says about the same parameter. Delays are of the bus: all joints of an environment have
-    the same share of their range."""
+    """Effects of servos to draw for every joint in each episode, by name and parameter:
+    command_delay.delay_s
+    0 0.04 draws a delay of up to 40 ms. Those given are all: others of --init or a preset go. They
+    replace what a hand layer says about the same parameter. Delays are of the bus: all joints of an
+    environment have the same share of their range."""
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
-    """How old the object's state is that the policy sees [s], drawn for each episode, to the nearest physics
+    """How old the object's state is that the policy sees [s], drawn for each episode, to the
+    nearest physics
     step: a camera and its loop. Rewards and success are of the true state."""
     observation_jitter_s: float = 0.0
-    """By how much more the object's state is old in a step, uniform from 0 to this [s]: images come at a rate
-    of their own, and the newest is up to one period old (1/30 s of a D415)."""
+    """By how much more the object's state is old in a step, uniform from 0 to this [s]: images come
+    at a rate of their own, and the newest is up to one period old (1/30 s of a D415)."""
     encoder_latency_s: tuple[float, float] = (0.0, 0.0)
-    """How old joints and fingertips are that the policy sees [s]; a loop reads them when its step begins.
-    Drawn at the same share of its range as the object's."""
+    """How old joints and fingertips are that the policy sees [s]; a loop reads them when its step
+    begins. Drawn at the same share of its range as the object's."""
     object_pose_error: tuple[float, float] = (0.0, 0.0)
-    """Ours: by how much the observed pose of the object is wrong [m] [rad], alike all through an episode."""
+    """Ours: by how much the observed pose of the object is wrong [m] [rad], alike all through an
+    episode.
+    """
     redraw_s: float = PAPER.randomisation.redraw_s
-    """Gains, contact frictions and constant errors are drawn anew at the first reset after this time [s]: the
-    solver takes them once a second. Servos (``effects``) and latency are drawn at every reset."""
+    """Gains, contact frictions and constant errors are drawn anew at the first reset after this
+    time [s]: the solver takes them once a second. Servos (``effects``) and latency are drawn at
+    every reset.
+    """
 
     def force_steps(self, sim: SimCfg) -> int:
         """Physics steps for which a new force acts."""
@@ -324,11 +372,13 @@ class RandomisationCfg:
             low, high = getattr(self, name)
             if not 0.0 <= low <= high <= MAX_LATENCY_S:
                 raise ValueError(
-                    f"randomisation.{name} is {low:g} {high:g}; it has to rise within 0 and {MAX_LATENCY_S:g}"
+                    f"randomisation.{name} is {low:g} {high:g}; it has to rise within 0 and "
+                    f"{MAX_LATENCY_S:g}"
                 )
         if not 0.0 <= self.observation_jitter_s <= MAX_LATENCY_S:
             raise ValueError(
-                f"randomisation.observation_jitter_s is {self.observation_jitter_s:g}; it has to be in "
+                f"randomisation.observation_jitter_s is {self.observation_jitter_s:g}; it has to "
+                f"be in "
                 f"[0, {MAX_LATENCY_S:g}]"
             )
         require(self, "randomisation.", "positive", "force_s")
@@ -361,7 +411,9 @@ class ReorientCfg:
     objects: tuple[str, ...] = ("cube",)
     """Object sets: names or folders of object USDs."""
     fit_objects: bool = False
-    """Scale objects as little as makes them fit the hand (the sizes in its USD): sets are made for D'Claw."""
+    """Scale objects as little as makes them fit the hand (the sizes in its USD): sets are made for
+    D'Claw.
+    """
     num_envs: int = 4096
     """Environments simulated side by side."""
     seed: int = 0
@@ -373,10 +425,14 @@ class ReorientCfg:
     visuals: bool = False
     """Keep visual shapes, for rendering."""
     table_friction: float = PAPER.materials.table_friction
-    """Friction coefficient of the table where nothing is randomised; its contacts get the mean of the two."""
+    """Friction coefficient of the table where nothing is randomised; its contacts get the mean of
+    the two.
+    """
     failures_per_million: float = 0.0
-    """Steps of environments in a million that may leave the finite numbers or become too fast: their episode
-    ends like one that times out. Ten more (few steps say little) stop the run, at 0 the first one does."""
+    """Steps of environments in a million that may leave the finite numbers or become too fast:
+    their episode ends like one that times out. Ten more (few steps say little) stop the run, at 0
+    the first one does.
+    """
     sim: SimCfg = field(default_factory=SimCfg)
     action: ActionCfg = field(default_factory=ActionCfg)
     observation: ObservationCfg = field(default_factory=ObservationCfg)
@@ -429,11 +485,14 @@ class ReorientCfg:
             return
         if self.success.rotation_rad > tightening.rotation_rad:
             raise ValueError(
-                f"success.rotation_rad is {self.success.rotation_rad:g}, looser than where it begins, "
+                f"success.rotation_rad is {self.success.rotation_rad:g}, looser than where it "
+                f"begins, "
                 f"curriculum.tightening.rotation_rad {tightening.rotation_rad:g}; raise the latter"
             )
         if tightening.object_weight != 1.0 and self.table.lift_share == 0.0:
             raise ValueError(
-                f"curriculum.tightening.object_weight is {tightening.object_weight:g}, but no environment "
-                "asks for objects off the table, and only there are they light; give table.lift_share"
+                f"curriculum.tightening.object_weight is {tightening.object_weight:g}, but no "
+                f"environment "
+                "asks for objects off the table, and only there are they light; give "
+                "table.lift_share"
             )

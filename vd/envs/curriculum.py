@@ -1,4 +1,7 @@
-"""How hard the task is while a policy learns it: nearer goals first, then success thresholds that tighten."""
+"""How hard the task is while a policy learns it.
+
+Nearer goals first, then success thresholds that tighten.
+"""
 
 from dataclasses import dataclass
 
@@ -17,14 +20,16 @@ class Stage:
 
 def first_stage(cfg: CurriculumCfg) -> Stage:
     """Where a run begins."""
-    return Stage(difficulty=0.0 if cfg.enabled else 1.0, tightness=0.0 if cfg.tightening.enabled else 1.0)
+    return Stage(
+        difficulty=0.0 if cfg.enabled else 1.0, tightness=0.0 if cfg.tightening.enabled else 1.0
+    )
 
 
 def next_stage(stage: Stage, success_rate: float, cfg: CurriculumCfg) -> Stage:
     """The stage after an update of the curriculum.
 
-    Only one of the two moves: the tightness where the difficulty is 1, else the difficulty. So goals come
-    nearer again only where stillness is as loose as it gets.
+    Only one of the two moves: the tightness where the difficulty is 1, else the difficulty. So
+    goals come nearer again only where stillness is as loose as it gets.
 
     Args:
         stage: Now.

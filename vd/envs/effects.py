@@ -18,11 +18,14 @@ def check_effects(effects: Mapping[str, tuple[float, float]]) -> None:
     """
     for name, (low, high) in effects.items():
         if name not in PARAMETERS:
-            raise ValueError(f"randomisation.effects: no parameter {name!r}; one of {', '.join(PARAMETERS)}")
+            raise ValueError(
+                f"randomisation.effects: no parameter {name!r}; one of {', '.join(PARAMETERS)}"
+            )
         parameter = PARAMETERS[name]
         lowest = -parameter.upper if parameter.signed else parameter.lower
         if not lowest <= low <= high <= parameter.upper:
             raise ValueError(
-                f"randomisation.effects: {name} from {low:g} to {high:g}; the low end comes first, and both "
+                f"randomisation.effects: {name} from {low:g} to {high:g}; the low end comes first, "
+                f"and both "
                 f"lie between {lowest:g} and {parameter.upper:g} {parameter.unit}"
             )

@@ -45,7 +45,8 @@ class Fingers:
         tips = [self.tip_body, self.tip_offset, sim.body_q]
         launch(fingertip_kernel, self.tip_pos.shape, tips, [self.tip_pos])
         if sim.servo is not None:
-            # Only the servo knows what it had in the last physics step: a late command, a limited torque.
+            # Only the servo knows what it had in the last physics step: a late command, a limited
+            # torque.
             torque = sim.solver.mjw_data.qfrc_actuator
             launch(copy_columns_kernel, self.effort.shape, [torque], [self.effort])
             return

@@ -1,4 +1,7 @@
-"""The state as a policy sees it: of the present, or as old as the latencies that its episode has drawn."""
+"""The state as a policy sees it.
+
+Of the present, or as old as the latencies that its episode has drawn.
+"""
 
 import math
 from collections.abc import Sequence
@@ -25,8 +28,9 @@ class SeenState:
     Attributes:
         latency: How late each object is seen in its episode [s], shape [N].
         encoder_latency: How late joints and fingertips are [s], shape [N].
-        arrays: Joint positions and velocities as the encoders report them, positions and velocities of hand
-            and object, poses and velocities of the links (of fingertips alone where they are late).
+        arrays: Joint positions and velocities as the encoders report them, positions and velocities
+            of hand and object, poses and velocities of the links (of fingertips alone where they
+            are late).
     """
 
     def __init__(self, state: TaskState):
@@ -34,12 +38,20 @@ class SeenState:
         sim, n, device = state.sim, state.num_envs, state.device
         random = state.cfg.randomisation
         longest = max(
-            random.observation_latency_s[1] + random.observation_jitter_s, random.encoder_latency_s[1]
+            random.observation_latency_s[1] + random.observation_jitter_s,
+            random.encoder_latency_s[1],
         )
         self.is_late = random.enabled and longest > 0.0
         self.latency = wp.zeros(n, dtype=float, device=device)
         self.encoder_latency = wp.zeros(n, dtype=float, device=device)
-        present = [state.measured_q, state.measured_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
+        present = [
+            state.measured_q,
+            state.measured_qd,
+            sim.joint_q,
+            sim.joint_qd,
+            sim.body_q,
+            sim.body_qd,
+        ]
         self.arrays: list[Any] = present
         if not self.is_late:
             return
@@ -52,7 +64,9 @@ class SeenState:
         self._model = [d, slots, state.fingers.tip_body]
         sim.after_physics_step = self.record
 
-    def record(self, joint_q: wp.array, joint_qd: wp.array, body_q: wp.array, body_qd: wp.array) -> None:
+    def record(
+        self, joint_q: wp.array, joint_qd: wp.array, body_q: wp.array, body_qd: wp.array
+    ) -> None:
         """Remember the state after a physics step, shapes [N, *]. Device work only."""
         now = self._now(joint_q, joint_qd, body_q, body_qd)
         self._state.launch(record_state_kernel, [*self._model, now], [self._head, self._ring])
@@ -77,7 +91,9 @@ class SeenState:
             state = self._state
             times = [state.cfg.sim.physics_dt, state.cfg.randomisation.observation_jitter_s]
             inputs = [*times, self.latency, self.encoder_latency, self._head, self._ring]
-            state.launch(recall_state_kernel, [*self._model, *inputs], [state.rng, _packed(self.arrays)])
+            state.launch(
+                recall_state_kernel, [*self._model, *inputs], [state.rng, _packed(self.arrays)]
+            )
 
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint, by name."""

@@ -26,7 +26,8 @@ class Observer:
         seen: The state that observations are made of.
         all_values: Everything, in the symmetry frames if there are any, shape [N, A].
         world_values: Everything in the world frame, shape [N, A].
-        symmetry_frames: The frames in which the policy observes and acts; None where that is the world frame.
+        symmetry_frames: The frames in which the policy observes and acts; None where that is the
+            world frame.
         shapes: Observes and measures shapes, or None.
     """
 
@@ -55,13 +56,20 @@ class Observer:
         hand, materials = state.hand, PAPER.materials
         self._gains = [wp.array(gain, dtype=float, device=device) for gain in (hand.kp, hand.kd)]
         self._nominal = wp.vec4(
-            materials.friction, materials.friction, state.cfg.table_friction, materials.object_mass_kg
+            materials.friction,
+            materials.friction,
+            state.cfg.table_friction,
+            materials.object_mass_kg,
         )
         self._no_servo = zeros(0, 0)
         self._exact: list[Any] = []
         if "present" in self.parts:
             settings = state.parameters.exact_observation
-            self._exact = [settings, zeros(n, slices["previous_action"].stop), zeros(n, dtype=wp.uint32)]
+            self._exact = [
+                settings,
+                zeros(n, slices["previous_action"].stop),
+                zeros(n, dtype=wp.uint32),
+            ]
 
     def split(self, values: wp.array) -> tuple[wp.array, wp.array]:
         """What the actor reads [N, O], and what the critic reads besides [N, A - O], of everything [N, A]."""
@@ -84,7 +92,9 @@ class Observer:
         if "present" in self.parts:
             sim = state.sim
             true = [sim.joint_q, sim.joint_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
-            self._observe_state(true, self._exact, self.world_values[:, self.parts["present"].start :])
+            self._observe_state(
+                true, self._exact, self.world_values[:, self.parts["present"].start :]
+            )
         self._tell()
         if self.symmetry_frames is not None:
             self.symmetry_frames.observe()

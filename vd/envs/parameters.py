@@ -60,7 +60,9 @@ class TaskParameters:
             for noise in (on, 0.0)
         )
         self.start = array(
-            StartParams, position=wp.vec3(*hand.workspace.drop_m), noise=PAPER.scene.object_start_noise_m
+            StartParams,
+            position=wp.vec3(*hand.workspace.drop_m),
+            noise=PAPER.scene.object_start_noise_m,
         )
         self.force = array(
             ForceParams,
@@ -88,7 +90,9 @@ class TaskParameters:
         self.goal = array(GoalParams)
         self.weight = wp.ones(1, dtype=float, device=device)
         """Share of its weight that an object which has to be lifted has, shape [1]."""
-        self._staging = {name: getattr(self, name).numpy() for name in ("reward", "success", "goal")}
+        self._staging = {
+            name: getattr(self, name).numpy() for name in ("reward", "success", "goal")
+        }
         self.set_stage(Stage())
 
     def set_stage(self, stage: Stage) -> None:
@@ -109,7 +113,9 @@ class TaskParameters:
             rotation=reward.rotation,
             rotation_epsilon=reward.rotation_epsilon_rad,
             fingertip=reward.fingertip,
-            fingertip_form=FINGERTIP_MEAN if reward.fingertip_mean_distance else FINGERTIP_SQUARED_SUM,
+            fingertip_form=FINGERTIP_MEAN
+            if reward.fingertip_mean_distance
+            else FINGERTIP_SQUARED_SUM,
             energy=reward.energy * difficulty,
             energy_clip=reward.energy_clip_w,
             fall=reward.fall,

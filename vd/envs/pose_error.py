@@ -10,7 +10,9 @@ from vd.kernels.task.pose_error import draw_pose_error_kernel, mistake_pose_kern
 
 
 class PoseError:
-    """The same error of the object's pose all through an episode; nothing where there is to be none.
+    """The same error of the object's pose all through an episode.
+
+    Nothing where there is to be none.
 
     Args:
         state: The task.
@@ -27,7 +29,9 @@ class PoseError:
     def begin(self, mask: wp.array) -> None:
         """Draw the errors of the environments of ``mask`` [N]."""
         if self.is_wrong:
-            self._state.launch(draw_pose_error_kernel, [self._size, mask, self._state.rng], [self._error])
+            self._state.launch(
+                draw_pose_error_kernel, [self._size, mask, self._state.rng], [self._error]
+            )
 
     def apply(self, seen: Sequence[Any]) -> Sequence[Any]:
         """What is seen (``SeenState.arrays``), with the errors. Device work only."""

@@ -28,7 +28,8 @@ from vd.paper import PAPER
 from vd.sim.graphs import Graphs
 from vd.sim.scene import SHAPE_HAND, SHAPE_OBJECT, SHAPE_TABLE
 
-# Drawn gains and frictions reach the solver once a second: an environment in this many has new ones then.
+# Drawn gains and frictions reach the solver once a second: an environment in this many has new ones
+# then.
 PUSH_INTERVAL_S = 1.0
 
 
@@ -55,7 +56,9 @@ class Randomiser:
         """Object mass [kg], shape [N]."""
         self.action_offset = zeros(n, d)
         # Not of the shape's values, which no sensor measures.
-        self.observation_offset = zeros(n, teacher_observation_size(state.num_fingers, state.num_joints))
+        self.observation_offset = zeros(
+            n, teacher_observation_size(state.num_fingers, state.num_joints)
+        )
         self.force = zeros(n, dtype=wp.vec3)
         """Disturbance force on the object [N], world frame, shape [N]."""
         self._no_force = zeros(n, dtype=wp.vec3)
@@ -83,7 +86,8 @@ class Randomiser:
         self._table_friction = self._ranges("table_friction", usual[0])
         self._object_mass = self._ranges("mass", usual[1])
         measured = self._of_objects(["table_friction" in item.contact for item in state.objects])
-        # The average of table and object, as the paper's engine has it; what was measured is of the pair.
+        # The average of table and object, as the paper's engine has it; what was measured is of the
+        # pair.
         self._table_share = wp.array(np.where(measured, 1.0, 0.5), dtype=float, device=device)
         self._shape_kind = wp.array(scene.shape_kind, dtype=wp.int32, device=device)
         self._nominal_friction = wp.clone(model.shape_material_mu)
@@ -97,7 +101,10 @@ class Randomiser:
         return np.array(values)[self._state.scene.world_object]
 
     def _ranges(self, name: str, usual: tuple[float, float]) -> wp.array:
-        """Range of a parameter in each environment [N]: an identified one varies within its interval."""
+        """Range of a parameter in each environment [N].
+
+        An identified one varies within its interval.
+        """
 
         def of(item: ObjectModel) -> tuple[float, float]:
             if name not in item.contact:
@@ -124,7 +131,9 @@ class Randomiser:
         mass = model.body_mass.numpy().reshape(n, -1)
         if not self.enabled:  # nothing is drawn: objects weigh what their files say
             self.object_mass.assign(mass[:, state.scene.object_body])
-        factor[:, state.scene.object_body] = self.object_mass.numpy() / mass[:, state.scene.object_body]
+        factor[:, state.scene.object_body] = (
+            self.object_mass.numpy() / mass[:, state.scene.object_body]
+        )
         flat = factor.reshape(-1)
         inverse = 1.0 / flat
         for array, scale in (
@@ -159,7 +168,12 @@ class Randomiser:
     def _draw_dynamics(self, mask: wp.array) -> None:
         """Draw gains, frictions and constant errors."""
         state = self._state
-        ranges = self._kp_scale, self._kd_scale, self._table_friction, state.parameters.randomisation
+        ranges = (
+            self._kp_scale,
+            self._kd_scale,
+            self._table_friction,
+            state.parameters.randomisation,
+        )
         state.launch(
             draw_dynamics_kernel,
             [self._nominal_kp, self._nominal_kd, *ranges, mask, state.rng],
@@ -175,7 +189,10 @@ class Randomiser:
         )
 
     def _draw_servos(self, mask: wp.array) -> None:
-        """Draw delays, friction, backlash and the like: the servos read them in every physics step."""
+        """Draw delays, friction, backlash and the like.
+
+        The servos read them in every physics step.
+        """
         state = self._state
         if state.sim.servo is not None:
             state.launch(
@@ -261,14 +278,18 @@ class Randomiser:
             [model.shape_material_mu],
             dim=model.shape_count,
         )
-        # The solver then puts fixed shapes back to where the model has them: tables that were taken away.
+        # The solver then puts fixed shapes back to where the model has them: tables that were taken
+        # away.
         places = state.sim.solver.mjw_data.geom_xpos
         wp.copy(self._places, places)
         state.sim.solver.notify_model_changed(flags)
         wp.copy(places, self._places)
 
     def stateful(self) -> dict[str, wp.array]:
-        """Arrays to save with a checkpoint. Masses are drawn from the seed alone and need no saving."""
+        """Arrays to save with a checkpoint.
+
+        Masses are drawn from the seed alone and need no saving.
+        """
         return {
             "kp": self.kp,
             "kd": self.kd,

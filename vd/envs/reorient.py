@@ -1,8 +1,8 @@
 """The in-hand reorientation environment: one call is one 12 Hz control step of N environments.
 
 World frame: z up, table top at z = 0. SI units, radians, quaternions xyzw. Everything but the
-physics is Warp kernels; a step copies nothing to the host, and it is one captured graph, on CPU and CUDA.
-What a step does stands in :meth:`ReorientEnv.launch_step`, in its order.
+physics is Warp kernels; a step copies nothing to the host, and it is one captured graph, on CPU and
+CUDA. What a step does stands in :meth:`ReorientEnv.launch_step`, in its order.
 """
 
 from typing import Any
@@ -31,8 +31,10 @@ from vd.kernels.task.success import success_kernel
 from vd.sim.graphs import Graphs
 
 FAILURES_AT_FIRST = 10.0
-"""Steps of environments that may fail beside those that ``failures_per_million`` allows (ours): one object
-in an unlucky start fails in the first step, again whenever the run is started anew, and is no rate."""
+"""Steps of environments that may fail beside those that ``failures_per_million`` allows (ours): one
+object in an unlucky start fails in the first step, again whenever the run is started anew, and is
+no rate.
+"""
 
 
 class ReorientEnv:
@@ -41,22 +43,28 @@ class ReorientEnv:
     Objects are over a table, but rest in a hand whose palm looks up, and then there is none.
     All arrays are Warp arrays on ``device``; ``wp.to_torch`` views them without copying.
 
-    Programs and own terms use :meth:`reset`, :meth:`step`, its halves :meth:`advance` and :meth:`renew`,
-    :meth:`give_goals`, :meth:`object_pose`, :meth:`check`, :meth:`close`, and:
+    Programs and own terms use :meth:`reset`, :meth:`step`, its halves :meth:`advance` and
+    :meth:`renew`, :meth:`give_goals`, :meth:`object_pose`, :meth:`check`, :meth:`close`, and:
 
     Attributes:
-        observation, privileged: What the actor reads, and the critic alone besides, shapes [N, O], [N, P].
-        action, smoothed: Actions of the step [N, A], and their moving average over all joints [N, D].
-        reward, reward_terms: Reward, and its terms (``reward_term_names``) unscaled, shapes [N], [N, T].
-        success, fell: 1 where the goal was reached, the object was lost, in this step, int32, shape [N].
+        observation, privileged: What the actor reads, and the critic alone besides, shapes [N, O],
+            [N, P].
+        action, smoothed: Actions of the step [N, A], and their moving average over all joints [N,
+            D].
+        reward, reward_terms: Reward, and its terms (``reward_term_names``) unscaled, shapes [N],
+            [N, T].
+        success, fell: 1 where the goal was reached, the object was lost, in this step, int32, shape
+            [N].
         timed_out: 1 where the episode ended by its length alone, int32, shape [N].
         ended: Not 0 where the episode ended, and the environment was reset, int32, shape [N].
         rotation_error: Angle to the goal at the end of the step, before resets [rad], shape [N].
         step_count: Control steps since the reset, int32, shape [N].
         goal_quat: Wanted orientation of the object, xyzw, shape [N].
-        measured_q, measured_qd: Joints as encoders report them [rad, rad/s], in the first D columns.
-        sim.joint_q, sim.joint_qd: Joints [rad, rad/s], then pose and velocity of the object (position [m] and
-            quaternion; linear [m/s] and angular [rad/s]), shapes [N, D + 7], [N, D + 6].
+        measured_q, measured_qd: Joints as encoders report them [rad, rad/s], in the first D
+            columns.
+        sim.joint_q, sim.joint_qd: Joints [rad, rad/s], then pose and velocity of the object
+            (position [m] and quaternion; linear [m/s] and angular [rad/s]), shapes [N, D + 7], [N,
+            D + 6].
         fingers.tip_pos: Fingertips in the world frame [m], shape [N, F].
     """
 
@@ -81,10 +89,19 @@ class ReorientEnv:
         self.state = state = build_task(cfg, self.device)
         """What this and its parts share."""
         self._launch = state.launch
-        self.hand, self.objects, self.scene, self.sim = state.hand, state.objects, state.scene, state.sim
+        self.hand, self.objects, self.scene, self.sim = (
+            state.hand,
+            state.objects,
+            state.scene,
+            state.sim,
+        )
         self.fingers, self.parameters = state.fingers, state.parameters
         self.measured_q, self.measured_qd = state.measured_q, state.measured_qd
-        self.smoothed, self.goal_quat, self.must_lift = state.smoothed, state.goal_quat, state.must_lift
+        self.smoothed, self.goal_quat, self.must_lift = (
+            state.smoothed,
+            state.goal_quat,
+            state.must_lift,
+        )
 
         self.num_envs = cfg.num_envs
         self.num_fingers = self.hand.num_fingers
@@ -106,22 +123,32 @@ class ReorientEnv:
         and what the critic alone is told, shape [N, P]."""
         present = self.observer.parts.get("present", slice(0, 0))
         self.num_present = present.stop - present.start
-        """Values of the present state and shape, the last of ``privileged``; 0 where none are told."""
+        """Values of the present state and shape, the last of ``privileged``; 0 where none are
+        told.
+        """
         self.world_observation, _ = self.observer.split(self.observer.world_values)
         """Observation in the world frame, shape [N, O]."""
         self.symmetry_frames = self.observer.symmetry_frames
-        """The symmetry frames in which the policy observes and acts; None where that is the world frame."""
+        """The symmetry frames in which the policy observes and acts; None where that is the world
+        frame.
+        """
         self.acts_in_frame = True
-        """Whether :meth:`step` takes actions in the symmetry frames, if any, or in the world's order."""
+        """Whether :meth:`step` takes actions in the symmetry frames, if any, or in the world's
+        order.
+        """
         leaves = cfg.table.away_share > 0.0
-        self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device) if leaves else None
+        self._table_steps = (
+            wp.array(table_steps(cfg), dtype=wp.int32, device=self.device) if leaves else None
+        )
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
         self.parameters.set_stage(self.stage)
         self._graphs = Graphs(self.device, captured=self.sim.solver.captured)
         self.steps = 0
-        """Control steps of all environments since the begin of the run, with those of a checkpoint."""
+        """Control steps of all environments since the begin of the run, with those of a
+        checkpoint.
+        """
         self._own_steps = 0
         if cfg.start.at_rest:
             self._rest_poses = wp.array(rest_poses(self), dtype=wp.transform, device=self.device)
@@ -147,9 +174,13 @@ class ReorientEnv:
         self.object_pose_end = zeros(n, dtype=wp.transform)
         """Object pose at the end of the step, before resets, shape [N]."""
         self.goal_counts = zeros(3)
-        """Goals ended, goals reached and objects lost since cleared, over all environments, shape [3]."""
+        """Goals ended, goals reached and objects lost since cleared, over all environments, shape
+        [3].
+        """
         self.clearance = zeros(n)
-        """Height of the object's lowest point above the table [m], shape [N]; 0 unless it is rewarded."""
+        """Height of the object's lowest point above the table [m], shape [N]; 0 unless it is
+        rewarded.
+        """
         self.previous_error = zeros(n)
         """Rotation error at the end of the last step, for the progress in it [rad], shape [N]."""
         self.ended = zeros(n, dtype=wp.int32)
@@ -173,7 +204,8 @@ class ReorientEnv:
 
         Args:
             object_quat: Start orientations of the objects, xyzw, shape [N, 4]; random by default.
-            goal_quat: Goal orientations, xyzw, either sign, shape [N, 4]; drawn as configured by default.
+            goal_quat: Goal orientations, xyzw, either sign, shape [N, 4]; drawn as configured by
+                default.
             seed: Begin the random streams anew from this; None: they go on.
         """
         if seed is not None:
@@ -183,7 +215,8 @@ class ReorientEnv:
                 given = np.asarray(given, dtype=np.float32)
                 if given.shape != (self.num_envs, 4):
                     raise ValueError(
-                        f"reset() takes orientations of shape ({self.num_envs}, 4), not {given.shape}"
+                        f"reset() takes orientations of shape ({self.num_envs}, 4), not "
+                        f"{given.shape}"
                     )
                 buffer.assign(given)
         self.ended.fill_(1)
@@ -194,7 +227,9 @@ class ReorientEnv:
         self.observe()
 
     def give_goals(self, envs: np.ndarray, goal_quat: np.ndarray) -> None:
-        """Give new goals to some environments in the middle of their episodes; the observation is fresh.
+        """Give new goals to some environments in the middle of their episodes.
+
+        The observation is fresh.
 
         Args:
             envs: Their numbers, shape [E].
@@ -212,7 +247,8 @@ class ReorientEnv:
         """Simulate one control step; environments that end are reset, and the observation is fresh.
 
         Args:
-            action: Actions in [-1, 1], shape [N, A]: a Warp array; ``wp.from_torch`` makes one of a tensor.
+            action: Actions in [-1, 1], shape [N, A]: a Warp array; ``wp.from_torch`` makes one of a
+                tensor.
         """
         if self._terms is None:
             self._take(action)
@@ -223,7 +259,9 @@ class ReorientEnv:
             self.renew()
 
     def advance(self, action: Any) -> None:
-        """The first half of :meth:`step`: simulate and judge; ``ended`` says where an episode is over.
+        """The first half of :meth:`step`: simulate and judge.
+
+        ``ended`` says where an episode is over.
 
         Arguments are those of :meth:`step`.
         """
@@ -233,7 +271,9 @@ class ReorientEnv:
             self._terms.pay(self)
 
     def renew(self, reset: wp.array | None = None) -> None:
-        """The other half of :meth:`step`: new goals where one was reached, resets, and the observation.
+        """The other half of :meth:`step`.
+
+        New goals where one was reached, resets, and the observation.
 
         Args:
             reset: 1 where to reset, int32, shape [N]; by default ``ended``, which becomes this.
@@ -249,14 +289,19 @@ class ReorientEnv:
     def _take(self, action: Any) -> None:
         """Put the actions of a step where the graph reads them."""
         if getattr(action, "ptr", None) is None or action.shape != self.action.shape:
-            raise ValueError(f"actions are an array {self.action.shape} of wp.from_torch, not {action!r:.40}")
+            raise ValueError(
+                f"actions are an array {self.action.shape} of wp.from_torch, not {action!r:.40}"
+            )
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
         self.steps += 1
         self._own_steps += 1
 
     def motion(self) -> dict[str, wp.array]:
-        """What the motion goes on from, the last targets included: arrays with a row for each; not copies."""
+        """What the motion goes on from, the last targets included: arrays with a row for each.
+
+        Not copies.
+        """
         sim = self.sim
         return {
             "joint_q": sim.joint_q,
@@ -267,7 +312,10 @@ class ReorientEnv:
         }
 
     def hold(self) -> None:
-        """One control step in which no policy acts and the hand keeps its last targets; nothing is reset."""
+        """One control step in which no policy acts and the hand keeps its last targets.
+
+        Nothing is reset.
+        """
         self._graphs.replay(self.sim.step)
 
     def _apply_action(self) -> None:
@@ -310,7 +358,9 @@ class ReorientEnv:
             self.observer.shapes.measure_clearance(sim.joint_q, self.num_joints, self.clearance)
         self._judge()
         self._end_episodes()
-        self._launch(keep_object_pose_kernel, [sim.joint_q, self.num_joints], [self.object_pose_end])
+        self._launch(
+            keep_object_pose_kernel, [sim.joint_q, self.num_joints], [self.object_pose_end]
+        )
 
     def _launch_renewal(self) -> None:
         """Give new goals, reset what has ended, and observe."""
@@ -414,7 +464,10 @@ class ReorientEnv:
         self.observer.begin(self.ended)
 
     def observe(self) -> None:
-        """Refresh the observation from the present state; :meth:`step` and :meth:`reset` have done so."""
+        """Refresh the observation from the present state.
+
+        :meth:`step` and :meth:`reset` have done so.
+        """
         self.observer.observe()
         if self._terms is not None:
             self._terms.observe(self)
@@ -426,7 +479,11 @@ class ReorientEnv:
         last = self._table_steps
         if self.hand.palm_up:
             return np.zeros(self.num_envs, bool)
-        return np.ones(self.num_envs, bool) if last is None else self.step_count.numpy() <= last.numpy()
+        return (
+            np.ones(self.num_envs, bool)
+            if last is None
+            else self.step_count.numpy() <= last.numpy()
+        )
 
     def object_pose(self) -> np.ndarray:
         """Present object poses, position [m] and quaternion xyzw, shape [N, 7] (host copy)."""

@@ -15,7 +15,9 @@ EARLIER_COLUMNS = 37
 """Servo parameters of checkpoints from before fingers had up to six joints."""
 
 
-def save_state(task: TaskState, arrays: Mapping[str, wp.array], stage: Stage, steps: int) -> dict[str, Any]:
+def save_state(
+    task: TaskState, arrays: Mapping[str, wp.array], stage: Stage, steps: int
+) -> dict[str, Any]:
     """Everything needed to continue exactly.
 
     Args:
@@ -54,7 +56,8 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         state: What was saved.
 
     Raises:
-        ValueError: If it belongs to another number of environments, other objects, another hand or servo
+        ValueError: If it belongs to another number of environments, other objects, another hand or
+            servo
         model.
     """
     # Checkpoints from before goals had an age: no goal is older than its episode.

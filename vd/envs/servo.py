@@ -1,4 +1,7 @@
-"""Which servo models the environments draw: a hand layer's values and intervals, Table S3, chosen effects."""
+"""Which servo models the environments draw.
+
+A hand layer's values and intervals, Table S3, chosen effects.
+"""
 
 import numpy as np
 
@@ -12,7 +15,8 @@ from vd.sim.joint_servo import has_effects
 def gain_scales(hand: HandModel, cfg: RandomisationCfg) -> tuple[np.ndarray, np.ndarray]:
     """Ranges of the factors on stiffness and damping, [D, 2] each.
 
-    The 95 % interval where the hand's layer has one, or else the configured range around the nominal value.
+    The 95 % interval where the hand's layer has one, or else the configured range around the
+    nominal value.
     """
     scales = []
     for column, nominal, span in (
@@ -26,7 +30,9 @@ def gain_scales(hand: HandModel, cfg: RandomisationCfg) -> tuple[np.ndarray, np.
 
 
 def servo_ranges(hand: HandModel, cfg: RandomisationCfg) -> np.ndarray:
-    """Range (low, high) from which each parameter of each joint is drawn, [D, P, 2]; equal ends are fixed.
+    """Range (low, high) from which each parameter of each joint is drawn, [D, P, 2].
+
+    Equal ends are fixed.
 
     Raises:
         ValueError: An effect to draw lacks a parameter without which it cannot be.
@@ -43,8 +49,8 @@ def servo_ranges(hand: HandModel, cfg: RandomisationCfg) -> np.ndarray:
 def needs_servo(ranges: np.ndarray) -> bool:
     """Whether any joint in any environment has more than a plain drive.
 
-    Stiffness and damping are randomised in the plain model too; a speed limit or an armature that differs
-    between environments takes the servo.
+    Stiffness and damping are randomised in the plain model too; a speed limit or an armature that
+    differs between environments takes the servo.
     """
     drives = ranges[:, [actuators.VELOCITY_LIMIT, actuators.INERTIA]]
     return has_effects(np.moveaxis(ranges, 2, 0)) or bool(np.any(drives[..., 0] != drives[..., 1]))
@@ -58,4 +64,6 @@ def _check_complete(ranges: np.ndarray, cfg: RandomisationCfg) -> None:
             if other.partition(".")[0] != effect or parameter.lower <= 0.0:
                 continue
             if (ranges[:, parameter.column, 0] <= 0.0).any():
-                raise ValueError(f"randomisation.effects has {name} but not {other}; give its range too")
+                raise ValueError(
+                    f"randomisation.effects has {name} but not {other}; give its range too"
+                )

@@ -1,4 +1,7 @@
-"""What is chosen once, when environments are built: sizes of objects, tables that leave, starts at rest."""
+"""What is chosen once, when environments are built.
+
+Sizes of objects, tables that leave, starts at rest.
+"""
 
 from typing import Any
 
@@ -23,8 +26,8 @@ def object_scales(random: RandomisationCfg) -> list[float]:
 def table_steps(cfg: ReorientCfg) -> np.ndarray:
     """Control steps for which each environment's table stays, int32, shape [N].
 
-    Which environments lose it, and when, is drawn once from the seed: an episode says nothing of it to the
-    policy.
+    Which environments lose it, and when, is drawn once from the seed: an episode says nothing of it
+    to the policy.
     """
     table, n = cfg.table, cfg.num_envs
     draw = np.random.default_rng(cfg.seed)
@@ -36,17 +39,20 @@ def table_steps(cfg: ReorientCfg) -> np.ndarray:
 def chosen(cfg: ReorientCfg, share: float) -> np.ndarray:
     """1 in a share of the environments, int32, shape [N].
 
-    They are chosen in the order of :func:`table_steps`: of two shares the smaller is a part of the larger.
+    They are chosen in the order of :func:`table_steps`: of two shares the smaller is a part of the
+    larger.
     """
     n = cfg.num_envs
     return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
 
 
 def rest_poses(env: Any) -> np.ndarray:
-    """Drop every object of a ReorientEnv a few times; where they came to lie, float, shape [N, K, 7].
+    """Drop every object of a ReorientEnv a few times.
 
-    A drop that left the claw is replaced by one of the same environment that did not, or, if all did, by the
-    start. Each is a position [m] and a quaternion xyzw.
+    Where they came to lie, float, shape [N, K, 7].
+
+    A drop that left the claw is replaced by one of the same environment that did not, or, if all
+    did, by the start. Each is a position [m] and a quaternion xyzw.
     """
     workspace, dropped = env.hand.workspace, []
     for _ in range(env.cfg.start.poses):
@@ -57,7 +63,9 @@ def rest_poses(env: Any) -> np.ndarray:
         env.check()
         dropped.append(env.object_pose())
     found = np.stack(dropped, axis=1)
-    inside = np.linalg.norm(found[:, :, :3] - workspace.goal_m, axis=2) < env.cfg.success.fall_of(workspace)
+    inside = np.linalg.norm(found[:, :, :3] - workspace.goal_m, axis=2) < env.cfg.success.fall_of(
+        workspace
+    )
     # Choose, for every slot, the slot itself or the first good one of the world.
     slot = np.where(inside, np.arange(len(dropped)), np.argmax(inside, axis=1)[:, None])
     poses = np.take_along_axis(found, slot[:, :, None], axis=1)

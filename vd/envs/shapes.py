@@ -1,4 +1,6 @@
-"""Shapes of objects on the device: what a teacher sees of them, and how high they are; without a simulator.
+"""Shapes of objects on the device: what a teacher sees of them, and how high they are.
+
+Without a simulator.
 
 N environments, D joints, F fingers, B bodies. World frame: z up; metres, quaternions xyzw.
 """
@@ -56,7 +58,13 @@ class ShapeObserver:
         launch(clearance_kernel, len(out), [*self._shapes, column, table, joint_q], [out])
 
     def observe(
-        self, joint_q: wp.array, column: int, body_q: wp.array, goal: wp.array, out: wp.array, first: int = 0
+        self,
+        joint_q: wp.array,
+        column: int,
+        body_q: wp.array,
+        goal: wp.array,
+        out: wp.array,
+        first: int = 0,
     ) -> None:
         """Write what is seen of the shapes.
 

@@ -40,7 +40,10 @@ class FreeStarts:
         self._depth = state.zeros(state.num_envs, len(self._places))
 
     def move(self, reset: wp.array) -> None:
-        """Move the objects of the environments of ``reset`` [N], once they are reset. Device work only."""
+        """Move the objects of the environments of ``reset`` [N], once they are reset.
+
+        Device work only.
+        """
         state, places = self._state, self._places
         state.launch(
             start_depth_kernel,
@@ -58,11 +61,16 @@ class FreeStarts:
             [self._depth],
             dim=(*self._depth.shape, CHUNKS),
         )
-        state.launch(move_start_kernel, [places, state.num_joints, reset], [self._depth, state.sim.joint_q])
+        state.launch(
+            move_start_kernel, [places, state.num_joints, reset], [self._depth, state.sim.joint_q]
+        )
 
 
 def rounded_box(shape: CollisionShape) -> tuple[tuple[float, ...], float]:
-    """Half extents and radius [m] of the rounded box that a shape is; of a cylinder the box around it."""
+    """Half extents and radius [m] of the rounded box that a shape is.
+
+    Of a cylinder the box around it.
+    """
     match shape.kind:
         case "sphere":
             return (0.0, 0.0, 0.0), shape.size[0]

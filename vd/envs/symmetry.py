@@ -1,10 +1,17 @@
-"""The symmetry frames of :mod:`vd.kernels.task.symmetry` in the environments of a task: their launches."""
+"""The symmetry frames of :mod:`vd.kernels.task.symmetry` in the environments of a task.
+
+Their launches.
+"""
 
 import warp as wp
 
 from vd.envs.symmetry_frames import symmetry_frames
 from vd.envs.task_state import TaskState
-from vd.kernels.task.symmetry import choose_frame_kernel, frame_observation_kernel, world_action_kernel
+from vd.kernels.task.symmetry import (
+    choose_frame_kernel,
+    frame_observation_kernel,
+    world_action_kernel,
+)
 
 
 class ChosenFrames:
@@ -13,7 +20,8 @@ class ChosenFrames:
     Attributes:
         tables: What they are made of.
         chosen: Symmetry frame of each environment, from 0, shape [N].
-        observation: Observation in the world frame, shape [N, A]; what its frames show goes to ``out``.
+        observation: Observation in the world frame, shape [N, A]; what its frames show goes to
+            ``out``.
     """
 
     def __init__(self, state: TaskState, out: wp.array):
@@ -24,7 +32,8 @@ class ChosenFrames:
             out: Where the observation is written as its frames show it, shape [N, A].
 
         Raises:
-            ValueError: The hand has no such frames, see :func:`vd.envs.symmetry_frames.symmetry_frames`.
+            ValueError: The hand has no such frames, see
+                :func:`vd.envs.symmetry_frames.symmetry_frames`.
         """
         self._state, self._out = state, out
         device, envs = state.device, state.num_envs
@@ -60,9 +69,15 @@ class ChosenFrames:
         )
 
     def world_action(self, action: wp.array, out: wp.array | None = None) -> wp.array:
-        """Action of the frames, shape [N, D], with the joints in the world's order; in ``out`` if given."""
+        """Action of the frames, shape [N, D], with the joints in the world's order.
+
+        In ``out`` if given.
+        """
         out = self._action if out is None else out
         self._state.launch(
-            world_action_kernel, [self._joints, self._sign, self.chosen, action], [out], dim=action.shape
+            world_action_kernel,
+            [self._joints, self._sign, self.chosen, action],
+            [out],
+            dim=action.shape,
         )
         return out

@@ -19,20 +19,24 @@ from vd.kernels.task.shapes import extent_directions, shape_observation_slices
 TERMS = 4
 """Most values that a turned value is made of: those of a quaternion."""
 TOLERANCE_M = 1e-4
-"""Farthest that a turned fingertip may be from the one whose place it takes; of a mirrored one's axes
-likewise."""
+"""Farthest that a turned fingertip may be from the one whose place it takes; of a mirrored one's
+axes likewise."""
 SECTOR = np.array([1.0, 0.0, 0.0])
 """Frames turn the axis of the wanted rotation near to this direction, world frame; any would do."""
 UP = np.array([0.0, 0.0, 10.0])
-"""Added to it where there are mirrors, so that up counts before the sector does: seen from above, wanted
-rotations are counter-clockwise, but for axes within 2 degrees of level (ours)."""
+"""Added to it where there are mirrors, so that up counts before the sector does: seen from above,
+wanted rotations are counter-clockwise, but for axes within 2 degrees of level (ours)."""
 MIRROR_SIGNS = np.array([-1.0, 1.0, 1.0])
-"""Factors on the angles of a finger in the mirror: it swings to the other side, and bends as before.
-The first joint is the one that swings (hand's description, joint order)."""
+"""Factors on the angles of a finger in the mirror: it swings to the other side, and bends as
+before. The first joint is the one that swings (hand's description, joint order)."""
 OBJECT_MIRROR = np.diag([1.0, -1.0, 1.0])
-"""What is mirrored has left-handed axes; its y axis is turned round, of fingertips and objects alike."""
+"""What is mirrored has left-handed axes; its y axis is turned round, of fingertips and objects
+alike.
+"""
 BENT = np.array([0.3, 0.5, -0.4])
-"""Angles [rad] of every finger, far from zero, at which a hand has to be its own mirror image (ours)."""
+"""Angles [rad] of every finger, far from zero, at which a hand has to be its own mirror image
+(ours).
+"""
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,9 @@ class SymmetryFrames:
     sign: np.ndarray
     """-1 where that joint turns the other way, else 1 [V, D]."""
     sector: np.ndarray
-    """The direction near which a frame has the axis of the wanted rotation, as it is in the world [V, 3]."""
+    """The direction near which a frame has the axis of the wanted rotation, as it is in the world
+    [V, 3].
+    """
 
 
 def symmetry_frames(hand: HandModel, observation: ObservationCfg, view: View) -> SymmetryFrames:
@@ -59,11 +65,12 @@ def symmetry_frames(hand: HandModel, observation: ObservationCfg, view: View) ->
     Args:
         hand: The hand.
         observation: What is observed.
-        view: What goals are seen in (``ObservationCfg.view``); frames in the mirror come after the others.
+        view: What goals are seen in (``ObservationCfg.view``); frames in the mirror come after the
+            others.
 
     Raises:
-        ValueError: The fingers are not spaced evenly about the vertical, or the hand is not its own mirror
-            image, or has joints that follow others.
+        ValueError: The fingers are not spaced evenly about the vertical, or the hand is not its own
+            mirror image, or has joints that follow others.
     """
     if len(hand.actuated) < hand.num_joints:
         raise ValueError(f"joints of {hand.name} follow others; set observation.view to world")
@@ -116,7 +123,9 @@ def _mirror(hand: HandModel, tips: np.ndarray) -> np.ndarray:
     bent, opposite = _tips(hand, BENT)[source], _tips(hand, MIRROR_SIGNS * BENT)
     apart = np.linalg.norm(bent[:, :3] @ mirror.T - opposite[:, :3], axis=1)
     axes = Rotation.from_quat(bent[:, 3:]).as_matrix()
-    twisted = np.abs(mirror @ axes @ OBJECT_MIRROR - Rotation.from_quat(opposite[:, 3:]).as_matrix())
+    twisted = np.abs(
+        mirror @ axes @ OBJECT_MIRROR - Rotation.from_quat(opposite[:, 3:]).as_matrix()
+    )
     if max(apart.max(), twisted.max()) > TOLERANCE_M:
         raise ValueError(refusal)
     return mirror
@@ -129,7 +138,8 @@ def _finger_source(tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
     source = np.argmin(distance, axis=0)
     if sorted(source) != list(range(len(tips))) or distance.min(axis=0).max() > TOLERANCE_M:
         raise ValueError(
-            "the fingers of this hand are not spaced evenly about the vertical; set observation.view to world"
+            "the fingers of this hand are not spaced evenly about the vertical; set "
+            "observation.view to world"
         )
     return source
 
@@ -144,11 +154,13 @@ def _joint_signs(turn: np.ndarray, fingers: int, each: int) -> np.ndarray:
     return np.tile(MIRROR_SIGNS if np.linalg.det(turn) < 0.0 else np.ones(each), fingers)
 
 
-def _observation_offset(hand: HandModel, observation: ObservationCfg, turn: np.ndarray) -> np.ndarray:
+def _observation_offset(
+    hand: HandModel, observation: ObservationCfg, turn: np.ndarray
+) -> np.ndarray:
     """What is added in a frame to what :func:`_observation_map` makes [A].
 
-    An angle is observed as it lies between its limits, from -1 to 1; of one that is turned round these are
-    the limits of the other side.
+    An angle is observed as it lies between its limits, from -1 to 1; of one that is turned round
+    these are the limits of the other side.
     """
     parts = observation_parts(observation, hand.num_fingers, hand.num_joints)
     offset = np.zeros(max(columns.stop for columns in parts.values()))
@@ -156,7 +168,9 @@ def _observation_offset(hand: HandModel, observation: ObservationCfg, turn: np.n
     turned_round = _joint_signs(turn, hand.num_fingers, hand.joints_per_finger) < 0.0
     columns = teacher_observation_slices(hand.num_fingers, hand.num_joints)["joint_position"]
     for part in {"state", "present"} & parts.keys():
-        offset[parts[part]][columns] = np.where(turned_round, -2.0 * (upper + lower) / (upper - lower), 0.0)
+        offset[parts[part]][columns] = np.where(
+            turned_round, -2.0 * (upper + lower) / (upper - lower), 0.0
+        )
     return offset
 
 
@@ -212,7 +226,9 @@ def _observation_map(
         first = parts["shape"].start
         for name, columns in shape_observation_slices(count).items():
             slices[name] = slice(first + columns.start, first + columns.stop)
-    blocks["dynamics"] = block_diag(np.kron(np.eye(JOINT_CHANNELS), np.abs(joints)), np.eye(SCALARS))
+    blocks["dynamics"] = block_diag(
+        np.kron(np.eye(JOINT_CHANNELS), np.abs(joints)), np.eye(SCALARS)
+    )
     for name in ("terms", "critic_terms"):  # own values, of which nobody here knows how they turn
         blocks[name] = np.eye(sum(getattr(observation, name).values()))
     slices |= {name: columns for name, columns in parts.items() if name in blocks}
@@ -232,7 +248,8 @@ def _orientation_map(turn: np.ndarray) -> np.ndarray:
     """Matrix [4, 4] from an orientation R, a quaternion xyzw, to ``turn`` R, in a mirror ``turn`` R M."""
     if np.linalg.det(turn) > 0.0:
         return _left_product(Rotation.from_matrix(turn).as_quat())
-    # turn R M = (turn M)(M R M), M = OBJECT_MIRROR: M R M turns about the mirrored axis, the other way.
+    # turn R M = (turn M)(M R M), M = OBJECT_MIRROR: M R M turns about the mirrored axis, the other
+    # way.
     mirrored = np.diag([*-np.diag(OBJECT_MIRROR), 1.0])
     return _left_product(Rotation.from_matrix(turn @ OBJECT_MIRROR).as_quat()) @ mirrored
 

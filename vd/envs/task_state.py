@@ -1,4 +1,7 @@
-"""What the parts of the environment share: the task, its simulation, and arrays of a row an environment."""
+"""What the parts of the environment share.
+
+The task, its simulation, and arrays of a row an environment.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +25,10 @@ from vd.sim.simulator import Simulator
 
 @dataclass(frozen=True)
 class TaskState:
-    """N environments with a hand of F fingers and D joints, and an object. Arrays are on ``device``."""
+    """N environments with a hand of F fingers and D joints, and an object.
+
+    Arrays are on ``device``.
+    """
 
     cfg: ReorientCfg
     device: str
@@ -62,10 +68,17 @@ class TaskState:
         return wp.zeros(shape, dtype=dtype, device=self.device)
 
     def launch(
-        self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any], *, dim: int | tuple[int, ...] = 0
+        self,
+        kernel: wp.Kernel,
+        inputs: list[Any],
+        outputs: list[Any],
+        *,
+        dim: int | tuple[int, ...] = 0,
     ) -> None:
         """Launch a kernel on the task's device; ``dim`` is N unless it is given."""
-        wp.launch(kernel, dim=dim or self.num_envs, inputs=inputs, outputs=outputs, device=self.device)
+        wp.launch(
+            kernel, dim=dim or self.num_envs, inputs=inputs, outputs=outputs, device=self.device
+        )
 
     @property
     def num_envs(self) -> int:
@@ -92,7 +105,8 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
     hand, objects = load_hand(cfg.hand, cfg.fingertip, cfg.hand_layer), load_set(list(cfg.objects))
     if hand.palm_up and (cfg.table.away_share > 0.0 or cfg.table.lift_share > 0.0):
         raise ValueError(
-            f"{hand.name} looks up, so there is no table: leave table.away_share and table.lift_share at 0"
+            f"{hand.name} looks up, so there is no table: leave table.away_share and "
+            f"table.lift_share at 0"
         )
     if cfg.fit_objects:
         objects = [item.fitted(hand.workspace.size_m) for item in objects]

@@ -1,7 +1,10 @@
-"""A user's own terms of reward and observation: functions of the environment, named by the configuration.
+"""A user's own terms of reward and observation.
 
-A function takes the :class:`vd.envs.reorient.ReorientEnv` and gives a torch tensor on its device: [N] for the
-reward, [N] or [N, K] for the observation. It reads the environment and writes nothing to it.
+Functions of the environment, named by the configuration.
+
+A function takes the :class:`vd.envs.reorient.ReorientEnv` and gives a torch tensor on its device:
+[N] for the reward, [N] or [N, K] for the observation. It reads the environment and writes nothing
+to it.
 """
 
 import importlib
@@ -31,11 +34,15 @@ class OwnTerms:
         self._coefficients, self._scale = cfg.reward.terms, cfg.reward.scale
         seen, told = cfg.observation.terms, cfg.observation.critic_terms
         if twice := sorted(seen.keys() & told.keys()):
-            raise ValueError(f"observation.critic_terms has {twice[0]}, which the critic is shown already")
+            raise ValueError(
+                f"observation.critic_terms has {twice[0]}, which the critic is shown already"
+            )
         self._sizes, self._told = cfg.observation.own, told
         if wrong := [name for name, size in self._sizes.items() if size < 1]:
             raise ValueError(f"observation.terms: {wrong[0]} has to give 1 value or more")
-        self._functions = {name: _function(name) for name in self._coefficients.keys() | self._sizes.keys()}
+        self._functions = {
+            name: _function(name) for name in self._coefficients.keys() | self._sizes.keys()
+        }
         self._not_finite: dict[str, torch.Tensor] = {}
         self._steps = 0
 
@@ -55,7 +62,10 @@ class OwnTerms:
         observer = env.observer
         first = {part: columns.start for part, columns in observer.parts.items()}
         for name, size in self._sizes.items():
-            value, part = self._value(env, name, size), "critic_terms" if name in self._told else "terms"
+            value, part = (
+                self._value(env, name, size),
+                "critic_terms" if name in self._told else "terms",
+            )
             for array in (observer.world_values, observer.all_values):
                 wp.to_torch(array)[:, first[part] : first[part] + size] = value
             first[part] += size
@@ -71,14 +81,18 @@ class OwnTerms:
         """
         for name, seen in self._not_finite.items():
             if bool(seen):
-                raise ValueError(f"the own term {name} gave a value that is not finite; mend the function")
+                raise ValueError(
+                    f"the own term {name} gave a value that is not finite; mend the function"
+                )
 
     def _value(self, env: Any, name: str, size: int) -> torch.Tensor:
         """What a function gives [N, K]."""
         try:
             value = self._functions[name](env)
         except Exception as error:
-            raise ValueError(f"the own term {name} raised {type(error).__name__}: {error}") from error
+            raise ValueError(
+                f"the own term {name} raised {type(error).__name__}: {error}"
+            ) from error
         shape: Any = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
         fits = shape in {(env.num_envs, size), (env.num_envs,) if size == 1 else None}
         if not fits or value.device != torch.device(env.device):
@@ -101,7 +115,8 @@ def _function(name: str) -> Callable[[Any], torch.Tensor]:
         found: Any = getattr(importlib.import_module(module), function)
     except Exception as error:
         raise ValueError(
-            f"the own term {name!r} is not found ({error}); name it module:function, and run where that "
+            f"the own term {name!r} is not found ({error}); name it module:function, and run where "
+            f"that "
             "module can be imported"
         ) from error
     finally:

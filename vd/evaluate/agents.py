@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from vd.assets_usd.cache import assets_dir
 from vd.bundle import is_bundle
-from vd.envs.cfg import CurriculumCfg, ObservationCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TableCfg
+from vd.envs.cfg import (
+    CurriculumCfg,
+    ObservationCfg,
+    RandomisationCfg,
+    ReorientCfg,
+    SuccessCfg,
+    TableCfg,
+)
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -20,9 +27,13 @@ BUILT_IN = ("zero", "random")
 POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 """Policies of the package, and POLICY_LIST. A wheel has two of them, a checkout all."""
 POLICY_LIST = "policies.json"
-"""Tells of the policies of a folder (:mod:`vd.policy_store`), in a wheel also of those that it lacks."""
+"""Tells of the policies of a folder (:mod:`vd.policy_store`), in a wheel also of those that it
+lacks.
+"""
 SHIPPED_POLICIES = {path.stem: path for path in sorted(POLICY_FOLDER.glob("*.pt"))}
-"""Trained policies that are installed with the package, by name: ``<hand>`` or ``<hand>-<task>``."""
+"""Trained policies that are installed with the package, by name: ``<hand>`` or
+``<hand>-<task>``.
+"""
 
 REPLACED = {
     "dclaw3-student": "dclaw3-tracking",
@@ -55,7 +66,9 @@ def installed_policies() -> dict[str, Path]:
 
 
 def find_policy(name: str | Path) -> Path:
-    """The policy file that ``name`` means: one that is installed, a file, or the best one of a run's folder.
+    """The policy file that ``name`` means.
+
+    One that is installed, a file, or the best one of a run's folder.
 
     The name of an installed policy means that one; write ``./name`` for a folder called the same.
 
@@ -74,7 +87,8 @@ def find_policy(name: str | Path) -> Path:
     known = json.loads((POLICY_FOLDER / POLICY_LIST).read_text())["policies"]
     if not path.exists() and str(name) in known:
         raise ValueError(
-            f"the policy {name} is not on this machine: vd-policies pull {name} --at PLACE, such as the "
+            f"the policy {name} is not on this machine: vd-policies pull {name} --at PLACE, such "
+            f"as the "
             "folder vd/policies of a checkout"
         )
     if not path.is_dir():
@@ -86,7 +100,9 @@ def find_policy(name: str | Path) -> Path:
     for candidate in _RUN_FILES:
         if (path / candidate).is_file():
             return path / candidate
-    raise FileNotFoundError(f"{path} holds no {' or '.join(_RUN_FILES)}; give a policy.pt or a checkpoint")
+    raise FileNotFoundError(
+        f"{path} holds no {' or '.join(_RUN_FILES)}; give a policy.pt or a checkpoint"
+    )
 
 
 def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None = None) -> None:
@@ -103,13 +119,20 @@ def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None 
 
 
 def policy_name(name: str | Path) -> str:
-    """``name`` as it is told to others: the name of an installed policy if it is the file of one."""
+    """``name`` as it is told to others.
+
+    The name of an installed policy if it is the file of one.
+    """
     path = Path(name).resolve()
-    return next((known for known, file in installed_policies().items() if file.resolve() == path), str(name))
+    return next(
+        (known for known, file in installed_policies().items() if file.resolve() == path), str(name)
+    )
 
 
 def open_policy(name: str, device: str) -> "TrainedPolicy | TrackingPolicy | None":
-    """Load what :func:`find_policy` finds; None for a built-in agent, which has to know its task first.
+    """Load what :func:`find_policy` finds.
+
+    None for a built-in agent, which has to know its task first.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -148,12 +171,16 @@ def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
     return policy
 
 
-def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_layer: str | None = None) -> None:
-    """Refuse a policy that moves another hand, before anything slow; agents without a file move any.
+def check_fits(
+    name: str, policy: Any | None, hand: str | None = None, hand_layer: str | None = None
+) -> None:
+    """Refuse a policy that moves another hand, before anything slow.
+
+    Agents without a file move any.
 
     Raises:
-        vd.bundle.contract.ContractError: A bundle of another hand, or a policy whose hand has changed since;
-            names field, found, expected and remedy.
+        vd.bundle.contract.ContractError: A bundle of another hand, or a policy whose hand has
+            changed since; names field, found, expected and remedy.
         ValueError: The hand has another name or number of joints, or cannot be read.
     """
     if policy is None:
@@ -168,7 +195,9 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
 
         return check_hand(read_contract(path), model, path)
     own = ReorientCfg.of(policy).hand
-    if policy.num_actions != len(model.actuated) or (task.hand != own and root_name(own) != model.name):
+    if policy.num_actions != len(model.actuated) or (
+        task.hand != own and root_name(own) != model.name
+    ):
         raise ValueError(
             f"{name} was trained for {own} ({policy.num_actions} motors), not for {model.name} "
             f"({len(model.actuated)}); use the hand it was trained for: --hand {own}"
@@ -181,7 +210,9 @@ def check_fits(name: str, policy: Any | None, hand: str | None = None, hand_laye
 
 def _on_hand(task: ReorientCfg, hand: str | None, hand_layer: str | None) -> ReorientCfg:
     """A task with the hand and layer that were asked for; None: as trained."""
-    layer = task.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer
+    layer = (
+        task.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer
+    )
     return replace(task, hand=hand or task.hand, hand_layer=layer)
 
 
@@ -199,8 +230,8 @@ def task_for(
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
 
-    Physics, actions and rewards are those of the training; the success criteria are the paper's, whatever
-    the policy was trained with, so that rates can be compared; there is no curriculum.
+    Physics, actions and rewards are those of the training; the success criteria are the paper's,
+    whatever the policy was trained with, so that rates can be compared; there is no curriculum.
 
     Args:
         policy: A trained policy, or None.
@@ -216,8 +247,12 @@ def task_for(
     base = ReorientCfg.of(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     if sees_clouds(policy):  # who does not look at its teacher's observation
         base = replace(base, observation=ObservationCfg())
-    seen = replace(base.observation, dynamics="none", critic_terms={})  # nobody asks the critic here
-    base = replace(base, observation=seen, reward=replace(base.reward, terms={}))  # and nobody is paid
+    seen = replace(
+        base.observation, dynamics="none", critic_terms={}
+    )  # nobody asks the critic here
+    base = replace(
+        base, observation=seen, reward=replace(base.reward, terms={})
+    )  # and nobody is paid
     return replace(
         _on_hand(base, hand, hand_layer),
         success=replace(SuccessCfg(), rotation_rad=stop_tolerance_rad),

@@ -73,8 +73,8 @@ class HandFlags:
     hand: str | None = None
     """dclaw3, dclaw4, an imported hand or a hand's USD; by default the policy's, or dclaw4."""
     hand_layer: str | None = None
-    """Layer over the hand with a servo model, identified.usda of vd-gap; by default the policy's, none for
-    the hand as it is."""
+    """Layer over the hand with a servo model, identified.usda of vd-gap; by default the policy's,
+    none for the hand as it is."""
 
 
 @dataclass(kw_only=True)
@@ -86,17 +86,19 @@ class EpisodeFlags(TaskFlags):
     stop_tolerance: float = PAPER.success.rotation_rad
     """An episode stops below this error [rad]; 0.1 for the paper's precise variant."""
     episode_s: float | None = None
-    """Time limit of an episode [s]; 10 by default, 15 with --in-air, 39 with --air-goals of vd-eval, of
-    whose --consecutive it is the time for each goal."""
+    """Time limit of an episode [s]; 10 by default, 15 with --in-air, 39 with --air-goals of
+    vd-eval, of whose --consecutive it is the time for each goal."""
     goals: Goals = "mesh"
-    """What camera policies know shapes and goals by: the exact mesh; 500 exact points, as the paper's; or a
-    scan, points with 4 mm of noise and a fifth missing. A surface is laid through points."""
+    """What camera policies know shapes and goals by: the exact mesh; 500 exact points, as the
+    paper's; or a scan, points with 4 mm of noise and a fifth missing. A surface is laid through
+    points.
+    """
     sensor_errors: bool = True
-    """Cameras of policies err as a D415 does: noise, gaps, late images, not quite where it is believed
-    (docs/concepts/perception.md). Without: as in their training."""
+    """Cameras of policies err as a D415 does: noise, gaps, late images, not quite where it is
+    believed (docs/concepts/perception.md). Without: as in their training."""
     num_envs: int | None = None
-    """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a GPU (1024
-    with camera policies)."""
+    """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a
+    GPU (1024 with camera policies)."""
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
@@ -107,31 +109,36 @@ class EpisodeFlags(TaskFlags):
 class EvalCfg(HandFlags, EpisodeFlags):
     """Evaluate policies: every object from the same starts to the same goals, whatever the policy.
 
-    Objects fall into the hand from orientations uniform on SO(3), or, with --at-rest, lie on the table.
+    Objects fall into the hand from orientations uniform on SO(3), or, with --at-rest, lie on the
+    table.
 
     Writes eval.json (every episode) and eval.html (one page) and prints tables. Episodes are
-    recorded to their ends; rules that stop them are applied to the record. Camera policies stop by the
-    distance that they predict and, for comparison, by the true one; others by the true one and, as a second
-    row, at the first step at which all success criteria of training hold, stillness included.
+    recorded to their ends; rules that stop them are applied to the record. Camera policies stop by
+    the distance that they predict and, for comparison, by the true one; others by the true one and,
+    as a second row, at the first step at which all success criteria of training hold, stillness
+    included.
 
-    --suite paper runs all of the paper's evaluations in simulation and writes paper.json and paper.html, its
-    figures beside ours. --suite robust changes one thing after the other and writes robust.json and
-    robust.html. What is finished is not repeated by the next call.
+    --suite paper runs all of the paper's evaluations in simulation and writes paper.json and
+    paper.html, its figures beside ours. --suite robust changes one thing after the other and writes
+    robust.json and robust.html. What is finished is not repeated by the next call.
     """
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = ()
     suite: Literal["paper", "robust"] | None = None
-    """Run the paper's evaluations, or those of every --condition, on the D'Claw policies if none is named.
-    --objects training=FOLDER held-out=FOLDER names objects; without, our procedural sets stand for them."""
+    """Run the paper's evaluations, or those of every --condition, on the D'Claw policies if none is
+    named. --objects training=FOLDER held-out=FOLDER names objects; without, our procedural sets
+    stand for them.
+    """
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
     """Of the suite only a part, with few objects and episodes: minutes on two CPU cores."""
     jobs: int = 1
     """Of a suite, evaluations side by side, each in a process of its own, spread over the GPUs."""
     shard: str | None = None
-    """I/N: of a suite every N-th evaluation from the I-th, from 0, for arrays of jobs. The same command
-    without it runs what is missing in --out and writes the page."""
+    """I/N: of a suite every N-th evaluation from the I-th, from 0, for arrays of jobs. The same
+    command without it runs what is missing in --out and writes the page."""
     objects: tuple[str, ...] = ()
-    """Object sets by name, folders or files (vd-assets makes them); cube by default. NAME=SET puts one into a
+    """Object sets by name, folders or files (vd-assets makes them); cube by default. NAME=SET puts
+    one into a
     group, which gets figures of its own: training=FOLDER held-out=FOLDER symmetric=symmetric."""
     max_goal_angle: float = math.pi
     """Goals are within this angle [rad] of the start; pi is all of SO(3)."""
@@ -141,20 +148,24 @@ class EvalCfg(HandFlags, EpisodeFlags):
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
     air_goals: tyro.conf.FlagCreatePairsOff[bool] = False
-    """The same, and a second later goal after goal, three with 12 s for each; what reaches the first is also
-    held for 30 s. Success is of the first."""
+    """The same, and a second later goal after goal, three with 12 s for each; what reaches the
+    first is also held for 30 s. Success is of the first."""
     consecutive: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Successes in a row: goal after goal, 50 at most, until the object is lost or one is not reached within
-    --episode-s. The distance decides; neither action nor stillness is asked for."""
+    """Successes in a row: goal after goal, 50 at most, until the object is lost or one is not
+    reached within --episode-s. The distance decides; neither action nor stillness is asked for."""
     table_friction: float | None = None
-    """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
+    """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by
+    default.
+    """
     condition: Condition | None = None
-    """Evaluate in a named condition, whatever the training: nominal; s3, Table S3; hard, the same with forces
-    that last a control step; mixed, Table S3 with friction, backlash, late commands and a late object;
-    observation-late (the object), all-late (joints too) and command-late, 83 ms and nothing else; the others
-    change one thing, which the page of --suite robust names."""
+    """Evaluate in a named condition, whatever the training: nominal; s3, Table S3; hard, the same
+    with forces that last a control step; mixed, Table S3 with friction, backlash, late commands and
+    a late object; observation-late (the object), all-late (joints too) and command-late, 83 ms and
+    nothing else; the others change one thing, which the page of --suite robust names."""
     engine: Engine = "newton"
-    """What steps the physics: as in training, or MuJoCo's own engine in C, in steps of 1 ms, on the CPU."""
+    """What steps the physics: as in training, or MuJoCo's own engine in C, in steps of 1 ms, on the
+    CPU.
+    """
     out: Path = Path("runs/eval")
     """Folder for eval.json and eval.html."""
     json: bool = False
@@ -169,7 +180,8 @@ class EvalCfg(HandFlags, EpisodeFlags):
         """
         if not self.policies and self.suite is None:
             raise ValueError(
-                f"name a policy: a file, zero, random, or an installed one ({', '.join(SHIPPED_POLICIES)})"
+                f"name a policy: a file, zero, random, or an installed one "
+                f"({', '.join(SHIPPED_POLICIES)})"
             )
         shipped = (name for name in SHIPPED_POLICIES if name.partition("-")[0] in HANDS)
         return tuple(dict.fromkeys(self.policies or shipped))
@@ -212,9 +224,13 @@ class EvalCfg(HandFlags, EpisodeFlags):
         require(self, "--", "positive", "jobs max_goal_angle")
         require(self, "--", "zero or positive", "table_friction")
         if self.max_goal_angle > math.pi + 1e-6:
-            raise ValueError(f"--max-goal-angle is {self.max_goal_angle}; it must be at most pi rad")
+            raise ValueError(
+                f"--max-goal-angle is {self.max_goal_angle}; it must be at most pi rad"
+            )
         if self.engine == "mujoco" and self.device.startswith("cuda"):
-            raise ValueError(f"--engine mujoco steps on the CPU, not on {self.device}; leave --device out")
+            raise ValueError(
+                f"--engine mujoco steps on the CPU, not on {self.device}; leave --device out"
+            )
         given = [name for name, value in vars(EvalCfg()).items() if getattr(self, name) != value]
         for names in EXCLUSIVE:
             if len(both := [flag(name) for name in names if name in given]) > 1:
@@ -226,7 +242,9 @@ class EvalCfg(HandFlags, EpisodeFlags):
             )
         decided = [flag(name) for name in OF_THE_SUITE if self.suite and name in given]
         if decided:
-            raise ValueError(f"{' and '.join(decided)} is decided by --suite {self.suite}; leave it out")
+            raise ValueError(
+                f"{' and '.join(decided)} is decided by --suite {self.suite}; leave it out"
+            )
 
 
 def flag(name: str) -> str:
@@ -235,7 +253,10 @@ def flag(name: str) -> str:
 
 
 def episode_limit_s(episode_s: float | None, *, in_air: bool) -> float:
-    """Length of an episode [s]: as asked for, or that of the paper's test on the table or in the air."""
+    """Length of an episode [s].
+
+    As asked for, or that of the paper's test on the table or in the air.
+    """
     if episode_s is not None:
         return episode_s
     return PAPER.scene.air_episode_s if in_air else PAPER.scene.episode_s
@@ -253,6 +274,8 @@ def parse_groups(objects: Sequence[str]) -> dict[str, tuple[str, ...]]:
         if not equals:
             name, sets = "objects", item
         if not name or not sets:
-            raise ValueError(f"--objects: '{item}' has to be NAME=SET, such as training=procedural-150-seed0")
+            raise ValueError(
+                f"--objects: '{item}' has to be NAME=SET, such as training=procedural-150-seed0"
+            )
         groups[name] = (*groups.get(name, ()), sets)
     return groups

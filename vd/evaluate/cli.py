@@ -42,7 +42,8 @@ def _evaluate(cfg: EvalCfg) -> int:
         result = run_suite(cfg)
     if cfg.shard is not None:
         print(
-            f"{cfg.out}: part {cfg.shard}; the same command without --shard writes the page", file=sys.stderr
+            f"{cfg.out}: part {cfg.shard}; the same command without --shard writes the page",
+            file=sys.stderr,
         )
     elif not cfg.json:
         print(f"{terminal_text(result)}\n{written}\n{page}")

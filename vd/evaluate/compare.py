@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from vd.evaluate.result import Agent, Protocol, Result
 
 ENVS_CPU, ENVS_GPU, ENVS_CAMERA_GPU = 64, 8192, 1024
-"""Environments simulated at once by default: enough to keep the device busy, few enough to fit anywhere;
-images and clouds take memory."""
+"""Environments simulated at once by default: enough to keep the device busy, few enough to fit
+anywhere; images and clouds take memory."""
 _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "mujoco", "torch")
 
 
@@ -61,7 +61,10 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
     for name, policy in policies.items():
         wanted = task_of(cfg, policy, everything, envs)
         if task != wanted:
-            print("building the environments (the first start compiles kernels: minutes)", file=sys.stderr)
+            print(
+                "building the environments (the first start compiles kernels: minutes)",
+                file=sys.stderr,
+            )
             if env is not None:
                 env.close()
             env = ReorientEnv(wanted, device)
@@ -77,7 +80,9 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
             objects = [env.objects[number] for number in chosen]
             protocol = _protocol(cfg, wanted, sets, agent.sees)
             judged = judge if cfg.series is None else judge_series
-            rows += judged(trace.of(chosen), protocol, objects, agent, group=group, condition=condition)
+            rows += judged(
+                trace.of(chosen), protocol, objects, agent, group=group, condition=condition
+            )
     env.close()
     software = {"device": wp.get_device(device).name} | installed_versions(_PACKAGES)
     result = Result(tuple(rows), software)
@@ -152,7 +157,10 @@ def actor_of(
     sensor_errors: bool = False,
     seed: int = 0,
 ) -> tuple[Any, "Agent"]:
-    """What acts in an environment, and who that is; a camera policy with ``goals`` and ``sensor_errors``."""
+    """What acts in an environment, and who that is.
+
+    A camera policy with ``goals`` and ``sensor_errors``.
+    """
     from vd.evaluate.result import Agent
     from vd.policy import BuiltIn
     from vd.stopping import StoppingRule
@@ -173,7 +181,10 @@ def actor_of(
 
 
 def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> Any:
-    """All episodes of one policy, with a progress bar: a Trace, or of goals in a row a SeriesTrace."""
+    """All episodes of one policy, with a progress bar.
+
+    A Trace, or of goals in a row a SeriesTrace.
+    """
     from vd.evaluate.in_a_row import draw_turns, record_series, way_of
     from vd.evaluate.trace import air_table_steps, record
 
@@ -196,7 +207,10 @@ def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> Any:
 
 
 def _drawn(cfg: EvalCfg, env: Any) -> dict[str, Any]:
-    """Starts and goals [K, M, 4] of all objects by these names; none: the environment draws them."""
+    """Starts and goals [K, M, 4] of all objects by these names.
+
+    None: the environment draws them.
+    """
     import numpy as np
 
     from vd.evaluate.rollout import draw_starts_and_goals
@@ -204,10 +218,14 @@ def _drawn(cfg: EvalCfg, env: Any) -> dict[str, Any]:
     if env.cfg.start.at_rest:
         return {}
     drawn = [
-        draw_starts_and_goals(item.name, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle)
+        draw_starts_and_goals(
+            item.name, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle
+        )
         for item in env.objects
     ]
-    return {name: np.stack([pair[i] for pair in drawn]) for i, name in enumerate(("starts", "goals"))}
+    return {
+        name: np.stack([pair[i] for pair in drawn]) for i, name in enumerate(("starts", "goals"))
+    }
 
 
 @contextmanager
@@ -218,11 +236,16 @@ def _progress(cfg: EvalCfg, env: Any, agent: "Agent") -> "Iterator[Callable[[], 
     rounds = math.ceil(cfg.episodes / (env.num_envs // len(env.objects)))
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
     title = Path(agent.policy).name or agent.policy
-    with tqdm(total=rounds * env.max_episode_steps, unit="step", desc=title, mininterval=refresh) as bar:
+    with tqdm(
+        total=rounds * env.max_episode_steps, unit="step", desc=title, mininterval=refresh
+    ) as bar:
         yield bar.update
 
 
 def envs_for(num_objects: int, episodes: int, device: str, *, camera: bool = False) -> int:
-    """Environments to simulate at once: the same number for every object, at most one for each episode."""
+    """Environments to simulate at once.
+
+    The same number for every object, at most one for each episode.
+    """
     limit = ENVS_CPU if device == "cpu" else ENVS_CAMERA_GPU if camera else ENVS_GPU
     return num_objects * max(1, min(episodes, limit // num_objects))

@@ -1,4 +1,7 @@
-"""Conditions to evaluate a policy in, by name, whatever its training: those of ``vd-eval --condition``."""
+"""Conditions to evaluate a policy in, by name, whatever its training.
+
+Those of ``vd-eval --condition``.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -36,9 +39,13 @@ STEP_LATE_S = 1.0 / PAPER.scene.control_hz
 """One control step, 83 ms: a camera and the loop behind it are this late at worst."""
 _LATE = _at(STEP_LATE_S)
 FRICTION_NM, PLAY_RAD = 0.15, 0.03
-"""Largest dry friction [N m] and backlash [rad] of a joint (ours; identified servos have up to half)."""
+"""Largest dry friction [N m] and backlash [rad] of a joint (ours; identified servos have up to
+half).
+"""
 COMMAND_DELAY_S, OBSERVATION_LATENCY_S = 0.04, 0.12
-"""Largest delay of commands, latency of the object [s] (ours): motor bus; depth camera and its loop."""
+"""Largest delay of commands, latency of the object [s] (ours): motor bus; depth camera and its
+loop.
+"""
 
 MASS_KG = (0.03, 0.18)
 """The paper's base range of the object's mass [kg]."""
@@ -50,7 +57,10 @@ POSE_ERROR = (0.005, 0.1)
 _NAMED: dict[str, tuple[str, RandomisationCfg]] = {
     "nominal": ("nothing", _only(enabled=False)),
     "s3": ("all of Table S3", RandomisationCfg()),
-    "hard": ("Table S3, forces last a control step", RandomisationCfg(force_s=1.0 / PAPER.scene.control_hz)),
+    "hard": (
+        "Table S3, forces last a control step",
+        RandomisationCfg(force_s=1.0 / PAPER.scene.control_hz),
+    ),
     "mixed": (
         "Table S3, friction, backlash, late commands, late object",
         RandomisationCfg(
@@ -62,19 +72,28 @@ _NAMED: dict[str, tuple[str, RandomisationCfg]] = {
             observation_latency_s=(0.0, OBSERVATION_LATENCY_S),
         ),
     ),
-    "observation-late": (f"object seen {STEP_LATE_S:.3f} s late", _only(observation_latency_s=_LATE)),
+    "observation-late": (
+        f"object seen {STEP_LATE_S:.3f} s late",
+        _only(observation_latency_s=_LATE),
+    ),
     "all-late": (
         f"object and joints seen {STEP_LATE_S:.3f} s late",
         _only(observation_latency_s=_LATE, encoder_latency_s=_LATE),
     ),
-    "command-late": (f"commands {STEP_LATE_S:.3f} s late", _only(effects={"command_delay.delay_s": _LATE})),
+    "command-late": (
+        f"commands {STEP_LATE_S:.3f} s late",
+        _only(effects={"command_delay.delay_s": _LATE}),
+    ),
     "joint-friction": (
         f"friction of {FRICTION_NM:g} N m in every joint",
         _only(effects={"coulomb_friction.tau_c_nm": _at(FRICTION_NM)}),
     ),
     "light": (f"objects of {MASS_KG[0]:g} kg", _only(object_mass_kg=_at(MASS_KG[0]))),
     "heavy": (f"objects of {MASS_KG[1]:g} kg", _only(object_mass_kg=_at(MASS_KG[1]))),
-    "slippery": (f"friction of hand and object {_FRICTION[0]:g}", _only(friction=_at(_FRICTION[0]))),
+    "slippery": (
+        f"friction of hand and object {_FRICTION[0]:g}",
+        _only(friction=_at(_FRICTION[0])),
+    ),
     "grippy": (f"friction of hand and object {_FRICTION[1]:g}", _only(friction=_at(_FRICTION[1]))),
     "off-centre": (f"centre of mass {OFF_CENTRE_M:g} m off", _only(object_com_m=OFF_CENTRE_M)),
     "soft-tips": ("soft fingertips", _only(enabled=False)),
@@ -96,10 +115,15 @@ else:
 
 
 def in_condition(task: ReorientCfg, name: Condition) -> ReorientCfg:
-    """A task with what a condition changes beside the draws: the fingertips, or how stiff contacts are."""
+    """A task with what a condition changes beside the draws.
+
+    The fingertips, or how stiff contacts are.
+    """
     if name == "soft-tips":
         return replace(task, fingertip="soft")
     if name == "stiff-contacts":  # two physics steps are the least time constant
         hz, constant_s = 2.0 * task.sim.physics_hz, 0.5 * task.sim.contact_time_constant_s
-        return replace(task, sim=replace(task.sim, physics_hz=hz, contact_time_constant_s=constant_s))
+        return replace(
+            task, sim=replace(task.sim, physics_hz=hz, contact_time_constant_s=constant_s)
+        )
     return task

@@ -6,7 +6,9 @@ from typing import Literal
 from vd.paper import PAPER
 
 Goals = Literal["mesh", "points", "scan"]
-"""What a camera policy knows of a shape and its goal: the mesh, 500 exact points of it, or a scan's."""
+"""What a camera policy knows of a shape and its goal: the mesh, 500 exact points of it, or a
+scan's.
+"""
 
 
 @dataclass(frozen=True)
@@ -18,8 +20,8 @@ class GoalSeries:
     goal_s: float
     """Time for each [s]."""
     first_s: float = 0.0
-    """When the first is given [s]; before, there is another, and a table that goes after 2 s. 0: the first is
-    that of the start, and the table, if any, stays."""
+    """When the first is given [s]; before, there is another, and a table that goes after 2 s. 0:
+    the first is that of the start, and the table, if any, stays."""
     hold_s: float = 0.0
     """For how long the hand then holds its object where it reached the first of them [s]."""
 
@@ -30,6 +32,10 @@ class GoalSeries:
 
 
 AIR_GOALS = GoalSeries(3, 12.0, PAPER.scene.air_table_s + 1.0, 30.0)
-"""In the air (ours): a second alone with the object, and 12 s to the 15 s of the paper for the first."""
+"""In the air (ours): a second alone with the object, and 12 s to the 15 s of the paper for the
+first.
+"""
 CONSECUTIVE = GoalSeries(50, PAPER.scene.episode_s)
-"""Consecutive successes: 50 at most, as OpenAI's Learning Dexterity counts them, each in the paper's time."""
+"""Consecutive successes: 50 at most, as OpenAI's Learning Dexterity counts them, each in the
+paper's time.
+"""

@@ -1,9 +1,11 @@
-"""Goal after goal, each drawn once the last is reached: consecutive successes, and goals in the air.
+"""Goal after goal, each drawn once the last is reached.
 
-Consecutive successes begin with start and goal of other evaluations. The paper's in-air test is mostly won
-before the table goes. Here a policy has the table for 2 s, as there, and 1 s to hold the object without it,
-and only then come the goals that count. What comes after a stop is simulated apart, as in
-:mod:`vd.evaluate.trace`. K objects, M episodes; quaternions xyzw.
+Consecutive successes, and goals in the air.
+
+Consecutive successes begin with start and goal of other evaluations. The paper's in-air test is
+mostly won before the table goes. Here a policy has the table for 2 s, as there, and 1 s to hold the
+object without it, and only then come the goals that count. What comes after a stop is simulated
+apart, as in :mod:`vd.evaluate.trace`. K objects, M episodes; quaternions xyzw.
 """
 
 import zlib
@@ -47,8 +49,8 @@ class SeriesTrace:
     """What became of the episodes.
 
     Attributes:
-        start_quat: Orientation of the object when the first goal was given; at the reset if it was lost
-            before [K, M, 4].
+        start_quat: Orientation of the object when the first goal was given; at the reset if it was
+            lost before [K, M, 4].
         goal_quat: The first goal [K, M, 4].
         end_quat: Orientation at its stop, or at the end [K, M, 4].
         steps: Steps from there to there [K, M].
@@ -101,10 +103,12 @@ def record_series(
     goals: np.ndarray | None = None,
     on_step: Callable[[], object] = lambda: None,
 ) -> SeriesTrace:
-    """Run a policy and write down what becomes of its objects; others as of :func:`vd.evaluate.trace.record`.
+    """Run a policy and write down what becomes of its objects.
 
-    It gets the first goal, and the next after each stop by ``way`` within ``tolerance`` [rad] of the true
-    one, by ``turns`` of :func:`draw_turns`; ``goals`` are those of the start.
+    Others as of :func:`vd.evaluate.trace.record`.
+
+    It gets the first goal, and the next after each stop by ``way`` within ``tolerance`` [rad] of
+    the true one, by ``turns`` of :func:`draw_turns`; ``goals`` are those of the start.
     """
     shape = turns.shape[:2]
     trace = SeriesTrace(
@@ -130,7 +134,10 @@ def record_series(
 
 
 def way_of(agent: Agent, series: GoalSeries, tolerance: float) -> tuple[StoppedBy, Way]:
-    """How a policy is stopped within a tolerance [rad]: its own way; consecutively, whatever its action."""
+    """How a policy is stopped within a tolerance [rad]: its own way.
+
+    Consecutively, whatever its action.
+    """
     stopped_by, (rule, by) = agent.own_way(tolerance)
     return stopped_by, (rule if series.first_s else replace(rule, action_norm=ANY_ACTION), by)
 
@@ -212,7 +219,10 @@ def _consecutive(trace: SeriesTrace, objects: list[Any]) -> tuple[Consecutive, .
 
 
 class _Round:
-    """One episode in every environment that has one: ``numbers`` [N], place among its object's, else -1."""
+    """One episode in every environment that has one.
+
+    ``numbers`` [N], place among its object's, else -1.
+    """
 
     def __init__(
         self,
@@ -288,8 +298,13 @@ class _Round:
         seen = policy.predicted.cpu().numpy() if by == "predicted" else true
         stops = rule.stops(seen, norm) & (self._age > 0)
         trace = self._trace
-        first = self._envs[(self._age >= 0)[self._envs] & (trace.reached[self._of(self._envs)] == 0)]
-        trace.end_quat[self._of(first)], trace.steps[self._of(first)] = quat[first], self._age[first]
+        first = self._envs[
+            (self._age >= 0)[self._envs] & (trace.reached[self._of(self._envs)] == 0)
+        ]
+        trace.end_quat[self._of(first)], trace.steps[self._of(first)] = (
+            quat[first],
+            self._age[first],
+        )
         trace.stopped[self._of(first)] = stops[first]
         self._go_on(~stops | (true <= self._tolerance))
         reached = self._envs[stops[self._envs]]
@@ -309,5 +324,7 @@ class _Round:
             env.hold()
             away = out_of_hand(env)
             lost |= away
-            copy_motion(live, self._kept, np.flatnonzero(away))  # or it would fall for half a minute
+            copy_motion(
+                live, self._kept, np.flatnonzero(away)
+            )  # or it would fall for half a minute
         self._trace.let_go[self._of(held)] = lost[held]

@@ -38,7 +38,14 @@ _CONSECUTIVE_HEADER = (
     f"{CONSECUTIVE.most} in a row",
 )
 _OBJECT_HEADER = ("object", *OUTCOMES, "up to symmetry", "median error [rad]")
-_BOUND_HEADER = ("policy", "objects", "bound [rad]", "near and seen so", "said and right", "mean error [rad]")
+_BOUND_HEADER = (
+    "policy",
+    "objects",
+    "bound [rad]",
+    "near and seen so",
+    "said and right",
+    "mean error [rad]",
+)
 GREY = "#8a8f98"
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Of policies in their order: those of Okabe and Ito, which colour-blind readers can tell apart."""
@@ -66,7 +73,9 @@ def number(interval: Interval | None) -> str:
 
 def points(difference: Interval, unit: str = "") -> str:
     """``+1.2 (-0.4 to +2.8)``, of shares in per cent, with ``unit`` behind the first number."""
-    value, low, high = (100 * share for share in (difference.value, difference.low, difference.high))
+    value, low, high = (
+        100 * share for share in (difference.value, difference.low, difference.high)
+    )
     return f"{value:+.1f}{unit} ({low:+.1f} to {high:+.1f})"
 
 
@@ -100,8 +109,8 @@ def write_page(
 ) -> None:
     """Write the page; all that follows ``path`` is of a suite.
 
-    Its own table is ``figures``, the paper's beside ours or not; ``notes`` are of its objects. ``conditions``
-    have a name, the place in the paper or what is changed, and flags.
+    Its own table is ``figures``, the paper's beside ours or not; ``notes`` are of its objects.
+    ``conditions`` have a name, the place in the paper or what is changed, and flags.
     """
     short = labels(result.policies)
     success, beside = _tables(result, short)
@@ -124,7 +133,9 @@ def write_page(
         errors=ecdf_figure(result, short) if result.rows else None,
         bounds=_bound_table(headlines, short),
         warnings=result.warnings,
-        objects=[] if conditions else [(_heading(row, short), *_object_table(row)) for row in headlines],
+        objects=[]
+        if conditions
+        else [(_heading(row, short), *_object_table(row)) for row in headlines],
         conditions=conditions,
         of_paper=of_paper,
         protocol=[] if conditions else _protocol(result, short),
@@ -134,14 +145,19 @@ def write_page(
 
 
 def terminal_text(result: Result) -> str:
-    """Tables, warnings and what was asked, for a terminal; of one policy without a suite by object too."""
+    """Tables, warnings and what was asked, for a terminal.
+
+    Of one policy without a suite by object too.
+    """
     if not result.rows:
         return ""
     short, suite = labels(result.policies), any(row.condition for row in result.rows)
     parts = []
     for header, rows in _tables(result, short):
         # Only the first figure has its interval here: a line has to fit.
-        cut = [[*row[: WORDS + 1], *(cell.split(" (")[0] for cell in row[WORDS + 1 :])] for row in rows]
+        cut = [
+            [*row[: WORDS + 1], *(cell.split(" (")[0] for cell in row[WORDS + 1 :])] for row in rows
+        ]
         parts.append(aligned([header, *cut], words=WORDS))
     header, rows = _air_table(result.rows, short)
     parts += [aligned([header, *rows], words=2)] if rows else []
@@ -311,9 +327,15 @@ def _differences(result: Result, short: dict[str, str]) -> list[tuple[str, ...]]
 
 
 def asked(protocols: Sequence[Protocol]) -> str:
-    """What was asked: hands, place, episodes, starts, goals, stop and randomisation; hands alone differ."""
+    """What was asked: hands, place, episodes, starts, goals, stop and randomisation.
+
+    Hands alone differ.
+    """
     protocol = protocols[0]
-    layers = {shown_name(p.hand): "" if p.hand_layer is None else f" with {p.hand_layer}" for p in protocols}
+    layers = {
+        shown_name(p.hand): "" if p.hand_layer is None else f" with {p.hand_layer}"
+        for p in protocols
+    }
     hands = ", ".join(f"{hand}{layer}" for hand, layer in layers.items())
     angle = protocol.max_goal_angle_rad
     if protocol.goals_about_vertical:

@@ -34,13 +34,15 @@ RESULT_FORMAT = "visual-dexterity evaluation 7"
 BOUNDS_RAD = (PAPER.success.precise_rad, PAPER.success.rotation_rad)
 """Bounds on the distance at which predictions are judged, as in the paper."""
 OUTCOMES = ("success", "orientation error", "time-out", "object falls")
-"""Classes of episodes: stopped within the tolerance of the very goal, stopped outside of it, never stopped,
-lost."""
+"""Classes of episodes: stopped within the tolerance of the very goal, stopped outside of it, never
+stopped, lost."""
 
 StoppedBy = Literal["prediction", "true distance", "success criteria of training"]
 SUCCESS: StoppedBy = "success criteria of training"
 OWN_NORM = "its own bound of the action"
-"""Mark of rows that are ours: stopped by the bound of the action's norm that a policy's file has."""
+"""Mark of rows that are ours: stopped by the bound of the action's norm that a policy's file
+has.
+"""
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,8 @@ class Protocol:
     randomisation: str = "off"
     """What is drawn: ``off``, ``on`` as in training, or a name of :mod:`vd.evaluate.conditions`."""
     at_rest: bool = False
-    """Objects start at rest on the table, and starts and goals are those the environment draws; otherwise
-    they fall, with starts uniform on SO(3), the same for any environment."""
+    """Objects start at rest on the table, and starts and goals are those the environment draws;
+    otherwise they fall, with starts uniform on SO(3), the same for any environment."""
     goals_about_vertical: bool = False
     """Goals only turn the object about the vertical."""
     palm_up: bool = False
@@ -101,7 +103,9 @@ class Summary:
     outcomes: dict[str, Interval]
     """Share of episodes in each class of OUTCOMES."""
     success: dict[str, Interval]
-    """By tolerance [rad] (as text): share of episodes that ended within it of the very goal, not lost."""
+    """By tolerance [rad] (as text): share of episodes that ended within it of the very goal, not
+    lost.
+    """
     symmetric: dict[str, Interval]
     """The same up to the object's symmetry."""
     median_error_rad: Interval
@@ -118,10 +122,12 @@ class Prediction:
     mean_error_rad: float
     """Mean absolute difference."""
     seen: dict[str, float | None]
-    """By bound [rad] (as text): share of the states truly within it that are predicted within it; None
-    without such states."""
+    """By bound [rad] (as text): share of the states truly within it that are predicted within it;
+    None without such states."""
     right: dict[str, float | None]
-    """By bound: share of the states predicted within it that truly are; None without such states."""
+    """By bound: share of the states predicted within it that truly are; None without such
+    states.
+    """
 
 
 @dataclass(frozen=True)
@@ -181,17 +187,21 @@ class Row:
     overall: Summary
     per_object: tuple[Summary, ...]
     held: Interval | None = None
-    """Share of episodes stopped so, and still there after the hand has held for HOLD_S; None: not tried."""
+    """Share of episodes stopped so, and still there after the hand has held for HOLD_S; None: not
+    tried.
+    """
     symmetric: Interval
-    """Share of episodes stopped within the tolerance of what looks like the goal; where the true distance
-    decides, it is that distance."""
+    """Share of episodes stopped within the tolerance of what looks like the goal; where the true
+    distance decides, it is that distance."""
     precise: Interval | None = None
-    """Share of episodes that stop within 0.1 rad of the very goal, by the rule for that; None: not tried."""
+    """Share of episodes that stop within 0.1 rad of the very goal, by the rule for that; None: not
+    tried.
+    """
     prediction: Prediction | None = None
     """What its predictions are worth; None: they do not stop it."""
     warnings: dict[str, str]
-    """By name of an object: what its import says may be wrong with it; and by policy, object and condition
-    in how many episodes the physics failed, which ended there."""
+    """By name of an object: what its import says may be wrong with it; and by policy, object and
+    condition in how many episodes the physics failed, which ended there."""
     episodes: tuple[Episode, ...]
     """K x M, object by object; of goals in a row those of the first."""
     in_air: InAir | None = None
@@ -206,7 +216,10 @@ class Row:
 
     @property
     def headline(self) -> bool:
-        """Whether it is the policy's own rule: by its prediction if it has one, else by the true distance."""
+        """Whether it is the policy's own rule.
+
+        By its prediction if it has one, else by the true distance.
+        """
         by = "prediction" if self.sees.endswith("clouds") else "true distance"
         return self.stopped_by == by and not self.ours
 
@@ -247,7 +260,9 @@ class Result:
             for other in others:
                 if other.protocol.episodes == first.protocol.episodes:
                     unit = first.overall.unit
-                    found.append((first, other, paired_difference(other.successes, first.successes, unit)))
+                    found.append(
+                        (first, other, paired_difference(other.successes, first.successes, unit))
+                    )
         return found
 
     def summary(self) -> dict[str, Any]:
@@ -256,7 +271,12 @@ class Result:
         for row in found["rows"]:
             del row["episodes"]
         found["differences"] = [
-            {"policy": other.policy, "from": first.policy, "condition": first.condition, "group": first.group}
+            {
+                "policy": other.policy,
+                "from": first.policy,
+                "condition": first.condition,
+                "group": first.group,
+            }
             | to_dict(interval)
             for first, other, interval in self.differences()
         ]
@@ -276,7 +296,9 @@ class Result:
         values: Any = json.loads(Path(path).read_text())
         found = values.get("format") if isinstance(values, dict) else None
         if found != RESULT_FORMAT:
-            raise ValueError(f"{path}: format is {found!r}, expected {RESULT_FORMAT!r}; run vd-eval again")
+            raise ValueError(
+                f"{path}: format is {found!r}, expected {RESULT_FORMAT!r}; run vd-eval again"
+            )
         try:
             return from_dict(Result, values)
         except ValueError as error:
@@ -298,9 +320,10 @@ class Agent:
     def ways_to_stop(self, tolerance_rad: float) -> dict[tuple[StoppedBy, str], Way]:
         """The ways to stop it within a tolerance [rad], the headline first, by name and what is ours of it.
 
-        They are the bounds of the distance that it predicts, if it does, and of the true one, both with the
-        released code's bound of the action's norm; and, as ours, its own bound of the norm where that is
-        another. What predicts nothing is stopped by the success criteria of training, too.
+        They are the bounds of the distance that it predicts, if it does, and of the true one, both
+        with the released code's bound of the action's norm; and, as ours, its own bound of the norm
+        where that is another. What predicts nothing is stopped by the success criteria of training,
+        too.
         """
         own, norm = self.rules(tolerance_rad), PAPER.success.action_norm
         true = StoppingRule(tolerance_rad, norm)
@@ -310,7 +333,11 @@ class Agent:
             ("prediction", ""): (replace(own, action_norm=norm), "predicted"),
             ("true distance", ""): (true, "exact"),
         }
-        return ways if own.action_norm == norm else ways | {("prediction", OWN_NORM): (own, "predicted")}
+        return (
+            ways
+            if own.action_norm == norm
+            else ways | {("prediction", OWN_NORM): (own, "predicted")}
+        )
 
     def own_way(self, tolerance_rad: float) -> tuple[StoppedBy, Way]:
         """The way of the headline, and its name."""
@@ -319,7 +346,13 @@ class Agent:
 
 
 def judge(
-    trace: Trace, protocol: Protocol, objects: list[Any], agent: Agent, *, group: str, condition: str = ""
+    trace: Trace,
+    protocol: Protocol,
+    objects: list[Any],
+    agent: Agent,
+    *,
+    group: str,
+    condition: str = "",
 ) -> list[Row]:
     """Rows of one policy, one for each way to stop, from its episodes with the objects of one group."""
     rows, tolerance, precise = [], protocol.stop_tolerance_rad, PAPER.success.precise_rad
@@ -346,9 +379,13 @@ def judge(
                 ours=ours,
                 held=None
                 if held is None
-                else share(_stopped_within(trace, rule, by, trace.exact, tolerance) & (held <= tolerance)),
+                else share(
+                    _stopped_within(trace, rule, by, trace.exact, tolerance) & (held <= tolerance)
+                ),
                 symmetric=share(
-                    _stopped_within(trace, rule, "error" if by == "exact" else by, trace.error, tolerance)
+                    _stopped_within(
+                        trace, rule, "error" if by == "exact" else by, trace.error, tolerance
+                    )
                 ),
                 precise=share(_stopped_within(trace, near_rule, by, trace.exact, precise)),
                 prediction=_prediction(trace) if by == "predicted" else None,
@@ -367,7 +404,10 @@ def row_of(
     condition: str,
     **rest: Any,
 ) -> Row:
-    """A row from its episodes, and which of them the physics failed [K, M]; ``rest`` are its other fields."""
+    """A row from its episodes, and which of them the physics failed [K, M].
+
+    ``rest`` are its other fields.
+    """
     names, count = tuple(item.name for item in objects), protocol.episodes
     return Row(
         policy=agent.policy,
@@ -383,7 +423,9 @@ def row_of(
         condition=condition,
         warnings={item.name: "; ".join(item.warnings) for item in objects if item.warnings}
         | {
-            " ".join((agent.policy, name, condition)).strip(): f"physics failed in {bad} of {count} episodes"
+            " ".join(
+                (agent.policy, name, condition)
+            ).strip(): f"physics failed in {bad} of {count} episodes"
             for name, bad in zip(names, failed.sum(axis=1), strict=True)
             if bad
         },

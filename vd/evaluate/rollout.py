@@ -15,8 +15,8 @@ def draw_starts_and_goals(
     """Draw the initial and goal orientations of one object.
 
     They depend on the object's name, the seed and the number of the episode alone: not on the other
-    objects, the number of environments or the device. Starts are uniform on SO(3); goals are uniform on the
-    part of SO(3) within ``max_goal_angle`` [rad], in (0, pi], of the start.
+    objects, the number of environments or the device. Starts are uniform on SO(3); goals are
+    uniform on the part of SO(3) within ``max_goal_angle`` [rad], in (0, pi], of the start.
 
     Returns:
         Starts and goals, quaternions xyzw, shapes [M, 4].
@@ -42,7 +42,8 @@ def episode_rounds(world_object: np.ndarray, objects: int, episodes: int) -> lis
     missing = sorted(set(range(objects)) - set(world_object.tolist()))
     if missing:
         raise ValueError(
-            f"no environment simulates object {missing[0]}; raise the number of environments to {objects}"
+            f"no environment simulates object {missing[0]}; raise the number of environments to "
+            f"{objects}"
         )
     # The position of each environment among those of its object.
     order = np.array([np.count_nonzero(world_object[:w] == k) for w, k in enumerate(world_object)])

@@ -1,9 +1,11 @@
-"""Shapes and goals known by points: 500 exact ones, or those of a scan, with noise and a side missing.
+"""Shapes and goals known by points.
 
-The paper's goals for household objects come from a tablet's scans, which are imperfect in ways it does not
-quantify (its Figure 5). Here a scan errs as much as a cloud in training may, but lastingly: the same points
-are wrong in every step. The surface behind them is laid as through those of a real scan
-(:mod:`vd.assets_usd.objects.scans`); the true shape is the simulation's alone.
+500 exact ones, or those of a scan, with noise and a side missing.
+
+The paper's goals for household objects come from a tablet's scans, which are imperfect in ways it
+does not quantify (its Figure 5). Here a scan errs as much as a cloud in training may, but
+lastingly: the same points are wrong in every step. The surface behind them is laid as through those
+of a real scan (:mod:`vd.assets_usd.objects.scans`); the true shape is the simulation's alone.
 """
 
 from collections.abc import Sequence
@@ -24,18 +26,26 @@ MISSING = PAPER.cloud.dropout_ratio[1]
 
 
 def scan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Samples [m] of a shape [K, 3], body frame, as a scan has them: noisy, one side replaced by others."""
+    """Samples [m] of a shape [K, 3], body frame, as a scan has them.
+
+    Noisy, one side replaced by others.
+    """
     along = np.argsort(points @ rng.normal(size=3))
     seen = along[: round(len(points) * (1.0 - MISSING))]
     again = rng.choice(seen, len(points) - len(seen))
     noise = rng.normal(scale=NOISE_M, size=points.shape).astype(points.dtype)
     scanned = np.empty_like(points)
-    scanned[along] = points[np.concatenate([seen, again])] + noise  # as without order as the points were
+    scanned[along] = (
+        points[np.concatenate([seen, again])] + noise
+    )  # as without order as the points were
     return scanned
 
 
 def known_by_points(item: ObjectModel, points: np.ndarray, device: str) -> ObjectModel:
-    """An object as points of it [m] [K, 3], body frame, tell: the surface through them, and its samples."""
+    """An object as points of it [m] [K, 3], body frame, tell.
+
+    The surface through them, and its samples.
+    """
     vertices, faces = surface_of_scan(points, device)
     samples = surface_points(vertices, faces, len(item.surface_points))
     return replace(
@@ -59,6 +69,8 @@ def known_objects(
     for item in objects:
         points = item.surface_points if goals == "points" else scan(item.surface_points, rng)
         known.append(
-            known_by_points(item, points, device) if surfaces else replace(item, surface_points=points)
+            known_by_points(item, points, device)
+            if surfaces
+            else replace(item, surface_points=points)
         )
     return known

@@ -1,16 +1,17 @@
 """Orientation errors and confidence intervals.
 
-Angles are radians in [0, pi], quaternions xyzw (unit), rotations world from body. K objects, M episodes of
-each.
+Angles are radians in [0, pi], quaternions xyzw (unit), rotations world from body. K objects, M
+episodes of each.
 
-Rates have t intervals on the log odds, with the jackknife's standard error (Efron and Stein 1981). Medians
-have the intervals of the share below them, turned into quantiles (Woodruff 1952). What the jackknife leaves
+Rates have t intervals on the log odds, with the jackknife's standard error (Efron and Stein 1981).
+Medians have the intervals of the share below them, turned into quantiles (Woodruff 1952). What the
+jackknife leaves
 out one at a time decides what they speak about:
 
-* ``object``: whole objects, each with all of its episodes. Episodes of one object are alike, so this is the
-  honest choice for statements about objects of this kind; it needs some objects.
-* ``episode``: episodes within each object (the objects are strata). The statement is then about these
-  very objects, under new starts and goals.
+* ``object``: whole objects, each with all of its episodes. Episodes of one object are alike, so
+  this is the honest choice for statements about objects of this kind; it needs some objects.
+* ``episode``: episodes within each object (the objects are strata). The statement is then about
+  these very objects, under new starts and goals.
 """
 
 from dataclasses import dataclass
@@ -37,13 +38,14 @@ class Interval:
     low: float
     high: float
     method: str
-    """``logit-t``, ``clopper-pearson``, ``woodruff``, ``order-statistics`` or ``paired-t``: what gave the
-    bounds."""
+    """``logit-t``, ``clopper-pearson``, ``woodruff``, ``order-statistics`` or ``paired-t``: what
+    gave the bounds."""
 
 
 def rotation_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle between two rotations in [0, pi], quaternions xyzw [..., 4], broadcast."""
-    # |a - b| and |a + b| stay exact for small angles, where the arc cosine of a dot product does not.
+    # |a - b| and |a + b| stay exact for small angles, where the arc cosine of a dot product does
+    # not.
     minus = np.linalg.norm(a - b, axis=-1)
     plus = np.linalg.norm(a + b, axis=-1)
     return 4.0 * np.arctan2(np.minimum(minus, plus), np.maximum(minus, plus))
@@ -57,7 +59,9 @@ def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.concatenate([vector, scalar], axis=-1)
 
 
-def symmetric_error(object_quat: np.ndarray, goal_quat: np.ndarray, symmetry: np.ndarray) -> np.ndarray:
+def symmetric_error(
+    object_quat: np.ndarray, goal_quat: np.ndarray, symmetry: np.ndarray
+) -> np.ndarray:
     """Orientation error [...] up to the object's symmetry: min over s of angle(q_object s, q_goal).
 
     Args:
@@ -95,8 +99,8 @@ def paired_difference(outcomes: np.ndarray, others: np.ndarray, unit: Unit) -> I
 def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
     """Rates of yes/no outcomes with 95 % intervals.
 
-    Where all units are equal (no success at all, say), nothing is known of how they differ, and the interval
-    is Clopper and Pearson's exact binomial one over all episodes, taken as independent.
+    Where all units are equal (no success at all, say), nothing is known of how they differ, and the
+    interval is Clopper and Pearson's exact binomial one over all episodes, taken as independent.
 
     Args:
         outcomes: Booleans, or shares in [0, 1], shape [R, K, M] for R rates.
@@ -107,9 +111,13 @@ def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
     for group, low, high in zip(outcomes, *_logit_t(outcomes, unit), strict=True):
         rate = float(group.mean())
         if np.isfinite(low):
-            intervals.append(Interval(rate, min(float(low), rate), max(float(high), rate), "logit-t"))
+            intervals.append(
+                Interval(rate, min(float(low), rate), max(float(high), rate), "logit-t")
+            )
         else:
-            exact = stats.binomtest(round(group.sum()), group.size).proportion_ci(CONFIDENCE, "exact")
+            exact = stats.binomtest(round(group.sum()), group.size).proportion_ci(
+                CONFIDENCE, "exact"
+            )
             intervals.append(Interval(rate, float(exact.low), float(exact.high), "clopper-pearson"))
     return intervals
 
@@ -117,8 +125,9 @@ def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
 def _logit_t(outcomes: np.ndarray, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
     """Bounds [R] of t intervals on the log odds of rates [R, K, M]; NaN where all units are equal.
 
-    The jackknife sees how the log odds bend: with 13 objects, few failures and objects that differ the plain
-    standard error is too small. Half a success and half a failure are added, which keeps the odds finite.
+    The jackknife sees how the log odds bend: with 13 objects, few failures and objects that differ
+    the plain standard error is too small. Half a success and half a failure are added, which keeps
+    the odds finite.
     """
     rates, objects, episodes = outcomes.shape
     units = outcomes.mean(axis=2)[:, None] if unit == "object" else outcomes
@@ -132,7 +141,9 @@ def _logit_t(outcomes: np.ndarray, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(logit((share * objects * episodes + 0.5) / (objects * episodes + 1.0)))
 
     total = units.mean(axis=(1, 2))
-    without = total[:, None, None] + (units.mean(axis=2, keepdims=True) - units) / ((n - 1) * strata)
+    without = total[:, None, None] + (units.mean(axis=2, keepdims=True) - units) / (
+        (n - 1) * strata
+    )
     moved = odds(without)
     variance = (n - 1) * moved.var(axis=2).sum(axis=1)
     half = stats.t.ppf((1 + CONFIDENCE) / 2, strata * (n - 1)) * np.sqrt(variance)
@@ -155,11 +166,14 @@ def median_interval(values: np.ndarray, unit: Unit) -> Interval:
 def order_interval(values: np.ndarray) -> Interval:
     """Median with the distribution-free interval between two order statistics.
 
-    With fewer than six values no such interval reaches 95 %: the smallest and largest are given. Values are
-    finite [n], n >= 1.
+    With fewer than six values no such interval reaches 95 %: the smallest and largest are given.
+    Values are finite [n], n >= 1.
     """
     ordered = np.sort(np.asarray(values, dtype=float))
     rank = max(int(stats.binom.ppf((1 - CONFIDENCE) / 2, len(ordered), 0.5)), 1)
     return Interval(
-        float(np.median(ordered)), float(ordered[rank - 1]), float(ordered[-rank]), "order-statistics"
+        float(np.median(ordered)),
+        float(ordered[rank - 1]),
+        float(ordered[-rank]),
+        "order-statistics",
     )

@@ -21,16 +21,18 @@ OWN_SETS: dict[str, str | None] = {
     "held-out": "procedural-heldout",
     "symmetric": "symmetric",
 }
-"""By group of objects the set where none is given: ours, made on demand; the paper's are meshes. Choices are
-made on training and validation, held-out judges. For validation nothing stands in: it is left out."""
+"""By group of objects the set where none is given: ours, made on demand; the paper's are meshes.
+Choices are made on training and validation, held-out judges. For validation nothing stands in: it
+is left out.
+"""
 
 FRICTIONS = (*PAPER.randomisation.table_friction, 0.25, 0.75)
-"""Frictions of the table beside the nominal one. The paper's five materials have no published values; these
-span the range of its training."""
+"""Frictions of the table beside the nominal one. The paper's five materials have no published
+values; these span the range of its training."""
 
 QUICK_OBJECTS, QUICK_EPISODES, QUICK_CAMERA_EPISODES = 6, 4, 1
-"""Objects of a group and episodes of each in the reduced suite; a control step of a camera policy takes a
-second and more on a CPU."""
+"""Objects of a group and episodes of each in the reduced suite; a control step of a camera policy
+takes a second and more on a CPU."""
 QUICK_S = 540.0
 """Time after which the reduced suite begins no evaluation any more [s]."""
 
@@ -54,12 +56,17 @@ class Condition:
     quick: bool = True
     """Part of the reduced suite."""
     by_camera: bool = True
-    """Whether camera policies meet it too; they look for themselves, as late as their images are."""
+    """Whether camera policies meet it too; they look for themselves, as late as their images
+    are.
+    """
 
     @property
     def flags(self) -> str:
         """What ``vd-eval`` is told to do the same, policy and objects apart."""
-        said = [f"--episodes {self.episodes} (camera policies {self.camera_episodes})", "--no-at-rest"]
+        said = [
+            f"--episodes {self.episodes} (camera policies {self.camera_episodes})",
+            "--no-at-rest",
+        ]
         for name, value in self.settings.items():
             text = f" {value:g}" if isinstance(value, float) else f" {value}"
             said.append(f"--{name.replace('_', '-')}{'' if value is True else text}")
@@ -90,7 +97,9 @@ CONDITIONS = (
     ),
     _AIR,
     replace(_AIR, name="air-points", settings={"in_air": True, "goals": "points"}),
-    Condition("air-training", "training", 20, 4, "Figures S12 to S14", {"in_air": True}, quick=False),
+    Condition(
+        "air-training", "training", 20, 4, "Figures S12 to S14", {"in_air": True}, quick=False
+    ),
     Condition("scanned-goals", "held-out", 100, 24, "Figure 5", {"goals": "scan"}),
 )
 """What the paper's suite runs, in this order."""
@@ -147,7 +156,10 @@ class Claim:
         return None
 
     def paper_text(self) -> str:
-        """What the paper says: ``96 % (94 to 97)``, ``0.12 to 0.13``, ``below 7``; empty: nothing."""
+        """What the paper says: ``96 % (94 to 97)``, ``0.12 to 0.13``, ``below 7``.
+
+        Empty: nothing.
+        """
         if self.paper is None:
             return ""
         value: tuple[float, ...] = getattr(PAPER.results, self.paper)
@@ -187,7 +199,10 @@ def _share(row: Row, chosen: list[bool] | np.ndarray) -> Interval:
 
 
 def _claims(name: str, *claims: tuple[Any, ...]) -> list[Claim]:
-    """Claims of a condition: their text, measure and figure of the paper, and what else they have."""
+    """Claims of a condition.
+
+    Their text, measure and figure of the paper, and what else they have.
+    """
     return [Claim(text, name, *others) for text, *others in claims]
 
 
@@ -197,7 +212,12 @@ def _on_table(name: str, key: str) -> list[Claim]:
         name,
         ("error at most 0.4 rad", lambda row: row.overall.success["0.4"], key),
         ("error at most 0.8 rad", lambda row: row.overall.success["0.8"], f"{key}_rad08"),
-        ("median error [rad]", lambda row: row.overall.median_error_rad, f"{key}_median_rad", "rad"),
+        (
+            "median error [rad]",
+            lambda row: row.overall.median_error_rad,
+            f"{key}_median_rad",
+            "rad",
+        ),
     )
 
 
@@ -226,8 +246,16 @@ def _in_air(name: str) -> list[Claim]:
         ("median time to success [s]", lambda row: row.overall.time_s, "air_time_s", "s"),
         ("object lost", share("object falls"), "air_dropped"),
         ("object lost within 0.5 s of the table", lost_at_once, "air_dropped_at_once"),
-        ("states within 0.4 rad up to symmetry seen so", lambda row: _seen(row, "0.4"), "near_seen"),
-        ("states within 0.1 rad up to symmetry seen so", lambda row: _seen(row, "0.1"), "near_seen_rad01"),
+        (
+            "states within 0.4 rad up to symmetry seen so",
+            lambda row: _seen(row, "0.4"),
+            "near_seen",
+        ),
+        (
+            "states within 0.1 rad up to symmetry seen so",
+            lambda row: _seen(row, "0.1"),
+            "near_seen_rad01",
+        ),
     )
 
 

@@ -48,7 +48,9 @@ NOT_RUN = "not run; the same command goes on from here"
 _NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs", "shard")
 
 Objects = tuple[tuple[str, ...], str]
-"""The objects of a group: what vd-eval is given, sets or chosen files of them, and the same for a reader."""
+"""The objects of a group: what vd-eval is given, sets or chosen files of them, and the same for a
+reader.
+"""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,9 @@ class Task:
     @property
     def wanted(self) -> dict[str, Any]:
         """What an evaluation that can stand for it was run with."""
-        settings = {key: value for key, value in to_dict(self.cfg).items() if key not in _NOT_MEASURED}
+        settings = {
+            key: value for key, value in to_dict(self.cfg).items() if key not in _NOT_MEASURED
+        }
         return {"policy": self.weights} | settings
 
     def there(self) -> Result | None:
@@ -95,13 +99,19 @@ def run_suite(cfg: EvalCfg) -> Result:
     groups = object_groups(cfg.objects, {c.objects for c in suite}, quick=cfg.quick)
     conditions = tuple(c for c in suite if (c.quick or not cfg.quick) and c.objects in groups)
     tasks = shard(make_tasks(cfg, conditions, groups), cfg.shard)
-    found: dict[tuple[str, str], Result | str] = {task.key: task.there() or NOT_RUN for task in tasks}
+    found: dict[tuple[str, str], Result | str] = {
+        task.key: task.there() or NOT_RUN for task in tasks
+    }
     waiting = [task for task in tasks if isinstance(found[task.key], str)]
-    print(f"{len(tasks) - len(waiting)} of {len(tasks)} evaluations were done before", file=sys.stderr)
+    print(
+        f"{len(tasks) - len(waiting)} of {len(tasks)} evaluations were done before", file=sys.stderr
+    )
 
     def finished(task: Task, failure: str | None, died: str) -> None:
         why, minutes = died if failure is None else failure, (time.monotonic() - begun) / 60.0
-        print(f"[{minutes:.1f} min] {task.condition}: {task.policy} {why or 'done'}", file=sys.stderr)
+        print(
+            f"[{minutes:.1f} min] {task.condition}: {task.policy} {why or 'done'}", file=sys.stderr
+        )
         found[task.key] = why or Result.read(task.cfg.out / "eval.json")
         if not why:
             write_json(task.cfg.out / SETTINGS_FILE, task.wanted)
@@ -119,7 +129,10 @@ def run_suite(cfg: EvalCfg) -> Result:
 
 
 def _run(
-    cfg: EvalCfg, waiting: list[Task], finished: Callable[[Task, str | None, str], None], stop_at: float
+    cfg: EvalCfg,
+    waiting: list[Task],
+    finished: Callable[[Task, str | None, str], None],
+    stop_at: float,
 ) -> None:
     """Evaluate one after the other, or in processes side by side."""
     if cfg.jobs == 1:
@@ -140,12 +153,18 @@ def _run(
 
 
 def measure(task: Task, stop_at: float) -> str:
-    """Evaluate into the task's folder, if it is not later than ``stop_at``; why that failed, or nothing."""
+    """Evaluate into the task's folder, if it is not later than ``stop_at``.
+
+    Why that failed, or nothing.
+    """
     if time.monotonic() > stop_at:  # the same clock in all processes
         return OUT_OF_TIME
     try:
         compare(task.cfg, task.condition)
-    except (RuntimeError, ValueError) as error:  # one environment that fails must not cost the others
+    except (
+        RuntimeError,
+        ValueError,
+    ) as error:  # one environment that fails must not cost the others
         return str(error)
     return ""
 
@@ -160,7 +179,9 @@ def _measure_apart(task: Task, stop_at: float) -> str:
             return str(error)
 
 
-def make_tasks(cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]) -> list[Task]:
+def make_tasks(
+    cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]
+) -> list[Task]:
     """Everything that is to be measured, camera policies at the end if time is short, else first.
 
     All names are looked up here, before anything slow.
@@ -179,7 +200,9 @@ def make_tasks(cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, 
     return sorted(tasks, key=lambda task: camera[task.policy] == cfg.quick)
 
 
-def settings(cfg: EvalCfg, condition: Condition, policy: str, objects: Objects, *, camera: bool) -> EvalCfg:
+def settings(
+    cfg: EvalCfg, condition: Condition, policy: str, objects: Objects, *, camera: bool
+) -> EvalCfg:
     """The evaluation of one policy under a condition: what ``vd-eval`` would be told."""
     episodes = condition.camera_episodes if camera else condition.episodes
     if cfg.quick:
@@ -199,7 +222,9 @@ def settings(cfg: EvalCfg, condition: Condition, policy: str, objects: Objects, 
 
 
 def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> dict[str, Objects]:
-    """The objects of each wanted group: those given as ``GROUP=SET``, our procedural ones for the others.
+    """The objects of each wanted group.
+
+    Those given as ``GROUP=SET``, our procedural ones for the others.
 
     Raises:
         ValueError: No such group is wanted.
@@ -209,7 +234,9 @@ def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> d
     given = parse_groups(objects)
     own_sets = {group: own for group, own in OWN_SETS.items() if group in wanted}
     if unknown := [name for name in given if name not in own_sets]:
-        raise ValueError(f"--objects: '{unknown[0]}' is no group of the suite; {', '.join(own_sets)} are")
+        raise ValueError(
+            f"--objects: '{unknown[0]}' is no group of the suite; {', '.join(own_sets)} are"
+        )
     groups: dict[str, Objects] = {}
     for group, own in own_sets.items():
         sets = given.get(group) or (() if own is None else (own,))
@@ -227,28 +254,45 @@ def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> d
 
 
 def fingerprint(name: str) -> str:
-    """What tells the content of a policy from others: a SHA-256, or the name of a built-in agent."""
+    """What tells the content of a policy from others.
+
+    A SHA-256, or the name of a built-in agent.
+    """
     if name in BUILT_IN:
         return name
     path = find_policy(name)
     # A bundle's contract has the digests of its other files.
-    return hashlib.sha256((path / CONTRACT_FILE if path.is_dir() else path).read_bytes()).hexdigest()
+    return hashlib.sha256(
+        (path / CONTRACT_FILE if path.is_dir() else path).read_bytes()
+    ).hexdigest()
 
 
-def _write(result: Result, cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]) -> None:
+def _write(
+    result: Result, cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]
+) -> None:
     """The page and its figures, of what there is."""
     short, of_paper = labels(result.policies), cfg.suite == "paper"
     if of_paper:
-        title, of, figures = "The paper's evaluations", " beside the paper", paper_figures(result, conditions)
+        title, of, figures = (
+            "The paper's evaluations",
+            " beside the paper",
+            paper_figures(result, conditions),
+        )
         table = [
-            {"figure": row["figure"], "condition": row["condition"], "paper": row["paper"] or NOTHING}
+            {
+                "figure": row["figure"],
+                "condition": row["condition"],
+                "paper": row["paper"] or NOTHING,
+            }
             | {short[policy]: text for policy, text in row["ours"].items()}
             for row in figures
         ]
     else:
         title, of, figures = "Robustness", "", robust_table(result, conditions, short)
         table = figures
-    write_json(cfg.out / f"{cfg.suite}.json", result.summary() | {"quick": cfg.quick, "figures": figures})
+    write_json(
+        cfg.out / f"{cfg.suite}.json", result.summary() | {"quick": cfg.quick, "figures": figures}
+    )
     notes = [f"Objects, {group}: {text}." for group, (_, text) in groups.items()]
     notes += ["Held-out objects judge, and nothing is chosen on them."]
     notes += [] if cfg.engine == "newton" else ["Physics by MuJoCo's own engine."]
@@ -276,17 +320,30 @@ def robust_table(
     table = []
     for condition in conditions:
         for policy in result.policies:
-            row, nominal = found.get((condition.name, policy)), found.get((conditions[0].name, policy))
+            row, nominal = (
+                found.get((condition.name, policy)),
+                found.get((conditions[0].name, policy)),
+            )
             if row is None:
                 continue
             change = NOTHING
             if nominal not in (None, row) and row.in_air is None:
-                change = points(paired_difference(row.successes, nominal.successes, row.overall.unit))
-            rates = (row.overall.outcomes["success"], row.precise, row.overall.outcomes["object falls"])
+                change = points(
+                    paired_difference(row.successes, nominal.successes, row.overall.unit)
+                )
+            rates = (
+                row.overall.outcomes["success"],
+                row.precise,
+                row.overall.outcomes["object falls"],
+            )
             success, precise, lost = (
                 NOTHING if r is None else share_text(r.value, r.low, r.high) for r in rates
             )
-            told = {"condition": condition.name, "changed": condition.shown, "policy": short[policy]}
+            told = {
+                "condition": condition.name,
+                "changed": condition.shown,
+                "policy": short[policy],
+            }
             figures = {"success": success, "points from nominal": change, "within 0.1 rad": precise}
             table.append(told | figures | {"lost": lost})
     return table
@@ -311,5 +368,9 @@ def _ours(result: Result, claim: Claim, policy: str) -> str:
     rows = [row for row in result.rows if (row.condition, row.policy) == (claim.condition, policy)]
     value = claim.of(rows)
     if isinstance(value, Interval):
-        return share_text(value.value, value.low, value.high) if claim.unit == "share" else number(value)
+        return (
+            share_text(value.value, value.low, value.high)
+            if claim.unit == "share"
+            else number(value)
+        )
     return NOTHING if value is None else share_text(value)

@@ -1,8 +1,11 @@
-"""Episodes that nothing stops: what happened at every step, so that any rule for stopping can be judged.
+"""Episodes that nothing stops.
 
-Whoever stops a policy, its own prediction or the true distance, does not change what it does before: one run
-serves all rules. What comes after a stop is simulated apart: the hand keeps its last targets for HOLD_S.
-K objects, M episodes each, T steps; angles in radians, quaternions xyzw.
+What happened at every step, so that any rule for stopping can be judged.
+
+Whoever stops a policy, its own prediction or the true distance, does not change what it does
+before: one run
+serves all rules. What comes after a stop is simulated apart: the hand keeps its last targets for
+HOLD_S. K objects, M episodes each, T steps; angles in radians, quaternions xyzw.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,8 +24,10 @@ from vd.stopping import StoppingRule
 HOLD_S = 2.0
 """For how long a hand holds its object after a stop, before it is looked at again [s] (ours)."""
 StopsBy = Literal["predicted", "exact", "error", "success"]
-"""What a rule asks for: a distance, which is a camera policy's prediction, or the true one to the very goal,
-or to what looks like it; or the success criteria of training, which are the true one and stillness."""
+"""What a rule asks for: a distance, which is a camera policy's prediction, or the true one to the
+very goal, or to what looks like it; or the success criteria of training, which are the true one and
+stillness.
+"""
 Way = tuple[StoppingRule, StopsBy]
 """A rule, and what it asks for."""
 NEVER_RAD = 1e-9
@@ -64,16 +69,18 @@ class Trace:
     Attributes:
         start_quat: Orientation of the object at the reset [K, M, 4].
         goal_quat: Wanted orientation [K, M, 4].
-        error: Orientation error after t steps, up to the object's symmetry, NaN after the end [K, M, T + 1].
+        error: Orientation error after t steps, up to the object's symmetry, NaN after the end [K,
+            M, T + 1].
         exact: The same without symmetry [K, M, T + 1].
         action_norm: Norm of the smoothed action that led there, NaN after the end [K, M, T + 1].
-        predicted: What a camera policy predicts of ``error`` there; None for other policies [K, M, T + 1].
+        predicted: What a camera policy predicts of ``error`` there; None for other policies [K, M,
+            T + 1].
         steps: Steps to the fall or the time limit [K, M].
         fell: Whether the object was lost [K, M].
         failed: Whether the physics failed, which ends an episode like the time limit [K, M].
         still: Whether hand and object are as still after t steps as success asks [K, M, T + 1].
-        held: By the way to stop that was to be held: error to the very goal after the hold, pi where the
-            object was lost, NaN where nothing stopped [K, M].
+        held: By the way to stop that was to be held: error to the very goal after the hold, pi
+            where the object was lost, NaN where nothing stopped [K, M].
     """
 
     start_quat: np.ndarray
@@ -105,7 +112,8 @@ class Trace:
             by: What it asks for; of success the bound of the action's norm is the environment's.
 
         Returns:
-            Steps to the stop, fall or time limit, and whether the rule stopped it, shape [K, M] each.
+            Steps to the stop, fall or time limit, and whether the rule stopped it, shape [K, M]
+            each.
         """
         if by == "success":
             stops = (self.exact <= rule.distance_rad) & self.still
@@ -141,7 +149,9 @@ def at_steps(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
 def episodes_of(**columns: np.ndarray) -> tuple[Episode, ...]:
     """Episodes, object by object, from columns [K, M, ..] of all their fields but the first."""
     places = np.ndindex(*columns["steps"].shape)
-    rows = ((k, {name: values[k, m].tolist() for name, values in columns.items()}) for k, m in places)
+    rows = (
+        (k, {name: values[k, m].tolist() for name, values in columns.items()}) for k, m in places
+    )
     return tuple(
         Episode(k, **row | {name: tuple(row[name]) for name in ("start_quat", "goal_quat")})
         for k, row in rows
@@ -161,13 +171,14 @@ def record(
 ) -> Trace:
     """Run a policy and write down what happens.
 
-    Errors are up to the symmetry that ``env.objects`` declare. All rounds are drawn before the first step,
-    since how often environments reset depends on the policy and moves the random streams: so starts, goals
-    and noise depend on the environment's configuration (seed and number of environments included), not on the
-    policy.
+    Errors are up to the symmetry that ``env.objects`` declare. All rounds are drawn before the
+    first step, since how often environments reset depends on the policy and moves the random
+    streams: so starts, goals and noise depend on the environment's configuration (seed and number
+    of environments included), not on the policy.
 
     Args:
-        env: An environment that no state ends (``success.rotation_rad`` of NEVER_RAD), as it was built.
+        env: An environment that no state ends (``success.rotation_rad`` of NEVER_RAD), as it was
+            built.
         policy: What acts; one with ``predicted`` is told where it need not act any more.
         episodes: M.
         starts: Initial orientations [K, M, 4]; None: the environment draws them.
@@ -211,7 +222,9 @@ def drawn_rounds(
     world_object, drawn = np.asarray(env.world_object), []
     for numbers in episode_rounds(world_object, len(env.objects), episodes):
         chosen = world_object, np.maximum(numbers, 0)
-        env.reset(*(None if quat is None else quat[chosen].astype(np.float32) for quat in (starts, goals)))
+        env.reset(
+            *(None if quat is None else quat[chosen].astype(np.float32) for quat in (starts, goals))
+        )
         drawn.append((numbers, env.state_dict()))
     return drawn
 
@@ -221,12 +234,16 @@ def motion_of(env: Any, *, copy: bool = False) -> dict[str, torch.Tensor]:
     found = {}
     for name, array in env.motion().items():
         rows = wp.to_torch(array).view(env.num_envs, -1)
-        rows = rows.view(torch.int32) if rows.dtype == torch.uint32 else rows  # the other has no index
+        rows = (
+            rows.view(torch.int32) if rows.dtype == torch.uint32 else rows
+        )  # the other has no index
         found[name] = rows.clone() if copy else rows
     return found
 
 
-def copy_motion(out: dict[str, torch.Tensor], motion: dict[str, torch.Tensor], envs: np.ndarray) -> None:
+def copy_motion(
+    out: dict[str, torch.Tensor], motion: dict[str, torch.Tensor], envs: np.ndarray
+) -> None:
     """Copy the motion of some environments, by number, of what :func:`motion_of` gave."""
     for name, values in motion.items():
         rows = torch.from_numpy(envs).to(values.device)
@@ -248,19 +265,32 @@ def advance(env: Any, action: torch.Tensor) -> None:
 
 
 def out_of_hand(env: Any) -> np.ndarray:
-    """Whether each object is where it counts as lost, bool [N]; what is not a number is lost too."""
+    """Whether each object is where it counts as lost, bool [N].
+
+    What is not a number is lost too.
+    """
     away = env.object_pose()[:, :3] - np.array(env.hand.workspace.goal_m)
-    return np.asarray(~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_of(env.hand.workspace)))
+    return np.asarray(
+        ~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_of(env.hand.workspace))
+    )
 
 
 class _Round:
-    """One episode in every environment that has one: ``numbers`` [N], place among its object's, else -1."""
+    """One episode in every environment that has one.
 
-    def __init__(self, env: Any, trace: Trace, numbers: np.ndarray, table_steps: int | None) -> None:
+    ``numbers`` [N], place among its object's, else -1.
+    """
+
+    def __init__(
+        self, env: Any, trace: Trace, numbers: np.ndarray, table_steps: int | None
+    ) -> None:
         self._env, self._trace, self._numbers, self._table_steps = env, trace, numbers, table_steps
         self._objects = np.asarray(env.world_object)
-        # The state in which each way to stop ends an environment, after how many steps; -1: not yet.
-        self._stopped = {way: (np.full(env.num_envs, -1), motion_of(env, copy=True)) for way in trace.held}
+        # The state in which each way to stop ends an environment, after how many steps; -1: not
+        # yet.
+        self._stopped = {
+            way: (np.full(env.num_envs, -1), motion_of(env, copy=True)) for way in trace.held
+        }
 
     def run(self, policy: Any, on_step: Callable[[], object]) -> None:
         """Go to the ends, then go on from the stops that are to be held."""
@@ -336,5 +366,7 @@ class _Round:
             env.hold()
             lost |= out_of_hand(env)[envs]
         place = self._place(envs)
-        error = rotation_angle(unit_quats(env.object_pose()[envs, 3:7]), self._trace.goal_quat[place])
+        error = rotation_angle(
+            unit_quats(env.object_pose()[envs, 3:7]), self._trace.goal_quat[place]
+        )
         self._trace.held[way][place] = np.where(lost, np.pi, error)

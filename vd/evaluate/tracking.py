@@ -56,9 +56,13 @@ class TrackingActor:
         scene, camera, depth = env.scene, env.hand.camera.at(policy.spec.camera), policy.spec.depth
         self.hand, self._surfaces = env.hand, [item.surface_points for item in env.objects]
         self.num_actions, self._env, frame_s = policy.num_actions, env, env.cfg.sim.control_dt
-        env.acts_in_frame = False  # who sees by a camera acts in the world, whatever its teacher does
+        env.acts_in_frame = (
+            False  # who sees by a camera acts in the world, whatever its teacher does
+        )
         depth = depth.with_errors() if sensor_errors else depth
-        self.camera = DepthCamera.of_scene(scene, env.sim.body_q, depth, camera, frame_s=frame_s, seed=seed)
+        self.camera = DepthCamera.of_scene(
+            scene, env.sim.body_q, depth, camera, frame_s=frame_s, seed=seed
+        )
         self.tracker = Tracker(
             policy,
             env.hand,
@@ -80,7 +84,10 @@ class TrackingActor:
         return self._surfaces[scene.world_object[world]] * scene.world_scale[world]
 
     def act(self, _observation: torch.Tensor) -> torch.Tensor:
-        """Mean actions [N, D] for what is sensed now; the teacher's observation is not looked at."""
+        """Mean actions [N, D] for what is sensed now.
+
+        The teacher's observation is not looked at.
+        """
         decision = self.tracker.step(sensed(self._env, self.camera))
         self.predicted.copy_(decision.angle)
         return decision.action.masked_fill(~self.active[:, None], 0.0)

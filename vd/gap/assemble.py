@@ -1,4 +1,7 @@
-"""Put the explanations of all joints together: shared effects, pooled numbers, one verdict, curves."""
+"""Put the explanations of all joints together.
+
+Shared effects, pooled numbers, one verdict, curves.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,7 +53,9 @@ class Analysed:
 def curves(
     recording: Recording, problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]
 ) -> np.ndarray:
-    """Positions of all trajectories one after the other [S, J] [rad]; NaN where no joint was fitted.
+    """Positions of all trajectories one after the other [S, J] [rad].
+
+    NaN where no joint was fitted.
 
     They are simulated with the time step at which an estimate is finished.
 
@@ -65,7 +70,9 @@ def curves(
         own = {spec.joint: rows[spec.joint] for spec, rows in models if spec.chain == index}
         if own:
             rows = np.array([own.get(joint, row) for joint, row in enumerate(chain.start_row)])
-            rollouts = Rollouts(chain, recording, dt=problems.dt / FINER[-1], device=problems.device)
+            rollouts = Rollouts(
+                chain, recording, dt=problems.dt / FINER[-1], device=problems.device
+            )
             result[:, chain.columns] = rollouts.predict(rows[None])[0]
     return result
 
@@ -120,7 +127,8 @@ def _residuals(joint: Analysed, predictions: Predictions) -> dict[int, np.ndarra
     """Measured minus simulated in what was analysed of each trajectory that moves a joint.
 
     Returns:
-        By trajectory, shape [samples, 2] [rad]: of baseline and identified model, everything fitted.
+        By trajectory, shape [samples, 2] [rad]: of baseline and identified model, everything
+            fitted.
     """
     spec, column = joint.spec, predictions.joints.index(joint.name)
     models = np.stack([predictions.baseline[:, column], predictions.identified[:, column]], axis=1)
@@ -134,7 +142,9 @@ def _residuals(joint: Analysed, predictions: Predictions) -> dict[int, np.ndarra
     return result
 
 
-def _errors(joint: Analysed, residuals: dict[int, np.ndarray], recording: Recording) -> list[TrajectoryError]:
+def _errors(
+    joint: Analysed, residuals: dict[int, np.ndarray], recording: Recording
+) -> list[TrajectoryError]:
     """Held-out errors where the trajectory was in a fold, errors of the full fit where it was in no fit."""
     fits, result = (joint.explanation.baseline, joint.explanation.final), []
     for index, left in residuals.items():
@@ -144,13 +154,21 @@ def _errors(joint: Analysed, residuals: dict[int, np.ndarray], recording: Record
             squares = np.array([fit.held_out[place] for fit in fits]) / len(left)
             sums = [np.nan if fit.held_out_abs is None else fit.held_out_abs[place] for fit in fits]
             absolutes = np.array(sums) / len(left)
-        part, (old, new), (old_abs, new_abs) = recording.trajectories[index], np.sqrt(squares), absolutes
+        part, (old, new), (old_abs, new_abs) = (
+            recording.trajectories[index],
+            np.sqrt(squares),
+            absolutes,
+        )
         errors = float(old), float(new), float(old_abs), float(new_abs)
-        result.append(TrajectoryError(part.file, part.excitation, joint.name, *errors, samples=len(left)))
+        result.append(
+            TrajectoryError(part.file, part.excitation, joint.name, *errors, samples=len(left))
+        )
     return result
 
 
-def _fit(joints: Sequence[Analysed], residuals: dict[str, dict[int, np.ndarray]], model: int) -> Fit:
+def _fit(
+    joints: Sequence[Analysed], residuals: dict[str, dict[int, np.ndarray]], model: int
+) -> Fit:
     """Errors on everything analysed, and the baseline's parameters, of one of the two models."""
     left = {name: np.concatenate([*of.values()])[:, model] for name, of in residuals.items()}
     everything = np.concatenate([*left.values()])
@@ -179,7 +197,9 @@ def _sums(rows: Sequence[TrajectoryError]) -> tuple[np.ndarray, np.ndarray, np.n
     return count, count * before**2, count * after**2
 
 
-def _held_out(files: Sequence[str], rows: Sequence[TrajectoryError], rng: np.random.Generator) -> HeldOut:
+def _held_out(
+    files: Sequence[str], rows: Sequence[TrajectoryError], rng: np.random.Generator
+) -> HeldOut:
     """Errors before and after, over trajectories of all joints."""
     count, old, new = _sums(rows)
     weights = resamples(len(count), rng)
@@ -193,7 +213,9 @@ def _held_out(files: Sequence[str], rows: Sequence[TrajectoryError], rng: np.ran
         reduction=1.0 - after / max(before, 1e-30),
         ci95=interval(samples),
         baseline_mae_rad=float(np.average([row.baseline_mae_rad for row in rows], weights=count)),
-        identified_mae_rad=float(np.average([row.identified_mae_rad for row in rows], weights=count)),
+        identified_mae_rad=float(
+            np.average([row.identified_mae_rad for row in rows], weights=count)
+        ),
     )
 
 
@@ -209,7 +231,9 @@ def _gap(joint: Analysed, rows: Sequence[TrajectoryError], rng: np.random.Genera
         identified_ci95=interval(rmse(new, count, weights)),
         verdict=joint.explanation.verdict,
         reason=joint.explanation.reason,
-        open_sets=tuple(_unique(one.name, *one.tied) for one in joint.found if one.tied and not one.named),
+        open_sets=tuple(
+            _unique(one.name, *one.tied) for one in joint.found if one.tied and not one.named
+        ),
     )
 
 
@@ -220,7 +244,9 @@ def _pool(joints: Sequence[Analysed], *, named: bool) -> tuple[NamedEffect, ...]
         for accepted in joint.found:
             if accepted.named == named:
                 alike = groups.setdefault(accepted.name, [])
-                group = next((g for g in alike if all(_agree(accepted, a) for a in g.values())), None)
+                group = next(
+                    (g for g in alike if all(_agree(accepted, a) for a in g.values())), None
+                )
                 if group is None:
                     alike.append(group := {})
                 group[joint.name] = accepted
@@ -230,12 +256,17 @@ def _pool(joints: Sequence[Analysed], *, named: bool) -> tuple[NamedEffect, ...]
 
 
 def _agree(one: Accepted, other: Accepted) -> bool:
-    """Whether the values of an effect on two joints can be the same: close, or of intervals that overlap."""
+    """Whether the values of an effect on two joints can be the same.
+
+    Close, or of intervals that overlap.
+    """
     if one.estimates.keys() != other.estimates.keys():
         return False
     pairs = [(one.estimates[key], other.estimates[key]) for key in one.estimates]
     near = [abs(a[0] - b[0]) <= CLOSE * max(abs(a[0]), abs(b[0])) for a, b in pairs]
-    return all(close or (a[1] <= b[2] and b[1] <= a[2]) for close, (a, b) in zip(near, pairs, strict=True))
+    return all(
+        close or (a[1] <= b[2] and b[1] <= a[2]) for close, (a, b) in zip(near, pairs, strict=True)
+    )
 
 
 def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
@@ -247,9 +278,12 @@ def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
         weight = np.maximum(0.5 * (highs - lows), 1e-12) ** -2
         weight /= weight.sum()
         value = float(weight @ values)
-        # No narrower than the joints' own, whose errors are one model's, nor than their values lie apart.
+        # No narrower than the joints' own, whose errors are one model's, nor than their values lie
+        # apart.
         apart = half_width(weight @ (values - value) ** 2 / max(len(every) - 1, 1), len(every))
-        below, above = (float(np.maximum(weight @ d, apart)) for d in (values - lows, highs - values))
+        below, above = (
+            float(np.maximum(weight @ d, apart)) for d in (values - lows, highs - values)
+        )
         low = max(value - below, -np.inf if known[key].signed else 0.0)
         parameters[key] = Estimate(value, (float(low), float(value + above)), known[key].unit)
     return NamedEffect(
@@ -258,7 +292,8 @@ def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
         confidence=float(np.mean([accepted.confidence for accepted in every])),
         parameters=parameters,
         alternatives=tuple(
-            Alternative(*other) for other in max(every, key=lambda accepted: accepted.confidence).alternatives
+            Alternative(*other)
+            for other in max(every, key=lambda accepted: accepted.confidence).alternatives
         ),
     )
 

@@ -1,7 +1,9 @@
-"""Chains of joints that move each other: a finger read from the hand's USD, or one bare servo or pendulum.
+"""Chains of joints that move each other.
 
-A bare servo and a pendulum are one joint with its own inertia; a finger is a chain of bodies, hanging palm
-down as in the simulator.
+A finger read from the hand's USD, or one bare servo or pendulum.
+
+A bare servo and a pendulum are one joint with its own inertia; a finger is a chain of bodies,
+hanging palm down as in the simulator.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,8 +55,10 @@ class Chain:
         baseline_free: Names of the parameters that the baseline fits.
         start_row: Nominal parameter rows, every effect off [n, PARAMETER_COLUMNS].
         slot: Place of each joint in its finger, which is its column of the coupling [n].
-        reference_p_gain: Largest ``p_gain`` of the recording, at which kp is identified; None without.
-        reference_load: A pendulum's load, at which inertia and gravity torque are identified, or None.
+        reference_p_gain: Largest ``p_gain`` of the recording, at which kp is identified; None
+            without.
+        reference_load: A pendulum's load, at which inertia and gravity torque are identified, or
+            None.
         bodies: Whether the links have mass; if not, each joint is its own inertia.
         axis: Unit joint axes in the base frame, all joints at zero, as all that follows [n, 3].
         offset: From the joint before (the base) to the joint [n, 3] [m].
@@ -100,15 +104,17 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
     Joints of a finger that are not recorded are taken to stand at zero.
 
     Raises:
-        ValueError: The recording is of a hand and none is given, it has joints that the hand has not, or
-            joints follow others.
+        ValueError: The recording is of a hand and none is given, it has joints that the hand has
+            not, or joints follow others.
     """
     gains = [t.conditions["p_gain"] for t in recording.trajectories if "p_gain" in t.conditions]
     p_gain = max((float(gain) for gain in gains), default=None)
     if recording.model in BARE_MODELS:
         return [_bare(recording, column, p_gain) for column in range(len(recording.joints))]
     if hand is None:
-        raise ValueError(f"{recording.path}: a recording of {recording.model!r} needs its hand; pass it")
+        raise ValueError(
+            f"{recording.path}: a recording of {recording.model!r} needs its hand; pass it"
+        )
     unknown = [name for name in recording.joints if name not in hand.joint_names]
     if unknown:
         raise ValueError(
@@ -116,7 +122,9 @@ def chains(recording: Recording, hand: HandModel | None = None) -> list[Chain]:
             f"({', '.join(hand.joint_names)}); name the hand that was recorded"
         )
     if (hand.mimic >= 0).any():
-        raise ValueError(f"{hand.name}: some joints follow others, which the gap workflow does not model")
+        raise ValueError(
+            f"{hand.name}: some joints follow others, which the gap workflow does not model"
+        )
     found = []
     for finger in hand.fingers:
         names = tuple(name for name in hand.joint_names[finger] if name in recording.joints)
@@ -162,9 +170,16 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
 
 
 def _finger(
-    recording: Recording, hand: HandModel, finger: slice, names: tuple[str, ...], p_gain: float | None
+    recording: Recording,
+    hand: HandModel,
+    finger: slice,
+    names: tuple[str, ...],
+    p_gain: float | None,
 ) -> Chain:
-    """A finger's bodies with all joints at zero; what an unrecorded joint carries is fixed to its parent."""
+    """A finger's bodies with all joints at zero.
+
+    What an unrecorded joint carries is fixed to its parent.
+    """
     slots = [i for i, name in enumerate(hand.joint_names[finger]) if name in names]
     joints, n = finger.start + np.array(slots), len(slots)
     poses = hand.forward_kinematics(np.zeros(hand.num_joints))
@@ -211,8 +226,8 @@ def _finger(
 def known_stiffness(recording: Recording, joint: str) -> float | None:
     """Stiffness of a joint's drive at the largest P gain recorded [N m/rad], if the recording tells it.
 
-    Commands and positions of a bare servo, or of a pendulum whose load is not known, show torques up to one
-    common factor. The fit holds the stiffness, at a nominal value unless it is told.
+    Commands and positions of a bare servo, or of a pendulum whose load is not known, show torques
+    up to one common factor. The fit holds the stiffness, at a nominal value unless it is told.
     """
     told = recording.servo.get(STIFFNESS)
     value = told.get(joint) if isinstance(told, Mapping) else told
@@ -220,7 +235,10 @@ def known_stiffness(recording: Recording, joint: str) -> float | None:
 
 
 def relative_torques(recording: Recording) -> bool:
-    """Whether nothing tells how large the torques of a recording are: they have a unit of their own."""
+    """Whether nothing tells how large the torques of a recording are.
+
+    They have a unit of their own.
+    """
     loads = any(load_of(trajectory.conditions) for trajectory in recording.trajectories)
     free = recording.model == "servo" or (recording.model in BARE_MODELS and not loads)
     return free and any(known_stiffness(recording, joint) is None for joint in recording.joints)

@@ -48,7 +48,10 @@ class _Step:
     """Print what the step wrote as JSON."""
 
     def analysis(self) -> "Analysis":
-        """The analysis in DIR with these settings; a recording is checked before anything slow begins."""
+        """The analysis in DIR with these settings.
+
+        A recording is checked before anything slow begins.
+        """
         from vd.gap.recording import read_recording
 
         recording = read_recording(self.recording)
@@ -78,9 +81,9 @@ class _Step:
 class Run(_Step):
     """Find, explain, close and report: the whole analysis of a recording.
 
-    Writes DIR/report.html (one page for people), report.json, identified.usda (the identified model, for
-    --hand-layer) and the figures. An interrupted run goes on with its step. The exit status is 0 for
-    every verdict and 2 for a recording that cannot be used.
+    Writes DIR/report.html (one page for people), report.json, identified.usda (the identified
+    model, for --hand-layer) and the figures. An interrupted run goes on with its step. The exit
+    status is 0 for every verdict and 2 for a recording that cannot be used.
     """
 
 
@@ -112,8 +115,9 @@ class Report(_Step):
 class Plan(_Step):
     """Choose the motions that would separate what is still ambiguous, as files vd-deploy record can play.
 
-    Each set of motions of a menu is simulated under the models that compete; the one on which they disagree
-    most, compared with the noise, wins. Writes DIR/next_experiment.json and its commands as CSV files.
+    Each set of motions of a menu is simulated under the models that compete; the one on which they
+    disagree most, compared with the noise, wins. Writes DIR/next_experiment.json and its commands
+    as CSV files.
     """
 
     def run(self) -> int:
@@ -136,8 +140,9 @@ class Plan(_Step):
 class Hide:
     """Make a recording in which effects are hidden, to see whether they are found.
 
-    The plant shares no code with the fitted model: it is integrated on its own at a high rate, with random
-    base parameters, encoder counts, noise and jittered time stamps. The truth is written beside the folder.
+    The plant shares no code with the fitted model: it is integrated on its own at a high rate, with
+    random base parameters, encoder counts, noise and jittered time stamps. The truth is written
+    beside the folder.
     """
 
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
@@ -145,8 +150,8 @@ class Hide:
     out: Path
     """Folder of the recording to write."""
     effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME, NAME:PARAMETER=VALUE,... or NAME@JOINT+JOINT:...; give it again for a second effect, or leave
-    it out to hide nothing."""
+    """NAME, NAME:PARAMETER=VALUE,... or NAME@JOINT+JOINT:...; give it again for a second effect, or
+    leave it out to hide nothing."""
     excitations: tuple[str, ...] = ("steps_and_sines",)
     """Sets of motions."""
     seed: int = 0
@@ -162,7 +167,8 @@ class Hide:
 
         if (self.out / "recording.json").exists() and not truth_path(self.out).exists():
             raise ValueError(
-                f"--out {self.out} holds a recording in which nothing was hidden; name another folder"
+                f"--out {self.out} holds a recording in which nothing was hidden; name another "
+                f"folder"
             )
         parsed = [parse_effect(text) for text in self.effect]
         hiding = Hiding(
@@ -177,7 +183,9 @@ class Hide:
         if self.json:
             print(json.dumps(hidden.truth, indent=1))
         else:
-            print(f"{self.out}: {len(hidden.recording.trajectories)} motions\n{truth_path(self.out)}")
+            print(
+                f"{self.out}: {len(hidden.recording.trajectories)} motions\n{truth_path(self.out)}"
+            )
         return 0
 
 
@@ -198,9 +206,9 @@ Command = (
 @interrupt.command("vd-gap")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
-    command: Run | Find | Explain | Close | Report | Plan | Hide | Convert | Contact | HideContact = parse(
-        Command, arguments, prog="vd-gap", description=__doc__
-    )
+    command: (
+        Run | Find | Explain | Close | Report | Plan | Hide | Convert | Contact | HideContact
+    ) = parse(Command, arguments, prog="vd-gap", description=__doc__)
     from vd.gap.recording import RecordingError
 
     try:

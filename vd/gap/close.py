@@ -1,6 +1,7 @@
 """Close the gap: write the identified model as a USD layer, read it back, and simulate the commands again.
 
-A hand is simulated in Newton, the simulator of training, never in the model that was fitted. A bare servo
+A hand is simulated in Newton, the simulator of training, never in the model that was fitted. A bare
+servo
 or pendulum has no articulation: there the layer is read back into the joint's own model.
 """
 
@@ -30,14 +31,17 @@ def write_identified(
     hand: "HandModel | None",
     start: Mapping[str, np.ndarray],
 ) -> str:
-    """Write what a report identified as a layer; for a hand with fingers like those recorded, one with them.
+    """Write what a report identified as a layer.
+
+    For a hand with fingers like those recorded, one with them.
 
     Args:
         report: The report.
         folder: Where.
         recording: What it was identified from.
         hand: The hand; None for a bare servo or pendulum.
-        start: Parameter row of each joint that the analysis started from; its effects stay in the layer.
+        start: Parameter row of each joint that the analysis started from; its effects stay in the
+            layer.
 
     Returns:
         Name of the layer for all fingers, empty without one.
@@ -56,7 +60,9 @@ def write_identified(
                 joint: {p.name: fitted[own][p.name] for p in BASELINE if p.name in fitted[own]}
                 for joint, own in known.items()
             },
-            effects={joint: _effects(held, own, fitted[own], start) for joint, own in known.items()},
+            effects={
+                joint: _effects(held, own, fitted[own], start) for joint, own in known.items()
+            },
             tool="vd-gap",
             recording=report.recording.path,
         )
@@ -77,7 +83,10 @@ def counterparts(hand: "HandModel", known: tuple[str, ...]) -> dict[str, str]:
 
 
 def _effects(
-    held: tuple[NamedEffect, ...], joint: str, fitted: Mapping[str, float], start: Mapping[str, np.ndarray]
+    held: tuple[NamedEffect, ...],
+    joint: str,
+    fitted: Mapping[str, float],
+    start: Mapping[str, np.ndarray],
 ) -> dict[str, dict[str, Any]]:
     """Effects of a joint: those it started with, a pendulum's gravity, and the identified ones."""
     values: dict[str, dict[str, Any]] = {}
@@ -131,13 +140,22 @@ def simulate_again(
         rows, column = np.isin(curves.trajectory, moved), curves.joints.index(joint)
         squares[joint] = (models[:, rows, column] - curves.measured[rows, column]) ** 2
     before, after = np.sqrt(np.concatenate([*squares.values()], axis=1).mean(axis=1)).tolist()
-    per_joint = {joint: tuple(np.sqrt(each.mean(axis=1)).tolist()) for joint, each in squares.items()}
-    closing = Closing("rollout" if hand_name is None else "newton", layer.name, before, after, per_joint)
+    per_joint = {
+        joint: tuple(np.sqrt(each.mean(axis=1)).tolist()) for joint, each in squares.items()
+    }
+    closing = Closing(
+        "rollout" if hand_name is None else "newton", layer.name, before, after, per_joint
+    )
     return closing, replace(curves, baseline=models[0], identified=models[1])
 
 
 def _newton(
-    report: Report, layer: Path, recording: Recording, hand_name: str, start_layer: Path | None, device: str
+    report: Report,
+    layer: Path,
+    recording: Recording,
+    hand_name: str,
+    start_layer: Path | None,
+    device: str,
 ) -> np.ndarray:
     """Both models in Newton [2, S, J]; the identified one as any user of the layer reads it."""
     from vd.assets_usd.hands import load_hand
@@ -162,5 +180,7 @@ def _bare(layer: Path, recording: Recording, curves: Predictions, device: str) -
     for chain in chains(recording, None):
         if np.isfinite(curves.identified[:, chain.columns]).any():
             rows, _ = read_bare_layer(layer, chain.joints)
-            after[:, chain.columns] = Rollouts(chain, recording, device=device).predict(rows[None])[0]
+            after[:, chain.columns] = Rollouts(chain, recording, device=device).predict(rows[None])[
+                0
+            ]
     return after

@@ -1,12 +1,15 @@
 """What the recorded motions of an object tell of its contact.
 
-Nothing is simulated. Each parameter is the slope of a law that is exact for a rigid object, fitted by linear
+Nothing is simulated. Each parameter is the slope of a law that is exact for a rigid object, fitted
+by linear
 least squares to every motion that obeys it:
 
 - ``table_friction`` mu: a sliding object slows down by mu g, its path is s0 + v t - mu g t^2 / 2.
 - ``centre_of_mass`` d: in flight o(t) + R(t) d is on a parabola, o the object's origin.
-- ``restitution`` e: what hits the table under the centre of mass leaves with e times the speed it came with.
-- ``mass`` m: while a pushed object slides, the impulse of the push is m (change of velocity + mu g time).
+- ``restitution`` e: what hits the table under the centre of mass leaves with e times the speed it
+  came with.
+- ``mass`` m: while a pushed object slides, the impulse of the push is m (change of velocity + mu g
+  time).
 - ``tip_compliance`` c: the rigid part of a pressing finger comes nearer by c times the force.
 
 The unit of all intervals is the motion, since residuals within one are correlated.
@@ -29,7 +32,9 @@ from vd.gap.contact_recording import ContactMotion, ContactRecording, Kind
 from vd.gap.recording_checks import RecordingError
 
 FALSE_NAMES = 0.02
-"""Share of recordings without a gap in which any name may be given; split evenly over all numbers."""
+"""Share of recordings without a gap in which any name may be given; split evenly over all
+numbers.
+"""
 OUTLIER = 3.5
 """Residuals beyond this many standard deviations, by the median, are samples that came late."""
 FEWEST = 5
@@ -37,19 +42,27 @@ FEWEST = 5
 SMOOTH_S = 0.05
 """Window of the parabola that gives velocities [s]."""
 CLEAR_M = 0.003
-"""An object flies if its lowest point is this far above the table: more than a tracker errs by [m]."""
+"""An object flies if its lowest point is this far above the table: more than a tracker errs by
+[m].
+"""
 SURE_S = 0.15
 """Before an impact a hand has let go for as long: a fall of 11 cm [s]."""
 SLIDING, MOVING = 0.1, 0.3
-"""Shares of the top speed down to which a slide, and a push, count: slower, noise decides the direction."""
+"""Shares of the top speed down to which a slide, and a push, count: slower, noise decides the
+direction.
+"""
 UPRIGHT_RAD = 0.05
 """Tilt within which a sliding object stays: more is tumbling or rolling."""
 TURNING = 0.3
-"""Speed of the rim by turning over that of the object below which friction is against the motion, to 2 %."""
+"""Speed of the rim by turning over that of the object below which friction is against the motion,
+to 2 %.
+"""
 FLAT_M = 0.003
 """Points this close to the lowest one hit the table with it [m]."""
 CENTRAL = 0.25
-"""Share of the object's reach within which an impact is under the centre of mass: others are several."""
+"""Share of the object's reach within which an impact is under the centre of mass: others are
+several.
+"""
 FAST_M_S = 1.0
 """Impacts from this speed on tell the restitution: the flight after slower ones is too short."""
 IMPACT_S = 0.01
@@ -67,7 +80,8 @@ class Found:
 
     Attributes:
         name: Key of :data:`vd.assets_usd.objects.contact_layer.CONTACT`.
-        verdict: ``effect``: other than the object's file says; ``no_gap``: as it says; ``unknown``: not told.
+        verdict: ``effect``: other than the object's file says; ``no_gap``: as it says; ``unknown``:
+            not told.
         value, low, high: Estimate, and its 95 % interval [P].
         nominal: As the object's file has it [P].
         confidence: That it differs.
@@ -90,7 +104,9 @@ class Found:
 
 @dataclass
 class _State:
-    """What laws need besides a motion: corners of the object [N, 3], height of the table, earlier parameters.
+    """What laws need besides a motion.
+
+    Corners of the object [N, 3], height of the table, earlier parameters.
 
     A bounce too low to be seen has the share ``unseen`` of the highest such.
     """
@@ -155,13 +171,18 @@ def verdict(found: Sequence[Found]) -> Literal["effects", "no_gap", "under_excit
 
 def by_weight(found: Sequence[Found]) -> list[Found]:
     """The effects, those that stand out most from their intervals first."""
-    return sorted((each for each in found if each.verdict == "effect"), key=lambda each: -each.weight)
+    return sorted(
+        (each for each in found if each.verdict == "effect"), key=lambda each: -each.weight
+    )
 
 
 def _judge(
     name: str, motions: list[Equations], item: ObjectModel, besides: np.ndarray | float = 0.0
 ) -> Found:
-    """A parameter's estimate and verdict; ``besides``: deviation from parameters taken as known [P]."""
+    """A parameter's estimate and verdict.
+
+    ``besides``: deviation from parameters taken as known [P].
+    """
     parameter = CONTACT[name]
     nominal = parameter.of(item)
     resolution = parameter.resolution * (nominal if parameter.relative else np.ones(len(nominal)))
@@ -189,7 +210,10 @@ def _judge(
 
 
 def _estimate(motions: list[Equations], size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares over all motions, and the jackknife's deviation over them [P]; NaN if not determined."""
+    """Least squares over all motions, and the jackknife's deviation over them [P].
+
+    NaN if not determined.
+    """
     count, blank = len(motions), np.full(size, np.nan)
     if count < 3:
         return blank, blank
@@ -203,7 +227,10 @@ def _estimate(motions: list[Equations], size: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _equations(nuisance: np.ndarray, slopes: np.ndarray, values: np.ndarray) -> Equations:
-    """Of values [T] = nuisance [T, K] a + slopes [T, P] theta; a is taken out, late samples are dropped."""
+    """Of values [T] = nuisance [T, K] a + slopes [T, P] theta.
+
+    A is taken out, late samples are dropped.
+    """
     full = np.hstack([nuisance, slopes])
     left = np.abs(values - full @ np.linalg.lstsq(full, values, rcond=None)[0])
     kept = left <= OUTLIER * 1.4826 * np.median(left) + 1e-12
@@ -224,7 +251,8 @@ def _velocity(motion: ContactMotion) -> np.ndarray:
     even = np.arange(time[0], time[-1] + step, step)
     window = min(max(2 * round(0.5 * SMOOTH_S / step) + 1, 5), 2 * ((len(even) - 1) // 2) + 1)
     smooth = (
-        savgol_filter(np.interp(even, time, v), window, 2, deriv=1, delta=step) for v in motion.position.T[:2]
+        savgol_filter(np.interp(even, time, v), window, 2, deriv=1, delta=step)
+        for v in motion.position.T[:2]
     )
     return np.stack([np.interp(time, even, v) for v in smooth], axis=1)
 
@@ -244,7 +272,10 @@ def _in_flight(motion: ContactMotion, state: _State) -> list[slice]:
 
 
 def _released(motion: ContactMotion, part: slice) -> slice:
-    """The end of a stretch that a hand begins: as long before the impact as the motion is free flight."""
+    """The end of a stretch that a hand begins.
+
+    As long before the impact as the motion is free flight.
+    """
     time, end = motion.time, part.stop
     first = min(max(int(np.searchsorted(time, time[end - 1] - SURE_S)), part.start), end - FEWEST)
     usual = float(np.median(_flight_errors(motion, slice(first, end))))
@@ -280,7 +311,8 @@ def _check_gravity(recording: ContactRecording, state: _State) -> None:
                 falls.append(-2.0 * np.polyfit(time, motion.position[part, 2], 2)[0])
     if falls and not 0.8 < np.median(falls) / GRAVITY_M_S2 < 1.25:
         raise RecordingError(
-            f"{recording.path}: dropped objects fall with {np.median(falls):.3g} m/s^2, not {GRAVITY_M_S2}: "
+            f"{recording.path}: dropped objects fall with {np.median(falls):.3g} m/s^2, not "
+            f"{GRAVITY_M_S2}: "
             "z of the table's frame points up, positions are in m, t is in s: correct "
             "table_pose or the columns"
         )
@@ -292,7 +324,9 @@ def _flights(motion: ContactMotion, state: _State) -> Iterator[Equations]:
         time = motion.time[part] - motion.time[part].mean()
         for axis, fall in enumerate((0.0, 0.0, GRAVITY_M_S2)):
             slopes = -motion.rotation[part].as_matrix()[:, axis, :]
-            yield _equations(np.vander(time, 2), slopes, motion.position[part, axis] + 0.5 * fall * time**2)
+            yield _equations(
+                np.vander(time, 2), slopes, motion.position[part, axis] + 0.5 * fall * time**2
+            )
 
 
 def _slides(motion: ContactMotion, state: _State) -> Iterator[Equations]:
@@ -322,7 +356,9 @@ def _impacts(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     flights = _in_flight(motion, state)
     step = float(np.median(np.diff(motion.time)))
     # Of the fastest bounce with too few samples above CLEAR_M.
-    unseen = math.sqrt(2.0 * GRAVITY_M_S2 * (CLEAR_M + GRAVITY_M_S2 * (0.5 * FEWEST * step) ** 2 / 2.0))
+    unseen = math.sqrt(
+        2.0 * GRAVITY_M_S2 * (CLEAR_M + GRAVITY_M_S2 * (0.5 * FEWEST * step) ** 2 / 2.0)
+    )
     for before, after in zip(flights, [*flights[1:], None], strict=False):
         if before.stop == len(motion.time):
             return
@@ -344,12 +380,15 @@ def _touch(
     """Where a flight meets the table: at its end, or at its begin for given points [N] bool.
 
     Returns:
-        When [s]; how fast the points that touch it rise then [m/s]; which points they are, [N] bool.
+        When [s]; how fast the points that touch it rise then [m/s]; which points they are, [N]
+        bool.
     """
     time, edge = motion.time[part], -1 if touching is None else 0
     since = time - time[edge]
     centre = motion.position[part] + motion.rotation[part].apply(state.centre)
-    height, rise = np.polynomial.polynomial.polyfit(since, centre[:, 2] + 0.5 * GRAVITY_M_S2 * since**2, 1)
+    height, rise = np.polynomial.polynomial.polyfit(
+        since, centre[:, 2] + 0.5 * GRAVITY_M_S2 * since**2, 1
+    )
     near = np.abs(since) < SMOOTH_S
     base = motion.rotation[part][edge]
     turned = (motion.rotation[part][near] * base.inv()).as_rotvec()
@@ -363,13 +402,20 @@ def _touch(
         touching = arms[first, 2] < arms[first, 2].min() + FLAT_M
     at = int(np.abs(above + arms[:, 2, touching].mean(1)).argmin())
     arm = arms[at][:, touching].mean(1)
-    return time[edge] + times[at], rise - GRAVITY_M_S2 * times[at] + np.cross(spin, arm)[2], touching
+    return (
+        time[edge] + times[at],
+        rise - GRAVITY_M_S2 * times[at] + np.cross(spin, arm)[2],
+        touching,
+    )
 
 
 def _pushes(motion: ContactMotion, state: _State) -> Iterator[Equations]:
     """Impulse of a push along the path = m (change of velocity + mu g time) while the object slides."""
     velocity = _velocity(motion)
-    speed, pressing = np.linalg.norm(velocity, axis=1), np.linalg.norm(motion.force, axis=1) > PRESSED_N
+    speed, pressing = (
+        np.linalg.norm(velocity, axis=1),
+        np.linalg.norm(motion.force, axis=1) > PRESSED_N,
+    )
     sliding = pressing & (speed > MOVING * speed.max()) & _flat_on_table(motion, state)
     margin = round(SMOOTH_S / float(np.median(np.diff(motion.time))))
     for whole in _stretches(sliding):

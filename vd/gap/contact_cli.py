@@ -1,4 +1,7 @@
-"""``vd-gap contact`` and ``vd-gap hide-contact``: what an object's recorded motions tell of its contact."""
+"""``vd-gap contact`` and ``vd-gap hide-contact``.
+
+What an object's recorded motions tell of its contact.
+"""
 
 import json
 import time
@@ -21,13 +24,16 @@ REPORT, LAYER = "report.json", "identified.usda"
 class Contact:
     """Friction, restitution, mass, its centre and soft fingertips from the recorded motions of an object.
 
-    Writes DIR/report.json and DIR/identified.usda, a layer over the object's file that --objects takes.
+    Writes DIR/report.json and DIR/identified.usda, a layer over the object's file that --objects
+    takes.
     """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """Folder with recording.json (model contact) and its CSV files."""
     object: str
-    """The object: a set of one, such as cube, its file, as vd-assets writes it, or a layer over that."""
+    """The object: a set of one, such as cube, its file, as vd-assets writes it, or a layer over
+    that.
+    """
     out: Path = Path("contact")
     """DIR: folder of the report and of the layer."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -45,19 +51,26 @@ class Contact:
 
         file, *others = set_files([self.object])
         if others:
-            raise ValueError(f"--object {self.object} has {1 + len(others)} objects; name the one that moved")
+            raise ValueError(
+                f"--object {self.object} has {1 + len(others)} objects; name the one that moved"
+            )
         item, layer = read_object(file), self.out / LAYER
         if layer.exists() and layer.samefile(file):
             raise ValueError(f"--out {self.out} holds --object itself; name another folder")
         found = identify_contact(recording, item)
-        report = contact_report(found, str(self.recording), self.object, time.perf_counter() - began)
+        report = contact_report(
+            found, str(self.recording), self.object, time.perf_counter() - began
+        )
         make_folder(self.out)
         write_contact_layer(layer, file, identified(found), str(self.recording))
         write_json(self.out / REPORT, report)
         if self.json:
             print(json.dumps(report, indent=1))
             return 0
-        print(f"{report['verdict']}: {', '.join(e['name'] for e in report['effects']) or 'nothing named'}")
+        print(
+            f"{report['verdict']}: "
+            f"{', '.join(e['name'] for e in report['effects']) or 'nothing named'}"
+        )
         for each in found:
             value = " ".join(
                 f"{v:.4g} ({a:.4g} to {b:.4g})"
@@ -75,7 +88,9 @@ def identified(found: "Sequence[Found]") -> dict[str, tuple[tuple[float, ...], .
             tuple(each.value.tolist()),
             # A coarse interval may reach below zero, which cannot be simulated.
             tuple(
-                each.low.tolist() if len(each.low) > 1 else np.maximum(each.low, 0.1 * each.value).tolist()
+                each.low.tolist()
+                if len(each.low) > 1
+                else np.maximum(each.low, 0.1 * each.value).tolist()
             ),
             tuple(each.high.tolist()),
         )
@@ -84,7 +99,9 @@ def identified(found: "Sequence[Found]") -> dict[str, tuple[tuple[float, ...], .
     }
 
 
-def contact_report(found: "Sequence[Found]", recording: str, item: str, seconds: float) -> Mapping[str, Any]:
+def contact_report(
+    found: "Sequence[Found]", recording: str, item: str, seconds: float
+) -> Mapping[str, Any]:
     """``report.json``; a number that is not known is None."""
     from vd.assets_usd.objects.contact_layer import CONTACT
     from vd.gap.contact import by_weight, verdict
@@ -100,7 +117,11 @@ def contact_report(found: "Sequence[Found]", recording: str, item: str, seconds:
         "format": FORMAT,
         "verdict": verdict(found),
         "effects": [
-            {"name": each.name, "confidence": each.confidence, "parameters": {each.name: estimate(each)}}
+            {
+                "name": each.name,
+                "confidence": each.confidence,
+                "parameters": {each.name: estimate(each)},
+            }
             for each in by_weight(found)
         ],
         "parameters": {
@@ -123,8 +144,8 @@ def contact_report(found: "Sequence[Found]", recording: str, item: str, seconds:
 class HideContact:
     """Make a recording of an object in MuJoCo, with contact parameters hidden, to see whether they are found.
 
-    The plant shares nothing with the analysis; a tracker adds noise, late and missing samples. The truth is
-    written beside the folder.
+    The plant shares nothing with the analysis; a tracker adds noise, late and missing samples. The
+    truth is written beside the folder.
     """
 
     out: Path
@@ -132,7 +153,9 @@ class HideContact:
     object: str = "cube"
     """Object set, or an object's file, whose first object it is."""
     hide: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME=VALUE such as table_friction=0.4, or centre_of_mass=X,Y,Z; give it again for a second one."""
+    """NAME=VALUE such as table_friction=0.4, or centre_of_mass=X,Y,Z; give it again for a second
+    one.
+    """
     seed: int = 0
     """Seed of motions, solver and tracker."""
 
@@ -143,7 +166,8 @@ class HideContact:
 
         if (self.out / "recording.json").exists() and not truth_path(self.out).exists():
             raise ValueError(
-                f"--out {self.out} holds a recording in which nothing was hidden; name another folder"
+                f"--out {self.out} holds a recording in which nothing was hidden; name another "
+                f"folder"
             )
         values = dict(_parse(text) for text in self.hide)
         hide_contact(ContactPlant(load_set(self.object)[0], values, seed=self.seed), self.out)

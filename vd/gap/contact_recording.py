@@ -30,7 +30,9 @@ IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 UNIT_ERROR = 0.02
 """How far a quaternion's length may be from 1: rounding to two digits."""
 FARTHEST_M = 10.0
-"""Farther from the table's middle than any arm or camera reaches: the positions are in millimetres."""
+"""Farther from the table's middle than any arm or camera reaches: the positions are in
+millimetres.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +41,9 @@ class ContactMotion:
 
     Attributes:
         file: Name of the CSV file.
-        kind: ``drop``: falls and bounces; ``slide``: slides freely until it rests; ``push``: is pushed along
-            by a finger whose force is measured; ``press``: is pressed onto the table by it, and stays.
+        kind: ``drop``: falls and bounces; ``slide``: slides freely until it rests; ``push``: is
+            pushed along by a finger whose force is measured; ``press``: is pressed onto the table
+            by it, and stays.
         time: Time stamps [T] [s].
         position: Origin of the object's USD frame [T, 3] [m].
         rotation: Orientation of the object's USD frame, [T].
@@ -81,19 +84,30 @@ def read_contact_recording(path: str | Path) -> ContactRecording:
         raise RecordingError(
             f"{file}: model must be {CONTACT_MODEL!r}; recordings of joints are for vd-gap run"
         )
-    frames = [_frame(file, name, header.get(name, IDENTITY)) for name in ("table_pose", "object_pose")]
+    frames = [
+        _frame(file, name, header.get(name, IDENTITY)) for name in ("table_pose", "object_pose")
+    ]
     entries = header.get("trajectories")
     if not isinstance(entries, list) or not entries:
-        raise RecordingError(f"{file}: 'trajectories' is empty; list at least one {{file, excitation}}")
+        raise RecordingError(
+            f"{file}: 'trajectories' is empty; list at least one {{file, excitation}}"
+        )
     for i, entry in enumerate(entries):
-        name, kind = (entry.get(key) if isinstance(entry, dict) else None for key in ("file", "excitation"))
+        name, kind = (
+            entry.get(key) if isinstance(entry, dict) else None for key in ("file", "excitation")
+        )
         if not isinstance(name, str) or kind not in get_args(Kind):
             raise RecordingError(
-                f"{file}: trajectories[{i}]: give 'file', and 'excitation' out of {', '.join(get_args(Kind))}"
+                f"{file}: trajectories[{i}]: give 'file', and 'excitation' out of "
+                f"{', '.join(get_args(Kind))}"
             )
         if any(name == other["file"] for other in entries[:i]) or Path(name).name != name:
-            raise RecordingError(f"{file}: trajectories[{i}]: list {name!r} once, a file of this folder")
-    motions = [_motion(file.parent / entry["file"], entry["excitation"], frames) for entry in entries]
+            raise RecordingError(
+                f"{file}: trajectories[{i}]: list {name!r} once, a file of this folder"
+            )
+    motions = [
+        _motion(file.parent / entry["file"], entry["excitation"], frames) for entry in entries
+    ]
     return ContactRecording(file.parent, tuple(motions))
 
 
@@ -107,12 +121,20 @@ def write_contact_recording(folder: Path, motions: Sequence[ContactMotion]) -> N
             motion.pusher,
             motion.force,
         ]
-        names = [*TIME, *POSE, *(PUSHER if motion.pusher.size else ()), *(FORCE if motion.force.size else ())]
+        names = [
+            *TIME,
+            *POSE,
+            *(PUSHER if motion.pusher.size else ()),
+            *(FORCE if motion.force.size else ()),
+        ]
         table = np.hstack([column for column in columns if column.size])
         with atomic_path(folder / motion.file) as temporary:
             np.savetxt(temporary, table, "%.6f", ",", header=",".join(names), comments="")
     entries = [{"file": motion.file, "excitation": motion.kind} for motion in motions]
-    write_json(folder / "recording.json", {"format": FORMAT, "model": CONTACT_MODEL, "trajectories": entries})
+    write_json(
+        folder / "recording.json",
+        {"format": FORMAT, "model": CONTACT_MODEL, "trajectories": entries},
+    )
 
 
 def _frame(where: Path, name: str, values: Any) -> tuple[np.ndarray, Rotation]:
@@ -156,7 +178,9 @@ def _columns(file: Path, kind: Kind) -> dict[str, np.ndarray]:
     names, rows = read_table(file)
     for name in (name for group in NEEDED[kind] for name in group):
         if names.count(name) != 1:
-            raise RecordingError(f"{file}: row 1 has no one column {name!r}, which a {kind} needs; add it")
+            raise RecordingError(
+                f"{file}: row 1 has no one column {name!r}, which a {kind} needs; add it"
+            )
     if len(rows) < MIN_SAMPLES:
         raise RecordingError(
             f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, record it again"
@@ -168,9 +192,23 @@ def _columns(file: Path, kind: Kind) -> dict[str, np.ndarray]:
 def _check_values(file: Path, time: np.ndarray, pose: np.ndarray) -> None:
     """Time increases, positions are in metres, quaternions are some."""
     for bad, column, remedy in (
-        (np.diff(time, prepend=time[0] - 1.0) <= 0.0, "t", "time must increase; sort the rows, drop doubles"),
-        (np.abs(pose[:, :3]).max(1) > FARTHEST_M, "x", "positions are in metres; divide millimetres by 1000"),
-        (np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) > UNIT_ERROR, "qx", "quaternions have length 1"),
+        (
+            np.diff(time, prepend=time[0] - 1.0) <= 0.0,
+            "t",
+            "time must increase; sort the rows, drop doubles",
+        ),
+        (
+            np.abs(pose[:, :3]).max(1) > FARTHEST_M,
+            "x",
+            "positions are in metres; divide millimetres by 1000",
+        ),
+        (
+            np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) > UNIT_ERROR,
+            "qx",
+            "quaternions have length 1",
+        ),
     ):
         if bad.any():
-            raise RecordingError(f"{file}: row {int(bad.argmax()) + 2}, column {column!r}: {remedy}")
+            raise RecordingError(
+                f"{file}: row {int(bad.argmax()) + 2}, column {column!r}: {remedy}"
+            )

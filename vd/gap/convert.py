@@ -20,7 +20,8 @@ REQUIRED = ("command", "position")
 class Convert:
     """Write a recording from a LeRobot dataset, a ROS bag or MCAP, BAM's logs, or CSV files with units.
 
-    An episode, bag or file becomes one motion. Nothing is guessed: what a file does not say, a flag says.
+    An episode, bag or file becomes one motion. Nothing is guessed: what a file does not say, a flag
+    says.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -32,14 +33,18 @@ class Convert:
     format: Literal["csv", "bam", "lerobot", "ros"] | None = None
     """Format of SOURCE; found by its name where left out."""
     model: str | None = None
-    """servo, pendulum, or the hand whose joints these are; by default servo, of BAM's logs pendulum."""
+    """servo, pendulum, or the hand whose joints these are; by default servo, of BAM's logs
+    pendulum.
+    """
     unit: Literal["rad", "deg"] | None = None
     """Unit of angles where the file has none, as in LeRobot datasets."""
     joints: tuple[str, ...] = ()
     """Joints to take; all by default."""
     rename: tuple[str, ...] = ()
     """OLD=NEW: columns of a CSV ('elbow angle=position.elbow [deg]'), or joints."""
-    drop: tuple[Literal["velocity", "current", "pwm", "voltage", "temperature", "enabled"], ...] = ()
+    drop: tuple[
+        Literal["velocity", "current", "pwm", "voltage", "temperature", "enabled"], ...
+    ] = ()
     """Telemetry to leave out, such as a velocity of unknown unit."""
     state_topic: str | None = None
     """ROS topic of the measured joints, where there is more than one JointState."""
@@ -66,7 +71,9 @@ def convert(asked: Convert) -> Recording:
     from vd.gap.recording import read_recording, write_recording
 
     if asked.counts_per_turn < 1:
-        raise ValueError(f"--counts-per-turn is {asked.counts_per_turn}; give the encoder's, such as 4096")
+        raise ValueError(
+            f"--counts-per-turn is {asked.counts_per_turn}; give the encoder's, such as 4096"
+        )
     if (asked.out / "recording.json").exists():
         raise ValueError(f"--out {asked.out} holds a recording; name another folder")
     if bad := [pair for pair in asked.rename if "=" not in pair]:
@@ -80,12 +87,18 @@ def convert(asked: Convert) -> Recording:
     told = Told(asked.unit, rename, asked.state_topic, asked.command_topic, asked.joints)
     motions = list(FORMATS[format](asked.source, told))
     if unused := sorted(rename.keys() - told.used):
-        raise ValueError(f"--rename {unused[0]}={rename[unused[0]]}: {asked.source} has no {unused[0]!r}")
+        raise ValueError(
+            f"--rename {unused[0]}={rename[unused[0]]}: {asked.source} has no {unused[0]!r}"
+        )
     joints = asked.joints or motions[0].joints
     resolution = 2.0 * math.pi / asked.counts_per_turn
-    trajectories = tuple(_trajectory(asked, one, joints, MIN_SAMPLES * resolution) for one in motions)
+    trajectories = tuple(
+        _trajectory(asked, one, joints, MIN_SAMPLES * resolution) for one in motions
+    )
     if there := [one.file for one in trajectories if (asked.out / one.file).exists()]:
-        raise ValueError(f"--out {asked.out} holds {there[0]}, which would be lost; name another folder")
+        raise ValueError(
+            f"--out {asked.out} holds {there[0]}, which would be lost; name another folder"
+        )
     model = asked.model or ("pendulum" if format == "bam" else "servo")
     with TemporaryDirectory() as work:
         write_recording(Recording(Path(work), model, joints, {}, resolution, trajectories), work)
@@ -97,11 +110,15 @@ def convert(asked: Convert) -> Recording:
     return recording
 
 
-def _trajectory(asked: Convert, motion: Motion, joints: tuple[str, ...], moved_rad: float) -> Trajectory:
+def _trajectory(
+    asked: Convert, motion: Motion, joints: tuple[str, ...], moved_rad: float
+) -> Trajectory:
     """A motion with the wanted joints in their order."""
     where = f"{asked.source}: {motion.name}"
     if missing := [joint for joint in joints if joint not in motion.joints]:
-        raise RecordingError(f"{where}: no joint {missing[0]!r}; there are {', '.join(motion.joints)}")
+        raise RecordingError(
+            f"{where}: no joint {missing[0]!r}; there are {', '.join(motion.joints)}"
+        )
     picked = [motion.joints.index(joint) for joint in joints]
     channels: dict[str, Any] = {
         name: values[:, picked]
@@ -111,7 +128,9 @@ def _trajectory(asked: Convert, motion: Motion, joints: tuple[str, ...], moved_r
     for name in REQUIRED:
         bad = joints if name not in channels else [joints[j] for j in _with_gaps(channels[name])]
         if len(bad):
-            raise RecordingError(f"{where}: {name} of {', '.join(bad)} has gaps; choose others by --joints")
+            raise RecordingError(
+                f"{where}: {name} of {', '.join(bad)} has gaps; choose others by --joints"
+            )
     enabled = channels.pop("enabled", np.ones_like(channels["position"])) > 0.5
     excited = np.ptp(channels["command"], axis=0) > moved_rad
     begun = motion.time[0] if len(motion.time) else 0.0

@@ -14,18 +14,28 @@ BASELINE_PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAV
 """Everything that a baseline can fit, by name."""
 
 LOG_STEP = 0.01
-"""Finite-difference step of a logarithmic coordinate: above the noise of single precision. Not tuned."""
+"""Finite-difference step of a logarithmic coordinate: above the noise of single precision. Not
+tuned.
+"""
 LINEAR_STEP = 0.05
 """The same of a linear coordinate, in its scale or in its value if that is larger. Not tuned."""
-SLOWING = ("torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag", "acceleration_limit")
+SLOWING = (
+    "torque_limit",
+    "torque_speed_limit",
+    "torque_saturation",
+    "supply_sag",
+    "acceleration_limit",
+)
 """Effects whose work a speed limit does in part."""
 SMOOTHING = ("command_filter", "elastic_transmission")
-"""Effects whose work a free inertia does in part: a lag is a lag, on which side of the motor it is."""
+"""Effects whose work a free inertia does in part: a lag is a lag, on which side of the motor it
+is.
+"""
 LIGHT = 0.1
 """An inertia that does none of it, in fitted ones. Not tuned."""
 FREE_SPEED = 3.0
-"""A speed limit that does not bind, in largest speeds. Not tuned; without starts there the XL330 keeps
-45 mrad for 30 at one gain."""
+"""A speed limit that does not bind, in largest speeds. Not tuned; without starts there the XL330
+keeps 45 mrad for 30 at one gain."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +68,18 @@ class Coordinate:
         return min(max(x, self.lower), self.upper)
 
     def step(self, x: float, widen: float = 1.0) -> float:
-        """Finite-difference step at x, times a factor: the other way where it would leave the bounds."""
+        """Finite-difference step at x, times a factor.
+
+        The other way where it would leave the bounds.
+        """
         size = widen * (LOG_STEP if self.log else LINEAR_STEP * max(1.0, abs(x)))
         return size if self.lower <= x + size <= self.upper else -size
 
     def bound(self, x: float) -> bool:
-        """Whether x is at the far end of its range; 0 of an effect and half a turn are values like others."""
+        """Whether x is at the far end of its range.
+
+        0 of an effect and half a turn are values like others.
+        """
         if self.column == servo.GRAVITY_PHASE:
             return False
         margin = 1e-3 * (self.upper - self.lower)
@@ -99,7 +115,9 @@ def coordinate(key: str, scales: Scales) -> Coordinate:
     """The coordinate of a parameter by its key (``kp``, ``effect.parameter``)."""
     effect, _, name = key.rpartition(".")
     parameter = (
-        next(p for p in EFFECTS[effect].parameters if p.name == name) if effect else BASELINE_PARAMETERS[name]
+        next(p for p in EFFECTS[effect].parameters if p.name == name)
+        if effect
+        else BASELINE_PARAMETERS[name]
     )
     if parameter.lower > 0.0:
         bounds = math.log(parameter.lower), math.log(parameter.upper)
@@ -112,7 +130,9 @@ def coordinate(key: str, scales: Scales) -> Coordinate:
 def torque_power(key: str) -> int:
     """Power with which an effect's parameter follows the unit of torque: 1, 0, or -1."""
     effect, _, name = key.rpartition(".")
-    unit = next((p.unit for p in EFFECTS[effect].parameters if p.name == name), "") if effect else ""
+    unit = (
+        next((p.unit for p in EFFECTS[effect].parameters if p.name == name), "") if effect else ""
+    )
     if unit == "1/(N m)":
         return -1
     return int(of_torque(unit))
@@ -164,7 +184,9 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
             {"sigma_s": s, "p_drop": p} for s in (0.0015, 0.005, 0.015) for p in (0.01, 0.1, 0.4)
         ],
         "command_filter": [{"tau_s": f * period} for f in (0.3, 1.0, 3.0, 10.0)],
-        "acceleration_limit": [{"a_max_rad_s2": f * scales.acceleration} for f in (2.0, 1.0, 0.5, 0.25, 0.1)],
+        "acceleration_limit": [
+            {"a_max_rad_s2": f * scales.acceleration} for f in (2.0, 1.0, 0.5, 0.25, 0.1)
+        ],
         "torque_limit": [{"tau_max_nm": f * peak} for f in (0.9, 0.6, 0.35, 0.2)],
         "torque_speed_limit": [
             {"tau_stall_nm": f * peak, "omega_0_rad_s": g * speed}
@@ -188,7 +210,9 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         "integral_action": [{"k_i": f * scales.kp} for f in (0.1, 0.5, 2.0, 8.0)],
         "encoder_bias": [{"bias_rad": f * small} for f in (0.5, -0.5, 1.5, -1.5)],
         "gravity_load": [
-            {"tau_g_nm": f * torque, "phase_rad": p} for f in (0.1, 0.5) for p in (0.0, 1.57, -1.57, 3.1)
+            {"tau_g_nm": f * torque, "phase_rad": p}
+            for f in (0.1, 0.5)
+            for p in (0.0, 1.57, -1.57, 3.1)
         ],
         "payload_inertia": [{"j_kgm2": f * scales.inertia} for f in (0.1, 0.5, 2.0)],
         "elastic_transmission": [
@@ -208,7 +232,9 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
     bounds = {p.name: (p.lower, p.upper) for p in EFFECTS[effect].parameters}
     starts = [
         {
-            f"{effect}.{name}": value if value <= 0.0 else min(max(value, bounds[name][0]), bounds[name][1])
+            f"{effect}.{name}": value
+            if value <= 0.0
+            else min(max(value, bounds[name][0]), bounds[name][1])
             for name, value in start.items()
         }
         for start in table[effect]

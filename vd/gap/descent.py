@@ -9,16 +9,20 @@ from scipy.optimize import least_squares
 from vd.gap.coordinates import Coordinate
 
 SHORT = 4
-"""Trials after which the worse half of several starts ends, and of a refit near its start. Not tuned."""
+"""Trials after which the worse half of several starts ends, and of a refit near its start. Not
+tuned.
+"""
 WIDEN = -3.0
-"""Factor on the finite-difference steps of a second descent: dry friction and limits make the squared error
-rugged at the scale of the first one's. Less than 0: to the other side. Without the second
-descent a limit of 10 comes out as 10.19; other factors were not tried."""
+"""Factor on the finite-difference steps of a second descent: dry friction and limits make the
+squared error rugged at the scale of the first one's. Less than 0: to the other side. Without the
+second descent a limit of 10 comes out as 10.19; other factors were not tried."""
 TOLERANCE = 1e-4
 """Relative improvement of the squared error at which a fit has converged. Not tuned."""
 
 Residuals = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
-"""Residuals [C, N] of coordinates [C, P], those of trajectories that a mask [S] leaves out being 0."""
+"""Residuals [C, N] of coordinates [C, P], those of trajectories that a mask [S] leaves out being
+0.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +41,9 @@ class LeastSquares:
     ridge: float
     slopes: Residuals
 
-    def jacobian(self, x: np.ndarray, keep: np.ndarray | None = None, widen: float = 1.0) -> np.ndarray:
+    def jacobian(
+        self, x: np.ndarray, keep: np.ndarray | None = None, widen: float = 1.0
+    ) -> np.ndarray:
         """d(predicted)/dx [P, N] at coordinates [P] by one-sided differences, their steps times a factor."""
         steps = np.array([c.step(v, widen) for c, v in zip(self.coordinates, x, strict=True)])
         moved = np.vstack([x, x + np.diag(steps)])
@@ -85,7 +91,10 @@ class LeastSquares:
         return np.clip(start + found.x, start + lower, start + upper)
 
     def best(self, starts: np.ndarray, iterations: int) -> np.ndarray:
-        """Coordinates [P] of the least minimum from several starts [B, P]; the worse half ends early."""
+        """Coordinates [P] of the least minimum from several starts [B, P].
+
+        The worse half ends early.
+        """
         x = list(starts)
         while len(x) > 1:
             x = [self.descend(one, SHORT) for one in x]

@@ -12,22 +12,27 @@ from vd.gap.statistics import held
 MAX_FOLDS = 6
 """Groups of motions that are held out in turn: each costs a refit of every model. Not tuned."""
 BYSTANDERS = 2
-"""Trajectories of each other joint of the chain in which a joint's own rest is fitted too; of one, a coupling
-would have no interval. More were not tried."""
+"""Trajectories of each other joint of the chain in which a joint's own rest is fitted too; of one,
+a coupling would have no interval. More were not tried."""
 MAX_MOTION_S = 150.0
 """Motion of a joint that is fitted [s], twice what the paper records: for time. Not tuned."""
 MAX_MOTIONS = 30
 """Trajectories of a joint that are fitted, spread over the recording: 5 s of each. Not tuned."""
 NEARLY = 0.95
-"""Share of the widest range that a piece must cover to be taken for being the earliest. Of the SO-101's
-elbow the widest piece alone (1 in its place) names asymmetric friction for gravity and Coulomb friction."""
+"""Share of the widest range that a piece must cover to be taken for being the earliest. Of the
+SO-101's elbow the widest piece alone (1 in its place) names asymmetric friction for gravity and
+Coulomb friction.
+"""
 
 
-def design(recording: Recording, chain: Chain, joint: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def design(
+    recording: Recording, chain: Chain, joint: int
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Trajectories of a joint and their folds.
 
-    Those that excite it, and the largest motions of the other joints of its chain, in which it should
-    hold. Folds are values of a condition that was varied (gain, payload, supply), or kinds of motion.
+    Those that excite it, and the largest motions of the other joints of its chain, in which it
+    should hold. Folds are values of a condition that was varied (gain, payload, supply), or kinds
+    of motion.
 
     Returns:
         ``(trajectories, folds)``, both empty for a joint that nothing excites.
@@ -45,8 +50,14 @@ def design(recording: Recording, chain: Chain, joint: int) -> tuple[tuple[int, .
     chosen = set(own)
     for other in range(len(chain.joints)):
         if other != joint:
-            alone = [i for i, t in enumerate(recording.trajectories) if t.joints == (chain.joints[other],)]
-            size = {i: np.ptp(recording.trajectories[i].command[:, chain.columns[other]]) for i in alone}
+            alone = [
+                i
+                for i, t in enumerate(recording.trajectories)
+                if t.joints == (chain.joints[other],)
+            ]
+            size = {
+                i: np.ptp(recording.trajectories[i].command[:, chain.columns[other]]) for i in alone
+            }
             chosen |= set(sorted(alone, key=lambda i: -size[i])[:BYSTANDERS])
     trajectories = sorted(chosen)
     condition = varied([recording.trajectories[i] for i in own])
@@ -58,11 +69,15 @@ def design(recording: Recording, chain: Chain, joint: int) -> tuple[tuple[int, .
     return tuple(trajectories), tuple(kinds.index(label) % MAX_FOLDS for label in labels)
 
 
-def pieces(recording: Recording, chain: Chain, trajectories: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """What is analysed of each trajectory, samples ``(first, end)``; empty for a recording taken whole.
+def pieces(
+    recording: Recording, chain: Chain, trajectories: Sequence[int]
+) -> tuple[tuple[int, int], ...]:
+    """What is analysed of each trajectory, samples ``(first, end)``.
 
-    Different motions say more than long ones: of a long recording, a piece of every trajectory, the one that
-    covers the widest range of those that begin at rest, as a simulation must.
+    Empty for a recording taken whole.
+
+    Different motions say more than long ones: of a long recording, a piece of every trajectory, the
+    one that covers the widest range of those that begin at rest, as a simulation must.
     """
     lengths = np.array([recording.trajectories[i].time[-1] for i in trajectories])
     if lengths.sum() <= MAX_MOTION_S:
@@ -76,13 +91,17 @@ def pieces(recording: Recording, chain: Chain, trajectories: Sequence[int]) -> t
     return tuple(_widest(recording, chain, recording.trajectories[i], share) for i in trajectories)
 
 
-def _widest(recording: Recording, chain: Chain, trajectory: Trajectory, share: float) -> tuple[int, int]:
+def _widest(
+    recording: Recording, chain: Chain, trajectory: Trajectory, share: float
+) -> tuple[int, int]:
     """The first piece of ``share`` seconds from rest in which the joints cover about the most they do."""
     time = trajectory.time
     if time[-1] <= share:
         return 0, len(time)
     columns = [int(column) for column in chain.columns]
-    rest = np.logical_and.reduce([held(trajectory, c, recording.encoder_resolution_rad) for c in columns])
+    rest = np.logical_and.reduce(
+        [held(trajectory, c, recording.encoder_resolution_rad) for c in columns]
+    )
     rest[0] = True
     starts = np.flatnonzero(rest & (time <= time[-1] - share))
     ends = np.searchsorted(time, time[starts] + share)
@@ -94,7 +113,10 @@ def _widest(recording: Recording, chain: Chain, trajectory: Trajectory, share: f
 
 
 def varied(trajectories: list[Trajectory]) -> str | None:
-    """The condition whose values are held out: that with the most, if two are left when one is held out."""
+    """The condition whose values are held out.
+
+    That with the most, if two are left when one is held out.
+    """
     values: dict[str, set[str]] = {}
     for trajectory in trajectories:
         for name, value in trajectory.conditions.items():

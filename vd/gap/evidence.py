@@ -1,7 +1,7 @@
 """Rules of evidence: what earns an effect its place, when two models are equals, and the verdict on the last.
 
-Everything is judged on trajectories that the fit has not seen, and resampled by whole trajectories with
-the choice inside the resampling.
+Everything is judged on trajectories that the fit has not seen, and resampled by whole trajectories
+with the choice inside the resampling.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,32 +25,40 @@ NESTED = {
 
 # Half and twice: what they turn of the decisions in the XL330 and eight recordings of the battery.
 NO_GAP = 1.15
-"""A model within this factor of the noise floor leaves white residuals, and nothing to explain. With half of
-what it leaves above 1 none of 40 is decided otherwise, with twice two are."""
+"""A model within this factor of the noise floor leaves white residuals, and nothing to explain.
+With half of what it leaves above 1 none of 40 is decided otherwise, with twice two are."""
 MIN_GAIN = 0.05
-"""Share of the held-out RMSE that an effect must remove. Half passes two more of 46, twice none less."""
+"""Share of the held-out RMSE that an effect must remove. Half passes two more of 46, twice none
+less.
+"""
 JITTER_GAIN_FLOORS = 0.3
-"""Gap that an effect must close beside random delays, as sqrt(before^2 - after^2), in noise floors: one of
-six floors leaves half of one there. Without delays it is what :data:`NO_GAP` takes for none. Half and twice
-turn none of 7."""
+"""Gap that an effect must close beside random delays, as sqrt(before^2 - after^2), in noise floors:
+one of six floors leaves half of one there. Without delays it is what :data:`NO_GAP` takes for none.
+Half and twice turn none of 7."""
 MEMORY = 8
-"""Samples in a row that say the same beside random delays: what a late command does lasts that long.
-Half and twice turn none of 38."""
+"""Samples in a row that say the same beside random delays: what a late command does lasts that
+long. Half and twice turn none of 38."""
 PENALTY = 0.01
-"""Relative RMSE that a further parameter must earn to be preferred. Half and twice turn none of 166."""
+"""Relative RMSE that a further parameter must earn to be preferred. Half and twice turn none of
+166.
+"""
 EXCESS_FLOORS = 0.07
-"""What an alternative to a winner that leaves white residuals must leave more, in noise floors, to be worse:
-thousands of samples carry that difference. Half and twice turn none of 164."""
+"""What an alternative to a winner that leaves white residuals must leave more, in noise floors, to
+be worse: thousands of samples carry that difference. Half and twice turn none of 164."""
 CONTAINED_FLOORS = 0.15
-"""The same for one that the winner contains: with more parameters it imitates what the integrator misses. Of
-two, half and twice turn none."""
+"""The same for one that the winner contains: with more parameters it imitates what the integrator
+misses. Of two, half and twice turn none."""
 RECOVERED = 0.5
-"""Share of the squared gap that the named effects must recover. Half turns none of 12, half more one."""
+"""Share of the squared gap that the named effects must recover. Half turns none of 12, half more
+one.
+"""
 JITTER = "command_jitter"
-"""The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
+"""The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is
+left.
+"""
 CANCELLING = ("gravity_load", "encoder_bias")
-"""Effects that hold a joint off its command at rest. Where they cancel there, they are no two causes but one
-that pulls with the travel from there, a spring, which the table has not."""
+"""Effects that hold a joint off its command at rest. Where they cancel there, they are no two
+causes but one that pulls with the travel from there, a spring, which the table has not."""
 DETERMINED = ("kp", "kd", "inertia")
 """Baseline parameters that every useful excitation determines."""
 
@@ -64,7 +72,8 @@ class Evidence:
         weights: Bootstrap weights of the trajectories [R, S].
         whole: Held-out RMSE of the plain model [rad].
         moves: Whether the joint's command changes, of each trajectory [S]; None: in all.
-        behind_jitter: Whether samples are weighted by what random delays do (:mod:`vd.gap.joint_fit`).
+        behind_jitter: Whether samples are weighted by what random delays do
+            (:mod:`vd.gap.joint_fit`).
         equivalent: Effects that one stands for, since the recording cannot tell them apart.
         joint: Index of the joint in its chain.
     """
@@ -79,15 +88,24 @@ class Evidence:
 
     @property
     def floor(self) -> float:
-        """The least error that a right model can have [rad]: noise, and what it misses of a large effect."""
+        """The least error that a right model can have [rad].
+
+        Noise, and what it misses of a large effect.
+        """
         return float(np.hypot(self.noise, OWN_ERROR * self.whole))
 
     def white(self, fit: JointFit) -> bool:
-        """Whether samples tell how good a fit is: it leaves no more than noise, or jitter, on all of them."""
+        """Whether samples tell how good a fit is.
+
+        It leaves no more than noise, or jitter, on all of them.
+        """
         return self.behind_jitter or fit.rmse < NO_GAP * self.floor
 
     def no_gap(self, fit: JointFit) -> bool:
-        """Whether a fit predicts as well as noise lets it; beside jitter that is not known as exactly."""
+        """Whether a fit predicts as well as noise lets it.
+
+        Beside jitter that is not known as exactly.
+        """
         return not self.behind_jitter and fit.held_out_rmse < NO_GAP * self.floor
 
     def scores(
@@ -100,7 +118,9 @@ class Evidence:
         return error + (price if weights is None else price[:, None])
 
     def best(self, fits: Sequence[JointFit]) -> JointFit:
-        """The fit with the best held-out score; with the best fitted one of those with white residuals.
+        """The fit with the best held-out score.
+
+        With the best fitted one of those with white residuals.
 
         Of these, samples tell more than the luck of a held-out motion.
         """
@@ -109,7 +129,9 @@ class Evidence:
         return found[int(np.argmin(self.scores(found, fitted=bool(at_floor))))]
 
     def winner(self, fits: Sequence[JointFit]) -> JointFit:
-        """The candidate with the best held-out score; the simpler one that it contains if that is as good.
+        """The candidate with the best held-out score.
+
+        The simpler one that it contains if that is as good.
 
         One with a parameter at its bound wins only if all have.
         """
@@ -123,19 +145,23 @@ class Evidence:
         old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
         return 1.0 - after.held_out_rmse / before.held_out_rmse, interval(1.0 - new / old)
 
-    def better(self, before: JointFit, after: JointFit, tentative: bool = False) -> tuple[bool, str]:
+    def better(
+        self, before: JointFit, after: JointFit, tentative: bool = False
+    ) -> tuple[bool, str]:
         """Whether the step from one model to the larger is earned, and if not why.
 
-        Motions that no fit has seen decide; but a larger model that leaves white residuals is judged on
-        all samples: that a parameter is not known well enough without one motion to predict it, as that of a
-        profile that cannot follow, says nothing against it. Nor does luck with such a motion speak for
-        a larger model if the smaller one leaves white residuals already.
+        Motions that no fit has seen decide; but a larger model that leaves white residuals is
+        judged on
+        all samples: that a parameter is not known well enough without one motion to predict it, as
+            that of a
+        profile that cannot follow, says nothing against it. Nor does luck with such a motion speak
+        for a larger model if the smaller one leaves white residuals already.
 
         Args:
             before: The smaller model.
             after: The larger.
-            tentative: Whether the gain may be that of a few motions: one of two causes alone can make some
-                worse.
+            tentative: Whether the gain may be that of a few motions: one of two causes alone can
+                make some worse.
         """
         white = self.white(before) or self.white(after)
         if white:
@@ -144,20 +170,27 @@ class Evidence:
         gain = 1.0 - after.held_out_rmse / before.held_out_rmse
         closed = before.held_out_rmse * np.sqrt(max(1.0 - (1.0 - gain) ** 2, 0.0))
         if gain < MIN_GAIN:
-            return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
+            return (
+                False,
+                f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %",
+            )
         if not tentative and interval(1.0 - new / old)[0] <= 0.0:
             return False, "its gain over trajectories is not distinguishable from 0"
-        if closed < (JITTER_GAIN_FLOORS if self.behind_jitter else np.sqrt(NO_GAP**2 - 1.0)) * self.floor:
+        if (
+            closed
+            < (JITTER_GAIN_FLOORS if self.behind_jitter else np.sqrt(NO_GAP**2 - 1.0)) * self.floor
+        ):
             return False, "what it removes is below the noise floor"
         return True, ""
 
     def likelier(self, before: JointFit, after: JointFit) -> tuple[bool, str]:
         """Whether random delays are likelier than a model without them, and if not why.
 
-        The other model has a width of its own for every motion, no less than the floor, lest jitter be
-        credited with what any excuse for some of them would gain; a width is a parameter, and costs what one
-        costs (half the log of its samples). A motion whose command stays as it is does not count: nothing can
-        be late there. What random delays add to a model has to be worth another effect.
+        The other model has a width of its own for every motion, no less than the floor, lest jitter
+        be credited with what any excuse for some of them would gain; a width is a parameter, and
+        costs what one costs (half the log of its samples). A motion whose command stays as it is
+        does not count: nothing can be late there. What random delays add to a model has to be worth
+            another effect.
 
         Args:
             before: The model without them.
@@ -170,7 +203,11 @@ class Evidence:
         gained = 0.5 * count * np.log(ratio)
         share = 1.0 - float(np.exp(-gained.sum() / max(count.sum(), 1.0)))
         if len(after.effects) > len(before.effects) and share < MIN_GAIN:
-            return False, f"narrows what is left by {100.0 * share:.1f} %, less than {100.0 * MIN_GAIN:.0f} %"
+            return (
+                False,
+                f"narrows what is left by {100.0 * share:.1f} %, less than {100.0 * MIN_GAIN:.0f} "
+                f"%",
+            )
         price = 0.5 * np.log(np.maximum(count, 1.0))
         if interval(self.weights @ (gained + price))[0] <= 0.0:
             return False, "not likelier than a width of its own for every motion"
@@ -181,13 +218,14 @@ class Evidence:
     ) -> tuple[bool, tuple[float, float]]:
         """Whether the recording does not tell two fits apart, and the interval of their difference [rad].
 
-        A winner at the noise floor leaves white residuals, so that samples count: what the other leaves
-        in excess of it is then decisive, even if few motions show it.
+        A winner at the noise floor leaves white residuals, so that samples count: what the other
+        leaves in excess of it is then decisive, even if few motions show it.
 
         Args:
             winner: The better fit.
             other: The other.
-            loose: Whether the winner can be better by imitating what the integrator of the true one misses.
+            loose: Whether the winner can be better by imitating what the integrator of the true one
+                misses.
         """
         best, error = (rmse(fit.held_out, fit.count, self.weights) for fit in (winner, other))
         low, high = interval(error - best)
@@ -247,7 +285,8 @@ class Evidence:
         explanation = Explanation(baseline, told, "unknown", "", tuple(accepted), tuple(trials))
         if not accepted:
             return self.nothing_earned(explanation, loose)
-        # One motion can be all that shows a parameter: that no fit without it predicts it says nothing then.
+        # One motion can be all that shows a parameter: that no fit without it predicts it says
+        # nothing then.
         fitted = self.white(final) and not self.behind_jitter
         before, after = ((f.rmse if fitted else f.held_out_rmse) ** 2 for f in (baseline, final))
         share = (before - after) / max(before - self.floor**2, 1e-30)
@@ -265,7 +304,9 @@ class Evidence:
             return replace(explanation, reason=f"a gap that no candidate explains: the best {why}")
         if loose:
             return replace(explanation, verdict="under_excited", reason=loose)
-        return replace(explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}")
+        return replace(
+            explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}"
+        )
 
     def accept(
         self,
@@ -279,7 +320,9 @@ class Evidence:
         own = next((fit for fit in rivals if fit.effects and fit.effects[-1] == name), None)
         mine = final if own is None or any(fit is final for fit in rivals) else own
         means = (*self.equivalent.get(name, ()), *self.same_beside(final, name))
-        others = [fit for fit in rivals if fit is not mine and fit.effects[-1] not in (name, *means)]
+        others = [
+            fit for fit in rivals if fit is not mine and fit.effects[-1] not in (name, *means)
+        ]
         alone = not {*DRY, *TOGETHER.get(name, ())} & {*final.effects}
         white = self.white(mine)
         choice = np.argmin(self.scores([mine, *others], self.weights, fitted=white), axis=0)
@@ -313,7 +356,9 @@ class Evidence:
         if ONE_SIDED in same:
             # A side of friction cannot push: it is at most what is dry in all.
             level = final.values.get("stribeck_friction.tau_c_nm", 0.0)
-            pull = abs(final.values["encoder_bias.bias_rad"]) * float(final.rows[self.joint, servo.KP])
+            pull = abs(final.values["encoder_bias.bias_rad"]) * float(
+                final.rows[self.joint, servo.KP]
+            )
             same = [other for other in same if other != ONE_SIDED or pull <= level]
         return tuple(same)
 
@@ -325,7 +370,9 @@ def _by_names(explanation: Explanation) -> Explanation:
     if named:
         return replace(explanation, verdict="effects", reason=explains(named))
     if all(a.at_bound for a in accepted):
-        return replace(explanation, reason=f"{accepted[0].name} fits only with a parameter at its bound")
+        return replace(
+            explanation, reason=f"{accepted[0].name} fits only with a parameter at its bound"
+        )
     sets = [" or ".join((a.name, *a.tied)) for a in accepted if a.tied and not a.at_bound]
     if not sets:
         absent = [a.name for a in accepted if not a.shown]
@@ -340,7 +387,9 @@ def explains(names: Sequence[str]) -> str:
 
 
 def cancelled(fit: JointFit, joint: int, rest: float) -> str:
-    """What two effects of a model are instead if they cancel at rest, in words; empty if they do not.
+    """What two effects of a model are instead if they cancel at rest, in words.
+
+    Empty if they do not.
 
     Args:
         fit: The model.
@@ -355,6 +404,7 @@ def cancelled(fit: JointFit, joint: int, rest: float) -> str:
     if abs(offset - load) > CLOSE * min(abs(load), abs(offset)):
         return ""
     return (
-        "gravity_load and encoder_bias cancel where the joint rests: a spring about that place would look "
+        "gravity_load and encoder_bias cancel where the joint rests: a spring about that place "
+        "would look "
         "the same, and is not among the candidates"
     )

@@ -1,4 +1,6 @@
-"""Motions that excite one joint at a time: the paper's steps and sines, and a menu for what they leave open.
+"""Motions that excite one joint at a time.
+
+The paper's steps and sines, and a menu for what they leave open.
 
 The paper commands steps and sines of 0.05 to 1.5 Hz, amplitudes in proportion to the joint limits.
 Commands are in rad, times in seconds.
@@ -88,7 +90,9 @@ def _sine(name: str, frequency_hz: float, duration_s: float) -> Motion:
 
 
 def _triangle(name: str, period_s: float, duration_s: float) -> Motion:
-    return Motion(name, -2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi / period_s * _time(duration_s))))
+    return Motion(
+        name, -2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi / period_s * _time(duration_s)))
+    )
 
 
 def _chirp(name: str, size: float, first_hz: float, last_hz: float, duration_s: float) -> Motion:
@@ -129,7 +133,11 @@ MENU: dict[str, tuple[Motion, ...]] = {
     "long_holds": (_levels("long_holds", 4.0, 0.5, 0.9, -0.3, -0.8),),
     # Small steps with more and more reversals: play, dead zone, stiction.
     "reversal_staircase": (
-        _levels("reversal_staircase", 0.8, *0.04 * np.array([1, 2, 3, 2, 1, 2, 1, 0, -1, 0, -2, -1, -2, 0])),
+        _levels(
+            "reversal_staircase",
+            0.8,
+            *0.04 * np.array([1, 2, 3, 2, 1, 2, 1, 0, -1, 0, -2, -1, -2, 0]),
+        ),
     ),
     # A small sine of rising frequency: delay against filter against inertia.
     "chirp": (_chirp("chirp", 0.25, 0.2, 6.0, 10.0),),
@@ -137,7 +145,9 @@ MENU: dict[str, tuple[Motion, ...]] = {
 """Sets of motions by name."""
 
 
-def excitation_set(reach: JointRange, names: Sequence[str] = ("steps_and_sines",)) -> list[Trajectory]:
+def excitation_set(
+    reach: JointRange, names: Sequence[str] = ("steps_and_sines",)
+) -> list[Trajectory]:
     """The motions of several sets, in order, joint by joint, with their commands in the place of positions.
 
     Args:

@@ -53,7 +53,9 @@ def explain(search: Search, baseline: JointFit) -> Explanation:
 def _nothing_to_explain(search: Search, baseline: JointFit, loose: str) -> Explanation | None:
     """The explanation of a joint whose plain model leaves nothing to search for, or cannot be judged."""
     if len(baseline.sse) < MIN_KINDS:
-        text = f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_KINDS} at least"
+        text = (
+            f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_KINDS} at least"
+        )
         return Explanation(baseline, baseline, "under_excited", text)
     if not search.no_gap(baseline):
         return None
@@ -64,15 +66,16 @@ def _nothing_to_explain(search: Search, baseline: JointFit, loose: str) -> Expla
 def _with_notes(search: Search, explanation: Explanation) -> Explanation:
     """The explanation with what its names do not say.
 
-    What a member of a set means that telemetry contradicts by its name; and no names where two effects are
-    but one that is not in the table.
+    What a member of a set means that telemetry contradicts by its name; and no names where two
+    effects are but one that is not in the table.
     """
     alike = cancelled(explanation.final, search.joint, search.rest)
     if alike and explanation.verdict in ("effects", "ambiguous"):
         return replace(explanation, verdict="unknown", reason=alike)
     tied = {name for one in explanation.accepted for name in one.tied}
     notes = [
-        f"{name} {BEHIND_SENSOR[name]}" for name in sorted(tied & set(BEHIND_SENSOR) & set(search.vetoes))
+        f"{name} {BEHIND_SENSOR[name]}"
+        for name in sorted(tied & set(BEHIND_SENSOR) & set(search.vetoes))
     ]
     return replace(explanation, reason="; ".join([explanation.reason, *notes]))
 
@@ -167,8 +170,9 @@ class Explainer:
 def _no_jitter(explained: Explained) -> bool:
     """Whether random delays are none on a joint, by what is known of the others of its finger.
 
-    They are none where they were tried on one and refused, not where too little was left there to try them;
-    and where another is explained without them or a fixed one, their mean, as commands go out together.
+    They are none where they were tried on one and refused, not where too little was left there to
+    try them; and where another is explained without them or a fixed one, their mean, as commands go
+    out together.
     """
     found = [one for _, one in explained]
     random = any(JITTER in one.final.effects for one in found)

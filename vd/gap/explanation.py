@@ -1,4 +1,7 @@
-"""What the search for what a joint lacks has found: the evidence, effects with intervals, the verdict."""
+"""What the search for what a joint lacks has found.
+
+The evidence, effects with intervals, the verdict.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,9 +16,9 @@ from vd.gap.statistics import OWN_ERROR, half_width
 from vd.kernels.servo.effects import EFFECTS
 
 CLOSE = 0.1
-"""Two values within this share of each other are one: of an effect on two joints, as what a model lacks moves
-them by more than their intervals tell; of a load and an offset that cancel, which by luck few in a
-hundred machines do; of a supply idle and under load. Not tuned."""
+"""Two values within this share of each other are one: of an effect on two joints, as what a model
+lacks moves them by more than their intervals tell; of a load and an offset that cancel, which by
+luck few in a hundred machines do; of a supply idle and under load. Not tuned."""
 NAMED = 0.9
 """Share of the resamples that must choose an effect for it to be named. Not tuned."""
 
@@ -56,12 +59,17 @@ class Accepted:
 
     @property
     def shown(self) -> bool:
-        """Whether the interval of its size leaves out its absence; several sizes stand in for each other.
+        """Whether the interval of its size leaves out its absence.
 
-        Absence is 0, but infinity of a limit or a stiffness: its inverse is more than 0 for sure if half
+        Several sizes stand in for each other.
+
+        Absence is 0, but infinity of a limit or a stiffness: its inverse is more than 0 for sure if
+            half
         the interval of its logarithm is less than 1, to first order.
         """
-        known = {p.name: p for p in EFFECTS[self.name].parameters if p.column != servo.GRAVITY_PHASE}
+        known = {
+            p.name: p for p in EFFECTS[self.name].parameters if p.column != servo.GRAVITY_PHASE
+        }
         told = [(known[key], *estimate) for key, estimate in self.estimates.items() if key in known]
         limits = [high < np.e * value for p, value, _, high in told if p.lower > 0.0 == p.neutral]
         sizes = limits or [not low <= 0.0 <= high for p, _, low, high in told if p.lower == 0.0]
@@ -81,7 +89,9 @@ class Explanation:
 
 
 def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
-    """95 % intervals by key: of the jackknife over folds, or of white noise at the floor if that is wider.
+    """95 % intervals by key.
+
+    Of the jackknife over folds, or of white noise at the floor if that is wider.
 
     To these come the error of the time step and the model's own, which all motions share.
     """

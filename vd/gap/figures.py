@@ -1,4 +1,6 @@
-"""Figures of a gap report: the gap of each joint, curves before and after, and what remains of them.
+"""Figures of a gap report.
+
+The gap of each joint, curves before and after, and what remains of them.
 
 Angles are shown in mrad where they are errors and in rad where they are positions.
 """
@@ -12,7 +14,9 @@ from vd.gap.words import LISTED
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
 INK, BLUE, ORANGE, GREEN, GREY = "#1c2330", "#0072B2", "#D55E00", "#009E73", "#8a8f98"
 WINDOW_S = 6.0
-"""Longest piece of a trajectory that is drawn: what the eye follows at a page's width. Not tuned."""
+"""Longest piece of a trajectory that is drawn: what the eye follows at a page's width. Not
+tuned.
+"""
 STYLE = {"axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
 
 
@@ -23,15 +27,25 @@ def gap_figure(report: Report) -> Figure:
     axes = figure.add_subplot()
     places = -np.arange(len(joints))
     models = (
-        ("before: the plain servo model", ORANGE, [(j.baseline_rmse_rad, *j.baseline_ci95) for j in joints]),
-        ("after: the identified model", GREEN, [(j.identified_rmse_rad, *j.identified_ci95) for j in joints]),
+        (
+            "before: the plain servo model",
+            ORANGE,
+            [(j.baseline_rmse_rad, *j.baseline_ci95) for j in joints],
+        ),
+        (
+            "after: the identified model",
+            GREEN,
+            [(j.identified_rmse_rad, *j.identified_ci95) for j in joints],
+        ),
     )
     for side, (label, color, numbers) in zip((0.2, -0.2), models, strict=True):
         values, lows, highs = 1e3 * np.array(numbers).T
         axes.barh(places + side, values, 0.36, color=color, alpha=0.75, label=label)
         axes.hlines(places + side, lows, highs, color=INK, linewidth=1.4)
         for place, value, high in zip(places, values, highs, strict=True):
-            axes.text(np.nanmax([value, high]), place + side, f"  {value:.3g}", va="center", fontsize=8)
+            axes.text(
+                np.nanmax([value, high]), place + side, f"  {value:.3g}", va="center", fontsize=8
+            )
     floors = [1e3 * joint.noise_floor_rad for joint in joints]
     axes.vlines(floors, places - 0.4, places + 0.4, color=BLUE, linewidth=2.0, label="noise floor")
     axes.set_yticks(places, [joint.joint for joint in joints])
@@ -52,7 +66,11 @@ def overlay_figure(report: Report, curves: Predictions, joint: str, index: int) 
         index: Index of the trajectory.
     """
     column, rows = curves.joints.index(joint), curves.trajectory == index
-    time, command, measured = curves.time[rows], curves.command[rows, column], curves.measured[rows, column]
+    time, command, measured = (
+        curves.time[rows],
+        curves.command[rows, column],
+        curves.measured[rows, column],
+    )
     models = _models(curves, column, rows)
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1.0))
@@ -75,8 +93,8 @@ def overlay_figure(report: Report, curves: Predictions, joint: str, index: int) 
 def residual_figure(report: Report, curves: Predictions, joint: str) -> Figure:
     """Error of one joint over all its trajectories, against time, speed and distance still to go.
 
-    A cause leaves its mark here: a delay grows with speed, friction changes sign with it, a dead zone shows
-    at rest, warming grows with time.
+    A cause leaves its mark here: a delay grows with speed, friction changes sign with it, a dead
+    zone shows at rest, warming grows with time.
     """
     column = curves.joints.index(joint)
     measured = curves.measured[:, column]
@@ -95,7 +113,9 @@ def residual_figure(report: Report, curves: Predictions, joint: str) -> Figure:
         _floor(axes, report)
         for name, color, position in _models(curves, column, seen):
             errors = 1e3 * (position - measured[seen])
-            axes.plot(quantity[seen], errors, ".", color=color, markersize=1.5, alpha=0.5, label=name)
+            axes.plot(
+                quantity[seen], errors, ".", color=color, markersize=1.5, alpha=0.5, label=name
+            )
         axes.set_xlabel(label)
         axes.set_xlim(*np.quantile(quantity[seen], [0.001, 0.999]))
     errors = 1e3 * np.abs(curves.baseline[seen, column] - measured[seen])
@@ -107,7 +127,9 @@ def residual_figure(report: Report, curves: Predictions, joint: str) -> Figure:
 
 
 def chosen_overlays(report: Report, curves: Predictions) -> list[tuple[str, int]]:
-    """Joint and trajectory index of the overlays: each joint's worst, then other kinds of motion of theirs.
+    """Joint and trajectory index of the overlays.
+
+    Each joint's worst, then other kinds of motion of theirs.
 
     Joints with a named effect come before others with a gap, and these before the rest.
     """
@@ -125,7 +147,9 @@ def chosen_overlays(report: Report, curves: Predictions) -> list[tuple[str, int]
     return list(pairs)[:LISTED]
 
 
-def _models(curves: Predictions, column: int, rows: np.ndarray) -> list[tuple[str, str, np.ndarray]]:
+def _models(
+    curves: Predictions, column: int, rows: np.ndarray
+) -> list[tuple[str, str, np.ndarray]]:
     """Name, colour and positions of the baseline, and of the identified model where it is another."""
     before, after = curves.baseline[rows, column], curves.identified[rows, column]
     same = np.allclose(before, after, equal_nan=True)

@@ -1,4 +1,7 @@
-"""Where simulation and measurement disagree: per joint and phase of motion, in plain words and numbers."""
+"""Where simulation and measurement disagree.
+
+Per joint and phase of motion, in plain words and numbers.
+"""
 
 from collections.abc import Mapping
 
@@ -27,7 +30,9 @@ def speed_of(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     return np.subtract(*ends) / SMOOTH_S
 
 
-def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) -> dict[str, np.ndarray]:
+def phases(
+    trajectory: Trajectory, joint: int, resolution: float, top: float
+) -> dict[str, np.ndarray]:
     """Samples of each phase of motion of a joint, [T] bool each; phases overlap.
 
     Args:
@@ -36,7 +41,11 @@ def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) ->
         resolution: Encoder count [rad].
         top: The joint's largest speed in the recording [rad/s].
     """
-    time, command, position = trajectory.time, trajectory.command[:, joint], trajectory.position[:, joint]
+    time, command, position = (
+        trajectory.time,
+        trajectory.command[:, joint],
+        trajectory.position[:, joint],
+    )
     speed, rest = speed_of(time, position), held(trajectory, joint, resolution)
     moving = np.abs(speed) > max(0.02 * top, resolution / SMOOTH_S)
     # The last direction of motion, carried through rests.
@@ -60,7 +69,9 @@ def phases(trajectory: Trajectory, joint: int, resolution: float, top: float) ->
     }
 
 
-def findings(recording: Recording, predicted: np.ndarray, floors: Mapping[str, float]) -> list[Finding]:
+def findings(
+    recording: Recording, predicted: np.ndarray, floors: Mapping[str, float]
+) -> list[Finding]:
     """Findings of all joints: the two worst phases of each, the worst first.
 
     Args:
@@ -79,7 +90,11 @@ def findings(recording: Recording, predicted: np.ndarray, floors: Mapping[str, f
 
 
 def _joint(
-    name: str, pairs: list[tuple[Trajectory, np.ndarray]], column: int, resolution: float, floor: float
+    name: str,
+    pairs: list[tuple[Trajectory, np.ndarray]],
+    column: int,
+    resolution: float,
+    floor: float,
 ) -> list[Finding]:
     """Findings of a joint from its trajectories and what the model leaves of each [T] [rad]."""
     speeds = [speed_of(t.time, t.position[:, column]) for t, _ in pairs]
@@ -108,7 +123,10 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _does(signature: Mapping[str, float]) -> str:
-    """What a joint does in a phase; an error without a sign that stands for half of it goes both ways."""
+    """What a joint does in a phase.
+
+    An error without a sign that stands for half of it goes both ways.
+    """
     rms, mean, along = (signature[key] for key in ("rms_rad", "mean_rad", "along_motion_rad"))
     if 2.0 * abs(along) > rms:
         verb, size = ("runs ahead of" if along > 0.0 else "lags behind"), abs(along)

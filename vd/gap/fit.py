@@ -1,7 +1,7 @@
 """Fit the servo model of one joint to its trajectories by least squares.
 
-Every simulation is a rollout of the whole trajectory; all perturbed parameter sets of a step go through
-one call of :class:`vd.gap.rollout.Rollouts`.
+Every simulation is a rollout of the whole trajectory; all perturbed parameter sets of a step go
+through one call of :class:`vd.gap.rollout.Rollouts`.
 """
 
 import copy
@@ -20,8 +20,8 @@ from vd.gap.joint_fit import JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
 
 RIDGE = 0.01
-"""Pull towards the start, as information in units of the noise floor: holds directions that the data
-leave free (the torque scale of a bare servo), moves no others. Not tuned."""
+"""Pull towards the start, as information in units of the noise floor: holds directions that the
+data leave free (the torque scale of a bare servo), moves no others. Not tuned."""
 ITERATIONS = 12
 """Trials of a fit at most. Not tuned."""
 FINER = (2, 4)
@@ -57,7 +57,8 @@ class JointProblem:
         self.floor = floor
         self.baseline = tuple(baseline)
         self._measured = {
-            int(t): rollouts.measured[rollouts.sample_trajectory == t, joint] for t in self.trajectories
+            int(t): rollouts.measured[rollouts.sample_trajectory == t, joint]
+            for t in self.trajectories
         }
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
         self._growth: dict[int, np.ndarray] = {}
@@ -79,7 +80,9 @@ class JointProblem:
         *,
         rollouts: Rollouts | None = None,
     ) -> np.ndarray:
-        """Measured minus predicted position of the joint for C chains [C, n, PARAMETER_COLUMNS]: [C, N].
+        """Measured minus predicted position of the joint for C chains [C, n, PARAMETER_COLUMNS].
+
+        [C, N].
 
         What ``keep`` [C, S] leaves out of the trajectories is not simulated, and is 0.
         """
@@ -95,11 +98,16 @@ class JointProblem:
         return residual
 
     def squares(
-        self, base: np.ndarray, coordinates: Sequence[Coordinate], trajectories: np.ndarray | None = None
+        self,
+        base: np.ndarray,
+        coordinates: Sequence[Coordinate],
+        trajectories: np.ndarray | None = None,
     ) -> LeastSquares:
         """The squared error of the model whose other parameters are those of ``base``."""
 
-        def residuals(x: np.ndarray, keep: np.ndarray | None, rollouts: Rollouts | None = None) -> np.ndarray:
+        def residuals(
+            x: np.ndarray, keep: np.ndarray | None, rollouts: Rollouts | None = None
+        ) -> np.ndarray:
             rows = self.rows(base, coordinates, x)
             mask = None if keep is None else np.repeat(keep[None], len(x), axis=0)
             return self.residuals(rows, trajectories, mask, rollouts=rollouts)
@@ -107,14 +115,18 @@ class JointProblem:
         slopes = partial(residuals, rollouts=self.coarse)
         return LeastSquares(coordinates, residuals, RIDGE * self.floor**2, slopes)
 
-    def rows(self, base: np.ndarray, coordinates: Sequence[Coordinate], x: np.ndarray) -> np.ndarray:
+    def rows(
+        self, base: np.ndarray, coordinates: Sequence[Coordinate], x: np.ndarray
+    ) -> np.ndarray:
         """Chains [C, n, PARAMETER_COLUMNS] with this joint's parameters at coordinates [C, P]."""
         rows = np.repeat(base[None], len(x), axis=0)
         for i, c in enumerate(coordinates):
             rows[:, self.joint, c.column] = c.value(x[:, i])
         return rows
 
-    def split(self, samples: np.ndarray, trajectories: np.ndarray | None = None) -> list[np.ndarray]:
+    def split(
+        self, samples: np.ndarray, trajectories: np.ndarray | None = None
+    ) -> list[np.ndarray]:
         """Cut the last axis into trajectories."""
         chosen = self.trajectories if trajectories is None else trajectories
         ends = np.cumsum([len(self._measured[int(t)]) for t in chosen])[:-1]
@@ -123,10 +135,15 @@ class JointProblem:
     def scales(self, row: np.ndarray, residual: float) -> Scales:
         """Sizes of the joint's motion with a baseline row [PARAMETER_COLUMNS]."""
         chain, recording = self.rollouts.chain, self.rollouts.recording
-        column, parts = int(chain.columns[self.joint]), [recording.trajectories[t] for t in self.trajectories]
+        column, parts = (
+            int(chain.columns[self.joint]),
+            [recording.trajectories[t] for t in self.trajectories],
+        )
         speeds = [speed_of(t.time, t.position[:, column]) for t in parts]
         changes = [speed_of(t.time, speed) for t, speed in zip(parts, speeds, strict=True)]
-        torque = row[servo.KP] * np.concatenate([t.command[:, column] - t.position[:, column] for t in parts])
+        torque = row[servo.KP] * np.concatenate(
+            [t.command[:, column] - t.position[:, column] for t in parts]
+        )
         peak, speed, acceleration = (
             float(np.percentile(np.abs(values), 99.5))
             for values in (torque, np.concatenate(speeds), np.concatenate(changes))
@@ -155,7 +172,8 @@ class JointProblem:
         """Fit a model from several starts by least squares.
 
         Args:
-            base: Rows of the chain's joints [n, PARAMETER_COLUMNS]; this joint's parameters start there.
+            base: Rows of the chain's joints [n, PARAMETER_COLUMNS]; this joint's parameters start
+                there.
             effects: Effects in the model besides the baseline.
             starts: Starting values by key; what is absent starts at ``base``.
             scales: Sizes of the joint's motion.
@@ -168,7 +186,10 @@ class JointProblem:
         coordinates = [coordinate(key, scales) for key in self.fitted(effects)]
         x0 = np.array(
             [
-                [c.inverse(float(start.get(c.key, base[self.joint, c.column]))) for c in coordinates]
+                [
+                    c.inverse(float(start.get(c.key, base[self.joint, c.column])))
+                    for c in coordinates
+                ]
                 for start in starts
             ]
         )
@@ -195,7 +216,11 @@ class JointProblem:
     def fitted(self, effects: Sequence[str]) -> list[str]:
         """Keys of what a model with these effects fits on this joint."""
         others = others_in(self.rollouts.chain, self.joint)
-        absent = {f"joint_coupling.from_{slot + 1}" for slot in range(servo.MAX_JOINTS) if slot not in others}
+        absent = {
+            f"joint_coupling.from_{slot + 1}"
+            for slot in range(servo.MAX_JOINTS)
+            if slot not in others
+        }
         return [key for key in keys(effects, self.baseline) if key not in absent]
 
     def jacobian(self, fit: JointFit) -> np.ndarray:
@@ -213,13 +238,17 @@ class JointProblem:
         model = self.squares(fit.rows, fit.coordinates)
         x = np.array(
             [
-                model.descend(fit.x, SHORT, ~fold, jacobian * np.repeat(~fold, self.count.astype(int)))
+                model.descend(
+                    fit.x, SHORT, ~fold, jacobian * np.repeat(~fold, self.count.astype(int))
+                )
                 for fold in out
             ]
         )
         residual = self.residuals(self.rows(fit.rows, fit.coordinates, x), keep=out)
         parts = self.split(residual.sum(0))
-        squared, absolute = (np.array([np.sum(abs(part) ** power) for part in parts]) for power in (2, 1))
+        squared, absolute = (
+            np.array([np.sum(abs(part) ** power) for part in parts]) for power in (2, 1)
+        )
         return replace(fit, held_out=squared, held_out_abs=absolute, refits=x)
 
     def refine(self, fit: JointFit, scales: Scales) -> JointFit:
@@ -239,10 +268,13 @@ class JointProblem:
         held_out = {name: getattr(fit, name) for name in ("held_out", "held_out_abs", "refits")}
         return replace(result, **held_out, step_error=error)
 
-    def promise(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> np.ndarray:
+    def promise(
+        self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales
+    ) -> np.ndarray:
         """Share of the squared error that each start could remove, the present parameters readjusted.
 
-        A linear estimate from one rollout per start: the start's change of the prediction, less what
+        A linear estimate from one rollout per start: the start's change of the prediction, less
+            what
         the fitted parameters can imitate, against the residual.
 
         Args:
@@ -264,7 +296,8 @@ class JointProblem:
         change -= (change @ basis.T) @ basis
         along = change @ left
         power = np.einsum("cn,cn->c", change, change)
-        # A multiple within a factor of a few of the start; more is another size, and less than 0 no effect.
+        # A multiple within a factor of a few of the start; more is another size, and less than 0 no
+        # effect.
         factor = np.clip(along / np.maximum(power, 1e-300), 0.0, 3.0)
         gain = 2.0 * factor * along - factor**2 * power
         return gain / max(float(residual[0] @ residual[0]), 1e-300)

@@ -1,10 +1,10 @@
 """Fit a delay that varies at random: no single prediction is right, so the spread is compared too.
 
-Many draws of the delays give the mean and variance of the position at every sample. The likelihood of
-what was measured, under a normal distribution with that mean and that variance on top of the noise
-floor, is maximised over the jitter's two parameters; the rest of the model is fitted through what the
-delays do to the samples (:mod:`vd.gap.joint_fit`). The result stands in the table as the RMSE that a
-normal distribution of constant width would need for the same likelihood.
+Many draws of the delays give the mean and variance of the position at every sample. The likelihood
+of what was measured, under a normal distribution with that mean and that variance on top of the
+noise floor, is maximised over the jitter's two parameters; the rest of the model is fitted through
+what the delays do to the samples (:mod:`vd.gap.joint_fit`). The result stands in the table as the
+RMSE that a normal distribution of constant width would need for the same likelihood.
 """
 
 from collections.abc import Callable, Iterable
@@ -25,11 +25,11 @@ from vd.gap.statistics import half_width
 DRAWS = 16
 """Realisations of the delays; alone they leave a third of error in the variance. Not tuned."""
 NARROW = 0.5
-"""Share of the first guess that is believed: behind more jitter than there is an effect would not show.
-Half and twice were not tried."""
+"""Share of the first guess that is believed: behind more jitter than there is an effect would not
+show. Half and twice were not tried."""
 FACTORS = (0.0, 0.5, 0.71, 1.0, 1.41, 2.0)
-"""Multiples of the best values at which the likelihood is looked at for the intervals. Not tuned: finer
-ones end closer to where the likelihood does."""
+"""Multiples of the best values at which the likelihood is looked at for the intervals. Not tuned:
+finer ones end closer to where the likelihood does."""
 
 
 class JitterFit:
@@ -43,7 +43,9 @@ class JitterFit:
 
     def __init__(self, problem: JointProblem, base: JointFit, scales: Scales):
         self.problem, self.base, self.scales = problem, base, scales
-        self.coordinates = [coordinate(f"command_jitter.{name}", scales) for name in ("sigma_s", "p_drop")]
+        self.coordinates = [
+            coordinate(f"command_jitter.{name}", scales) for name in ("sigma_s", "p_drop")
+        ]
         recording = problem.rollouts.recording
         chosen = [recording.trajectories[int(t)] for t in problem.trajectories]
         # A trajectory's name seeds its draws.
@@ -96,7 +98,8 @@ class JitterFit:
         """
         mean, spread = self.draws(sigma, drop)
         tried = [
-            self._likelihood(self.measured - mean, spread + (n * self.problem.floor) ** 2) for n in noises
+            self._likelihood(self.measured - mean, spread + (n * self.problem.floor) ** 2)
+            for n in noises
         ]
         return min(tried, key=lambda losses: float(losses.sum()))
 
@@ -109,7 +112,10 @@ class JitterFit:
         return np.array([part.sum() for part in np.split(losses, self.ends)])
 
     def guess(self) -> tuple[float, float]:
-        """Less than the likeliest of the starts, whatever else the model lacks: that can count as noise."""
+        """Less than the likeliest of the starts, whatever else the model lacks.
+
+        That can count as noise.
+        """
         noises = np.geomspace(1.0, max(self.base.rmse / self.problem.floor, 1.0), 3)
         starts = [tuple(start.values()) for start in sizes(JITTER, (), self.scales)]
         totals = [float(self.losses(sigma, drop, noises).sum()) for sigma, drop in starts]
@@ -131,7 +137,9 @@ class JitterFit:
         x, upper = np.log(start), np.log([c.value(c.upper) for c in self.coordinates])
         simplex = x + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0]])
         options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
-        x = minimize(total, x, method="Nelder-Mead", bounds=Bounds(-np.inf, upper), options=options).x
+        x = minimize(
+            total, x, method="Nelder-Mead", bounds=Bounds(-np.inf, upper), options=options
+        ).x
         total(x)
         bounds = np.array([(c.lower, c.upper) for c in self.base.coordinates]).T
         moved = np.clip(self.base.x + self.shift, *bounds)
@@ -142,11 +150,14 @@ class JitterFit:
         return sigma, drop
 
     def extents(self, sigma: float, drop: float) -> dict[str, tuple[float, float]]:
-        """Intervals of both parameters: the values of the pairs that the trajectories do not reject.
+        """Intervals of both parameters.
 
-        Delays and losses stand in for each other in part, so that the pairs are what is judged: by the sum of
-        their losses of likelihood over the trajectories, and its interval, since the model is not quite right
-        (Vuong 1989). Each end is half way to the first value that is rejected with every other.
+        The values of the pairs that the trajectories do not reject.
+
+        Delays and losses stand in for each other in part, so that the pairs are what is judged: by
+        the sum of their losses of likelihood over the trajectories, and its interval, since the
+        model is not quite right (Vuong 1989). Each end is half way to the first value that is
+        rejected with every other.
         """
         here, sigmas = self.losses(sigma, drop), [sigma * f for f in FACTORS]
         # A share that is found too small says nothing of larger ones by its multiples.
@@ -156,9 +167,14 @@ class JitterFit:
         kept = worse.sum(axis=-1) < half_width(len(here) * worse.var(axis=-1, ddof=1), len(here))
         kept[sigmas.index(sigma), drops.index(drop)] = True
         ranges = {}
-        for name, values, inside in (("sigma_s", sigmas, kept.any(1)), ("p_drop", drops, kept.any(0))):
+        for name, values, inside in (
+            ("sigma_s", sigmas, kept.any(1)),
+            ("p_drop", drops, kept.any(0)),
+        ):
             first, last = np.flatnonzero(inside)[[0, -1]]
-            ends = np.interp([first - 0.5, last + 0.5], range(len(values) + 1), [*values, 2.0 * values[-1]])
+            ends = np.interp(
+                [first - 0.5, last + 0.5], range(len(values) + 1), [*values, 2.0 * values[-1]]
+            )
             ranges[f"command_jitter.{name}"] = float(ends[0]), float(ends[1])
         return ranges
 
@@ -182,7 +198,9 @@ class JitterFit:
         )
 
 
-def look(problem: JointProblem, fit: JointFit, scales: Scales) -> tuple[tuple[float, float], SampleWeighting]:
+def look(
+    problem: JointProblem, fit: JointFit, scales: Scales
+) -> tuple[tuple[float, float], SampleWeighting]:
     """A first guess of the jitter of a model, and what it does to the samples."""
     jitter = JitterFit(problem, fit, scales)
     values = jitter.guess()
@@ -203,10 +221,14 @@ def bound_jitter(problem: JointProblem, fit: JointFit, scales: Scales) -> JointF
     rows, values = fit.rows.copy(), fit.values
     for c in fit.coordinates[-2:]:
         rows[problem.joint, c.column] = 0.0
-    rest = replace(fit, effects=fit.effects[:-1], coordinates=fit.coordinates[:-2], x=fit.x[:-2], rows=rows)
+    rest = replace(
+        fit, effects=fit.effects[:-1], coordinates=fit.coordinates[:-2], x=fit.x[:-2], rows=rows
+    )
     sigma, drop = (values[c.key] for c in fit.coordinates[-2:])
     return replace(fit, extents=JitterFit(problem, rest, scales).extents(sigma, drop))
 
 
-CALLS: dict[str, Callable[..., Any]] = {call.__name__: call for call in (look, fit_jitter, bound_jitter)}
+CALLS: dict[str, Callable[..., Any]] = {
+    call.__name__: call for call in (look, fit_jitter, bound_jitter)
+}
 """What is asked of a joint's problem by name, besides its methods."""

@@ -1,8 +1,8 @@
 """Random delays as the cause of what a search leaves, and the search for what there is beside them.
 
-No single prediction shows them (:mod:`vd.gap.jitter`). So the same search is made once more with samples
-weighted by what delays do (:mod:`vd.gap.joint_fit`); they and what is found beside them are looked for
-in turn.
+No single prediction shows them (:mod:`vd.gap.jitter`). So the same search is made once more with
+samples weighted by what delays do (:mod:`vd.gap.joint_fit`); they and what is found beside them are
+looked for in turn.
 """
 
 from collections.abc import Callable
@@ -21,8 +21,10 @@ SIGMA, DROP = (f"{JITTER}.{name}" for name in ("sigma_s", "p_drop"))
 FIXED = "command_delay"
 """What is the mean of random delays, too."""
 PASSES = 2
-"""Searches for what there is beside random delays, each with these as they are beside what the last found.
-With one, the interval of a delay beside them is a quarter as wide, and misses; three were not tried."""
+"""Searches for what there is beside random delays, each with these as they are beside what the last
+found. With one, the interval of a delay beside them is a quarter as wide, and misses; three were
+not tried.
+"""
 SPREAD = "its spread is what is measured"
 """Why they are named."""
 
@@ -48,12 +50,16 @@ def try_jitter(
     if others:
         rest = search.refit(random, others)
         if search.white(rest) and not search.likelier(rest, random)[0]:
-            # No jitter is needed: it has only smoothed the way to where the search before did not come.
+            # No jitter is needed: it has only smoothed the way to where the search before did not
+            # come.
             search.report(f"+ {' and '.join(others)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")
             return rest, (), []
     accepted, why = search.likelier(present, random)
     if left > REPEATABLE * search.floor:
-        accepted, why = False, f"leaves {left / search.floor:.1f} noise floors besides, more than chance does"
+        accepted, why = (
+            False,
+            f"leaves {left / search.floor:.1f} noise floors besides, more than chance does",
+        )
     gain, ci = search.gain(present, random)
     decision = "named" if accepted else "rejected"
     row = Trial(1, JITTER, random, gain, ci, decision, SPREAD if accepted else why)
@@ -71,7 +77,8 @@ def with_jitter(
 ) -> tuple[JointFit, tuple[Accepted, ...], list[Trial], float]:
     """The model with random delays, what is named beside them, and the evidence for that.
 
-    The arguments are those of :func:`try_jitter`. The last result is the error of the rest of the model, seen
+    The arguments are those of :func:`try_jitter`. The last result is the error of the rest of the
+    model, seen
     through what the delays do [rad]: the noise floor if it is right.
     """
     jitter, weighting = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]

@@ -26,9 +26,11 @@ class JointFit:
         count: Samples of each trajectory [S].
         gram: J^T J [P, P].
         refits: Coordinates of the fits without each fold [F, P].
-        held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad]; None where not taken.
+        held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad]; None where not
+            taken.
         extents: 95 % intervals by key, of parameters for which the refits do not give them.
-        step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
+        step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not
+            estimated.
     """
 
     effects: tuple[str, ...]
@@ -65,9 +67,12 @@ class JointFit:
         pairs = zip(self.coordinates, self.x, strict=True)
         bound = [c.key for c, x in pairs if "." in c.key and c.bound(float(x))]
         if ONE_SIDED in self.effects and not set(DRY) & set(self.effects):
-            # No dry friction spares one direction: what does is a load, and a greater one would push.
+            # No dry friction spares one direction: what does is a load, and a greater one would
+            # push.
             sides = {key: value for key, value in self.values.items() if key.startswith(ONE_SIDED)}
-            bound += [key for key, value in sides.items() if value <= OWN_ERROR * max(sides.values())]
+            bound += [
+                key for key, value in sides.items() if value <= OWN_ERROR * max(sides.values())
+            ]
         return tuple(bound)
 
 
@@ -75,8 +80,9 @@ class JointFit:
 class SampleWeighting:
     """The mean and the spread that random delays, or errors of the clock, add to N samples.
 
-    A sample counts by how surely it is known: a residual, less the mean of what delays do, is divided by the
-    growth of its standard deviation. What a right model leaves is the noise floor again.
+    A sample counts by how surely it is known: a residual, less the mean of what delays do, is
+    divided by the growth of its standard deviation. What a right model leaves is the noise floor
+    again.
 
     Attributes:
         shift: Mean change of the position [N] [rad].

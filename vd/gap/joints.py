@@ -15,8 +15,8 @@ SPRUNG = f"{explains(CANCELLING)} here, but cancel at rest on another joint of t
 def doubted(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[Explanation]:
     """Explanations without what another joint of the finger shows to be a cause that is not in the table.
 
-    That is a load and an offset that cancel at rest there: where a joint travels little they imitate the same
-    spring.
+    That is a load and an offset that cancel at rest there: where a joint travels little they
+    imitate the same spring.
 
     Args:
         explanations: Of the joints.
@@ -36,7 +36,9 @@ def doubted(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[
 
 
 def explain_joints(explainer: Explainer) -> list[Explanation]:
-    """What every joint lacks: of each finger from its tip on, as a joint's motion shakes those before it.
+    """What every joint lacks.
+
+    Of each finger from its tip on, as a joint's motion shakes those before it.
 
     Args:
         explainer: Explains one, knowing those of its finger that are explained already.

@@ -26,13 +26,15 @@ class Trajectory:
         conditions: What was varied on purpose (``p_gain``, ``payload_kg``, ``supply_v`` ...).
         time: Time stamps [T] [s], float64, starting at 0 (:meth:`piece`: later).
         command: Commanded positions [T, J] [rad].
-        position: Measured positions [T, J] [rad]; the commands of a motion that is still to be recorded.
+        position: Measured positions [T, J] [rad]; the commands of a motion that is still to be
+            recorded.
         velocity: Measured velocities [T, J] [rad/s], or None; NaN for joints without the column.
         current: Motor currents [T, J] [A], or None, as all telemetry.
         pwm: Duty cycles [T, J] in [-1, 1], or None.
         voltage: Supply voltages [T, J] [V], or None.
         temperature: Motor temperatures [T, J] [deg C], or None.
-        command_time: When the commands were sent [T] [s], in the time of ``time``; None: at the time stamps.
+        command_time: When the commands were sent [T] [s], in the time of ``time``; None: at the
+            time stamps.
         enabled: Whether the servo's torque is on [T, J] bool; all true where not recorded.
     """
 
@@ -99,4 +101,6 @@ class Recording:
             pieces: Index of the trajectory -> samples ``(first, end)``.
         """
         parts = enumerate(self.trajectories)
-        return replace(self, trajectories=tuple(t.piece(*pieces[i]) if i in pieces else t for i, t in parts))
+        return replace(
+            self, trajectories=tuple(t.piece(*pieces[i]) if i in pieces else t for i, t in parts)
+        )

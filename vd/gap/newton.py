@@ -31,20 +31,26 @@ from vd.sim.scene import build_hand, new_builder
 
 
 def simulate_hand(
-    recording: Recording, hand: HandModel, rows: np.ndarray, *, dt: float = STEP_S, device: str = "cpu"
+    recording: Recording,
+    hand: HandModel,
+    rows: np.ndarray,
+    *,
+    dt: float = STEP_S,
+    device: str = "cpu",
 ) -> np.ndarray:
     """What Newton makes of a recording's commands, sampled where the recording has positions.
 
     Args:
         recording: A recording of the hand.
         hand: The hand.
-        rows: Servo parameters, shape [D, P], or of M models that are simulated side by side [M, D, P].
+        rows: Servo parameters, shape [D, P], or of M models that are simulated side by side [M, D,
+            P].
         dt: Physics step [s].
         device: Warp device.
 
     Returns:
-        Predicted recorded positions [rad] in the recording's columns, the samples of the trajectories one
-        after the other, shape [S, J] or [M, S, J].
+        Predicted recorded positions [rad] in the recording's columns, the samples of the
+        trajectories one after the other, shape [S, J] or [M, S, J].
     """
     rows = np.asarray(rows, dtype=float)
     models = rows[None] if rows.ndim == 2 else rows
@@ -84,7 +90,9 @@ class _Replay:
         first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
         gains = [float(t.conditions.get("p_gain", 0.0)) for t in trajectories]
         shares = [gain / max(gains) if gain > 0.0 else 1.0 for gain in gains]
-        power = np.concatenate([t.enabled * share for t, share in zip(trajectories, shares, strict=True)])
+        power = np.concatenate(
+            [t.enabled * share for t, share in zip(trajectories, shares, strict=True)]
+        )
         command = np.concatenate([t.command for t in trajectories])
         column = np.array([names.index(n) if n in names else -1 for n in self.hand.joint_names])
         self.duration = max(t.duration for t in trajectories)
@@ -115,7 +123,10 @@ class _Replay:
         self._tracks.stream = array(np.tile([t.stream for t in trajectories], models), int)
 
     def _build(self) -> None:
-        """The worlds; without contacts a joint has three rows: its limit, friction, and whom it follows."""
+        """The worlds; without contacts a joint has three rows.
+
+        Its limit, friction, and whom it follows.
+        """
         w, d = self.shape
         cfg = dataclasses.replace(
             SimCfg(),
@@ -160,7 +171,9 @@ class _Replay:
         self._held.assign(self._start_command.astype(np.float32))
         self._held_power.assign(self._start_power.astype(np.float32))
         wp.copy(self.servo.power, self._held_power)
-        self.servo.reset(wp.ones(self.shape[0], dtype=wp.int32, device=self.device), command=self._held)
+        self.servo.reset(
+            wp.ones(self.shape[0], dtype=wp.int32, device=self.device), command=self._held
+        )
         if rows[..., BACKLASH_WIDTH].any():
             load = wp.array(self._gravity(start), dtype=float, device=self.device)
             servo = [self.servo.parameters, self.servo.first]

@@ -1,10 +1,10 @@
 """Plan the next experiment: the motions on which the models that are still possible disagree most.
 
-Every set of motions of the menu is simulated under every model in question. The disagreement of two models is
-the criterion of Buzzi-Ferraris and Forzatti (1983) for telling rivals apart: the difference of their
-predictions in units of the noise, less what the uncertainty of their parameters explains, which the recorded
-motions bound. Noise is all that the identified model leaves of them. The set of motions on which the models
-disagree most is proposed.
+Every set of motions of the menu is simulated under every model in question. The disagreement of two
+models is the criterion of Buzzi-Ferraris and Forzatti (1983) for telling rivals apart: the
+difference of their predictions in units of the noise, less what the uncertainty of their parameters
+explains, which the recorded motions bound. Noise is all that the identified model leaves of them.
+The set of motions on which the models disagree most is proposed.
 """
 
 import contextlib
@@ -50,8 +50,8 @@ class Score:
     name: str
     """Key of :data:`vd.gap.excitations.MENU`."""
     disagreement: float
-    """Of two models, RMS in units of the noise; of several pairs the one at which as much is learnt, which is
-    log(1 + disagreement^2) in the mean."""
+    """Of two models, RMS in units of the noise; of several pairs the one at which as much is
+    learnt, which is log(1 + disagreement^2) in the mean."""
     seconds: float
     """Length of all its motions."""
 
@@ -98,11 +98,17 @@ def plan(
     competing: dict[str, tuple[tuple[str, ...], ...]] = {}
     for chain in chains(recording, hand):
         base = _base(chain, report, start or {})
-        for joint, group in ((name, group) for name in chain.joints for group in targets.get(name, ())):
+        for joint, group in (
+            (name, group) for name in chain.joints for group in targets.get(name, ())
+        ):
             models = _models(report, chain, joint, base, group)
             competing[joint] = (*competing.get(joint, ()), tuple(models))
-            own = {name: [m for m in motions if m.joints == (joint,)] for name, motions in menu.items()}
-            for name, values in _compare(chain, recording, own, joint, models, noise[joint], device).items():
+            own = {
+                name: [m for m in motions if m.joints == (joint,)] for name, motions in menu.items()
+            }
+            for name, values in _compare(
+                chain, recording, own, joint, models, noise[joint], device
+            ).items():
                 found[name] += values
     if not competing:
         raise ValueError(f"{recording.path}: no joint has a fitted model; run vd-gap explain first")
@@ -125,8 +131,8 @@ def plan(
 def write_plan(result: Plan, folder: Path) -> Path:
     """Write ``next_experiment.json`` and its commands, one CSV file per motion.
 
-    A CSV has the header of a recording without what is measured: ``t``, ``command.<joint>`` for every joint
-    and, where the torque is switched off, ``enabled.<joint>``.
+    A CSV has the header of a recording without what is measured: ``t``, ``command.<joint>`` for
+    every joint and, where the torque is switched off, ``enabled.<joint>``.
 
     Returns:
         The JSON file.
@@ -135,7 +141,9 @@ def write_plan(result: Plan, folder: Path) -> Path:
     path, entries = Path(folder) / PLAN_JSON, []
     for motion in numbered(result.motions):
         entries.append(entry_of(replace(motion, file=f"{PLAN_FOLDER}/{motion.file}")))
-        write_table(Path(folder) / entries[-1]["file"], motion, result.joints, ("command", "enabled"))
+        write_table(
+            Path(folder) / entries[-1]["file"], motion, result.joints, ("command", "enabled")
+        )
     contents = {name: value for name, value in vars(result).items() if name != "motions"}
     contents |= {"format": FORMAT, "excitation": result.ranking[0].name, "trajectories": entries}
     write_json(path, to_dict(contents))
@@ -144,25 +152,34 @@ def write_plan(result: Plan, folder: Path) -> Path:
 
 def discard_plan(folder: Path) -> None:
     """Remove a plan that :func:`write_plan` wrote, and no other file."""
-    for file in (Path(folder) / PLAN_JSON, *(Path(folder) / PLAN_FOLDER).glob("[0-9][0-9][0-9]_*.csv")):
+    for file in (
+        Path(folder) / PLAN_JSON,
+        *(Path(folder) / PLAN_FOLDER).glob("[0-9][0-9][0-9]_*.csv"),
+    ):
         file.unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # something else is in it, or it is not there
         (Path(folder) / PLAN_FOLDER).rmdir()
 
 
 def _targets(report: Report) -> dict[str, tuple[tuple[str, ...], ...]]:
-    """Fitted joints in question with the sets of effects that compete on each; an empty set is of all."""
+    """Fitted joints in question with the sets of effects that compete on each.
+
+    An empty set is of all.
+    """
     targets = {one.joint: one.open_sets for one in report.joints if one.open_sets}
     if not targets:
         shaky = [one.joint for one in report.joints if one.verdict not in ("effects", "no_gap")]
         targets = {joint: ((),) for joint in shaky or report.recording.joints}
-    return {joint: groups for joint, groups in targets.items() if joint in report.identified.parameters}
+    return {
+        joint: groups for joint, groups in targets.items() if joint in report.identified.parameters
+    }
 
 
 def _menu(recording: Recording, hand: "HandModel | None") -> dict[str, list[Trajectory]]:
     """The menu for this machine, under the conditions that its recording has throughout.
 
-    Joints move in the hand's range, or in that of the commands before. Only a pendulum's load is modelled.
+    Joints move in the hand's range, or in that of the commands before. Only a pendulum's load is
+    modelled.
     """
     parts = recording.trajectories
     common = {
@@ -175,14 +192,23 @@ def _menu(recording: Recording, hand: "HandModel | None") -> dict[str, list[Traj
     if hand is not None:
         index = [hand.joint_names.index(name) for name in recording.joints]
         lower, upper = hand.lower[index], hand.upper[index]
-    gain = max((float(t.conditions["p_gain"]) for t in parts if "p_gain" in t.conditions), default=1.0)
+    gain = max(
+        (float(t.conditions["p_gain"]) for t in parts if "p_gain" in t.conditions), default=1.0
+    )
     load, names = common.get("payload_kg"), list(MENU)
-    if recording.model not in BARE_MODELS or not isinstance(load, float) or "arm_length_m" not in common:
+    if (
+        recording.model not in BARE_MODELS
+        or not isinstance(load, float)
+        or "arm_length_m" not in common
+    ):
         load = 0.0
         names.remove("second_payload")
     reach = JointRange(recording.joints, lower, upper, gain, (load, 2.0 * load))
     return {
-        name: [replace(m, conditions={**common, **m.conditions}) for m in excitation_set(reach, (name,))]
+        name: [
+            replace(m, conditions={**common, **m.conditions})
+            for m in excitation_set(reach, (name,))
+        ]
         for name in names
     }
 
@@ -209,8 +235,13 @@ def _models(
             rows[index, parameter.column] = values.get(key, parameter.typical)
         return rows
 
-    if len(group) < 2:  # nothing in particular competes: which motion would show the most of everything?
-        return {PLAIN: base, **{name: having(name, {}) for name in candidates(chain, tuple(EFFECTS))}}
+    if (
+        len(group) < 2
+    ):  # nothing in particular competes: which motion would show the most of everything?
+        return {
+            PLAIN: base,
+            **{name: having(name, {}) for name in candidates(chain, tuple(EFFECTS))},
+        }
     for parameter in (p for name in group for p in EFFECTS[name].parameters):
         base[index, parameter.column] = parameter.neutral  # one of them stands in the model for all
     held = {e.name for e in (*report.effects, *report.provisional) if joint in e.joints} - {*group}
@@ -219,7 +250,11 @@ def _models(
 
 def _fitted(report: Report, joint: str, name: str, given: set[str]) -> dict[str, float]:
     """Parameters of an effect on a joint as they were fitted beside the effects given, or else last."""
-    rows = [row for row in report.evidence if row.name == name and joint in row.joints and row.parameters]
+    rows = [
+        row
+        for row in report.evidence
+        if row.name == name and joint in row.joints and row.parameters
+    ]
     beside = [row for row in rows if {*row.given} == given]
     return (beside or rows)[-1].parameters if rows else {}
 
@@ -246,7 +281,9 @@ def _compare(
     predicted = rollouts.predict(np.concatenate(varied))[:, :, index].astype(float) / noise
     ends = np.cumsum([len(rows) for rows in varied])[:-1]
     measured = rollouts.measured[:, index] / noise
-    rivals = [Rival.of(curves, measured, of == "", len(known)) for curves in np.split(predicted, ends)]
+    rivals = [
+        Rival.of(curves, measured, of == "", len(known)) for curves in np.split(predicted, ends)
+    ]
     pairs = list(itertools.combinations(rivals, 2))
     if PLAIN in models:  # then every effect is one of many
         pairs = [(rivals[0], other) for other in rivals[1:]]
@@ -274,7 +311,9 @@ def _varied(chain: Chain, rows: np.ndarray, joint: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """A model in question, refitted to what is recorded; S samples, recorded and imagined, P parameters.
+    """A model in question, refitted to what is recorded.
+
+    S samples, recorded and imagined, P parameters.
 
     Errors within a motion are correlated: each recorded motion counts as one observation.
 
@@ -317,7 +356,9 @@ def disagreement(one: Rival, other: Rival, new: np.ndarray) -> float:
     count = len(one.slopes)
     stiffness[:count, :count] += one.precision
     stiffness[count:, count:] += other.precision
-    return float(np.sqrt(max(apart @ apart / len(apart) - pull @ np.linalg.solve(stiffness, pull), 0.0)))
+    return float(
+        np.sqrt(max(apart @ apart / len(apart) - pull @ np.linalg.solve(stiffness, pull), 0.0))
+    )
 
 
 def _sentence(best: Score, report: Report, joints: tuple[str, ...], kinds: int) -> str:
@@ -329,12 +370,16 @@ def _sentence(best: Score, report: Report, joints: tuple[str, ...], kinds: int) 
         if kinds < MIN_KINDS:
             decide = f"but here are {kinds} kinds of motion: record {MIN_KINDS} at least"
         return (
-            f"No motion of the menu would decide{between}: on all of them the models in question differ by "
-            f"less than {REPEATABLE:g} times the noise, {decide}. The best of the menu is in {PLAN_FOLDER}/."
+            f"No motion of the menu would decide{between}: on all of them the models in question "
+            f"differ by "
+            f"less than {REPEATABLE:g} times the noise, {decide}. The best of the menu is in "
+            f"{PLAN_FOLDER}/."
         )
     goal = f"to decide{between}" if sets else "to see what these motions do not show"
     return (
-        f"Record the motions {best.name} on {joints_text(joints)}, {best.seconds:.0f} s, {goal}: there the "
-        f"models in question differ by {best.disagreement:.1f} times the noise. The commands are in "
+        f"Record the motions {best.name} on {joints_text(joints)}, {best.seconds:.0f} s, {goal}: "
+        f"there the "
+        f"models in question differ by {best.disagreement:.1f} times the noise. The commands are "
+        f"in "
         f"{PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
     )

@@ -1,4 +1,6 @@
-"""Motions in files of other programs: LeRobot datasets, ROS bags and MCAP, BAM's logs, CSV with units.
+"""Motions in files of other programs.
+
+LeRobot datasets, ROS bags and MCAP, BAM's logs, CSV with units.
 
 Every reader yields a :class:`Motion` for each episode, bag or file. ``FORMATS`` has them by name.
 """
@@ -43,7 +45,8 @@ class Motion:
         name: Of its episode or file.
         joints: J names.
         time: Time stamps [T] [s].
-        channels: ``command`` and ``position`` [T, J] [rad], and telemetry as :mod:`vd.gap.motions` has it.
+        channels: ``command`` and ``position`` [T, J] [rad], and telemetry as :mod:`vd.gap.motions`
+            has it.
         command_time: When the command of a row was sent [T] [s]; None: at its time stamp.
         conditions: What was varied on purpose.
         kind: Kind of motion, the unit of held-out splits; empty: of its own.
@@ -86,7 +89,10 @@ class Told:
 
 
 def read_csv(path: Path, told: Told) -> Iterator[Motion]:
-    """A CSV whose header names ``t [ms]``, ``position.JOINT [deg]``, ...; a folder: every CSV in it."""
+    """A CSV whose header names ``t [ms]``, ``position.JOINT [deg]``, ....
+
+    A folder: every CSV in it.
+    """
     for file in _files(path, ".csv"):
         header, rows = read_table(file)
         columns: dict[str, np.ndarray] = {}
@@ -94,10 +100,14 @@ def read_csv(path: Path, told: Told) -> Iterator[Motion]:
             name, scale = _column(file, text, told)
             if scale is not None:
                 if name in columns:
-                    raise RecordingError(f"{file}: two columns are {name!r}; --rename one to 'unused'")
+                    raise RecordingError(
+                        f"{file}: two columns are {name!r}; --rename one to 'unused'"
+                    )
                 columns[name] = scale * numbers(file, text, [row[i] for row in rows])
         if "t" not in columns:
-            raise RecordingError(f"{file}: no column 't'; give --rename 'ITS TIME=t' with its unit: 't [ms]'")
+            raise RecordingError(
+                f"{file}: no column 't'; give --rename 'ITS TIME=t' with its unit: 't [ms]'"
+            )
         joints = tuple(dict.fromkeys(name.partition(".")[2] for name in columns if "." in name))
         yield Motion(file.stem, joints, columns["t"], by_channel(columns, joints, len(rows)))
 
@@ -114,7 +124,9 @@ def _column(file: Path, text: str, told: Told) -> tuple[str, float | None]:
     unit = given or own or stated
     if unit is None or unit not in units:
         said = f"has the unit {unit!r}" if unit else "has no unit"
-        raise RecordingError(f"{file}: column {text!r} {said}; write '{name} [{'] or ['.join(units)}]'")
+        raise RecordingError(
+            f"{file}: column {text!r} {said}; write '{name} [{'] or ['.join(units)}]'"
+        )
     return name, units[unit]
 
 
@@ -141,12 +153,17 @@ def read_bam(path: Path, told: Told) -> Iterator[Motion]:
                 if all(key in row for row in rows)
             }
             channels["enabled"] = np.array([float(row.get("torque_enable", 1)) for row in rows])
-            conditions = {"p_gain": log["kp"], "payload_kg": log["mass"], "arm_length_m": log["length"]}
+            conditions = {
+                "p_gain": log["kp"],
+                "payload_kg": log["mass"],
+                "arm_length_m": log["length"],
+            }
             conditions |= {"supply_v": log["vin"]} if "vin" in log else {}
             name = f"{log['trajectory']}_p{log['kp']:g}_{file.stem}".replace("/", "_")
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(
-                f"{file}: no log of BAM ({error!r}); it has mass, length, kp, trajectory, and entries of "
+                f"{file}: no log of BAM ({error!r}); it has mass, length, kp, trajectory, and "
+                f"entries of "
                 "timestamp, position and goal_position"
             ) from error
         joint = told.called("pendulum", "pendulum")
@@ -155,7 +172,10 @@ def read_bam(path: Path, told: Told) -> Iterator[Motion]:
 
 
 def read_lerobot(path: Path, told: Told) -> Iterator[Motion]:
-    """Episodes of a LeRobot dataset, v2 or v3: ``action`` commands, ``observation.state`` is measured."""
+    """Episodes of a LeRobot dataset, v2 or v3.
+
+    ``action`` commands, ``observation.state`` is measured.
+    """
     need("pyarrow")
     info = path / "meta" / "info.json"
     try:
@@ -167,12 +187,15 @@ def read_lerobot(path: Path, told: Told) -> Iterator[Motion]:
         ) from error
     if told.unit is None:
         raise RecordingError(
-            f"{info}: LeRobot does not say the unit of joints; give --unit deg or rad. Values normalised to "
+            f"{info}: LeRobot does not say the unit of joints; give --unit deg or rad. Values "
+            f"normalised to "
             "-100 to 100 are no angles: record with use_degrees=True"
         )
     joints = [joint for joint in names[1] if joint in names[0]]
     if not joints:
-        raise RecordingError(f"{info}: 'action' has {names[0]}, 'observation.state' {names[1]}: none in both")
+        raise RecordingError(
+            f"{info}: 'action' has {names[0]}, 'observation.state' {names[1]}: none in both"
+        )
     index, time, action, state = _lerobot_rows(path, names)
     scale = ANGLES[told.unit]
     ours = tuple(told.called(joint, joint.removesuffix(".pos")) for joint in joints)
@@ -181,7 +204,10 @@ def read_lerobot(path: Path, told: Told) -> Iterator[Motion]:
         rows = index == episode
         both = {"command": action[rows][:, picked[0]], "position": state[rows][:, picked[1]]}
         yield Motion(
-            f"episode_{int(episode):06d}", ours, time[rows], {key: scale * v for key, v in both.items()}
+            f"episode_{int(episode):06d}",
+            ours,
+            time[rows],
+            {key: scale * v for key, v in both.items()},
         )
 
 
@@ -201,7 +227,9 @@ def _lerobot_rows(path: Path, names: Sequence[list[str]]) -> list[np.ndarray]:
             if len(values):
                 columns[name].append(values)
     if not columns["timestamp"]:
-        raise RecordingError(f"{path}: no rows in data/**/*.parquet; download the dataset's data folder")
+        raise RecordingError(
+            f"{path}: no rows in data/**/*.parquet; download the dataset's data folder"
+        )
     rows = [np.concatenate(columns[name]) for name in wanted]
     for values, of in zip(rows[2:], names, strict=True):
         if values.shape[1:] != (len(of),):
@@ -218,10 +246,10 @@ def _lerobot_names(feature: Mapping[str, Any]) -> list[str]:
 def read_ros(path: Path, told: Told) -> Iterator[Motion]:
     """A ROS 1 bag, a ROS 2 bag's folder or file, or an MCAP of ROS 2 messages.
 
-    Measured are JointState, commanded JointState, JointTrajectory of one point, or Float64MultiArray in the
-    order of the measured joints. A command holds until the next. Stamps are those of the headers where all
-    have one, else of the bag. Of a topic that several devices share, states of the joints that are asked for
-    are taken, or of those in its first message.
+    Measured are JointState, commanded JointState, JointTrajectory of one point, or
+    Float64MultiArray in the order of the measured joints. A command holds until the next. Stamps
+    are those of the headers where all have one, else of the bag. Of a topic that several devices
+    share, states of the joints that are asked for are taken, or of those in its first message.
     """
     need("rosbags")
     from rosbags.highlevel import AnyReader, AnyReaderError
@@ -248,7 +276,12 @@ def read_ros(path: Path, told: Told) -> Iterator[Motion]:
 
 
 def _topic(
-    path: Path, which: str, given: str | None, kinds: Mapping[str, str], allowed: tuple[str, ...], no: tuple
+    path: Path,
+    which: str,
+    given: str | None,
+    kinds: Mapping[str, str],
+    allowed: tuple[str, ...],
+    no: tuple,
 ) -> str:
     """The topic that is given, or the only one that can be meant."""
     fit = [topic for topic, kind in kinds.items() if kind in allowed and topic not in no]
@@ -259,7 +292,8 @@ def _topic(
     there = ", ".join(f"{topic} ({kind})" for topic, kind in kinds.items())
     found = f"{given} is none" if given else "there is none" if not fit else "there are several"
     raise RecordingError(
-        f"{path}: {which} topic: {found}; give --{which}-topic one of {' or '.join(allowed)}; it has {there}"
+        f"{path}: {which} topic: {found}; give --{which}-topic one of {' or '.join(allowed)}; it "
+        f"has {there}"
     )
 
 
@@ -268,7 +302,9 @@ def _held(path: Path, states: list[_Heard], commands: list[_Heard], told: Told) 
     ours = [{told.called(name, name) for name in message.name} for *_, message in states]
     first = next((i for i, names in enumerate(ours) if names.issuperset(told.joints)), None)
     if first is None:
-        raise RecordingError(f"{path}: no state of {', '.join(told.joints)}; there are {sorted(ours[0])}")
+        raise RecordingError(
+            f"{path}: no state of {', '.join(told.joints)}; there are {sorted(ours[0])}"
+        )
     joints = list(states[first][2].name)
     states = [row for row, names in zip(states, ours, strict=True) if names & ours[first]]
     stamped = all(own > 0.0 for own, _, _ in (*states, *commands))
@@ -290,18 +326,24 @@ def _held(path: Path, states: list[_Heard], commands: list[_Heard], told: Told) 
     channels = {"command": wanted[last], "position": position[kept], "velocity": velocity[kept]}
     named = tuple(told.called(joint, joint) for joint in joints)
     # A command is new in one row; in those after it, it is held.
-    return Motion(path.stem, named, time, channels, np.where(new, np.minimum(sent[last], time), time))
+    return Motion(
+        path.stem, named, time, channels, np.where(new, np.minimum(sent[last], time), time)
+    )
 
 
 def _goal(path: Path, message: Any, joints: list[str]) -> np.ndarray:
-    """The positions that a message commands, in the order of the joints; NaN for those it leaves out."""
+    """The positions that a message commands, in the order of the joints.
+
+    NaN for those it leaves out.
+    """
     if hasattr(message, "data"):
         names, values = joints, message.data
     elif hasattr(message, "points"):
         names, points = message.joint_names, message.points
         if len(points) != 1:
             raise RecordingError(
-                f"{path}: a JointTrajectory of {len(points)} points says what a controller is to make of it, "
+                f"{path}: a JointTrajectory of {len(points)} points says what a controller is to "
+                f"make of it, "
                 "not what was sent; give a --command-topic of positions"
             )
         values = points[0].positions

@@ -1,8 +1,8 @@
 """Recordings of real machines: the format ``vd-recording/1``, read with every check and written.
 
 A recording is a folder with ``recording.json`` and one CSV file per trajectory. SI units, radians,
-seconds. A command holds from its row's time stamp on, or from when it was sent where the row says that;
-stamps increase but need not be regular.
+seconds. A command holds from its row's time stamp on, or from when it was sent where the row says
+that; stamps increase but need not be regular.
 """
 
 import contextlib
@@ -37,7 +37,9 @@ USD_SUFFIXES = (".usd", ".usda", ".usdc")
 POSITIVE = ("p_gain", "payload_kg", "arm_length_m")
 """Conditions that the model computes with: numbers, not negative."""
 STIFFNESS = "kp_nm_rad"
-"""Key of ``servo``: the drive's stiffness at the largest P gain recorded [N m/rad], one or by joint."""
+"""Key of ``servo``: the drive's stiffness at the largest P gain recorded [N m/rad], one or by
+joint.
+"""
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -47,18 +49,23 @@ def read_recording(path: str | Path) -> Recording:
         path: The folder, or its ``recording.json``.
 
     Raises:
-        RecordingError: It cannot be used; names file, row (1 is the header), column, why, and the remedy.
+        RecordingError: It cannot be used; names file, row (1 is the header), column, why, and the
+            remedy.
     """
     path = Path(path)
     file = path if path.suffix == ".json" else path / "recording.json"
     header = read_header(file)
-    require(header.get("model") != CONTACT_MODEL, f"{file}: an object's motions; they are for vd-gap contact")
+    require(
+        header.get("model") != CONTACT_MODEL,
+        f"{file}: an object's motions; they are for vd-gap contact",
+    )
     joints = _names(file, "joints", header.get("joints"))
     _check_model(file, header.get("model"), joints)
     resolution: Any = header.get("encoder_resolution_rad")
     require(
         _is_number(resolution) and 0.0 < resolution < math.radians(1.0),
-        f"{file}: 'encoder_resolution_rad' is {resolution!r}, as if in degrees; give the size of one "
+        f"{file}: 'encoder_resolution_rad' is {resolution!r}, as if in degrees; give the size of "
+        f"one "
         "encoder count in rad, e.g. 0.001534 for 4096 counts a turn",
     )
     servo: Any = header.get("servo", {})
@@ -69,20 +76,27 @@ def read_recording(path: str | Path) -> Recording:
         isinstance(entries, list) and bool(entries),
         f"{file}: 'trajectories' is empty; list at least one {{file, excitation, joints}}",
     )
-    trajectories = tuple(_read_trajectory(file, i, entry, joints) for i, entry in enumerate(entries))
+    trajectories = tuple(
+        _read_trajectory(file, i, entry, joints) for i, entry in enumerate(entries)
+    )
     names = [trajectory.file for trajectory in trajectories]
     twice = sorted({name for name in names if names.count(name) > 1})
     require(
         not twice,
-        f"{file}: 'trajectories' lists {twice} twice; list each once, or it counts as evidence twice",
+        f"{file}: 'trajectories' lists {twice} twice; list each once, or it counts as evidence "
+        f"twice",
     )
-    recording = Recording(file.parent, header["model"], joints, servo, float(resolution), trajectories)
+    recording = Recording(
+        file.parent, header["model"], joints, servo, float(resolution), trajectories
+    )
     check_motion(recording)
     check_units(recording)
     return recording
 
 
-def write_recording(recording: Recording, folder: str | Path, *, only: Collection[str] | None = None) -> Path:
+def write_recording(
+    recording: Recording, folder: str | Path, *, only: Collection[str] | None = None
+) -> Path:
     """Write a recording into a folder: each file atomically, ``recording.json`` last.
 
     Args:
@@ -125,7 +139,8 @@ def _read_text(file: Path) -> str:
         return file.read_text(encoding="utf-8-sig")  # spreadsheets put a mark in front
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise RecordingError(
-            f"{file}: no such file; give a folder with recording.json and the CSV files that it lists"
+            f"{file}: no such file; give a folder with recording.json and the CSV files that it "
+            f"lists"
         ) from None
     except UnicodeDecodeError as error:
         raise RecordingError(f"{file}: not a text file ({error}); export it in UTF-8") from error
@@ -148,13 +163,21 @@ def read_header(file: Path) -> dict[str, Any]:
 
 def _is_number(value: Any) -> bool:
     largest = sys.float_info.max
-    return isinstance(value, int | float) and not isinstance(value, bool) and -largest <= value <= largest
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and -largest <= value <= largest
+    )
 
 
 def _names(file: Path, key: str, value: Any) -> tuple[str, ...]:
-    strings = isinstance(value, list) and bool(value) and all(isinstance(v, str) and v for v in value)
+    strings = (
+        isinstance(value, list) and bool(value) and all(isinstance(v, str) and v for v in value)
+    )
     require(strings, f"{file}: {key!r} is {value!r}; make it a list of joint names")
-    require(len({*value}) == len(value), f"{file}: {key!r} names a joint twice: {value}; name each once")
+    require(
+        len({*value}) == len(value), f"{file}: {key!r} names a joint twice: {value}; name each once"
+    )
     return tuple(value)
 
 
@@ -164,7 +187,8 @@ def _check_stiffness(file: Path, told: Any, joints: tuple[str, ...]) -> None:
     for joint, value in values.items():
         require(
             joint in joints and _is_number(value) and value > 0.0,
-            f"{file}: servo.{STIFFNESS} is {told!r}; give a positive number in N m/rad, or one by joint: "
+            f"{file}: servo.{STIFFNESS} is {told!r}; give a positive number in N m/rad, or one by "
+            f"joint: "
             f"{', '.join(joints)}",
         )
 
@@ -179,7 +203,8 @@ def _check_model(file: Path, model: Any, joints: tuple[str, ...]) -> None:
         known = load_hand(model_path(file.parent, str(model))).joint_names
     except ValueError as error:
         raise RecordingError(
-            f"{file}: 'model': {error}; it is a hand, a USD file beside it, {' or '.join(BARE_MODELS)}"
+            f"{file}: 'model': {error}; it is a hand, a USD file beside it, "
+            f"{' or '.join(BARE_MODELS)}"
         ) from error
     _check_known(f"{file}: 'joints'", joints, known, str(model))
 
@@ -220,7 +245,9 @@ def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...
     time = columns.pop("t")
     sent = columns.pop(COMMAND_TIME, None)
     channels = by_channel(columns, joints, len(time))
-    enabled = np.nan_to_num(channels.pop("enabled", np.ones((len(time), len(joints)))), nan=1.0) > 0.5
+    enabled = (
+        np.nan_to_num(channels.pop("enabled", np.ones((len(time), len(joints)))), nan=1.0) > 0.5
+    )
     return Trajectory(
         file=name,
         excitation=str(entry.get("excitation", Path(name).stem)),
@@ -252,7 +279,8 @@ def read_table(file: Path) -> tuple[list[str], list[list[str]]]:
     Beside semicolons a comma is the decimal point, as spreadsheets of many languages write it.
 
     Raises:
-        RecordingError: There is none, it is empty, or a row has another number of cells than the header.
+        RecordingError: There is none, it is empty, or a row has another number of cells than the
+            header.
     """
     text = _read_text(file)
     separator = max(",;\t", key=text.partition("\n")[0].count)
@@ -262,7 +290,9 @@ def read_table(file: Path) -> tuple[list[str], list[list[str]]]:
         rows.pop()
     require(bool(rows), f"{file}: empty; record it again or drop it")
     for i, row in enumerate(rows):
-        said = f"{file}: row {i + 1} has {len(row)} cells, the header {len(rows[0])}; correct the row"
+        said = (
+            f"{file}: row {i + 1} has {len(row)} cells, the header {len(rows[0])}; correct the row"
+        )
         require(len(row) == len(rows[0]), said)
     return [name.strip() for name in rows[0]], rows[1:]
 
@@ -279,7 +309,8 @@ def numbers(file: Path, name: str, cells: list[str]) -> np.ndarray:
             values[i] = float(cell)
         if not math.isfinite(values[i]):
             raise RecordingError(
-                f"{file}: row {i + 2}, column {name!r}: {cell.strip() or 'an empty cell'} is not a finite "
+                f"{file}: row {i + 2}, column {name!r}: {cell.strip() or 'an empty cell'} is not a "
+                f"finite "
                 "number; drop the row, or the column if it is optional"
             )
     return values
@@ -291,13 +322,20 @@ def _read_columns(file: Path, joints: tuple[str, ...]) -> dict[str, np.ndarray]:
     kept = _check_columns(file, names, joints)
     require(
         len(rows) >= MIN_SAMPLES,
-        f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, better some seconds at 100 Hz: "
+        f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, better some seconds at "
+        f"100 Hz: "
         "record it again or drop it from 'trajectories'",
     )
-    columns = {name: numbers(file, name, [row[index] for row in rows]) for name, index in kept.items()}
+    columns = {
+        name: numbers(file, name, [row[index] for row in rows]) for name, index in kept.items()
+    }
     if COMMAND_TIME in columns:
         # A log over a gap of the bus tells the state before once more.
-        same = [np.diff(v) == 0.0 for key, v in columns.items() if key == "t" or key.startswith("position.")]
+        same = [
+            np.diff(v) == 0.0
+            for key, v in columns.items()
+            if key == "t" or key.startswith("position.")
+        ]
         new = np.concatenate([[True], ~np.all(same, axis=0)])
         columns = {name: values[new] for name, values in columns.items()}
     check_values(file, columns)
@@ -311,9 +349,16 @@ def _check_columns(file: Path, names: list[str], joints: tuple[str, ...]) -> dic
         channel, dot, joint = name.partition(".")
         if dot and channel in CHANNELS:
             _check_known(f"{file}: row 1, column {name!r}", (joint,), joints, "recording.json")
-    for name in ("t", *(f"{channel}.{joint}" for joint in joints for channel in ("command", "position"))):
+    for name in (
+        "t",
+        *(f"{channel}.{joint}" for joint in joints for channel in ("command", "position")),
+    ):
         require(name in names, f"{file}: row 1 has no column {name!r}; add it")
-    wanted = {"t", COMMAND_TIME, *(f"{channel}.{joint}" for channel in CHANNELS for joint in joints)}
+    wanted = {
+        "t",
+        COMMAND_TIME,
+        *(f"{channel}.{joint}" for channel in CHANNELS for joint in joints),
+    }
     return {name: index for index, name in enumerate(names) if name in wanted}
 
 
@@ -336,7 +381,9 @@ def write_table(
         if values is None or (channel == "enabled" and values.all()):
             continue
         each = zip(joints, np.asarray(values, dtype=float).T, strict=True)
-        columns |= {f"{channel}.{joint}": column for joint, column in each if not np.isnan(column).all()}
+        columns |= {
+            f"{channel}.{joint}": column for joint, column in each if not np.isnan(column).all()
+        }
     formats = ["%d" if name.startswith("enabled") else "%.6f" for name in columns]
     table, header = np.stack([*columns.values()], axis=1), ",".join(columns)
     with atomic_path(file) as temporary:

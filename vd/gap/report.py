@@ -55,7 +55,9 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
         for joint, index in figures.chosen_overlays(report, curves):
             file = curves.files[index]
             overlay = figures.overlay_figure(report, curves, joint, index)
-            overlays.append((draw(f"overlay_{joint}_{Path(file).stem}", overlay), f"{joint} in {file}"))
+            overlays.append(
+                (draw(f"overlay_{joint}_{Path(file).stem}", overlay), f"{joint} in {file}")
+            )
             if joint not in residuals:
                 residual = figures.residual_figure(report, curves, joint)
                 residuals[joint] = draw(f"residual_{joint}", residual)
@@ -64,7 +66,9 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
         report.evidence,
         key=lambda r: (joints.index(r.joints[0]), r.round, math.isnan(r.gain), -r.gain),
     )
-    rivals = {((one.joint,), name) for one in report.joints for group in one.open_sets for name in group}
+    rivals = {
+        ((one.joint,), name) for one in report.joints for group in one.open_sets for name in group
+    }
     kept = [
         _evidence_row(row)[:-1]
         for row in evidence
@@ -81,7 +85,13 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
         overlays=overlays,
         residuals=residuals,
         trajectories=[
-            (one.joint, one.excitation, one.file, mrad(one.baseline_rmse_rad), mrad(one.identified_rmse_rad))
+            (
+                one.joint,
+                one.excitation,
+                one.file,
+                mrad(one.baseline_rmse_rad),
+                mrad(one.identified_rmse_rad),
+            )
             for one in report.trajectories
         ],
         evidence=[_evidence_row(row) for row in evidence],
@@ -89,7 +99,12 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
         not_fitted=[plain(name) for name in EFFECTS if name not in {row.name for row in evidence}],
         parameters=[*_parameters(report.effects), *_parameters(report.provisional, " (not named)")],
         alternatives=[
-            (effect.name, other.name, mrad(other.held_out_rmse_rad), words.mrad_range(other.difference_ci95))
+            (
+                effect.name,
+                other.name,
+                mrad(other.held_out_rmse_rad),
+                words.mrad_range(other.difference_ci95),
+            )
             for effect in report.effects
             for other in effect.alternatives
         ],
@@ -107,7 +122,11 @@ def _headline(report: Report) -> list[Row]:
         answer = "; ".join(words.causes(group) for group in report.open_sets)
     tiles = [
         (_VERDICTS[report.verdict], "verdict", answer),
-        (mrad(held.baseline_rmse_rad), "gap before", "error on held-out motions, plain servo model fitted"),
+        (
+            mrad(held.baseline_rmse_rad),
+            "gap before",
+            "error on held-out motions, plain servo model fitted",
+        ),
     ]
     if report.effects or report.provisional:
         note = f"{percent(held.reduction)} less (95 %: {words.percent_range(held.ci95)})"
@@ -117,8 +136,15 @@ def _headline(report: Report) -> list[Row]:
 
 
 def _joint_row(report: Report, one: JointGap) -> Row:
-    where = [f.where.removeprefix(f"{one.joint}: ") for f in report.findings if f.joint == one.joint]
-    return one.joint, "; ".join(where) or "nothing", _VERDICTS[one.verdict].lower(), plain(one.reason)
+    where = [
+        f.where.removeprefix(f"{one.joint}: ") for f in report.findings if f.joint == one.joint
+    ]
+    return (
+        one.joint,
+        "; ".join(where) or "nothing",
+        _VERDICTS[one.verdict].lower(),
+        plain(one.reason),
+    )
 
 
 def _evidence_row(row: Candidate) -> Row:
@@ -131,7 +157,9 @@ def _evidence_row(row: Candidate) -> Row:
         mrad(row.held_out_rmse_rad) if known else "not fitted",
         f"{percent(row.gain)} ({words.percent_range(row.gain_ci95)})" if known else "",
         f"{_DECISIONS[row.decision]}{plain(row.reason)}",
-        ", ".join(f"{key} {amount(value, units[key].unit)}" for key, value in row.parameters.items()),
+        ", ".join(
+            f"{key} {amount(value, units[key].unit)}" for key, value in row.parameters.items()
+        ),
     )
 
 

@@ -1,9 +1,11 @@
-"""What ``vd-gap`` found: the contents of ``report.json`` (format ``vd-gap-report/1``), typed and checked.
+"""What ``vd-gap`` found.
+
+The contents of ``report.json`` (format ``vd-gap-report/1``), typed and checked.
 
 ``explain`` writes a :class:`Report` without a closing to ``DIR/explain.json`` and its curves
 (:class:`Predictions`) to ``DIR/predictions.npz``; ``close`` adds the closing simulation
-(``DIR/close.json``, ``DIR/closing.npz``); ``report`` writes ``DIR/report.json`` and the page. Angles are
-radians, errors are of the recorded joint position, intervals are 95 %.
+(``DIR/close.json``, ``DIR/closing.npz``); ``report`` writes ``DIR/report.json`` and the page.
+Angles are radians, errors are of the recorded joint position, intervals are 95 %.
 """
 
 import json
@@ -90,7 +92,10 @@ class Fit:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors on trajectories that the fit has not seen; with cross-validation every one is such once."""
+    """Errors on trajectories that the fit has not seen.
+
+    With cross-validation every one is such once.
+    """
 
     trajectories: tuple[str, ...]
     """Their files."""
@@ -123,7 +128,10 @@ class JointGap:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A row of the evidence table: one effect tried on some joints in one round of the selection."""
+    """A row of the evidence table.
+
+    One effect tried on some joints in one round of the selection.
+    """
 
     joints: tuple[str, ...]
     round: int
@@ -173,7 +181,9 @@ class Closing:
     per_joint: dict[str, Interval]
     """(baseline, identified) RMSE [rad] of each joint."""
     whole_hand_layer: str = ""
-    """The layer with the same on every finger, where not all were recorded: the one to train with."""
+    """The layer with the same on every finger, where not all were recorded: the one to train
+    with.
+    """
 
 
 @dataclass(frozen=True)
@@ -188,7 +198,9 @@ class Source:
     seconds: float
     servo: str = ""
     relative_torques: bool = False
-    """Nothing tells how large torques are: all in N m or kg m^2 is known up to one factor a joint."""
+    """Nothing tells how large torques are: all in N m or kg m^2 is known up to one factor a
+    joint.
+    """
 
 
 @dataclass(frozen=True)
@@ -211,7 +223,9 @@ class Report:
     recording: Source
     format: str = FORMAT
     provisional: tuple[NamedEffect, ...] = ()
-    """The first of each set in ``ambiguous``: not named, but what the identified model holds of the set."""
+    """The first of each set in ``ambiguous``: not named, but what the identified model holds of the
+    set.
+    """
     hand: str | None = None
     hand_layer: str | None = None
     """Identified model that the analysis started from."""
@@ -254,7 +268,9 @@ class Report:
     @property
     def open_sets(self) -> tuple[tuple[str, ...], ...]:
         """The sets in ``ambiguous`` that another recording can split, without what their names stand for."""
-        return tuple({frozenset(group): group for one in self.joints for group in one.open_sets}.values())
+        return tuple(
+            {frozenset(group): group for one in self.joints for group in one.open_sets}.values()
+        )
 
 
 @dataclass(frozen=True)
@@ -308,7 +324,9 @@ class Predictions:
             with np.load(path) as data:
                 arrays = {one.name: data[one.name] for one in fields(Predictions)}
         except (KeyError, OSError, ValueError) as error:
-            raise ValueError(f"{path}: not curves of vd-gap ({error}); run vd-gap explain again") from error
+            raise ValueError(
+                f"{path}: not curves of vd-gap ({error}); run vd-gap explain again"
+            ) from error
         names = {key: tuple(arrays[key].tolist()) for key in ("joints", "files")}
         return Predictions(**{**arrays, **names})
 
@@ -323,7 +341,9 @@ def parameter_columns(report: Report, joint: str) -> dict[int, float]:
     baseline = report.identified.parameters.get(joint, {})
     columns = {BASELINE_PARAMETERS[name].column: value for name, value in baseline.items()}
     for effect, values in effect_values((*report.effects, *report.provisional), joint).items():
-        columns |= {parameters_of(effect)[name].column: value for name, (value, *_) in values.items()}
+        columns |= {
+            parameters_of(effect)[name].column: value for name, (value, *_) in values.items()
+        }
     return columns
 
 

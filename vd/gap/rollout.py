@@ -17,7 +17,9 @@ from vd.kernels.servo.chain_bodies import links_of_size, room_for
 from vd.kernels.servo.chains import Samples, rollout_kernel
 
 STEP_S = 1.0 / 480.0
-"""Time step [s]: four of the simulator's, a fifth of a servo's fastest time constant (inertia / kd)."""
+"""Time step [s]: four of the simulator's, a fifth of a servo's fastest time constant (inertia /
+kd).
+"""
 
 
 def links_of(
@@ -49,7 +51,8 @@ class Rollouts:
     """Predictions of a recording's trajectories for one chain. S samples in all, n joints.
 
     A gain set on purpose acts on the stiffness (``p_gain`` over the chain's reference), as does the
-    servo's torque being off; both travel with the command. Before the first command is sent it holds.
+    servo's torque being off; both travel with the command. Before the first command is sent it
+    holds.
 
     Attributes:
         chain: The chain.
@@ -94,21 +97,28 @@ class Rollouts:
         self.sample_trajectory = np.repeat(np.arange(len(trajectories)), counts)
 
     def at(self, dt: float) -> "Rollouts":
-        """The same with another time step [s]; kept, so that who asks again simulates with the same."""
+        """The same with another time step [s].
+
+        Kept, so that who asks again simulates with the same.
+        """
         if dt not in self._finer:
             self._finer[dt] = Rollouts(self.chain, self.recording, dt=dt, device=self.device)
         return self._finer[dt]
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the device's arrays behind: another process makes its own."""
-        kept = {key: value for key, value in self.__dict__.items() if key not in ("_samples", "_links")}
+        kept = {
+            key: value for key, value in self.__dict__.items() if key not in ("_samples", "_links")
+        }
         return {**kept, "_finer": {}}
 
     @cached_property
     def _samples(self) -> Samples:
         trajectories, columns = self.recording.trajectories, self.chain.columns
         command = np.concatenate([t.command[:, columns] for t in trajectories])
-        power = np.concatenate([t.enabled[:, columns] * self._gain(t.conditions) for t in trajectories])
+        power = np.concatenate(
+            [t.enabled[:, columns] * self._gain(t.conditions) for t in trajectories]
+        )
         samples = Samples()
         samples.step, samples.fraction = self._steps_of(self.time)
         sent = np.concatenate([t.sent for t in trajectories])
@@ -121,7 +131,8 @@ class Rollouts:
         """Times [s] as whole steps and a fraction in [0, 1)."""
         steps = time / self.dt
         whole = np.floor(steps)
-        # In single precision a fraction just under 1 is 1: the next step, which must then be counted.
+        # In single precision a fraction just under 1 is 1: the next step, which must then be
+        # counted.
         fraction = (steps - whole).astype(np.float32)
         whole, fraction = whole + (fraction >= 1.0), np.where(fraction < 1.0, fraction, 0.0)
         return (
@@ -137,7 +148,9 @@ class Rollouts:
     def _links(self) -> tuple[Any, wp.array, wp.array, wp.array, wp.array]:
         """The links; slots; lower and upper stops; efforts."""
         chain = self.chain
-        links = links_of(chain.axis, chain.offset, chain.mass, chain.com, chain.inertia, chain.gravity)
+        links = links_of(
+            chain.axis, chain.offset, chain.mass, chain.com, chain.inertia, chain.gravity
+        )
         slot = wp.array(chain.slot, dtype=int, device=self.device)
         bounds = (chain.lower, chain.upper, chain.effort)
         lower, upper, effort = (wp.array(v, dtype=float, device=self.device) for v in bounds)
@@ -153,13 +166,15 @@ class Rollouts:
     ) -> np.ndarray:
         """Recorded positions as each parameter set would have them, in one launch.
 
-        Joints start at rest where they were measured. A rollout that diverges stays finite, far away.
+        Joints start at rest where they were measured. A rollout that diverges stays finite, far
+        away.
 
         Args:
             rows: Parameter rows of C sets [C, n, PARAMETER_COLUMNS].
             trajectories: Indices of the trajectories, in the order wanted; all by default.
             joint: The only joint whose positions are wanted.
-            keep: Which of the trajectories to simulate with each set [C, trajectories]; all by default.
+            keep: Which of the trajectories to simulate with each set [C, trajectories]; all by
+                default.
 
         Returns:
             Positions [C, S', n] [rad], or [C, S'] of one joint, float32, S' samples of the chosen
@@ -171,8 +186,12 @@ class Rollouts:
         n = self.num_joints
         rows = np.asarray(rows, np.float32)
         if rows.ndim != 3 or rows.shape[1:] != (n, servo.PARAMETER_COLUMNS):
-            raise ValueError(f"rows has shape {rows.shape}; it must be (C, {n}, {servo.PARAMETER_COLUMNS})")
-        chosen = np.arange(len(self._count)) if trajectories is None else np.asarray(trajectories, int)
+            raise ValueError(
+                f"rows has shape {rows.shape}; it must be (C, {n}, {servo.PARAMETER_COLUMNS})"
+            )
+        chosen = (
+            np.arange(len(self._count)) if trajectories is None else np.asarray(trajectories, int)
+        )
         counts = self._count[chosen]
         length, width = int(counts.sum()), n if joint is None else 1
         kept = np.ones((len(rows), len(counts)), bool) if keep is None else keep
@@ -222,7 +241,9 @@ class Rollouts:
                 effort,
                 int(self.chain.bodies),
                 links,
-                wp.array(parameters.reshape(-1, servo.PARAMETER_COLUMNS), dtype=float, device=device),
+                wp.array(
+                    parameters.reshape(-1, servo.PARAMETER_COLUMNS), dtype=float, device=device
+                ),
                 self.dt,
             ],
             outputs=[state, predicted],
@@ -232,8 +253,8 @@ class Rollouts:
     def _scale_loads(self, parameters: np.ndarray, trajectory: np.ndarray) -> None:
         """Turn inertia and gravity torque from the reference load's to each trajectory's, in place.
 
-        The gravity torque scales with mass times arm. The inertia changes by the difference of the point
-        masses, in the unit of torque in which the gravity torque stands.
+        The gravity torque scales with mass times arm. The inertia changes by the difference of the
+        point masses, in the unit of torque in which the gravity torque stands.
         """
         reference = self.chain.reference_load
         if reference is None:

@@ -1,4 +1,6 @@
-"""Search for the effects that a joint's servo lacks: forward selection with full refits, checked backward.
+"""Search for the effects that a joint's servo lacks.
+
+Forward selection with full refits, checked backward.
 
 A step of the search is tentative; :mod:`vd.gap.evidence` has the last word.
 """
@@ -21,7 +23,9 @@ from vd.kernels.servo.effects import EFFECTS, equivalent
 MAX_EFFECTS = 3
 """Effects of a joint, but for random delays. Not tuned: hidden were two at most."""
 SHORT_LIST = 10
-"""Candidates of a round that are fitted, after the linear screening of all: half of the table. Not tuned."""
+"""Candidates of a round that are fitted, after the linear screening of all: half of the table. Not
+tuned.
+"""
 
 Run = Callable[[list[Call]], list[Any]]
 """Runs methods of the joint's :class:`vd.gap.fit.JointProblem` by name, in parallel."""
@@ -40,7 +44,8 @@ class Search(Evidence):
         nominal: Nominal values of the baseline's parameters, by key.
         report: Called with a line of progress.
         rest: Where the joint rests before it moves [rad].
-        known: Values of the models that steps led to, by their effects: fits of these start there, too.
+        known: Values of the models that steps led to, by their effects: fits of these start there,
+            too.
     """
 
     run: Run
@@ -53,11 +58,18 @@ class Search(Evidence):
     rest: float = 0.0
     known: dict[frozenset[str], Mapping[str, float]] = field(default_factory=dict)
 
-    def fit(self, base: np.ndarray, effects: Sequence[str], starts: Sequence[Mapping[str, float]]) -> Call:
+    def fit(
+        self, base: np.ndarray, effects: Sequence[str], starts: Sequence[Mapping[str, float]]
+    ) -> Call:
         """The call that fits a model from the rows of a chain."""
         known = self.known.get(frozenset(effects))
         starts = [*starts, *([] if known is None else [known])]
-        return "fit", {"base": base, "effects": tuple(effects), "starts": starts, "scales": self.scales}
+        return "fit", {
+            "base": base,
+            "effects": tuple(effects),
+            "starts": starts,
+            "scales": self.scales,
+        }
 
     def plain(self, baseline: JointFit) -> JointFit:
         """The plain model, fitted anew."""
@@ -91,8 +103,8 @@ class Search(Evidence):
             vetoed: Effects to try in spite of a veto.
 
         Returns:
-            The fits by name; and the share of the squared error that each candidate can remove at best, by
-            a linear estimate, the most promising first.
+            The fits by name; and the share of the squared error that each candidate can remove at
+            best, by a linear estimate, the most promising first.
         """
         out = {*present.effects, *(set(self.vetoes) - set(vetoed)), *skip, JITTER}
         flat = [
@@ -114,16 +126,26 @@ class Search(Evidence):
             best.setdefault(name, []).append(start)
             promised.setdefault(name, float(promise[i]))
         tried = list(best)[:SHORT_LIST]
-        calls = [self.fit(present.rows, (*present.effects, n), self.starts(present, best[n])) for n in tried]
+        calls = [
+            self.fit(present.rows, (*present.effects, n), self.starts(present, best[n]))
+            for n in tried
+        ]
         return dict(zip(tried, self.run(calls), strict=True)), promised
 
-    def starts(self, present: JointFit, added: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
-        """Where a fit with a further effect starts: at the present model with two sizes, and the nominal one.
+    def starts(
+        self, present: JointFit, added: Sequence[Mapping[str, float]]
+    ) -> list[dict[str, float]]:
+        """Where a fit with a further effect starts.
 
-        Without the effect, the baseline may have gone far to imitate it (an unmodelled delay is best met
-        by a servo twenty times as stiff), and from there no descent comes back.
+        At the present model with two sizes, and the nominal one.
+
+        Without the effect, the baseline may have gone far to imitate it (an unmodelled delay is
+        best met by a servo twenty times as stiff), and from there no descent comes back.
         """
-        starts, nominal = [{**present.values, **one} for one in added[:2]], self.nominal.get("kp", 0.0)
+        starts, nominal = (
+            [{**present.values, **one} for one in added[:2]],
+            self.nominal.get("kp", 0.0),
+        )
         # No slope leads to a speed limit that binds from one that does not.
         limit = {"velocity_limit": self.scales.speed} if "velocity_limit" in self.nominal else {}
         torque = nominal / present.values["kp"] if nominal else 1.0
@@ -134,7 +156,9 @@ class Search(Evidence):
         """The same search with samples weighted, and other attributes changed."""
 
         def run(calls: list[Call]) -> list[Any]:
-            return self.run([(name, {"weighting": weighting, **options}) for name, options in calls])
+            return self.run(
+                [(name, {"weighting": weighting, **options}) for name, options in calls]
+            )
 
         return replace(self, run=run, known=dict(self.known), **changes)
 
@@ -191,7 +215,9 @@ class Search(Evidence):
                 return best
         return None
 
-    def rivals(self, present: JointFit, name: str, without: JointFit | None = None) -> list[JointFit]:
+    def rivals(
+        self, present: JointFit, name: str, without: JointFit | None = None
+    ) -> list[JointFit]:
         """The model itself, and fits with other effects in the place of one of its own."""
         without = self.without(present, name) if without is None else without
         # Beside Coulomb friction, a friction that contains it is no other cause.
@@ -212,18 +238,28 @@ class Search(Evidence):
         rows = []
         for name, fit in sorted(fits.items(), key=lambda item: item[1].held_out_rmse):
             gain, ci = self.gain(before, fit)
-            decision, reason = "rejected", why or f"{best.effects[-1]} predicts unseen motions better"
+            decision, reason = (
+                "rejected",
+                why or f"{best.effects[-1]} predicts unseen motions better",
+            )
             if fit is best and accepted:
                 decision, reason = "named", "best on unseen motions"
             elif accepted and self.tied(best, fit)[0]:
                 decision, reason = "tied", f"not told from {best.effects[-1]} by this recording"
                 if set(NESTED.get(name, ())) & {best.effects[-1]}:
-                    decision, reason = "rejected", f"contains {best.effects[-1]} and adds nothing to it"
+                    decision, reason = (
+                        "rejected",
+                        f"contains {best.effects[-1]} and adds nothing to it",
+                    )
             rows.append(Trial(number, name, fit, gain, ci, decision, reason))
         return rows
 
     def screened_out(
-        self, number: int, before: JointFit, fits: Mapping[str, JointFit], promised: Mapping[str, float]
+        self,
+        number: int,
+        before: JointFit,
+        fits: Mapping[str, JointFit],
+        promised: Mapping[str, float],
     ) -> list[Trial]:
         """The rows of candidates that promised too little to be fitted in a round."""
         text = "screened out: promised {:.0f} % of the squared error"

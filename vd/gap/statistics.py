@@ -1,7 +1,9 @@
-"""What the data can carry: noise floor, bootstrap over trajectories, intervals that allow for few of them.
+"""What the data can carry.
 
-Residuals within a trajectory are strongly correlated, so the unit of every interval is the trajectory,
-never the sample.
+Noise floor, bootstrap over trajectories, intervals that allow for few of them.
+
+Residuals within a trajectory are strongly correlated, so the unit of every interval is the
+trajectory, never the sample.
 """
 
 import numpy as np
@@ -13,13 +15,15 @@ from vd.gap.recording_checks import MIN_SAMPLES
 CONFIDENCE = 0.95
 """Of every interval: the field's custom."""
 OWN_ERROR = 0.02
-"""A model's own error, as a share of the whole gap and of each parameter: no fit of a large effect is better.
-Beside a friction of 97 noise floors a second effect came with a share of 0.015 that was not there. Of 178
-parameters of the development battery 96 % are in their 95 % intervals, with half of it 93, twice 98 %."""
+"""A model's own error, as a share of the whole gap and of each parameter: no fit of a large effect
+is better. Beside a friction of 97 noise floors a second effect came with a share of 0.015 that was
+not there. Of 178 parameters of the development battery 96 % are in their 95 % intervals, with half
+of it 93, twice 98 %.
+"""
 REPEATABLE = 2.0
-"""Error, in noise floors, up to which residuals are held against noise alone, and no phase of motion or model
-in question stands out. A real machine that is farther from it does not repeat its motions that well; how well
-is not known from one recording of each."""
+"""Error, in noise floors, up to which residuals are held against noise alone, and no phase of
+motion or model in question stands out. A real machine that is farther from it does not repeat its
+motions that well; how well is not known from one recording of each."""
 BOOTSTRAP = 2000
 """Resamples of whole trajectories. Not tuned: quantiles are known to half a percent."""
 HOLD_S = 0.25
@@ -30,7 +34,9 @@ def held(trajectory: Trajectory, joint: int, resolution: float) -> np.ndarray:
     """Samples at which command and position both rest, shape [T] bool."""
     time = trajectory.time
     first = np.searchsorted(time, time - HOLD_S)
-    changed = np.abs(np.diff(trajectory.command[:, joint], prepend=trajectory.command[0, joint])) > 0.0
+    changed = (
+        np.abs(np.diff(trajectory.command[:, joint], prepend=trajectory.command[0, joint])) > 0.0
+    )
     changes = np.cumsum(changed)
     still = (changes - changes[first] == 0) & (time >= HOLD_S)
     position = trajectory.position[:, joint]
@@ -65,7 +71,10 @@ def noise_floor(recording: Recording, joint: int) -> float:
 
 
 def _slow_noise(time: np.ndarray, position: np.ndarray, resolution: float) -> list[float]:
-    """Variances about a parabola in windows of slow steady motion [rad^2]: at most two counts a sample."""
+    """Variances about a parabola in windows of slow steady motion [rad^2].
+
+    At most two counts a sample.
+    """
     result = []
     for first in range(0, len(time) - MIN_SAMPLES + 1, MIN_SAMPLES):
         part = slice(first, first + MIN_SAMPLES)
@@ -78,7 +87,10 @@ def _slow_noise(time: np.ndarray, position: np.ndarray, resolution: float) -> li
 
 
 def resamples(units: int, rng: np.random.Generator) -> np.ndarray:
-    """Weights of the units in each bootstrap resample, [BOOTSTRAP, units]; every row sums to ``units``."""
+    """Weights of the units in each bootstrap resample, [BOOTSTRAP, units].
+
+    Every row sums to ``units``.
+    """
     return rng.multinomial(units, np.full(units, 1.0 / units), size=BOOTSTRAP).astype(float)
 
 

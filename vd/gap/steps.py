@@ -1,7 +1,7 @@
 """The steps of ``vd-gap run``, each from files to files, skipped where they have run on the same input.
 
-``DIR/run.json`` keeps a digest of recording, model and settings, and which steps have run on them, so that an
-interrupted run goes on with the step it was in.
+``DIR/run.json`` keeps a digest of recording, model and settings, and which steps have run on them,
+so that an interrupted run goes on with the step it was in.
 """
 
 import hashlib
@@ -99,7 +99,8 @@ class Analysis:
             return named or model_path(recording.path, recording.model)
         if named is not None:
             raise ValueError(
-                f"{recording.path} is of a bare {recording.model}, not of {named}: leave out --hand, or name "
+                f"{recording.path} is of a bare {recording.model}, not of {named}: leave out "
+                f"--hand, or name "
                 "the hand as 'model' in recording.json"
             )
         return None
@@ -111,24 +112,33 @@ class Analysis:
             return None
         from vd.assets_usd.hands import load_hand, root_name
 
-        hand, model = load_hand(self.hand_name, layer=self.settings.hand_layer), self.recording.model
+        hand, model = (
+            load_hand(self.hand_name, layer=self.settings.hand_layer),
+            self.recording.model,
+        )
         model = root_name(model_path(self.recording.path, model))
         if model != hand.name:
             raise ValueError(
-                f"{self.recording.path} is of {model}, not of {hand.name}; name the hand that was recorded"
+                f"{self.recording.path} is of {model}, not of {hand.name}; name the hand that was "
+                f"recorded"
             )
         return hand
 
     @cached_property
     def start(self) -> dict[str, np.ndarray]:
-        """Parameter row of each excited joint from the layer that the analysis starts from; empty without."""
+        """Parameter row of each excited joint from the layer that the analysis starts from.
+
+        Empty without.
+        """
         if self.settings.hand_layer is None:
             return {}
         moved = {joint for trajectory in self.recording.trajectories for joint in trajectory.joints}
         joints = tuple(joint for joint in self.recording.joints if joint in moved)
         if self.hand is not None:
             names = self.hand.joint_names
-            return {joint: self.hand.servo[names.index(joint)] for joint in joints if joint in names}
+            return {
+                joint: self.hand.servo[names.index(joint)] for joint in joints if joint in names
+            }
         from vd.assets_usd.hand_layer import read_bare_layer
 
         rows, _ = read_bare_layer(self.settings.hand_layer, joints)
@@ -151,7 +161,9 @@ class Analysis:
             if name in self._seconds() and not fresh:
                 print(f"{name}: nothing has changed, kept", file=sys.stderr)
                 continue
-            for file in OUTPUTS[name]:  # what was found before is not what an interrupted step finds
+            for file in OUTPUTS[
+                name
+            ]:  # what was found before is not what an interrupted step finds
                 (self.out / file).unlink(missing_ok=True)
             self._note(done)
             print(f"{name}: {_DOES[name]}", file=sys.stderr)
@@ -176,7 +188,9 @@ class Analysis:
         try:
             record = json.loads((self.out / RUN).read_text())
             ran = record["steps"].items() if record["made_from"] == self._made_from else ()
-            return {name: s for name, s in ran if all((self.out / f).is_file() for f in OUTPUTS[name])}
+            return {
+                name: s for name, s in ran if all((self.out / f).is_file() for f in OUTPUTS[name])
+            }
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return {}  # none, or written by something else: start afresh
 
@@ -188,10 +202,18 @@ class Analysis:
     def _made_from(self) -> str:
         """Digest of everything that the steps are made from."""
         settings = to_dict(replace(self.settings, recording=Path()))
-        digest, folder = hashlib.sha256(json.dumps([METHOD, settings]).encode()), self.recording.path
+        digest, folder = (
+            hashlib.sha256(json.dumps([METHOD, settings]).encode()),
+            self.recording.path,
+        )
         files = ["recording.json", *(trajectory.file for trajectory in self.recording.trajectories)]
-        models = [Path(model) for model in (self.hand_name, self.settings.hand_layer) if model is not None]
-        for file in (*(folder / name for name in files), *(model for model in models if model.is_file())):
+        models = [
+            Path(model) for model in (self.hand_name, self.settings.hand_layer) if model is not None
+        ]
+        for file in (
+            *(folder / name for name in files),
+            *(model for model in models if model.is_file()),
+        ):
             digest.update(file.read_bytes())
         return digest.hexdigest()
 
@@ -239,7 +261,9 @@ def _close(analysis: Analysis) -> None:
     from vd.gap.plan import discard_plan, plan, write_plan
 
     report = analysis.explained()
-    whole = write_identified(report, analysis.out, analysis.recording, analysis.hand, analysis.start)
+    whole = write_identified(
+        report, analysis.out, analysis.recording, analysis.hand, analysis.start
+    )
     closing, curves = simulate_again(
         report,
         analysis.out / LAYER,
@@ -272,7 +296,9 @@ def _report(analysis: Analysis) -> None:
         next_experiment=json.loads(planned.read_text())["sentence"] if planned.is_file() else "",
         seconds=sum(analysis._seconds().values()),
         hand=analysis.hand_name,
-        hand_layer=None if analysis.settings.hand_layer is None else str(analysis.settings.hand_layer),
+        hand_layer=None
+        if analysis.settings.hand_layer is None
+        else str(analysis.settings.hand_layer),
         warnings=cautions(analysis.recording),
         command=analysis.command(),
         software=installed_versions(_PACKAGES),

@@ -1,8 +1,8 @@
 """What recorded voltage and duty cycle contradict.
 
-The voltage that a sagging supply needs is there to be seen. And the duty cycle of a position servo is
-its controller's output: where it follows the plain error at the recorded gain, nothing upstream of it
-(a delay, a filter, a dead zone, integral action) is at work.
+The voltage that a sagging supply needs is there to be seen. And the duty cycle of a position servo
+is its controller's output: where it follows the plain error at the recorded gain, nothing upstream
+of it (a delay, a filter, a dead zone, integral action) is at work.
 """
 
 import numpy as np
@@ -16,7 +16,9 @@ from vd.gap.worker_pool import JointSpec
 from vd.kernels.servo.effects import EFFECTS
 
 LINEAR = 0.995
-"""Share of the duty cycle's variance that the plain error must explain for it to be linear. Not tuned."""
+"""Share of the duty cycle's variance that the plain error must explain for it to be linear. Not
+tuned.
+"""
 UPSTREAM = (
     "command_delay",
     "read_delay",
@@ -27,12 +29,14 @@ UPSTREAM = (
     "integral_action",
     "backlash",
 )
-"""Effects between command and controller output, each of which the duty cycle shows. Backlash is that of the
-reference, as the servo model has it, not play behind the motor."""
+"""Effects between command and controller output, each of which the duty cycle shows. Backlash is
+that of the reference, as the servo model has it, not play behind the motor."""
 BEHIND_SENSOR = {
     "supply_sag": "only as a resistance behind the voltage sensor, which loses torque like a sagging supply"
 }
-"""Effects whose cause telemetry contradicts, but not a loss of the same form where it has no sensor."""
+"""Effects whose cause telemetry contradicts, but not a loss of the same form where it has no
+sensor.
+"""
 CLEARER = 4.0
 """How many times more of the duty cycle the wrong delay must leave than the right one: a read delay
 leaves 0.5 % on either side. Not tuned."""
@@ -64,11 +68,13 @@ def vetoes(recording: Recording, chain: Chain, spec: JointSpec) -> dict[str, str
 def late_side(recording: Recording, chain: Chain, spec: JointSpec) -> str:
     """Which of command and reading is late, if the recorded duty cycle says so.
 
-    Positions alone cannot tell (:data:`vd.kernels.servo.effects.EQUIVALENT`). The duty cycle follows the late
-    command less the position there is, or the command there is less the position that is reported later.
+    Positions alone cannot tell (:data:`vd.kernels.servo.effects.EQUIVALENT`). The duty cycle
+    follows the late command less the position there is, or the command there is less the position
+    that is reported later.
 
     Returns:
-        ``command_delay``, ``read_delay``, or nothing where neither fits, both do, or no duty is recorded.
+        ``command_delay``, ``read_delay``, or nothing where neither fits, both do, or no duty is
+        recorded.
     """
     parts = [recording.trajectories[i] for i in spec.trajectories]
     (delay,) = EFFECTS["command_delay"].parameters

@@ -5,7 +5,9 @@ from collections.abc import Iterable, Sequence
 from vd.gap.result import LAYER, Estimate, Interval, NamedEffect, Report
 
 LISTED = 4
-"""More joints than this are counted rather than listed, and no more curves are drawn than this. Not tuned."""
+"""More joints than this are counted rather than listed, and no more curves are drawn than this. Not
+tuned.
+"""
 
 
 def plain(name: str) -> str:
@@ -57,7 +59,10 @@ def unit_text(unit: str) -> str:
 
 
 def amount(value: float, unit: str) -> str:
-    """A number with its unit, in the size in which people speak of it: ``40.2 ms``, ``12.1 mrad``."""
+    """A number with its unit, in the size in which people speak of it.
+
+    ``40.2 ms``, ``12.1 mrad``.
+    """
     factor, shown = _size(value, unit)
     return f"{_digits(factor * value)} {shown}".strip()
 
@@ -70,7 +75,10 @@ def estimate(one: Estimate) -> str:
 
 
 def effects_sentence(effects: Iterable[NamedEffect]) -> str:
-    """``backlash on f0_j1 (40 mrad), f0_j2 (12 mrad) and dead zone on f0_j3 (8 mrad)``: each name once."""
+    """``backlash on f0_j1 (40 mrad), f0_j2 (12 mrad) and dead zone on f0_j3 (8 mrad)``.
+
+    Each name once.
+    """
     places: dict[str, list[str]] = {}
     for effect in effects:
         sizes = ", ".join(amount(p.value, p.unit) for p in effect.parameters.values())
@@ -80,27 +88,33 @@ def effects_sentence(effects: Iterable[NamedEffect]) -> str:
 
 def verdict_sentence(report: Report) -> str:
     """The verdict in one or two sentences that need no context."""
-    before, after = mrad(report.held_out.baseline_rmse_rad), mrad(report.held_out.identified_rmse_rad)
+    before, after = (
+        mrad(report.held_out.baseline_rmse_rad),
+        mrad(report.held_out.identified_rmse_rad),
+    )
     sizes = f"{before} on motions that the fit has not seen, against a noise floor of "
     sizes += mrad(report.noise_floor_rad)
     if report.verdict == "effects":
-        return (
-            f"The simulation lacks {effects_sentence(report.effects)}. {_shrinks(report)}{_besides(report)}"
-        )
+        lacks = f"The simulation lacks {effects_sentence(report.effects)}. "
+        return lacks + _shrinks(report) + _besides(report)
     if report.verdict == "ambiguous":
         text = f"There is a gap: {sizes}. {_leaves(report)}"
         if report.provisional:
             text += f" With {effects_sentence(report.provisional)} it falls to {after}."
         return text
     if report.verdict == "no_gap":
-        model = "plain servo model" if report.hand_layer is None else f"model in {report.hand_layer}"
+        model = (
+            "plain servo model" if report.hand_layer is None else f"model in {report.hand_layer}"
+        )
         return (
-            f"No gap: the {model} explains this recording. It leaves {sizes}: no more than noise, or "
+            f"No gap: the {model} explains this recording. It leaves {sizes}: no more than noise, "
+            f"or "
             "what no candidate explains."
         )
     if report.verdict == "under_excited":
         return (
-            "No verdict on effects: the motions in this recording do not determine the model. Different "
+            "No verdict on effects: the motions in this recording do not determine the model. "
+            "Different "
             "parameters fit equally well."
         )
     return f"There is a gap: {sizes}. No effect that was tried explains it."
@@ -109,9 +123,12 @@ def verdict_sentence(report: Report) -> str:
 def _shrinks(report: Report) -> str:
     held, names = report.held_out, {one.name for one in report.effects}
     return (
-        f"With {'it' if len(names) == 1 else 'them'} the error on motions that the fit has not seen falls "
-        f"from {mrad(held.baseline_rmse_rad)} to {mrad(held.identified_rmse_rad)} ({percent(held.reduction)} "
-        f"less, 95 %: {percent_range(held.ci95)}); the noise floor is {mrad(report.noise_floor_rad)}."
+        f"With {'it' if len(names) == 1 else 'them'} the error on motions that the fit has not "
+        f"seen falls "
+        f"from {mrad(held.baseline_rmse_rad)} to {mrad(held.identified_rmse_rad)} "
+        f"({percent(held.reduction)} "
+        f"less, 95 %: {percent_range(held.ci95)}); the noise floor is "
+        f"{mrad(report.noise_floor_rad)}."
     )
 
 
@@ -120,13 +137,15 @@ def _besides(report: Report) -> str:
     text = ""
     if any(effect.name == "encoder_bias" for effect in report.effects):
         text += (
-            " An encoder bias is first of all a difference of zeros between command and reading: compare "
+            " An encoder bias is first of all a difference of zeros between command and reading: "
+            "compare "
             "them before you use the model."
         )
     for name, *others in report.ambiguous:
         if not any({name, *others} >= {*group} for group in report.open_sets):
             text += (
-                f" {plain(name).capitalize()} stands for {causes(others, 'and')} too: commands and positions "
+                f" {plain(name).capitalize()} stands for {causes(others, 'and')} too: commands and "
+                f"positions "
                 "are the same, whichever it is."
             )
     return f"{text} More is missing. {_leaves(report)}" if report.open_sets else text
@@ -154,7 +173,8 @@ def next_step(report: Report) -> str:
     if report.hand is not None:
         use = f"vd-train adapt POLICY --hand-layer {layer} goes on in it; vd-eval and vd-play take it too."
     return (
-        f"Nothing is open. {use} To confirm that the gap is closed, run vd-gap on a new recording with "
+        f"Nothing is open. {use} To confirm that the gap is closed, run vd-gap on a new recording "
+        f"with "
         f"--hand-layer {LAYER}."
     )
 

@@ -121,7 +121,10 @@ class WorkerPool:
         if self.workers > 1:
             context = get_context("spawn")  # Warp and its threads may be running
             self._processes = ProcessPoolExecutor(
-                self.workers, mp_context=context, initializer=_start, initargs=(self.problems, os.getpid())
+                self.workers,
+                mp_context=context,
+                initializer=_start,
+                initargs=(self.problems, os.getpid()),
             )
         return self
 
@@ -143,7 +146,8 @@ class WorkerPool:
             return [future.result() for future in waiting]
         except BrokenProcessPool as error:
             raise ChildProcessError(
-                f"one of {self.workers} processes was killed, most often since memory ran out: free "
+                f"one of {self.workers} processes was killed, most often since memory ran out: "
+                f"free "
                 "some, or give fewer processors (taskset), and run the same command again"
             ) from error
 

@@ -1,7 +1,7 @@
 """Find and explain a gap: from a recording to a :class:`vd.gap.result.Report` without a closing.
 
-``find`` identifies the baseline and says where it fails (``DIR/find.json``); ``explain`` selects the
-effects (``DIR/explain.json``, ``DIR/predictions.npz``).
+``find`` identifies the baseline and says where it fails (``DIR/find.json``); ``explain`` selects
+the effects (``DIR/explain.json``, ``DIR/predictions.npz``).
 """
 
 import json
@@ -41,8 +41,8 @@ class Options:
         seed: Of everything random.
         device: Warp device.
         workers: Processes; the machine's cores by default, one on a GPU.
-        start: Parameter rows [PARAMETER_COLUMNS] of joints by name, of an identified model to start from:
-            its effects are part of the baseline, and what is named comes on top.
+        start: Parameter rows [PARAMETER_COLUMNS] of joints by name, of an identified model to start
+            from: its effects are part of the baseline, and what is named comes on top.
         progress: Called with lines of progress.
     """
 
@@ -54,7 +54,9 @@ class Options:
     progress: Progress = lambda line: None
 
 
-def find(recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any) -> list[Finding]:
+def find(
+    recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any
+) -> list[Finding]:
     """Identify the baseline of every excited joint, and say where it and the measurement disagree.
 
     Args:
@@ -80,7 +82,9 @@ def find(recording: Recording | Path, hand: HandModel | None, out: Path, **optio
         value = {
             "format": FIND_FORMAT,
             "findings": [asdict(f) for f in found],
-            "joints": {j.name: {"rows": j.fit.rows.tolist(), "rmse_rad": j.fit.rmse} for j in joints},
+            "joints": {
+                j.name: {"rows": j.fit.rows.tolist(), "rmse_rad": j.fit.rmse} for j in joints
+            },
         }
         write_json(Path(out) / "find.json", value)
     for finding in found:
@@ -88,7 +92,9 @@ def find(recording: Recording | Path, hand: HandModel | None, out: Path, **optio
     return found
 
 
-def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any) -> Report:
+def explain(
+    recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any
+) -> Report:
     """Name what the baseline lacks; runs :func:`find` first where the folder has no ``find.json``.
 
     Args:
@@ -112,7 +118,9 @@ def explain(recording: Recording | Path, hand: HandModel | None, out: Path, **op
     with pool:
         recording = pool.problems.recording
         joints = _resume(pool, specs, known["joints"])
-        explained = explain_joints(Explainer(pool, joints, chosen.effects, chosen.seed, chosen.progress))
+        explained = explain_joints(
+            Explainer(pool, joints, chosen.effects, chosen.seed, chosen.progress)
+        )
         analysed = [
             Analysed(j.name, j.spec, replace(e, baseline=j.fit))
             for j, e in zip(joints, explained, strict=True)
@@ -139,18 +147,27 @@ def _workers(
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
     parts, specs = [], []
     for index, chain in enumerate(chains(recording, hand)):
-        rows = [options.start.get(name, row) for name, row in zip(chain.joints, chain.start_row, strict=True)]
+        rows = [
+            options.start.get(name, row)
+            for name, row in zip(chain.joints, chain.start_row, strict=True)
+        ]
         parts.append(replace(chain, start_row=np.array(rows, dtype=float)))
         for joint, column in enumerate(chain.columns):
             trajectories, folds = design(recording, chain, joint)
             if trajectories:
-                floor, analysed = noise_floor(recording, int(column)), pieces(recording, chain, trajectories)
+                floor, analysed = (
+                    noise_floor(recording, int(column)),
+                    pieces(recording, chain, trajectories),
+                )
                 free = baseline_of(chain)
                 specs.append(JointSpec(index, joint, trajectories, folds, floor, free, analysed))
-    # A recording so long that pieces of it are analysed would take minutes a joint with the usual step.
+    # A recording so long that pieces of it are analysed would take minutes a joint with the usual
+    # step.
     dt = STEP_S * (2.0 if any(spec.pieces for spec in specs) else 1.0)
     cores = len(os.sched_getaffinity(0)) if options.device == "cpu" else 1
-    return WorkerPool(Problems(recording, parts, dt, options.device), options.workers or cores), specs
+    return WorkerPool(
+        Problems(recording, parts, dt, options.device), options.workers or cores
+    ), specs
 
 
 def baseline_of(chain: Chain) -> tuple[str, ...]:

@@ -39,8 +39,8 @@ class PlayCfg(HandFlags, TaskFlags):
 
     Starts and goals are as trained; without a policy objects drop, and goals are all of SO(3).
 
-    The folder of a log that vd-deploy wrote in place of the policy replays that run, all of it, whatever the
-    other settings of the simulation. Without arguments it shows dclaw4.
+    The folder of a log that vd-deploy wrote in place of the policy replays that run, all of it,
+    whatever the other settings of the simulation. Without arguments it shows dclaw4.
     """
 
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = DEFAULT_POLICY
@@ -161,7 +161,10 @@ def _policies() -> list[str]:
             with suppress(ValueError):  # of a hand that has to be imported
                 check_hand_name(entry.hand)
                 names.append(name)
-    except (OSError, ValueError) as error:  # of what was pulled; the policy that is asked for needs no list
+    except (
+        OSError,
+        ValueError,
+    ) as error:  # of what was pulled; the policy that is asked for needs no list
         print(f"vd-play: no menu of policies: {error}", file=sys.stderr)
     return names
 
@@ -181,7 +184,8 @@ def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any]:
     trained = open_policy(cfg.policy, device)
     check_fits(cfg.policy, trained, cfg.hand, cfg.hand_layer)  # before anything slow
     print(
-        f"vd-play: {cfg.policy}; building the scene (the first start compiles kernels: minutes)", flush=True
+        f"vd-play: {cfg.policy}; building the scene (the first start compiles kernels: minutes)",
+        flush=True,
     )
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.cfg import TableCfg
@@ -190,7 +194,10 @@ def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any]:
 
     count = len(load_set(list(cfg.objects)))
     if device == "cpu" and count > FAST_WORLDS_CPU:
-        print(f"vd-play: {count} objects are {count} environments, slow on a CPU; name fewer with --objects")
+        print(
+            f"vd-play: {count} objects are {count} environments, slow on a CPU; name fewer with "
+            f"--objects"
+        )
     task = task_for(
         trained,
         hand=cfg.hand,

@@ -1,4 +1,7 @@
-"""Replaying the log of a run on a hand: the same pictures as of a simulation, from what was measured."""
+"""Replaying the log of a run on a hand.
+
+The same pictures as of a simulation, from what was measured.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -77,7 +80,8 @@ class Replay:
             believed = float(columns["distance"][step])
             number = min(int(columns["goal"][step]), len(log.goals) - 1)  # one may not have begun
             stop = ends.get(number)
-            # Events have the time of their writing: the last step before it is the one that ended the goal.
+            # Events have the time of their writing: the last step before it is the one that ended
+            # the goal.
             over = stop is not None and columns["t"][step] <= stop.time_s
             last = step + 1 == steps or columns["t"][step + 1] > (stop.time_s if stop else np.inf)
             near = "error" not in columns or error[step] <= log.tolerance_rad
@@ -95,7 +99,9 @@ class Replay:
                 goals=reached,
                 drops=lost,
                 table=not self.hand.palm_up,
-                believed_rad=believed if np.isfinite(believed) else None,  # not while the hand is held
+                believed_rad=believed
+                if np.isfinite(believed)
+                else None,  # not while the hand is held
                 latency_s=None if heard is None else float(columns["sent_s"][step] - heard[step]),
             )
 
@@ -108,4 +114,6 @@ def film(log: HandLog, path: Path) -> int:
     """
     shown, (width, height) = Replay(log), SINGLE_CELL
     renderer = Renderer(shown.hand, shown.objects, width=width, height=height)
-    return write_frames(path, drawn(renderer, ([shot] for shot in shown.snapshots)), shown.control_hz)
+    return write_frames(
+        path, drawn(renderer, ([shot] for shot in shown.snapshots)), shown.control_hz
+    )

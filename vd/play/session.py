@@ -15,7 +15,9 @@ from vd.play.video import Snapshot, Watcher
 
 
 class Session:
-    """One environment is watched at a time, ``snapshot`` shows it; all run, one for each object at least.
+    """One environment is watched at a time, ``snapshot`` shows it.
+
+    All run, one for each object at least.
 
     Attributes:
         sees: Whether the policy sees by a camera.
@@ -74,7 +76,9 @@ class Session:
     def new_goal(self) -> Snapshot:
         """Give every environment a new goal; nothing else changes."""
         env = self.env
-        goals = draw_goals(env.object_pose()[:, 3:7].astype(float), self._rng, env.cfg.goal.max_angle_rad)
+        goals = draw_goals(
+            env.object_pose()[:, 3:7].astype(float), self._rng, env.cfg.goal.max_angle_rad
+        )
         env.give_goals(np.arange(env.num_envs), goals)
         self.snapshot = self._watcher.read(stepped=False)[0]
         return self.snapshot

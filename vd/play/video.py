@@ -27,7 +27,8 @@ FLASH_STEPS = 6
 INK, SOFT, STRIP = (28, 35, 48), (110, 119, 134), (250, 251, 252)
 GREEN, RED = (0, 140, 100), (205, 70, 20)
 GOAL_EDGE = (89, 173, 107)
-# H.264 quality of libx264 (0 lossless, 51 worst): no visible blocks at this size, about 0.5 MB for 10 s.
+# H.264 quality of libx264 (0 lossless, 51 worst): no visible blocks at this size, about 0.5 MB for
+# 10 s.
 VIDEO_CRF = 22
 
 
@@ -56,11 +57,15 @@ class Snapshot:
     table: bool = True
     """The table was there."""
     believed_rad: float | None = None
-    """The error that a policy which sees by camera expected, to the nearest goal that looks alike."""
+    """The error that a policy which sees by camera expected, to the nearest goal that looks
+    alike.
+    """
     alike_rad: float | None = None
     """The true error to that."""
     latency_s: float | None = None
-    """Time that the policy took to decide; on a hand from the image, or the joints, to the command."""
+    """Time that the policy took to decide; on a hand from the image, or the joints, to the
+    command.
+    """
 
 
 class Watcher:
@@ -117,7 +122,8 @@ def drawn(
 ) -> Iterator[np.ndarray]:
     """Draw each of ``steps``, on a thread of its own while the next one is made, unless not ``meanwhile``.
 
-    So the kernels of both are compiled at the same time. The renderer has a cell for each snapshot of a step.
+    So the kernels of both are compiled at the same time. The renderer has a cell for each snapshot
+    of a step.
 
     Yields:
         Frames, RGB bytes [height, width, 3].
@@ -155,8 +161,13 @@ class Composer:
         self._flash = [(0, INK)] * cells
 
     def frame(self, pictures: Sequence[Picture], snapshots: Sequence[Snapshot]) -> np.ndarray:
-        """One frame of all cells, in a grid as square as it gets: RGB bytes [height, width, 3], both even."""
-        cells = [self._cell(i, *pair) for i, pair in enumerate(zip(pictures, snapshots, strict=True))]
+        """One frame of all cells, in a grid as square as it gets.
+
+        RGB bytes [height, width, 3], both even.
+        """
+        cells = [
+            self._cell(i, *pair) for i, pair in enumerate(zip(pictures, snapshots, strict=True))
+        ]
         return _grid(cells, int(np.ceil(np.sqrt(len(cells)))))
 
     def _cell(self, index: int, picture: Picture, shot: Snapshot) -> np.ndarray:
@@ -173,10 +184,14 @@ class Composer:
         size = goal.shape[0]
         left = canvas.width - size - MARGIN
         canvas.paste(Image.fromarray(goal), (left, MARGIN))
-        draw.rectangle((left, MARGIN, left + size - 1, MARGIN + size - 1), outline=GOAL_EDGE, width=2)
+        draw.rectangle(
+            (left, MARGIN, left + size - 1, MARGIN + size - 1), outline=GOAL_EDGE, width=2
+        )
         draw.text((left + 7, MARGIN + 4), "goal", fill=GREEN, font=_font(13))
 
-    def _edge(self, index: int, draw: ImageDraw.ImageDraw, shot: Snapshot, width: int, height: int) -> None:
+    def _edge(
+        self, index: int, draw: ImageDraw.ImageDraw, shot: Snapshot, width: int, height: int
+    ) -> None:
         if shot.success or shot.fell:
             self._flash[index] = (FLASH_STEPS, GREEN if shot.success else RED)
         left, color = self._flash[index]
@@ -207,7 +222,9 @@ def _grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
     rows, (height, width, _) = -(-len(cells) // columns), cells[0].shape
     tiles = np.full((rows * columns, height, width, 3), 255, np.uint8)
     tiles[: len(cells)] = cells
-    grid = tiles.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, -1, 3)
+    grid = (
+        tiles.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, -1, 3)
+    )
     return np.pad(grid, [(0, size % 2) for size in grid.shape[:2]] + [(0, 0)], constant_values=255)
 
 

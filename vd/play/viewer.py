@@ -1,7 +1,7 @@
 """The web viewer: Newton's viser viewer with goal ghost, menus of policies and objects, a camera's view.
 
-Browser events arrive on viser's threads; they are queued and handled between steps on the thread that runs
-the simulation. Everything is served from this machine, so it works without a network.
+Browser events arrive on viser's threads; they are queued and handled between steps on the thread
+that runs the simulation. Everything is served from this machine, so it works without a network.
 """
 
 import math
@@ -22,23 +22,28 @@ from vd.play.session import Session
 from vd.play.video import Snapshot
 from vd.render import Camera, PictureModel
 
-# Where the goal's object floats, in the camera's right and up [m]: left of the hand, for panels are right.
+# Where the goal's object floats, in the camera's right and up [m]: left of the hand, for panels are
+# right.
 GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
-# The viewer's camera stands this much farther than that of videos: a browser window has panels around it.
+# The viewer's camera stands this much farther than that of videos: a browser window has panels
+# around it.
 CAMERA_DISTANCE = 1.25
 # Options of Newton's viewer that show something here; others are of cloth, particles, contacts.
 SHOWN_OPTIONS = ("show_visual", "show_joints", "show_com", "wireframe")
 
 
 class PlayViewer:
-    """Shows a session in the browser and lets it be steered from there; :meth:`close` closes the session too.
+    """Shows a session in the browser and lets it be steered from there.
+
+    :meth:`close` closes the session too.
 
     It serves on ``host``, of which ``127.0.0.1`` keeps it on this machine, and the next free port.
 
     Args:
         session: What is shown first.
         policies: Names of policies to choose from, that of the session first.
-        reopen: Gives a session of another of them; it may raise ValueError, OSError or RuntimeError.
+        reopen: Gives a session of another of them; it may raise ValueError, OSError or
+            RuntimeError.
         host: Address.
         port: Port.
         verbose: Whether Newton's viewer says that it begins.
@@ -77,7 +82,9 @@ class PlayViewer:
         done, due = 0, time.monotonic()
         while self.viewer.is_running() and (steps is None or done < steps):
             done += self.update()
-            due = max(due + period, time.monotonic() - period)  # after a pause, do not hurry to catch up
+            due = max(
+                due + period, time.monotonic() - period
+            )  # after a pause, do not hurry to catch up
             time.sleep(max(0.0, due - time.monotonic()))
 
     def update(self) -> bool:
@@ -116,7 +123,10 @@ class PlayViewer:
         self._set_camera()
 
     def _show_object(self) -> None:
-        """Show the model of the chosen object; models are kept, since building one takes a second."""
+        """Show the model of the chosen object.
+
+        Models are kept, since building one takes a second.
+        """
         name = self.session.object_name
         if name not in self._models:
             item = self.session.objects[self.session.object_names.index(name)]
@@ -129,7 +139,9 @@ class PlayViewer:
         if isinstance(self.session, Session) and self.session.sees:
             image = self.session.view()
             if self._eye is None:
-                folder = self.viewer.server.gui.add_folder("Camera, believed pose drawn in", order=-0.5)
+                folder = self.viewer.server.gui.add_folder(
+                    "Camera, believed pose drawn in", order=-0.5
+                )
                 with folder:
                     self._eye = folder, self.viewer.server.gui.add_image(image, format="jpeg")
             self._eye[1].image = image
@@ -152,7 +164,9 @@ class PlayViewer:
             self._status = gui.add_html(status_html(session.snapshot))
             if len(self._policies) > 1:
                 self._acting = self._policies[0]
-                self._policy_menu = self._menu("Policy", self._policies, self._acting, self._choose_policy)
+                self._policy_menu = self._menu(
+                    "Policy", self._policies, self._acting, self._choose_policy
+                )
             if len(session.object_names) > 1:
                 self._menu("Object", session.object_names, session.object_name, self._choose_object)
             new_goal = gui.add_button("New goal")
@@ -161,7 +175,9 @@ class PlayViewer:
         def _(_event: Any) -> None:
             self._events.put(lambda: self.session.new_goal())
 
-    def _menu(self, label: str, names: Sequence[str], now: str, choose: Callable[[str], None]) -> Any:
+    def _menu(
+        self, label: str, names: Sequence[str], now: str, choose: Callable[[str], None]
+    ) -> Any:
         menu = self.viewer.server.gui.add_dropdown(label, tuple(names), initial_value=now)
 
         @menu.on_update

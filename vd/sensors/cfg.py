@@ -1,4 +1,7 @@
-"""Settings of the depth camera and of its errors; by default a perfect camera at the hand's viewpoint."""
+"""Settings of the depth camera and of its errors.
+
+By default a perfect camera at the hand's viewpoint.
+"""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
@@ -7,14 +10,15 @@ from vd.config import Dropped, require
 from vd.paper import PAPER
 
 BASELINE_M, FOCAL_PX = 0.055, 1024.2
-"""Distance of the imagers of an Intel RealSense D415 [m] (D400 series data sheet), and their focal length
+"""Distance of the imagers of an Intel RealSense D415 [m] (D400 series data sheet), and their focal
+length
 [pixel] where disparities are found: 1280 pixels over 64 degrees."""
 LATENCY_S = (1.0 / 30.0, 2.0 / 30.0)
-"""Age of images at 30 Hz, as vd-deploy asks for [s]: one period to take and send, and up to one until it is
-read (an assumption; the data sheet gives none)."""
+"""Age of images at 30 Hz, as vd-deploy asks for [s]: one period to take and send, and up to one
+until it is read (an assumption; the data sheet gives none)."""
 POSITION_NOISE_M, ROTATION_NOISE_RAD = 0.001, 0.002
-"""What a calibration leaves of the camera's place along and about each axis: 2 mm in the median at an object
-half a metre away, as of 20 views of one finger."""
+"""What a calibration leaves of the camera's place along and about each axis: 2 mm in the median at
+an object half a metre away, as of 20 views of one finger."""
 
 
 @dataclass(frozen=True)
@@ -23,13 +27,14 @@ class DepthSensorCfg:
 
     RETIRED: ClassVar[dict[str, Any]] = {"imager": {"baseline_m": BASELINE_M, "focal_px": FOCAL_PX}}
     disparity_std_px: float = 0.0
-    """Noise of the disparity [pixel]; in depth it is z^2 / (focal length * baseline) times that. Real cameras
+    """Noise of the disparity [pixel]; in depth it is z^2 / (focal length * baseline) times that.
+    Real cameras
     of this kind: 0.05 to 0.1."""
     disparity_step_px: float = 0.0
     """Rounding of the disparity [pixel]; the D400 series resolves 1/32."""
     shadow: bool = False
-    """No depth where the second imager, a baseline to the right, sees nothing: left of near things, and along
-    the left border of the image."""
+    """No depth where the second imager, a baseline to the right, sees nothing: left of near things,
+    and along the left border of the image."""
     edge_jump_m: float = 0.02
     """Difference of depth between neighbouring pixels that makes an edge [m]."""
     edge_dropout: float = 0.0
@@ -67,7 +72,9 @@ class DepthSensorCfg:
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        require(self, "sensor.", "zero or positive", "disparity_std_px disparity_step_px min_range_m")
+        require(
+            self, "sensor.", "zero or positive", "disparity_std_px disparity_step_px min_range_m"
+        )
         require(self, "sensor.", "positive", "edge_jump_m")
         require(self, "sensor.", "in [0, 1]", "edge_dropout flying dropout")
         if self.edge_dropout + self.flying > 1.0:
@@ -81,14 +88,18 @@ class DepthSensorCfg:
 class DepthCameraCfg:
     """A depth camera on the hand's base in every environment."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"method": Dropped("raster"), "block": 1, "focal_noise": 0.0}
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "method": Dropped("raster"),
+        "block": 1,
+        "focal_noise": 0.0,
+    }
     points: int = PAPER.camera.points
     """Points of a cloud at most; 0 makes no clouds."""
     crop_m: tuple[float, float] = PAPER.camera.crop_m
     """Least and largest height over the table of a cloud's points [m]."""
     position_noise_m: float = 0.0
-    """Standard deviation of the camera's position along each axis [m], one draw an environment; clouds do not
-    know."""
+    """Standard deviation of the camera's position along each axis [m], one draw an environment;
+    clouds do not know."""
     rotation_noise_rad: float = 0.0
     """Standard deviation of its orientation about each axis [rad], likewise."""
     latency_s: tuple[float, float] = (0.0, 0.0)
@@ -97,7 +108,10 @@ class DepthCameraCfg:
     """Errors of the measured depth."""
 
     def with_errors(self) -> "DepthCameraCfg":
-        """The same camera as a D415: its sensor's errors, late images, not quite where it is believed."""
+        """The same camera as a D415.
+
+        Its sensor's errors, late images, not quite where it is believed.
+        """
         return replace(
             self,
             sensor=DepthSensorCfg.realistic(),
@@ -113,4 +127,6 @@ class DepthCameraCfg:
         if self.crop_m[0] > self.crop_m[1]:
             raise ValueError(f"crop_m = {self.crop_m}; name the lower height first")
         if not 0.0 <= self.latency_s[0] <= self.latency_s[1]:
-            raise ValueError(f"latency_s = {self.latency_s}; name two times, none negative, the least first")
+            raise ValueError(
+                f"latency_s = {self.latency_s}; name two times, none negative, the least first"
+            )

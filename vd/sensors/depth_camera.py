@@ -1,8 +1,8 @@
 """A depth camera in every world: image and cloud from the simulator's poses, on its device.
 
-World frame: z up, table top at z = 0. The optical frame has x right, y down, z forward. Depth is measured
-along the optical axis [m]; 0 means no value: nothing within the camera's range, or lost by the sensor, as
-real depth cameras report it. Quaternions are xyzw.
+World frame: z up, table top at z = 0. The optical frame has x right, y down, z forward. Depth is
+measured along the optical axis [m]; 0 means no value: nothing within the camera's range, or lost by
+the sensor, as real depth cameras report it. Quaternions are xyzw.
 """
 
 import math
@@ -36,15 +36,17 @@ from vd.sensors.surfaces import SurfaceSet, scene_surfaces
 from vd.sim.scene import Scene
 
 WARP_LANES = 32
-"""Threads that share a tile or a row of pixels on a GPU. The CPU runs one after the other anyway."""
+"""Threads that share a tile or a row of pixels on a GPU. The CPU runs one after the other
+anyway.
+"""
 
 
 class DepthCamera:
     """N depth cameras of H x W pixels, one a world, over S shapes and a table.
 
-    ``capture()`` launches kernels only, so that it can be part of a CUDA graph; results lie in ``depth``,
-    ``points`` and ``count``. Extrinsics, intrinsics, sensor and latency are arrays with one entry a world and
-    may be changed between captures.
+    ``capture()`` launches kernels only, so that it can be part of a CUDA graph; results lie in
+    ``depth``, ``points`` and ``count``. Extrinsics, intrinsics, sensor and latency are arrays with
+    one entry a world and may be changed between captures.
     """
 
     def __init__(
@@ -88,8 +90,8 @@ class DepthCamera:
             device=device,
         )
         self.points = cloud.points
-        """Points within the crop, in the frame of the camera's body (the hand's base) [m], shape [N, K]. Rows
-        beyond ``count`` are NaN, which the voxels ignore."""
+        """Points within the crop, in the frame of the camera's body (the hand's base) [m], shape
+        [N, K]. Rows beyond ``count`` are NaN, which the voxels ignore."""
         self.count = cloud.count
         """Points of each cloud, shape [N]."""
         self.available = cloud.available
@@ -105,10 +107,14 @@ class DepthCamera:
         generator.standard_normal(n)  # keeps the viewpoints that a seed has had
         self.views = make_views(camera, n, device)
         """Focal lengths, principal point [pixel] and range [m] of each camera, shape [N]."""
-        self.extrinsics = wp.array(_extrinsics(camera, generator, cfg, n), dtype=wp.transform, device=device)
+        self.extrinsics = wp.array(
+            _extrinsics(camera, generator, cfg, n), dtype=wp.transform, device=device
+        )
         """Optical frame of each camera in the frame of the body that carries it, shape [N]."""
         self._believed = _believed(camera, cfg, self.extrinsics)
-        self.sensors = wp.array([_sensor(cfg.sensor, camera)] * n, dtype=DepthSensorParams, device=device)
+        self.sensors = wp.array(
+            [_sensor(cfg.sensor, camera)] * n, dtype=DepthSensorParams, device=device
+        )
         """Sensor settings of each camera; used if any was on at the start, shape [N]."""
         delay = generator.uniform(*cfg.latency_s, size=n) / frame_s
         self.delay = wp.array(delay, dtype=float, device=device)
@@ -123,20 +129,27 @@ class DepthCamera:
         self.true_depth = empty(n, *image)
         """Depth without sensor errors [m], shape [N, H, W]."""
         self.depth = empty(n, *image) if cfg.sensor.enabled else self.true_depth
-        """Measured depth [m], 0 for none; the same array as ``true_depth`` if the sensor is perfect."""
+        """Measured depth [m], 0 for none; the same array as ``true_depth`` if the sensor is
+        perfect.
+        """
         self.rng = wp.empty(n, dtype=wp.uint32, device=device)
         """Random state of each world, shape [N]."""
         launch(init_rng_kernel, n, [seed], [self.rng])
 
-        self._rotation, self._position = empty(n, shapes, dtype=wp.mat33), empty(n, shapes, dtype=wp.vec3)
+        self._rotation = empty(n, shapes, dtype=wp.mat33)
+        self._position = empty(n, shapes, dtype=wp.vec3)
         self._depth_bits = self.true_depth.view(wp.int32)
         self._history: wp.array | None = None
         if cfg.latency_s[1] > 0.0:
-            slots = math.ceil(cfg.latency_s[1] / frame_s) + 1
-            self._frame = empty(1, dtype=wp.int32)
-            self._late_q = wp.clone(body_q)
-            self._history = empty(slots, *body_q.shape, dtype=wp.transform)
-            self.reset()
+            self._remember_poses(math.ceil(cfg.latency_s[1] / frame_s) + 1)
+
+    def _remember_poses(self, slots: int) -> None:
+        """Allocate the body poses of the last ``slots`` frames, of which late images are made."""
+        self._frame = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._late_q = wp.clone(self.body_q)
+        shape = (slots, *self.body_q.shape)
+        self._history = wp.zeros(shape, dtype=wp.transform, device=self.device)
+        self.reset()
 
     @classmethod
     def of_scene(
@@ -169,16 +182,26 @@ class DepthCamera:
 
     def stateful(self) -> dict[str, wp.array]:
         """What another camera of the same settings and seed needs to go on as this one would."""
-        state = {"rng": self.rng, "extrinsics": self.extrinsics, "delay": self.delay, "table": self.table}
+        state = {
+            "rng": self.rng,
+            "extrinsics": self.extrinsics,
+            "delay": self.delay,
+            "table": self.table,
+        }
         if self._history is not None:
             state |= {"history": self._history, "frame": self._frame}
         return state
 
     def capture(self) -> None:
-        """Take an image in every world and make its cloud. Launches only; nothing reaches the host."""
+        """Take an image in every world and make its cloud. Launches only.
+
+        Nothing reaches the host.
+        """
         n, surfaces = self.num_envs, self.surfaces
         body_q = self._late_poses()
-        launch(place_camera_kernel, n, [self._camera_body, self.extrinsics, body_q], [self.camera_q])
+        launch(
+            place_camera_kernel, n, [self._camera_body, self.extrinsics, body_q], [self.camera_q]
+        )
         launch(
             place_meshes_kernel,
             self._rotation.shape,
@@ -250,7 +273,9 @@ def _extrinsics(
     """Poses of the optical frames [N, 7], the turn about the camera's own axes."""
     turn = Rotation.from_rotvec(cfg.rotation_noise_rad * generator.standard_normal((n, 3)))
     position = camera.position + cfg.position_noise_m * generator.standard_normal((n, 3))
-    return np.concatenate([position, (Rotation.from_quat(camera.quaternion) * turn).as_quat()], axis=1)
+    return np.concatenate(
+        [position, (Rotation.from_quat(camera.quaternion) * turn).as_quat()], axis=1
+    )
 
 
 def _believed(camera: CameraModel, cfg: DepthCameraCfg, extrinsics: wp.array) -> wp.array:
@@ -258,7 +283,9 @@ def _believed(camera: CameraModel, cfg: DepthCameraCfg, extrinsics: wp.array) ->
     if not (cfg.position_noise_m > 0.0 or cfg.rotation_noise_rad > 0.0):
         return extrinsics
     nominal = np.concatenate([camera.position, camera.quaternion])
-    return wp.array(np.tile(nominal, (len(extrinsics), 1)), dtype=wp.transform, device=extrinsics.device)
+    return wp.array(
+        np.tile(nominal, (len(extrinsics), 1)), dtype=wp.transform, device=extrinsics.device
+    )
 
 
 def _sensor(cfg: DepthSensorCfg, camera: CameraModel) -> DepthSensorParams:

@@ -51,7 +51,9 @@ class DepthCloud:
             return wp.zeros(shape, dtype=dtype, device=device)
 
         self.points = empty(num_envs, points, dtype=wp.vec3)
-        """Points in the frame of the camera's body (the base) [m], NaN beyond ``count``, shape [N, K]."""
+        """Points in the frame of the camera's body (the base) [m], NaN beyond ``count``, shape [N,
+        K].
+        """
         self.count = empty(num_envs)
         """Points of each cloud, shape [N]."""
         self.available = empty(num_envs)
@@ -61,7 +63,12 @@ class DepthCloud:
         self._row_count, self._row_first = (empty(num_envs, self._tile_rows) for _ in range(2))
 
     def make(
-        self, depth: wp.array, views: wp.array, camera_q: wp.array, extrinsics: wp.array, rng: wp.array
+        self,
+        depth: wp.array,
+        views: wp.array,
+        camera_q: wp.array,
+        extrinsics: wp.array,
+        rng: wp.array,
     ) -> None:
         """Make the clouds of images. Launches only.
 
@@ -88,7 +95,16 @@ class DepthCloud:
         launch(
             choose_points_kernel,
             self.points.shape,
-            [views, self._tile_columns, extrinsics, rng, depth, *marked, self._row_first, self.available],
+            [
+                views,
+                self._tile_columns,
+                extrinsics,
+                rng,
+                depth,
+                *marked,
+                self._row_first,
+                self.available,
+            ],
             [self.points],
         )
 
@@ -106,11 +122,15 @@ class CameraCloud:
         device: str = "cpu",
         seed: int = 0,
     ):
-        """Prepare a cloud of at most K ``points`` within heights ``crop_m`` [m]; ``seed`` is of their choice.
+        """Prepare a cloud of at most K ``points`` within heights ``crop_m`` [m].
+
+        ``seed`` is of their choice.
 
         The camera's pose is that in the hand's base, whose own in the world is ``mount`` [7].
         """
-        self.cloud = DepthCloud(camera.height, camera.width, 1, points=points, crop_m=crop_m, device=device)
+        self.cloud = DepthCloud(
+            camera.height, camera.width, 1, points=points, crop_m=crop_m, device=device
+        )
         self.depth = wp.zeros((1, camera.height, camera.width), dtype=float, device=device)
         """The image [m], 0 for none, shape [1, H, W]."""
         self._views = make_views(camera, 1, device)
@@ -128,7 +148,8 @@ class CameraCloud:
             depth: Depth along the optical axis [m], 0 for none, shape [H, W].
 
         Returns:
-            Points in the frame of the hand's base [m], NaN beyond the count, shape [1, K]; the count, [1].
+            Points in the frame of the hand's base [m], NaN beyond the count, shape [1, K]; the
+            count, [1].
 
         Raises:
             ValueError: The image has another size than the camera.
@@ -144,7 +165,9 @@ class CameraCloud:
         return self.cloud.points, self.cloud.count
 
     def seen(self, depth: np.ndarray) -> wp.array:
-        """The points of an image as :class:`vd.senses.Senses` has them [1, K]; the next call changes them.
+        """The points of an image as :class:`vd.senses.Senses` has them [1, K].
+
+        The next call changes them.
 
         Argument and errors are those of :meth:`make`.
         """

@@ -30,7 +30,8 @@ class SurfaceSet:
 
         Args:
             meshes: The meshes, each in the frame of its body [m].
-            shape_body: Body that carries each shape, an index within a world; -1 for the world, shape [S].
+            shape_body: Body that carries each shape, an index within a world; -1 for the world,
+                shape [S].
             shape_mesh: Mesh of each shape in each world, shape [N, S].
             shape_scale: Size factor of each shape in each world, shape [N, S].
             device: Warp device.
@@ -68,7 +69,10 @@ class SurfaceSet:
 
 
 def scene_surfaces(scene: Scene) -> SurfaceSet:
-    """What a camera sees of a scene but the table: the hand's links, and the object as its last shape."""
+    """What a camera sees of a scene but the table.
+
+    The hand's links, and the object as its last shape.
+    """
     drawn = read_surfaces(scene.hand)
     meshes: list[Surface] = []
     known: dict[bytes, int] = {}

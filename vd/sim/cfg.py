@@ -8,7 +8,8 @@ from vd.paper import PAPER
 
 Engine = Literal["newton", "mujoco"]
 
-# Of a light object (0.1 kg) pinched by strong fingers (2.6 N m), measured in docs/concepts/physics.md.
+# Of a light object (0.1 kg) pinched by strong fingers (2.6 N m), measured in
+# docs/concepts/physics.md.
 CONE = "elliptic"
 """Friction cone. A pyramidal one lets a pinched object creep by millimetres per second."""
 IMPRATIO = 10.0
@@ -16,27 +17,32 @@ IMPRATIO = 10.0
 TOLERANCE = 1e-6
 """Solver tolerance; single precision gains nothing below it."""
 JACOBIAN = "sparse"
-"""How the solver keeps the constraints' Jacobian. A contact moves one finger and the object, of four fingers
-9 of 18 coordinates; sparse, the solver passes over these alone: the same steps, to rounding."""
+"""How the solver keeps the constraints' Jacobian. A contact moves one finger and the object, of
+four fingers 9 of 18 coordinates; sparse, the solver passes over these alone: the same steps, to
+rounding.
+"""
 CONTACT_IMPEDANCE = (0.99, 0.995)
-"""Contact ``solimp`` d0 and dmax of hand and object. Contact stiffness scales with the object's mass, so the
-default (0.9, 0.95) lets fingers sink more than a millimetre into a 0.1 kg object."""
+"""Contact ``solimp`` d0 and dmax of hand and object. Contact stiffness scales with the object's
+mass, so the default (0.9, 0.95) lets fingers sink more than a millimetre into a 0.1 kg object."""
 TABLE_IMPEDANCE = (0.97, 0.99)
-"""The same for contacts with the table: stiffer ones keep some light, slim objects rocking, softer ones let
-more of them roll on."""
+"""The same for contacts with the table: stiffer ones keep some light, slim objects rocking, softer
+ones let more of them roll on."""
 IMPEDANCE_WIDTH_M = 0.001
 """Penetration over which the impedance rises from d0 to dmax [m]."""
 GAP_M = 0.002
-"""Detection distance beyond touching [m]. The default of 0.1 m, the size of the whole scene, makes hundreds
-of candidate contacts a world that never touch."""
+"""Detection distance beyond touching [m]. The default of 0.1 m, the size of the whole scene, makes
+hundreds of candidate contacts a world that never touch."""
 FINGERTIP_TORSION_M = 0.005
-"""Torsional friction radius of the fingertips [m], about the radius of their contact patch; fingertip
-contacts have condim 4, all others 3."""
+"""Torsional friction radius of the fingertips [m], about the radius of their contact patch;
+fingertip contacts have condim 4, all others 3."""
 
 
 @dataclass(frozen=True)
 class SimCfg:
-    """Rates, sizes and limits of the physics; what is the same in every run is a constant of this module."""
+    """Rates, sizes and limits of the physics.
+
+    What is the same in every run is a constant of this module.
+    """
 
     RETIRED: ClassVar[dict[str, Any]] = {
         "cone": CONE,
@@ -52,14 +58,18 @@ class SimCfg:
     }
 
     engine: Engine = "newton"
-    """What steps the physics: Newton on MuJoCo Warp, or MuJoCo's own engine in C, on the CPU alone."""
+    """What steps the physics: Newton on MuJoCo Warp, or MuJoCo's own engine in C, on the CPU
+    alone.
+    """
     physics_hz: float = PAPER.scene.physics_hz
     """Physics rate [Hz]; a whole, even multiple of ``control_hz``."""
     control_hz: float = PAPER.scene.control_hz
     """Policy rate [Hz]."""
     iterations: int = 10
-    """Newton solver iterations at most; it stops earlier by ``tolerance``. Contact quality is that of
-    100 iterations (rest, creep, penetration); 20 cost a fifth of the speed: all wait for the slowest."""
+    """Newton solver iterations at most; it stops earlier by ``tolerance``. Contact quality is that
+    of 100 iterations (rest, creep, penetration); 20 cost a fifth of the speed: all wait for the
+    slowest.
+    """
     ls_iterations: int = 10
     """Line-search iterations at most."""
     contact_time_constant_s: float = 2.0 / 120.0
@@ -67,12 +77,12 @@ class SimCfg:
     njmax: int = 160
     """Constraint rows an environment may use; an overflow stops the run and names this setting."""
     nconmax: int = 32
-    """Contacts an environment may use, averaged over all (about 10 are used, 20 in a handful); likewise.
-    Of objects of more than 8 convex parts in proportion more."""
+    """Contacts an environment may use, averaged over all (about 10 are used, 20 in a handful);
+    likewise. Of objects of more than 8 convex parts in proportion more."""
     nccdmax: int = 3
-    """Pairs of convex shapes, of any one combination of kinds, that may overlap in an environment, averaged
-    over all (0.1 to 0.25 do while fingers push); likewise. Each takes 5 kB of work space: with one for
-    each contact, the solver's choice, they were most of the memory."""
+    """Pairs of convex shapes, of any one combination of kinds, that may overlap in an environment,
+    averaged over all (0.1 to 0.25 do while fingers push); likewise. Each takes 5 kB of work space:
+    with one for each contact, the solver's choice, they were most of the memory."""
 
     @property
     def physics_dt(self) -> float:
@@ -95,12 +105,14 @@ class SimCfg:
         if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 2 or round(ratio) % 2:
             raise ValueError(
                 f"sim.physics_hz = {self.physics_hz} must be an even multiple of sim.control_hz = "
-                f"{self.control_hz} (states are swapped every physics step and must end where they began); "
+                f"{self.control_hz} (states are swapped every physics step and must end where they "
+                f"began); "
                 f"set sim.physics_hz to {self.control_hz * max(2, 2 * round(ratio / 2))}"
             )
         if self.contact_time_constant_s < 2.0 * self.physics_dt * (1.0 - 1e-6):
             raise ValueError(
-                f"sim.contact_time_constant_s = {self.contact_time_constant_s} is below two physics steps; "
+                f"sim.contact_time_constant_s = {self.contact_time_constant_s} is below two "
+                f"physics steps; "
                 f"set it to {2.0 * self.physics_dt} or raise sim.physics_hz"
             )
 
@@ -132,7 +144,9 @@ def coarser(cfg: SimCfg) -> SimCfg:
 
 
 MUJOCO_PHYSICS_HZ = 1008.0
-"""Physics rate in MuJoCo's engine [Hz]: the even multiple of the control rate next to a step of 1 ms."""
+"""Physics rate in MuJoCo's engine [Hz]: the even multiple of the control rate next to a step of 1
+ms.
+"""
 MUJOCO_ITERATIONS, MUJOCO_LS_ITERATIONS = 100, 50
 """MuJoCo's defaults. With 10 iterations of its line search the solver stops at wrong answers."""
 

@@ -1,7 +1,7 @@
 """The engines that step the physics of a Newton model: MuJoCo Warp, and MuJoCo's own in C.
 
-Newton translates in both: its state, controls and model into MuJoCo's arrays, and the state back. What lies
-between is one method, and all else reads those arrays, whichever engine filled them.
+Newton translates in both: its state, controls and model into MuJoCo's arrays, and the state back.
+What lies between is one method, and all else reads those arrays, whichever engine filled them.
 """
 
 import math
@@ -22,12 +22,12 @@ from vd.kernels.inverse_weights import LEAST_LEVER_M, inverse_weights_kernel
 from vd.kernels.launch import launch
 from vd.sim.cfg import CONE, IMPRATIO, JACOBIAN, TOLERANCE, SimCfg
 
-# Work space of convex pairs (5 kB each) is shared by all worlds; few worlds have no average to rely on:
-# 60 of objects wedged between the fingers filled three for each (our choice).
+# Work space of convex pairs (5 kB each) is shared by all worlds; few worlds have no average to rely
+# on: 60 of objects wedged between the fingers filled three for each (our choice).
 FEWEST_CONVEX_PAIRS = 1024
 
-# Convex parts of an object up to which sim.nconmax and sim.nccdmax are as they are set: one of 32 parts
-# touches table and fingers at 25 places, one of 8 at 9.
+# Convex parts of an object up to which sim.nconmax and sim.nccdmax are as they are set: one of 32
+# parts touches table and fingers at 25 places, one of 8 at 9.
 USUAL_PARTS = 8
 # Constraint rows for each part more that any world's object has: a dish of 32 took 170 within 10 s.
 ROWS_A_PART = 8
@@ -51,7 +51,10 @@ class WarpSolver(SolverMuJoCo):
         launch(inverse_weights_kernel, weights.shape, [], [weights])
 
     def publish_contacts(self) -> None:
-        """Have the contacts of the last step, with their normal forces, in ``mjw_data``: they are there."""
+        """Have the contacts of the last step, with their normal forces, in ``mjw_data``.
+
+        They are there.
+        """
 
 
 class CSolver(WarpSolver):
@@ -73,7 +76,8 @@ class CSolver(WarpSolver):
 
         Args:
             model: The model of all worlds.
-            worlds: Runs of equal worlds in their order: what builds one of them, and how many they are.
+            worlds: Runs of equal worlds in their order: what builds one of them, and how many they
+                are.
             physics_dt: Physics step [s].
             settings: Of :class:`SolverMuJoCo`.
 
@@ -105,7 +109,10 @@ class CSolver(WarpSolver):
         self._model_changed = True
 
     def _mujoco_warp_step(self) -> None:
-        """In place of Newton's method of this name: one step of all worlds, from its arrays into them."""
+        """In place of Newton's method of this name.
+
+        One step of all worlds, from its arrays into them.
+        """
         for run in self._runs:
             run.step(self.mjw_model, self.mjw_data, model_changed=self._model_changed)
         self._model_changed = False
@@ -119,13 +126,17 @@ class CSolver(WarpSolver):
 
 
 class _Run:
-    """Equal worlds in MuJoCo: those of ``rows`` of MuJoCo Warp's arrays, with those of its geoms."""
+    """Equal worlds in MuJoCo.
+
+    Those of ``rows`` of MuJoCo Warp's arrays, with those of its geoms.
+    """
 
     def __init__(self, exported: mujoco.MjModel, rows: slice, geoms: np.ndarray):
         self._exported, self._rows, self._geoms = exported, rows, geoms
         self._worlds = rows.stop - rows.start
         exported.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO  # dense: faster on a CPU
-        # A state that is not finite is for the guard to see; bounding volumes do not follow centres of mass.
+        # A state that is not finite is for the guard to see; bounding volumes do not follow centres
+        # of mass.
         exported.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         exported.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
         self._batch = Batch(exported, self._worlds, nthread=threads(), persistent=True)
@@ -137,10 +148,13 @@ class _Run:
         batch, rows = self._batch, self._rows
         self._copy_model(model, DRIVES)
         if model_changed:
-            self._copy_model(model, [field.name for field in fields(model) if field.name in MODEL_FIELDS])
+            self._copy_model(
+                model, [field.name for field in fields(model) if field.name in MODEL_FIELDS]
+            )
             batch.set_const()
             mend_weights(batch.expand("body_invweight0"))
-            # Tables are moved: their place counts, also if it was that of their body when this was computed.
+            # Tables are moved: their place counts, also if it was that of their body when this was
+            # computed.
             batch.expand("geom_sameframe")[:, self._fixed] = 0
         places = data.geom_xpos.numpy()[rows, self._geoms[self._fixed]]
         batch.expand("geom_pos")[:, self._fixed] = places
@@ -151,7 +165,10 @@ class _Run:
             getattr(data, name).numpy()[rows] = batch.bind(name)
 
     def _copy_model(self, model: Any, names: Iterable[str]) -> None:
-        """Copy numbers that MuJoCo Warp has for each world; all others are as they were exported."""
+        """Copy numbers that MuJoCo Warp has for each world.
+
+        All others are as they were exported.
+        """
         for name in names:
             ours, exported = getattr(model, name), getattr(self._exported, name)
             if not exported.size or not isinstance(ours, wp.array) or ours.dtype is wp.int32:
@@ -196,9 +213,9 @@ def make_solver(
 ) -> WarpSolver:
     """The solver of ``sim.engine`` with the project's settings.
 
-    Overflow is left to the guards, which need no prints. Room for contacts, which worlds share, grows with
-    the convex parts of a world on average; that for constraint rows, which each has for itself, with the most
-    parts of any.
+    Overflow is left to the guards, which need no prints. Room for contacts, which worlds share,
+    grows with the convex parts of a world on average; that for constraint rows, which each has for
+    itself, with the most parts of any.
 
     Raises:
         ValueError: The engine does not run on the device of the model.
@@ -208,7 +225,9 @@ def make_solver(
     room = max(1.0, parts.mean() / USUAL_PARTS)
     rows = cfg.njmax + ROWS_A_PART * max(0, int(parts.max()) - USUAL_PARTS)
     engine = (
-        WarpSolver if cfg.engine == "newton" else partial(CSolver, worlds=worlds, physics_dt=cfg.physics_dt)
+        WarpSolver
+        if cfg.engine == "newton"
+        else partial(CSolver, worlds=worlds, physics_dt=cfg.physics_dt)
     )
     solver = engine(
         model,
@@ -227,5 +246,7 @@ def make_solver(
     )
     solver.mjw_model.opt.warn_overflow = False
     # The solver would take one for each contact, and has no argument for it.
-    solver.mjw_data.naccdmax = max(math.ceil(room * cfg.nccdmax) * model.world_count, FEWEST_CONVEX_PAIRS)
+    solver.mjw_data.naccdmax = max(
+        math.ceil(room * cfg.nccdmax) * model.world_count, FEWEST_CONVEX_PAIRS
+    )
     return solver

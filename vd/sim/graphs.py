@@ -7,14 +7,20 @@ import warp as wp
 
 
 class Graphs:
-    """Replays what was launched before; ``captured``: nothing of it is the host's work, so that it can."""
+    """Replays what was launched before.
+
+    ``captured``: nothing of it is the host's work, so that it can.
+    """
 
     def __init__(self, device: str, *, captured: bool = True):
         self._device, self._captured = device, captured
         self._known: dict[str, Any] = {}
 
     def replay(self, launch: Callable[[], None]) -> None:
-        """Launch what a function launches: at first as it is, which loads the kernels, then as a graph."""
+        """Launch what a function launches.
+
+        At first as it is, which loads the kernels, then as a graph.
+        """
         name = launch.__name__
         if not self._captured or name not in self._known:
             self._known[name] = None

@@ -1,7 +1,8 @@
 """The identified servo of every hand joint, in every world of a simulation.
 
-The solver's own drive knows kp, kd and an effort limit. :class:`JointServo` puts the missing effects of
-:data:`vd.kernels.servo.effects.EFFECTS` around it; without one it is not built and nothing is launched.
+The solver's own drive knows kp, kd and an effort limit. :class:`JointServo` puts the missing
+effects of :data:`vd.kernels.servo.effects.EFFECTS` around it; without one it is not built and
+nothing is launched.
 """
 
 import math
@@ -69,8 +70,8 @@ class JointServo:
 
         Args:
             solver: The solver, whose model this class writes drives and friction of the hand into.
-            control: The control of the simulation; its joint targets become the drives' references and
-                its joint forces the torques besides the drives'.
+            control: The control of the simulation; its joint targets become the drives' references
+                and its joint forces the torques besides the drives'.
             joint_q: Positions, hand joints first, shape [N, *]; read at every reset.
             rows: Parameter rows, shape [D, P] or [N, D, P].
             fingers: Each finger's joints, as columns.
@@ -90,16 +91,22 @@ class JointServo:
         dofs = solver.mjc_dof_to_newton_dof.numpy()[0, :d]
         drives = solver.mjc_actuator_to_newton_idx.numpy()[:d]
         if not (np.array_equal(dofs, expected) and np.array_equal(drives, expected)):
-            raise ValueError("the hand's joints must be the first of each world, one position drive each")
+            raise ValueError(
+                "the hand's joints must be the first of each world, one position drive each"
+            )
 
         def zeros(*shape: int, dtype: Any = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=self.device)
 
         self.parameters = zeros(n * d, PARAMETER_COLUMNS)
-        """Parameter rows, shape [N D, P]. May be written on the device (then :meth:`push_inertia`)."""
+        """Parameter rows, shape [N D, P]. May be written on the device (then
+        :meth:`push_inertia`).
+        """
         self.state = zeros(n * d, STATE_COLUMNS)
         """State rows, shape [N D, STATE_COLUMNS]."""
-        first = np.concatenate([np.full(finger.stop - finger.start, finger.start) for finger in fingers])
+        first = np.concatenate(
+            [np.full(finger.stop - finger.start, finger.start) for finger in fingers]
+        )
         self.first = wp.array(first, dtype=int, device=self.device)
         """First joint of each joint's finger [D]."""
         self._dim = n, d
@@ -163,7 +170,8 @@ class JointServo:
             if bad.any():
                 joint = int(np.argwhere(bad)[0][-1])
                 raise ValueError(
-                    f"joint {joint}: {effect}:{parameter.name} = {values[bad][0]:g} {parameter.unit}; "
+                    f"joint {joint}: {effect}:{parameter.name} = {values[bad][0]:g} "
+                    f"{parameter.unit}; "
                     f"set a finite value of at most {limit:g}"
                 )
         self.parameters.assign(np.broadcast_to(rows, (n, d, PARAMETER_COLUMNS)).reshape(n * d, -1))

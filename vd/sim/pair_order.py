@@ -1,8 +1,9 @@
 """Candidate pairs of shapes, sorted by kind between the solver's broad and narrow phase.
 
-The broad phase lists pairs as it finds them, world by world, and the narrow phase has a kernel for each
-combination of kinds, which passes over all of them: of the threads of a warp few have a pair of its kind,
-and the others wait. Sorted, nearly all of a warp have one, or none. Contacts are the same.
+The broad phase lists pairs as it finds them, world by world, and the narrow phase has a kernel for
+each
+combination of kinds, which passes over all of them: of the threads of a warp few have a pair of its
+kind, and the others wait. Sorted, nearly all of a warp have one, or none. Contacts are the same.
 """
 
 from typing import Any
@@ -54,8 +55,11 @@ def sort_pairs(model: Any, data: Data) -> None:
         ValueError: The model has shapes of kinds that a key has no room for.
     """
     if int(model.geom_type.numpy().max(initial=0)) >= KINDS:
-        raise ValueError("pairs with signed distance fields cannot be sorted; make their shapes meshes")
-    # The solver has no place for it between the phases: a function of its module is replaced, for all data.
+        raise ValueError(
+            "pairs with signed distance fields cannot be sorted; make their shapes meshes"
+        )
+    # The solver has no place for it between the phases: a function of its module is replaced, for
+    # all data.
     collision_driver._narrowphase = _narrowphase
     data.pair_order = PairOrder(data)
 

@@ -26,8 +26,8 @@ from vd.sim.cfg import (
     SimCfg,
 )
 
-# Contact friction in MuJoCo is the larger of two geoms' unless one has a higher priority. The paper's
-# engine averages the two, so each pair's average is written to its higher-priority geom:
+# Contact friction in MuJoCo is the larger of two geoms' unless one has a higher priority. The
+# paper's engine averages the two, so each pair's average is written to its higher-priority geom:
 # table over hand over object.
 PRIORITY_OBJECT, PRIORITY_HAND, PRIORITY_TABLE = 0, 1, 2
 
@@ -39,8 +39,10 @@ SHAPE_OTHER, SHAPE_TABLE, SHAPE_OBJECT, SHAPE_HAND = 0, 1, 2, 3
 OBJECT_COLOR, TABLE_COLOR = (0.93, 0.60, 0.18), (0.55, 0.5, 0.45)
 OBJECT_LABEL = "object"
 OBJECT_GROUP = -1
-"""Collision group of an object's parts: with all but each other. Of one body they never touch, but in a group
-with the rest every pair of them takes room in MuJoCo's 32 bits, and from about 20 parts there is none."""
+"""Collision group of an object's parts: with all but each other. Of one body they never touch, but
+in a group with the rest every pair of them takes room in MuJoCo's 32 bits, and from about 20 parts
+there is none.
+"""
 TABLE_LABEL = "table"
 MASKED_SHAPES = 33
 """Most shapes whose filters fit into MuJoCo's masks whatever they are."""
@@ -113,13 +115,18 @@ def damping_ratio(restitution: float) -> float:
 
     def kept(ratio: float) -> float:
         root = math.sqrt(1.0 - ratio**2)
-        return math.exp(-ratio / root * math.atan2(2.0 * ratio * root, 2.0 * ratio**2 - 1.0)) - restitution
+        return (
+            math.exp(-ratio / root * math.atan2(2.0 * ratio * root, 2.0 * ratio**2 - 1.0))
+            - restitution
+        )
 
     low, high = 1e-6, 1.0 - 1e-6
     return float(brentq(kept, low, high)) if kept(low) > 0.0 > kept(high) else high
 
 
-def shape_cfg(cfg: SimCfg, friction: float, *, visual: bool = False) -> newton.ModelBuilder.ShapeConfig:
+def shape_cfg(
+    cfg: SimCfg, friction: float, *, visual: bool = False
+) -> newton.ModelBuilder.ShapeConfig:
     """Newton's shape settings for a colliding (or visual-only) shape."""
     # kd and ke such that MuJoCo's solref becomes (time constant, damping ratio 1).
     kd = 2.0 / cfg.contact_time_constant_s
@@ -165,7 +172,9 @@ def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBu
         builder.shape_gap[shape] = GAP_M
         builder.shape_margin[shape] = 0.0
         builder.shape_material_mu_torsional[shape] = FINGERTIP_TORSION_M
-        attributes = contact_attributes(PRIORITY_HAND, CONDIM_TORSIONAL if is_tip else CONDIM_SLIDING)
+        attributes = contact_attributes(
+            PRIORITY_HAND, CONDIM_TORSIONAL if is_tip else CONDIM_SLIDING
+        )
         for key, value in attributes.items():
             builder.custom_attributes[key].values[shape] = value
     return builder
@@ -174,18 +183,26 @@ def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBu
 def _group_fingers(builder: newton.ModelBuilder, hand: HandModel) -> None:
     """Put each finger whose links never touch each other into a collision group.
 
-    That says nothing new, but to the compiler of MuJoCo's masks: of what is filtered pair by pair, more than
-    33 shapes may not fit into their 32 bits.
+    That says nothing new, but to the compiler of MuJoCo's masks: of what is filtered pair by pair,
+    more than 33 shapes may not fit into their 32 bits.
     """
-    colliding = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES]
+    colliding = [
+        i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES
+    ]
     if len(colliding) <= MASKED_SHAPES:
         return
     names = [label.rsplit("/", 1)[-1] for label in builder.body_label]
     apart = set(builder.shape_collision_filter_pairs)
     for finger, joints in enumerate(hand.fingers):
-        links = [hand.link_names[hand.joint_child[joint]] for joint in range(joints.start, joints.stop)]
+        links = [
+            hand.link_names[hand.joint_child[joint]] for joint in range(joints.start, joints.stop)
+        ]
         shapes = [i for i in colliding if names[builder.shape_body[i]] in links]
-        pairs = [(a, b) for a, b in combinations(shapes, 2) if builder.shape_body[a] != builder.shape_body[b]]
+        pairs = [
+            (a, b)
+            for a, b in combinations(shapes, 2)
+            if builder.shape_body[a] != builder.shape_body[b]
+        ]
         if apart.issuperset(pairs):
             for shape in shapes:
                 builder.shape_collision_group[shape] = OBJECT_GROUP - 1 - finger
@@ -196,7 +213,8 @@ def add_table(
 ) -> None:
     """Add the table of this world: a plane to the physics, a box to the eye.
 
-    Objects bounce on it as their files say, where they were identified (``item``), and hardly otherwise.
+    Objects bounce on it as their files say, where they were identified (``item``), and hardly
+    otherwise.
 
     The paper's table reaches 0.3 m to each side and an object counts as lost at half of that, so
     nothing can tell a plane from it, except that contacts with a plane are exact: against a box, a
@@ -235,7 +253,9 @@ def show_table(builder: newton.ModelBuilder, cfg: SimCfg, body: int = -1) -> Non
 
 def scaled_mesh(vertices: np.ndarray, faces: np.ndarray, scale: float) -> newton.Mesh:
     """A Newton mesh of ``vertices`` [V, 3] times ``scale``; mass properties are the body's."""
-    return newton.Mesh(np.asarray(vertices) * scale, np.asarray(faces).flatten(), compute_inertia=False)
+    return newton.Mesh(
+        np.asarray(vertices) * scale, np.asarray(faces).flatten(), compute_inertia=False
+    )
 
 
 def add_object(
@@ -332,9 +352,13 @@ def build_scene(
                 continue
             world = new_builder()
             world.add_builder(hand_builder)
-            if not hand.palm_up:  # what rests in a hand needs no table, and what falls from it is lost
+            if (
+                not hand.palm_up
+            ):  # what rests in a hand needs no table, and what falls from it is lost
                 add_table(world, cfg, visible=visuals, item=item)
-            add_object(world, item, cfg, at=hand.workspace.drop_m, scale=float(scale), visuals=visuals)
+            add_object(
+                world, item, cfg, at=hand.workspace.drop_m, scale=float(scale), visuals=visuals
+            )
             scene.replicate(world, int(copies))
             worlds.append((world, int(copies)))
     model = scene.finalize(device=device)

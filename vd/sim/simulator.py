@@ -23,7 +23,8 @@ from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
 # this is a solver failure on its way to NaN.
 MAX_SPEED = 500.0
 
-# Height of a table that is not there [m]: an object that is lost on the way down is reset long before.
+# Height of a table that is not there [m]: an object that is lost on the way down is reset long
+# before.
 AWAY_M = -10.0
 
 # MuJoCo Warp's overflow bits that mean lost contacts or constraint rows, by the setting to change.
@@ -82,7 +83,9 @@ class Simulator:
             arrays = state.joint_q, state.joint_qd, state.body_q, state.body_qd, state.body_f
             return [array.reshape((n, -1)) for array in arrays]
 
-        self.joint_q, self.joint_qd, self.body_q, self.body_qd, self.body_force = per_env(self.state)
+        self.joint_q, self.joint_qd, self.body_q, self.body_qd, self.body_force = per_env(
+            self.state
+        )
         *self._next_arrays, self._next_body_force = per_env(self._next)
         self.target = self.control.joint_target_q.reshape((n, -1))
         self.servo: JointServo | None = None
@@ -94,7 +97,9 @@ class Simulator:
         self.velocity_limit = array(scene.hand.velocity_limit, wp.float32)
         """Joint speed limits [rad/s], shape [D]."""
         geom_shape = self.solver.mjc_geom_to_newton_shape.numpy()
-        self._geom_kind = array(np.where(geom_shape >= 0, scene.shape_kind[geom_shape], 0).astype(np.int32))
+        self._geom_kind = array(
+            np.where(geom_shape >= 0, scene.shape_kind[geom_shape], 0).astype(np.int32)
+        )
         self.table_force = wp.zeros(n, dtype=float, device=self.device)
         """Normal force between object and table at the end of the control step [N], shape [N]."""
         self.overflow = wp.zeros(n, dtype=wp.int32, device=self.device)
@@ -103,12 +108,16 @@ class Simulator:
         self.failed = wp.zeros(n, dtype=wp.int32, device=self.device)
         """1 where the latest control step did, shape [N]."""
         self.force_steps = cfg.substeps
-        """Physics steps of a control step in which ``body_force`` acts, then :attr:`lasting_force` does."""
+        """Physics steps of a control step in which ``body_force`` acts, then :attr:`lasting_force`
+        does.
+        """
         self.lasting_force = wp.zeros_like(self.body_force)
         """What goes on once ``force_steps`` are over [N, N m], shape [N, B]."""
-        self.after_physics_step: Callable[[wp.array, wp.array, wp.array, wp.array], None] | None = None
-        """Called in every physics step with the new positions, velocities and link poses and velocities,
-        shape [N, *]; device work only."""
+        self.after_physics_step: Callable[[wp.array, wp.array, wp.array, wp.array], None] | None = (
+            None
+        )
+        """Called in every physics step with the new positions, velocities and link poses and
+        velocities, shape [N, *]; device work only."""
         self._start_q = wp.clone(self.joint_q)
         if servo_rows is not None:
             self.target = wp.clone(self.target)  # the drives' references become the servos' output
@@ -154,7 +163,10 @@ class Simulator:
         )
 
     def _physics_steps(self) -> None:
-        """The physics steps of one control step, with what surrounds them; states end where they began."""
+        """The physics steps of one control step, with what surrounds them.
+
+        States end where they began.
+        """
         here = self.state, self.joint_q, self.joint_qd, self.body_q, self.body_qd
         there = self._next, *self._next_arrays
         for step in range(self.cfg.substeps):
@@ -165,7 +177,12 @@ class Simulator:
                 self.servo.receive()
                 self.servo.drive(*here[1:3])
             self.solver.step(
-                here[0], there[0], self.control, None, self.cfg.physics_dt, observables=self._observables
+                here[0],
+                there[0],
+                self.control,
+                None,
+                self.cfg.physics_dt,
+                observables=self._observables,
             )
             self._limit_and_collect(here[1], *there[1:3])
             if self.after_physics_step is not None:
@@ -207,8 +224,8 @@ class Simulator:
     def place_tables(self, step_count: wp.array, last_step: wp.array) -> None:
         """Put each world's table where it belongs until its last step, then out of reach of everything.
 
-        The solver computes where fixed shapes are once, when it is built, so this is written into its data,
-        where a captured step finds it. Device work only.
+        The solver computes where fixed shapes are once, when it is built, so this is written into
+        its data, where a captured step finds it. Device work only.
 
         Args:
             step_count: Control steps since the world's reset, shape [N].
@@ -229,7 +246,8 @@ class Simulator:
         """Raise if a step lost contacts, or if more steps failed than are tolerated (two host reads).
 
         Args:
-            tolerated: Control steps of worlds that may have left the finite numbers or been too fast.
+            tolerated: Control steps of worlds that may have left the finite numbers or been too
+                fast.
 
         Raises:
             SimulationError: Names the worlds, the numbers and the setting to change.
@@ -239,7 +257,8 @@ class Simulator:
             worlds = np.flatnonzero(overflow)
             names = {self.scene.objects[self.scene.world_object[w]].name for w in worlds}
             lines = [
-                f"ran out of {what}: raise {setting} (now {getattr(self.cfg, setting.removeprefix('sim.'))})"
+                f"ran out of {what}: raise {setting} (now "
+                f"{getattr(self.cfg, setting.removeprefix('sim.'))})"
                 for bit, (what, setting) in OVERFLOW_REMEDY.items()
                 if np.any(overflow & bit)
             ]

@@ -1,10 +1,12 @@
-"""From joints and a camera's points to what a teacher would observe: of the simulator and of a robot alike.
+"""From joints and a camera's points to what a teacher would observe.
+
+Of the simulator and of a robot alike.
 
 The object is found among the camera's points and followed: by its known shape
 (:mod:`vd.tracking.registration`), or by the cloud of its goal alone (:mod:`vd.vision.finder`).
 
-N hands, D joints, G fingers, K camera points. World frame unless said otherwise: z up; metres, radians,
-quaternions xyzw.
+N hands, D joints, G fingers, K camera points. World frame unless said otherwise: z up; metres,
+radians, quaternions xyzw.
 """
 
 from collections.abc import Sequence
@@ -35,8 +37,8 @@ if TYPE_CHECKING:
 UNSEEN = ("object_orientation", "goal_orientation")
 """Orientations in the axes of the object's file, which no camera shows: zeros stand for them."""
 AGES_S = (0.0, 0.035, 0.07)
-"""How old what a camera shows of a moving hand may be [s]: known shapes are found beside fingers too, clouds
-are not."""
+"""How old what a camera shows of a moving hand may be [s]: known shapes are found beside fingers
+too, clouds are not."""
 LEAP_RAD = 0.5
 """A larger turn in one step is another belief, not a motion."""
 
@@ -60,8 +62,10 @@ class CameraObserver:
 
     Args:
         hand: The hand.
-        objects: The objects, as their shapes are known; with ``alignment`` only their surface points count.
-        num_observations: O, values that the teacher observes: its state, and with more the object's shape.
+        objects: The objects, as their shapes are known; with ``alignment`` only their surface
+            points count.
+        num_observations: O, values that the teacher observes: its state, and with more the object's
+            shape.
         world_object: Object of each hand [N].
         world_scale: Size factor of each hand's object [N].
         camera: What sees them, posed in the base frame.
@@ -94,7 +98,11 @@ class CameraObserver:
         def own(values: Any) -> Array:
             return xp.asarray(values, dtype=xp.float32, device=place, copy=True)
 
-        envs: dict[str, Any] = {"world_object": world_object, "world_scale": world_scale, "device": device}
+        envs: dict[str, Any] = {
+            "world_object": world_object,
+            "world_scale": world_scale,
+            "device": device,
+        }
         self._hand_cloud = HandCloud(hand, link_body=links, device=device)
         self._ages = (0.0,) if alignment is None else AGES_S
         self.finder: Registration | GoalFinder
@@ -112,9 +120,16 @@ class CameraObserver:
         self._fingertips = Fingertips(hand, own)
         self._links = wp.empty((len(world_object), len(links)), dtype=wp.transform, device=device)
         self._past_links = wp.empty_like(self._links)
-        self._base, self._lower, self._upper = own(hand.mount[None]), own(hand.lower), own(hand.upper)
+        self._base, self._lower, self._upper = (
+            own(hand.mount[None]),
+            own(hand.lower),
+            own(hand.upper),
+        )
         self._columns = teacher_observation_slices(hand.num_fingers, hand.num_joints)
-        self._size, state = num_observations, teacher_observation_size(hand.num_fingers, hand.num_joints)
+        self._size, state = (
+            num_observations,
+            teacher_observation_size(hand.num_fingers, hand.num_joints),
+        )
         self._columns["shape"] = slice(state, num_observations)
         self._shapes = ShapeObserver(
             array(np.stack([item.surface_points for item in objects]), wp.vec3),
@@ -135,16 +150,18 @@ class CameraObserver:
         """Look once.
 
         Returns:
-            The teacher's observation in the world frame [N, O], and how far the object is expected to be from
-            its goal [rad] [N]. Of the orientations in which a known shape looks like the wanted one
-            (:mod:`.symmetry`) the nearest is the goal: which of them it is, nobody can see.
+            The teacher's observation in the world frame [N, O], and how far the object is expected
+            to be from its goal [rad] [N]. Of the orientations in which a known shape looks like the
+            wanted one (:mod:`.symmetry`) the nearest is the goal: which of them it is, nobody can
+            see.
         """
         self._hand_cloud.pose(as_warp(senses.joint_q), self._links)
         found = self.found = self._find(senses)
         goal = nearest_goal(found.orientation, senses.goal_quat, self._symmetry)
         angle = rotation_distance(found.orientation, goal)
         parts = {
-            "joint_position": 2.0 * (senses.joint_q - self._lower) / (self._upper - self._lower) - 1.0,
+            "joint_position": 2.0 * (senses.joint_q - self._lower) / (self._upper - self._lower)
+            - 1.0,
             "joint_velocity": PAPER.observation.velocity_scale * senses.joint_qd,
             "object_position": found.position,
             "object_velocity": found.velocity,
@@ -157,7 +174,9 @@ class CameraObserver:
         observation = xp.zeros((len(angle), self._size), dtype=xp.float32, device=angle.device)
         if (first := self._columns["shape"].start) < self._size:
             pose = as_warp(xp.concatenate([found.position, found.orientation], axis=1))
-            self._shapes.observe(pose, 0, self._links, as_warp(goal, wp.quat), as_warp(observation), first)
+            self._shapes.observe(
+                pose, 0, self._links, as_warp(goal, wp.quat), as_warp(observation), first
+            )
         for name, values in parts.items():
             observation[:, self._columns[name]] = values
         return observation, angle
@@ -176,7 +195,9 @@ class CameraObserver:
         followed, before, xp = self.finder, self._before, library_of(senses.points)
         cloud = [*(self._hand_points(age, senses) for age in self._ages), senses.points]
         hand = len(self._ages) * self._hand_cloud.count
-        seen, count = object_points(xp.concatenate(cloud, axis=1), hand, PAPER.cloud.voxel_m, followed.most)
+        seen, count = object_points(
+            xp.concatenate(cloud, axis=1), hand, PAPER.cloud.voxel_m, followed.most
+        )
         pose, base, turn = followed.pose[:, 0], self._base[:, :3], self._base[:, 3:]
         if isinstance(followed, Registration):
             followed.look(seen, count, fresh=senses.fresh, points=senses.points)
@@ -190,7 +211,9 @@ class CameraObserver:
             orientation=product(turn, pose[:, 3:]),
             position=base + rotated(turn, pose[:, :3]),
             velocity=moves * rotated(turn, pose[:, :3] - before[:, :3]),
-            spin=moves * 2.0 * rotated(turn, step[:, :3] * xp.sign(step[:, 3:])),  # of a small angle
+            spin=moves
+            * 2.0
+            * rotated(turn, step[:, :3] * xp.sign(step[:, 3:])),  # of a small angle
         )
         before[:] = pose
         return found

@@ -31,12 +31,15 @@ class Fingertips:
         for finger, joints in enumerate(order):
             before, links = hand.mount, [0, *hand.joint_child[joints]]
             if list(hand.joint_parent[joints]) != links[:-1] or hand.tip_link[finger] != links[-1]:
-                raise ValueError(f"the joints of finger {finger} of {hand.name} are no chain to its tip")
+                raise ValueError(
+                    f"the joints of finger {finger} of {hand.name} are no chain to its tip"
+                )
             for number, joint in enumerate(joints):
                 frames[finger, number] = compose(before, hand.joint_parent_frame[joint])
                 before = invert(hand.joint_child_frame[joint])
             frames[finger, -1] = compose(before, hand.tip_frame[finger])
-        # From each joint's frame, turned, to the next one's: of the first from the world, at the end the tip.
+        # From each joint's frame, turned, to the next one's: of the first from the world, at the
+        # end the tip.
         self._frame, self._axis = array(frames), array(hand.joint_axis[order])
 
     def __call__(self, position: Array, velocity: Array) -> Array:

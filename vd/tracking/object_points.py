@@ -1,27 +1,36 @@
-"""Which of a camera's points are the object's: those of voxels that neither are the hand's nor touch one."""
+"""Which of a camera's points are the object's.
+
+Those of voxels that neither are the hand's nor touch one.
+"""
 
 import warp as wp
 
 from vd.arrays import Array, as_warp, library_of
 from vd.kernels.launch import launch
-from vd.kernels.sensor.voxels import CLOUD_SHIFT, beside_kernel, coordinates_kernel, voxel_key_kernel
+from vd.kernels.sensor.voxels import (
+    CLOUD_SHIFT,
+    beside_kernel,
+    coordinates_kernel,
+    voxel_key_kernel,
+)
 
 
 def object_points(points: Array, hand: int, voxel_m: float, most: int) -> tuple[Array, Array]:
     """Centres of the object's voxels.
 
-    The hand's own samples leave gaps, so a voxel that touches one of them, by a corner at least, is taken for
-    the hand's too.
+    The hand's own samples leave gaps, so a voxel that touches one of them, by a corner at least, is
+    taken for the hand's too.
 
     Args:
-        points: Clouds [m]: the hand's own samples, then what the camera sees, NaN for none [N, P, 3].
+        points: Clouds [m]: the hand's own samples, then what the camera sees, NaN for none [N, P,
+            3].
         hand: Column at which the hand's samples end.
         voxel_m: Side of a voxel [m].
         most: M, voxels of a cloud at most.
 
     Returns:
-        Centres [m], zeros where a cloud has fewer, shape [N, M', 3] with M' <= M, neighbours beside each
-        other, and how many there are, int32 [N]. Waits for the device.
+        Centres [m], zeros where a cloud has fewer, shape [N, M', 3] with M' <= M, neighbours beside
+        each other, and how many there are, int32 [N]. Waits for the device.
     """
     xp, device, envs = library_of(points), points.device, len(points)
     keys = xp.empty(points.shape[:2], dtype=xp.int64, device=device)
@@ -37,8 +46,8 @@ def object_points(points: Array, hand: int, voxel_m: float, most: int) -> tuple[
     cloud = xp.asarray(rows[:, 0], dtype=xp.int64)
     first = xp.searchsorted(cloud, xp.arange(envs + 1, device=device))
     counts, rank = xp.diff(first), xp.arange(len(cloud), device=device) - first[cloud]
-    # Of more than ``most`` every so many-th is taken, in the order of the rows, in which neighbours follow
-    # each other: those left out would share a place with the one before them.
+    # Of more than ``most`` every so many-th is taken, in the order of the rows, in which neighbours
+    # follow each other: those left out would share a place with the one before them.
     share = counts.clip(min=most)[cloud]
     place = rank * most // share
     taken = (rank == 0) | ((rank - 1) * most // share < place)

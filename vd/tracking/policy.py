@@ -1,6 +1,7 @@
 """Policies by camera in files: a teacher, and how it is let act on what a camera shows.
 
-Tracking policies find the object by its known shape, vision policies by a network that was trained for it.
+Tracking policies find the object by its known shape, vision policies by a network that was trained
+for it.
 """
 
 from dataclasses import dataclass, field
@@ -27,16 +28,22 @@ class TrackingSpec(StoppingRules):
     teacher: str = ""
     """Name of that teacher."""
     camera: tuple[float, ...] | None = None
-    """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the hand's."""
+    """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the
+    hand's.
+    """
     depth: DepthCameraCfg = field(default_factory=DepthCameraCfg)
     """Points and crop of the camera's clouds."""
     alignment: AlignmentCfg | None = None
-    """Sizes of the network that finds the object by the cloud of its goal; None: it is found by its shape."""
+    """Sizes of the network that finds the object by the cloud of its goal; None: it is found by its
+    shape.
+    """
 
 
 @dataclass(frozen=True)
 class TrackingPolicy:
-    """A teacher that acts on a camera's view of an object; its layers have learned nothing for that.
+    """A teacher that acts on a camera's view of an object.
+
+    Its layers have learned nothing for that.
 
     Attributes:
         teacher: Its layers, critic, and task.

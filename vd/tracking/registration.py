@@ -1,8 +1,9 @@
 """Where the object is, from the points seen of it and its known shape, followed over time.
 
-What a network has to learn of each shape anew is computed: many rotations are tried at the first look, the
-best are improved, and a few that fit well are kept and followed, so that a turn of the object tells apart
-what one look does not. A few other rotations are tried in each step, in case none of those kept is right.
+What a network has to learn of each shape anew is computed: many rotations are tried at the first
+look, the best are improved, and a few that fit well are kept and followed, so that a turn of the
+object tells apart what one look does not. A few other rotations are tried in each step, in case
+none of those kept is right.
 
 N environments, P seen points at most, K kept poses. Base frame; metres, quaternions xyzw.
 """
@@ -35,12 +36,14 @@ GRID = 32
 BEYOND_M = 0.02
 """How far that grid reaches beyond the shape [m]."""
 ON_MESH_M = 1e-3
-"""A mesh is a shape's surface if the samples are no farther from it than this, root mean square: one that was
-simplified misses a few by more. That of a scan is its hull."""
+"""A mesh is a shape's surface if the samples are no farther from it than this, root mean square:
+one that was simplified misses a few by more. That of a scan is its hull."""
 FAR_M = 0.012
 """Length at which distances are cut off [m]: what is farther is no point of the object."""
 CELL_PX = 4.0
-"""Side of a cell of the image [pixel]: with 6000 points of an image few cells on a surface are empty."""
+"""Side of a cell of the image [pixel]: with 6000 points of an image few cells on a surface are
+empty.
+"""
 MARGIN_M = 0.002
 """Depth within which the shape may stand out [m]: half a cell, seen aslant."""
 ROTATIONS = 2048
@@ -64,8 +67,8 @@ APART_RAD = 0.3
 STAY = 0.8
 """Another pose must fit better by a fifth to be believed."""
 WORSE = 1.5
-"""A pose of which the misfit has grown by no more than this factor has not been left behind (ours, likewise;
-1.2 errs as little, 2 a little more)."""
+"""A pose of which the misfit has grown by no more than this factor has not been left behind (ours,
+likewise; 1.2 errs as little, 2 a little more)."""
 SHARE = 0.1
 """Share of the latest misfit in the average: some ten looks count."""
 
@@ -131,7 +134,10 @@ class Registration:
         shapes.samples = array(samples, wp.vec3)
         shapes.half = array(np.abs(samples).max(axis=(1, 2)) + BEYOND_M, float)
         shapes.distance = wp.empty((len(objects), GRID, GRID, GRID), dtype=float, device=device)
-        shapes.world_shape, shapes.world_scale = array(world_object, wp.int32), array(world_scale, float)
+        shapes.world_shape, shapes.world_scale = (
+            array(world_object, wp.int32),
+            array(world_scale, float),
+        )
         meshes = [
             wp.Mesh(
                 array(item.vertices, wp.vec3),
@@ -152,7 +158,10 @@ class Registration:
         )
         self._eye, cells = Eye(), (0, 0)
         if camera is not None:
-            self._eye.focal, self._eye.centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
+            self._eye.focal, self._eye.centre = (
+                wp.vec2(camera.fx, camera.fy),
+                wp.vec2(camera.cx, camera.cy),
+            )
             self._eye.pose = wp.transform(*camera.position.tolist(), *camera.quaternion.tolist())
             self._eye.cell, self._eye.margin = CELL_PX, MARGIN_M
             cells = (math.ceil(camera.height / CELL_PX), math.ceil(camera.width / CELL_PX))
@@ -198,8 +207,12 @@ class Registration:
             self._find(as_warp(self._worlds[first]), inputs)
         self.looks += seen_now
 
-    def tried(self, seen: Array, count: Array, *, steps: int, every: int) -> tuple[wp.array, wp.array]:
-        """All rotations that a first look tries, improved, where there is no camera; nothing is kept.
+    def tried(
+        self, seen: Array, count: Array, *, steps: int, every: int
+    ) -> tuple[wp.array, wp.array]:
+        """All rotations that a first look tries, improved, where there is no camera.
+
+        Nothing is kept.
 
         Args:
             seen: Points of the object from all sides [m], [N, P, 3].
@@ -210,7 +223,9 @@ class Registration:
         Returns:
             Poses [N, H] and their misfits [m^2], [N, H].
         """
-        return self._tried(as_warp(self._worlds), steps, every, [as_warp(seen, wp.vec3), as_warp(count)])
+        return self._tried(
+            as_warp(self._worlds), steps, every, [as_warp(seen, wp.vec3), as_warp(count)]
+        )
 
     def _tried(
         self, envs: wp.array, steps: int, every: int, inputs: list[wp.array]
@@ -233,13 +248,16 @@ class Registration:
         self._keep(0, envs, chosen, cost)
 
     def _follow(self, envs: wp.array, inputs: list[wp.array]) -> None:
-        """Go on from the kept poses, and try a few others; a row an environment, -1 where it is left out."""
+        """Go on from the kept poses, and try a few others.
+
+        A row an environment, -1 where it is left out.
+        """
         known, again, others = slice(KEPT), slice(KEPT, 2 * KEPT), slice(2 * KEPT, None)
         self._cost.zero_()
         wp.copy(self._found[:, known], self._kept[0])
         self._fit(self._found[:, known], self._cost[:, known], envs, STEPS, 1, inputs)
-        # What falls is 4 cm farther at the next look, and steps look FAR_M far: poses that do not fit as they
-        # did are put where points are now, turned as they were.
+        # What falls is 4 cm farther at the next look, and steps look FAR_M far: poses that do not
+        # fit as they did are put where points are now, turned as they were.
         xp = self._xp
         pose, cost = of_warp(self._found, xp), of_warp(self._cost, xp)
         cost[:, again][cost[:, known] <= WORSE * self.misfit] = float(NEVER)
@@ -261,7 +279,13 @@ class Registration:
         launch(place_poses_kernel, pose.shape, [*given, *inputs], [pose])
 
     def _fit(
-        self, pose: wp.array, cost: wp.array, envs: wp.array, steps: int, every: int, inputs: list[wp.array]
+        self,
+        pose: wp.array,
+        cost: wp.array,
+        envs: wp.array,
+        steps: int,
+        every: int,
+        inputs: list[wp.array],
     ) -> None:
         """Improve poses [M, C], and write their misfits."""
         sizes = [FAR_M, steps, every, EVERY_SAMPLE]

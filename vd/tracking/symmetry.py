@@ -1,8 +1,8 @@
 """The rotations that map a shape onto itself, as far as a depth camera could tell.
 
-Registration proposes them: the shape's own samples are looked for, from many rotations. The whole surface
-decides, and that they form a group. A shape's own file may declare them, as those of our solids do. Object
-frame; quaternions xyzw.
+Registration proposes them: the shape's own samples are looked for, from many rotations. The whole
+surface decides, and that they form a group. A shape's own file may declare them, as those of our
+solids do. Object frame; quaternions xyzw.
 """
 
 import hashlib
@@ -22,11 +22,16 @@ from vd.quaternions import product, rotation_distance
 from vd.tracking.registration import POINTS, Registration
 
 OFF_M, OFF_SHARE = 0.003, 0.01
-"""A turned shape looks the same if at most this share of its surface is farther than this from where the
-surface was [m]: a depth camera's points are off by 2 to 3 mm, and a hundredth is the edge of a lid. Of 159
-imported training meshes 72 have a symmetry then, with half of the distance 28, with twice 83."""
+"""A turned shape looks the same if at most this share of its surface is farther than this from
+where the
+surface was [m]: a depth camera's points are off by 2 to 3 mm, and a hundredth is the edge of a lid.
+Of 159 imported training meshes 72 have a symmetry then, with half of the distance 28, with twice
+83.
+"""
 DENSE = 2000
-"""Points of the surface that this is measured on: the share is then known to 0.4 % (two standard errors)."""
+"""Points of the surface that this is measured on: the share is then known to 0.4 % (two standard
+errors).
+"""
 STEPS, EVERY = 12, 2
 """Steps of each rotation that is tried, and every so many-th sample they look at."""
 APART_RAD = 0.12
@@ -42,7 +47,9 @@ MOST = 128
 
 
 _found: dict[bytes, np.ndarray] = {}
-"""Symmetries of the shapes that were asked for before: looking for those of one takes a processor 0.3 s."""
+"""Symmetries of the shapes that were asked for before: looking for those of one takes a processor
+0.3 s.
+"""
 
 
 def symmetries(objects: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
@@ -65,7 +72,9 @@ def with_symmetries(objects: Sequence[ObjectModel], device: str) -> list[ObjectM
     return [replace(item, symmetry=turns) for item, turns in zip(objects, found, strict=True)]
 
 
-def symmetries_of_worlds(objects: Sequence[ObjectModel], world_object: np.ndarray, device: str) -> np.ndarray:
+def symmetries_of_worlds(
+    objects: Sequence[ObjectModel], world_object: np.ndarray, device: str
+) -> np.ndarray:
     """Symmetries of the object of each environment [N, S, 4], the identity where there are fewer."""
     found = symmetries(objects, device)
     turns = np.zeros((len(found), max(map(len, found)), 4), dtype=np.float32)
@@ -76,7 +85,10 @@ def symmetries_of_worlds(objects: Sequence[ObjectModel], world_object: np.ndarra
 
 
 def nearest_goal(orientation: Array, goal: Array, turns: Array) -> Array:
-    """Of the orientations that look like the wanted one the nearest [N, 4]; arguments [N, 4], [N, S, 4]."""
+    """Of the orientations that look like the wanted one the nearest [N, 4].
+
+    Arguments [N, 4], [N, S, 4].
+    """
     goals = product(goal[:, None], turns)
     best = rotation_distance(orientation[:, None], goals).argmin(axis=1)
     return goals[library_of(goals).arange(len(goals), device=goals.device), best]
@@ -100,14 +112,18 @@ def _search(items: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
         library=library,
     )
     # Samples are in an order in which any leading part of them is evenly spread.
-    place, samples = wp.device_to_torch(device), np.stack([item.surface_points[:POINTS] for item in items])
+    place, samples = (
+        wp.device_to_torch(device),
+        np.stack([item.surface_points[:POINTS] for item in items]),
+    )
     seen = library.asarray(samples, dtype=library.float32, device=place)
     count = library.full((len(items),), seen.shape[1], dtype=library.int32, device=place)
     poses, misfits = itself.tried(seen, count, steps=STEPS, every=EVERY)
     found = []
     for item, turns, misfit in zip(items, poses.numpy()[..., 3:], misfits.numpy(), strict=True):
         surface = _Surface(item, device)
-        # Where no more than a hundredth is off by more, the mean square is less, but for a few outliers.
+        # Where no more than a hundredth is off by more, the mean square is less, but for a few
+        # outliers.
         likely = _apart(turns[misfit.argsort()[: int((misfit < OFF_M**2).sum())]])
         off = surface.share_off(likely)
         same = likely[np.argsort(off, kind="stable")][: int((off <= OFF_SHARE).sum())]
@@ -134,16 +150,18 @@ class _Surface:
         points = wp.array(turned, dtype=wp.vec3, device=self._device)
         mesh = wp.full(len(turns), self._mesh.id, dtype=wp.uint64, device=self._device)
         off = wp.empty(points.shape, dtype=float, device=self._device)
-        wp.launch(off_mesh_kernel, off.shape, inputs=[points, mesh], outputs=[off], device=self._device)
+        wp.launch(
+            off_mesh_kernel, off.shape, inputs=[points, mesh], outputs=[off], device=self._device
+        )
         return (off.numpy() > OFF_M).mean(axis=1)
 
 
 def _distinct(turns: np.ndarray) -> np.ndarray:
     """Symmetries among the rotations that fit, best first [R, 4]: the identity, then others [S, 4].
 
-    A small turn of any shape fits too, and so do turns that differ little from a symmetry. Of rotations that
-    neighbour each other only the best counts, unless those that neighbour the identity go around: then the
-    shape is one of revolution, and all count.
+    A small turn of any shape fits too, and so do turns that differ little from a symmetry. Of
+    rotations that neighbour each other only the best counts, unless those that neighbour the
+    identity go around: then the shape is one of revolution, and all count.
     """
     chosen = _apart(np.concatenate([np.array([[0.0, 0.0, 0.0, 1.0]], dtype=np.float32), turns]))
     angle = _angles(chosen[:, None], chosen[None])
@@ -163,10 +181,12 @@ def _apart(turns: np.ndarray) -> np.ndarray:
 
 
 def _closed(turns: np.ndarray, surface: _Surface) -> np.ndarray:
-    """A group of rotations [S, 4]: products that were missed are added, what has others is left out.
+    """A group of rotations [S, 4].
 
-    Symmetries form a group: where the product of two is none, one of them only nearly is. Those of a ball are
-    too many to be one; then all stay.
+    Products that were missed are added, what has others is left out.
+
+    Symmetries form a group: where the product of two is none, one of them only nearly is. Those of
+    a ball are too many to be one; then all stay.
     """
     growing = True
     while True:

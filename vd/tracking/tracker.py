@@ -24,14 +24,17 @@ class Decision:
     action: Array
     """Mean actions [N, D]."""
     angle: Array
-    """How far the object is expected to be from what looks like its goal [rad] [N]: it is stopped by this."""
+    """How far the object is expected to be from what looks like its goal [rad] [N]: it is stopped
+    by this.
+    """
 
 
 class Tracker:
     """Finds the objects of N hands, and lets the teacher act on them.
 
-    ``camera`` is posed in the base frame. By default there is one hand, with the first object in its size;
-    else ``world_object`` and ``world_scale`` [N] tell the objects of the hands, and size factors.
+    ``camera`` is posed in the base frame. By default there is one hand, with the first object in
+    its size; else ``world_object`` and ``world_scale`` [N] tell the objects of the hands, and size
+    factors.
 
     Attributes:
         observer: Finds and follows the objects.

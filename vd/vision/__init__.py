@@ -1,1 +1,4 @@
-"""Finding an object by the cloud of its goal: a network that turns one cloud onto another, and its search."""
+"""Finding an object by the cloud of its goal.
+
+A network that turns one cloud onto another, and its search.
+"""

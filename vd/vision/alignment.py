@@ -1,11 +1,13 @@
 """How a goal's cloud has to be turned to lie on what a camera sees of an object, learned.
 
-A transformer reads patches of both clouds together, and predicts by how much the goal is still to be turned.
-From far off that is ambiguous, from near it is not: so many starts are improved by several passes, and laid
-onto what is seen (:mod:`.icp`). What fits best is believed, and followed.
+A transformer reads patches of both clouds together, and predicts by how much the goal is still to
+be turned.
+From far off that is ambiguous, from near it is not: so many starts are improved by several passes,
+and laid onto what is seen (:mod:`.icp`). What fits best is believed, and followed.
 
-B clouds, P points of a cloud, T tokens, E the width; N objects, H hypotheses. Clouds are in metres, in axes
-that goal and object share (the world's); a rotation turns the goal onto the object: seen ~ R goal + offset.
+B clouds, P points of a cloud, T tokens, E the width; N objects, H hypotheses. Clouds are in metres,
+in axes that goal and object share (the world's); a rotation turns the goal onto the object: seen ~
+R goal + offset.
 """
 
 from collections.abc import Sequence
@@ -22,16 +24,18 @@ from vd.vision.rotations import cube_rotations, matrices
 PATCH_M = 0.03
 """Unit of places within a patch [m]: about its size."""
 WAVES = (1.5, 3.0, 6.0, 12.0)
-"""Frequencies at which a token knows its place [rad per CLOUD_M]: half a wave is from 17 to 2 cm."""
+"""Frequencies at which a token knows its place [rad per CLOUD_M]: half a wave is from 17 to 2
+cm.
+"""
 PAIRS_AT_ONCE = 4096
 """Pairs of clouds compared at a time: what the tokens of more take counts in gigabytes."""
 PASSES = 2
-"""Passes by which each start of a first look is improved. Of 208 made looks at validation meshes, goals half
-whole and half scans, 57 % are then within 0.4 rad, with one pass 51, with four 54."""
+"""Passes by which each start of a first look is improved. Of 208 made looks at validation meshes,
+goals half whole and half scans, 57 % are then within 0.4 rad, with one pass 51, with four 54."""
 STEPS = 4
-"""Steps of Gauss and Newton by which an improved hypothesis is laid onto what is seen. With none 5.4
-points fewer (2.6 to 8.8) of 1664 validation episodes stop at the goal, with 2 2.0 (0.7 to 3.3); 8 are no
-better."""
+"""Steps of Gauss and Newton by which an improved hypothesis is laid onto what is seen. With none
+5.4 points fewer (2.6 to 8.8) of 1664 validation episodes stop at the goal, with 2 2.0 (0.7 to 3.3);
+8 are no better."""
 GOAL, SEEN = 0, 1
 """Kinds of clouds, in the order in which they are given."""
 
@@ -58,7 +62,10 @@ class Patches(nn.Module):
 
     @torch.no_grad()
     def neighbours(self, cloud: torch.Tensor) -> torch.Tensor:
-        """Points of each patch of clouds [B, P, 3], indices [B, T, K]; they stay when a cloud is turned."""
+        """Points of each patch of clouds [B, P, 3], indices [B, T, K].
+
+        They stay when a cloud is turned.
+        """
         apart = torch.cdist(cloud[:, : self.cfg.tokens], cloud)
         return apart.topk(self.cfg.neighbours, largest=False, sorted=False).indices
 
@@ -80,7 +87,9 @@ class Layer(nn.Module):
         self.heads = heads
         self.norms = nn.ModuleList([nn.LayerNorm(width), nn.LayerNorm(width)])
         self.mix, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
-        self.inner = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+        self.inner = nn.Sequential(
+            nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
+        )
 
     def forward(self, tokens: torch.Tensor, first: int | None = None) -> torch.Tensor:
         """Tokens [B, T, E] that have read each other; the ``first`` ones alone, or all."""
@@ -136,7 +145,10 @@ class AlignmentNetwork(nn.Module):
     def forward(
         self, goal: torch.Tensor, seen: torch.Tensor, near: Sequence[torch.Tensor] | None = None
     ) -> Residual:
-        """What is predicted of clouds about their means [m] [B, P, 3]; their :meth:`neighbours` if known."""
+        """What is predicted of clouds about their means [m] [B, P, 3].
+
+        Their :meth:`neighbours` if known.
+        """
         near = near or [self.neighbours(cloud) for cloud in (goal, seen)]
         return self.compare(self.encode(goal, GOAL, near[0]), self.encode(seen, SEEN, near[1]))
 
@@ -154,9 +166,9 @@ class Alignment:
 class Aligner:
     """Finds the rotation from goals to objects, and follows it from look to look.
 
-    A first look begins from the 24 rotations of a cube: none is farther than 1.1 rad from one of them. They
-    are improved and laid onto what is seen; the one that fits best is believed. Every look, the first
-    too, improves it once more.
+    A first look begins from the 24 rotations of a cube: none is farther than 1.1 rad from one of
+    them. They are improved and laid onto what is seen; the one that fits best is believed. Every
+    look, the first too, improves it once more.
 
     Args:
         network: The trained network.
@@ -193,7 +205,9 @@ class Aligner:
         if bool(new.any()):
             self._found[rows[new]] = self._first(rows[new], tokens[new], seen[new])
             self._known[rows] = True
-        found, offset, _ = self._laid(rows, seen, *self._improve(rows, tokens, self._found[rows, None]))
+        found, offset, _ = self._laid(
+            rows, seen, *self._improve(rows, tokens, self._found[rows, None])
+        )
         self._found[rows] = found[:, 0]
         return Alignment(found[:, 0], mean + offset[:, 0])
 
@@ -214,7 +228,9 @@ class Aligner:
         for some in torch.arange(len(pair), device=rows.device).split(PAIRS_AT_ONCE):
             goal = rows[pair[some]]
             clouds = self._goal[goal], self._normals[goal], seen[pair[some]]
-            parts.append(refine(*clouds, rotations.flatten(0, 1)[some], offsets.flatten(0, 1)[some], STEPS))
+            parts.append(
+                refine(*clouds, rotations.flatten(0, 1)[some], offsets.flatten(0, 1)[some], STEPS)
+            )
         found, offset, misfit = (torch.cat(v).unflatten(0, shape) for v in zip(*parts, strict=True))
         return found, offset, misfit
 
@@ -231,5 +247,9 @@ class Aligner:
             tokens = self.network.encode(turned, GOAL, self._near[goal])
             parts.append(self.network.compare(tokens, seen[pair[some]]))
         better = torch.cat([part.rotation for part in parts]) @ flat
-        better = matrices(torch.cat([better[..., 0], better[..., 1]], dim=-1))  # still rotations after many
-        return better.unflatten(0, shape), torch.cat([part.offset for part in parts]).unflatten(0, shape)
+        better = matrices(
+            torch.cat([better[..., 0], better[..., 1]], dim=-1)
+        )  # still rotations after many
+        return better.unflatten(0, shape), torch.cat([part.offset for part in parts]).unflatten(
+            0, shape
+        )

@@ -29,4 +29,6 @@ class AlignmentCfg:
             if getattr(self, field_.name) < 1:
                 raise ValueError(f"--align.network.{field_.name} must be positive")
         if self.width % self.heads:
-            raise ValueError(f"--align.network.heads = {self.heads} must divide the width {self.width}")
+            raise ValueError(
+                f"--align.network.heads = {self.heads} must divide the width {self.width}"
+            )

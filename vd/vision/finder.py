@@ -16,8 +16,10 @@ from vd.vision.rotations import quaternions
 LEAST = 16
 """Of fewer points nothing is told: those that it learned from had twice as many."""
 CROWD, CROWD_M = 4, 0.0102
-"""So many others within this [m] has a point of a surface, two voxels: also one in a line of voxels. Others
-are a quarter of what a camera with errors sees; 3 % are left, and 7 % of the surface's go with them."""
+"""So many others within this [m] has a point of a surface, two voxels: also one in a line of
+voxels. Others are a quarter of what a camera with errors sees; 3 % are left, and 7 % of the
+surface's go with them.
+"""
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 """Multiples of the golden ratio, but for whole numbers, are spread evenly whatever their count."""
 
@@ -25,7 +27,8 @@ GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 class GoalFinder:
     """Finds and follows the object of each environment by a network of alignment.
 
-    The cloud is aligned in its own axes, so that a new goal of the same shape leaves what is known as it is.
+    The cloud is aligned in its own axes, so that a new goal of the same shape leaves what is known
+    as it is.
 
     Args:
         network: The network.
@@ -65,7 +68,9 @@ class GoalFinder:
         self.seen_now = torch.zeros(envs, dtype=torch.bool, device=device)
 
     def look(self, seen: torch.Tensor, count: torch.Tensor, *, fresh: torch.Tensor) -> None:
-        """Look once in every environment; where too little is seen of the object all stays as it is.
+        """Look once in every environment.
+
+        Where too little is seen of the object all stays as it is.
 
         Args:
             seen: Points seen of the object [m], neighbours beside each other [N, M, 3].
@@ -79,15 +84,22 @@ class GoalFinder:
         rows = self.seen_now.nonzero().flatten()  # waits for the device
         if not len(rows):
             return
-        chosen = torch.searchsorted(crowded[rows].cumsum(dim=1), (self.share * count[rows, None]).long() + 1)
+        chosen = torch.searchsorted(
+            crowded[rows].cumsum(dim=1), (self.share * count[rows, None]).long() + 1
+        )
         self.seen[rows] = points = seen[rows].take_along_dim(chosen[..., None], dim=1)
         found = self._aligner.look(points, rows)
         place = found.position - (found.rotation @ self._mean[rows, :, None]).squeeze(-1)
         self.pose[rows, 0] = torch.cat([place, quaternions(found.rotation)], dim=1)
         self.looks[rows] += 1
 
-    def _crowded(self, seen: torch.Tensor, count: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Which points have others beside them [N, M], and how many [N]: edges of depth fly about alone."""
+    def _crowded(
+        self, seen: torch.Tensor, count: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Which points have others beside them [N, M], and how many [N].
+
+        Edges of depth fly about alone.
+        """
         crowded = (torch.cdist(seen, seen) < CROWD_M).sum(dim=-1) > CROWD
         crowded &= torch.arange(seen.shape[1], device=seen.device) < count[:, None]
         return crowded.sum(dim=1), crowded.long()

@@ -1,4 +1,6 @@
-"""Iterated closest points to planes (Chen and Medioni 1992): clouds that lie nearly right are laid right.
+"""Iterated closest points to planes (Chen and Medioni 1992).
+
+Clouds that lie nearly right are laid right.
 
 B pairs of clouds, P points of a goal, S of what is seen. Metres.
 """
@@ -11,11 +13,11 @@ NEIGHBOURS = 12
 """Points of which a goal's normals are taken: of 500 they reach about 1.5 cm.
 On validation 8 do the same, on scans 24."""
 NEAREST = 0.9
-"""Share of seen points that pull, the nearest: others may be the hand's, or of a side that a goal lacks.
-On scans 0.8 does the same."""
+"""Share of seen points that pull, the nearest: others may be the hand's, or of a side that a goal
+lacks. On scans 0.8 does the same."""
 CLOUD_M = 0.08
-"""Unit of places in a cloud and of offsets [m], so that turns and shifts count alike: half the length of the
-largest objects."""
+"""Unit of places in a cloud and of offsets [m], so that turns and shifts count alike: half the
+length of the largest objects."""
 DAMPING = 1e-4
 """Of steps that no plane hinders: along a flat face nothing tells where it is."""
 STEP_RAD = 0.2
@@ -32,7 +34,10 @@ def normals(cloud: torch.Tensor) -> torch.Tensor:
 
 
 def nearest(apart: torch.Tensor) -> torch.Tensor:
-    """Indices [..] of the least of squared distances [.., P]; on a CPU NumPy takes an eighth of the time."""
+    """Indices [..] of the least of squared distances [.., P].
+
+    On a CPU NumPy takes an eighth of the time.
+    """
     if apart.device.type == "cpu":
         return torch.from_numpy(apart.numpy().argmin(axis=-1))
     return apart.argmin(dim=-1)

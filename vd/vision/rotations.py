@@ -20,7 +20,10 @@ def rotations_about(axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
 
 
 def two_columns(quaternion: torch.Tensor) -> torch.Tensor:
-    """First two columns of the matrices of quaternions xyzw [.., 4], one after the other: [.., 6]."""
+    """First two columns of the matrices of quaternions xyzw [.., 4], one after the other.
+
+    [.., 6].
+    """
     x, y, z, w = quaternion.unbind(-1)
     return torch.stack(
         (
@@ -39,7 +42,9 @@ def matrices(columns: torch.Tensor) -> torch.Tensor:
     """Rotation matrices [.., 3, 3] nearest to two columns [.., 6], by Gram and Schmidt."""
     first = nn.functional.normalize(columns[..., :3], dim=-1)
     second = columns[..., 3:]
-    second = nn.functional.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
+    second = nn.functional.normalize(
+        second - (first * second).sum(-1, keepdim=True) * first, dim=-1
+    )
     return torch.stack((first, second, torch.linalg.cross(first, second)), dim=-1)
 
 
@@ -48,7 +53,8 @@ def quaternions(matrix: torch.Tensor) -> torch.Tensor:
     m = matrix.flatten(-2)
     xx, xy, xz, yx, yy, yz, zx, zy, zz = m.unbind(-1)
     x, y, z, w = 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz
-    # Each row is the quaternion times four of its own numbers: the one of the largest loses no digits.
+    # Each row is the quaternion times four of its own numbers: the one of the largest loses no
+    # digits.
     rows = torch.stack(
         [
             torch.stack([x, xy + yx, xz + zx, zy - yz], dim=-1),
@@ -63,8 +69,13 @@ def quaternions(matrix: torch.Tensor) -> torch.Tensor:
 
 
 def turn_angle(matrix: torch.Tensor) -> torch.Tensor:
-    """Angles [..] in [0, pi] [rad] of rotation matrices [.., 3, 3]; exact for small ones, as acos is not."""
-    half = (matrix - torch.eye(3, device=matrix.device)).square().sum((-1, -2)).sqrt() / math.sqrt(8.0)
+    """Angles [..] in [0, pi] [rad] of rotation matrices [.., 3, 3].
+
+    Exact for small ones, as acos is not.
+    """
+    half = (matrix - torch.eye(3, device=matrix.device)).square().sum((-1, -2)).sqrt() / math.sqrt(
+        8.0
+    )
     return 2.0 * torch.asin(half.clamp(max=1.0))
 
 

@@ -23,7 +23,9 @@ class AlignmentSpec:
     hand: str
     """The hand that hid them."""
     camera: tuple[float, ...] | None = None
-    """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the hand's."""
+    """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the
+    hand's.
+    """
 
 
 def alignment_export(state: dict[str, Any]) -> dict[str, Any]:
@@ -45,7 +47,9 @@ def load_alignment(path: str | Path, device: str = "cpu") -> tuple[AlignmentNetw
         raise FileNotFoundError(f"no network at {path}; give an alignment.pt of vd-train student")
     state = read_state(path, device, remedy="copy it again, or give another file of its run")
     if state.get("format") != ALIGNMENT_FORMAT:
-        raise ValueError(f"{path} holds no network of alignment; give an alignment.pt of vd-train student")
+        raise ValueError(
+            f"{path} holds no network of alignment; give an alignment.pt of vd-train student"
+        )
     try:
         spec = from_dict(AlignmentSpec, state["spec"], where="spec")
         return alignment_network(spec.network, state["alignment_state_dict"], device), spec
@@ -57,5 +61,7 @@ def alignment_network(cfg: AlignmentCfg, weights: dict[str, Any], device: str) -
     """A network of alignment with weights, in evaluation mode and without gradients."""
     network = AlignmentNetwork(cfg).to(device)
     # Files of before have a head that predicted errors.
-    network.load_state_dict({name: v for name, v in weights.items() if not name.startswith("heads.error")})
+    network.load_state_dict(
+        {name: v for name, v in weights.items() if not name.startswith("heads.error")}
+    )
     return network.eval().requires_grad_(False)
