@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -91,8 +91,8 @@ class Objects:
     """Number of objects."""
     seed: int = 0
     """Seed of the set; equal seeds give equal objects."""
-    held_out: bool = False
-    """Take the held-out families, which share no kind with the training families."""
+    families: Literal["training", "heldout", "slender"] = "training"
+    """slender: long, flat and hollow things, for training too; heldout: kinds that training lacks."""
     out: Path | None = None
     """Folder to write to; by default the named set in the asset cache (such as
     procedural-150-seed0).
@@ -104,10 +104,11 @@ class Objects:
 
         if self.procedural < 1 or self.seed < 0:
             raise ValueError("--procedural must be at least 1 and --seed at least 0")
-        name = f"procedural-{'heldout-' if self.held_out else ''}{self.procedural}-seed{self.seed}"
+        kinds = "" if self.families == "training" else f"{self.families}-"
+        name = f"procedural-{kinds}{self.procedural}-seed{self.seed}"
         folder = self.out or sets.built_in_folder(name)
         models = procedural.procedural_set(
-            self.procedural, self.seed, held_out=self.held_out, progress=_bar("authoring")
+            self.procedural, self.seed, families=self.families, progress=_bar("authoring")
         )
         size = sum(path.stat().st_size for path in sets.write_set(folder, models))
         print(f"{len(models)} objects, {size / 1e6:.1f} MB in {folder}")

@@ -20,7 +20,12 @@ def training() -> list[ObjectModel]:
 
 @pytest.fixture(scope="module")
 def held_out() -> list[ObjectModel]:
-    return procedural.procedural_set(8, 0, held_out=True)
+    return procedural.procedural_set(8, 0, families="heldout")
+
+
+@pytest.fixture(scope="module")
+def slender() -> list[ObjectModel]:
+    return procedural.procedural_set(12, 0, families="slender")
 
 
 def test_only_what_has_no_rotational_symmetry_is_for_training(training: list[ObjectModel]):
@@ -65,8 +70,21 @@ def test_equal_seeds_are_equal_and_others_differ(training: list[ObjectModel]):
         assert a.inertia.tolist() != c.inertia.tolist()
 
 
-def test_every_object_is_valid(training: list[ObjectModel], held_out: list[ObjectModel]):
-    for model in training + held_out:
+def test_slender_objects_are_longer_and_flatter(
+    training: list[ObjectModel], slender: list[ObjectModel]
+):
+    def aspects(models: list[ObjectModel]) -> np.ndarray:
+        sides = [np.ptp(model.vertices, axis=0) for model in models]
+        return np.array([side.max() / side.min() for side in sides])
+
+    assert np.median(aspects(slender)) > 1.3 * np.median(aspects(training))
+    assert aspects(slender).max() > 5.0
+
+
+def test_every_object_is_valid(
+    training: list[ObjectModel], held_out: list[ObjectModel], slender: list[ObjectModel]
+):
+    for model in training + held_out + slender:
         assert 1 < len(model.hulls) <= procedural.MAX_PARTS, model.name
         assert LONGEST_SIDE_M[0] - 1e-6 <= model.longest_side <= LONGEST_SIDE_M[1] + 1e-6, (
             model.name
@@ -74,7 +92,8 @@ def test_every_object_is_valid(training: list[ObjectModel], held_out: list[Objec
         # It fits the hand, neither wedged between the fingers nor too flat to get hold of.
         everything = np.concatenate([hull.vertices for hull in model.hulls])
         assert mean_width(everything) <= MEAN_WIDTH_M + 1e-6, model.name
-        assert np.ptp(everything, axis=0).min() >= THINNEST_M - 1e-6, model.name
+        least = procedural.SLENDEREST_M if model in slender else THINNEST_M
+        assert np.ptp(everything, axis=0).min() >= least - 1e-6, model.name
         assert procedural.is_connected(model.hulls), model.name
         for hull in model.hulls:
             assert len(hull.vertices) <= 32

@@ -378,6 +378,96 @@ def branch(u: Draw) -> Iterator[Hull]:
         yield ellipsoid(end, u(0.25, 0.5, 3))
 
 
+def handled_tool(u: Draw) -> Iterator[Hull]:
+    """A handle with a collar and a head of any form at an angle: spoon, brush, key, ladle, mallet."""
+    length, thick, flat = u(2.4, 4.5), u(0.16, 0.32), u(0.4, 1.0)
+    head = vec(length, 0.0, 0.0)
+    lean, size = u(-0.9, 0.9), u(0.35, 0.9, 3) * (1.0, 1.0, flat)
+    aside = u(-0.3, 0.3)
+    yield rod((0, 0, 0), head, thick, thick * u(0.6, 1.0))
+    yield cylinder((0.3 * length, 0, 0), (u(0.45, 0.6) * length, 0, 0), thick * u(1.0, 1.4))
+    place = head + vec(0.6 * size[0], aside, 0.0)
+    form = int(u.integers(3))
+    if form == 0:
+        yield ellipsoid(place, size, euler=(0, lean, aside))
+    elif form == 1:
+        yield box(place, 1.6 * size, euler=(0, lean, aside), top=(u(0.6, 1.0), 1.0))
+    else:
+        across = vec(0.0, size[1] + 0.3, u(-0.4, 0.4))
+        yield cylinder(place - across, place + u(0.4, 1.0) * across, 0.7 * size[0])
+    yield box((0.0, 0, 0), (0.5, u(2.2, 3.0) * thick, u(1.6, 2.4) * thick))
+
+
+def bent_bar(u: Draw) -> Iterator[Hull]:
+    """A bar of two or three straight pieces, with a knob near one end: lever, crank, bracket."""
+    thick, depth, bend = u(0.3, 0.55), u(0.3, 0.6), u(-1.1, 1.1)
+    length, rest = u(1.8, 3.2), u(0.5, 1.6)
+    end = vec(length + rest * np.cos(bend), rest * np.sin(bend))
+    yield beam((0, 0), (length, 0), thick, depth)
+    yield beam((length, 0), end, thick * u(0.7, 1.0), depth)
+    if u() < 0.5:
+        turn = bend + u(0.6, 1.4) * u.choice([-1.0, 1.0])
+        yield beam(end, end + u(0.4, 0.9) * vec(np.cos(turn), np.sin(turn)), thick, depth)
+    knob = vec(u(0.1, 0.4) * length, 0.0, u(0.2, 0.6) * thick)
+    yield ellipsoid(knob, u(0.3, 0.5, 3))
+
+
+def plate(u: Draw) -> Iterator[Hull]:
+    """A flat body with a lobe, a boss and a rim: phone, tray, cover, pan without a handle."""
+    angle = np.sort(u(0.0, 2.0 * np.pi, 7)) + 0.2 * np.arange(7)
+    angle *= 2.0 * np.pi / (angle[-1] + 0.4)
+    outline = np.stack([u(1.0, 1.4) * np.cos(angle), u(0.7, 1.2) * np.sin(angle)], axis=1)
+    thick = u(0.2, 0.4)
+    yield prism(outline, 0.0, thick, axis="z")
+    yield prism(0.5 * outline + vec(u(0.6, 1.0), u(-0.5, 0.5)), 0.0, thick, axis="z")
+    boss = vec(u(-0.5, 0.2), u(-0.4, 0.4), 0.5 * thick)
+    yield cylinder(boss, boss + vec(0, 0, u(0.3, 0.7)), u(0.25, 0.45), sides=10)
+    yield beam((-0.9, 0.5 * thick), (0.4, thick * u(0.5, 1.2)), thick, u(0.2, 0.5))
+
+
+def open_ring(u: Draw) -> Iterator[Hull]:
+    """Six pieces around a flattened ring, one of them heavy, and a stub: ring, clamp, frame, watch."""
+    wide, high, thick, depth = u(0.9, 1.3), u(0.5, 1.1), u(0.22, 0.36), u(0.3, 0.7)
+    count = 6 if u() < 0.7 else 5
+    corners = 2.0 * np.pi * np.arange(7) / 6 + u(0.0, 1.0)
+    points = np.stack([wide * np.cos(corners), high * np.sin(corners)], axis=1)
+    for start, end in pairwise(points[: count + 1]):
+        yield beam(start, end, thick, depth)
+    heavy = np.insert(points[1], 1, u(-0.1, 0.1))
+    yield box(
+        heavy, (u(0.5, 0.9), u(0.6, 1.0) * (depth + 0.2), u(0.4, 0.8)), euler=(0, u(-1, 1), 0)
+    )
+    if count == 5:
+        yield beam(points[0], 1.5 * points[0], thick, depth)
+
+
+def hook(u: Draw) -> Iterator[Hull]:
+    """A straight shank and an arc of four pieces, with a foot: hook, cane, tap, handle."""
+    shank, radius, thick = u(1.2, 2.6), u(0.5, 0.9), u(0.18, 0.3)
+    angles = np.linspace(np.pi, np.pi - u(2.0, 4.0), 5)
+    arc = np.stack([radius * (1.0 + np.cos(angles)), shank + radius * np.sin(angles)], axis=1)
+    arc = np.insert(arc, 1, u(-0.3, 0.3) * np.linspace(0.0, 1.0, 5) ** 2, axis=1)
+    yield rod((0, 0, 0), arc[0], thick * u(0.9, 1.3), thick)
+    for start, end in pairwise(arc):
+        yield rod(start, end, thick)
+    yield box((0.1, u(-0.2, 0.2), 0), (u(0.5, 1.0), u(0.4, 0.9), u(0.2, 0.5)))
+
+
+def shell(u: Draw) -> Iterator[Hull]:
+    """A trough of four wall pieces with one end closed and a tab: scoop, half a shell, soap dish."""
+    radius, length, wall, span = u(0.7, 1.1), u(1.4, 2.6), u(0.14, 0.22), u(2.2, 3.6)
+    angles = -0.5 * np.pi + np.linspace(-0.5, 0.5, 5) * span
+    for start, end in pairwise(angles):
+        outline = [
+            (r * np.cos(t), r * np.sin(t)) for r in (radius, radius - wall) for t in (start, end)
+        ]
+        yield prism(outline, 0.0, length)
+    closed = [(0.97 * radius * np.cos(t), 0.97 * radius * np.sin(t)) for t in angles]
+    yield prism(closed, 0.0, wall * u(1.0, 1.6))
+    tab = vec(radius * np.cos(angles[0]), u(0.2, 0.8) * length, radius * np.sin(angles[0]))
+    yield box(tab, (u(0.4, 0.8), u(0.4, 0.9), 1.2 * wall))
+
+
 def mug(u: Draw) -> Iterator[Hull]:
     """A bottom, five walls, a handle of two rods: open, so truly concave."""
     radius, height, wall = u(0.8, 1.0), u(1.5, 2.2), u(0.14, 0.2)
@@ -467,3 +557,11 @@ HELD_OUT: dict[str, tuple[Kind, ...]] = {
     "cameras": (camera,),
 }
 """Kinds by held-out family, none of which resembles a training kind."""
+
+SLENDER: dict[str, tuple[Kind, ...]] = {
+    "slender": (handled_tool, bent_bar, plate, open_ring, hook, shell),
+}
+"""Long, flat and hollow kinds, for training beside ``TRAINING``."""
+
+FAMILIES = {"training": TRAINING, "heldout": HELD_OUT, "slender": SLENDER}
+"""Kinds by family, by what a set of them is called. Their order is part of every object's seed."""

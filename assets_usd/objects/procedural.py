@@ -17,8 +17,8 @@ from vd.assets_usd.objects.geometry import (
     union_depth,
     voxelise_hulls,
 )
-from vd.assets_usd.objects.kinds import HELD_OUT, TRAINING, Kind
-from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, mean_width, scales_that_fit
+from vd.assets_usd.objects.kinds import FAMILIES, Kind
+from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, THINNEST_M, mean_width, scales_that_fit
 from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectModel, build_model
 from vd.assets_usd.objects.primitives import Draw, box
 
@@ -38,6 +38,12 @@ CUBOID_SIDES_M = (0.05, 0.07, 0.10)
 """Sides of the cuboid, all different: its group is the four rotations of a brick."""
 
 MAX_PARTS = 8
+
+SLENDEREST_M = 0.015
+"""Least shortest side of a slender object, which may have less than ``THINNEST_M`` where it would
+be longer than ``LONGEST_SIDE_M`` at that size. What is flatter is out of reach where it lies:
+straight fingers of dclaw4 end 9 mm above the table under their roots, 17 mm above it in the middle.
+"""
 
 MIN_ASYMMETRY = 0.012
 """Least asymmetry (see :func:`asymmetry`) of a training object: 1.5 mm of mean surface distance at
@@ -145,7 +151,9 @@ def model_of_parts(
     )
 
 
-def draw_object(name: str, make: Kind, seed: Sequence[int], **fields: Any) -> ObjectModel:
+def draw_object(
+    name: str, make: Kind, seed: Sequence[int], thinnest: float = THINNEST_M, **fields: Any
+) -> ObjectModel:
     """One object of a kind: the first draw that is one piece, fits the hand and has no rotational symmetry.
 
     Its longest side is uniform in ``LONGEST_SIDE_M``, as far as the object fits the hand at that
@@ -155,6 +163,7 @@ def draw_object(name: str, make: Kind, seed: Sequence[int], **fields: Any) -> Ob
         name: Object name.
         make: Kind.
         seed: Entropy; equal entropy gives an equal object.
+        thinnest: Least shortest side where ``THINNEST_M`` does not fit [m].
         **fields: Further fields of :class:`ObjectModel`.
 
     Raises:
@@ -172,9 +181,12 @@ def draw_object(name: str, make: Kind, seed: Sequence[int], **fields: Any) -> Ob
         vertices = np.concatenate([hull.vertices for hull in hulls])
         sides = np.ptp(vertices, axis=0)
         smallest, largest = np.multiply(scales_that_fit(sides, mean_width(vertices)), sides.max())
-        if smallest > largest:
+        too_wide = largest < LONGEST_SIDE_M[0]
+        too_thin = largest * sides.min() / sides.max() < thinnest
+        if too_wide or too_thin:
             continue
-        model = model_of_parts(name, hulls, float(np.clip(longest, smallest, largest)), **fields)
+        longest = float(min(max(longest, smallest), largest))
+        model = model_of_parts(name, hulls, longest, **fields)
         if asymmetry(model) >= MIN_ASYMMETRY:
             return model
     raise RuntimeError(f"{name}: no valid object in {ATTEMPTS} draws")
@@ -184,18 +196,19 @@ def procedural_set(
     count: int,
     seed: int,
     *,
-    held_out: bool = False,
+    families: str = "training",
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[ObjectModel]:
     """Objects in turn from every family, deterministic from the seed.
 
     Args:
         count: Number of objects.
-        seed: Seed of the set. Object i depends on the seed and i alone.
-        held_out: Take the held-out families in place of the training ones.
+        seed: Seed of the set. Object i depends on the families, the seed and i alone.
+        families: ``training``, ``heldout``, or ``slender`` (``FAMILIES``).
         progress: Called with each name, the number done and the number of all.
     """
-    order = list((HELD_OUT if held_out else TRAINING).items())
+    order = list(FAMILIES[families].items())
+    word = list(FAMILIES).index(families)
     models = []
     for i in range(count):
         family, kinds = order[i % len(order)]
@@ -206,11 +219,12 @@ def procedural_set(
             draw_object(
                 name,
                 make,
-                (SHAPE_ENTROPY, int(held_out), seed, i),
+                (SHAPE_ENTROPY, word, seed, i),
+                thinnest=SLENDEREST_M if families == "slender" else THINNEST_M,
                 family=family,
-                split="test" if held_out else "train",
+                split="test" if families == "heldout" else "train",
                 source=f"procedural {family}/{kind}, seed {seed}, index {i}",
-                content_hash=f"procedural-{PROCEDURAL_VERSION}-{int(held_out)}-{seed}-{i}",
+                content_hash=f"procedural-{PROCEDURAL_VERSION}-{word}-{seed}-{i}",
             )
         )
         if progress:

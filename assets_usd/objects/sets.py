@@ -20,10 +20,10 @@ HELD_OUT_COUNT = 30
 """Objects of ``procedural-heldout``: a dozen worlds each in an evaluation of a few hundred."""
 
 BUILT_IN = ("cube", "cuboid", "symmetric", "procedural-150-seed0", "procedural-heldout")
-"""Sets named in help texts; ``procedural-<count>-seed<seed>`` and
-``procedural-heldout-<count>-seed<seed>`` take any numbers."""
+"""Sets named in help texts; ``procedural-<count>-seed<seed>``, ``procedural-slender-<count>-seed<seed>``
+and ``procedural-heldout-<count>-seed<seed>`` take any numbers."""
 
-_PROCEDURAL = re.compile(r"procedural-(heldout-)?([1-9]\d*)-seed(\d+)")
+_PROCEDURAL = re.compile(r"procedural-(?:(heldout|slender)-)?([1-9]\d*)-seed(\d+)")
 
 
 def objects_dir() -> Path:
@@ -53,8 +53,8 @@ def _built_in_models(name: str) -> list[ObjectModel]:
         return [make() for make in (cube, cuboid) if name in (make.__name__, "symmetric")]
     match = _PROCEDURAL.fullmatch(name)
     if match is None:
-        return procedural_set(HELD_OUT_COUNT, 0, held_out=True)
-    return procedural_set(int(match[2]), int(match[3]), held_out=match[1] is not None)
+        return procedural_set(HELD_OUT_COUNT, 0, families="heldout")
+    return procedural_set(int(match[2]), int(match[3]), families=match[1] or "training")
 
 
 def write_set(folder: Path, models: list[ObjectModel]) -> list[Path]:
