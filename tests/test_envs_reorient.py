@@ -231,6 +231,22 @@ def test_a_state_that_is_not_finite_stops_the_run():
         run(env, 3)
 
 
+@pytest.mark.parametrize("tolerant", [0.0, 1e6])
+def test_a_policy_that_gives_no_number_ends_the_run(tolerant):
+    """Also where steps may fail: it is the policy that does, and its episodes are worth nothing."""
+    env = make(failures_per_million=tolerant)
+    run(env, 2)
+    before = env.sim.joint_q.numpy()[2, : env.num_joints].copy()
+    env.action.numpy()[2, 0] = np.nan
+    with pytest.raises(ValueError, match=r"1 actions were not finite \(first: environment 2\)"):
+        for _ in range(2):
+            env.step(env.action)
+    moved = np.abs(env.sim.joint_q.numpy()[2, : env.num_joints] - before).max()
+    assert moved < 0.1, "it drove to a limit"
+    env.action.zero_()
+    run(env, 2)  # it was told
+
+
 @pytest.mark.parametrize(
     "effects", [{}, {"command_delay.delay_s": (0.0, 0.04)}], ids=["drives", "servos"]
 )

@@ -14,8 +14,8 @@ import warp as wp
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.envs.terms import CHECKED
 from vd.interrupt import remedy
+from vd.sim.simulator import CHECKED
 
 try:
     import gymnasium

@@ -27,6 +27,7 @@ class ActionFilter:
             wp.zeros((1, count), dtype=float, device="cpu") for _ in range(5)
         )
         self._rng = wp.zeros(1, dtype=wp.uint32, device="cpu")
+        self._refused = wp.zeros(1, dtype=wp.int32, device="cpu")
 
     @property
     def smoothed(self) -> np.ndarray:
@@ -48,8 +49,8 @@ class ActionFilter:
         wp.launch(
             apply_action_kernel,
             dim=1,
-            inputs=[*self._model, self._action, self._offset, self._q, self._smoothed, self._rng],
-            outputs=[self._target],
+            inputs=[*self._model, self._action, self._offset, self._q],
+            outputs=[self._smoothed, self._rng, self._refused, self._target],
             device="cpu",
         )
         return self._target.numpy()[0].astype(float)

@@ -34,6 +34,7 @@ def apply_action_kernel(
     # In/Out:
     smoothed: wp.array2d[float],  # [N, D] moving average of the applied action
     rng: wp.array[wp.uint32],  # [N] random stream of each world
+    refused: wp.array[wp.int32],  # [N] actions so far that were not finite
     # Out:
     joint_target_out: wp.array2d[float],  # [N, *] position targets [rad], D columns are written
 ):
@@ -41,19 +42,31 @@ def apply_action_kernel(
 
     a = clip(action + N(0, noise_std) + offset, -1, 1); smoothed = alpha a + (1 - alpha) smoothed;
     target = clamp(q + smoothed step_rad, lower, upper), relative to the joint's present position.
+    An action that is not finite is refused as a whole, for a clip would make a number of it: the
+    target is where the joint is, and the average stays.
     """
     world = wp.tid()
     settings = params[0]
     state = rng[world]
+    finite = wp.bool(True)
+    for joint in range(joint_lower.shape[0]):
+        if not wp.isfinite(action_in[world, joint]):
+            finite = False
+    if not finite:
+        refused[world] = refused[world] + 1
     for joint in range(joint_lower.shape[0]):
         action = action_in[world, joint] + action_offset_in[world, joint]
         if settings.noise_std > 0.0:
             action += settings.noise_std * wp.randn(state)
         action = wp.clamp(action, -1.0, 1.0)
         average = settings.alpha * action + (1.0 - settings.alpha) * smoothed[world, joint]
-        smoothed[world, joint] = average
+        step = average * settings.step_rad
+        if finite:
+            smoothed[world, joint] = average
+        else:
+            step = 0.0
         joint_target_out[world, joint] = wp.clamp(
-            joint_q_in[world, joint] + average * settings.step_rad,
+            joint_q_in[world, joint] + step,
             joint_lower[joint],
             joint_upper[joint],
         )

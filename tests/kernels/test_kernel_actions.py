@@ -21,14 +21,15 @@ STEP_RAD = PAPER.action.scale_rad_s / PAPER.scene.control_hz
 def apply_action(
     device, action, offset, q, smoothed, lower, upper, *, noise_std=0.0, seed=0, alpha=0.8
 ):
-    """One launch; returns the smoothed action and the targets (with the EXTRA columns) and the streams."""
+    """One launch: smoothed action, targets (with the EXTRA columns), streams, refused actions."""
     worlds = len(action)
     average, rng = device_array(smoothed, float, device), streams(worlds, seed, device)
+    refused = device_array(np.zeros(worlds), int, device)
     params = {"alpha": alpha, "step_rad": STEP_RAD, "noise_std": noise_std}
     wide = np.pad(q, ((0, 0), (0, EXTRA)), constant_values=np.nan)
-    inputs = [lower, upper, params, action, offset, wide, average, rng]
+    inputs = [lower, upper, params, action, offset, wide, average, rng, refused]
     (target,) = launch(apply_action_kernel, worlds, inputs, device, wide.shape)
-    return average.numpy(), target, rng.numpy()
+    return average.numpy(), target, rng.numpy(), refused.numpy()
 
 
 @EXAMPLES
@@ -43,7 +44,7 @@ def test_targets_match_the_paper(device, data, fingers, worlds, alpha):
     action, offset = data.draw(floats(shape)), data.draw(floats(shape, -0.1, 0.1))
     q, smoothed = data.draw(floats(shape)), data.draw(floats(shape, -1.0, 1.0))
     lower, upper = data.draw(floats(shape[1:], -2.0, -0.4)), data.draw(floats(shape[1:], 0.4, 2.0))
-    average, target, _ = apply_action(
+    average, target, _, refused = apply_action(
         device, action, offset, q, smoothed, lower, upper, alpha=alpha
     )
     expected = alpha * np.clip(action + offset, -1, 1) + (1 - alpha) * smoothed
@@ -52,6 +53,7 @@ def test_targets_match_the_paper(device, data, fingers, worlds, alpha):
     np.testing.assert_allclose(
         target[:, :joints], np.clip(q + expected * STEP_RAD, lower, upper), atol=1e-6
     )
+    assert not refused.any()
     assert np.isnan(target[:, joints:]).all(), "the object's columns are not the kernel's to write"
 
 
@@ -59,7 +61,7 @@ def test_action_noise_has_the_moments_of_table_s3(device):
     std = PAPER.randomisation.action_noise_std
     zero = np.zeros((20_000, 9))
     limits = np.full(9, 2.0)
-    noise, _, rng = apply_action(
+    noise, _, rng, _ = apply_action(
         device, zero, zero, zero, zero, -limits, limits, noise_std=std, seed=3, alpha=1.0
     )
     assert noise.mean() == pytest.approx(0.0, abs=5 * std / np.sqrt(noise.size))
@@ -75,6 +77,21 @@ def test_action_noise_has_the_moments_of_table_s3(device):
     )
     np.testing.assert_array_equal(noise, again[0])
     assert not np.any(rng == streams(len(zero), 3, device).numpy()), "the streams did not advance"
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_action_that_is_not_finite_is_refused_whole(device, value):
+    """A clip would make a limit of it; the other worlds go on."""
+    action, q, smoothed = np.full((3, 9), 0.5), np.full((3, 9), 0.1), np.full((3, 9), 0.2)
+    action[1, 4] = value
+    limits = np.full(9, 2.0)
+    average, target, _, refused = apply_action(
+        device, action, np.zeros((3, 9)), q, smoothed, -limits, limits, noise_std=0.1
+    )
+    assert refused.tolist() == [0, 1, 0]
+    np.testing.assert_allclose(target[1, :9], 0.1, atol=1e-6)
+    np.testing.assert_allclose(average[1], 0.2, atol=1e-6)
+    assert (target[[0, 2], :9] > 0.1).all() and (average[[0, 2]] != 0.2).all()
 
 
 @EXAMPLES

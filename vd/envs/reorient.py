@@ -29,6 +29,7 @@ from vd.kernels.task.resets import episode_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.task.success import success_kernel
 from vd.sim.graphs import Graphs
+from vd.sim.simulator import CHECKED
 
 FAILURES_AT_FIRST = 10.0
 """Steps of environments that may fail beside those that ``failures_per_million`` allows (ours): one
@@ -191,6 +192,8 @@ class ReorientEnv:
         self._reset_q = wp.array(self.hand.start, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, self.hand.start)
         self._actuated = ActuatedActions(self.state)
+        self.refused = zeros(n, dtype=wp.int32)
+        """Actions that were not finite since that was told, shape [N]."""
 
     # Stepping
 
@@ -294,6 +297,8 @@ class ReorientEnv:
             )
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
+        if self.device == "cpu" or self.steps % CHECKED == 0:
+            self._check_actions()
         self.steps += 1
         self._own_steps += 1
 
@@ -334,6 +339,7 @@ class ReorientEnv:
                 self.measured_q,
                 self.smoothed,
                 self.state.rng,
+                self.refused,
             ],
             [sim.target],
         )
@@ -489,8 +495,25 @@ class ReorientEnv:
         """Present object poses, position [m] and quaternion xyzw, shape [N, 7] (host copy)."""
         return self.sim.joint_q.numpy()[:, self.num_joints : self.num_joints + 7].copy()
 
+    def _check_actions(self) -> None:
+        """Raise ValueError if an action was refused."""
+        refused = self.refused.numpy().copy()
+        if refused.any():
+            self.refused.zero_()
+            first = int(np.flatnonzero(refused)[0])
+            raise ValueError(
+                f"{int(refused.sum())} actions were not finite (first: environment {first}), and "
+                "were not taken; mend the policy"
+            )
+
     def check(self) -> None:
-        """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or too many steps failed."""
+        """Raise what went wrong since the environment was made.
+
+        Raises:
+            ValueError: An action was not finite.
+            vd.sim.simulator.SimulationError: Contacts were lost, or too many steps failed.
+        """
+        self._check_actions()
         if self._terms is not None:
             self._terms.check()
         rate = self.cfg.failures_per_million

@@ -18,9 +18,7 @@ import warp as wp
 
 from vd.envs.cfg import ReorientCfg
 from vd.kernels.task.rewards import REWARD_TERMS
-
-CHECKED = 128
-"""Steps on a GPU between two looks at whether values were finite, for which it is waited."""
+from vd.sim.simulator import CHECKED
 
 
 class OwnTerms:

@@ -27,6 +27,9 @@ MAX_SPEED = 500.0
 # before.
 AWAY_M = -10.0
 
+CHECKED = 128
+"""Steps on a GPU between two looks at whether values were finite, for which it is waited."""
+
 # MuJoCo Warp's overflow bits that mean lost contacts or constraint rows, by the setting to change.
 # Its other bits count solver and line-search iterations, which are stopping rules, not losses.
 OVERFLOW_REMEDY = {
