@@ -9,7 +9,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import Protocol
 
 
@@ -63,10 +63,16 @@ class MonotonicClock:
         return stop
 
     def beside(self, do: Callable[[], object]) -> Callable[[], bool]:
-        """Do something in a thread."""
-        pool = ThreadPoolExecutor(1, "beside")
-        future = pool.submit(do)
-        pool.shutdown(wait=False)
+        """Do something in a thread, which does not keep the program from its end."""
+        future: Future[object] = Future()
+
+        def work() -> None:
+            try:
+                future.set_result(do())
+            except BaseException as error:
+                future.set_exception(error)
+
+        threading.Thread(target=work, name="beside", daemon=True).start()
 
         def ended() -> bool:
             if not future.done():

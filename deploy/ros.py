@@ -32,6 +32,7 @@ from vd.deploy.hardware.answers import HandState, SilentError
 from vd.deploy.hardware.connect import Connection, HandOptions
 from vd.deploy.hardware.joints import Joints
 from vd.deploy.loop.goals import GoalError, make_goals
+from vd.deploy.safety.limits import out_of_range
 from vd.paper import PAPER
 
 NODE = "visual_dexterity"
@@ -44,8 +45,6 @@ LOOK_S = 2.0
 """How long messages are counted before the hand moves."""
 FEWEST = 2.0
 """States for each control step, at least."""
-OUTSIDE_RAD = 0.1
-"""How far out of its range a joint may be and still be brought back."""
 
 
 class _Joints(Joints):
@@ -150,9 +149,7 @@ class RosHand:
         remedy = f"nobody listens on {self._node.resolve_topic_name(COMMANDS)}: start a controller, or remap"
         yield finding("commands", [] if listen else [remedy], f"{listen} listen")
         assert self._state is not None
-        q = self._state.position
-        out = np.maximum(self.hand.lower - q, q - self.hand.upper) > OUTSIDE_RAD
-        bad = [f"{self.hand.joint_names[axis]}: {q[axis]:.2f} rad" for axis in np.flatnonzero(out)]
+        bad = out_of_range(self.hand, self._state.position)
         yield finding("pose within limits", bad, "every joint")
 
     def read_state(self, *, retries: int | None = None) -> HandState:
@@ -178,6 +175,9 @@ class RosHand:
         """Have joints stay where they were last."""
         if self._state is not None:
             self.write_goals(self._state.position)
+
+    def stiffen(self, share: float) -> None:
+        """The driver's."""
 
     def torque(self, on: bool, ids: Sequence[int] | None = None) -> dict[int, str]:
         """The driver's: nothing fails here."""

@@ -43,6 +43,16 @@ class SimulatedClock:
     def beside(self, do: Callable[[], object]) -> Callable[[], bool]:
         """Do it at once, but in a time of its own: it has ended once as much has passed here."""
         begun, others, self._beside = self._now, self._beside, []
-        do()
+        failed: list[Exception] = []
+        try:
+            do()
+        except Exception as error:
+            failed.append(error)
         ended, self._now, self._beside = self._now, begun, others
-        return lambda: self._now >= ended
+
+        def over() -> bool:
+            if self._now >= ended and failed:
+                raise failed[0]
+            return self._now >= ended
+
+        return over

@@ -16,6 +16,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop import run_page
 from vd.deploy.loop.log import LogWriter
+from vd.deploy.safety.safety import StopReport
 from vd.gap.recording import read_recording
 from vd.hand_log import is_log, read_log
 from vd.log_format import (
@@ -173,6 +174,36 @@ def test_without_its_encoder_there_is_a_page_without_a_film(folder, monkeypatch)
     log.run.update(policy="one", twin=True)
     page = run_page.write_page(log, run_page.goal_results(log))
     assert "visual-dexterity[video]" in page.read_text() and not (folder / "run.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("event", "said"),
+    [
+        (("finished", {}), "Ended: all goals done. | The torque of every motor is off."),
+        (("Ctrl-C", {}), "Stopped: Ctrl-C. | The torque of every motor is off."),
+        (
+            ("lost the bus", {11: "motor 11 does not answer", 12: "it holds"}),
+            "Stopped: lost the bus. | Motors that may still be on, cut their power: "
+            "11 (motor 11 does not answer); 12 (it holds).",
+        ),
+        (None, "Ended: all goals done. | Nobody noted that the torque went off"),
+    ],
+)
+def test_the_page_says_first_why_the_run_ended_and_which_motors_may_be_on(folder, event, said):
+    if event is not None:
+        (folder.parent / "other").mkdir()
+        log = LogWriter(folder.parent / "other", load_hand("dclaw3"), {"goals": GOALS}, servo={})
+        log.stopped(StopReport(event[0], 0.0, unreleased=event[1]))
+        log.finish("all goals done")
+        with (folder / "events.jsonl").open("a") as events:
+            events.write((folder.parent / "other" / "events.jsonl").read_text())
+    log = read_log(folder)
+    log.run.update(policy="one", twin=True)
+    page = run_page.write_page(log, run_page.goal_results(log), filmed=False).read_text()
+    page = page.replace("&#39;", "'")
+    first, second = said.split(" | ")
+    assert page.index(first) < page.index(second) < page.index("goals reached")
+    assert "vd-play" in page and "<video" not in page
 
 
 def test_the_viewer_steps_through_a_log(folder, monkeypatch):

@@ -160,6 +160,73 @@ def test_it_acts_until_the_policy_has_arrived_then_holds_and_goes_on(parts):
     np.testing.assert_allclose(read.columns["error"], 0.0, atol=1e-6)
 
 
+@pytest.fixture
+def looped(parts):
+    """A hand on a simulated line whose loop runs a policy that decides by a function."""
+    pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
+    from simulated_hand import energised, simulated_bus
+
+    _, _, actions, _, log = parts
+    joints = read_joints(load_hand("dclaw3"))
+
+    def run(decide) -> tuple[list[int], list[str]]:
+        said: list[str] = []
+        with simulated_bus(joints.hand, joints) as (line, bus):
+            line.plant.position[:] = joints.hand.start
+            bus.clock.sleep(0.01)
+            runner = Countdown(bus.clock, start=99.0)
+            runner.decide = lambda sensed: decide(bus.clock, line)
+            with SafeHand(bus, joints, say=said.append) as safe:
+                safe.arm()
+                pacer = Pacer(HZ, bus.clock)
+                loop = ControlLoop(safe, runner, actions, pacer, log, episode_s=3.0, twin=Truth())
+                loop.run([GOAL])
+        return energised(line), said
+
+    return run
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_action_that_is_not_finite_stops_the_hand(looped, value):
+    """The filter would make a limit of it, to which joints are driven and pressed."""
+    where = []
+
+    def decide(clock, line):
+        where.append((line.motors, line.plant.position.copy()))
+        action = np.zeros(9)
+        action[4] = value if len(where) > 5 else 0.0
+        return Decision(action, 9.0)
+
+    with pytest.raises(ValueError, match="the policy's action is not finite"):
+        looped(decide)
+    motors, last = where[-1]
+    assert not any(motor.get("torque_enable") for motor in motors) and len(where) == 6
+    np.testing.assert_allclose(last, where[0][1], atol=0.01)
+
+
+def test_a_policy_that_hangs_is_stopped_and_it_is_said(looped):
+    states = []
+
+    def decide(clock, line):
+        if len(states) == 3:
+            clock.sleep(5.0)
+        states.append(sum(motor.get("torque_enable") for motor in line.motors))
+        return Decision(np.zeros(9), 9.0)
+
+    with pytest.raises(StoppedError, match="the loop stands: no step ended for 0"):
+        looped(decide)
+    assert states == [9, 9, 9, 0], "it hung with its torque on"
+
+
+def test_a_first_look_that_does_not_end_is_stopped(looped):
+    def decide(clock, line):
+        clock.sleep(60.0)
+        return Decision(np.zeros(9), 9.0)
+
+    with pytest.raises(StoppedError, match="the policy has not decided for 10 s"):
+        looped(decide)
+
+
 def test_the_hand_is_held_while_the_first_look_takes_longer_than_a_step_may(parts):
     """0.33 s: longer than images may be old, steps late, and the motors without a word."""
     pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
@@ -363,9 +430,9 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(
     assert all(image.shape == (180, 320) and (image > 0.0).mean() > 0.5 for image in seen)
     assert read_log(folder).run["kind"] == "tracking"
     assert "goal 1: not reached: aborted" in out
-    assert (
-        "aborted" in (folder / PAGE_FILE).read_text() and (folder / FILM_FILE).stat().st_size > 1000
-    )
+    page = (folder / PAGE_FILE).read_text()
+    assert "aborted" in page and (folder / FILM_FILE).stat().st_size > 1000
+    assert "81 deg C, over 70" in page and "The torque of every motor is off" in page
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ class Driver(threading.Thread):
 def test_a_hand_behind_ros_pursues_goals_of_the_service_until_it_is_told_to_finish(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("vd.deploy.loop.run.write_page", lambda log, _: log.path)
+    monkeypatch.setattr("vd.deploy.loop.run.write_page", lambda log, *_, **__: log.path)
     driver, answers = Driver(), []
     driver.start()
 

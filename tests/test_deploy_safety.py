@@ -16,6 +16,7 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 from simulated_hand import energised, push, simulated_bus
 
 from vd.assets_usd.hands import load_hand
+from vd.deploy.hardware.answers import BusError
 from vd.deploy.hardware.joints import Joints
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import WATCH_S, SafeHand, StoppedError
@@ -97,6 +98,72 @@ def test_goals_keep_the_limits(bus, hand, joints):
             safe.command(np.full(9, np.nan))
         with pytest.raises(StoppedError, match="9 finite angles"):
             safe.command(here)  # a stop stays
+
+
+def fastest(bus, line) -> list[float]:
+    """Keeps the largest speed of any joint from now on [rad/s]."""
+    seen = [0.0]
+    bus.clock.every(0.005, lambda: seen.append(float(np.abs(line.plant.read()[1]).max())))
+    return seen
+
+
+@pytest.mark.parametrize(("axis", "moved"), [(1, 1.6), (0, -0.8), (5, 2 * np.pi)])
+@pytest.mark.parametrize("current", [0.0, 0.3])
+def test_a_joint_that_was_moved_since_the_preflight_is_not_snapped_back(hand, axis, moved, current):
+    """By hand, while the question waits: beyond its range, or by a whole turn as LEAP's motors count."""
+    joints = Joints(hand, tuple(replace(motor, current=current) for motor in hand.motors))
+    with simulated_bus(hand, joints) as (line, bus):
+        line.plant.position[:] = START
+        line.plant.position[axis] += moved
+        bus.clock.sleep(0.01)
+        before, speeds = line.plant.position.copy(), fastest(bus, line)
+        with SafeHand(bus, joints, QUICK) as safe:
+            with pytest.raises(StoppedError, match=f"nothing moves: {joints.names[axis]}"):
+                safe.arm()
+        bus.clock.sleep(0.5)
+        assert energised(line) == [] and max(speeds) == 0.0
+        np.testing.assert_array_equal(line.plant.position, before)
+
+
+@pytest.mark.parametrize("current", [0.0, 0.3])
+def test_a_joint_that_hangs_a_little_out_of_its_range_is_brought_back_slowly(hand, current):
+    joints = Joints(hand, tuple(replace(motor, current=current) for motor in hand.motors))
+    with simulated_bus(hand, joints) as (line, bus):
+        line.plant.position[:] = START
+        line.plant.position[0] = hand.upper[0] + 0.09
+        bus.clock.sleep(0.01)
+        speeds = fastest(bus, line)
+        with SafeHand(bus, joints, QUICK) as safe:
+            safe.arm()
+            assert line.plant.position[0] < hand.upper[0] + 0.02
+            assert {motor.get("position_p_gain") for motor in line.motors} == {200}
+        assert 0.1 < max(speeds) < 0.5  # of the way to the start
+
+
+def test_a_joint_that_is_pushed_far_out_of_its_range_is_not_sent_back_at_once(hand):
+    """Motors that limit their current have no limits of position, and take goals out of the range."""
+    joints = Joints(hand, tuple(replace(motor, current=0.3) for motor in hand.motors))
+    with simulated_bus(hand, joints) as (line, bus):
+        line.plant.position[:] = START
+        bus.clock.sleep(0.01)
+        with SafeHand(bus, joints, QUICK) as safe:
+            safe.arm()
+            line.plant.blocked[0] = True
+            while line.plant.position[0] < hand.upper[0] + 1.0:
+                line.plant.position[0] += 0.05
+                bus.clock.sleep(0.02)
+                safe.read()
+                safe.command(START)
+                safe.beat()
+                assert push(line)[0] < QUICK.step_rad + 0.06
+
+
+def test_the_step_limit_comes_last(joints):
+    """After the clip to the range."""
+    limits = SafeHand(None, joints, replace(QUICK, step_rad=0.3)).limits
+    here = joints.hand.upper + 1.0
+    np.testing.assert_allclose(limits.goal(START, here), here - 0.3)
+    np.testing.assert_allclose(limits.goal(here, joints.hand.upper), joints.hand.upper)
 
 
 def run_until_stopped(safe: SafeHand, target: np.ndarray, seconds: float = 5.0) -> str:
@@ -219,6 +286,39 @@ def test_a_loop_that_stands_is_stopped_by_the_watchdog(bus, hand, joints):
         assert safe.report.held_s - safe.report.detected_s < EXCHANGE_S
         with pytest.raises(StoppedError, match="the loop stands"):
             safe.read()
+
+
+def test_a_loop_that_stands_is_switched_off_and_it_is_said_before_it_comes_back(bus, line, joints):
+    said, ended = [], []
+    with SafeHand(bus, joints, QUICK, said.append, ended.append) as safe:
+        safe.arm()
+        safe.beat()
+        bus.clock.sleep(0.3)
+        assert len(energised(line)) == 9 and "the loop stands" in said[0]
+        bus.clock.sleep(0.3)
+        assert energised(line) == [] and "torque off" in said[1] and len(ended) == 1
+        with pytest.raises(StoppedError, match="the loop stands"):
+            safe.switch(np.ones(9, dtype=bool))
+    assert energised(line) == [] and len(said) == 2
+
+
+def test_words_that_cannot_be_said_keep_no_torque_on(bus, line, joints, monkeypatch):
+    """The terminal is gone, and the hold cannot be sent: the hand is let go all the same."""
+
+    def gone(*_):
+        raise OSError("Input/output error")
+
+    def full(*_, **__):
+        raise BusError("the port did not take what was to be sent")
+
+    with SafeHand(bus, joints, QUICK, gone) as safe:
+        safe.arm()
+        monkeypatch.setattr(bus, "write_goals", full)
+        monkeypatch.setattr(bus, "freeze", full)
+        os.kill(os.getpid(), signal.SIGHUP)
+        bus.clock.sleep(0.1)
+    assert energised(line) == []
+    assert safe.report.reason == "the terminal is gone" and safe.report.unreleased == {}
 
 
 def test_motors_stop_by_themselves_if_the_driver_dies(bus, line, hand, joints):

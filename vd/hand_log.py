@@ -25,6 +25,7 @@ from vd.log_format import (
     MCAP,
     RUN_FILE,
     STEPS_FILE,
+    STOPPED,
     TRUTH_COLUMNS,
     LogError,
 )
@@ -92,6 +93,14 @@ class HandLog:
             for event in self.events
             if event["event"] == "stop"
         ]
+
+    @property
+    def stopped(self) -> tuple[str, dict[str, str]] | None:
+        """Why the hand was stopped, and motors that may be on, by ID; None where nobody noted it."""
+        for event in reversed(self.events):
+            if event["event"] == STOPPED:
+                return event["reason"], event["may_be_on"]
+        return None
 
     def channel(self, name: str) -> np.ndarray:
         """One of JOINT_CHANNELS [T, D]; NaN where it was not logged."""

@@ -32,6 +32,12 @@ TRUTH_COLUMNS = (*(f"object.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz"
 FOUND_COLUMNS = tuple(f"found.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw"))
 """Pose of the object as a policy that sees by camera finds it; NaN where none was looked for."""
 
+FINISHED = "finished"
+"""Reason of the stop at the end of what was to be done."""
+STOPPED = "hand stopped"
+"""Event of the hand's stop: ``reason``, and in ``may_be_on`` the motors whose torque may be on, by
+ID, each with why."""
+
 
 class LogError(ValueError):
     """A log that cannot be used; names file and remedy."""

@@ -23,9 +23,11 @@ from vd.deploy.camera.camera import CameraError
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
+from vd.deploy.finding import listed
 from vd.deploy.hardware.answers import BusError
 from vd.deploy.hardware.check import confirm
 from vd.deploy.hardware.connect import HandOptions, connect, motors_of
+from vd.deploy.safety.signals import held
 from vd.files import check_file
 from vd.paper import PAPER
 
@@ -126,8 +128,10 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
         connection = stack.enter_context(connect(cfg))
         hand, bus, joints = connection.hand, connection.bus, connection.joints
         confirm("The torque goes off, and the hand lets go.", yes=cfg.yes)
-        if failed := bus.torque(False):
-            raise BusError(next(iter(failed.values())))
+        with held():  # else some motors would keep their torque
+            failed = bus.torque(False)
+        if failed:
+            raise BusError(listed(list(failed.values())))
         print(
             "Bend one finger after the other, its marker to the camera; turn it all ways, hold it "
             "still."

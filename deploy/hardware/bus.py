@@ -270,6 +270,18 @@ class MotorBus:
                 failed[id] = str(error)
         return failed
 
+    def stiffen(self, share: float) -> None:
+        """Have every motor hold with a share of the position gain that was configured.
+
+        One packet for all, which none answers; the whole gain is written to each, which does.
+        """
+        gains = [round(share * self._settings[id].p_gain) for id in self.ids]
+        if share < 1.0:
+            self._write_all("position_p_gain", gains)
+            return
+        for id, gain in zip(self.ids, gains, strict=True):
+            self.write(id, "position_p_gain", gain)
+
     def release(self) -> None:
         """Switch the torque of all motors off with one packet, which none of them answers."""
         self._write_all("torque_enable", [0] * len(self.ids))
@@ -303,7 +315,8 @@ class MotorBus:
         """Send all goals in one packet.
 
         Args:
-            goals: Angles [rad], shape [D]; clipped to the limits that were configured.
+            goals: Angles [rad], shape [D]; clipped to the limits that were configured where the
+                motor refuses goals beyond.
             with_state: Send them in one piece with the question of the next :meth:`read_state`, so
                 that both arrive at the same moment; others that are sent before take their place.
 
@@ -316,8 +329,9 @@ class MotorBus:
             raise ValueError(f"goals have to be {len(self.ids)} finite angles, not {goals}")
         counts = []
         for id, goal in zip(self.ids, goals, strict=True):
-            if id in self._settings:
-                goal = np.clip(goal, self._settings[id].lower_rad, self._settings[id].upper_rad)
+            known = self._settings.get(id)
+            if known is not None and not known.current_based:
+                goal = np.clip(goal, known.lower_rad, known.upper_rad)
             counts.append(to_counts(float(goal)))
         self._write_all("goal_position", counts, later=with_state)
 

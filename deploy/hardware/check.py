@@ -6,7 +6,6 @@ With --range it moves, after asking.
 import contextlib
 import itertools
 import json
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import tyro
 
 from vd.assets_usd.hand_data import CameraModel
+from vd.deploy.asking import answer, ask, attended
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.finding import Finding, finding, listed, show
 from vd.deploy.hardware.answers import BusError, GarbledError, LateError
@@ -23,8 +23,9 @@ from vd.deploy.hardware.aside import aside
 from vd.deploy.hardware.connect import Connection, HandOptions, connect, motors_of
 from vd.deploy.hardware.joints import CalibrationError
 from vd.deploy.hardware.registers import RESTART, Register, different, kept
-from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
+from vd.deploy.safety.limits import PERIOD_S, SafetyCfg, out_of_range
 from vd.deploy.safety.safety import SafeHand
+from vd.deploy.safety.signals import held
 from vd.deploy.twin.child import TwinCamera
 from vd.paper import PAPER
 
@@ -45,8 +46,6 @@ COOL_C = 60.0
 """Temperature [deg C] above which a motor should rest first: it warms by some degrees in use."""
 VOLTAGE_SHARE = 0.1
 """Deviation from the supply's nominal voltage that is normal."""
-OUTSIDE_RAD = 0.1
-"""How far a joint may hang out of its range and still be brought back slowly."""
 RANGE_SHARE = 0.8
 """Share of a joint's range that --range moves it through."""
 RANGE_SPEED_RAD_S = 0.7
@@ -202,7 +201,8 @@ def write_settings(connection: Connection) -> Finding:
     """Write the registers that differ, with the torque off, and read them back."""
     bus, what = connection.bus, "settings"
     try:
-        bus.configure(connection.joints.settings())
+        with held():  # else some motors would keep their torque
+            bus.configure(connection.joints.settings())
     except BusError as error:
         return Finding(what, False, str(error))
     return Finding(what, True, "registers written and read back, torque off")
@@ -210,7 +210,7 @@ def write_settings(connection: Connection) -> Finding:
 
 def _state(connection: Connection) -> Iterator[Finding]:
     """Temperature, voltage and pose."""
-    bus, joints, hand = connection.bus, connection.joints, connection.hand
+    bus, joints = connection.bus, connection.joints
     state = bus.read_state()
     hot = [
         f"motor {id}: {t:.0f} deg C, over {COOL_C:g}: let it cool"
@@ -224,19 +224,7 @@ def _state(connection: Connection) -> Iterator[Finding]:
         if abs(v - model.supply_v) > VOLTAGE_SHARE * model.supply_v
     ]
     yield finding("voltage", weak, f"{state.voltage.min():.1f} to {state.voltage.max():.1f} V")
-    q = joints.to_joint(state.position)
-    out = np.maximum(hand.lower - q, q - hand.upper)
-    turns = np.round((q - 0.5 * (hand.lower + hand.upper)) / (2.0 * np.pi))
-    outside = []
-    for axis in np.flatnonzero(out > OUTSIDE_RAD):
-        # Turned by hand without torque a motor counts on; one that starts counts within one turn.
-        mend = (
-            f"it was turned round: {RESTART}"
-            if turns[axis]
-            else "move it by hand, or mend its calibration"
-        )
-        where = f"{q[axis]:.2f} rad, out of {hand.lower[axis]:.2f} to {hand.upper[axis]:.2f}"
-        outside.append(f"{joints.names[axis]}: {where}: {mend}")
+    outside = out_of_range(connection.hand, joints.to_joint(state.position))
     yield finding("pose within limits", outside, "every joint")
 
 
@@ -316,19 +304,19 @@ def _stop_at_wrong(findings: Iterable[Finding]) -> None:
 
 
 def confirm(question: str, *, yes: bool) -> None:
-    """Ask before something moves.
+    """Ask before something moves; what was typed before the question, or no more input, is no yes.
 
     Raises:
         RuntimeError: The answer was no, or nobody is there to ask.
     """
     if yes:
         return
-    if not sys.stdin.isatty():
+    if not attended():
         raise RuntimeError(
             f"nothing moves: {question} Nobody is there to ask; --yes says so at once"
         )
-    print(f"{question} Keep hands and cables clear. [y/N] ", end="", file=sys.stderr, flush=True)
-    if input().strip().lower() not in ("y", "yes"):
+    ask(f"{question} Keep hands and cables clear. [y/N]")
+    if (answer() or "").lower() not in ("y", "yes"):
         raise RuntimeError("nothing moves: not confirmed")
 
 

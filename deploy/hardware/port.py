@@ -19,6 +19,8 @@ BAUD_RATE = 1_000_000
 WAIT_S = 0.002
 """How long a read of the port sleeps at most until its bytes are there. The SDK's own does not
 sleep but asks again and again, which takes a core, and keeps whatever shares it from answering."""
+FULL_S = 0.1
+"""Longest wait for a port that takes no bytes any more: of a dead adapter, or a twin that hangs."""
 PSEUDO_TERMINALS = "/dev/pts/"
 """A twin holds its own end of these open, so exclusive use by one program is for the lock alone."""
 
@@ -53,7 +55,9 @@ def open_port(path: str, baud_rate: int = BAUD_RATE) -> Any:
         raise BusError(f"{path}: no baud rate {baud_rate}")
     try:
         # The SDK's own opening drops what has come for whoever has the port.
-        handler.ser = serial.Serial(path, baud_rate, timeout=WAIT_S, exclusive=True)
+        handler.ser = serial.Serial(
+            path, baud_rate, timeout=WAIT_S, write_timeout=FULL_S, exclusive=True
+        )
         if not pseudo(path):
             fcntl.ioctl(handler.ser.fileno(), termios.TIOCEXCL)
     except OSError as error:

@@ -19,6 +19,7 @@ from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hands import called
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.hardware.control_table import RAD_PER_COUNT
+from vd.deploy.safety.safety import StopReport
 from vd.files import make_folder, write_json, writing
 from vd.gap.recording import COMMAND_TIME
 from vd.gap.recording import FORMAT as RECORDING_FORMAT
@@ -31,6 +32,7 @@ from vd.log_format import (
     RUN_FILE,
     STEP_COLUMNS,
     STEPS_FILE,
+    STOPPED,
     TRUTH_COLUMNS,
 )
 
@@ -180,6 +182,11 @@ class LogWriter:
         line = {"t": round(self.since(self._clock.now()), DIGITS), "event": event, **values}
         self._append(self._events, json.dumps(line))
         self._tell(lambda sink: sink.event(line))
+
+    def stopped(self, report: StopReport) -> None:
+        """The hand was stopped; with the motors that may still have their torque on, by ID."""
+        may_be_on = {str(id): why for id, why in report.unreleased.items()}
+        self.event(STOPPED, reason=report.reason, may_be_on=may_be_on)
 
     def finish(self, reason: str, **summary: Any) -> None:
         """Say how it ended, and close the files.

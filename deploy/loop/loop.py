@@ -23,6 +23,8 @@ from vd.paper import PAPER
 
 CAMERA_SHARE = 0.5
 """Share of a control period for which an image is waited for."""
+LOOK_S = 10.0
+"""Longest first look for an object, which takes 0.3 s where nothing else runs."""
 STATUS_STEPS = 60
 """Control steps between two status lines: five seconds."""
 NO_SYMMETRY = np.array([[0.0, 0.0, 0.0, 1.0]])
@@ -118,8 +120,11 @@ class ControlLoop:
         """Find the object anew, which takes longer than to follow it, and than a step may."""
         self._runner.begin()
         sensed, *_ = self._sense(goal)
-        found = self._pacer.clock.beside(lambda: self._runner.decide(sensed))
+        clock = self._pacer.clock
+        found, end = clock.beside(lambda: self._runner.decide(sensed)), clock.now() + LOOK_S
         while not found():
+            if clock.now() > end:
+                raise self._safe.stop(f"the policy has not decided for {LOOK_S:g} s")
             self.step(number, goal, acting=False)
 
     def _pursue(self, number: int, goal: np.ndarray) -> tuple[str, float | None]:

@@ -47,7 +47,11 @@ class Sensed:
 
 @dataclass(frozen=True)
 class Decision:
-    """What a policy says of a moment."""
+    """What a policy says of a moment.
+
+    Raises:
+        ValueError: Its action is not finite, which no clip or filter may hide.
+    """
 
     action: np.ndarray
     """Mean action [D]."""
@@ -55,6 +59,11 @@ class Decision:
     """Distance to the goal by which it is stopped [rad], as it is predicted; NaN: not known."""
     found: np.ndarray | None = None
     """Pose of the object as it was found [7]; None: it was not looked for."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no action."""
+        if not np.isfinite(self.action).all():
+            raise ValueError(f"the policy's action is not finite: {self.action}; mend the policy")
 
 
 class PolicyRunner:

@@ -8,7 +8,6 @@ truth.
 
 import contextlib
 import importlib.util
-import select
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,13 +20,14 @@ import tyro
 
 from vd import interrupt
 from vd.config import require
+from vd.deploy.asking import answer, answered, ask, attended
 from vd.deploy.camera.camera import Camera
 from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.finding import Finding
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
 from vd.deploy.loop.run_page import goal_results, summary_line, write_page
 from vd.deploy.safety.limits import SafetyCfg
-from vd.deploy.safety.safety import MOVE_S, SafeHand, StoppedError
+from vd.deploy.safety.safety import MOVE_S, SafeHand
 from vd.deploy.timely import undisturbed
 from vd.evaluate.agents import check_names
 from vd.files import check_folder
@@ -59,6 +59,8 @@ WARM_UP = 3
 """Decisions before the hand is switched on: kernels are loaded, allocators have grown."""
 FIRST_IMAGE_S = 5.0
 """Longest wait for a camera's first image."""
+PLACE = "Put the object between the fingers, then press Enter alone."
+DRAWING = "drawing the film (the first one compiles its kernels) ..."
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,7 @@ def run(cfg: RunCfg) -> int:
             "vd-train tracker finds a better one",
             file=sys.stderr,
         )
-    fault: StoppedError | None = None
+    fault: Exception | None = None
     status = 0
     camera = runner.camera or hand.mounted_camera
     camera_pose = (
@@ -198,9 +200,7 @@ def run(cfg: RunCfg) -> int:
     with connect_ros(cfg, cfg.ros2_args) if cfg.ros2 else connect(cfg, **twin) as connection:
         try:
             status = _pursue(cfg, name, runner, connection, item, goals, folder)
-        except StoppedError as error:
-            if error.signal:  # who ends it does not wait for a film
-                raise
+        except Exception as error:  # the page says why, too
             fault = error
     try:
         log = read_log(folder)
@@ -208,10 +208,14 @@ def run(cfg: RunCfg) -> int:
             raise LogError(f"{folder} has no goal to show")
     except LogError as error:  # it ended before the first step, or goal
         raise fault or error from None
-    print("drawing the film (the first one compiles its kernels) ...", file=sys.stderr, flush=True)
-    print(f"page: {write_page(log, goal_results(log))}")
-    if fault is not None:
-        raise fault
+    filmed = not getattr(fault, "signal", 0)  # who ends it does not wait for a film
+    if filmed:
+        print(DRAWING, file=sys.stderr, flush=True)
+    try:
+        print(f"page: {write_page(log, goal_results(log), filmed=filmed)}")
+    finally:  # also where there is no page
+        if fault is not None:
+            raise fault
     return status
 
 
@@ -268,7 +272,7 @@ def _pursue(
         try:
             # With ROS 2 torque is the driver's.
             safety = replace(cfg.safety, then="hold") if cfg.ros2 else cfg.safety
-            with SafeHand(connection.bus, connection.joints, safety) as safe:
+            with SafeHand(connection.bus, connection.joints, safety, ended=log.stopped) as safe:
                 safe.arm()
                 safe.move(pose, HOME_RAD_S)
                 place(safe, pose, twin, yes=cfg.yes)
@@ -353,25 +357,28 @@ def place(safe: SafeHand, pose: np.ndarray, twin: "TwinChild | None", *, yes: bo
     Raises:
         StoppedError: The hand was stopped meanwhile.
     """
-    asked = twin is None and not yes and sys.stdin.isatty()
+    asked = twin is None and not yes
     if twin is not None:
         twin.place_object()
     elif asked:
-        print(
-            "Put the object between the fingers, then press Enter. ",
-            end="",
-            file=sys.stderr,
-            flush=True,
-        )
+        if not attended():
+            raise safe.stop("nobody is there to say that the object is between the fingers")
+        ask(PLACE)
     clock = safe.bus.clock
     end = clock.now() + SETTLE_S
-    while clock.now() < end or (asked and not select.select([sys.stdin], [], [], 0.0)[0]):
+    while asked or clock.now() < end:
         safe.read()
         safe.command(pose)
         safe.beat()
         clock.sleep(MOVE_S)
-    if asked:
-        sys.stdin.readline()
+        if not (asked and answered()):
+            continue
+        line = answer()
+        if line is None:
+            raise safe.stop("the input has ended: nobody says that the object is in the hand")
+        asked = bool(line)
+        if asked:
+            ask(PLACE)
 
 
 def report(folder: Path, steps: int, missed: int, times: dict[str, Any]) -> None:

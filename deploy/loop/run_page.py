@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from vd import interrupt
+from vd.deploy.safety.safety import LEFT_ON
 from vd.hand_log import HandLog
+from vd.log_format import FINISHED
 from vd.page import write_html
 
 FILM_FILE, PAGE_FILE = "run.mp4", "run.html"
@@ -77,8 +79,31 @@ def summary_line(results: Sequence[GoalResult], goals: int) -> str:
     return f"{sum(bool(one.success) for one in results)} of {goals} goals reached"
 
 
-def write_page(log: HandLog, results: Sequence[GoalResult]) -> Path:
+def ending(log: HandLog) -> list[str]:
+    """Why a run ended, and which motors may still have their torque on, in sentences."""
+    said = str(log.run.get("end", {}).get("reason", ""))
+    if log.stopped is None:
+        unknown = "Nobody noted that the torque went off: every motor may be on. Cut their power."
+        return [f"Ended: {said or 'without a word, as a program that is killed'}.", unknown]
+    reason, may_be_on = log.stopped
+    sentences = [f"Stopped: {reason}."]
+    if reason == FINISHED:
+        sentences = [f"Ended: {said or reason}."]
+    if not may_be_on:
+        return [*sentences, "The torque of every motor is off."]
+    if LEFT_ON in may_be_on.values():
+        return [*sentences, "The hand holds, its torque is on."]
+    motors = "; ".join(f"{id} ({why})" for id, why in may_be_on.items())
+    return [*sentences, f"Motors that may still be on, cut their power: {motors}."]
+
+
+def write_page(log: HandLog, results: Sequence[GoalResult], *, filmed: bool = True) -> Path:
     """Write the film of a run, if the extra ``video`` is there, and the page that shows it, into its folder.
+
+    Args:
+        log: Of the run.
+        results: How each of its goals ended.
+        filmed: Whether to draw the film.
 
     Returns:
         The page.
@@ -88,8 +113,8 @@ def write_page(log: HandLog, results: Sequence[GoalResult]) -> Path:
     """
     from vd.play.replay import film
 
-    filmed = find_spec("imageio_ffmpeg") is not None
-    if filmed:
+    able = find_spec("imageio_ffmpeg") is not None
+    if filmed and able:
         film(log, log.path / FILM_FILE)
     write_html(
         log.path / PAGE_FILE,
@@ -97,8 +122,9 @@ def write_page(log: HandLog, results: Sequence[GoalResult]) -> Path:
         run=log.run,
         goals=len(log.goals),
         summary=summary_line(results, len(log.goals)),
-        film=log.path / FILM_FILE if filmed else None,
-        remedy=interrupt.remedy("imageio_ffmpeg"),
+        ending=ending(log),
+        film=log.path / FILM_FILE if filmed and able else None,
+        remedy=f"vd-play {log.path}" if able else interrupt.remedy("imageio_ffmpeg"),
         rows=[
             (
                 one.goal + 1,

@@ -11,12 +11,16 @@ from typing import Literal
 
 import numpy as np
 
+from vd.assets_usd.hand_data import HandModel
 from vd.config import require
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.registers import RESTART
 from vd.paper import PAPER
 
 PERIOD_S = 1.0 / PAPER.scene.control_hz
+OUTSIDE_RAD = 0.1
+"""How far a joint may hang out of its range and still be brought back slowly."""
 SHUTDOWN_C = 10.0
 """How far below the temperature at which a motor shuts down the hand is stopped."""
 
@@ -72,6 +76,28 @@ class SafetyCfg:
         require(self, "safety.", "zero or positive", "margin_rad watchdog_s hold_s")
 
 
+def out_of_range(hand: HandModel, q: np.ndarray) -> list[str]:
+    """Joints that are too far out of their ranges to be brought back, in words with the remedy.
+
+    Args:
+        hand: The hand.
+        q: Angles of its joints [rad] [D].
+    """
+    out = np.maximum(hand.lower - q, q - hand.upper)
+    turns = np.round((q - 0.5 * (hand.lower + hand.upper)) / (2.0 * np.pi))
+    wrong = []
+    for axis in np.flatnonzero(out > OUTSIDE_RAD):
+        # Turned by hand without torque a motor counts on; one that starts counts within one turn.
+        mend = (
+            f"it was turned round: {RESTART}"
+            if turns[axis]
+            else "move it by hand, or mend its calibration"
+        )
+        where = f"{q[axis]:.2f} rad, out of {hand.lower[axis]:.2f} to {hand.upper[axis]:.2f}"
+        wrong.append(f"{hand.joint_names[axis]}: {where}: {mend}")
+    return wrong
+
+
 class Limits:
     """Limits of one hand; ``lower`` and ``upper`` are the least and largest goals [rad] [D].
 
@@ -93,9 +119,12 @@ class Limits:
         self._strained_since = np.full(len(self._names), np.inf)
 
     def goal(self, target: np.ndarray, here: np.ndarray) -> np.ndarray:
-        """The goal nearest to the target, in range and not too far from where the joints are, all [D]."""
-        near = np.clip(target, here - self._cfg.step_rad, here + self._cfg.step_rad)
-        return np.clip(near, self.lower, self.upper)
+        """The goal in range nearest to the target, but never far from where the joints are, all [D].
+
+        A joint that is out of its range is brought back by steps.
+        """
+        inside = np.clip(target, self.lower, self.upper)
+        return np.clip(inside, here - self._cfg.step_rad, here + self._cfg.step_rad)
 
     def passed(self, state: HandState) -> str:
         """Which limit the newest state of the joints is beyond, in words; empty for none."""

@@ -14,23 +14,22 @@ They hold whatever it decides.
             work
 
 Whatever ends the block, the hand is brought to a hold where it is, and then, as configured, its
-torque is switched off. A limit that is passed, a lost bus, a stale image, missed deadlines, Ctrl-C
-or the end of the terminal raise :class:`StoppedError` with the reason at the next call; a thread
-has stopped the hand by then, also if no call ever comes. Where the driver itself dies, the motors'
-bus watchdog stops them.
+torque is switched off. A limit that is passed, a lost bus, a stale image, missed deadlines or a
+signal raise :class:`StoppedError` with the reason at the next call; a thread has stopped the hand
+by then, and switches it off and says so also if no call ever comes. No signal cuts that off. Where
+the driver itself dies, the motors' bus watchdog stops them.
 
 Angles and speeds are the joints', rad and rad/s; times of the monotonic clock.
 """
 
 import contextlib
 import math
+import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from types import FrameType
-from typing import Any
 
 import numpy as np
 
@@ -38,7 +37,9 @@ from vd.deploy.finding import listed
 from vd.deploy.hardware.answers import BusError, HandState, LateError, SilentError
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.joints import Joints
-from vd.deploy.safety.limits import PERIOD_S, Limits, SafetyCfg
+from vd.deploy.safety.limits import PERIOD_S, Limits, SafetyCfg, out_of_range
+from vd.deploy.safety.signals import REASONS, Signals
+from vd.log_format import FINISHED
 
 MOVE_S = 0.04
 """Time between the goals of a slow movement."""
@@ -59,14 +60,14 @@ some ms.
 """
 OFF_S = 1.0
 """How long switching off is tried on a bus that does not answer soundly."""
-FINISHED = "finished"
-"""Reason of the stop at the end of what was to be done."""
-SIGNALS = {
-    signal.SIGINT: "Ctrl-C",
-    signal.SIGTERM: "asked to end",
-    signal.SIGHUP: "the terminal is gone",
-}
-"""Signals that stop the hand; a second one ends at once."""
+SOFT_STEPS = 10
+"""Steps of MOVE_S in which the motors come to their gain when they are switched on."""
+SAY_S = 1.0
+"""Longest wait for a terminal that takes no words, as after Ctrl-S."""
+END_S = 1.0
+"""Time that a program has to come to its end once its hand is off, if a signal asked for that."""
+LEFT_ON = "it holds, as --safety.then says"
+"""Why the torque of each motor is on where the hand is left holding."""
 
 
 class StoppedError(RuntimeError):
@@ -92,6 +93,19 @@ class StopReport:
     signal: int = 0
     """Number of the signal that asked for it; 0 for another reason."""
 
+    def __str__(self) -> str:
+        """What is told of it: the reason, and each motor that may be on."""
+        why = "" if self.reason == FINISHED else f"stopped: {self.reason}; "
+        if LEFT_ON in self.unreleased.values():
+            return f"{why}the hand holds, its torque is on"
+        if not self.unreleased:
+            return f"{why}torque off"
+        motors = [
+            f"motor {id} may still be on, cut its power: {reason}"
+            for id, reason in self.unreleased.items()
+        ]
+        return "\n".join([f"{why}not every torque is off", *motors])
+
 
 def unheard(error: BusError) -> str:
     """Why no state came: by this computer's fault, or the bus'."""
@@ -102,7 +116,8 @@ class SafeHand:
     """A hand whose goals are limited and that stops by itself.
 
     Once it is stopped, each method raises :class:`StoppedError` with the reason. Its bus has to be
-    configured; ``say`` tells the person.
+    configured; ``say`` tells the person, and ``ended`` takes the report once the stop is complete,
+    in whichever thread that happens.
     """
 
     def __init__(
@@ -111,9 +126,11 @@ class SafeHand:
         joints: Joints,
         cfg: SafetyCfg = DEFAULTS,
         say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
+        ended: Callable[[StopReport], None] = lambda report: None,
     ):
         """Nothing is sent before :meth:`arm`."""
-        self.bus, self.joints, self.hand, self.cfg, self._say = bus, joints, joints.hand, cfg, say
+        self.bus, self.joints, self.hand, self.cfg = bus, joints, joints.hand, cfg
+        self._say, self._ended = say, ended
         self._names = [
             f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)
         ]
@@ -123,50 +140,81 @@ class SafeHand:
         self.report: StopReport | None = None
         """How the stop went, once there was one."""
         self._state: HandState | None = None
-        self._misses = self._signal = 0
+        self._misses = 0
         self._beat_s = self._image_s = np.inf
         self._torque_s = -np.inf
         self._armed = False
-        self._on = np.ones(len(joints.ids), dtype=bool)
+        self._on = np.zeros(len(joints.ids), dtype=bool)
         self._stopping = threading.RLock()
+        self._ending = threading.RLock()
+        self._off_s = np.inf  # when the stop was complete
+        self._ends = False  # whether someone brings it to its end
+        self._back = False  # whether the program has come to the end of the block
         self._unwatch: Callable[[], None] = lambda: None
-        self._handlers: dict[signal.Signals, Any] = {}
+        self._signals = Signals()
 
     def __enter__(self) -> "SafeHand":
-        if threading.current_thread() is threading.main_thread():
-            self._handlers = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
+        self._signals.__enter__()
         self._unwatch = self.bus.clock.every(WATCH_S, self._watch)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, _: object
     ) -> None:
+        self._back = True
         try:
             if self._armed:
-                self._hold(
-                    FINISHED if error is None else f"{kind.__name__ if kind else ''}: {error}"
-                )
-                self._off()
+                why = FINISHED if error is None else f"{kind.__name__ if kind else ''}: {error}"
+                try:
+                    self._hold(why)
+                finally:
+                    self._off()
         finally:
             self._unwatch()
-            for number, handler in self._handlers.items():
-                signal.signal(number, handler)
+            self._signals.__exit__()
 
     def arm(self) -> HandState:
-        """Switch the torque on where the hand is, and start the watchdogs."""
+        """Switch the torque on where the hand is, softly, and start the watchdogs.
+
+        Raises:
+            StoppedError: A joint is out of its range, whatever the preflight found before somebody
+                said yes; or the motors could not be switched on.
+        """
+        try:
+            self._within(self._read())
+            self._armed = True  # from here on whatever happens ends with torque off
+            self.bus.watch(self.cfg.watchdog_s)
+            self._state = state = self._within(self._read())
+            goals = self.joints.to_motor(self.limits.goal(state.position, state.position))
+            self.bus.write_goals(goals)
+            self.bus.stiffen(1.0 / SOFT_STEPS)
+            self._switch(True, self.joints.ids)
+            self._on[:] = True
+            for step in range(2, SOFT_STEPS + 1):
+                self.bus.clock.sleep(MOVE_S)
+                self.read()
+                self.bus.write_goals(goals)  # a motor may forget them when it is switched on
+                self.bus.stiffen(step / SOFT_STEPS)
+        except BusError as error:
+            raise self.stop(f"could not switch on: {error}", lost=True) from error
+        self._beat_s = self.bus.clock.now()
+        return state
+
+    def _within(self, state: HandState) -> HandState:
+        """A state whose joints are in their ranges: the motors' limits would have others jump."""
+        if wrong := out_of_range(self.hand, state.position):
+            raise self.stop(f"nothing moves: {listed(wrong)}")
+        return state
+
+    def _switch(self, on: bool, ids: Sequence[int]) -> None:
+        """Switch the torque of motors, but not on again after a hold."""
         with self._stopping:
-            try:
-                self._state = state = self._read()
-                self._armed = True  # from here on whatever happens ends with torque off
-                self.bus.watch(self.cfg.watchdog_s)
-                self.bus.write_goals(self.joints.to_motor(state.position))
-                failed = self.bus.torque(True)
-            except BusError as error:
-                raise self._stop(f"could not switch on: {error}", lost=True) from error
-            if failed:
-                raise self._stop(f"could not switch on: {next(iter(failed.values()))}")
-            self._beat_s = self.bus.clock.now()
-            return state
+            self._check()
+            failed = self.bus.torque(on, ids)
+        if failed:
+            raise self.stop(
+                f"could not switch {'on' if on else 'off'}: {listed(list(failed.values()))}"
+            )
 
     def read(self) -> HandState:
         """Read the joints; for a short gap in the bus the last state once more, with its own time."""
@@ -176,7 +224,7 @@ class SafeHand:
         except BusError as error:
             last = self._state
             if last is None or self.bus.clock.now() - last.time_s > self.cfg.lost_s:
-                raise self._stop(unheard(error), lost=True) from error
+                raise self.stop(unheard(error), lost=True) from error
             self.repeated += 1
             self._check()
             return last
@@ -199,14 +247,14 @@ class SafeHand:
         if self._state is None or not self._armed:
             raise RuntimeError("arm() has to come before command()")
         if target.shape != self.limits.lower.shape or not np.isfinite(target).all():
-            raise self._stop(f"the target is not {len(self.joints.ids)} finite angles: {target}")
+            raise self.stop(f"the target is not {len(self.joints.ids)} finite angles: {target}")
         goal = self.limits.goal(target, self._state.position)
         with self._stopping:  # never after the hold
             self._check()
             try:
                 self.bus.write_goals(self.joints.to_motor(goal), with_state=with_state)
             except BusError as error:
-                raise self._stop(unheard(error), lost=True) from error
+                raise self.stop(unheard(error), lost=True) from error
         return goal
 
     def move(self, goal: np.ndarray, speed: float) -> np.ndarray:
@@ -240,9 +288,7 @@ class SafeHand:
         """
         self.command(self.read().position)
         for axis in np.flatnonzero(on != self._on):
-            failed = self.bus.torque(bool(on[axis]), [self.joints.ids[axis]])
-            if failed:
-                raise self._stop(next(iter(failed.values())))
+            self._switch(bool(on[axis]), [self.joints.ids[axis]])
         self._on = np.array(on, dtype=bool)
 
     def beat(self, *, missed: bool = False) -> None:
@@ -255,7 +301,7 @@ class SafeHand:
         self._beat_s = self.bus.clock.now()
         self._misses = self._misses + 1 if missed else 0
         if self._misses >= self.cfg.misses:
-            raise self._stop(f"{self._misses} deadlines missed in a row")
+            raise self.stop(f"{self._misses} deadlines missed in a row")
 
     def image_at(self, time_s: float) -> None:
         """The newest image is of this time [s], by the monotonic clock.
@@ -265,7 +311,7 @@ class SafeHand:
         """
         ahead = time_s - self.bus.clock.now()
         if ahead > AHEAD_S:
-            raise self._stop(
+            raise self.stop(
                 f"the newest image is {ahead:.2f} s from the future: wait until the computer's "
                 f"clock is set "
                 "(NTP), then plug the camera in again"
@@ -282,10 +328,10 @@ class SafeHand:
             raise
         state = self.joints.state(raw)
         if raw.alert.any():
-            raise self._stop(self._errors(raw.alert, "a hardware error"))
+            raise self.stop(self._errors(raw.alert, "a hardware error"))
         self._check_torque()
         if passed := self.limits.passed(state):
-            raise self._stop(passed)
+            raise self.stop(passed)
         return state
 
     def _check_torque(self) -> None:
@@ -299,7 +345,7 @@ class SafeHand:
         gone = self._on & ~self.bus.read_torque()
         self._torque_s = now
         if gone.any():
-            raise self._stop(f"torque went off: {self._errors(gone, TORQUE_GONE)}")
+            raise self.stop(f"torque went off: {self._errors(gone, TORQUE_GONE)}")
 
     def _errors(self, which: np.ndarray, otherwise: str) -> str:
         """What some motors [D] bool report as their errors, and what is said of one that reports none."""
@@ -315,21 +361,21 @@ class SafeHand:
             raise self._error()
         due = self._due()
         if due:
-            raise self._stop(due)
+            raise self.stop(due)
 
     def _due(self) -> str:
         """Why the hand has to stop now, whatever its motors say; empty if it has not."""
         now = self.bus.clock.now()
         silent, age = now - self._beat_s, now - self._image_s
-        if self._signal:
-            return SIGNALS[signal.Signals(self._signal)]
+        if came := self._signals.came():
+            return REASONS[signal.Signals(came[0])]
         if silent > self.cfg.misses * PERIOD_S:
             return f"the loop stands: no step ended for {silent:.2f} s"
         if age > self.cfg.stale_s:
             return f"the newest image is {age:.2f} s old"
         return ""
 
-    def _stop(self, reason: str, *, lost: bool = False) -> StoppedError:
+    def stop(self, reason: str, *, lost: bool = False) -> StoppedError:
         """Hold, without the states of a bus that is ``lost``, and give what to raise."""
         self._hold(reason, lost=lost)
         return self._error()
@@ -345,7 +391,8 @@ class SafeHand:
         with self._stopping:
             if self.report is not None:
                 return
-            self.report = StopReport(reason, detected, signal=self._signal)
+            asked = self._signals.came()[:1]
+            self.report = StopReport(reason, detected, signal=asked[0] if asked else 0)
             if not self._armed:
                 return
             try:
@@ -358,37 +405,51 @@ class SafeHand:
 
     def _hold_at(self, where: np.ndarray) -> None:
         """Send angles of the joints [rad] as goals, whatever else is going on."""
-        goals = self.joints.to_motor(np.clip(where, self.limits.lower, self.limits.upper))
+        goals = self.joints.to_motor(self.limits.goal(where, where))
         self._tell(lambda: self.bus.write_goals(goals))
 
     def _tell(self, send: Callable[[], None]) -> None:
-        """Tell the motors to hold, and note when."""
+        """Tell the motors to hold, and note when; a line that takes nothing is told of at the end."""
         assert self.report is not None
-        try:
+        with contextlib.suppress(BusError):
             send()
-        except BusError as error:
-            self._say(f"could not be told to hold: {error}")
-        else:
             self.report = replace(self.report, held_s=self.report.held_s or self.bus.clock.now())
 
     def _off(self) -> None:
-        """Settle where the hand came to rest, then torque off as configured."""
+        """Settle where the hand came to rest, then torque off as configured; the first caller does it."""
+        with self._ending:
+            if self._ends:
+                return
+            self._ends = True
+            assert self.report is not None
+            try:
+                with contextlib.suppress(BusError):
+                    self._hold_at(self.joints.state(self.bus.read_state()).position)
+                while self.cfg.then == "off" and not self._held_long():
+                    self.bus.clock.sleep(WATCH_S)
+            finally:
+                left = dict.fromkeys(self.bus.ids, LEFT_ON)
+                if self.cfg.then == "off":
+                    left = self._release()
+                self.report = replace(self.report, unreleased=left)
+                self._inform(str(self.report))
+                self._off_s = self.bus.clock.now()
+                self._ended(self.report)
+
+    def _held_long(self) -> bool:
+        """Whether the torque is to go off now: after its time, or as a further signal asks."""
         assert self.report is not None
-        with contextlib.suppress(BusError):
-            self._hold_at(self.joints.state(self.bus.read_state()).position)
-        why = "" if self.report.reason == FINISHED else f"stopped: {self.report.reason}; "
-        if self.cfg.then == "hold":
-            self._say(f"{why}the hand holds, its torque is on")
-            return
-        end = self.bus.clock.now() + self.cfg.hold_s
-        self._signal = 0
-        while self.bus.clock.now() < end and not self._signal:  # a signal: at once
-            self.bus.clock.sleep(WATCH_S)
-        left = self._release()
-        self.report = replace(self.report, unreleased=left)
-        self._say(f"{why}torque off")
-        for id, why in left.items():
-            self._say(f"motor {id} may still be on, cut its power: {why}")
+        further = len(self._signals.came()) > bool(self.report.signal)
+        held_s = self.bus.clock.now() - self.report.detected_s
+        return further or held_s >= self.cfg.hold_s
+
+    def _inform(self, text: str) -> None:
+        """Tell the person; a terminal that is stopped or gone does not keep the hand on."""
+        end = self.bus.clock.now() + SAY_S
+        with contextlib.suppress(OSError, ValueError):
+            said = self.bus.clock.beside(lambda: self._say(text))
+            while not said() and self.bus.clock.now() < end:
+                self.bus.clock.sleep(WATCH_S)
 
     def _release(self) -> dict[int, str]:
         """Switch all motors off; those of which that is not known, with the reason."""
@@ -408,13 +469,19 @@ class SafeHand:
             if not left or self.bus.clock.now() > end:
                 return left
 
-    def _on_signal(self, number: int, _: FrameType | None) -> None:
-        """Note a signal; the watchdog acts on it. A second one is not caught any more."""
-        self._signal = number
-        if self.report is not None:
-            signal.signal(number, signal.default_int_handler)
-
     def _watch(self) -> None:
-        """Stop the hand when the loop does not."""
-        if self._armed and self.report is None and (due := self._due()):
-            self._hold(due)
+        """Stop the hand when the loop does not, and bring to its end what the loop does not."""
+        if not self._armed or self._back:
+            return
+        if self.report is None:
+            if due := self._due():
+                self._hold(due)
+                self._inform(f"stopping: {due}; the hand holds")
+            return
+        if not self._ends and self._held_long():
+            with contextlib.suppress(OSError):  # of the log, whose end is not for this thread
+                self._off()
+        came = self._signals.came()
+        if came and self.bus.clock.now() > self._off_s + END_S:
+            self._inform("the program does not come to its end, and is ended")
+            os._exit(128 + came[0])

@@ -27,13 +27,14 @@ from vd.deploy.hardware.connect import Connection
 from vd.deploy.hardware.control_table import HardwareError
 from vd.deploy.hardware.joints import Joints, read_joints
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
-from vd.deploy.safety.safety import FINISHED, SafeHand, StoppedError
+from vd.deploy.safety.safety import SafeHand, StoppedError
 from vd.deploy.twin.line import Faults
 from vd.deploy.twin.motor import Motor, make_motors
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.deploy.twin.plant import Drive, FirstOrderPlant, Plant
 from vd.deploy.twin.twin import Twin
 from vd.files import write_json
+from vd.log_format import FINISHED
 from vd.warp_quiet import quiet_warp
 
 PUSH_RAD = 0.29
