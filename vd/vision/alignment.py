@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from vd.vision.cfg import AlignmentCfg
 from vd.vision.icp import CLOUD_M, normals, refine
-from vd.vision.rotations import cube_rotations, matrices
+from vd.vision.rotations import cube_rotations, first_columns, matrices
 
 PATCH_M = 0.03
 """Unit of places within a patch [m]: about its size."""
@@ -247,9 +247,7 @@ class Aligner:
             tokens = self.network.encode(turned, GOAL, self._near[goal])
             parts.append(self.network.compare(tokens, seen[pair[some]]))
         better = torch.cat([part.rotation for part in parts]) @ flat
-        better = matrices(
-            torch.cat([better[..., 0], better[..., 1]], dim=-1)
-        )  # still rotations after many
+        better = matrices(first_columns(better))  # still rotations after many
         return better.unflatten(0, shape), torch.cat([part.offset for part in parts]).unflatten(
             0, shape
         )

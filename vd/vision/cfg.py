@@ -1,6 +1,8 @@
-"""Settings of the network that sees."""
+"""Settings of the networks that see."""
 
 from dataclasses import dataclass, fields
+
+from vd.paper import PAPER
 
 SEEN_POINTS = 512
 """Points of what is seen that a policy looks at: as many as its network learns from."""
@@ -32,3 +34,35 @@ class AlignmentCfg:
             raise ValueError(
                 f"--align.network.heads = {self.heads} must divide the width {self.width}"
             )
+
+
+@dataclass(frozen=True)
+class StudentCfg:
+    """Sizes of the student (:mod:`vd.vision.student`), by default the paper's."""
+
+    channels: tuple[int, ...] = (32, 64, 128, 256)
+    """Width of each stage; each halves the grid."""
+    blocks: int = 2
+    """Residual blocks of a stage."""
+    embedding: int = 256
+    """Width of what one look shows."""
+    senses: int = 128
+    """Width of the layers that read joints, last action and belief."""
+    memory: int = 256
+    """Width of the GRU."""
+    head: int = 256
+    """Width of the layer before action and distance."""
+    voxel_m: float = PAPER.cloud.voxel_m
+    """Side of a voxel [m]."""
+
+    def validate(self) -> None:
+        """Raise ``ValueError`` for what cannot be built, naming the field."""
+        if not self.channels or min(self.channels) < 1:
+            raise ValueError(f"student.channels = {self.channels} must name positive widths")
+        if self.blocks < 0:
+            raise ValueError(f"student.blocks = {self.blocks} must not be negative")
+        if not self.voxel_m > 0.0:
+            raise ValueError(f"student.voxel_m = {self.voxel_m} must be positive")
+        for name in ("embedding", "senses", "memory", "head"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"student.{name} must be positive")

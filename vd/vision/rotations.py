@@ -38,6 +38,11 @@ def two_columns(quaternion: torch.Tensor) -> torch.Tensor:
     )
 
 
+def first_columns(matrix: torch.Tensor) -> torch.Tensor:
+    """First two columns of matrices [.., 3, 3], one after the other [.., 6]."""
+    return torch.cat([matrix[..., 0], matrix[..., 1]], dim=-1)
+
+
 def matrices(columns: torch.Tensor) -> torch.Tensor:
     """Rotation matrices [.., 3, 3] nearest to two columns [.., 6], by Gram and Schmidt."""
     first = nn.functional.normalize(columns[..., :3], dim=-1)

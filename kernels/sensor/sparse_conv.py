@@ -1,0 +1,82 @@
+"""What sparse convolutions read: rows of neighbouring cells, and what the points of a voxel are like.
+
+A cell of level l is a cube of 2^l voxels a side. Its key is that of its first voxel
+(:mod:`vd.kernels.sensor.voxels`), the last 3 l bits zero. So keys of all levels sort alike, their
+coordinates count voxels, and one kernel makes every map between levels.
+"""
+
+import warp as wp
+
+from vd.kernels.sensor.voxels import CLOUD_SHIFT, key_coordinates, voxel_key
+
+wp.set_module_options({"enable_backward": False})
+
+KERNEL = 27
+"""Weights of a 3x3x3 kernel; offset k is (k // 9 - 1, k // 3 % 3 - 1, k % 3 - 1)."""
+
+_KERNEL = wp.constant(KERNEL)
+_MORTON_MASK = wp.constant(wp.int64((1 << CLOUD_SHIFT) - 1))
+_CLOUD_SHIFT = wp.constant(wp.int64(CLOUD_SHIFT))
+
+
+@wp.kernel
+def kernel_map_kernel(
+    # In:
+    output_key_in: wp.array[wp.int64],  # [M] keys of the cells for which rows are looked up
+    input_key_in: wp.array[wp.int64],  # [F] keys of the cells that are read, each once, ascending
+    step: int,  # voxels between the offsets of the kernel
+    # Out:
+    table_out: wp.array2d[int],  # [M, 27] row of the cell at each offset, F where there is none
+):
+    """Find the cells under a 3x3x3 kernel about each cell. Launch: [M].
+
+    Of one level and itself with the level's step: a convolution of stride 1 (submanifold). Of a
+    coarse level reading a fine one with the fine step: stride 2, input = 2 output + offset. The
+    other way round with the same step: the outputs of that at each input, offsets reversed.
+    """
+    row = wp.tid()
+    key = output_key_in[row]
+    cell = key_coordinates(key & _MORTON_MASK)
+    for k in range(_KERNEL):
+        x = cell[0] + step * (k // 9 - 1)
+        y = cell[1] + step * ((k // 3) % 3 - 1)
+        z = cell[2] + step * (k % 3 - 1)
+        wanted = voxel_key(key >> _CLOUD_SHIFT, x, y, z)
+        place = wp.lower_bound(input_key_in, wanted)
+        if place < input_key_in.shape[0] and input_key_in[place] == wanted:
+            table_out[row, k] = place
+        else:
+            table_out[row, k] = input_key_in.shape[0]
+
+
+@wp.kernel
+def voxel_feature_kernel(
+    # In:
+    points_in: wp.array2d[wp.vec3],  # [B, P] points [m]
+    kind_in: wp.array[int],  # [P] kind of each column of points, from 0 to below C
+    order_in: wp.array[wp.int64],  # [K] points in the order of their keys: cloud * P + column
+    start_in: wp.array[wp.int64],  # [M + 1] first of each voxel's points in that order, and the end
+    voxel_size: float,  # side of a voxel [m]
+    # Out:
+    feature_out: wp.array2d[
+        float
+    ],  # [M, 4 C] of each kind: 1 if a point is there, their mean place
+):
+    """Tell what points a voxel holds, and where in it, from its middle [voxels]. Launch: [M, C].
+
+    Sums go in the order of the points, so equal clouds give equal features.
+    """
+    row, kind = wp.tid()
+    count = wp.float32(0.0)
+    total = wp.vec3(0.0)
+    for i in range(int(start_in[row]), int(start_in[row + 1])):
+        point = int(order_in[i])
+        column = point % points_in.shape[1]
+        if kind_in[column] == kind:
+            scaled = points_in[point // points_in.shape[1], column] / voxel_size
+            for axis in range(3):
+                total[axis] += scaled[axis] - wp.floor(scaled[axis]) - 0.5
+            count += 1.0
+    feature_out[row, 4 * kind] = wp.min(count, 1.0)
+    for axis in range(3):
+        feature_out[row, 4 * kind + 1 + axis] = total[axis] / wp.max(count, 1.0)

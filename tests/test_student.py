@@ -1,0 +1,244 @@
+"""The student: what it reads, what it believes and remembers, and that it learns."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from vd.assets_usd.hands import load_hand
+from vd.senses import Senses
+from vd.vision.cfg import StudentCfg
+from vd.vision.rotations import (
+    matrices,
+    random_rotations,
+    rotations_about,
+    turn_angle,
+    two_columns,
+)
+from vd.vision.sparse import voxelise
+from vd.vision.student import Belief, Sight, SightBuilder, Student, carried, each
+
+JOINTS = 9
+SMALL = StudentCfg(
+    channels=(8, 16), blocks=1, embedding=32, senses=16, memory=32, head=32, voxel_m=0.01
+)
+
+
+def box_clouds(count: int, points: int, generator: torch.Generator) -> torch.Tensor:
+    """Points [m] on boxes of different lengths, with a smaller one on a face [count, points, 3]."""
+    size = 0.02 + 0.04 * torch.rand((count, 1, 3), generator=generator)
+    place = 2.0 * torch.rand((count, points, 3), generator=generator) - 1.0
+    face = place.abs().argmax(dim=-1, keepdim=True)
+    surface = place.scatter(-1, face, place.gather(-1, face).sign())
+    bump = torch.arange(points)[None, :, None] % 3 == 0
+    middle = torch.tensor([0.7, 0.5, 1.0])
+    return 0.5 * size * torch.where(bump, 0.5 * surface + middle, surface)
+
+
+def sights(lead: tuple[int, ...], seed: int = 0, points: int = 60) -> Sight:
+    """Sights of objects turned by up to half a radian from where they are believed to be."""
+    generator = torch.Generator().manual_seed(seed)
+    count = int(np.prod(lead))
+    torch.manual_seed(seed)
+    goal = box_clouds(count, points, generator)
+    goal = goal - goal.mean(dim=1, keepdim=True)
+    cpu = torch.device("cpu")
+    believed = matrices(two_columns(random_rotations(count, cpu)))
+    axis = torch.randn((count, 3), generator=generator)
+    off = matrices(two_columns(rotations_about(axis, 0.5 * torch.ones(count))))
+    position = 0.02 * torch.randn((count, 3), generator=generator) + torch.tensor([0.0, 0, 0.17])
+    sight = Sight(
+        camera=carried(goal, off @ believed, position[:, None]),
+        hand=0.05 * torch.randn((count, points, 3), generator=generator),
+        goal=goal,
+        goal_rotation=matrices(two_columns(random_rotations(count, cpu))),
+        proprioception=torch.randn((count, 3 * JOINTS), generator=generator),
+        belief=Belief(believed, position),
+    )
+    return each(sight, lambda value: value.unflatten(0, lead))
+
+
+def student(cfg: StudentCfg = SMALL, seed: int = 0) -> Student:
+    torch.manual_seed(seed)
+    return Student(cfg, JOINTS).eval()
+
+
+def test_without_weights_it_does_nothing_and_believes_what_it_did():
+    network = student()
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.zero_()
+    for seed in range(2):
+        sight = sights((2, 3), seed)
+        output = network(sight, network.first_hidden(3))
+        assert not output.mean.any()
+        torch.testing.assert_close(output.belief.rotation, sight.belief.rotation)
+        torch.testing.assert_close(output.belief.position, sight.belief.position)
+        assert (output.log_distance == 0.0).all()
+
+
+def test_what_it_says_depends_on_every_thing_that_it_reads():
+    network = student()
+    sight = sights((2,))
+    output = network.act(sight, network.first_hidden(2))
+    other = sights((2,), seed=1)
+    for field in dataclasses.fields(Sight):
+        changed = dataclasses.replace(sight, **{field.name: getattr(other, field.name)})
+        found = network.act(changed, network.first_hidden(2))
+        assert (found.mean != output.mean).any(dim=1).all(), field.name
+    remembered = network.act(sight, output.hidden)
+    assert (remembered.mean != output.mean).any(dim=1).all()
+
+
+def test_a_sequence_is_its_steps_and_ended_episodes_are_forgotten():
+    network = student()
+    sight = sights((4, 3))
+    done = torch.zeros((4, 3), dtype=torch.bool)
+    done[1, 0] = done[3, 2] = True
+    whole = network(sight, torch.ones(3, SMALL.memory), done)
+    hidden = torch.ones(3, SMALL.memory)
+    for step in range(4):
+        output = network.act(each(sight, lambda value, step=step: value[step]), hidden)
+        hidden = output.hidden.masked_fill(done[step, :, None], 0.0)
+        for name in ("mean", "log_std", "log_distance"):
+            found = getattr(output, name)
+            torch.testing.assert_close(found, getattr(whole, name)[step], atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(output.belief.rotation, whole.belief.rotation[step])
+    torch.testing.assert_close(hidden, whole.hidden)
+    assert not hidden[2].any()
+
+
+def test_a_scene_moved_with_the_belief_looks_the_same():
+    """Voxels are counted from where the object is believed to be."""
+    network = student()
+    sight = sights((3,), points=20)
+    shift = torch.tensor([0.0123, -0.0077, 0.0031])
+    belief = Belief(sight.belief.rotation, sight.belief.position + shift)
+    moved = dataclasses.replace(
+        sight, camera=sight.camera + shift, hand=sight.hand + shift, belief=belief
+    )
+    torch.testing.assert_close(network.encode(moved), network.encode(sight), atol=2e-3, rtol=0.0)
+    aside = dataclasses.replace(sight, belief=belief)
+    assert (network.encode(aside) - network.encode(sight)).abs().max() > 0.05
+
+
+def senses_of(hand, envs: int, place: torch.device) -> Senses:
+    generator = np.random.default_rng(0)
+
+    def random(low, high, *shape):
+        return torch.tensor(generator.uniform(low, high, shape), dtype=torch.float32, device=place)
+
+    joints = hand.num_joints
+    return Senses(
+        joint_q=torch.tensor(
+            generator.uniform(hand.lower, hand.upper, (envs, joints)),
+            dtype=torch.float32,
+            device=place,
+        ),
+        joint_qd=random(-1, 1, envs, joints),
+        action=random(-1, 1, envs, joints),
+        goal_quat=random_rotations(envs, place),
+        points=torch.full((envs, 4, 3), torch.nan, device=place),
+        fresh=torch.ones(envs, dtype=torch.bool, device=place),
+    )
+
+
+def test_it_reads_the_hand_by_its_joints_and_the_goal_where_it_is_believed(device):
+    hand = load_hand("dclaw3")
+    place = torch.device(wp.device_to_torch(device))
+    generator = torch.Generator().manual_seed(0)
+    goals = (box_clouds(2, 300, generator) + 0.01).to(place)
+    build = SightBuilder(hand, goals)
+    senses = senses_of(hand, 2, place)
+    belief = build.first_belief(senses.goal_quat)
+    # In the world's axes, about where objects are handled: 8 cm above the table.
+    world = matrices(two_columns(senses.goal_quat)).cpu()
+    to_base = matrices(two_columns(torch.tensor(hand.mount[3:]).float())).T
+    torch.testing.assert_close(belief.rotation.cpu(), to_base @ world)
+    torch.testing.assert_close(belief.position.cpu(), torch.tensor([[0.0, 0.0, 0.17]] * 2))
+    sight = build(senses, belief)
+    poses = hand.forward_kinematics(senses.joint_q.cpu().numpy())
+    tip = sight.hand[0].cpu().numpy().reshape(len(hand.point_link), -1, 3)
+    for link, points in zip(hand.point_link, tip, strict=True):
+        assert np.abs(points - poses[0, link, :3]).max() < 0.12
+    # An object where it is believed to be fills the goal's voxels, and no others.
+    seen = carried(goals, belief.rotation, belief.position[:, None])
+    mean = goals.mean(dim=1, keepdim=True)
+    seen = seen - carried(mean, belief.rotation)
+    laid = carried(sight.goal, belief.rotation)
+    both = voxelise([seen - belief.position[:, None], laid], 0.005).features
+    assert (both[:, 0] == both[:, 4]).float().mean() > 0.97
+    twice = build(each_row(senses, [1, 0]), each(belief, lambda v: v.flip(0)), torch.tensor([1, 0]))
+    torch.testing.assert_close(twice.goal, sight.goal.flip(0))
+    torch.testing.assert_close(twice.hand, sight.hand.flip(0))
+
+
+def each_row(senses: Senses, rows: list[int]) -> Senses:
+    taken = {f.name: getattr(senses, f.name)[rows] for f in dataclasses.fields(Senses)}
+    return Senses(**taken)
+
+
+def test_it_learns_by_what_rotation_a_belief_is_wrong():
+    """Eight objects half a radian off are turned right after a few dozen steps."""
+    network = student().train()
+    sight = sights((1, 8), points=200)
+    seen = sight.camera - sight.belief.position[..., None, :]
+    # What carries the goal's cloud onto what is seen, by least squares.
+    u, _, vt = torch.linalg.svd(sight.goal.transpose(-1, -2) @ seen)
+    truth = (u @ vt).transpose(-1, -2)
+    off = turn_angle(sight.belief.rotation @ truth.transpose(-1, -2))
+    torch.testing.assert_close(off, torch.full((1, 8), 0.5), atol=1e-3, rtol=0.0)
+    optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
+    for _ in range(60):
+        found = network(sight, network.first_hidden(8)).belief
+        loss = (found.rotation - truth).square().sum((-1, -2)).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    left = turn_angle(found.rotation.detach() @ truth.transpose(-1, -2))
+    assert left.mean() < 0.15
+
+
+def test_it_learns_in_half_precision(device):
+    place = torch.device(wp.device_to_torch(device))
+    network = student().train().to(place)
+    sight = each(sights((2, 3)), lambda value: value.to(place))
+    single = network(sight, network.first_hidden(3))
+    network.half = True
+    output = network(sight, network.first_hidden(3))
+    assert output.mean.dtype == output.belief.rotation.dtype == torch.float32
+    torch.testing.assert_close(output.mean, single.mean, atol=0.02, rtol=0.02)
+    assert (output.mean != single.mean).any()
+    spoken = [output.mean, output.log_std, output.belief.rotation, output.log_distance]
+    sum(value.square().sum() for value in spoken).backward()
+    for name, weight in network.named_parameters():
+        assert torch.isfinite(weight.grad).all(), name
+        assert weight.grad.any(), name
+
+
+def test_a_robot_runs_its_stages_in_half_precision():
+    network = student()
+    sight = sights((2,))
+    with torch.inference_mode():
+        single = network.act(sight, network.first_hidden(2))
+        network.stages.bfloat16()
+        output = network.act(sight, network.first_hidden(2))
+    torch.testing.assert_close(output.mean, single.mean, atol=0.02, rtol=0.02)
+    assert output.hidden.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"channels": ()}, "channels"),
+        ({"channels": (8, 0)}, "channels"),
+        ({"blocks": -1}, "blocks"),
+        ({"voxel_m": 0.0}, "voxel_m"),
+        ({"memory": 0}, "memory"),
+    ],
+)
+def test_refuses_sizes_that_make_no_network(change, field):
+    with pytest.raises(ValueError, match=f"student.{field}"):
+        Student(dataclasses.replace(SMALL, **change), JOINTS)

@@ -1,0 +1,310 @@
+"""The student: a network that turns what a camera sees, joints and a goal's cloud into an action.
+
+One sparse tensor holds what the camera sees, the hand's own points by its joints, and the goal's
+cloud, each kind in channels of its own. The goal's cloud is laid where the object is believed to be,
+so what is wrong with the belief shows as a small shift between two surfaces, wherever the object is.
+The network predicts by how much the belief is to be turned and shifted, and acts on the better one.
+A GRU carries over steps what one look does not show.
+
+The voxels of a step depend on the belief that the step before left. So a sequence can only be encoded
+at once if its beliefs are those of the rollout: training stores them beside the rest of a
+:class:`Sight`, as data through which no gradient flows, and teaches the residual from each stored
+belief to the truth.
+
+N environments, T steps, D joints and actions, E the embedding, G the memory. Base frame of the hand;
+metres, radians.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+import warp as wp
+from torch import nn
+
+from vd.arrays import as_warp
+from vd.assets_usd.hand_data import HandModel
+from vd.clouds import HandCloud
+from vd.paper import PAPER
+from vd.senses import Senses
+from vd.vision.cfg import StudentCfg
+from vd.vision.rotations import first_columns, matrices, two_columns
+from vd.vision.sparse import ResidualBlock, SparseTensor, StridedConv, global_pool, voxelise
+
+KINDS = 3
+"""Kinds of points: of the camera, of the hand, of the goal."""
+PLACE_M = 0.1
+"""Unit of places and offsets [m]: about the size of the scene."""
+LOG_STD = (-4.0, 0.0)
+"""Least and largest logarithm of an action's standard deviation, as wide as teachers' are."""
+UNTURNED = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+"""The identity as two columns: what a network that predicts zeros turns by."""
+
+Step = TypeVar("Step", "Sight", "Belief")
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Where a goal's cloud is believed to lie on the object; leading axes [N] or [T, N]."""
+
+    rotation: torch.Tensor
+    """From the cloud's own axes to the base frame, matrices [.., 3, 3]."""
+    position: torch.Tensor
+    """Of the cloud's mean [m] [.., 3]."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a student reads of a step; leading axes [N] or [T, N]."""
+
+    camera: torch.Tensor
+    """What the camera sees, or complete surfaces; NaN for none [.., K, 3]."""
+    hand: torch.Tensor
+    """The hand's own points by its joints [.., H, 3]."""
+    goal: torch.Tensor
+    """The goal's cloud about its mean, in its own axes [.., P, 3]."""
+    goal_rotation: torch.Tensor
+    """Wanted rotation, from the cloud's own axes to the base frame, matrices [.., 3, 3]."""
+    proprioception: torch.Tensor
+    """Joint positions and velocities, scaled, and the last action [.., 3 D]."""
+    belief: Belief
+    """What the step before left."""
+
+
+@dataclass(frozen=True)
+class StudentOutput:
+    """What a student says of a step; leading axes [N] or [T, N], the memory's [N]."""
+
+    mean: torch.Tensor
+    """Mean of the action, not clipped [.., D]."""
+    log_std: torch.Tensor
+    """Logarithm of its standard deviation [.., D]."""
+    belief: Belief
+    """The better belief; detached it is the next step's."""
+    log_distance: torch.Tensor
+    """Logarithm of the angle to the goal [rad] [..]."""
+    hidden: torch.Tensor
+    """Memory after the last step [N, G]."""
+
+
+def each(step: Step, change: Callable[[torch.Tensor], torch.Tensor]) -> Step:
+    """A step with every tensor changed, such as indexed."""
+    values: dict[str, Any] = {}
+    for field in fields(step):
+        value = getattr(step, field.name)
+        nested = isinstance(value, Belief)
+        values[field.name] = each(value, change) if nested else change(value)
+    return type(step)(**values)
+
+
+def carried(
+    points: torch.Tensor, rotation: torch.Tensor, position: torch.Tensor | float = 0.0
+) -> torch.Tensor:
+    """Points [.., P, 3] turned by matrices [.., 3, 3] and shifted by [.., 1, 3]: P R^T + p."""
+    return points @ rotation.transpose(-1, -2) + position
+
+
+class SightBuilder:
+    """Makes what a student reads of what N hands sense.
+
+    Args:
+        hand: The hand.
+        goals: Clouds of the goals, in their own axes and of true size [m] [N, P, 3].
+    """
+
+    def __init__(self, hand: HandModel, goals: torch.Tensor):
+        device = goals.device
+        links = np.arange(len(hand.link_names))
+        self._goals = goals - goals.mean(dim=1, keepdim=True)
+        self._cloud = HandCloud(hand, link_body=links, device=str(device))
+        self._links = len(links)
+
+        def constant(values: np.ndarray) -> torch.Tensor:
+            return torch.tensor(values, dtype=torch.float32, device=device)
+
+        self._to_base = matrices(two_columns(constant(hand.mount[3:]))).T
+        self._place = constant(hand.goal_in_base)
+        self._lower = constant(hand.lower)
+        self._range = constant(hand.upper - hand.lower)
+
+    def goal_rotation(self, goal_quat: torch.Tensor) -> torch.Tensor:
+        """Wanted rotations in the base frame [R, 3, 3] of quaternions xyzw in the world frame [R, 4]."""
+        return self._to_base @ matrices(two_columns(goal_quat))
+
+    def first_belief(self, goal_quat: torch.Tensor) -> Belief:
+        """What is believed of an object before it is seen.
+
+        It is turned as it is wanted and lies where objects are handled.
+        """
+        return Belief(self.goal_rotation(goal_quat), self._place.repeat(len(goal_quat), 1))
+
+    def __call__(self, senses: Senses, belief: Belief, rows: torch.Tensor | None = None) -> Sight:
+        """What is read of R steps.
+
+        Args:
+            senses: What was sensed, R rows; instead of what a camera sees ``points`` may hold
+                complete surfaces (:func:`carried`).
+            belief: What was believed before [R].
+            rows: Environment of each row [R]; row i is of environment i by default.
+        """
+        joint_q = senses.joint_q
+        poses = joint_q.new_empty((len(joint_q), self._links, 7))
+        links = as_warp(poses, wp.transform)
+        self._cloud.pose(as_warp(joint_q), links)
+        position = 2.0 * (joint_q - self._lower) / self._range - 1.0
+        velocity = PAPER.observation.velocity_scale * senses.joint_qd
+        return Sight(
+            camera=senses.points,
+            hand=wp.to_torch(self._cloud(links)),
+            goal=self._goals if rows is None else self._goals[rows],
+            goal_rotation=self.goal_rotation(senses.goal_quat),
+            proprioception=torch.cat([position, velocity, senses.action], dim=-1),
+            belief=belief,
+        )
+
+
+class VoxelStage(nn.Module):
+    """A convolution of stride 2, BN and residual blocks on the coarser cells.
+
+    Args:
+        inputs: C_in.
+        outputs: C_out.
+        blocks: Residual blocks.
+    """
+
+    def __init__(self, inputs: int, outputs: int, blocks: int):
+        super().__init__()
+        self.conv = StridedConv(inputs, outputs)
+        self.norm = nn.BatchNorm1d(outputs)
+        self.blocks = nn.Sequential(*(ResidualBlock(outputs) for _ in range(blocks)))
+
+    def forward(self, x: SparseTensor) -> SparseTensor:
+        """Features of the coarser cells."""
+        x = self.conv(x)
+        return self.blocks(SparseTensor(self.norm(x.features), x.sites))
+
+
+class Student(nn.Module):
+    """From what is seen and sensed to the action, with memory (the paper's Figure 7).
+
+    Its stages multiply in their weights' precision: ``stages.bfloat16()`` is for a robot's
+    computer, ``half`` for learning. Geometry is computed in single precision; so call it outside
+    of autocast.
+
+    Args:
+        cfg: Its sizes.
+        num_actions: D.
+
+    Attributes:
+        half: The stages multiply in bfloat16 while weights stay in single precision.
+    """
+
+    def __init__(self, cfg: StudentCfg, num_actions: int):
+        super().__init__()
+        cfg.validate()
+        self.cfg = cfg
+        self.half = False
+        widths = (4 * KINDS + 3, *cfg.channels)
+        self.stages = nn.Sequential(
+            *(
+                VoxelStage(inner, outer, cfg.blocks)
+                for inner, outer in zip(widths, cfg.channels, strict=False)
+            )
+        )
+        self.project = nn.Sequential(nn.Linear(2 * widths[-1], cfg.embedding), nn.ReLU())
+        believed = len(UNTURNED) + 3
+        self.senses = nn.Sequential(
+            nn.Linear(3 * num_actions + believed, cfg.senses),
+            nn.GELU(),
+            nn.Linear(cfg.senses, cfg.senses),
+        )
+        self.memory = nn.GRU(cfg.embedding + cfg.senses, cfg.memory)
+        self.residual = nn.Linear(cfg.memory, believed)
+        self.head = nn.Sequential(nn.Linear(cfg.memory + believed, cfg.head), nn.GELU())
+        self.mean = nn.Linear(cfg.head, num_actions)
+        self.log_std = nn.Linear(cfg.head, num_actions)
+        self.log_distance = nn.Linear(cfg.head, 1)
+        self.register_buffer("unturned", torch.tensor(UNTURNED), persistent=False)
+
+    def first_hidden(self, envs: int) -> torch.Tensor:
+        """The memory where an episode begins: zeros [N, G]."""
+        return self.mean.weight.new_zeros((envs, self.cfg.memory))
+
+    def encode(self, sight: Sight) -> torch.Tensor:
+        """What one look shows [.., E]. Waits for the device."""
+        lead = sight.camera.shape[:-2]
+        place = sight.belief.position[..., None, :]
+        kinds = (
+            sight.camera - place,
+            sight.hand - place,
+            carried(sight.goal, sight.belief.rotation),
+        )
+        voxels = voxelise([kind.flatten(0, -3) for kind in kinds], self.cfg.voxel_m)
+        middles = self.cfg.voxel_m / PLACE_M * (voxels.sites.coordinates[:, 1:] + 0.5)
+        features = torch.cat([voxels.features, middles], dim=1)
+        features = features.to(next(self.stages.parameters()).dtype)
+        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.half):
+            cells = self.stages(SparseTensor(features, voxels.sites))
+        pooled = global_pool(cells).to(place.dtype)
+        return self.project(pooled).unflatten(0, lead)
+
+    def forward(
+        self, sight: Sight, hidden: torch.Tensor, done: torch.Tensor | None = None
+    ) -> StudentOutput:
+        """Read a sequence.
+
+        Args:
+            sight: What was sensed in each step [T, N].
+            hidden: Memory before the first step [N, G].
+            done: Where step t was the last of an episode, bool [T, N]: t + 1 begins without memory.
+        """
+        belief = sight.belief
+        known = [sight.proprioception, self._believed(belief, sight.goal_rotation)]
+        inputs = torch.cat([self.encode(sight), self.senses(torch.cat(known, dim=-1))], dim=-1)
+        remembered, hidden = self._remember(inputs, hidden, done)
+        turn, shift = self.residual(remembered).split([len(UNTURNED), 3], dim=-1)
+        better = Belief(
+            rotation=matrices(self.unturned + turn) @ belief.rotation,
+            position=belief.position + PLACE_M * shift,
+        )
+        known = [remembered, self._believed(better, sight.goal_rotation)]
+        features = self.head(torch.cat(known, dim=-1))
+        low, high = LOG_STD
+        return StudentOutput(
+            mean=self.mean(features),
+            log_std=low + (high - low) * torch.sigmoid(self.log_std(features)),
+            belief=better,
+            log_distance=self.log_distance(features).squeeze(-1),
+            hidden=hidden,
+        )
+
+    def act(self, sight: Sight, hidden: torch.Tensor) -> StudentOutput:
+        """One step of N hands: what :meth:`forward` says of it, leading axis [N]."""
+        output = self(each(sight, lambda value: value[None]), hidden)
+        return StudentOutput(
+            mean=output.mean[0],
+            log_std=output.log_std[0],
+            belief=each(output.belief, lambda value: value[0]),
+            log_distance=output.log_distance[0],
+            hidden=output.hidden,
+        )
+
+    def _believed(self, belief: Belief, goal_rotation: torch.Tensor) -> torch.Tensor:
+        """From the goal to the object as two columns, and the object's place [.., 9]."""
+        turn = belief.rotation @ goal_rotation.transpose(-1, -2)
+        return torch.cat([first_columns(turn), belief.position / PLACE_M], dim=-1)
+
+    def _remember(
+        self, inputs: torch.Tensor, hidden: torch.Tensor, done: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The GRU over [T, N, ..], its memory cleared where episodes ended: [T, N, G], [N, G]."""
+        outputs = []
+        state = hidden[None]
+        for step in range(len(inputs)):
+            output, state = self.memory(inputs[step : step + 1], state)
+            outputs.append(output)
+            if done is not None:
+                state = state.masked_fill(done[step, :, None], 0.0)
+        return torch.cat(outputs), state[0]
