@@ -124,6 +124,18 @@ def test_a_scene_moved_with_the_belief_looks_the_same():
     assert (network.encode(aside) - network.encode(sight)).abs().max() > 0.05
 
 
+def test_it_reads_nothing_out_of_reach():
+    network = student()
+    sight = sights((2,))
+    far = sight.belief.position[:, None] + torch.tensor([0.0, 0.0, SMALL.reach_m])
+    read = network.encode(sight)
+    for step, seen in ((1.01, False), (0.95, True)):
+        points = sight.belief.position[:, None] + step * (far - sight.belief.position[:, None])
+        camera = torch.cat([sight.camera, points], dim=1)
+        found = network.encode(dataclasses.replace(sight, camera=camera))
+        assert torch.allclose(found, read, atol=1e-6) != seen
+
+
 def senses_of(hand, envs: int, place: torch.device) -> Senses:
     generator = np.random.default_rng(0)
 
@@ -236,6 +248,7 @@ def test_a_robot_runs_its_stages_in_half_precision():
         ({"channels": (8, 0)}, "channels"),
         ({"blocks": -1}, "blocks"),
         ({"voxel_m": 0.0}, "voxel_m"),
+        ({"reach_m": -0.1}, "reach_m"),
         ({"memory": 0}, "memory"),
     ],
 )

@@ -54,6 +54,9 @@ class StudentCfg:
     """Width of the layer before action and distance."""
     voxel_m: float = PAPER.cloud.voxel_m
     """Side of a voxel [m]."""
+    reach_m: float = 0.12
+    """Points are read up to this far from where the object is believed to be [m]: the largest
+    objects reach 8 cm."""
 
     def validate(self) -> None:
         """Raise ``ValueError`` for what cannot be built, naming the field."""
@@ -61,8 +64,9 @@ class StudentCfg:
             raise ValueError(f"student.channels = {self.channels} must name positive widths")
         if self.blocks < 0:
             raise ValueError(f"student.blocks = {self.blocks} must not be negative")
-        if not self.voxel_m > 0.0:
-            raise ValueError(f"student.voxel_m = {self.voxel_m} must be positive")
+        for name in ("voxel_m", "reach_m"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"student.{name} = {getattr(self, name)} must be positive")
         for name in ("embedding", "senses", "memory", "head"):
             if getattr(self, name) < 1:
                 raise ValueError(f"student.{name} must be positive")

@@ -105,6 +105,7 @@ def kernel_map(outputs: torch.Tensor, inputs: torch.Tensor, step: int) -> torch.
     return table
 
 
+@torch.no_grad()
 def voxelise(kinds: Sequence[torch.Tensor], voxel_m: float) -> SparseTensor:
     """Voxels of clouds, with features that tell what points they hold.
 
@@ -115,7 +116,7 @@ def voxelise(kinds: Sequence[torch.Tensor], voxel_m: float) -> SparseTensor:
 
     Returns:
         Of each kind 1 if a point of it is there, and their mean place from the voxel's middle
-        [voxels], zeros for none [M, 4 kinds]. Waits for the device.
+        [voxels], zeros for none [M, 4 kinds]. No gradient flows. Waits for the device.
     """
     points = torch.cat(tuple(kinds), dim=1)
     device = points.device

@@ -236,12 +236,11 @@ class Student(nn.Module):
         """What one look shows [.., E]. Waits for the device."""
         lead = sight.camera.shape[:-2]
         place = sight.belief.position[..., None, :]
-        kinds = (
-            sight.camera - place,
-            sight.hand - place,
-            carried(sight.goal, sight.belief.rotation),
+        laid = carried(sight.goal, sight.belief.rotation)
+        kinds = [sight.camera - place, sight.hand - place, laid]
+        voxels = voxelise(
+            [self._within_reach(kind).flatten(0, -3) for kind in kinds], self.cfg.voxel_m
         )
-        voxels = voxelise([kind.flatten(0, -3) for kind in kinds], self.cfg.voxel_m)
         middles = self.cfg.voxel_m / PLACE_M * (voxels.sites.coordinates[:, 1:] + 0.5)
         features = torch.cat([voxels.features, middles], dim=1)
         features = features.to(next(self.stages.parameters()).dtype)
@@ -265,8 +264,9 @@ class Student(nn.Module):
         inputs = torch.cat([self.encode(sight), self.senses(torch.cat(known, dim=-1))], dim=-1)
         remembered, hidden = self._remember(inputs, hidden, done)
         turn, shift = self.residual(remembered).split([len(UNTURNED), 3], dim=-1)
+        turned = matrices(self.unturned + turn) @ belief.rotation
         better = Belief(
-            rotation=matrices(self.unturned + turn) @ belief.rotation,
+            rotation=matrices(first_columns(turned)),  # still a rotation after many steps
             position=belief.position + PLACE_M * shift,
         )
         known = [remembered, self._believed(better, sight.goal_rotation)]
@@ -290,6 +290,11 @@ class Student(nn.Module):
             log_distance=output.log_distance[0],
             hidden=output.hidden,
         )
+
+    def _within_reach(self, points: torch.Tensor) -> torch.Tensor:
+        """Points [.., 3] about the object's place; NaN for those that are out of reach."""
+        far = points.norm(dim=-1, keepdim=True) > self.cfg.reach_m
+        return points.masked_fill(far, torch.nan)
 
     def _believed(self, belief: Belief, goal_rotation: torch.Tensor) -> torch.Tensor:
         """From the goal to the object as two columns, and the object's place [.., 9]."""
