@@ -1,6 +1,8 @@
 """The student: what it reads, what it believes and remembers, and that it learns."""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -239,6 +241,23 @@ def test_a_robot_runs_its_stages_in_half_precision():
         output = network.act(sight, network.first_hidden(2))
     torch.testing.assert_close(output.mean, single.mean, atol=0.02, rtol=0.02)
     assert output.hidden.dtype == torch.float32
+
+
+def test_a_robot_needs_no_simulator():
+    code = """
+import sys, torch
+from vd.vision.cfg import StudentCfg
+from vd.vision.student import Belief, Sight, Student
+belief = Belief(torch.eye(3)[None], torch.zeros(1, 3))
+points = torch.rand(1, 5, 3)
+sight = Sight(points, points, points, belief.rotation, torch.zeros(1, 9), belief)
+student = Student(StudentCfg(channels=(8,), blocks=0), 3).eval()
+print(student.act(sight, student.first_hidden(1)).mean.shape[1], *sys.modules)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    printed = run.stdout.split()
+    assert "3" in printed
+    assert not {"newton", "mujoco", "pxr", "rsl_rl"} & set(printed)
 
 
 @pytest.mark.parametrize(

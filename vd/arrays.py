@@ -37,6 +37,7 @@ def as_warp(array: Array, dtype: Any = None) -> wp.array:
     """
     if isinstance(array, np.ndarray):
         return wp.array(np.ascontiguousarray(array), dtype=dtype or Any, copy=False, device="cpu")
+    wp.init()  # which ``from_torch`` alone leaves out
     return wp.from_torch(array.contiguous(), dtype=dtype)
 
 
