@@ -1,4 +1,4 @@
-"""What sparse convolutions read: rows of neighbouring cells, and what the points of a voxel are like.
+"""What sparse convolutions read: rows of neighbouring cells, and what points a voxel holds.
 
 A cell of level l is a cube of 2^l voxels a side. Its key is that of its first voxel
 (:mod:`vd.kernels.sensor.voxels`), the last 3 l bits zero. So keys of all levels sort alike, their

@@ -25,8 +25,8 @@ from vd.kernels.sensor.sparse_conv import KERNEL, kernel_map_kernel, voxel_featu
 from vd.kernels.sensor.voxels import CLOUD_SHIFT, coordinates_kernel, voxel_key_kernel
 
 GATHERED = {"cpu": 2**20, "cuda": 2**28}
-"""Entries of a gathered matrix at most, larger ones are made in parts: 4 MB on a CPU, where a part is
-multiplied before it leaves the cache, 512 MB in half precision on a GPU."""
+"""Entries of a gathered matrix at most; larger ones are made in parts. 4 MB on a CPU, where a part
+is multiplied before it leaves the cache; 512 MB in half precision on a GPU."""
 
 
 class Sites:
@@ -35,7 +35,8 @@ class Sites:
     Maps and coarser grids are made when first asked for, and kept.
 
     Args:
-        keys: Keys of the cells (:mod:`vd.kernels.sensor.sparse_conv`), each once, ascending, int64 [M].
+        keys: Keys of the cells (:mod:`vd.kernels.sensor.sparse_conv`), each once, ascending,
+            int64 [M].
         clouds: B.
         step: Voxels of a cell's side, a power of two.
     """
@@ -74,7 +75,7 @@ class Sites:
 
     @cached_property
     def strided(self) -> torch.Tensor:
-        """Rows that a kernel of stride 2 reads for each coarser cell, M for none, int32 [.., 27]."""
+        """Rows a kernel of stride 2 reads for each coarser cell, M for none, int32 [.., 27]."""
         return kernel_map(self.coarser.keys, self.keys, self.step)
 
     @cached_property
@@ -94,9 +95,9 @@ class SparseTensor:
 
 
 def kernel_map(outputs: torch.Tensor, inputs: torch.Tensor, step: int) -> torch.Tensor:
-    """Rows of ``inputs`` [F] under a 3x3x3 kernel about each of ``outputs`` [M], keys; int32 [M, 27].
+    """Rows of ``inputs`` under a 3x3x3 kernel about each of ``outputs``, int32 [M, 27].
 
-    Offsets are ``step`` voxels apart; F is where there is no cell.
+    Both are keys, [F] and [M]. Offsets are ``step`` voxels apart; F is where there is no cell.
     """
     table = outputs.new_empty((len(outputs), KERNEL), dtype=torch.int32)
     launch(
@@ -167,9 +168,10 @@ def gather_multiply(
 def weight_gradient(
     features: torch.Tensor, table: torch.Tensor, grad: torch.Tensor
 ) -> torch.Tensor:
-    """Gradient of the weights of :func:`gather_multiply` [K, C_in, C_out], in single precision at least.
+    """Gradient of the weights of :func:`gather_multiply` [K, C_in, C_out].
 
-    Gathers again: kept, the matrix would take 27 times the memory of the features.
+    It is of single precision at least. Gathers again: kept, the matrix would take 27 times the
+    memory of the features.
     """
     rows = padded(features)
     shape = table.shape[1] * features.shape[1], grad.shape[1]
@@ -253,7 +255,7 @@ class SubmanifoldConv(nn.Module):
 
 
 class StridedConv(nn.Module):
-    """A 3x3x3 convolution of stride 2 without bias, at the coarser cells that hold any of its input.
+    """A 3x3x3 convolution of stride 2 without bias; its outputs are at the coarser cells.
 
     Args:
         inputs: C_in.
@@ -294,7 +296,10 @@ class ResidualBlock(nn.Module):
 
 
 def global_pool(x: SparseTensor) -> torch.Tensor:
-    """Largest and mean of each cloud's features, single precision at least [B, 2 C]; of none zeros."""
+    """Largest and mean of each cloud's features [B, 2 C]; zeros of a cloud without cells.
+
+    Of single precision at least.
+    """
     values = x.features.to(torch.promote_types(x.features.dtype, torch.float32))
     lengths = x.sites.lengths
     most = torch.segment_reduce(values, "max", lengths=lengths, unsafe=True)

@@ -1,18 +1,18 @@
 """The student: a network that turns what a camera sees, joints and a goal's cloud into an action.
 
 One sparse tensor holds what the camera sees, the hand's own points by its joints, and the goal's
-cloud, each kind in channels of its own. The goal's cloud is laid where the object is believed to be,
-so what is wrong with the belief shows as a small shift between two surfaces, wherever the object is.
-The network predicts by how much the belief is to be turned and shifted, and acts on the better one.
-A GRU carries over steps what one look does not show.
+cloud, each kind in channels of its own. The goal's cloud is laid where the object is believed to
+be, so what is wrong with the belief shows as a small shift between two surfaces, wherever the
+object is. The network predicts by how much the belief is to be turned and shifted, and acts on the
+better one. A GRU carries over steps what one look does not show.
 
-The voxels of a step depend on the belief that the step before left. So a sequence can only be encoded
-at once if its beliefs are those of the rollout: training stores them beside the rest of a
+The voxels of a step depend on the belief that the step before left. So a sequence can only be
+encoded at once if its beliefs are those of the rollout: training stores them beside the rest of a
 :class:`Sight`, as data through which no gradient flows, and teaches the residual from each stored
 belief to the truth.
 
-N environments, T steps, D joints and actions, E the embedding, G the memory. Base frame of the hand;
-metres, radians.
+N environments, T steps, D joints and actions, E the embedding, G the memory. Base frame of the
+hand; metres, radians.
 """
 
 from collections.abc import Callable
@@ -130,7 +130,7 @@ class SightBuilder:
         self._range = constant(hand.upper - hand.lower)
 
     def goal_rotation(self, goal_quat: torch.Tensor) -> torch.Tensor:
-        """Wanted rotations in the base frame [R, 3, 3] of quaternions xyzw in the world frame [R, 4]."""
+        """Wanted rotations in the base frame [R, 3, 3], of quaternions in the world's [R, 4]."""
         return self._to_base @ matrices(two_columns(goal_quat))
 
     def first_belief(self, goal_quat: torch.Tensor) -> Belief:
