@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from vd.bench import gap
 from vd.bench.cli import GapCommand
-from vd.bench.gap_score import BATTERIES, Case, figures, markdown, score
+from vd.gap.bench import battery as gap
+from vd.gap.bench.score import BATTERIES, Case, figures, markdown, score
 
 TRUTH = {
     "noise_floor_rad": 5e-4,

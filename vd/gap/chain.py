@@ -15,10 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel
-from vd.gap.coordinates import of_torque
-from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
+from vd.logs.recording import BARE_MODELS, STIFFNESS, Recording
 
 GRAVITY_M_S2 = 9.81
 """Acceleration of gravity, the simulator's."""
@@ -146,7 +145,7 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
     told = known_stiffness(recording, recording.joints[column])
     unit = 1.0 if told is None else told / BASELINE[0].typical
     for parameter in BASELINE:
-        row[parameter.column] = parameter.typical * (unit if of_torque(parameter.unit) else 1.0)
+        row[parameter.column] = parameter.typical * (unit if parameter.of_torque else 1.0)
     free = [parameter.name for parameter in BASELINE]
     if all(t.enabled[:, column].all() for t in recording.trajectories):
         free.remove("kd_off")  # nothing shows it

@@ -1,6 +1,6 @@
 """The battery of the gap workflow: does it name what is hidden, and nothing else?
 
-Every case is a recording from :mod:`vd.bench.hide`, analysed by :mod:`vd.gap.workflow` from the
+Every case is a recording from :mod:`vd.gap.bench.hide`, analysed by :mod:`vd.gap.workflow` from the
 recording
 alone, and compared with the truth: every effect of the table at four sizes, all pairs at one,
 nothing hidden, and effects outside the table. Results are one JSON file per case, so that a run can
@@ -21,12 +21,12 @@ from typing import Any
 import warp as wp
 
 from vd.assets_usd.hands import HANDS, load_hand
-from vd.bench.gap_score import KINDS, Case, said, score
-from vd.bench.gap_sizes import showing
-from vd.bench.hidden_plant import OUTSIDE
-from vd.bench.hide import hide
 from vd.files import make_folder, write_json
 from vd.gap import workflow
+from vd.gap.bench.hidden_plant import OUTSIDE
+from vd.gap.bench.hide import hide
+from vd.gap.bench.score import KINDS, Case, said, score
+from vd.gap.bench.sizes import showing
 from vd.kernels.servo import chains
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks

@@ -13,8 +13,6 @@ import numpy as np
 import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
-from vd.gap.motions import Recording
-from vd.gap.rollout import STEP_S
 from vd.kernels.launch import count_kernel, launch
 from vd.kernels.servo.actuators import BACKLASH_WIDTH, ENCODER_BIAS
 from vd.kernels.servo.chains import Samples
@@ -24,6 +22,7 @@ from vd.kernels.servo.joint_replay import (
     rest_play_kernel,
     sample_position_kernel,
 )
+from vd.logs.motions import Recording
 from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
 from vd.sim.joint_servo import JointServo
@@ -35,7 +34,7 @@ def simulate_hand(
     hand: HandModel,
     rows: np.ndarray,
     *,
-    dt: float = STEP_S,
+    dt: float,
     device: str = "cpu",
 ) -> np.ndarray:
     """What Newton makes of a recording's commands, sampled where the recording has positions.
