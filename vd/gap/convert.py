@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from vd.gap.readers import FORMATS, SourceMotion, Told, format_of
 from vd.logs.motions import Recording, Trajectory
+from vd.logs.readers import FORMATS, SourceMotion, Told, format_of
 from vd.logs.recording_checks import MIN_SAMPLES, RecordingError
 
 REQUIRED = ("command", "position")
