@@ -41,6 +41,8 @@ not tried.
 Progress = Callable[[str], None]
 FitCall = Callable[[JointProblem], Any]
 """What is asked of a joint's problem, in another process too."""
+RunCalls = Callable[[Sequence[FitCall]], list[Any]]
+"""Asks a joint's problem, in parallel."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +63,7 @@ class Search:
             too.
     """
 
-    run: Callable[[Sequence[FitCall]], list[Any]]
+    run: RunCalls
     evidence: Evidence
     others: Sequence[int]
     candidates: Sequence[str]
@@ -111,7 +113,7 @@ class Search:
             best, by a linear estimate, the most promising first.
         """
         out = {*present.effects, *(set(self.vetoes) - set(vetoed)), *skip, JITTER}
-        flat = []
+        flat: list[tuple[str, dict[str, float]]] = []
         for name in self.candidates:
             if name not in out:
                 # None that differ only in what the joint's baseline does not fit.
@@ -325,9 +327,7 @@ def with_jitter(
     for _ in range(PASSES):
         inner = replace(
             search,
-            run=lambda calls, seen=weighting: search.run(
-                [partial(weighted, c, seen) for c in calls]
-            ),
+            run=partial(run_weighted, search.run, weighting),
             known=dict(search.known),
             candidates=[name for name in search.candidates if name != JITTER],
             evidence=replace(search.evidence, behind_jitter=True),
@@ -347,6 +347,11 @@ def with_jitter(
         fit = replace(row.fit, effects=(JITTER, *row.fit.effects))
         rows.append(replace(row, round=row.round + 1, fit=fit))
     return random, beside, rows, rest.rmse
+
+
+def run_weighted(run: RunCalls, weighting: SampleWeighting, calls: Sequence[FitCall]) -> list[Any]:
+    """The results of calls that weight the samples."""
+    return run([partial(weighted, call, weighting) for call in calls])
 
 
 def weighted(call: FitCall, weighting: SampleWeighting, problem: JointProblem) -> Any:
@@ -399,7 +404,7 @@ def explain_joints(
             explained.append((joint, result))
         return explained
 
-    by_name = {}
+    by_name: dict[str, Explanation] = {}
     for explained in parallel(finger, sorted({joint.spec.chain for joint in joints})):
         by_name |= {joint.name: explanation for joint, explanation in explained}
     alone = [by_name[joint.name] for joint in joints]

@@ -72,8 +72,9 @@ def _voltage_fall(trajectories: list[Trajectory], column: int) -> tuple[float, f
     pairs = [np.zeros((2, 0))]
     for t in trajectories:
         if t.voltage is not None and _recorded(t.voltage, column):
-            duty = t.pwm is not None and _recorded(t.pwm, column)
-            pull = t.pwm if duty else t.command - t.position
+            pull = t.command - t.position
+            if t.pwm is not None and _recorded(t.pwm, column):
+                pull = t.pwm
             on = t.enabled[:, column]
             pairs.append(np.array([np.abs(pull[on, column]), t.voltage[on, column]]))
     pull, volt = np.concatenate(pairs, axis=1)
