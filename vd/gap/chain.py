@@ -6,7 +6,7 @@ A bare servo and a pendulum are one joint with its own inertia; a finger is a ch
 hanging palm down as in the simulator.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel
 from vd.kernels.servo import actuators as servo
-from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
+from vd.kernels.servo.effects import BASELINE, neutral_row
 from vd.logs.recording import BARE_MODELS, STIFFNESS, Recording
 
 GRAVITY_M_S2 = 9.81
@@ -246,12 +246,3 @@ def relative_torques(recording: Recording) -> bool:
 def others_in(chain: Chain, joint: int) -> list[int]:
     """Slots of the other joints of a chain, whose motion can drive a joint."""
     return [int(slot) for j, slot in enumerate(chain.slot) if j != joint]
-
-
-def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
-    """Effects that a joint of a chain can have besides its baseline."""
-    own = {"tau_g_nm": "gravity_load", "inertia": "payload_inertia"}
-    excluded = {effect for name, effect in own.items() if name in chain.baseline_free}
-    if len(chain.joints) == 1:
-        excluded.add("joint_coupling")
-    return [name for name in EFFECTS if name in effects and name not in excluded]

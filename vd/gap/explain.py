@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vd.gap import rules
-from vd.gap.chain import candidates, others_in
+from vd.gap.chain import others_in
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales, sizes, torque_power
 from vd.gap.fit import JointProblem, JointSpec, Problems
 from vd.gap.jitter import DROP, SIGMA, bound_jitter, fit_jitter, look
@@ -428,7 +428,7 @@ def search_of(
     chain = problems.chains[spec.chain]
     column = int(chain.columns[spec.joint])
     own = [recording.trajectories[i] for i in spec.trajectories]
-    names = candidates(chain, effects)
+    names = rules.candidates(chain, effects)
     if rules.without_jitter([(other.spec.floor, found) for other, found in explained]):
         names = [name for name in names if name != JITTER]
     told = rules.contradicted(telemetry_of(recording, chain, spec))

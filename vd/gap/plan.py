@@ -18,12 +18,13 @@ import numpy as np
 
 from vd.config import to_dict
 from vd.files import write_json
-from vd.gap.chain import Chain, candidates, chains
+from vd.gap.chain import Chain, chains
 from vd.gap.coordinates import BASELINE_PARAMETERS
 from vd.gap.design import design, pieces
 from vd.gap.fit import FINER
 from vd.gap.result import Report, effect_values, parameters_of
 from vd.gap.rollout import STEP_S, Rollouts
+from vd.gap.rules import candidates
 from vd.gap.statistics import REPEATABLE
 from vd.gap.words import causes, joints_text
 from vd.kernels.servo.effects import EFFECTS

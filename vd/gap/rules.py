@@ -13,6 +13,7 @@ from typing import get_args
 import numpy as np
 
 import vd.kernels.servo.actuators as servo
+from vd.gap.chain import Chain
 from vd.gap.models import (
     Accepted,
     Explanation,
@@ -147,6 +148,15 @@ class Evidence:
 
 
 # 1. Which effects are tried on a joint.
+
+
+def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
+    """Effects that a joint of a chain can have besides its baseline."""
+    own = {"tau_g_nm": "gravity_load", "inertia": "payload_inertia"}
+    excluded = {effect for name, effect in own.items() if name in chain.baseline_free}
+    if len(chain.joints) == 1:
+        excluded.add("joint_coupling")
+    return [name for name in EFFECTS if name in effects and name not in excluded]
 
 
 def alike(names: Sequence[str], model: str) -> dict[str, tuple[str, ...]]:
