@@ -102,11 +102,13 @@ def test_commands_act_from_when_they_were_sent():
     recording = motions("sine_0.50hz", ("f0_j1",), 0.5)
     (motion,) = recording.trajectories
     sent = replace(recording, trajectories=(replace(motion, command_time=motion.time + 0.007),))
-    got = simulate_hand(sent, HAND, rows(), dt=STEP_S)
+    got = simulate_hand(sent, HAND, rows()[None], dt=STEP_S)[0]
     np.testing.assert_allclose(
-        got, simulate_hand(recording, HAND, rows(COMMAND_DELAY=0.007), dt=STEP_S), atol=1e-5
+        got,
+        simulate_hand(recording, HAND, rows(COMMAND_DELAY=0.007)[None], dt=STEP_S)[0],
+        atol=1e-5,
     )
-    assert np.abs(got - simulate_hand(recording, HAND, rows(), dt=STEP_S)).max() > 1e-3
+    assert np.abs(got - simulate_hand(recording, HAND, rows()[None], dt=STEP_S)[0]).max() > 1e-3
 
 
 def test_load_friction_follows_what_the_drive_gives_not_what_its_controller_wants():
@@ -125,6 +127,6 @@ def test_torque_off_lets_a_finger_hang():
     (trajectory,) = recording.trajectories
     enabled = np.zeros_like(trajectory.enabled)
     limp = replace(recording, trajectories=(replace(trajectory, enabled=enabled),))
-    held = simulate_hand(recording, HAND, rows(), dt=1.0 / 240.0)
-    free = simulate_hand(limp, HAND, rows(), dt=1.0 / 240.0)
+    held = simulate_hand(recording, HAND, rows()[None], dt=1.0 / 240.0)[0]
+    free = simulate_hand(limp, HAND, rows()[None], dt=1.0 / 240.0)[0]
     assert np.ptp(held[:, 1]) > 0.3 and np.abs(free[:, 1] - held[:, 1]).max() > 0.3

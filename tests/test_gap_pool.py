@@ -83,6 +83,6 @@ def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
     for column, value in {**TRUE, servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2}.items():
         rows[0, column] = value
     exact = Rollouts(chain, recording, dt=STEP_S / 32).predict(rows[None])[0]
-    drawn = curves(recording, problems, [(spec, rows)])
+    drawn = curves(problems, [(spec, rows)])
     searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
     assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)

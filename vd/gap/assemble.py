@@ -43,9 +43,7 @@ class Analysed:
     explanation: Explanation
 
 
-def curves(
-    recording: Recording, problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]
-) -> np.ndarray:
+def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -> np.ndarray:
     """Positions of all trajectories one after the other [S, J] [rad].
 
     NaN where no joint was fitted.
@@ -53,10 +51,10 @@ def curves(
     They are simulated with the time step at which an estimate is finished.
 
     Args:
-        recording: The recording.
-        problems: Its chains.
+        problems: Of the recording.
         models: Problem and parameter rows of each fitted joint.
     """
+    recording = problems.recording
     total = sum(len(t.time) for t in recording.trajectories)
     result = np.full((total, len(recording.joints)), np.nan)
     for index, chain in enumerate(problems.chains):
@@ -71,7 +69,6 @@ def curves(
 
 
 def assemble(
-    recording: Recording,
     problems: Problems,
     joints: Sequence[Analysed],
     findings: Sequence[Misfit],
@@ -79,8 +76,9 @@ def assemble(
     seed: int,
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
-    before = curves(recording, problems, [(j.spec, j.explanation.baseline.rows) for j in joints])
-    after = curves(recording, problems, [(j.spec, j.explanation.final.rows) for j in joints])
+    recording = problems.recording
+    before = curves(problems, [(j.spec, j.explanation.baseline.rows) for j in joints])
+    after = curves(problems, [(j.spec, j.explanation.final.rows) for j in joints])
     predictions = Predictions.of(recording, before, after)
     rng = np.random.default_rng(seed)
     residuals = {j.name: _residuals(j, predictions) for j in joints}

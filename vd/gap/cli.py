@@ -163,13 +163,9 @@ class HideCommand:
 
     def run(self) -> int:
         """Write the recording."""
-        from vd.gap.bench.hide import Hiding, hide, parse_effect, truth_path
+        from vd.gap.bench.hide import Hiding, check_hidden, hide, parse_effect, truth_path
 
-        if (self.out / "recording.json").exists() and not truth_path(self.out).exists():
-            raise ValueError(
-                f"--out {self.out} holds a recording in which nothing was hidden; name another "
-                f"folder"
-            )
+        check_hidden(self.out)
         parsed = [parse_effect(text) for text in self.effect]
         hiding = Hiding(
             self.model,

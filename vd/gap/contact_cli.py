@@ -162,13 +162,10 @@ class HideContact:
     def run(self) -> int:
         """Write the recording."""
         from vd.assets_usd.objects.sets import load_set
-        from vd.gap.bench.hidden_contact import ContactPlant, hide_contact, truth_path
+        from vd.gap.bench.hidden_contact import ContactPlant, hide_contact
+        from vd.gap.bench.hide import check_hidden, truth_path
 
-        if (self.out / "recording.json").exists() and not truth_path(self.out).exists():
-            raise ValueError(
-                f"--out {self.out} holds a recording in which nothing was hidden; name another "
-                f"folder"
-            )
+        check_hidden(self.out)
         values = dict(_parse(text) for text in self.hide)
         hide_contact(ContactPlant(load_set(self.object)[0], values, seed=self.seed), self.out)
         print(f"{self.out}\n{truth_path(self.out)}")

@@ -78,7 +78,7 @@ def find(
     recording = problems.recording
     with _workers(problems, chosen) as pool:
         joints = _identify(pool, problems.chains, specs, chosen)
-        predicted = curves(recording, problems, [(j.spec, j.fit.rows) for j in joints])
+        predicted = curves(problems, [(j.spec, j.fit.rows) for j in joints])
         found = findings(recording, predicted, {j.name: j.spec.floor for j in joints})
         value = {
             "format": FIND_FORMAT,
@@ -127,7 +127,6 @@ def explain(
             for j, e in zip(joints, explained, strict=True)
         ]
         report, predictions = assemble(
-            recording,
             problems,
             analysed,
             [Misfit(**f) for f in known["findings"]],

@@ -22,7 +22,7 @@ import warp as wp
 from vd.assets_usd.hands import HANDS, load_hand
 from vd.files import write_json
 from vd.gap import workflow
-from vd.gap.bench.cases import read_result, run_cases
+from vd.gap.bench.cases import run_cases
 from vd.gap.bench.hidden_plant import OUTSIDE
 from vd.gap.bench.hide import hide
 from vd.gap.bench.score import KINDS, Case, said, score
@@ -115,8 +115,7 @@ def run_battery(
 
     What failed before comes last.
     """
-    if any(read_result(folder / f"{case.name}.json") is None for case in cases):
-        _prepare(device, {case.model for case in cases})
+    _prepare(device, {case.model for case in cases})
     return run_cases(
         cases,
         folder,

@@ -176,6 +176,18 @@ def truth_path(out: str | Path) -> Path:
     return out.parent / f"{out.name}.truth.json"
 
 
+def check_hidden(out: Path) -> None:
+    """Refuse a folder with a recording in which nothing was hidden.
+
+    Raises:
+        ValueError: It is one.
+    """
+    if (out / "recording.json").exists() and not truth_path(out).exists():
+        raise ValueError(
+            f"--out {out} holds a recording in which nothing was hidden; name another folder"
+        )
+
+
 def simulate_hidden(hidings: Sequence[Hiding]) -> list[Hidden]:
     """Make recordings, many at a time: a batch costs little more than one.
 
