@@ -10,12 +10,12 @@ from vd.gap.chain import chains
 from vd.gap.coordinates import Coordinate
 from vd.gap.design import design
 from vd.gap.fit import JointProblem
-from vd.gap.joint_fit import JointFit
-from vd.gap.recording import Recording, Trajectory
+from vd.gap.models import JointFit
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import noise_floor
 from vd.gap.workflow import baseline_of
 from vd.kernels.servo.effects import EFFECTS
+from vd.logs.recording import Recording, Trajectory
 
 ENCODER_COUNT = 2.0 * np.pi / 4096
 TRUE = {servo.KP: 3.0, servo.KD: 0.25, servo.VELOCITY_LIMIT: 7.0, servo.INERTIA: 2.5e-3}

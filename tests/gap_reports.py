@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from vd.bench.hide import Hiding, hide
+from vd.gap.bench.hide import Hiding, hide
 from vd.gap.chain import chains
-from vd.gap.recording import read_recording
 from vd.gap.result import (
+    AnalysedRecording,
     Candidate,
     Estimate,
     Fit,
@@ -16,11 +16,11 @@ from vd.gap.result import (
     NamedEffect,
     Predictions,
     Report,
-    Source,
     TrajectoryError,
 )
 from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators
+from vd.logs.recording import read_recording
 
 JOINT = "joint"
 FLOOR = 1e-3
@@ -80,7 +80,9 @@ def servo_report(folder, *, verdict="effects", ambiguous=(), friction=FRICTION):
         held_out=HeldOut(curves.files, before, after, 1.0 - after / before, (0.5, 0.9)),
         next_experiment="",
         seconds=1.0,
-        recording=Source(str(folder), "servo", (JOINT,), len(curves.files), len(curves.time), 40.0),
+        recording=AnalysedRecording(
+            str(folder), "servo", (JOINT,), len(curves.files), len(curves.time), 40.0
+        ),
         joints=(
             JointGap(
                 JOINT, FLOOR, before, (0.0, 1.0), after, (0.0, 1.0), verdict, "made up", ambiguous

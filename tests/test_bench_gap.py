@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from vd.bench import gap
 from vd.bench.cli import GapCommand
-from vd.bench.gap_score import BATTERIES, Case, figures, markdown, score
+from vd.gap.bench import battery as gap
+from vd.gap.bench.score import BATTERIES, Case, figures, markdown, score
 
 TRUTH = {
     "noise_floor_rad": 5e-4,
@@ -143,7 +143,7 @@ def test_a_battery_goes_on_where_it_ended_and_names_what_is_hidden(tmp_path, mon
             ran.append(one)
             finished(one, work(one), "")
 
-    monkeypatch.setattr(gap, "run_tasks", here)
+    monkeypatch.setattr("vd.gap.bench.cases.run_tasks", here)
     effects = ("coulomb_friction", "encoder_bias")
     some = {"out": tmp_path, "model": "servo", "effects": effects, "sizes": (3,), "seeds": 1}
     monkeypatch.setattr(gap, "NOTHING_A_SEED", 1)

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vd.bench.hidden_plant import OUTSIDE
-from vd.bench.hide import (
+from vd.gap.bench.hidden_plant import OUTSIDE
+from vd.gap.bench.hide import (
     ENCODER_COUNT,
     Hiding,
     hide,
@@ -16,11 +16,12 @@ from vd.bench.hide import (
     truth_path,
 )
 from vd.gap.chain import chains
-from vd.gap.excitations import MENU, JointRange, excitation_set
-from vd.gap.recording import read_recording
-from vd.gap.telemetry import late_side, vetoes
-from vd.gap.worker_pool import JointSpec
+from vd.gap.fit import JointSpec
+from vd.gap.rules import contradicted, late_side
+from vd.gap.telemetry import telemetry_of
 from vd.kernels.servo.effects import EFFECTS
+from vd.logs.excitations import MENU, JointRange, excitation_set
+from vd.logs.recording import read_recording
 
 
 def test_the_recording_tells_nothing_and_the_truth_lies_beside_it(tmp_path):
@@ -52,18 +53,19 @@ def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path)
     everything = tuple(range(len(recording.trajectories)))
     spec = JointSpec(0, 0, everything, everything, 1e-3, ("kd",))
     other = {"command_delay": "read_delay", "read_delay": "command_delay"}[late]
-    assert late_side(recording, chain, spec) == late
-    contradicted = set(vetoes(recording, chain, spec))
+    telemetry = telemetry_of(recording, chain, spec)
+    assert late_side(telemetry) == late
+    refused = set(contradicted(telemetry))
     assert {
         other,
         "command_filter",
         "dead_zone",
         "backlash",
-    } <= contradicted and late not in contradicted
+    } <= refused and late not in refused
     silent = replace(
         recording, trajectories=tuple(replace(t, pwm=None) for t in recording.trajectories)
     )
-    assert late_side(silent, chain, spec) == ""
+    assert late_side(telemetry_of(silent, chain, spec)) == ""
 
 
 def test_seeds_repeat_and_differ_alone_and_in_batches():

@@ -10,10 +10,10 @@ from test_hand_import import MESH, MIMIC, PARTS, write_urdf
 
 from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hands import load_hand
-from vd.bench.gap_sizes import effect_at
-from vd.bench.hidden_finger import finger_of
-from vd.bench.hidden_plant import Physics, Plant, Run, simulate
-from vd.bench.hide import COUPLING, NOISE_RAD, Hiding, _Session, simulate_hidden
+from vd.gap.bench.hidden_finger import finger_of
+from vd.gap.bench.hidden_plant import HiddenPlant, Physics, PlantRun, simulate
+from vd.gap.bench.hide import COUPLING, NOISE_RAD, Hiding, _Session, simulate_hidden
+from vd.gap.bench.sizes import effect_at
 from vd.gap.chain import chains
 from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators as kernel
@@ -23,9 +23,9 @@ KP, KD, INERTIA = 2.0, 0.1, 4.0e-3
 STEP = 0.4
 
 
-def servo(joints=1, gravity=0.0, limit=50.0, **effects) -> Plant:
+def servo(joints=1, gravity=0.0, limit=50.0, **effects) -> HiddenPlant:
     ones = np.ones(joints)
-    return Plant(
+    return HiddenPlant(
         tuple(f"j{i}" for i in range(joints)),
         KP * ones,
         KD * ones,
@@ -45,7 +45,7 @@ def answer(
     time = np.arange(int(duration * rate) + 1) / rate
     values = np.stack([np.broadcast_to(command(time), time.shape)] * len(plant.joints), axis=1)
     enabled = run.pop("enabled", np.ones(values.shape, dtype=bool))
-    return time, simulate([Run(plant, time, values, enabled, **run)], dt=dt)[0].position
+    return time, simulate([PlantRun(plant, time, values, enabled, **run)], dt=dt)[0].position
 
 
 def step(time):
@@ -71,8 +71,8 @@ SMALL = ("thermal_drift", "load_friction", "supply_sag", "torque_saturation")
 def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect(monkeypatch):
     """They share no code; both are rounded to encoder counts, of 0.44 mrad root mean square."""
     names = [name for name in EFFECTS if name not in (COUPLING, "command_jitter")]
-    monkeypatch.setattr("vd.bench.hide.NOISE_RAD", 0.0)
-    monkeypatch.setattr("vd.bench.hide.STAMP_JITTER_S", 0.0)
+    monkeypatch.setattr("vd.gap.bench.hide.NOISE_RAD", 0.0)
+    monkeypatch.setattr("vd.gap.bench.hide.STAMP_JITTER_S", 0.0)
     exact = {"base_spread": 0.0, "excitations": ("gain_ladder",)}
     sizes = {name: effect_at(name, 3.0 if name in SMALL else 1.0) for name in names}
     hidden = simulate_hidden(
@@ -153,13 +153,15 @@ def test_a_finger_moves_as_by_the_steps_of_another_integrator(payload):
         expected.append(data.qpos.copy())
         mujoco.mj_step(model, data, 50)
     ones = np.ones(3)
-    plant = Plant(("a", "b", "c"), ones, 0.02 * ones, 99 * ones, 1e-3 * ones, 0 * ones, body=body)
+    plant = HiddenPlant(
+        ("a", "b", "c"), ones, 0.02 * ones, 99 * ones, 1e-3 * ones, 0 * ones, body=body
+    )
     # Switched off at the start, and so without damping: it falls and swings, bends driving each
     # other.
     time = np.arange(100) * 5e-3
     off = np.zeros((100, 3), dtype=bool)
     conditions = {"payload_kg": payload}
-    (moved,) = simulate([Run(plant, time, np.tile(start, (100, 1)), off, conditions)], dt=1e-4)
+    (moved,) = simulate([PlantRun(plant, time, np.tile(start, (100, 1)), off, conditions)], dt=1e-4)
     assert np.ptp(moved.position, axis=0).min() > 0.1
     np.testing.assert_allclose(moved.position, np.array(expected), atol=2e-3)
 
@@ -169,7 +171,7 @@ def test_a_finger_of_any_hand_moves_as_the_rollouts_say(tmp_path, monkeypatch):
 
     Rounded to encoder counts.
     """
-    monkeypatch.setattr("vd.bench.hide.NOISE_RAD", 0.0)
+    monkeypatch.setattr("vd.gap.bench.hide.NOISE_RAD", 0.0)
     parts = [part.replace(MIMIC, "").replace(MESH, '<sphere radius="0.01"/>') for part in PARTS]
     hand = import_hand(write_urdf(tmp_path, parts), tmp_path / "out").hand
     names = hand.joint_names[hand.fingers[1]]

@@ -27,7 +27,7 @@ from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.twin.faults import BEFORE, MOVING, try_fault, try_preflight
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.deploy.twin.plant import Drive
-from vd.gap.recording import read_recording
+from vd.logs.recording import read_recording
 from vd.sim.cfg import SimCfg
 
 PORT = "/dev/simulated"

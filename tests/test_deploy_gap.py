@@ -32,10 +32,10 @@ from vd.deploy.safety.safety import SafeHand
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.envs.cfg import ReorientCfg
 from vd.gap.chain import chains
-from vd.gap.recording import read_recording
 from vd.gap.rollout import Rollouts
 from vd.gap.steps import Analysis, Settings
 from vd.kernels.servo.actuators import COMMAND_DELAY
+from vd.logs.recording import read_recording
 from vd.sim.cfg import SimCfg
 from vd.stopping import StoppingRule
 

@@ -17,7 +17,6 @@ from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop import run_page
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.safety.safety import StopReport
-from vd.gap.recording import read_recording
 from vd.hand_log import is_log, read_log
 from vd.log_format import (
     FOUND_COLUMNS,
@@ -27,6 +26,7 @@ from vd.log_format import (
     TRUTH_COLUMNS,
     LogError,
 )
+from vd.logs.recording import read_recording
 from vd.mcap_log import McapLog
 from vd.play.cli import main as play
 from vd.play.replay import Replay

@@ -17,9 +17,9 @@ from vd.gap import cli, steps
 from vd.gap.chain import chains
 from vd.gap.close import simulate_again, write_identified
 from vd.gap.plan import Rival, disagreement, discard_plan, plan, write_plan
-from vd.gap.recording import read_recording
 from vd.gap.result import Candidate, Report
 from vd.kernels.servo import actuators
+from vd.logs.recording import read_recording
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,9 @@ import pytest
 
 from vd.assets_usd.objects.model import ObjectError, read_object, write_object
 from vd.assets_usd.objects.sets import load_set, set_files
-from vd.bench.hidden_contact import ContactPlant, hide_contact
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
+from vd.gap.bench.hidden_contact import ContactPlant, hide_contact
 from vd.gap.cli import main
 from vd.sim.scene import SHAPE_TABLE
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vd.gap.cli import main
-from vd.gap.recording import read_recording
+from vd.logs.recording import read_recording
 
 RATE, COUNT = 100.0, 2.0 * np.pi / 4096
 TIME = np.arange(400) / RATE

@@ -8,14 +8,14 @@ import pytest
 from gap_recordings import recorded, true_row
 
 import vd.kernels.servo.actuators as servo
-from vd.bench.hidden_plant import COGGING, OUTSIDE
-from vd.bench.hide import Hiding, simulate_hidden
+from vd.gap.bench.hidden_plant import COGGING, OUTSIDE
+from vd.gap.bench.hide import Hiding, simulate_hidden
 from vd.gap.chain import chains
-from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
 from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain
 from vd.kernels.servo.effects import EFFECTS
+from vd.logs.recording import Recording
 
 SMALL = (
     "command_delay",

@@ -9,9 +9,9 @@ import pytest
 import vd.kernels.servo.actuators as servo
 from vd.assets_usd.hands import load_hand
 from vd.gap.chain import chains
-from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Rollouts
 from vd.gap.workflow import explain
+from vd.logs.recording import Recording, Trajectory
 
 JOINTS = ("f0_j1", "f0_j2", "f0_j3")
 NOISE = 3e-4

@@ -10,13 +10,13 @@ import pytest
 from gap_recordings import ENCODER_COUNT, TRUE, blank, problem_of, recorded, true_row
 
 import vd.kernels.servo.actuators as servo
-from vd.gap.chain import candidates, chains
+from vd.gap.chain import chains
 from vd.gap.design import design
-from vd.gap.explanation import intervals
 from vd.gap.find import findings
 from vd.gap.fit import JointProblem
-from vd.gap.joint_fit import JointFit
+from vd.gap.models import JointFit, intervals
 from vd.gap.rollout import Rollouts
+from vd.gap.rules import candidates
 from vd.gap.statistics import noise_floor
 from vd.kernels.servo.effects import EFFECTS
 

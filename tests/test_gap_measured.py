@@ -11,10 +11,10 @@ import pytest
 
 from vd.gap.chain import chains
 from vd.gap.design import MAX_MOTION_S, design, pieces
-from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Report
 from vd.gap.statistics import held
 from vd.gap.workflow import explain
+from vd.logs.recording import Recording, read_recording
 
 FRICTION = ("coulomb_friction", "dead_zone", "backlash")
 LOAD = ("coulomb_friction", "gravity_load", "encoder_bias", "asymmetric_friction")

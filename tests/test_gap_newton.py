@@ -13,11 +13,11 @@ from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hands import load_hand
 from vd.gap.chain import chains
 from vd.gap.close import counterparts
-from vd.gap.excitations import JointRange, excitation_set
-from vd.gap.newton import simulate_hand
-from vd.gap.recording import Recording
-from vd.gap.rollout import Rollouts
+from vd.gap.rollout import STEP_S, Rollouts
 from vd.kernels.servo import actuators as servo
+from vd.logs.excitations import JointRange, excitation_set
+from vd.logs.recording import Recording
+from vd.sim.replay import simulate_hand
 
 HAND = load_hand("dclaw3")
 EFFECTS: dict[str, dict[str, float]] = {
@@ -67,7 +67,7 @@ def rows(**columns: float) -> np.ndarray:
 def test_newton_agrees_with_the_rollouts_under_every_kind_of_effect():
     recording = motions("sine_0.50hz", ("f0_j1", "f0_j2"), 0.9)
     each = np.stack([rows(**columns) for columns in EFFECTS.values()])
-    newton = simulate_hand(recording, HAND, each)[..., :3]
+    newton = simulate_hand(recording, HAND, each, dt=STEP_S)[..., :3]
     predicted = Rollouts(chains(recording, HAND)[0], recording).predict(each[:, :3])
     error = np.sqrt(np.mean((newton - predicted) ** 2, axis=(1, 2)))
     moved = np.sqrt(np.mean((predicted - predicted[0]) ** 2, axis=(1, 2)))
@@ -86,7 +86,7 @@ def test_newton_agrees_on_fingers_that_differ(tmp_path):
     each = np.stack([hand.servo, hand.servo, hand.servo])
     each[1, :, [servo.COULOMB_TORQUE, servo.COMMAND_DELAY]] = [[0.05], [0.013]]
     each[2, 2, servo.COUPLING_0 + 5], each[2, 7, servo.COUPLING_0 + 4] = 0.3, 0.4
-    newton = simulate_hand(recording, hand, each)
+    newton = simulate_hand(recording, hand, each, dt=STEP_S)
     short, long = chains(recording, hand)
     assert (len(short.joints), len(long.joints)) == (2, 6)
     for chain in (short, long):
@@ -102,11 +102,13 @@ def test_commands_act_from_when_they_were_sent():
     recording = motions("sine_0.50hz", ("f0_j1",), 0.5)
     (motion,) = recording.trajectories
     sent = replace(recording, trajectories=(replace(motion, command_time=motion.time + 0.007),))
-    got = simulate_hand(sent, HAND, rows())
+    got = simulate_hand(sent, HAND, rows()[None], dt=STEP_S)[0]
     np.testing.assert_allclose(
-        got, simulate_hand(recording, HAND, rows(COMMAND_DELAY=0.007)), atol=1e-5
+        got,
+        simulate_hand(recording, HAND, rows(COMMAND_DELAY=0.007)[None], dt=STEP_S)[0],
+        atol=1e-5,
     )
-    assert np.abs(got - simulate_hand(recording, HAND, rows())).max() > 1e-3
+    assert np.abs(got - simulate_hand(recording, HAND, rows()[None], dt=STEP_S)[0]).max() > 1e-3
 
 
 def test_load_friction_follows_what_the_drive_gives_not_what_its_controller_wants():
@@ -115,7 +117,7 @@ def test_load_friction_follows_what_the_drive_gives_not_what_its_controller_want
     command = recording.trajectories[0].command[:, 1]
     assert np.ptp(command) * HAND.kp[1] > 1.5 * HAND.effort[1]
     each = np.stack([rows(), rows(LOAD_FRICTION=0.3)])
-    newton = simulate_hand(recording, HAND, each)[..., 1]
+    newton = simulate_hand(recording, HAND, each, dt=STEP_S)[..., 1]
     predicted = Rollouts(chains(recording, HAND)[0], recording).predict(each[:, :3], joint=1)
     assert np.sqrt(np.mean((newton - predicted) ** 2, axis=1)).max() < 2e-3
 
@@ -125,6 +127,6 @@ def test_torque_off_lets_a_finger_hang():
     (trajectory,) = recording.trajectories
     enabled = np.zeros_like(trajectory.enabled)
     limp = replace(recording, trajectories=(replace(trajectory, enabled=enabled),))
-    held = simulate_hand(recording, HAND, rows(), dt=1.0 / 240.0)
-    free = simulate_hand(limp, HAND, rows(), dt=1.0 / 240.0)
+    held = simulate_hand(recording, HAND, rows()[None], dt=1.0 / 240.0)[0]
+    free = simulate_hand(limp, HAND, rows()[None], dt=1.0 / 240.0)[0]
     assert np.ptp(held[:, 1]) > 0.3 and np.abs(free[:, 1] - held[:, 1]).max() > 0.3

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import threading
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,22 +13,22 @@ import vd.kernels.servo.actuators as servo
 from vd.gap.assemble import curves
 from vd.gap.chain import chains
 from vd.gap.design import design
+from vd.gap.fit import JointProblem, JointSpec, Problems
 from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.statistics import noise_floor
-from vd.gap.worker_pool import Call, JointSpec, Problems, WorkerPool, parallel
+from vd.gap.worker_pool import WorkerPool, parallel
 from vd.gap.workflow import baseline_of
 
 EFFECTS = ("coulomb_friction", "backlash", "load_friction")
 
 
-def fits(pool: WorkerPool, spec: JointSpec) -> list[Any]:
-    base = pool.problems.chains[0].start_row.copy()
+def fits(pool: WorkerPool, problems: Problems, spec: JointSpec) -> list[Any]:
+    base = problems.chains[0].start_row.copy()
     for column, value in TRUE.items():
         base[0, column] = 1.1 * value
-    scales = pool.run(spec, [("scales", {"row": base[0], "residual": 0.02})])[0]
-    given = {"base": base, "starts": [{}], "scales": scales, "iterations": 3}
-    calls: list[Call] = [("fit", {**given, "effects": (effect,)}) for effect in EFFECTS]
-    return pool.run(spec, calls)
+    scales = pool.run(spec, [partial(JointProblem.scales, row=base[0], residual=0.02)])[0]
+    fit = partial(JointProblem.fit, base=base, starts=[{}], scales=scales, iterations=3)
+    return pool.run(spec, [partial(fit, effects=(effect,)) for effect in EFFECTS])
 
 
 def problem(extra: dict[int, float]) -> tuple[Problems, JointSpec]:
@@ -41,10 +42,10 @@ def problem(extra: dict[int, float]) -> tuple[Problems, JointSpec]:
 
 def test_processes_find_what_one_alone_finds() -> None:
     problems, spec = problem({servo.COULOMB_TORQUE: 0.06})
-    with WorkerPool(problems, workers=1) as pool:
-        alone = fits(pool, spec)
-    with WorkerPool(problems, workers=2) as pool:
-        for one, other in zip(alone, fits(pool, spec), strict=True):
+    with WorkerPool(problems.of, workers=1) as pool:
+        alone = fits(pool, problems, spec)
+    with WorkerPool(problems.of, workers=2) as pool:
+        for one, other in zip(alone, fits(pool, problems, spec), strict=True):
             np.testing.assert_array_equal(one.x, other.x)
             np.testing.assert_array_equal(one.held_out, other.held_out)
 
@@ -52,13 +53,13 @@ def test_processes_find_what_one_alone_finds() -> None:
 def test_a_worker_that_is_killed_ends_the_run_with_what_to_change() -> None:
     problems, spec = problem({})
     others = multiprocessing.active_children()
-    with WorkerPool(problems, workers=2) as pool:
-        fits(pool, spec)
+    with WorkerPool(problems.of, workers=2) as pool:
+        fits(pool, problems, spec)
         for process in multiprocessing.active_children():
             if process not in others:
                 process.kill()
         with pytest.raises(ChildProcessError, match=r"one of 2 processes was killed.*memory"):
-            pool.run(spec, [("scales", {"row": problems.chains[0].start_row[0], "residual": 0.03})])
+            pool.run(spec, [partial(JointProblem.scales, row=np.ones(99), residual=0.03)])
 
 
 def test_whoever_stops_does_not_wait_for_the_other_joints() -> None:
@@ -82,6 +83,6 @@ def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
     for column, value in {**TRUE, servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2}.items():
         rows[0, column] = value
     exact = Rollouts(chain, recording, dt=STEP_S / 32).predict(rows[None])[0]
-    drawn = curves(recording, problems, [(spec, rows)])
+    drawn = curves(problems, [(spec, rows)])
     searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
     assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)

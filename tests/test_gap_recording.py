@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vd.bench.hide import Hiding, simulate_hidden
-from vd.gap.recording import Recording, RecordingError, Trajectory, read_recording, write_recording
-from vd.gap.recording_checks import cautions, check_motion
+from vd.gap.bench.hide import Hiding, simulate_hidden
+from vd.logs.recording import Recording, RecordingError, Trajectory, read_recording, write_recording
+from vd.logs.recording_checks import cautions, check_motion
 
 SAMPLES = 200
 COUNT = 2.0 * np.pi / 4096

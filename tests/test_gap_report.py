@@ -11,15 +11,15 @@ import pytest
 from gap_reports import FRICTION, JOINT, rubbing_servo, servo_report
 
 from vd.gap import words
+from vd.gap.plan import parameter_columns
 from vd.gap.report import write_report
 from vd.gap.result import (
     Alternative,
     Closing,
-    Finding,
+    Misfit,
     Predictions,
     Report,
     effect_values,
-    parameter_columns,
 )
 from vd.kernels.servo import actuators
 from vd.kernels.servo.effects import EFFECTS
@@ -34,7 +34,7 @@ def made(tmp_path_factory):
     whole = dataclasses.replace(
         report,
         effects=(dataclasses.replace(friction, alternatives=(rival,)),),
-        findings=(Finding(JOINT, "joint: it sticks at every reversal", {"lag_s": 0.04}),),
+        findings=(Misfit(JOINT, "joint: it sticks at every reversal", {"lag_s": 0.04}),),
         closing=Closing("rollout", "identified.usda", 0.02, 0.002, {JOINT: (0.02, 0.002)}),
         command="vd-gap run recordings/servo --out gap",
     )

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
 from vd.gap.chain import GRAVITY_M_S2, chains
-from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators as servo
+from vd.logs.recording import Recording, Trajectory
 
 
 def trajectory(

@@ -228,10 +228,9 @@ class Demo:
         seed = ("--seed", str(self.cfg.seed))
         part.run(["vd-gap", "hide", "servo", "--effect", HIDDEN, "--out", recording, *seed])
         part.run(["vd-gap", "run", recording, "--out", analysis, *seed])
-        from vd.gap.result import Report
-        from vd.gap.words import verdict_sentence
+        from vd.api import gap_verdict
 
-        verdict = verdict_sentence(Report.read(analysis / "report.json"))
+        verdict = gap_verdict(analysis / "report.json")
         pictures = sorted(analysis.glob("overlay_*.png"), key=lambda path: path.stat().st_mtime)
         page = f"{part.name}/analysis/report.html"
         return {"hidden": HIDDEN, "verdict": verdict, "picture": pictures[0], "page": page}

@@ -186,6 +186,18 @@ def analyse_gap(recording: str | Path, out: str | Path, **settings: Any) -> "Rep
     return Report.read(Path(out) / "report.json")
 
 
+def gap_verdict(report: str | Path) -> str:
+    """The verdict in ``report.json`` of ``vd-gap``, in one or two sentences.
+
+    Raises:
+        ValueError: Not such a file.
+    """
+    from vd.gap.result import Report
+    from vd.gap.words import verdict_sentence
+
+    return verdict_sentence(Report.read(Path(report)))
+
+
 def read(path: str | Path) -> Any:
     """Read a file or folder of any of the formats, as its own content says which.
 
@@ -202,9 +214,9 @@ def read(path: str | Path) -> Any:
     """
     from vd.bundle import is_bundle
     from vd.evaluate.result import Result
-    from vd.gap.recording import read_recording
     from vd.gap.result import Report
     from vd.hand_log import is_log, read_log
+    from vd.logs.recording import read_recording
 
     path = Path(path)
     if not path.exists():
@@ -242,8 +254,8 @@ def write(value: Any, path: str | Path) -> None:
         TypeError: There is no format for such a value.
     """
     from vd.evaluate.result import Result
-    from vd.gap.recording import Recording, write_recording
     from vd.gap.result import Report
+    from vd.logs.recording import Recording, write_recording
 
     if isinstance(value, Recording):
         write_recording(value, path)

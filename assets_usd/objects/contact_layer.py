@@ -6,10 +6,12 @@ root prim has what was identified, ``vd:contact:<parameter>``, with ``vd:contact
 attributes besides.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from vd.paper import PAPER
 
@@ -151,3 +153,20 @@ def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ..
             )
         found[name] = tuple(tuple(float(v) for v in part) for part in (value, low, high))
     return found
+
+
+def damping_ratio(restitution: float) -> float:
+    """Of a spring and a damper that push but never pull, whose impacts have this restitution.
+
+    Critically damped it is exp(-2), the least there is here.
+    """
+
+    def kept(ratio: float) -> float:
+        root = math.sqrt(1.0 - ratio**2)
+        return (
+            math.exp(-ratio / root * math.atan2(2.0 * ratio * root, 2.0 * ratio**2 - 1.0))
+            - restitution
+        )
+
+    low, high = 1e-6, 1.0 - 1e-6
+    return float(brentq(kept, low, high)) if kept(low) > 0.0 > kept(high) else high

@@ -33,7 +33,7 @@ from vd.hand_log import read_columns
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
     from vd.deploy.hardware.joints import Joints
-    from vd.gap.recording import Recording, Trajectory
+    from vd.logs.recording import Recording, Trajectory
 
 RATE_HZ = 100.0
 """Rate that is tried, that of the excitations; the bus may be slower."""
@@ -109,7 +109,7 @@ def motions_of(motors: "Joints", fingers: Sequence[int], sets: Sequence[str]) ->
     Raises:
         ValueError: A set or a finger is unknown.
     """
-    from vd.gap.excitations import JointRange, excitation_set, numbered
+    from vd.logs.excitations import JointRange, excitation_set, numbered
 
     hand = motors.hand
     reach = JointRange(hand.joint_names, hand.lower, hand.upper, p_gain=float(motors.p_gain))
@@ -161,7 +161,7 @@ def _planned(
     folder: Path, entry: Mapping[str, Any], joints: Sequence[str], motors: "Joints"
 ) -> "Trajectory":
     """The motion of a plan's entry, whose file is in ``folder``."""
-    from vd.gap.recording import Trajectory
+    from vd.logs.recording import Trajectory
 
     hand, columns = motors.hand, read_columns(folder / entry["file"])
     command = np.tile(0.5 * (hand.lower + hand.upper), (len(columns["t"]), 1))
@@ -294,7 +294,7 @@ def _trajectory(
 
 def record(cfg: RecordCfg) -> int:
     """Record what is not recorded yet."""
-    from vd.gap.recording import write_recording
+    from vd.logs.recording import write_recording
 
     require(cfg, "--", "positive", "rate_hz")
     check_folder(cfg.out)
@@ -375,7 +375,7 @@ def _session(
 def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":
     """The recording in the folder, or an empty one."""
     from vd.assets_usd.hands import called
-    from vd.gap.recording import Recording, read_recording
+    from vd.logs.recording import Recording, read_recording
 
     model = called(connection.hand)
     if (cfg.out / "recording.json").exists():

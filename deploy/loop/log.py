@@ -21,8 +21,6 @@ from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.hardware.control_table import RAD_PER_COUNT
 from vd.deploy.safety.safety import StopReport
 from vd.files import make_folder, write_json, writing
-from vd.gap.recording import COMMAND_TIME
-from vd.gap.recording import FORMAT as RECORDING_FORMAT
 from vd.log_format import (
     EVENTS_FILE,
     FOUND_COLUMNS,
@@ -35,6 +33,8 @@ from vd.log_format import (
     STOPPED,
     TRUTH_COLUMNS,
 )
+from vd.logs.recording import COMMAND_TIME
+from vd.logs.recording import FORMAT as RECORDING_FORMAT
 
 DIGITS = 6
 DEPTH_STEPS = 12

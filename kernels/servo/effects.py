@@ -23,6 +23,11 @@ class Parameter:
     neutral: float = 0.0  # value at which it does nothing
     signed: bool = False  # whether the negative range is searched too
 
+    @property
+    def of_torque(self) -> bool:
+        """Whether it is a torque, or what torques are divided by: a stiffness, an inertia."""
+        return "N m" in self.unit or "kg" in self.unit
+
 
 @dataclass(frozen=True)
 class Effect:

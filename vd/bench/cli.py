@@ -181,9 +181,9 @@ class GapCommand:
         from vd.workers import shard
 
         shard((), self.shard)  # before anything slow
-        from vd.bench.gap import battery, run_battery
-        from vd.bench.gap_score import markdown
         from vd.files import write_text
+        from vd.gap.bench.battery import battery, run_battery
+        from vd.gap.bench.score import markdown
 
         cases = battery(
             self.model,
@@ -221,7 +221,7 @@ class ContactCommand:
 
     def run(self) -> int:
         """Run the cases, then write and print the tables."""
-        from vd.bench.contact import battery, run_battery, summary
+        from vd.gap.bench.contact_battery import battery, run_battery, summary
 
         print(summary(run_battery(battery(self.battery, self.seeds), self.out, self.jobs)))
         return 0

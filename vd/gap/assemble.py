@@ -3,36 +3,35 @@
 Shared effects, pooled numbers, one verdict, curves.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 
 from vd.gap.coordinates import BASELINE_PARAMETERS, GRAVITY
-from vd.gap.explanation import CLOSE, Accepted, Explanation
-from vd.gap.fit import FINER
-from vd.gap.recording import Recording
+from vd.gap.fit import FINER, JointSpec, Problems
+from vd.gap.models import Accepted, Explanation
 from vd.gap.result import (
     Alternative,
+    AnalysedRecording,
     Candidate,
     Estimate,
-    Finding,
     Fit,
     HeldOut,
     JointGap,
+    Misfit,
     NamedEffect,
     Predictions,
     Report,
-    Source,
     TrajectoryError,
-    Verdict,
     parameters_of,
 )
 from vd.gap.rollout import Rollouts
+from vd.gap.rules import agree, answered, named, overall
 from vd.gap.statistics import half_width, interval, resamples, rmse
-from vd.gap.worker_pool import JointSpec, Problems
 from vd.kernels.servo.effects import EFFECTS
+from vd.logs.recording import Recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +42,8 @@ class Analysed:
     spec: JointSpec
     explanation: Explanation
 
-    @property
-    def found(self) -> tuple[Accepted, ...]:
-        """Effects of its final model, where that is an answer."""
-        answers = self.explanation.verdict in ("effects", "ambiguous")
-        return self.explanation.accepted if answers else ()
 
-
-def curves(
-    recording: Recording, problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]
-) -> np.ndarray:
+def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -> np.ndarray:
     """Positions of all trajectories one after the other [S, J] [rad].
 
     NaN where no joint was fitted.
@@ -60,10 +51,10 @@ def curves(
     They are simulated with the time step at which an estimate is finished.
 
     Args:
-        recording: The recording.
-        problems: Its chains.
+        problems: Of the recording.
         models: Problem and parameter rows of each fitted joint.
     """
+    recording = problems.recording
     total = sum(len(t.time) for t in recording.trajectories)
     result = np.full((total, len(recording.joints)), np.nan)
     for index, chain in enumerate(problems.chains):
@@ -78,34 +69,33 @@ def curves(
 
 
 def assemble(
-    recording: Recording,
     problems: Problems,
     joints: Sequence[Analysed],
-    findings: Sequence[Finding],
+    findings: Sequence[Misfit],
     *,
     seed: int,
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
-    before = curves(recording, problems, [(j.spec, j.explanation.baseline.rows) for j in joints])
-    after = curves(recording, problems, [(j.spec, j.explanation.final.rows) for j in joints])
+    recording = problems.recording
+    before = curves(problems, [(j.spec, j.explanation.baseline.rows) for j in joints])
+    after = curves(problems, [(j.spec, j.explanation.final.rows) for j in joints])
     predictions = Predictions.of(recording, before, after)
     rng = np.random.default_rng(seed)
     residuals = {j.name: _residuals(j, predictions) for j in joints}
     rows = {j.name: _errors(j, residuals[j.name], recording) for j in joints}
     every = [row for j in joints for row in rows[j.name]]
-    verdicts = [j.explanation.verdict for j in joints]
     report = Report(
-        verdict=next((v for v in get_args(Verdict) if v in verdicts), "no_gap"),
+        verdict=overall([j.explanation.verdict for j in joints]),
         noise_floor_rad=float(np.sqrt(np.mean([j.spec.floor**2 for j in joints]))),
         baseline=_fit(joints, residuals, 0),
         findings=tuple(findings),
-        effects=_pool(joints, named=True),
+        effects=_pool(joints, True),
         ambiguous=_sets(joints),
         identified=_fit(joints, residuals, 1),
         held_out=_held_out(predictions.files, every, rng),
         next_experiment="",
         seconds=np.nan,
-        recording=Source(
+        recording=AnalysedRecording(
             path=str(recording.path),
             model=recording.model,
             joints=tuple(j.name for j in joints),
@@ -114,7 +104,7 @@ def assemble(
             seconds=float(sum(t.time[-1] for t in recording.trajectories)),
             servo=str(recording.servo.get("model", "")),
         ),
-        provisional=_pool(joints, named=False),
+        provisional=_pool(joints, False),
         joints=tuple(_gap(j, rows[j.name], rng) for j in joints),
         evidence=tuple(c for j in joints for c in _evidence(j)),
         trajectories=tuple(every),
@@ -232,41 +222,34 @@ def _gap(joint: Analysed, rows: Sequence[TrajectoryError], rng: np.random.Genera
         verdict=joint.explanation.verdict,
         reason=joint.explanation.reason,
         open_sets=tuple(
-            _unique(one.name, *one.tied) for one in joint.found if one.tied and not one.named
+            _unique(one.name, *one.tied)
+            for one in answered(joint.explanation)
+            if one.tied and not named(one)
         ),
     )
 
 
-def _pool(joints: Sequence[Analysed], *, named: bool) -> tuple[NamedEffect, ...]:
+def _pool(joints: Sequence[Analysed], as_named: bool) -> tuple[NamedEffect, ...]:
     """Named (or provisional) effects, those of several joints in one entry where their values agree."""
     groups: dict[str, list[dict[str, Accepted]]] = {}
+    often: Counter[str] = Counter()
     for joint in joints:
-        for accepted in joint.found:
-            if accepted.named == named:
-                alike = groups.setdefault(accepted.name, [])
-                group = next(
-                    (g for g in alike if all(_agree(accepted, a) for a in g.values())), None
-                )
-                if group is None:
-                    alike.append(group := {})
-                group[joint.name] = accepted
-    order, often = list(EFFECTS), {name: sum(map(len, alike)) for name, alike in groups.items()}
+        for accepted in answered(joint.explanation):
+            if named(accepted) == as_named:
+                often[accepted.name] += 1
+                _put(groups.setdefault(accepted.name, []), joint.name, accepted)
+    order = list(EFFECTS)
     names = sorted(groups, key=lambda name: (-often[name], order.index(name)))
     return tuple(_entry(name, group) for name in names for group in groups[name])
 
 
-def _agree(one: Accepted, other: Accepted) -> bool:
-    """Whether the values of an effect on two joints can be the same.
-
-    Close, or of intervals that overlap.
-    """
-    if one.estimates.keys() != other.estimates.keys():
-        return False
-    pairs = [(one.estimates[key], other.estimates[key]) for key in one.estimates]
-    near = [abs(a[0] - b[0]) <= CLOSE * max(abs(a[0]), abs(b[0])) for a, b in pairs]
-    return all(
-        close or (a[1] <= b[2] and b[1] <= a[2]) for close, (a, b) in zip(near, pairs, strict=True)
-    )
+def _put(groups: list[dict[str, Accepted]], joint: str, accepted: Accepted) -> None:
+    """Add a joint's effect to the joints with which it agrees, or to a group of its own."""
+    for group in groups:
+        if all(agree(accepted, other) for other in group.values()):
+            group[joint] = accepted
+            return
+    groups.append({joint: accepted})
 
 
 def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
@@ -301,10 +284,11 @@ def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
 def _sets(joints: Sequence[Analysed]) -> tuple[tuple[str, ...], ...]:
     """Sets of effects not told apart, each once."""
     sets: dict[frozenset[str], tuple[str, ...]] = {}
-    for accepted in (one for joint in joints for one in joint.found):
-        if (accepted.tied and not accepted.named) or accepted.equivalent:
-            members = _unique(accepted.name, *accepted.equivalent, *accepted.tied)
-            sets.setdefault(frozenset(members), members)
+    for joint in joints:
+        for one in answered(joint.explanation):
+            if (one.tied and not named(one)) or one.equivalent:
+                members = _unique(one.name, *one.equivalent, *one.tied)
+                sets.setdefault(frozenset(members), members)
     return tuple(sets.values())
 
 

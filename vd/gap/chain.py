@@ -6,7 +6,7 @@ A bare servo and a pendulum are one joint with its own inertia; a finger is a ch
 hanging palm down as in the simulator.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
@@ -15,10 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel
-from vd.gap.coordinates import of_torque
-from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording
 from vd.kernels.servo import actuators as servo
-from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
+from vd.kernels.servo.effects import BASELINE, neutral_row
+from vd.logs.recording import BARE_MODELS, STIFFNESS, Recording
 
 GRAVITY_M_S2 = 9.81
 """Acceleration of gravity, the simulator's."""
@@ -146,7 +145,7 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
     told = known_stiffness(recording, recording.joints[column])
     unit = 1.0 if told is None else told / BASELINE[0].typical
     for parameter in BASELINE:
-        row[parameter.column] = parameter.typical * (unit if of_torque(parameter.unit) else 1.0)
+        row[parameter.column] = parameter.typical * (unit if parameter.of_torque else 1.0)
     free = [parameter.name for parameter in BASELINE]
     if all(t.enabled[:, column].all() for t in recording.trajectories):
         free.remove("kd_off")  # nothing shows it
@@ -247,12 +246,3 @@ def relative_torques(recording: Recording) -> bool:
 def others_in(chain: Chain, joint: int) -> list[int]:
     """Slots of the other joints of a chain, whose motion can drive a joint."""
     return [int(slot) for j, slot in enumerate(chain.slot) if j != joint]
-
-
-def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
-    """Effects that a joint of a chain can have besides its baseline."""
-    own = {"tau_g_nm": "gravity_load", "inertia": "payload_inertia"}
-    excluded = {effect for name, effect in own.items() if name in chain.baseline_free}
-    if len(chain.joints) == 1:
-        excluded.add("joint_coupling")
-    return [name for name in EFFECTS if name in effects and name not in excluded]

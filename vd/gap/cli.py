@@ -52,7 +52,7 @@ class _Step:
 
         A recording is checked before anything slow begins.
         """
-        from vd.gap.recording import read_recording
+        from vd.logs.recording import read_recording
 
         recording = read_recording(self.recording)
         from vd.gap.steps import Analysis, Settings
@@ -78,7 +78,7 @@ class _Step:
         return 0
 
 
-class Run(_Step):
+class RunCommand(_Step):
     """Find, explain, close and report: the whole analysis of a recording.
 
     Writes DIR/report.html (one page for people), report.json, identified.usda (the identified
@@ -87,32 +87,32 @@ class Run(_Step):
     """
 
 
-class Find(_Step):
+class FindCommand(_Step):
     """Fit the plain servo model of every joint, and say where and in what motion it fails."""
 
     first = last = "find"
 
 
-class Explain(_Step):
+class ExplainCommand(_Step):
     """Try every effect on motions that the fit has not seen, and name what is missing, or abstain."""
 
     first = last = "explain"
 
 
-class Close(_Step):
+class CloseCommand(_Step):
     """Write identified.usda and simulate the recorded commands again with it, a hand in Newton."""
 
     first = last = "close"
 
 
-class Report(_Step):
+class ReportCommand(_Step):
     """Write report.json, report.html and the figures from what the steps before have found."""
 
     first = last = "report"
 
 
 @dataclass(frozen=True)
-class Plan(_Step):
+class PlanCommand(_Step):
     """Choose the motions that would separate what is still ambiguous, as files vd-deploy record can play.
 
     Each set of motions of a menu is simulated under the models that compete; the one on which they
@@ -137,7 +137,7 @@ class Plan(_Step):
 
 
 @dataclass(frozen=True)
-class Hide:
+class HideCommand:
     """Make a recording in which effects are hidden, to see whether they are found.
 
     The plant shares no code with the fitted model: it is integrated on its own at a high rate, with
@@ -163,13 +163,9 @@ class Hide:
 
     def run(self) -> int:
         """Write the recording."""
-        from vd.bench.hide import Hiding, hide, parse_effect, truth_path
+        from vd.gap.bench.hide import Hiding, check_hidden, hide, parse_effect, truth_path
 
-        if (self.out / "recording.json").exists() and not truth_path(self.out).exists():
-            raise ValueError(
-                f"--out {self.out} holds a recording in which nothing was hidden; name another "
-                f"folder"
-            )
+        check_hidden(self.out)
         parsed = [parse_effect(text) for text in self.effect]
         hiding = Hiding(
             self.model,
@@ -190,13 +186,13 @@ class Hide:
 
 
 Command = (
-    Annotated[Run, tyro.conf.subcommand("run")]
-    | Annotated[Find, tyro.conf.subcommand("find")]
-    | Annotated[Explain, tyro.conf.subcommand("explain")]
-    | Annotated[Close, tyro.conf.subcommand("close")]
-    | Annotated[Report, tyro.conf.subcommand("report")]
-    | Annotated[Plan, tyro.conf.subcommand("plan")]
-    | Annotated[Hide, tyro.conf.subcommand("hide")]
+    Annotated[RunCommand, tyro.conf.subcommand("run")]
+    | Annotated[FindCommand, tyro.conf.subcommand("find")]
+    | Annotated[ExplainCommand, tyro.conf.subcommand("explain")]
+    | Annotated[CloseCommand, tyro.conf.subcommand("close")]
+    | Annotated[ReportCommand, tyro.conf.subcommand("report")]
+    | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
+    | Annotated[HideCommand, tyro.conf.subcommand("hide")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Contact, tyro.conf.subcommand("contact")]
     | Annotated[HideContact, tyro.conf.subcommand("hide-contact")]
@@ -206,10 +202,10 @@ Command = (
 @interrupt.command("vd-gap")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
-    command: (
-        Run | Find | Explain | Close | Report | Plan | Hide | Convert | Contact | HideContact
-    ) = parse(Command, arguments, prog="vd-gap", description=__doc__)
-    from vd.gap.recording import RecordingError
+    command: _Step | HideCommand | Convert | Contact | HideContact = parse(
+        Command, arguments, prog="vd-gap", description=__doc__
+    )
+    from vd.logs.recording import RecordingError
 
     try:
         check_folder(command.out)
@@ -224,11 +220,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _print_report(analysis: "Analysis") -> None:
-    from vd.gap.result import Report as Contents
+    from vd.gap.result import Report
     from vd.gap.words import next_step, open_questions, verdict_sentence
 
     path = analysis.out / "report.json"
-    report = Contents.read(path)
+    report = Report.read(path)
     print(verdict_sentence(report))
     for finding in report.findings:
         print(f"  {finding.where}")

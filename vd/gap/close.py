@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vd.gap.coordinates import GRAVITY
-from vd.gap.recording import Recording
 from vd.gap.result import LAYER, Closing, NamedEffect, Predictions, Report, effect_values
 from vd.kernels.servo.effects import BASELINE, EFFECTS
+from vd.logs.recording import Recording
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
@@ -159,7 +159,8 @@ def _newton(
 ) -> np.ndarray:
     """Both models in Newton [2, S, J]; the identified one as any user of the layer reads it."""
     from vd.assets_usd.hands import load_hand
-    from vd.gap.newton import simulate_hand
+    from vd.gap.rollout import STEP_S
+    from vd.sim.replay import simulate_hand
 
     before, after = load_hand(hand_name, layer=start_layer), load_hand(hand_name, layer=layer)
     rows = np.array([before.servo, after.servo], dtype=float)
@@ -167,7 +168,7 @@ def _newton(
         for parameter in (*BASELINE, GRAVITY):
             if parameter.name in values:
                 rows[0, before.joint_names.index(joint), parameter.column] = values[parameter.name]
-    return simulate_hand(recording, after, rows, device=device)
+    return simulate_hand(recording, after, rows, dt=STEP_S, device=device)
 
 
 def _bare(layer: Path, recording: Recording, curves: Predictions, device: str) -> np.ndarray:

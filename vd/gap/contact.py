@@ -28,8 +28,8 @@ from scipy.stats import t as student
 from vd.assets_usd.objects.contact_layer import CONTACT
 from vd.assets_usd.objects.model import ObjectModel
 from vd.gap.chain import GRAVITY_M_S2
-from vd.gap.contact_recording import ContactMotion, ContactRecording, Kind
-from vd.gap.recording_checks import RecordingError
+from vd.logs.contact_recording import ContactMotion, ContactRecording, Kind
+from vd.logs.recording_checks import RecordingError
 
 FALSE_NAMES = 0.02
 """Share of recordings without a gap in which any name may be given; split evenly over all
@@ -75,7 +75,7 @@ Equations = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Found:
+class ContactEstimate:
     """A parameter as the motions tell it; P numbers each, NaN where they do not.
 
     Attributes:
@@ -122,7 +122,7 @@ class _State:
         return float(np.linalg.norm(self.points, axis=1).max())
 
 
-def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Found]:
+def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[ContactEstimate]:
     """Every parameter of the contact, in the order of :data:`CONTACT`.
 
     Args:
@@ -163,13 +163,13 @@ def identify_contact(recording: ContactRecording, item: ObjectModel) -> list[Fou
     return [found[name] for name in CONTACT]
 
 
-def verdict(found: Sequence[Found]) -> Literal["effects", "no_gap", "under_excited"]:
+def verdict(found: Sequence[ContactEstimate]) -> Literal["effects", "no_gap", "under_excited"]:
     """What the recording says as a whole, in the words of ``vd-gap run``."""
     told = {each.verdict for each in found}
     return "effects" if "effect" in told else "no_gap" if "no_gap" in told else "under_excited"
 
 
-def by_weight(found: Sequence[Found]) -> list[Found]:
+def by_weight(found: Sequence[ContactEstimate]) -> list[ContactEstimate]:
     """The effects, those that stand out most from their intervals first."""
     return sorted(
         (each for each in found if each.verdict == "effect"), key=lambda each: -each.weight
@@ -178,7 +178,7 @@ def by_weight(found: Sequence[Found]) -> list[Found]:
 
 def _judge(
     name: str, motions: list[Equations], item: ObjectModel, besides: np.ndarray | float = 0.0
-) -> Found:
+) -> ContactEstimate:
     """A parameter's estimate and verdict.
 
     ``besides``: deviation from parameters taken as known [P].
@@ -206,7 +206,9 @@ def _judge(
     confidence = float(1.0 - 2.0 * student.sf((gap / deviation).max(), freedom)) if told else 0.0
     usual = student.ppf(0.975, freedom) * deviation
     ends = value - usual, value + usual
-    return Found(name, says, value, *ends, nominal, confidence, weight, len(motions), reason)
+    return ContactEstimate(
+        name, says, value, *ends, nominal, confidence, weight, len(motions), reason
+    )
 
 
 def _estimate(motions: list[Equations], size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 
 if TYPE_CHECKING:
-    from vd.gap.contact import Found
+    from vd.gap.contact import ContactEstimate
 
 FORMAT = "vd-contact-report/1"
 REPORT, LAYER = "report.json", "identified.usda"
@@ -41,7 +41,7 @@ class Contact:
 
     def run(self) -> int:
         """Identify, write, and print the verdict."""
-        from vd.gap.contact_recording import read_contact_recording
+        from vd.logs.contact_recording import read_contact_recording
 
         recording, began = read_contact_recording(self.recording), time.perf_counter()
         from vd.assets_usd.objects.model import read_object, write_contact_layer
@@ -81,7 +81,7 @@ class Contact:
         return 0
 
 
-def identified(found: "Sequence[Found]") -> dict[str, tuple[tuple[float, ...], ...]]:
+def identified(found: "Sequence[ContactEstimate]") -> dict[str, tuple[tuple[float, ...], ...]]:
     """What is told, as :func:`vd.assets_usd.objects.contact_layer.write_contact_layer` takes it."""
     return {
         each.name: (
@@ -100,7 +100,7 @@ def identified(found: "Sequence[Found]") -> dict[str, tuple[tuple[float, ...], .
 
 
 def contact_report(
-    found: "Sequence[Found]", recording: str, item: str, seconds: float
+    found: "Sequence[ContactEstimate]", recording: str, item: str, seconds: float
 ) -> Mapping[str, Any]:
     """``report.json``; a number that is not known is None."""
     from vd.assets_usd.objects.contact_layer import CONTACT
@@ -109,7 +109,7 @@ def contact_report(
     def numbers(values: Any) -> list[float | None]:
         return [float(value) if value == value else None for value in values]
 
-    def estimate(each: "Found") -> dict[str, Any]:
+    def estimate(each: "ContactEstimate") -> dict[str, Any]:
         interval = [numbers(each.low), numbers(each.high)]
         return {"value": numbers(each.value), "ci95": interval, "unit": CONTACT[each.name].unit}
 
@@ -162,13 +162,10 @@ class HideContact:
     def run(self) -> int:
         """Write the recording."""
         from vd.assets_usd.objects.sets import load_set
-        from vd.bench.hidden_contact import ContactPlant, hide_contact, truth_path
+        from vd.gap.bench.hidden_contact import ContactPlant, hide_contact
+        from vd.gap.bench.hide import check_hidden, truth_path
 
-        if (self.out / "recording.json").exists() and not truth_path(self.out).exists():
-            raise ValueError(
-                f"--out {self.out} holds a recording in which nothing was hidden; name another "
-                f"folder"
-            )
+        check_hidden(self.out)
         values = dict(_parse(text) for text in self.hide)
         hide_contact(ContactPlant(load_set(self.object)[0], values, seed=self.seed), self.out)
         print(f"{self.out}\n{truth_path(self.out)}")

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from vd.gap.motions import Recording, Trajectory
-from vd.gap.readers import FORMATS, Motion, Told, format_of
-from vd.gap.recording_checks import MIN_SAMPLES, RecordingError
+from vd.logs.motions import Recording, Trajectory
+from vd.logs.readers import FORMATS, SourceMotion, Told, format_of
+from vd.logs.recording_checks import MIN_SAMPLES, RecordingError
 
 REQUIRED = ("command", "position")
 
@@ -61,14 +61,14 @@ class Convert:
 
 
 def convert(asked: Convert) -> Recording:
-    """Write the recording, once it passes the checks of :func:`vd.gap.recording.read_recording`.
+    """Write the recording, once it passes the checks of :func:`vd.logs.recording.read_recording`.
 
     Raises:
         RecordingError: The source cannot be used; names file, column and remedy.
         ValueError: A flag cannot be used, or the folder holds a recording.
         ModuleNotFoundError: The reader's library is not installed.
     """
-    from vd.gap.recording import read_recording, write_recording
+    from vd.logs.recording import read_recording, write_recording
 
     if asked.counts_per_turn < 1:
         raise ValueError(
@@ -111,7 +111,7 @@ def convert(asked: Convert) -> Recording:
 
 
 def _trajectory(
-    asked: Convert, motion: Motion, joints: tuple[str, ...], moved_rad: float
+    asked: Convert, motion: SourceMotion, joints: tuple[str, ...], moved_rad: float
 ) -> Trajectory:
     """A motion with the wanted joints in their order."""
     where = f"{asked.source}: {motion.name}"

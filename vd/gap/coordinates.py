@@ -130,17 +130,11 @@ def coordinate(key: str, scales: Scales) -> Coordinate:
 def torque_power(key: str) -> int:
     """Power with which an effect's parameter follows the unit of torque: 1, 0, or -1."""
     effect, _, name = key.rpartition(".")
-    unit = (
-        next((p.unit for p in EFFECTS[effect].parameters if p.name == name), "") if effect else ""
-    )
-    if unit == "1/(N m)":
-        return -1
-    return int(of_torque(unit))
-
-
-def of_torque(unit: str) -> bool:
-    """Whether a unit is of torque, or of what torques are divided by: a stiffness, an inertia."""
-    return "N m" in unit or "kg" in unit
+    parameters = EFFECTS[effect].parameters if effect else ()
+    for parameter in parameters:
+        if parameter.name == name:
+            return -1 if parameter.unit == "1/(N m)" else int(parameter.of_torque)
+    return 0
 
 
 def keys(effects: Sequence[str], baseline: Sequence[str]) -> list[str]:

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from vd.gap.chain import Chain
-from vd.gap.recording import Recording, Trajectory
-from vd.gap.recording_checks import MIN_KINDS
 from vd.gap.statistics import held
+from vd.logs.recording import Recording, Trajectory
+from vd.logs.recording_checks import MIN_KINDS
 
 MAX_FOLDS = 6
 """Groups of motions that are held out in turn: each costs a refit of every model. Not tuned."""

@@ -7,12 +7,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from vd.gap.recording import Recording, Trajectory
-from vd.gap.result import Finding
-from vd.gap.statistics import HOLD_S, REPEATABLE, held
+from vd.gap.result import Misfit
+from vd.gap.statistics import HOLD_S, REPEATABLE, SMOOTH_S, held, speed_of
+from vd.logs.recording import Recording, Trajectory
 
-SMOOTH_S = 0.05
-"""Window over which speeds are taken [s]: longer than an encoder count at low speed. Not tuned."""
 PHASES = {
     "onset": f"for {1e3 * HOLD_S:.0f} ms after the command starts to move",
     "reversal": f"for {1e3 * HOLD_S:.0f} ms after each reversal",
@@ -22,12 +20,6 @@ PHASES = {
     "load": "when the servo pulls hard",
 }
 """Phase -> when."""
-
-
-def speed_of(time: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Speed over ``SMOOTH_S`` [T] [rad/s], without the noise of encoder counts."""
-    ends = (np.interp(time + side * SMOOTH_S, time, position) for side in (0.5, -0.5))
-    return np.subtract(*ends) / SMOOTH_S
 
 
 def phases(
@@ -71,7 +63,7 @@ def phases(
 
 def findings(
     recording: Recording, predicted: np.ndarray, floors: Mapping[str, float]
-) -> list[Finding]:
+) -> list[Misfit]:
     """Findings of all joints: the two worst phases of each, the worst first.
 
     Args:
@@ -95,7 +87,7 @@ def _joint(
     column: int,
     resolution: float,
     floor: float,
-) -> list[Finding]:
+) -> list[Misfit]:
     """Findings of a joint from its trajectories and what the model leaves of each [T] [rad]."""
     speeds = [speed_of(t.time, t.position[:, column]) for t, _ in pairs]
     residual, speed = np.concatenate([left for _, left in pairs]), np.concatenate(speeds)
@@ -114,7 +106,7 @@ def _joint(
                 "overall_rms_rad": _rms(residual),
                 "noise_floor_rad": floor,
             }
-            rows.append(Finding(name, f"{name}: {when} the joint {_does(signature)}", signature))
+            rows.append(Misfit(name, f"{name}: {when} the joint {_does(signature)}", signature))
     return sorted(rows, key=lambda row: -row.signature["rms_rad"])[:2]
 
 

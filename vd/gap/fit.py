@@ -6,22 +6,20 @@ through one call of :class:`vd.gap.rollout.Rollouts`.
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 import vd.kernels.servo.actuators as servo
-from vd.gap.chain import others_in
+from vd.gap.chain import Chain, others_in
 from vd.gap.coordinates import Coordinate, Scales, coordinate, keys
 from vd.gap.descent import SHORT, LeastSquares
-from vd.gap.find import speed_of
-from vd.gap.joint_fit import JointFit, SampleWeighting
+from vd.gap.models import RIDGE, JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
+from vd.gap.statistics import speed_of
+from vd.logs.recording import Recording
 
-RIDGE = 0.01
-"""Pull towards the start, as information in units of the noise floor: holds directions that the
-data leave free (the torque scale of a bare servo), moves no others. Not tuned."""
 ITERATIONS = 12
 """Trials of a fit at most. Not tuned."""
 FINER = (2, 4)
@@ -301,3 +299,62 @@ class JointProblem:
         factor = np.clip(along / np.maximum(power, 1e-300), 0.0, 3.0)
         gain = 2.0 * factor * along - factor**2 * power
         return gain / max(float(residual[0] @ residual[0]), 1e-300)
+
+
+@dataclass(frozen=True, eq=False)
+class JointSpec:
+    """What makes the problem of one joint.
+
+    Attributes:
+        chain: Index of the chain.
+        joint: Index of the joint in the chain.
+        trajectories: Indices of the trajectories used.
+        folds: Fold of each.
+        floor: Noise floor [rad].
+        baseline: Keys of the fitted baseline parameters.
+        pieces: Samples ``(first, end)`` of each trajectory that are analysed; empty: all.
+    """
+
+    chain: int
+    joint: int
+    trajectories: tuple[int, ...]
+    folds: tuple[int, ...]
+    floor: float
+    baseline: tuple[str, ...]
+    pieces: tuple[tuple[int, int], ...] = ()
+
+
+class Problems:
+    """The problems of a recording, made when they are first asked for.
+
+    Args:
+        recording: The recording.
+        chains: Its chains.
+        dt: Time step of the rollouts [s].
+        device: Warp device.
+    """
+
+    def __init__(self, recording: Recording, chains: Sequence[Chain], dt: float, device: str):
+        self.recording, self.chains, self.dt, self.device = recording, chains, dt, device
+        self._rollouts: dict[tuple[int, int | None], Rollouts] = {}
+        self._problems: dict[tuple[int, int], JointProblem] = {}
+
+    def of(self, spec: JointSpec) -> JointProblem:
+        """The problem of a joint."""
+        key = spec.chain, spec.joint
+        if key not in self._problems:
+            # Whole trajectories are shared by the joints of a chain, pieces are each joint's own.
+            shared = spec.chain, None if not spec.pieces else spec.joint
+            if shared not in self._rollouts:
+                parts = dict(zip(spec.trajectories, spec.pieces, strict=bool(spec.pieces)))
+                recording, chain = self.recording.cut(parts), self.chains[spec.chain]
+                self._rollouts[shared] = Rollouts(chain, recording, dt=self.dt, device=self.device)
+            self._problems[key] = JointProblem(
+                self._rollouts[shared],
+                spec.joint,
+                spec.trajectories,
+                spec.folds,
+                spec.floor,
+                spec.baseline,
+            )
+        return self._problems[key]

@@ -3,25 +3,26 @@
 Many draws of the delays give the mean and variance of the position at every sample. The likelihood
 of what was measured, under a normal distribution with that mean and that variance on top of the
 noise floor, is maximised over the jitter's two parameters; the rest of the model is fitted through
-what the delays do to the samples (:mod:`vd.gap.joint_fit`). The result stands in the table as the
-RMSE that a normal distribution of constant width would need for the same likelihood.
+what the delays do to the samples (:class:`vd.gap.models.SampleWeighting`). The result stands in the
+table as the RMSE that a normal distribution of constant width would need for the same likelihood.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.optimize import Bounds, minimize
 
 from vd.gap.coordinates import Scales, coordinate, sizes
-from vd.gap.evidence import JITTER, MEMORY
-from vd.gap.fit import RIDGE, JointProblem
-from vd.gap.joint_fit import JointFit, SampleWeighting
+from vd.gap.fit import JointProblem
+from vd.gap.models import RIDGE, JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
+from vd.gap.rules import JITTER, MEMORY
 from vd.gap.statistics import half_width
 
+SIGMA = f"{JITTER}.sigma_s"
+DROP = f"{JITTER}.p_drop"
 DRAWS = 16
 """Realisations of the delays; alone they leave a third of error in the variance. Not tuned."""
 NARROW = 0.5
@@ -43,9 +44,7 @@ class JitterFit:
 
     def __init__(self, problem: JointProblem, base: JointFit, scales: Scales):
         self.problem, self.base, self.scales = problem, base, scales
-        self.coordinates = [
-            coordinate(f"command_jitter.{name}", scales) for name in ("sigma_s", "p_drop")
-        ]
+        self.coordinates = [coordinate(key, scales) for key in (SIGMA, DROP)]
         recording = problem.rollouts.recording
         chosen = [recording.trajectories[int(t)] for t in problem.trajectories]
         # A trajectory's name seeds its draws.
@@ -78,8 +77,12 @@ class JitterFit:
 
     def draws(self, sigma: float, drop: float) -> tuple[np.ndarray, np.ndarray]:
         """Mean of the positions [N] [rad] over draws of the delays, and their variance [N] [rad^2]."""
-        rows, joint = self.row(sigma, drop)[None], self.problem.joint
-        draws = self.rollouts.predict(rows, joint=joint)[0].astype(float).reshape(DRAWS, -1)
+        rows = self.row(sigma, drop)[None]
+        draws = (
+            self.rollouts.predict(rows, joint=self.problem.joint)[0]
+            .astype(float)
+            .reshape(DRAWS, -1)
+        )
         spread = np.split(draws.var(axis=0, ddof=1), self.ends)
         kernel = np.ones(MEMORY) / MEMORY
         smooth = np.concatenate([np.convolve(part, kernel, mode="same") for part in spread])
@@ -161,21 +164,18 @@ class JitterFit:
         """
         here, sigmas = self.losses(sigma, drop), [sigma * f for f in FACTORS]
         # A share that is found too small says nothing of larger ones by its multiples.
-        starts = [start[f"{JITTER}.p_drop"] for start in sizes(JITTER, (), self.scales)]
+        starts = [start[DROP] for start in sizes(JITTER, (), self.scales)]
         drops = sorted({*starts, *(drop * f for f in FACTORS)})
         worse = np.array([[self.losses(s, d) - here for d in drops] for s in sigmas])
         kept = worse.sum(axis=-1) < half_width(len(here) * worse.var(axis=-1, ddof=1), len(here))
         kept[sigmas.index(sigma), drops.index(drop)] = True
         ranges = {}
-        for name, values, inside in (
-            ("sigma_s", sigmas, kept.any(1)),
-            ("p_drop", drops, kept.any(0)),
-        ):
+        for key, values, inside in ((SIGMA, sigmas, kept.any(1)), (DROP, drops, kept.any(0))):
             first, last = np.flatnonzero(inside)[[0, -1]]
             ends = np.interp(
                 [first - 0.5, last + 0.5], range(len(values) + 1), [*values, 2.0 * values[-1]]
             )
-            ranges[f"command_jitter.{name}"] = float(ends[0]), float(ends[1])
+            ranges[key] = float(ends[0]), float(ends[1])
         return ranges
 
     def result(self, sigma: float, drop: float) -> JointFit:
@@ -226,9 +226,3 @@ def bound_jitter(problem: JointProblem, fit: JointFit, scales: Scales) -> JointF
     )
     sigma, drop = (values[c.key] for c in fit.coordinates[-2:])
     return replace(fit, extents=JitterFit(problem, rest, scales).extents(sigma, drop))
-
-
-CALLS: dict[str, Callable[..., Any]] = {
-    call.__name__: call for call in (look, fit_jitter, bound_jitter)
-}
-"""What is asked of a joint's problem by name, besides its methods."""

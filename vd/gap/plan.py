@@ -1,4 +1,4 @@
-"""Plan the next experiment: the motions on which the models that are still possible disagree most.
+"""Experiment the next experiment: the motions on which the models that are still possible disagree most.
 
 Every set of motions of the menu is simulated under every model in question. The disagreement of two
 models is the criterion of Buzzi-Ferraris and Forzatti (1983) for telling rivals apart: the
@@ -18,18 +18,19 @@ import numpy as np
 
 from vd.config import to_dict
 from vd.files import write_json
-from vd.gap.chain import Chain, candidates, chains
+from vd.gap.chain import Chain, chains
 from vd.gap.coordinates import BASELINE_PARAMETERS
 from vd.gap.design import design, pieces
-from vd.gap.excitations import MENU, JointRange, excitation_set, numbered
 from vd.gap.fit import FINER
-from vd.gap.recording import BARE_MODELS, Recording, Trajectory, entry_of, write_table
-from vd.gap.recording_checks import MIN_KINDS
-from vd.gap.result import Report, parameter_columns, parameters_of
+from vd.gap.result import Report, effect_values, parameters_of
 from vd.gap.rollout import STEP_S, Rollouts
+from vd.gap.rules import candidates
 from vd.gap.statistics import REPEATABLE
 from vd.gap.words import causes, joints_text
 from vd.kernels.servo.effects import EFFECTS
+from vd.logs.excitations import MENU, JointRange, excitation_set, numbered
+from vd.logs.recording import BARE_MODELS, Recording, Trajectory, entry_of, write_table
+from vd.logs.recording_checks import MIN_KINDS
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
@@ -44,11 +45,11 @@ PLAIN = "plain servo"
 
 
 @dataclass(frozen=True)
-class Score:
+class MenuScore:
     """What a set of motions would show."""
 
     name: str
-    """Key of :data:`vd.gap.excitations.MENU`."""
+    """Key of :data:`vd.logs.excitations.MENU`."""
     disagreement: float
     """Of two models, RMS in units of the noise; of several pairs the one at which as much is
     learnt, which is log(1 + disagreement^2) in the mean."""
@@ -57,7 +58,7 @@ class Score:
 
 
 @dataclass(frozen=True)
-class Plan:
+class Experiment:
     """The next experiment."""
 
     model: str
@@ -65,7 +66,7 @@ class Plan:
     """All joints of the recording; commands name every one of them."""
     competing: dict[str, tuple[tuple[str, ...], ...]]
     """Sets of models in question, by joint."""
-    ranking: tuple[Score, ...]
+    ranking: tuple[MenuScore, ...]
     """Best first."""
     motions: tuple[Trajectory, ...]
     """Of the best set."""
@@ -79,7 +80,7 @@ def plan(
     start: Mapping[str, np.ndarray] | None = None,
     *,
     device: str = "cpu",
-) -> Plan:
+) -> Experiment:
     """Choose the next experiment.
 
     Args:
@@ -114,7 +115,7 @@ def plan(
         raise ValueError(f"{recording.path}: no joint has a fitted model; run vd-gap explain first")
     motions = {name: [m for m in every if m.joints[0] in competing] for name, every in menu.items()}
     scores = [
-        Score(
+        MenuScore(
             name,
             disagreement=float(np.sqrt(np.expm1(np.mean(np.log1p(np.square(values)))))),
             seconds=sum(motion.duration for motion in motions[name]),
@@ -125,10 +126,10 @@ def plan(
     kinds = len({t.excitation for t in recording.trajectories})
     sentence = _sentence(ranking[0], report, tuple(competing), kinds)
     chosen = tuple(motions[ranking[0].name])
-    return Plan(recording.model, recording.joints, competing, ranking, chosen, sentence)
+    return Experiment(recording.model, recording.joints, competing, ranking, chosen, sentence)
 
 
-def write_plan(result: Plan, folder: Path) -> Path:
+def write_plan(result: Experiment, folder: Path) -> Path:
     """Write ``next_experiment.json`` and its commands, one CSV file per motion.
 
     A CSV has the header of a recording without what is measured: ``t``, ``command.<joint>`` for
@@ -221,6 +222,17 @@ def _base(chain: Chain, report: Report, start: Mapping[str, np.ndarray]) -> np.n
         for column, value in parameter_columns(report, joint).items():
             row[column] = value
     return rows
+
+
+def parameter_columns(report: Report, joint: str) -> dict[int, float]:
+    """Columns of the joint's parameter row (:mod:`vd.kernels.servo.actuators`) that the report identified."""
+    baseline = report.identified.parameters.get(joint, {})
+    columns = {BASELINE_PARAMETERS[name].column: value for name, value in baseline.items()}
+    for effect, values in effect_values((*report.effects, *report.provisional), joint).items():
+        columns |= {
+            parameters_of(effect)[name].column: value for name, (value, *_) in values.items()
+        }
+    return columns
 
 
 def _models(
@@ -361,7 +373,7 @@ def disagreement(one: Rival, other: Rival, new: np.ndarray) -> float:
     )
 
 
-def _sentence(best: Score, report: Report, joints: tuple[str, ...], kinds: int) -> str:
+def _sentence(best: MenuScore, report: Report, joints: tuple[str, ...], kinds: int) -> str:
     """What to record, and what it would show."""
     sets = report.open_sets
     between = f" between {causes(sets[0], 'and')}" if len(sets) == 1 else ""

@@ -19,9 +19,8 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import atomic_path, write_json
-from vd.gap.coordinates import BASELINE_PARAMETERS
-from vd.gap.motions import Recording
 from vd.kernels.servo.effects import EFFECTS, Parameter
+from vd.logs.motions import Recording
 
 FORMAT = "vd-gap-report/1"
 LAYER = "identified.usda"
@@ -68,7 +67,7 @@ class NamedEffect:
 
 
 @dataclass(frozen=True)
-class Finding:
+class Misfit:
     """Where measurement and baseline disagree."""
 
     joint: str
@@ -187,7 +186,7 @@ class Closing:
 
 
 @dataclass(frozen=True)
-class Source:
+class AnalysedRecording:
     """What was analysed."""
 
     path: str
@@ -210,7 +209,7 @@ class Report:
     verdict: Verdict
     noise_floor_rad: float
     baseline: Fit
-    findings: tuple[Finding, ...]
+    findings: tuple[Misfit, ...]
     effects: tuple[NamedEffect, ...]
     ambiguous: tuple[tuple[str, ...], ...]
     """Sets of effects that the recording cannot tell apart."""
@@ -220,7 +219,7 @@ class Report:
     next_experiment: str
     """What to record next, in one sentence; empty if nothing is open."""
     seconds: float
-    recording: Source
+    recording: AnalysedRecording
     format: str = FORMAT
     provisional: tuple[NamedEffect, ...] = ()
     """The first of each set in ``ambiguous``: not named, but what the identified model holds of the
@@ -334,17 +333,6 @@ class Predictions:
 def parameters_of(effect: str) -> dict[str, Parameter]:
     """Parameters of an effect by name."""
     return {parameter.name: parameter for parameter in EFFECTS[effect].parameters}
-
-
-def parameter_columns(report: Report, joint: str) -> dict[int, float]:
-    """Columns of the joint's parameter row (:mod:`vd.kernels.servo.actuators`) that the report identified."""
-    baseline = report.identified.parameters.get(joint, {})
-    columns = {BASELINE_PARAMETERS[name].column: value for name, value in baseline.items()}
-    for effect, values in effect_values((*report.effects, *report.provisional), joint).items():
-        columns |= {
-            parameters_of(effect)[name].column: value for name, (value, *_) in values.items()
-        }
-    return columns
 
 
 def effect_values(

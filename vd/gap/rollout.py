@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 
 from vd.gap.chain import Chain, load_of
-from vd.gap.recording import Recording
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.chain_bodies import links_of_size, room_for
 from vd.kernels.servo.chains import Samples, rollout_kernel
+from vd.logs.recording import Recording
 
 STEP_S = 1.0 / 480.0
 """Time step [s]: four of the simulator's, a fifth of a servo's fastest time constant (inertia /

@@ -9,8 +9,8 @@ trajectory, never the sample.
 import numpy as np
 from scipy.stats import t as student
 
-from vd.gap.motions import FLICKER_COUNTS, Recording, Trajectory
-from vd.gap.recording_checks import MIN_SAMPLES
+from vd.logs.motions import FLICKER_COUNTS, Recording, Trajectory
+from vd.logs.recording_checks import MIN_SAMPLES
 
 CONFIDENCE = 0.95
 """Of every interval: the field's custom."""
@@ -26,8 +26,16 @@ motion or model in question stands out. A real machine that is farther from it d
 motions that well; how well is not known from one recording of each."""
 BOOTSTRAP = 2000
 """Resamples of whole trajectories. Not tuned: quantiles are known to half a percent."""
+SMOOTH_S = 0.05
+"""Window over which speeds are taken [s]: longer than an encoder count at low speed. Not tuned."""
 HOLD_S = 0.25
 """The command must have been constant for this long before a sample counts as held. Not tuned."""
+
+
+def speed_of(time: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Speed over ``SMOOTH_S`` [T] [rad/s], without the noise of encoder counts."""
+    ends = (np.interp(time + side * SMOOTH_S, time, position) for side in (0.5, -0.5))
+    return np.subtract(*ends) / SMOOTH_S
 
 
 def held(trajectory: Trajectory, joint: int, resolution: float) -> np.ndarray:

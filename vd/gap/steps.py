@@ -10,17 +10,17 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import make_folder, write_json
-from vd.gap.recording import BARE_MODELS, Recording, model_path, read_recording
 from vd.gap.result import LAYER, Closing, Predictions, Report
 from vd.kernels.servo.effects import EFFECTS
+from vd.logs.recording import BARE_MODELS, Recording, model_path, read_recording
 from vd.versions import installed_versions
 
 if TYPE_CHECKING:
@@ -240,20 +240,28 @@ def _show(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _fit(analysis: Analysis, step: str) -> None:
+def _options(analysis: Analysis) -> dict[str, Any]:
+    """Fields of :class:`vd.gap.workflow.Options`."""
+    settings = analysis.settings
+    return {
+        "effects": tuple(name for name in settings.effects or EFFECTS if name != NO_EFFECTS),
+        "seed": settings.seed,
+        "device": settings.device,
+        "start": analysis.start,
+        "progress": _show,
+    }
+
+
+def _find(analysis: Analysis) -> None:
     from vd.gap import workflow
 
-    settings = analysis.settings
-    getattr(workflow, step)(
-        analysis.recording,
-        analysis.hand,
-        analysis.out,
-        effects=tuple(name for name in settings.effects or EFFECTS if name != NO_EFFECTS),
-        seed=settings.seed,
-        device=settings.device,
-        start=analysis.start,
-        progress=_show,
-    )
+    workflow.find(analysis.recording, analysis.hand, analysis.out, **_options(analysis))
+
+
+def _explain(analysis: Analysis) -> None:
+    from vd.gap import workflow
+
+    workflow.explain(analysis.recording, analysis.hand, analysis.out, **_options(analysis))
 
 
 def _close(analysis: Analysis) -> None:
@@ -286,8 +294,8 @@ def _close(analysis: Analysis) -> None:
 
 def _report(analysis: Analysis) -> None:
     from vd.gap.plan import PLAN_JSON
-    from vd.gap.recording_checks import cautions
     from vd.gap.report import write_report
+    from vd.logs.recording_checks import cautions
 
     planned = analysis.out / PLAN_JSON
     report = replace(
@@ -307,8 +315,8 @@ def _report(analysis: Analysis) -> None:
 
 
 _RUN: dict[str, Callable[[Analysis], None]] = {
-    "find": partial(_fit, step="find"),
-    "explain": partial(_fit, step="explain"),
+    "find": _find,
+    "explain": _explain,
     "close": _close,
     "report": _report,
 }

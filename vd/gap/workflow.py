@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,15 @@ from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.chain import Chain, chains, relative_torques
 from vd.gap.coordinates import FREE_SPEED, Scales
 from vd.gap.design import design, pieces
-from vd.gap.explain import Explainer, Joint, Progress
+from vd.gap.explain import ExcitedJoint, Progress, explain_joints
 from vd.gap.find import findings
-from vd.gap.joints import explain_joints
-from vd.gap.recording import Recording, read_recording
-from vd.gap.result import Finding, Report
+from vd.gap.fit import JointProblem, JointSpec, Problems
+from vd.gap.result import Misfit, Report
 from vd.gap.rollout import STEP_S
 from vd.gap.statistics import noise_floor
-from vd.gap.worker_pool import JointSpec, Problems, WorkerPool, parallel
+from vd.gap.worker_pool import WorkerPool, parallel
 from vd.kernels.servo.effects import EFFECTS
+from vd.logs.recording import Recording, read_recording
 
 FIND_FORMAT = "vd-gap-find/1"
 
@@ -56,7 +57,7 @@ class Options:
 
 def find(
     recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any
-) -> list[Finding]:
+) -> list[Misfit]:
     """Identify the baseline of every excited joint, and say where it and the measurement disagree.
 
     Args:
@@ -73,11 +74,11 @@ def find(
         ValueError: A recording that is not of this hand.
     """
     chosen = Options(**options)
-    pool, specs = _workers(recording, hand, chosen)
-    with pool:
-        recording = pool.problems.recording
-        joints = _identify(pool, specs, chosen)
-        predicted = curves(recording, pool.problems, [(j.spec, j.fit.rows) for j in joints])
+    problems, specs = _problems(recording, hand, chosen)
+    recording = problems.recording
+    with _workers(problems, chosen) as pool:
+        joints = _identify(pool, problems.chains, specs, chosen)
+        predicted = curves(problems, [(j.spec, j.fit.rows) for j in joints])
         found = findings(recording, predicted, {j.name: j.spec.floor for j in joints})
         value = {
             "format": FIND_FORMAT,
@@ -114,22 +115,21 @@ def explain(
     if not (out / "find.json").is_file():
         find(recording, hand, out, **options)
     known = json.loads((out / "find.json").read_text())
-    pool, specs = _workers(recording, hand, chosen)
-    with pool:
-        recording = pool.problems.recording
-        joints = _resume(pool, specs, known["joints"])
+    problems, specs = _problems(recording, hand, chosen)
+    recording = problems.recording
+    with _workers(problems, chosen) as pool:
+        joints = _resume(pool, problems.chains, specs, known["joints"])
         explained = explain_joints(
-            Explainer(pool, joints, chosen.effects, chosen.seed, chosen.progress)
+            pool, problems, joints, chosen.effects, chosen.seed, chosen.progress
         )
         analysed = [
             Analysed(j.name, j.spec, replace(e, baseline=j.fit))
             for j, e in zip(joints, explained, strict=True)
         ]
         report, predictions = assemble(
-            recording,
-            pool.problems,
+            problems,
             analysed,
-            [Finding(**f) for f in known["findings"]],
+            [Misfit(**f) for f in known["findings"]],
             seed=chosen.seed,
         )
         source = replace(report.recording, relative_torques=relative_torques(recording))
@@ -140,10 +140,16 @@ def explain(
     return report
 
 
-def _workers(
+def _workers(problems: Problems, options: Options) -> WorkerPool:
+    """Who fits."""
+    cores = len(os.sched_getaffinity(0)) if options.device == "cpu" else 1
+    return WorkerPool(problems.of, options.workers or cores)
+
+
+def _problems(
     recording: Recording | Path, hand: HandModel | None, options: Options
-) -> tuple[WorkerPool, list[JointSpec]]:
-    """Who fits, and the problems of all excited joints."""
+) -> tuple[Problems, list[JointSpec]]:
+    """The problems of a recording, and of which joints: all excited ones."""
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
     parts, specs = [], []
     for index, chain in enumerate(chains(recording, hand)):
@@ -164,10 +170,7 @@ def _workers(
     # A recording so long that pieces of it are analysed would take minutes a joint with the usual
     # step.
     dt = STEP_S * (2.0 if any(spec.pieces for spec in specs) else 1.0)
-    cores = len(os.sched_getaffinity(0)) if options.device == "cpu" else 1
-    return WorkerPool(
-        Problems(recording, parts, dt, options.device), options.workers or cores
-    ), specs
+    return Problems(recording, parts, dt, options.device), specs
 
 
 def baseline_of(chain: Chain) -> tuple[str, ...]:
@@ -182,59 +185,67 @@ def baseline_of(chain: Chain) -> tuple[str, ...]:
     return tuple(name for name in chain.baseline_free if name != anchor)
 
 
-def _identify(pool: WorkerPool, specs: Sequence[JointSpec], options: Options) -> list[Joint]:
+def _identify(
+    pool: WorkerPool, chains: Sequence[Chain], specs: Sequence[JointSpec], options: Options
+) -> list[ExcitedJoint]:
     """Baselines of all joints; the joints of a chain once more with the others' baselines."""
 
-    def first(spec: JointSpec) -> Joint:
-        chain = pool.problems.chains[spec.chain]
-        rows = chain.start_row.copy()
+    def first(spec: JointSpec) -> ExcitedJoint:
+        rows = chains[spec.chain].start_row.copy()
         scales = _scales(pool, spec, rows, spec.floor)
         # One limit that binds, one that does not.
         starts = [{}, *({"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED))]
-        joint = _fitted(pool, spec, rows, scales, starts=starts)
+        joint = _fitted(pool, chains, spec, rows, scales, starts=starts)
         error, floor = 1e3 * joint.fit.rmse, 1e3 * spec.floor
         options.progress(f"find: {joint.name}: baseline {error:.2f} mrad, noise floor {floor:.2f}")
         return joint
 
-    def again(joint: Joint) -> Joint:
+    def again(joint: ExcitedJoint) -> ExcitedJoint:
         rows = joint.fit.rows.copy()
         for other in joints:
             if other.spec.chain == joint.spec.chain:
                 rows[other.spec.joint] = other.fit.rows[other.spec.joint]
-        return _fitted(pool, joint.spec, rows, joint.scales)
+        return _fitted(pool, chains, joint.spec, rows, joint.scales)
 
     joints = parallel(first, specs)
-    single = all(len(chain.joints) == 1 for chain in pool.problems.chains)
+    single = all(len(chain.joints) == 1 for chain in chains)
     return joints if single else parallel(again, joints)
 
 
-def _resume(pool: WorkerPool, specs: Sequence[JointSpec], known: dict[str, Any]) -> list[Joint]:
+def _resume(
+    pool: WorkerPool,
+    chains: Sequence[Chain],
+    specs: Sequence[JointSpec],
+    known: dict[str, Any],
+) -> list[ExcitedJoint]:
     """The joints of an earlier ``find``, their fits recomputed from its rows."""
 
-    def one(spec: JointSpec) -> Joint:
-        found = known[pool.problems.chains[spec.chain].joints[spec.joint]]
+    def again(spec: JointSpec) -> ExcitedJoint:
+        found = known[chains[spec.chain].joints[spec.joint]]
         rows = np.array(found["rows"])
         scales = _scales(pool, spec, rows, found["rmse_rad"])
-        return replace(_fitted(pool, spec, rows, scales, iterations=1), scales=scales)
+        return replace(_fitted(pool, chains, spec, rows, scales, iterations=1), scales=scales)
 
-    return parallel(one, specs)
+    return parallel(again, specs)
 
 
 def _scales(pool: WorkerPool, spec: JointSpec, rows: np.ndarray, residual: float) -> Scales:
-    return pool.run(spec, [("scales", {"row": rows[spec.joint], "residual": residual})])[0]
+    call = partial(JointProblem.scales, row=rows[spec.joint], residual=residual)
+    return pool.run(spec, [call])[0]
 
 
 def _fitted(
     pool: WorkerPool,
+    chains: Sequence[Chain],
     spec: JointSpec,
     base: np.ndarray,
     scales: Scales,
     *,
     starts: Sequence[Mapping[str, float]] = ({},),
     **options: Any,
-) -> Joint:
+) -> ExcitedJoint:
     """A joint's plain model, fitted from rows of its chain, and the sizes of its motion with that."""
-    call = {"base": base, "effects": (), "starts": starts, "scales": scales, **options}
-    fit = pool.run(spec, [("fit", call)])[0]
-    name = pool.problems.chains[spec.chain].joints[spec.joint]
-    return Joint(name, spec, _scales(pool, spec, fit.rows, fit.rmse), fit)
+    call = partial(JointProblem.fit, base=base, effects=(), starts=starts, scales=scales, **options)
+    fit = pool.run(spec, [call])[0]
+    name = chains[spec.chain].joints[spec.joint]
+    return ExcitedJoint(name, spec, _scales(pool, spec, fit.rows, fit.rmse), fit)

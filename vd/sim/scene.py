@@ -3,7 +3,6 @@
 World frame: z up, table top at z = 0, all worlds at one origin. SI units, quaternions xyzw.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -12,9 +11,9 @@ import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
-from scipy.optimize import brentq
 
 from vd.assets_usd.hand_model import HandModel, open_stage
+from vd.assets_usd.objects.contact_layer import damping_ratio
 from vd.assets_usd.objects.model import ObjectModel
 from vd.paper import PAPER
 from vd.sim.cfg import (
@@ -105,23 +104,6 @@ def contact_attributes(priority: int, condim: int = CONDIM_SLIDING) -> dict[str,
         "mujoco:geom_priority": priority,
         "mujoco:geom_solimp": wp.types.vector(5, float)(d0, dmax, IMPEDANCE_WIDTH_M, 0.5, 2.0),
     }
-
-
-def damping_ratio(restitution: float) -> float:
-    """Of a spring and a damper that push but never pull, whose impacts have this restitution.
-
-    Critically damped it is exp(-2), the least there is here.
-    """
-
-    def kept(ratio: float) -> float:
-        root = math.sqrt(1.0 - ratio**2)
-        return (
-            math.exp(-ratio / root * math.atan2(2.0 * ratio * root, 2.0 * ratio**2 - 1.0))
-            - restitution
-        )
-
-    low, high = 1e-6, 1.0 - 1e-6
-    return float(brentq(kept, low, high)) if kept(low) > 0.0 > kept(high) else high
 
 
 def shape_cfg(

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from vd.bench.hide import effect_parameters
+from vd.gap.bench.hide import effect_parameters
 from vd.kernels.servo.effects import EFFECTS
 
 WEAKER: Mapping[tuple[str, str], float] = {

@@ -2,7 +2,7 @@
 
 LeRobot datasets, ROS bags and MCAP, BAM's logs, CSV with units.
 
-Every reader yields a :class:`Motion` for each episode, bag or file. ``FORMATS`` has them by name.
+Every reader yields a :class:`SourceMotion` for each episode, bag or file. ``FORMATS`` has them by name.
 """
 
 import json
@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.recording import by_channel, numbers, read_table
-from vd.gap.recording_checks import RecordingError
 from vd.interrupt import need
+from vd.logs.recording import by_channel, numbers, read_table
+from vd.logs.recording_checks import RecordingError
 
 ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
 UNITS: dict[str, Mapping[str, float]] = {
@@ -38,14 +38,14 @@ _Heard = tuple[float, float, Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class SourceMotion:
     """One motion of a file, in SI units.
 
     Attributes:
         name: Of its episode or file.
         joints: J names.
         time: Time stamps [T] [s].
-        channels: ``command`` and ``position`` [T, J] [rad], and telemetry as :mod:`vd.gap.motions`
+        channels: ``command`` and ``position`` [T, J] [rad], and telemetry as :mod:`vd.logs.motions`
             has it.
         command_time: When the command of a row was sent [T] [s]; None: at its time stamp.
         conditions: What was varied on purpose.
@@ -88,7 +88,7 @@ class Told:
         return self.rename.get(old, default)
 
 
-def read_csv(path: Path, told: Told) -> Iterator[Motion]:
+def read_csv(path: Path, told: Told) -> Iterator[SourceMotion]:
     """A CSV whose header names ``t [ms]``, ``position.JOINT [deg]``, ....
 
     A folder: every CSV in it.
@@ -109,7 +109,7 @@ def read_csv(path: Path, told: Told) -> Iterator[Motion]:
                 f"{file}: no column 't'; give --rename 'ITS TIME=t' with its unit: 't [ms]'"
             )
         joints = tuple(dict.fromkeys(name.partition(".")[2] for name in columns if "." in name))
-        yield Motion(file.stem, joints, columns["t"], by_channel(columns, joints, len(rows)))
+        yield SourceMotion(file.stem, joints, columns["t"], by_channel(columns, joints, len(rows)))
 
 
 def _column(file: Path, text: str, told: Told) -> tuple[str, float | None]:
@@ -136,7 +136,7 @@ def _name_and_unit(text: str) -> tuple[str, str]:
     return name.strip(), unit.rstrip("]").strip()
 
 
-def read_bam(path: Path, told: Told) -> Iterator[Motion]:
+def read_bam(path: Path, told: Told) -> Iterator[SourceMotion]:
     """Logs of BAM's pendulum, one JSON file for each; a folder: every JSON in it."""
     for file in _files(path, ".json"):
         try:
@@ -168,10 +168,10 @@ def read_bam(path: Path, told: Told) -> Iterator[Motion]:
             ) from error
         joint = told.called("pendulum", "pendulum")
         values = {channel: of_joint[:, None] for channel, of_joint in channels.items()}
-        yield Motion(name, (joint,), time, values, None, conditions, str(log["trajectory"]))
+        yield SourceMotion(name, (joint,), time, values, None, conditions, str(log["trajectory"]))
 
 
-def read_lerobot(path: Path, told: Told) -> Iterator[Motion]:
+def read_lerobot(path: Path, told: Told) -> Iterator[SourceMotion]:
     """Episodes of a LeRobot dataset, v2 or v3.
 
     ``action`` commands, ``observation.state`` is measured.
@@ -203,7 +203,7 @@ def read_lerobot(path: Path, told: Told) -> Iterator[Motion]:
     for episode in np.unique(index):
         rows = index == episode
         both = {"command": action[rows][:, picked[0]], "position": state[rows][:, picked[1]]}
-        yield Motion(
+        yield SourceMotion(
             f"episode_{int(episode):06d}",
             ours,
             time[rows],
@@ -243,7 +243,7 @@ def _lerobot_names(feature: Mapping[str, Any]) -> list[str]:
     return list(next(iter(names.values())) if isinstance(names, Mapping) else names)
 
 
-def read_ros(path: Path, told: Told) -> Iterator[Motion]:
+def read_ros(path: Path, told: Told) -> Iterator[SourceMotion]:
     """A ROS 1 bag, a ROS 2 bag's folder or file, or an MCAP of ROS 2 messages.
 
     Measured are JointState, commanded JointState, JointTrajectory of one point, or
@@ -297,7 +297,7 @@ def _topic(
     )
 
 
-def _held(path: Path, states: list[_Heard], commands: list[_Heard], told: Told) -> Motion:
+def _held(path: Path, states: list[_Heard], commands: list[_Heard], told: Told) -> SourceMotion:
     """The measured rows, each with the command that was sent last."""
     ours = [{told.called(name, name) for name in message.name} for *_, message in states]
     first = next((i for i, names in enumerate(ours) if names.issuperset(told.joints)), None)
@@ -326,7 +326,7 @@ def _held(path: Path, states: list[_Heard], commands: list[_Heard], told: Told) 
     channels = {"command": wanted[last], "position": position[kept], "velocity": velocity[kept]}
     named = tuple(told.called(joint, joint) for joint in joints)
     # A command is new in one row; in those after it, it is held.
-    return Motion(
+    return SourceMotion(
         path.stem, named, time, channels, np.where(new, np.minimum(sent[last], time), time)
     )
 
@@ -367,7 +367,7 @@ def _files(path: Path, suffix: str) -> list[Path]:
     return files
 
 
-FORMATS: dict[str, Callable[[Path, Told], Iterator[Motion]]] = {
+FORMATS: dict[str, Callable[[Path, Told], Iterator[SourceMotion]]] = {
     "csv": read_csv,
     "bam": read_bam,
     "lerobot": read_lerobot,

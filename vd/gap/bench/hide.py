@@ -1,6 +1,6 @@
 """Make recordings in which an effect is hidden, to test what finds it.
 
-The recording comes from :mod:`vd.bench.hidden_plant`: random base parameters, sensor noise, encoder
+The recording comes from :mod:`vd.gap.bench.hidden_plant`: random base parameters, sensor noise, encoder
 counts and jittered stamps. What is hidden is written beside the folder, never into it.
 """
 
@@ -15,12 +15,20 @@ import numpy as np
 from scipy.signal import lfilter
 
 from vd.assets_usd.hands import load_hand
-from vd.bench.hidden_finger import finger_of
-from vd.bench.hidden_plant import OUTSIDE, TUNED, Motion, Physics, Plant, Run, simulate
 from vd.files import write_json
-from vd.gap.excitations import JointRange, excitation_set, numbered
-from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording, Trajectory, write_recording
+from vd.gap.bench.hidden_finger import finger_of
+from vd.gap.bench.hidden_plant import (
+    OUTSIDE,
+    TUNED,
+    HiddenPlant,
+    Physics,
+    PlantMotion,
+    PlantRun,
+    simulate,
+)
 from vd.kernels.servo.effects import EFFECTS
+from vd.logs.excitations import JointRange, excitation_set, numbered
+from vd.logs.recording import BARE_MODELS, STIFFNESS, Recording, Trajectory, write_recording
 
 ENCODER_COUNT = 2.0 * math.pi / 4096
 """Twelve bits a turn, as of Dynamixel X and Feetech STS servos [rad]."""
@@ -82,7 +90,7 @@ class Hiding:
         seed: Of base parameters, noise, jitter.
         joints: Joints recorded; empty: the first finger, or the one joint of a bare model.
         effect_joints: Joints that have the effect; absent or empty: all.
-        excitations: Sets of :data:`vd.gap.excitations.MENU`.
+        excitations: Sets of :data:`vd.logs.excitations.MENU`.
         base_spread: Spread of stiffness, damping and speed limit about the hand's; 0: exactly the
             hand's.
         mass_spread: Spread of the finger's masses and inertias about the hand's.
@@ -168,6 +176,18 @@ def truth_path(out: str | Path) -> Path:
     return out.parent / f"{out.name}.truth.json"
 
 
+def check_hidden(out: Path) -> None:
+    """Refuse a folder with a recording in which nothing was hidden.
+
+    Raises:
+        ValueError: It is one.
+    """
+    if (out / "recording.json").exists() and not truth_path(out).exists():
+        raise ValueError(
+            f"--out {out} holds a recording in which nothing was hidden; name another folder"
+        )
+
+
 def simulate_hidden(hidings: Sequence[Hiding]) -> list[Hidden]:
     """Make recordings, many at a time: a batch costs little more than one.
 
@@ -181,7 +201,7 @@ def simulate_hidden(hidings: Sequence[Hiding]) -> list[Hidden]:
     runs = [run for session in sessions for run in session.runs]
     # Long trajectories with long ones: a batch runs as long as its longest, with one time step.
     order = sorted(range(len(runs)), key=lambda i: runs[i].time[-1])
-    moved: dict[int, Motion] = {}
+    moved: dict[int, PlantMotion] = {}
     for step in {run.plant.physics.step_s for run in runs}:
         same = [i for i in order if runs[i].plant.physics.step_s == step]
         for start in range(0, len(same), CHUNK):
@@ -199,13 +219,13 @@ class _Session:
         self.rng = np.random.default_rng(hiding.seed)
         reach, self.plant = machine(hiding, self.rng)
         self.motions = numbered(excitation_set(reach, hiding.excitations))
-        self.runs: list[Run] = []
+        self.runs: list[PlantRun] = []
         session_s = 0.0
         for motion in self.motions:
             time = self._stamps(motion)
             seed = int(self.rng.integers(2**31))
             self.runs.append(
-                Run(
+                PlantRun(
                     self.plant,
                     time,
                     motion.command,
@@ -236,7 +256,7 @@ class _Session:
         new = math.sqrt(1.0 - keep * keep)
         return lfilter([new], [1.0, -keep], white, axis=0, zi=(1.0 - new) * white[:1])[0]
 
-    def finish(self, moved: Sequence[Motion]) -> Hidden:
+    def finish(self, moved: Sequence[PlantMotion]) -> Hidden:
         """Add noise and rounding; the recording and the truth."""
         hiding = self.hiding
         trajectories = []
@@ -285,11 +305,11 @@ class _Session:
         }
 
 
-def _by_joint(plant: Plant, values: np.ndarray) -> dict[str, float]:
+def _by_joint(plant: HiddenPlant, values: np.ndarray) -> dict[str, float]:
     return {joint: float(value) for joint, value in zip(plant.joints, values, strict=True)}
 
 
-def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
+def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, HiddenPlant]:
     """Draw the machine: the range of its joints, and the plant with its effects."""
     reach, plant = _bare(hiding, rng) if hiding.model in BARE_MODELS else _finger(hiding, rng)
     effects = {}
@@ -323,7 +343,7 @@ def _effect_joints(hiding: Hiding, name: str, joints: tuple[str, ...]) -> tuple[
     return having
 
 
-def _bare(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
+def _bare(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, HiddenPlant]:
     nominal = BARE[hiding.model]
     joints = hiding.joints or ("joint" if hiding.model == "servo" else "pendulum",)
     count = len(joints)
@@ -333,7 +353,7 @@ def _bare(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
         joints, np.full(count, -BARE_REACH_RAD), np.full(count, BARE_REACH_RAD), FULL_P_GAIN
     )
     base = {name: nominal[name] * factor for name, factor in zip(BASE, [*near, *far], strict=True)}
-    return reach, Plant(joints=joints, **base, full_gain=FULL_P_GAIN)
+    return reach, HiddenPlant(joints=joints, **base, full_gain=FULL_P_GAIN)
 
 
 def _spread(rng: np.random.Generator, width: float, shape: tuple[int, ...]) -> np.ndarray:
@@ -341,7 +361,7 @@ def _spread(rng: np.random.Generator, width: float, shape: tuple[int, ...]) -> n
     return 1.0 + rng.uniform(-width, width, shape)
 
 
-def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
+def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, HiddenPlant]:
     try:
         hand = load_hand(hiding.model)
     except ValueError as error:
@@ -361,7 +381,7 @@ def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
     near = _spread(rng, hiding.base_spread, (3, n))
     heavy = _spread(rng, hiding.mass_spread, (n,))
     reach = JointRange(joints, hand.lower[index], hand.upper[index], FULL_P_GAIN)
-    return reach, Plant(
+    return reach, HiddenPlant(
         joints=joints,
         kp=hand.kp[index] * near[0],
         kd=hand.kd[index] * near[1],

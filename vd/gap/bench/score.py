@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from vd.bench.gap_sizes import sized_effect
-from vd.bench.hidden_plant import CABLE, COGGING, TUNED, WARMING, Physics
-from vd.bench.hide import Hiding
+from vd.gap.bench.hidden_plant import CABLE, COGGING, TUNED, WARMING, Physics
+from vd.gap.bench.hide import Hiding
+from vd.gap.bench.sizes import sized_effect
 from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 
 KINDS = ("single", "none", "pair", "outside")

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
-from vd.bench.hidden_finger import Finger, slip
+from vd.gap.bench.hidden_finger import Finger, slip
 
 STEP_S = 4.0e-4
 """Time step [s]: five times finer than the fitted model's, second order where the motion is
@@ -69,7 +69,7 @@ TUNED = Physics()
 
 
 @dataclass(frozen=True, eq=False)
-class Plant:
+class HiddenPlant:
     """One machine; arrays have one entry per joint [J].
 
     Attributes:
@@ -101,7 +101,7 @@ class Plant:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class PlantRun:
     """One trajectory to simulate on a plant.
 
     Attributes:
@@ -114,7 +114,7 @@ class Run:
         seed: Of the jitter of the commands.
     """
 
-    plant: Plant
+    plant: HiddenPlant
     time: np.ndarray
     command: np.ndarray
     enabled: np.ndarray
@@ -124,7 +124,7 @@ class Run:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class PlantMotion:
     """What an ideal sensor would record at the stamps of a run: noise and counts not included.
 
     Attributes:
@@ -138,7 +138,7 @@ class Motion:
     duty: np.ndarray
 
 
-def simulate(runs: Sequence[Run], *, dt: float | None = None) -> list[Motion]:
+def simulate(runs: Sequence[PlantRun], *, dt: float | None = None) -> list[PlantMotion]:
     """Simulate runs together.
 
     Args:
@@ -162,14 +162,14 @@ def simulate(runs: Sequence[Run], *, dt: float | None = None) -> list[Motion]:
         # The step after the stamp: a command is written before the servo is read.
         step = np.minimum(np.ceil(run.time / dt).astype(int), batch.steps - 1)
         duty = np.clip(asked[step, b] / FULL_DUTY_RAD, -1.0, 1.0)
-        recorded.append(Motion(np.stack(columns, axis=1) + bias[b], duty))
+        recorded.append(PlantMotion(np.stack(columns, axis=1) + bias[b], duty))
     return recorded
 
 
 class _Batch:
     """Runs as arrays [B, J], and their integration."""
 
-    def __init__(self, runs: Sequence[Run], dt: float):
+    def __init__(self, runs: Sequence[PlantRun], dt: float):
         self.runs, self.dt = runs, dt
         plants = [run.plant for run in runs]
         self.plants = plants
@@ -275,7 +275,7 @@ class _Batch:
         Also what the controllers ask for in each step, as an error at full gain [K, B, J] [rad].
         """
         dt, half = self.dt, 0.5 * self.dt
-        loads, motor, switch = _Loads(self, dt), _Motor(self), self._switch()
+        loads, motor, switch = _Loads(self, dt), _Servo(self), self._switch()
         dead = 0.5 * self.of("dead_zone", "width_rad")
         integral_gain = self.of("integral_action", "k_i")
         coupling = np.stack(
@@ -379,7 +379,7 @@ def _hold_mean(arrival: np.ndarray, command: np.ndarray, edges: np.ndarray) -> n
     return np.diff(np.interp(edges, knots, area)) / np.diff(edges)
 
 
-class _Motor:
+class _Servo:
     """Torque of the motors for what the controllers want, and its slope, which the implicit damping needs."""
 
     def __init__(self, batch: _Batch):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vd.gap.motions import Trajectory
+from vd.logs.motions import Trajectory
 
 RATE_HZ = 100.0
 """Rate at which commands are written. Not tuned."""
@@ -39,7 +39,7 @@ class JointRange:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class MenuMotion:
     """A motion of the menu, of any joint.
 
     Attributes:
@@ -78,35 +78,37 @@ def numbered(motions: Iterable[Trajectory]) -> tuple[Trajectory, ...]:
     return tuple(replace(motion, file=f"{i:03d}_{motion.file}") for i, motion in enumerate(motions))
 
 
-def _levels(name: str, hold_s: float, *levels: float) -> Motion:
+def _levels(name: str, hold_s: float, *levels: float) -> MenuMotion:
     """Levels held in turn, after half a second at zero so that the onset is in the recording."""
     time = _time(0.5 + hold_s * len(levels))
     place = np.floor((time - 0.5) / hold_s + 1e-9).astype(int) + 1
-    return Motion(name, np.array([0.0, *levels])[np.clip(place, 0, len(levels))])
+    return MenuMotion(name, np.array([0.0, *levels])[np.clip(place, 0, len(levels))])
 
 
-def _sine(name: str, frequency_hz: float, duration_s: float) -> Motion:
-    return Motion(name, np.sin(2.0 * np.pi * frequency_hz * _time(duration_s)))
+def _sine(name: str, frequency_hz: float, duration_s: float) -> MenuMotion:
+    return MenuMotion(name, np.sin(2.0 * np.pi * frequency_hz * _time(duration_s)))
 
 
-def _triangle(name: str, period_s: float, duration_s: float) -> Motion:
-    return Motion(
+def _triangle(name: str, period_s: float, duration_s: float) -> MenuMotion:
+    return MenuMotion(
         name, -2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi / period_s * _time(duration_s)))
     )
 
 
-def _chirp(name: str, size: float, first_hz: float, last_hz: float, duration_s: float) -> Motion:
+def _chirp(
+    name: str, size: float, first_hz: float, last_hz: float, duration_s: float
+) -> MenuMotion:
     """A sine whose frequency grows exponentially."""
     time = _time(duration_s)
     rate = np.log(last_hz / first_hz) / duration_s
-    return Motion(name, size * np.sin(2.0 * np.pi * first_hz * np.expm1(rate * time) / rate))
+    return MenuMotion(name, size * np.sin(2.0 * np.pi * first_hz * np.expm1(rate * time) / rate))
 
 
 def _time(duration_s: float) -> np.ndarray:
     return np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ
 
 
-MENU: dict[str, tuple[Motion, ...]] = {
+MENU: dict[str, tuple[MenuMotion, ...]] = {
     "steps_and_sines": (
         _levels("step_small", 1.75, 0.12, -0.12),
         _levels("step_medium", 1.75, 0.4, -0.2),

@@ -1,6 +1,6 @@
 """The battery of the gap workflow: does it name what is hidden, and nothing else?
 
-Every case is a recording from :mod:`vd.bench.hide`, analysed by :mod:`vd.gap.workflow` from the
+Every case is a recording from :mod:`vd.gap.bench.hide`, analysed by :mod:`vd.gap.workflow` from the
 recording
 alone, and compared with the truth: every effect of the table at four sizes, all pairs at one,
 nothing hidden, and effects outside the table. Results are one JSON file per case, so that a run can
@@ -8,7 +8,6 @@ be interrupted, resumed and split over machines.
 """
 
 import itertools
-import json
 import time
 import traceback
 from collections.abc import Sequence
@@ -21,15 +20,15 @@ from typing import Any
 import warp as wp
 
 from vd.assets_usd.hands import HANDS, load_hand
-from vd.bench.gap_score import KINDS, Case, said, score
-from vd.bench.gap_sizes import showing
-from vd.bench.hidden_plant import OUTSIDE
-from vd.bench.hide import hide
-from vd.files import make_folder, write_json
+from vd.files import write_json
 from vd.gap import workflow
+from vd.gap.bench.cases import run_cases
+from vd.gap.bench.hidden_plant import OUTSIDE
+from vd.gap.bench.hide import hide
+from vd.gap.bench.score import KINDS, Case, said, score
+from vd.gap.bench.sizes import showing
 from vd.kernels.servo import chains
 from vd.warp_quiet import quiet_warp
-from vd.workers import run_tasks
 
 PAIR_SIZE = 2
 """Size of both effects of a pair, some six noise floors each: from there on single effects are told
@@ -116,31 +115,16 @@ def run_battery(
 
     What failed before comes last.
     """
-    make_folder(folder)
-    done = {case: read_result(folder / f"{case.name}.json") for case in cases}
-    failed = [case for case in cases if "error" in (done[case] or {})]
-    waiting = [*(case for case in cases if done[case] is None), *failed]
-    print(
-        f"{len(cases) - len(waiting)} of {len(cases)} cases have results; {len(waiting)} to run",
-        flush=True,
+    _prepare(device, {case.model for case in cases})
+    return run_cases(
+        cases,
+        folder,
+        partial(run_case, folder=folder, device=device),
+        lambda result: f"{result['verdict']}: {said(result)}",
+        jobs=jobs,
+        limit_s=CASE_LIMIT_S,
+        gpu=device.startswith("cuda"),
     )
-    numbers = itertools.count(1)
-
-    def finished(case: Case, result: dict[str, Any] | None, why: str) -> None:
-        if result is None:
-            result = {"case": asdict(case), "error": why}
-            write_json(folder / f"{case.name}.json", result)
-        done[case] = result
-        answer = f"failed: {why}" if "error" in result else f"{result['verdict']}: {said(result)}"
-        print(f"[{next(numbers)}/{len(waiting)}] {case.name}: {answer}", flush=True)
-
-    if waiting:
-        _prepare(device, {case.model for case in waiting})
-    work = partial(run_case, folder=folder, device=device)
-    run_tasks(
-        work, waiting, finished, jobs=jobs, limit_s=CASE_LIMIT_S, gpu=device.startswith("cuda")
-    )
-    return [result for result in done.values() if result is not None]
 
 
 def _prepare(device: str, models: set[str]) -> None:
@@ -149,12 +133,3 @@ def _prepare(device: str, models: set[str]) -> None:
         load_hand(model)
     quiet_warp()
     wp.load_module(chains, device=device)
-
-
-def read_result(path: Path) -> dict[str, Any] | None:
-    """The result of a case, or None if it has not been run, was cut short or is of an earlier version."""
-    try:
-        result = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return None
-    return result if {"found", "error"} & result.keys() else None

@@ -4,24 +4,24 @@ Does it name what is hidden in a plant of MuJoCo, and nothing else?
 """
 
 import itertools
-import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from vd.assets_usd.objects.contact_layer import CONTACT
 from vd.assets_usd.objects.sets import load_set
-from vd.bench.gap_score import Figure
-from vd.bench.hidden_contact import OUTSIDE, ContactPlant, hide_contact
-from vd.files import make_folder, write_json, write_text
+from vd.files import write_json, write_text
+from vd.gap.bench.cases import run_cases
+from vd.gap.bench.hidden_contact import OUTSIDE, ContactPlant, hide_contact
+from vd.gap.bench.score import Figure
 from vd.gap.contact import by_weight, identify_contact, verdict
-from vd.gap.contact_recording import read_contact_recording
-from vd.workers import run_tasks
+from vd.logs.contact_recording import read_contact_recording
 
 FIRST_SEED = {"development": 0, "closed": 100_000}
 OBJECTS = ("cube", "cuboid")
@@ -42,7 +42,8 @@ value. Outside
 the table: growth with the speed [s/m], growth with the depth [1/m], angle [rad]."""
 
 
-class Case(NamedTuple):
+@dataclass(frozen=True)
+class ContactCase:
     """One recording: its kind, what is hidden, and its seed."""
 
     kind: str
@@ -71,7 +72,7 @@ class Case(NamedTuple):
         return ContactPlant(item, values, outside, self.seed)
 
 
-def battery(which: str, seeds: int) -> list[Case]:
+def battery(which: str, seeds: int) -> list[ContactCase]:
     """The cases: every parameter and cause outside the table, ten times as often nothing, pairs.
 
     Args:
@@ -82,17 +83,19 @@ def battery(which: str, seeds: int) -> list[Case]:
     cases += [("none", ())] * 10 + [("outside", (name,)) for name in OUTSIDE]
     cases *= seeds
     cases += [("pair", pair) for pair in itertools.combinations(CONTACT, 2)] * math.ceil(seeds / 4)
-    return [Case(kind, hidden, FIRST_SEED[which] + i) for i, (kind, hidden) in enumerate(cases)]
+    return [
+        ContactCase(kind, hidden, FIRST_SEED[which] + i) for i, (kind, hidden) in enumerate(cases)
+    ]
 
 
-def run_case(case: Case, folder: Path) -> dict[str, Any]:
+def run_case(case: ContactCase, folder: Path) -> dict[str, Any]:
     """Make the recording, analyse it, compare; writes ``folder/CASE.json``."""
     plant = case.plant()
     with TemporaryDirectory() as work:
         true = hide_contact(plant, Path(work) / "recording")["parameters"]
         found = identify_contact(read_contact_recording(Path(work) / "recording"), plant.item)
     result = {
-        "case": case._asdict(),
+        "case": asdict(case),
         "verdict": verdict(found),
         "named": [each.name for each in by_weight(found)],
         "parameters": {
@@ -111,21 +114,18 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
     return result
 
 
-def run_battery(cases: Sequence[Case], folder: Path, jobs: int) -> list[dict[str, Any]]:
+def run_battery(cases: Sequence[ContactCase], folder: Path, jobs: int) -> list[dict[str, Any]]:
     """Run the cases that have no result yet, with a line for each; returns the results of all."""
-    make_folder(folder)
-    files = {case: folder / f"{case.name}.json" for case in cases}
-    done = {case: json.loads(file.read_text()) for case, file in files.items() if file.is_file()}
-
-    def finished(case: Case, result: dict[str, Any] | None, why: str) -> None:
-        done[case] = result or {"case": case._asdict(), "error": why}
-        said = why if result is None else ", ".join(result["named"]) or "nothing"
-        print(f"[{len(done)}/{len(cases)}] {case.name}: {said}", flush=True)
-
-    waiting = [case for case in cases if case not in done]
-    run_tasks(partial(run_case, folder=folder), waiting, finished, jobs=jobs, limit_s=CASE_LIMIT_S)
-    write_text(folder / "summary.md", summary([done[case] for case in cases]))
-    return [done[case] for case in cases]
+    results = run_cases(
+        cases,
+        folder,
+        partial(run_case, folder=folder),
+        lambda result: ", ".join(result["named"]) or "nothing",
+        jobs=jobs,
+        limit_s=CASE_LIMIT_S,
+    )
+    write_text(folder / "summary.md", summary(results))
+    return results
 
 
 def summary(results: Sequence[Mapping[str, Any]]) -> str:
@@ -168,7 +168,9 @@ def summary(results: Sequence[Mapping[str, Any]]) -> str:
     wrong = [
         r for r in results if set(named(r)) != set(hidden(r)) and r["case"]["kind"] != "outside"
     ]
-    lines = [f"- {Case(**r['case']).name}: {', '.join(named(r)) or 'nothing'}" for r in wrong]
+    lines = [
+        f"- {ContactCase(**r['case']).name}: {', '.join(named(r)) or 'nothing'}" for r in wrong
+    ]
     head = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
     return (
         "\n".join([*head, *(figure.row() for figure in figures), "", "Not as hidden:", "", *lines])

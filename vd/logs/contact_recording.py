@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.files import atomic_path, write_json
-from vd.gap.recording import CONTACT_MODEL, FORMAT, MIN_SAMPLES, numbers, read_header, read_table
-from vd.gap.recording_checks import RecordingError
+from vd.logs.recording import CONTACT_MODEL, FORMAT, MIN_SAMPLES, numbers, read_header, read_table
+from vd.logs.recording_checks import RecordingError
 
 Kind = Literal["drop", "slide", "push", "press"]
 TIME, POSE = ("t",), ("x", "y", "z", "qx", "qy", "qz", "qw")

@@ -13,8 +13,6 @@ import numpy as np
 import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
-from vd.gap.motions import Recording
-from vd.gap.rollout import STEP_S
 from vd.kernels.launch import count_kernel, launch
 from vd.kernels.servo.actuators import BACKLASH_WIDTH, ENCODER_BIAS
 from vd.kernels.servo.chains import Samples
@@ -24,6 +22,7 @@ from vd.kernels.servo.joint_replay import (
     rest_play_kernel,
     sample_position_kernel,
 )
+from vd.logs.motions import Recording
 from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
 from vd.sim.joint_servo import JointServo
@@ -35,7 +34,7 @@ def simulate_hand(
     hand: HandModel,
     rows: np.ndarray,
     *,
-    dt: float = STEP_S,
+    dt: float,
     device: str = "cpu",
 ) -> np.ndarray:
     """What Newton makes of a recording's commands, sampled where the recording has positions.
@@ -43,24 +42,21 @@ def simulate_hand(
     Args:
         recording: A recording of the hand.
         hand: The hand.
-        rows: Servo parameters, shape [D, P], or of M models that are simulated side by side [M, D,
-            P].
+        rows: Servo parameters of M models that are simulated side by side [M, D, P].
         dt: Physics step [s].
         device: Warp device.
 
     Returns:
         Predicted recorded positions [rad] in the recording's columns, the samples of the
-        trajectories one after the other, shape [S, J] or [M, S, J].
+        trajectories one after the other, shape [M, S, J].
     """
-    rows = np.asarray(rows, dtype=float)
-    models = rows[None] if rows.ndim == 2 else rows
+    models = np.asarray(rows, dtype=float)
     lengths = [len(trajectory.time) for trajectory in recording.trajectories]
     replay = _Replay(recording, hand, len(models), dt, device)
     positions = replay.run(np.repeat(models, len(lengths), axis=0))
     positions = positions.reshape(len(models), len(lengths), -1, hand.num_joints)
     answers = np.concatenate([positions[:, k, :length] for k, length in enumerate(lengths)], axis=1)
-    answers = answers[..., [hand.joint_names.index(name) for name in recording.joints]]
-    return answers[0] if rows.ndim == 2 else answers
+    return answers[..., [hand.joint_names.index(name) for name in recording.joints]]
 
 
 class _Replay:

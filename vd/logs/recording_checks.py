@@ -2,7 +2,7 @@
 
 Possible values, one clock, one unit, an answer to the command.
 
-The checks of :mod:`vd.gap.recording` on values, beside those on the form of the files.
+The checks of :mod:`vd.logs.recording` on values, beside those on the form of the files.
 """
 
 import math
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import correlate, correlation_lags
 
-from vd.gap.motions import FLICKER_COUNTS, Recording, Trajectory
+from vd.logs.motions import FLICKER_COUNTS, Recording, Trajectory
 
 COMMAND_TIME = "t_command"
 """Optional column: when the commands of a row were sent [s], if not at the row's time stamp."""

@@ -16,13 +16,12 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.objects.contact_layer import CONTACT
+from vd.assets_usd.objects.contact_layer import CONTACT, damping_ratio
 from vd.assets_usd.objects.model import ObjectModel
-from vd.bench.hidden_finger import GRAVITY_M_S2
-from vd.bench.hide import truth_path
 from vd.files import write_json
-from vd.gap.contact_recording import ContactMotion, Kind, write_contact_recording
-from vd.sim.scene import damping_ratio
+from vd.gap.bench.hidden_finger import GRAVITY_M_S2
+from vd.gap.bench.hide import truth_path
+from vd.logs.contact_recording import ContactMotion, Kind, write_contact_recording
 
 OUTSIDE = {
     "speed_friction": "table_friction",
@@ -268,7 +267,7 @@ def _drop(world: World, upright: Rotation, rng: np.random.Generator, *, flat: bo
     return np.concatenate([before, time + PUSH_OFF_S]), pose, pusher, force
 
 
-class Tracker:
+class ImperfectTracker:
     """What is recorded of a motion, by one of the trackers that there are.
 
     Motion capture or a camera.
@@ -317,7 +316,7 @@ def hide_contact(
         counts: Motions of each kind.
     """
     rng = np.random.default_rng(plant.seed)
-    tracker = Tracker(rng)
+    tracker = ImperfectTracker(rng)
     motions = [
         tracker.see(_motion(plant, kind, i, rng), kind, f"{kind}_{i}.csv")
         for kind, count in counts.items()

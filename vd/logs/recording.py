@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from vd.files import atomic_path, write_json
-from vd.gap.motions import CHANNELS, Recording, Trajectory
-from vd.gap.recording_checks import (
+from vd.logs.motions import CHANNELS, Recording, Trajectory
+from vd.logs.recording_checks import (
     COMMAND_TIME,
     MIN_SAMPLES,
     RecordingError,

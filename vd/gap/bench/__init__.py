@@ -1,0 +1,1 @@
+"""Test recordings of machines that are independent of the analysis, and what it makes of them."""
