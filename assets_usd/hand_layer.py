@@ -192,7 +192,7 @@ def add_layer(stage: Usd.Stage, path: Path) -> None:
         if prim.name != root:
             raise HandError(
                 f"{path}: {prim.path}: this layer is for {prim.name}, not for {root} ({hand}); "
-                "use the layer that was identified on this hand"
+                "use one that was made on this hand"
             )
     unknown: list[str] = []
 

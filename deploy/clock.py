@@ -12,6 +12,19 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Protocol
 
+AHEAD_S = 0.02
+"""What came cannot be newer than the moment it came [s]; clocks that stamp it are off by some
+ms.
+"""
+
+
+def from_future(time_s: float, now_s: float) -> str:
+    """By how much a time [s] lies ahead of the present, with the remedy; empty where it does not."""
+    ahead_s = time_s - now_s
+    if ahead_s <= AHEAD_S:
+        return ""
+    return f"{ahead_s:.2f} s from the future: wait until the computers' clocks are set (NTP)"
+
 
 class Clock(Protocol):
     """Tells the time, waits, and has something done beside the program."""

@@ -26,7 +26,7 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel, MotorModel
 from vd.assets_usd.hands import load_hand
 from vd.deploy.camera.ros_camera import FIRST_S, monotonic
-from vd.deploy.clock import MONOTONIC
+from vd.deploy.clock import MONOTONIC, from_future
 from vd.deploy.finding import Finding, finding
 from vd.deploy.hardware.answers import HandState, SilentError
 from vd.deploy.hardware.connect import Connection, HandOptions
@@ -93,7 +93,13 @@ class RosHand:
         if len(missing) == len(self.hand.joint_names):
             return
         none = np.full(len(self.ids), np.nan)
+        time_s = monotonic(message.header.stamp)
+        ahead = from_future(time_s, self.clock.now())
         with self._arrived:
+            if ahead:
+                topic = self._node.resolve_topic_name(STATES)
+                self._wrong = f"a JointState on {topic} is {ahead}, and stamp it when it is read"
+                return
             if missing or not len(message.position) == len(message.velocity) == len(places):
                 lacks = (
                     f"lacks {missing[0]}"
@@ -102,9 +108,10 @@ class RosHand:
                 )
                 self._wrong = f"JointState {lacks}; names are those of the hand's USD"
                 return
+            self._wrong = ""
             order = [places[name] for name in self.hand.joint_names]
             self._state = HandState(
-                time_s=monotonic(message.header.stamp),
+                time_s=time_s,
                 position=np.asarray(message.position, dtype=float)[order],
                 velocity=np.asarray(message.velocity, dtype=float)[order],
                 current=none,
@@ -138,7 +145,7 @@ class RosHand:
         wrong = []
         if rate < FEWEST * PAPER.scene.control_hz:
             wrong.append(f"{rate:.0f} a second, fewer than {FEWEST * PAPER.scene.control_hz:.0f}")
-        if not abs(age) <= STATE_S:
+        if not age <= STATE_S:
             wrong.append(
                 f"{1e3 * age:.0f} ms old: stamp them when they are read, and set clocks (NTP)"
             )
@@ -156,7 +163,7 @@ class RosHand:
         """The newest state.
 
         Raises:
-            SilentError: It is too old, and no new one comes.
+            SilentError: It is too old, and none comes that is new, whole and of the present.
         """
 
         def fresh() -> bool:
@@ -164,7 +171,8 @@ class RosHand:
 
         with self._arrived:
             if not self._arrived.wait_for(fresh, STATE_S) or self._state is None:
-                raise SilentError(f"no new JointState on {self._node.resolve_topic_name(STATES)}")
+                topic = self._node.resolve_topic_name(STATES)
+                raise SilentError(self._wrong or f"no new JointState on {topic}")
             return self._state
 
     def write_goals(self, goals: np.ndarray, *, with_state: bool = False) -> None:
@@ -186,6 +194,10 @@ class RosHand:
     def read_torque(self) -> np.ndarray:
         """Taken to be on."""
         return np.ones(len(self.ids), dtype=bool)
+
+    def read_tripped(self) -> np.ndarray:
+        """Taken to hear goals."""
+        return np.zeros(len(self.ids), dtype=bool)
 
     def hardware_errors(self) -> dict[int, str]:
         """None that we know."""

@@ -158,6 +158,40 @@ def test_the_range_is_swept(line, hand, monkeypatch):
     assert (moved > 0.7).all() and (moved < 0.9).all()
 
 
+def test_each_joint_wiggles_in_turn_as_it_is_told_and_only_after_a_yes(
+    line, hand, monkeypatch, capsys
+):
+    """What is told is what a person compares with what turns; one joint is blocked."""
+    monkeypatch.setattr(check, "CYCLES", 1)
+    monkeypatch.setattr(check, "WIGGLE_RAD_S", 1.0)
+    asked = check.CheckCfg(port=PORT, wiggle=True, no_camera=True)
+    with pytest.raises(RuntimeError, match=r"turn by 5 degrees.*Nobody is there to ask"):
+        check.check(asked)
+    assert not any(motor.get("torque_enable") for motor in line.motors)
+    advance, turns, home = line.plant.advance, [], line.plant.position.copy()
+
+    def watched(*drives):
+        advance(*drives)
+        turns.append(line.plant.position - home)
+
+    monkeypatch.setattr(line.plant, "advance", watched)
+    line.plant.blocked[3] = True
+    capsys.readouterr()
+    assert check.check(replace(asked, yes=True)) == 1
+    out, told = capsys.readouterr()
+    turned = np.array(turns)
+    free = np.delete(np.arange(9), 3)
+    when = np.abs(turned[:, free]).argmax(axis=0)
+    assert (np.diff(when) > 0).all()  # palm to tip, finger by finger
+    np.testing.assert_allclose(np.degrees(np.abs(turned).max(axis=0))[free], 5.0, atol=0.6)
+    assert (np.abs(turned) > np.radians(2.0)).sum(axis=1).max() == 1  # one at a time
+    np.testing.assert_allclose(turned[-1], 0.0, atol=0.01)
+    way = "inwards" if turned[when[1], 1] < 0.0 else "outwards"
+    assert re.search(f"watch f0_j2, motor 11: the tip of finger 0 goes 1. mm {way}\n", told)
+    assert re.search(r"WRONG  wiggle of f1_j1 .*turned by .0\.0 of .5 deg: blocked", out)
+    assert out.count("ok     wiggle of") == 8
+
+
 @pytest.fixture
 def plan(tmp_path, hand):
     """A plan of two short motions, one with a torque release and a lower gain."""

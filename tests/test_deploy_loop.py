@@ -1,5 +1,6 @@
 """The control loop: its clock, how goals end, what is logged, and the whole of it on a twin."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -53,7 +54,7 @@ class Hand:
         """As :class:`SafeHand`."""
         self.missed.append(missed)
 
-    def image_at(self, time_s: float) -> None:
+    def image_at(self, time_s: float, fault: str = "") -> None:
         """As :class:`SafeHand`."""
 
 
@@ -258,6 +259,83 @@ def test_the_hand_is_held_while_the_first_look_takes_longer_than_a_step_may(part
     np.testing.assert_allclose(
         read.channel("command")[held], hand.start.astype(float)[None].repeat(5, 0)
     )
+
+
+@pytest.mark.parametrize(
+    ("often", "rarely", "ended"), [(50, 50, "time limit"), (512, 60, "lost"), (0, 0, "lost")]
+)
+def test_an_object_that_the_camera_sees_no_more_is_lost(parts, often, rarely, ended):
+    """For a second, in which it may be behind a finger; of a thin one little is seen at all times."""
+    hand, runner, actions, pacer, log = parts
+    runner.start, runner.look_s, decide = 9.0, 0.0, runner.decide
+    shown = iter([often] * 12 + ([rarely] * 11 + [often]) * 2 + [rarely] * 30)
+    runner.decide = lambda sensed: replace(decide(sensed), voxels=next(shown))
+    runner.camera = hand.hand.camera
+    loop = ControlLoop(hand, runner, actions, pacer, log, episode_s=5.0, hold_s=0.0)
+    assert loop.run([GOAL]) == [ended]
+    lost_at = {"lost": 12 if not often else 47, "time limit": 60}[ended]
+    assert len(loop.times) == pytest.approx(lost_at, abs=1)
+
+
+@dataclass
+class SpoiltCamera:
+    """Images of a wall with a little noise, and after a second what has become of them."""
+
+    clock: SimulatedClock
+    spoil: Callable[[np.ndarray], np.ndarray]
+    last: np.ndarray = field(default_factory=lambda: np.zeros((180, 320), np.float32))
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    images: int = 0
+
+    def read(self, _timeout_s: float) -> Frame:
+        """As :class:`Camera`: each image is new by its time."""
+        self.clock.sleep(0.005)
+        self.images += 1
+        wall = self.rng.normal(0.6, 0.002, self.last.shape).astype(np.float32)
+        if self.images <= round(HZ):
+            self.last = wall
+            return Frame(wall, self.clock.now())
+        return Frame(self.spoil(self.last.copy()), self.clock.now())
+
+
+def with_noise(image: np.ndarray, noise_m: float = 0.03) -> np.ndarray:
+    """What a camera sends that finds wrong disparities: depth everywhere, and nowhere right."""
+    noise = np.random.default_rng().normal(0.0, noise_m, image.shape)
+    return (image + noise).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (np.zeros_like, "0 % of the pixels around the object's place show a surface, not 25"),
+        (lambda image: np.full_like(image, 65.535), "0 % of the pixels around"),
+        (with_noise, r"\d+ % of the pixels around"),
+        (lambda image: image, "the same image comes again and again, though the hand moves"),
+        (lambda image: with_noise(image, 0.001), ""),
+    ],
+    ids=["black", "saturated", "noisy", "frozen", "sound"],
+)
+def test_a_camera_that_goes_blind_stops_the_hand(parts, spoil, said):
+    """However new its images are by their times; with one that sees it goes on."""
+    pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
+    from simulated_hand import simulated_bus
+
+    _, _, actions, _, log = parts
+    hand = load_hand("dclaw3")
+    joints = read_joints(hand)
+    with simulated_bus(hand, joints) as (line, bus), SafeHand(bus, joints) as safe:
+        line.plant.position[:] = joints.to_motor(hand.start)
+        safe.arm()
+        camera = SpoiltCamera(bus.clock, spoil)
+        runner = Countdown(bus.clock, 9.0)
+        runner.camera, pacer = hand.camera, Pacer(HZ, bus.clock)
+        loop = ControlLoop(safe, runner, actions, pacer, log, episode_s=3.0, camera=camera)
+        if not said:
+            assert loop.run([GOAL]) == ["time limit"]
+            return
+        with pytest.raises(StoppedError, match=rf"the camera is blind for 0\.\d\d s: {said}"):
+            loop.run([GOAL])
+        assert camera.images <= round(HZ) + 8
 
 
 @pytest.mark.parametrize(

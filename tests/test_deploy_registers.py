@@ -60,13 +60,21 @@ def test_every_register_of_the_table_is_compared(rig):
     assert [one.what for one in check.register_findings(rig.connection, tables)] == ["registers"]
     for register in REGISTERS:
         right = tables[12][register.name]
-        other = 0 if register.bits else right + 1
+        other = 0 if register.bits else right - 1 if register.least else right + 1
         spoilt = {**tables, 12: {**tables[12], register.name: other}}
         (only,) = check.register_findings(rig.connection, spoilt)
         assert only.what == register.name and f"motor 12: {other};" in only.found
         assert only.ok != bool(register.remedy)
     more = {**tables, 12: {**tables[12], "shutdown": FACTORY["shutdown"] | 1}}
     assert [one.what for one in check.register_findings(rig.connection, more)] == ["registers"]
+
+
+def test_a_motor_whose_firmware_has_no_watchdog_is_refused_and_a_newer_one_is_not(rig):
+    rig.motor.put("firmware_version", 52)
+    assert rig.wrong() == []
+    rig.motor.put("firmware_version", 37)
+    (wrong,) = rig.wrong()
+    assert re.search("bus watchdog.*motor 10: 37; update it to 38 or later with", wrong)
 
 
 def test_another_operating_mode_is_set_before_the_gains_that_it_resets(rig):

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy import cli
+from vd.deploy import cli, ros
 from vd.deploy.camera.camera import CameraError, StaleCamera
 from vd.deploy.camera.ros_camera import RosCamera
 from vd.deploy.hardware.answers import SilentError
 from vd.deploy.ros import RosHand
+from vd.deploy.safety.safety import SafeHand, StoppedError
 from vd.hand_log import read_log
 
 HAND = load_hand("dclaw3")
@@ -157,13 +158,47 @@ def test_what_is_missing_old_or_of_other_names_is_said_and_nothing_moves(capsys)
     few = Message(header=stamped(), name=["f0_j1"], position=[0.0], velocity=[0.0])
     publish("/joint_states", few)
     assert "lacks f0_j2; names are those of the hand's USD" in next(hand.findings()).found
-    with pytest.raises(SilentError, match="no new JointState on /joint_states"):
+    with pytest.raises(SilentError, match="JointState lacks f0_j2"):
         hand.read_state()
     whole = {"name": HAND.joint_names, "position": HAND.upper + 1.0, "velocity": HAND.upper}
     publish("/joint_states", Message(header=stamped(9.0), **whole))
+    with pytest.raises(SilentError, match="no new JointState on /joint_states"):
+        hand.read_state()
     states, commands, pose = hand.findings()
     assert "fewer than 24" in states.found and "set clocks" in states.found and not states.ok
     assert "nobody listens on /commands" in commands.found and "f0_j1" in pose.found
+
+
+def test_states_and_images_from_the_future_are_refused_with_their_topic():
+    """Five seconds ahead they would be fresh for five seconds after the last one came."""
+    hand = RosHand(HAND, make_node("a"))
+    whole = {"name": HAND.joint_names, "position": HAND.start, "velocity": 0.0 * HAND.start}
+    publish("/joint_states", Message(header=stamped(-5.0), **whole))
+    said = (
+        r"JointState on /joint_states is \d\.\d\d s from the future: wait .*clocks.*stamp it when"
+    )
+    with pytest.raises(SilentError, match=said):
+        hand.read_state()
+    (states,) = hand.findings()
+    assert not states.ok and "from the future" in states.found
+    age_s, over = [0.0], threading.Event()
+
+    def driver():
+        while not over.wait(0.01):
+            publish("/joint_states", Message(header=stamped(age_s[0]), **whole))
+
+    threading.Thread(target=driver, daemon=True).start()
+    with SafeHand(hand, ros._Joints(HAND)) as safe:
+        safe.arm()
+        begin, age_s[0] = time.monotonic(), -5.0
+        with pytest.raises(StoppedError, match=said):
+            while time.monotonic() < begin + 2.0:
+                safe.read()
+                safe.beat()
+        assert time.monotonic() - begin < 1.0
+    over.set()
+    publish("/joint_states", Message(header=stamped(), **whole))
+    np.testing.assert_array_equal(hand.read_state().position, HAND.start)
 
 
 def test_depth_comes_in_either_encoding_with_its_age_and_other_images_are_refused():
@@ -191,7 +226,10 @@ def test_depth_comes_in_either_encoding_with_its_age_and_other_images_are_refuse
         assert 0.04 < time.monotonic() - frame.time_s < 0.5
     with pytest.raises(StaleCamera, match="no image on /depth/image_rect_raw"):
         camera.read(0.01)
-    publish("/depth/image_rect_raw", Message(encoding="rgb8"))
+    publish("/depth/image_rect_raw", Message(header=stamped(-1.0), data=data, **size))
+    with pytest.raises(CameraError, match=r"an image on /depth/image_rect_raw is \d.\d\d s from"):
+        camera.read(0.1)
+    publish("/depth/image_rect_raw", Message(header=stamped(), encoding="rgb8"))
     with pytest.raises(CameraError, match=r"images are rgb8; depth is 16UC1 or 32FC1"):
         camera.read(0.1)
     camera.close()

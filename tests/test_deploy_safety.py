@@ -4,6 +4,7 @@ Times are exact, on any machine.
 """
 
 import os
+import re
 import signal
 import threading
 from dataclasses import replace
@@ -22,8 +23,9 @@ from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import WATCH_S, SafeHand, StoppedError
 from vd.deploy.timely import undisturbed
 
-EXCHANGE_S = 0.006
-"""Asking nine motors once: 3.7 ms on the line, and what the program waits for."""
+EXCHANGE_S = 0.008
+"""Asking nine motors for their state, torque and watchdog: 5.8 ms on the line, and what the program
+waits for."""
 STEP_S = PERIOD_S + EXCHANGE_S
 """A step of the loop below."""
 HOLD_S = 0.05
@@ -198,6 +200,17 @@ def run_until_stopped(safe: SafeHand, target: np.ndarray, seconds: float = 5.0) 
             "torque went off: f1_j1, motor 20",
             STEP_S,
         ),
+        (
+            lambda line: line.motors[3].put("bus_watchdog", -1),
+            "f1_j1, motor 20: its bus watchdog stopped it, and it refuses goals",
+            STEP_S,
+        ),
+        # A fifth of 24 V is lost in the wires, for half a second, found with the next state.
+        (
+            lambda line: line.motors[5].put("present_input_voltage", 190),
+            "f1_j3, motor 22: 19.0 V for 0.5 s, not 24: check the supply",
+            0.5 + 2 * STEP_S,
+        ),
         # No cable: nobody listens for 50 ms. The last sound state is older than 0.25 s, as above.
         (
             lambda line: setattr(line.put.__self__, "starved_s", 0.05),
@@ -207,7 +220,17 @@ def run_until_stopped(safe: SafeHand, target: np.ndarray, seconds: float = 5.0) 
         (lambda line: os.kill(os.getpid(), signal.SIGINT), "Ctrl-C", 2 * WATCH_S),
         (lambda line: os.kill(os.getpid(), signal.SIGHUP), "the terminal is gone", 2 * WATCH_S),
     ],
-    ids=["cable", "heat", "restart", "torque", "starved", "ctrl-c", "hangup"],
+    ids=[
+        "cable",
+        "heat",
+        "restart",
+        "torque",
+        "watchdog",
+        "voltage",
+        "starved",
+        "ctrl-c",
+        "hangup",
+    ],
 )
 def test_faults_stop_the_hand_in_time_and_are_named(
     bus, line, hand, joints, fault, reason, found_s
@@ -255,6 +278,34 @@ def test_a_blocked_joint_is_let_go(bus, line, hand, joints):
     assert energised(line) == []
 
 
+@pytest.mark.parametrize(("p_gain", "push_rad"), [(200, 0.35), (200, 0.29), (50, 0.29)])
+def test_a_joint_that_is_blocked_is_let_go_whatever_its_current(
+    bus, line, hand, joints, p_gain, push_rad
+):
+    """At most 0.34 A, 0.56 A being the current of the largest torque, or a fourth of that."""
+    with SafeHand(bus, joints, QUICK) as safe:
+        here = safe.arm().position
+        line.motors[2].put("position_p_gain", p_gain)
+        line.plant.blocked[2] = True
+        begin = bus.clock.now()
+        said = run_until_stopped(safe, here + push_rad * np.eye(9)[2], 20.0)
+        assert re.match(rf"f0_j3, motor 12: it stands {push_rad:.2f} rad from its goal for", said)
+        assert 0.0 < safe.report.detected_s - begin - QUICK.blocked_s < 3 * STEP_S
+        bus.clock.sleep(0.01)
+        assert push(line)[2] < 0.002
+    assert energised(line) == []
+
+
+def test_joints_that_press_for_a_while_or_hold_still_go_on(bus, line, hand, joints):
+    """A grip is released before its time, comes again, and ends; less than half is no matter."""
+    with SafeHand(bus, joints, replace(QUICK, blocked_s=3.0)) as safe:
+        here = safe.arm().position
+        line.plant.blocked[:] = True
+        for _ in range(2):
+            assert run_until_stopped(safe, here + 0.3, 2.8) == "nothing stopped it"
+            assert run_until_stopped(safe, here + 0.1, 4.0) == "nothing stopped it"
+
+
 def test_deadlines_and_images_stop_the_hand(bus, hand, joints):
     with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
@@ -270,7 +321,7 @@ def test_deadlines_and_images_stop_the_hand(bus, hand, joints):
         assert 0.0 < safe.report.detected_s - shown - QUICK.stale_s < 2 * WATCH_S
     with SafeHand(bus, joints, QUICK) as safe:
         safe.arm()
-        with pytest.raises(StoppedError, match=r"3\.00 s from the future"):
+        with pytest.raises(StoppedError, match=r"image is 3\.00 s from the future: wait .*plug"):
             safe.image_at(bus.clock.now() + 3.0)
 
 

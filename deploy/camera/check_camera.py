@@ -1,6 +1,6 @@
-"""The depth camera's part of the preflight.
+"""What a depth camera has to show: images in time, with depth about the object's place.
 
-Images come, in time, with depth, and the object is in view.
+The preflight looks at that before a hand moves, and the control loop while it does.
 """
 
 import math
@@ -10,7 +10,7 @@ import numpy as np
 
 from vd.assets_usd.hand_data import CameraModel
 from vd.deploy.camera.camera import Camera, CameraError
-from vd.deploy.clock import MONOTONIC, Clock
+from vd.deploy.clock import MONOTONIC, Clock, from_future
 from vd.deploy.finding import Finding, finding
 
 FIRST_S = 5.0
@@ -25,12 +25,114 @@ AGE_S = 0.1
 """An image as old as this when it comes is about one control period late before anything is done
 with it.
 """
+MOVED_RAD = 0.02
+"""A joint that has moved so far is elsewhere in the image."""
+BLIND_SHARE = 0.25
+"""Half of what the preflight asks for: fingers come near, and things pass by."""
+REPLUG = "plug the camera in again"
+SEEN_SHARE = 0.25
+"""Share of the most that was seen of an object below which it is gone."""
+FEWEST_VOXELS, MOST_VOXELS = 16, 256
+"""What is seen at least of any object, and what counts as the most. Of 30 objects between fingers
+90 or more are seen; where there is none up to 72, in the median 45, at the edges of fingers."""
+LOST_IMAGES = 12
+"""Images in a row of a second: for less long it may be behind a finger."""
 AROUND_M = 0.06
 """Half a side of the square around the object's place in which depth is counted: hand and object
 fill it.
 """
+SMOOTH_M = 0.01
+"""Difference of depth to a neighbour below which the two show one surface: a D415's noise at 0.6 m
+is 1 mm, and a pixel 2 mm wide."""
 DEPTH_SHARE = 0.5
-"""Share of its pixels that must have depth: rendered with the errors of a D415, 78 to 85 % do."""
+"""Share of its pixels that must show surfaces: rendered with the errors of a D415, 52 to 94 % do,
+with noise of 20 mm 15 to 30 %."""
+
+
+class ObjectPlace:
+    """Where objects are handled, in a camera's images: how much is seen there.
+
+    Args:
+        camera: The camera, where it is taken to be.
+        around: Where objects are handled, in the base frame [m] [3].
+    """
+
+    def __init__(self, camera: CameraModel, around: np.ndarray):
+        self.spot = camera.project(around)
+        """Its column and row [pixel], and depth [m]."""
+        column, row, depth = self.spot
+        half = AROUND_M * np.array([camera.fx, camera.fy]) / abs(depth)
+        first = np.maximum(np.round(np.array([column, row]) - half), 0).astype(int)
+        last = np.maximum(np.round(np.array([column, row]) + half), 0).astype(int)
+        self._columns, self._rows = map(slice, first, last)
+        self._near, self._far = camera.near, camera.far
+
+    def seen(self, image: np.ndarray) -> float:
+        """Share of the pixels about it that show a surface: depth in range, like its neighbours'.
+
+        Args:
+            image: Depth [m], 0 for none [H, W].
+        """
+        depth = image[self._rows, self._columns]
+        if not depth.size:
+            return 0.0
+        alike = np.zeros(depth.shape, dtype=int)
+        beside = np.abs(np.diff(depth, axis=1)) < SMOOTH_M
+        alike[:, 1:] += beside
+        alike[:, :-1] += beside
+        below = np.abs(np.diff(depth, axis=0)) < SMOOTH_M
+        alike[1:] += below
+        alike[:-1] += below
+        surface = (depth >= self._near) & (depth <= self._far) & (alike >= 2)
+        return float(surface.mean())
+
+
+class Sight:
+    """Whether a camera goes on seeing the object's place, and the object, while the hand moves.
+
+    Arguments are those of :class:`ObjectPlace`.
+    """
+
+    def __init__(self, camera: CameraModel, around: np.ndarray):
+        self._place = ObjectPlace(camera, around)
+        self._image = np.zeros(0)
+        self._joint_q = np.zeros(0)
+        self._most = 0
+        self._without = 0
+
+    def fault(self, image: np.ndarray, joint_q: np.ndarray) -> str:
+        """Why an image shows nothing new of the object's place; empty where it does.
+
+        Args:
+            image: Depth [m], 0 for none [H, W].
+            joint_q: Where the joints are meanwhile [rad] [D].
+        """
+        if not np.array_equal(image, self._image):
+            self._image, self._joint_q = image, joint_q
+        elif np.abs(joint_q - self._joint_q).max() > MOVED_RAD:
+            return f"the same image comes again and again, though the hand moves: {REPLUG}"
+        share = self._place.seen(image)
+        return "" if share >= BLIND_SHARE else _unseen(share, BLIND_SHARE)
+
+    def loses(self, voxels: int) -> bool:
+        """Whether the object has been gone for a while.
+
+        Args:
+            voxels: How much of it the newest image shows.
+        """
+        self._most = max(self._most, min(voxels, MOST_VOXELS))
+        gone = voxels < max(FEWEST_VOXELS, SEEN_SHARE * self._most)
+        self._without = self._without + 1 if gone else 0
+        return self._without >= LOST_IMAGES
+
+
+def _unseen(share: float, wanted: float) -> str:
+    """How much shows a surface, and what to do."""
+    return (
+        f"{100 * share:.0f} % of the pixels around the object's place show a surface, not "
+        f"{100 * wanted:.0f}: clean the lens, keep it off by what its range asks for, switch the "
+        f"emitter on"
+    )
 
 
 def camera_findings(
@@ -61,9 +163,18 @@ def camera_findings(
     yield Finding("camera streams", True, f"{len(frames)} images of {width} x {height}")
     yield _rate(np.array([frame.time_s for frame in frames]), float(np.median(ages)), fps)
     seen = camera.intrinsics.seen_from(place)
-    spot = seen.project(around)
-    yield _lens(seen, spot)
-    yield _depth(np.stack([frame.image for frame in frames]), seen, spot)
+    place_seen = ObjectPlace(seen, around)
+    yield _lens(seen, place_seen.spot)
+    images = [frame.image for frame in frames]
+    valid = np.mean([(image >= seen.near) & (image <= seen.far) for image in images])
+    share = float(np.mean([place_seen.seen(image) for image in images]))
+    if share < DEPTH_SHARE:
+        yield Finding("camera depth", False, _unseen(share, DEPTH_SHARE))
+    else:
+        around_it = f"{100 * share:.0f} % of those around the object's place show surfaces"
+        yield Finding(
+            "camera depth", True, f"{100 * valid:.0f} % of the pixels have it, {around_it}"
+        )
 
 
 def _rate(times: np.ndarray, age: float, fps: float) -> Finding:
@@ -78,6 +189,8 @@ def _rate(times: np.ndarray, age: float, fps: float) -> Finding:
         wrong.append(
             f"images come {1e3 * age:.0f} ms old, more than {1e3 * AGE_S:.0f}: use a USB 3 port"
         )
+    if ahead := from_future(-age, 0.0):
+        wrong.append(f"images are {ahead}")
     right = (
         f"{rate:.1f} images a second, longest gap {1e3 * gaps.max():.0f} ms, {1e3 * age:.0f} ms old"
     )
@@ -93,19 +206,3 @@ def _lens(seen: CameraModel, spot: np.ndarray) -> Finding:
         return Finding("camera lens", True, f"{lens}; {where}")
     remedy = "the object's place is not in view: mount it as in training, or find it by calibrate"
     return Finding("camera lens", False, f"{lens}; {remedy}")
-
-
-def _depth(images: np.ndarray, seen: CameraModel, spot: np.ndarray) -> Finding:
-    """Share of the pixels [N, H, W] with depth, in all and where the object is handled."""
-    valid = (images >= seen.near) & (images <= seen.far)
-    column, row, depth = spot
-    half = AROUND_M * np.array([seen.fx, seen.fy]) / abs(depth)
-    first = np.maximum(np.round(np.array([column, row]) - half), 0).astype(int)
-    last = np.maximum(np.round(np.array([column, row]) + half), 0).astype(int)
-    around = valid[:, first[1] : last[1], first[0] : last[0]]
-    share = float(around.mean()) if around.size else 0.0
-    found = f"{100 * valid.mean():.0f} % of the pixels have it, {100 * share:.0f} % around the object's place"
-    if share < DEPTH_SHARE:
-        remedy = "clean the lens, keep it off by what its range asks for, switch the emitter on"
-        return Finding("camera depth", False, f"{found}, not {100 * DEPTH_SHARE:.0f}: {remedy}")
-    return Finding("camera depth", True, found)

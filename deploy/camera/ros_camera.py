@@ -8,6 +8,7 @@ import numpy as np
 
 from vd.assets_usd.hand_data import Intrinsics
 from vd.deploy.camera.camera import CameraError, Frame, StaleCamera
+from vd.deploy.clock import from_future
 
 IMAGES, LENS = "depth/image_rect_raw", "depth/camera_info"
 FIRST_S = 5.0
@@ -66,7 +67,7 @@ class RosCamera:
 
         Raises:
             StaleCamera: None came within ``timeout_s``.
-            CameraError: It is no depth image.
+            CameraError: It is no depth image, or from the future.
         """
         with self._arrived:
             if not self._arrived.wait_for(lambda: self._newest is not None, timeout_s):
@@ -77,13 +78,17 @@ class RosCamera:
             raise CameraError(
                 f"images are {image.encoding}; depth is {' or '.join(DEPTHS)}: remap {IMAGES}"
             )
+        time_s = monotonic(image.header.stamp)
+        if ahead := from_future(time_s, time.monotonic()):
+            where = self._node.resolve_topic_name(IMAGES)
+            raise CameraError(f"an image on {where} is {ahead}, and stamp it when it is exposed")
         kind, unit = DEPTHS[image.encoding]
         order = ">" if image.is_bigendian else "<"
         rows = np.frombuffer(image.data, dtype=order + kind).reshape(image.height, -1)
         depth = np.nan_to_num(
             rows[:, : image.width].astype(np.float32) * np.float32(unit), posinf=0.0
         )
-        return Frame(depth, monotonic(image.header.stamp))
+        return Frame(depth, time_s)
 
     def close(self) -> None:
         """Listen no more."""

@@ -32,6 +32,7 @@ from vd.deploy.hardware.answers import (
 )
 from vd.deploy.hardware.control_table import (
     SIZE,
+    WATCHDOG_TRIPPED,
     WATCHDOG_UNIT_S,
     Model,
     describe_hardware_error,
@@ -389,13 +390,22 @@ class MotorBus:
 
     def read_torque(self) -> np.ndarray:
         """Whether each motor has its torque on, shape [D] bool."""
-        return self._again(self._read_torque, self.retries)
+        return self._read_all("torque_enable") != 0
 
-    def _read_torque(self) -> np.ndarray:
-        item = self._items[self.ids[0]]["torque_enable"]
-        with self._line():
-            _, answers = self._ask_all(item.address, item.size)
-        return np.array([bool(item.from_bytes(answer.data)) for answer in answers])
+    def read_tripped(self) -> np.ndarray:
+        """Whether each motor was stopped by its bus watchdog, shape [D] bool."""
+        return self._read_all("bus_watchdog") == WATCHDOG_TRIPPED
+
+    def _read_all(self, name: str) -> np.ndarray:
+        """One item of every motor, with one packet, shape [D]."""
+        item = self._items[self.ids[0]][name]
+
+        def ask() -> np.ndarray:
+            with self._line():
+                _, answers = self._ask_all(item.address, item.size)
+            return np.array([item.from_bytes(answer.data) for answer in answers])
+
+        return self._again(ask, self.retries)
 
     def _ask_all(
         self, address: int, length: int, before: bytes = b""

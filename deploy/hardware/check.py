@@ -1,12 +1,14 @@
 """Preflight: everything that must be right before a hand moves.
 
-With --range it moves, after asking.
+With --wiggle or --range it moves, after asking.
 """
 
 import contextlib
 import itertools
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -30,6 +32,7 @@ from vd.deploy.twin.child import TwinCamera
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
+    from vd.assets_usd.hand_model import HandModel
     from vd.deploy.camera.camera import Camera
     from vd.deploy.hardware.bus import MotorBus
 
@@ -50,6 +53,12 @@ RANGE_SHARE = 0.8
 """Share of a joint's range that --range moves it through."""
 RANGE_SPEED_RAD_S = 0.7
 """Speed of that."""
+WIGGLE_RAD = math.radians(5.0)
+"""How far --wiggle turns each joint: what a person sees, and what nothing is in the way of."""
+WIGGLE_RAD_S = 0.1
+"""Speed of that."""
+SIDEWAYS = 0.5
+"""Share of a fingertip's way by which it nears what it goes towards."""
 FOLLOW_RAD = 0.25
 """How far a joint may be from its slow goal: gravity bends it by 0.1 rad at the paper's gain."""
 
@@ -61,7 +70,7 @@ Tables = Mapping[int, Mapping[str, int]]
 class CheckCfg(HandOptions):
     """Look at everything that must be right before the hand moves.
 
-    Without --range nothing is written.
+    Without --wiggle and --range nothing is written.
     """
 
     camera: RealSenseCfg = field(default_factory=RealSenseCfg)
@@ -72,6 +81,9 @@ class CheckCfg(HandOptions):
     """
     no_camera: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Leave the camera out: homing and recording need none."""
+    wiggle: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Also turn each joint in turn by 5 degrees and back, after asking: a person sees whether it is
+    the one that is named, and turns the way that is said."""
     range: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Also move each joint slowly through its range, after asking."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -250,6 +262,49 @@ def _cycles(bus: "MotorBus") -> Finding:
     return Finding("loop rate", right, found + ("" if right else remedy))
 
 
+def wiggle(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
+    """Turn every joint alone by 5 degrees, for a person to look at, and then back, slowly.
+
+    What a person is to see is told before it moves.
+
+    Raises:
+        StoppedError: A limit was passed.
+    """
+    hand, home = connection.hand, safe.arm().position
+    for axis, name in enumerate(hand.joint_names):
+        # Away from the nearer end of its range.
+        way = 1.0 if home[axis] < 0.5 * (hand.lower[axis] + hand.upper[axis]) else -1.0
+        goal = home.copy()
+        goal[axis] += way * WIGGLE_RAD
+        motor, degrees = connection.joints.ids[axis], math.degrees(way * WIGGLE_RAD)
+        where = _tip_goes(hand, home, goal, hand.joint_finger[axis])
+        print(f"watch {name}, motor {motor}: {where}", file=sys.stderr, flush=True)
+        before = safe.read().position[axis]
+        safe.move(goal, WIGGLE_RAD_S)
+        turned = math.degrees(safe.read().position[axis] - before)
+        safe.move(home, WIGGLE_RAD_S)
+        ok = turned / degrees > 0.5
+        found = f"turned by {turned:+.1f} of {degrees:+.0f} deg{'' if ok else ': blocked?'}"
+        yield Finding(f"wiggle of {name}", ok, found)
+
+
+def _tip_goes(hand: "HandModel", before: np.ndarray, after: np.ndarray, finger: int) -> str:
+    """What the tip of a finger does between two poses of the joints [rad] [D], in words."""
+    old, new = hand.tip_poses(before)[:, :3], hand.tip_poses(after)[:, :3]
+    moved_m = np.linalg.norm(new[finger] - old[finger])
+
+    def nears(places: np.ndarray) -> np.ndarray:
+        to = [np.linalg.norm(places - tip, axis=-1) for tip in (old[finger], new[finger])]
+        return (to[0] - to[1]) / max(moved_m, 1e-9)
+
+    object_share, finger_shares = nears(hand.goal_in_base), nears(old)
+    finger_shares[finger] = -np.inf
+    where = f"towards finger {int(np.argmax(finger_shares))}" if len(old) > 1 else "sideways"
+    if abs(object_share) > SIDEWAYS:
+        where = "inwards" if object_share > 0.0 else "outwards"
+    return f"the tip of finger {finger} goes {1e3 * moved_m:.0f} mm {where}"
+
+
 def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
     """Move every joint alone through most of its range, the other fingers aside, and then back, slowly.
 
@@ -363,12 +418,20 @@ def check(cfg: CheckCfg) -> int:
         findings = show(preflight(connection), quiet=cfg.json)
         if not cfg.no_camera:
             findings += show(camera_preflight(cfg, connection), quiet=cfg.json)
-        if cfg.range and all(one.ok for one in findings):
-            confirm("Every joint will move slowly through its range.", yes=cfg.yes)
+        motions: dict[str, Callable[[Connection, SafeHand], Iterator[Finding]]] = {}
+        if cfg.wiggle:
+            motions["Joint by joint will turn by 5 degrees and back, as is told; watch each."] = (
+                wiggle
+            )
+        if cfg.range:
+            motions["Every joint will move slowly through its range."] = sweep
+        if motions and all(one.ok for one in findings):
+            confirm(" ".join(motions), yes=cfg.yes)
             findings += show([write_settings(connection)], quiet=cfg.json)
             _stop_at_wrong(findings)
-            safe = SafeHand(connection.bus, connection.joints, SafetyCfg())
-            findings += show(sweep(connection, stack.enter_context(safe)), quiet=cfg.json)
+            for motion in motions.values():
+                with SafeHand(connection.bus, connection.joints, SafetyCfg()) as safe:
+                    findings += show(motion(connection, safe), quiet=cfg.json)
     right = all(one.ok for one in findings)
     if cfg.json:
         print(json.dumps({"ok": right, "findings": [asdict(one) for one in findings]}, indent=1))

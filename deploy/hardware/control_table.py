@@ -30,6 +30,10 @@ FULL_PWM = 885.0
 """Counts of the whole supply voltage."""
 WATCHDOG_UNIT_S = 0.02
 """Unit of the bus watchdog."""
+WATCHDOG_TRIPPED = -1
+"""Value of the bus watchdog of a motor that it has stopped: goals are refused until 0 is written."""
+WATCHDOG_FIRMWARE = 38
+"""First firmware that has a bus watchdog; the XL330 and XC330 had it from their first one on."""
 TICK_MODULUS = 32768
 """Milliseconds after which a motor's clock begins anew."""
 
@@ -172,7 +176,7 @@ def table(model: Model) -> dict[str, Item]:
     items = {
         "model_number": Item(0, 2, False, model.number, 0),
         "model_information": Item(2, 4, False, 0, 0),
-        "firmware_version": Item(6, 1, False, 45, 0),
+        "firmware_version": Item(6, 1, False, WATCHDOG_FIRMWARE, 0),
         "id": Item(7, 1, True, 1, 0, 252),
         "baud_rate": Item(8, 1, True, 1, 0, 7),
         "return_delay_time": Item(9, 1, True, 250, 0, 254),
@@ -204,7 +208,7 @@ def table(model: Model) -> dict[str, Item]:
         "position_p_gain": Item(84, 2, True, 800, **gain),
         "feedforward_2nd_gain": Item(88, 2, True, 0, **gain),
         "feedforward_1st_gain": Item(90, 2, True, 0, **gain),
-        "bus_watchdog": Item(98, 1, True, 0, -1, 127),
+        "bus_watchdog": Item(98, 1, True, 0, WATCHDOG_TRIPPED, 127),
         "goal_pwm": Item(100, 2, True, int(FULL_PWM)),
         "goal_current": Item(102, 2, True, model.current_limit),
         "goal_velocity": Item(104, 4, True, model.velocity_limit),

@@ -36,8 +36,8 @@ class _File:
     """A calibration file."""
 
     format: str
+    hand: str
     motors: tuple[_Motor, ...]
-    hand: str = ""
 
 
 class CalibrationError(ValueError):
@@ -207,10 +207,15 @@ def _by_joint(file: _File, hand: HandModel) -> dict[str, _Motor]:
     """The entries of a file by joint.
 
     Raises:
-        ValueError: Its format is another, or its entries are not one for each joint.
+        ValueError: Its format or hand is another, or its entries are not one for each joint.
     """
     if file.format != FORMAT:
         raise ValueError(f"its format is {file.format!r}, not {FORMAT!r}")
+    if file.hand != hand.name:
+        raise ValueError(
+            f"its field hand names {file.hand!r}: zeros and directions of another hand's motors "
+            f"are not this one's; calibrate {hand.name}"
+        )
     named, ids = ([getattr(motor, name) for motor in file.motors] for name in ("joint", "id"))
     for name in hand.joint_names:
         if named.count(name) != 1:

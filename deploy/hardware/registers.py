@@ -39,13 +39,23 @@ class Register:
     """What a person has to do where it is not ours to set; empty where we set it."""
     bits: bool = False
     """Whether its bits are protections, of which more may be on than are wanted."""
+    least: bool = False
+    """Whether a larger value will do, too."""
 
     def right(self, found: int, wanted: int) -> bool:
         """Whether a value will do."""
+        if self.least:
+            return found >= wanted
         return found & wanted == wanted if self.bits else found == wanted
 
 
 REGISTERS = (
+    Register(
+        "firmware_version",
+        "it has no bus watchdog, so it drives on when this program dies",
+        "update it to {wanted} or later with ROBOTIS' DYNAMIXEL Wizard 2.0",
+        least=True,
+    ),
     Register(
         "drive_mode",
         "angles, profiles or the torque follow other rules",

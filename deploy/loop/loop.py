@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vd.deploy.camera.camera import Camera
+from vd.deploy.camera.check_camera import Sight
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.loop.action import ActionFilter
@@ -85,6 +86,9 @@ class ControlLoop:
         )
         self._episode_s, self._hold_s = episode_s, hold_s
         self._camera, self._twin, self._symmetry = camera, twin, symmetry
+        self._sight: Sight | None = None
+        if runner.camera is not None:
+            self._sight = Sight(runner.camera, safe.hand.goal_in_base)
         self._more = more
         self._target = safe.hand.start
         self.times: list[StepTimes] = []
@@ -164,7 +168,7 @@ class ControlLoop:
         decision, ended = Decision(np.zeros_like(sensed.smoothed), np.nan), ""
         if acting:
             decision = self._runner.decide(sensed)
-            ended = self._ended(decision.distance, sensed, first=first)
+            ended = self._ended(decision, sensed, first=first)
             if ended:
                 decision = replace(decision, action=np.zeros_like(decision.action))
             else:
@@ -189,17 +193,22 @@ class ControlLoop:
         depth, image_s = None, np.nan
         if self._camera is not None:
             frame = self._camera.read(CAMERA_SHARE * self._pacer.period_s)
-            self._safe.image_at(frame.time_s)
             depth, image_s = frame.image, frame.time_s
         truth = None if self._twin is None else self._twin.object_state()
         state = self._safe.read()
+        if depth is not None:
+            fault = "" if self._sight is None else self._sight.fault(depth, state.position)
+            self._safe.image_at(image_s, fault)
         smoothed = self._actions.smoothed
         return Sensed(state.position, state.velocity, smoothed, goal, depth, truth), state, image_s
 
-    def _ended(self, distance: float, sensed: Sensed, *, first: bool) -> str:
+    def _ended(self, decision: Decision, sensed: Sensed, *, first: bool) -> str:
         """``stopped``, ``lost``, or nothing."""
-        rule = self._runner.rule
-        if rule.stops(np.array(distance), np.array(np.linalg.norm(sensed.smoothed))) and not first:
+        sight, voxels = self._sight, decision.voxels
+        if sight is not None and voxels is not None and sight.loses(voxels):
+            return "lost"
+        rule, distance = self._runner.rule, np.array(decision.distance)
+        if rule.stops(distance, np.array(np.linalg.norm(sensed.smoothed))) and not first:
             return "stopped"
         if sensed.truth is not None:
             away = np.linalg.norm(sensed.truth[:3] - np.array(self._safe.hand.workspace.goal_m))

@@ -59,6 +59,8 @@ class Decision:
     """Distance to the goal by which it is stopped [rad], as it is predicted; NaN: not known."""
     found: np.ndarray | None = None
     """Pose of the object as it was found [7]; None: it was not looked for."""
+    voxels: int | None = None
+    """How much of the object the camera saw; None: it was not looked for."""
 
     def __post_init__(self) -> None:
         """Refuse what is no action."""
@@ -210,7 +212,8 @@ class TrackingRunner(PolicyRunner):
         self._fresh, found = False, self._tracker.observer.found
         assert found is not None
         pose = np.concatenate([np.asarray(found.position[0]), np.asarray(found.orientation[0])])
-        return Decision(np.array(decided.action[0]), float(decided.angle[0]), pose)
+        action, angle = np.array(decided.action[0]), float(decided.angle[0])
+        return Decision(action, angle, pose, int(found.voxels[0]))
 
 
 def load_runner(

@@ -21,6 +21,10 @@ from vd.paper import PAPER
 PERIOD_S = 1.0 / PAPER.scene.control_hz
 OUTSIDE_RAD = 0.1
 """How far a joint may hang out of its range and still be brought back slowly."""
+BLOCKED_SHARE = 0.5
+"""Distance from its goal, over the farthest that a goal may be, from which a joint is to move."""
+STANDING_RAD_S = 0.1
+"""Speed below which it does not."""
 SHUTDOWN_C = 10.0
 """How far below the temperature at which a motor shuts down the hand is stopped."""
 
@@ -34,6 +38,9 @@ class SafetyCfg:
     step_rad: float = 0.35
     """Farthest goal from where a joint is [rad]: the policy asks for 3.5 rad/s / 12 Hz = 0.29 at
     most. It limits the torque as well, to stiffness times this."""
+    blocked_s: float = 15.0
+    """How long [s] a joint may stand at half of that or more from its goal: what blocks it is
+    pressed for no longer. In the 10 s of a goal dclaw4 presses so for up to 9 s."""
     velocity_share: float = 1.5
     """Speed over the joints' own limit at which the hand is stopped; it turns faster only when
     something else moves it."""
@@ -43,7 +50,10 @@ class SafetyCfg:
     at that limit.
     """
     current_s: float = 0.5
-    """How long [s] a current may be above that."""
+    """How long [s] a current may be above that, or a voltage beyond ``voltage_share``."""
+    voltage_share: float = 0.2
+    """Deviation of a motor's voltage from its supply's, over the latter, at which the hand is
+    stopped, if it lasts: under load it sags by less."""
     temperature_c: float = 70.0
     """Temperature [deg C] at which the hand is stopped, or 10 below that at which a motor shuts
     down.
@@ -70,7 +80,8 @@ class SafetyCfg:
     def __post_init__(self) -> None:
         """Refuse numbers that would switch a limit off by accident."""
         limits = (
-            "step_rad velocity_share current_share current_s temperature_c lost_s misses stale_s"
+            "step_rad blocked_s velocity_share current_share current_s voltage_share "
+            "temperature_c lost_s misses stale_s"
         )
         require(self, "safety.", "positive", limits)
         require(self, "safety.", "zero or positive", "margin_rad watchdog_s hold_s")
@@ -116,7 +127,10 @@ class Limits:
         most = [model.temperature_limit - SHUTDOWN_C for model in joints.models]
         self._temperature = np.minimum(cfg.temperature_c, most)
         self._velocity = cfg.velocity_share * hand.velocity_limit
-        self._strained_since = np.full(len(self._names), np.inf)
+        self._supply = np.array([model.supply_v for model in joints.models])
+        self._blocked = Lasting(cfg.blocked_s)
+        self._strained = Lasting(cfg.current_s)
+        self._weak = Lasting(cfg.current_s)
 
     def goal(self, target: np.ndarray, here: np.ndarray) -> np.ndarray:
         """The goal in range nearest to the target, but never far from where the joints are, all [D].
@@ -126,15 +140,22 @@ class Limits:
         inside = np.clip(target, self.lower, self.upper)
         return np.clip(inside, here - self._cfg.step_rad, here + self._cfg.step_rad)
 
-    def passed(self, state: HandState) -> str:
-        """Which limit the newest state of the joints is beyond, in words; empty for none."""
+    def passed(self, state: HandState, away: np.ndarray) -> str:
+        """Which limit the newest state of the joints is beyond, in words; empty for none.
+
+        Args:
+            state: The state.
+            away: Distance of each joint from the goal that it had until then [rad] [D]; zero for
+                one that is let go.
+        """
+        far = np.abs(away) >= BLOCKED_SHARE * self._cfg.step_rad
+        standing = np.abs(state.velocity) < STANDING_RAD_S
+        off = np.abs(state.voltage - self._supply) > self._cfg.voltage_share * self._supply
         fast = np.abs(state.velocity) > self._velocity
         hot = state.temperature > self._temperature
-        strained = np.abs(state.current) > self._current
-        self._strained_since = np.where(
-            strained, np.minimum(self._strained_since, state.time_s), np.inf
-        )
-        long = state.time_s - self._strained_since > self._cfg.current_s
+        blocked = self._blocked(state.time_s, far & standing)
+        strained = self._strained(state.time_s, np.abs(state.current) > self._current)
+        weak = self._weak(state.time_s, off)
         for axis, name in enumerate(self._names):
             if fast[axis]:
                 return f"{name}: {state.velocity[axis]:.1f} rad/s, over {self._velocity[axis]:.1f}"
@@ -142,6 +163,35 @@ class Limits:
                 return (
                     f"{name}: {state.temperature[axis]:.0f} deg C, over {self._temperature[axis]:g}"
                 )
-            if long[axis]:
+            if strained[axis]:
                 return f"{name}: {state.current[axis]:.2f} A for {self._cfg.current_s:g} s; is it blocked?"
+            if blocked[axis]:
+                return (
+                    f"{name}: it stands {abs(away[axis]):.2f} rad from its goal for "
+                    f"{self._cfg.blocked_s:g} s: free it, or raise --safety.blocked-s where it "
+                    f"is to press for longer"
+                )
+            if weak[axis]:
+                return (
+                    f"{name}: {state.voltage[axis]:.1f} V for {self._cfg.current_s:g} s, not "
+                    f"{self._supply[axis]:g}: check the supply and its wires"
+                )
         return ""
+
+
+class Lasting:
+    """Which joints something has been true of for longer than ``seconds``."""
+
+    def __init__(self, seconds: float):
+        self._seconds = seconds
+        self._since = np.array(np.inf)
+
+    def __call__(self, time_s: float, now: np.ndarray) -> np.ndarray:
+        """Of which it has, shape [D] bool.
+
+        Args:
+            time_s: The present [s].
+            now: Of which it is true at present, shape [D] bool.
+        """
+        self._since = np.where(now, np.minimum(self._since, time_s), np.inf)
+        return time_s - self._since > self._seconds

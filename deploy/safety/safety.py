@@ -33,6 +33,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from vd.deploy.clock import from_future
 from vd.deploy.finding import listed
 from vd.deploy.hardware.answers import BusError, HandState, LateError, SilentError
 from vd.deploy.hardware.bus import MotorBus
@@ -54,10 +55,10 @@ of a recording.
 """
 DEFAULTS = SafetyCfg()
 TORQUE_GONE = "another program on the line switched it off, or it restarted"
-AHEAD_S = 0.02
-"""An image cannot be newer than the moment it came [s]; what the SDK makes of its clock is off by
-some ms.
-"""
+TRIPPED = (
+    "its bus watchdog stopped it, and it refuses goals: check its cable, and that watchdog_s is "
+    "longer than the line may be silent"
+)
 OFF_S = 1.0
 """How long switching off is tried on a bus that does not answer soundly."""
 SOFT_STEPS = 10
@@ -140,8 +141,10 @@ class SafeHand:
         self.report: StopReport | None = None
         """How the stop went, once there was one."""
         self._state: HandState | None = None
+        self._goal: np.ndarray | None = None
         self._misses = 0
         self._beat_s = self._image_s = np.inf
+        self._image_fault = ""
         self._torque_s = -np.inf
         self._armed = False
         self._on = np.zeros(len(joints.ids), dtype=bool)
@@ -248,7 +251,7 @@ class SafeHand:
             raise RuntimeError("arm() has to come before command()")
         if target.shape != self.limits.lower.shape or not np.isfinite(target).all():
             raise self.stop(f"the target is not {len(self.joints.ids)} finite angles: {target}")
-        goal = self.limits.goal(target, self._state.position)
+        self._goal = goal = self.limits.goal(target, self._state.position)
         with self._stopping:  # never after the hold
             self._check()
             try:
@@ -303,20 +306,21 @@ class SafeHand:
         if self._misses >= self.cfg.misses:
             raise self.stop(f"{self._misses} deadlines missed in a row")
 
-    def image_at(self, time_s: float) -> None:
+    def image_at(self, time_s: float, fault: str = "") -> None:
         """The newest image is of this time [s], by the monotonic clock.
+
+        Args:
+            time_s: When it was exposed [s].
+            fault: Why it shows nothing; then the one before it grows older.
 
         Raises:
             StoppedError: It is from the future, so its age is not known.
         """
-        ahead = time_s - self.bus.clock.now()
-        if ahead > AHEAD_S:
-            raise self.stop(
-                f"the newest image is {ahead:.2f} s from the future: wait until the computer's "
-                f"clock is set "
-                "(NTP), then plug the camera in again"
-            )
-        self._image_s = time_s
+        if ahead := from_future(time_s, self.bus.clock.now()):
+            raise self.stop(f"the newest image is {ahead}, then plug the camera in again")
+        self._image_fault = fault
+        if not fault or self._image_s == np.inf:
+            self._image_s = time_s
 
     def _read(self) -> HandState:
         try:
@@ -330,12 +334,15 @@ class SafeHand:
         if raw.alert.any():
             raise self.stop(self._errors(raw.alert, "a hardware error"))
         self._check_torque()
-        if passed := self.limits.passed(state):
+        away = np.zeros(len(state.position))
+        if self._goal is not None:
+            away = np.where(self._on, self._goal - state.position, 0.0)
+        if passed := self.limits.passed(state, away):
             raise self.stop(passed)
         return state
 
     def _check_torque(self) -> None:
-        """Stop where a motor that was switched on is so no more.
+        """Stop where a motor that was switched on is so no more, or refuses goals.
 
         Every TORQUE_S once the hand is armed.
         """
@@ -346,6 +353,10 @@ class SafeHand:
         self._torque_s = now
         if gone.any():
             raise self.stop(f"torque went off: {self._errors(gone, TORQUE_GONE)}")
+        if (tripped := self.bus.read_tripped()).any():
+            raise self.stop(
+                listed([f"{self._names[a]}: {TRIPPED}" for a in np.flatnonzero(tripped)])
+            )
 
     def _errors(self, which: np.ndarray, otherwise: str) -> str:
         """What some motors [D] bool report as their errors, and what is said of one that reports none."""
@@ -372,6 +383,8 @@ class SafeHand:
         if silent > self.cfg.misses * PERIOD_S:
             return f"the loop stands: no step ended for {silent:.2f} s"
         if age > self.cfg.stale_s:
+            if self._image_fault:
+                return f"the camera is blind for {age:.2f} s: {self._image_fault}"
             return f"the newest image is {age:.2f} s old"
         return ""
 

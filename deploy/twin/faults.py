@@ -24,7 +24,7 @@ from vd.assets_usd.hands import called, load_hand
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import preflight, write_settings
 from vd.deploy.hardware.connect import Connection
-from vd.deploy.hardware.control_table import HardwareError
+from vd.deploy.hardware.control_table import WATCHDOG_FIRMWARE, WATCHDOG_TRIPPED, HardwareError
 from vd.deploy.hardware.joints import Joints, read_joints
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import SafeHand, StoppedError
@@ -78,7 +78,7 @@ class Witness:
         self.times.append(time.monotonic())
         self.pushes.append(np.nan_to_num(np.abs(goals - where)))
         for axis, motor in enumerate(self._motors):
-            if motor.get("bus_watchdog") == -1:
+            if motor.get("bus_watchdog") == WATCHDOG_TRIPPED:
                 self.own.setdefault(axis, self.times[-1])
 
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -115,6 +115,8 @@ class Scene:
     """When the fault came [s]."""
     camera: bool = False
     """Whether there is a camera whose newest image is always new."""
+    blind: str = ""
+    """Why its images show nothing."""
     pause_s: float = 0.0
     """Time that the loop wastes in each step."""
     error: Exception | None = None
@@ -171,9 +173,9 @@ def _renamed(scene: Scene) -> None:
 
 
 def _low(scene: Scene) -> None:
-    """A fifth of the supply's voltage is lost in the wires."""
+    """A fourth of the supply's voltage is lost in the wires."""
     for motor in scene.twin.motors:
-        motor.put("present_input_voltage", round(8.0 * motor.model.supply_v))
+        motor.put("present_input_voltage", round(7.5 * motor.model.supply_v))
 
 
 def _block(scene: Scene) -> None:
@@ -201,6 +203,8 @@ def _stubborn(scene: Scene) -> None:
 
 WIDE = SafetyCfg(step_rad=4.0)
 """Limits that let goals far away through."""
+BRIEF = SafetyCfg(blocked_s=1.0)
+"""Limits that let nothing be pressed for long."""
 MOVING = (
     Fault("1 % of packets lost", _line(lose=0.01), stops=False),
     Fault("1 % of packets corrupted", _line(corrupt=0.01), stops=False),
@@ -217,12 +221,15 @@ MOVING = (
     Fault("adapter unplugged", lambda s: s.bus.close()),
     Fault("a motor warms by 50 deg C/s", lambda s: setattr(s.motor(4), "heat_c_per_s", 50.0)),
     Fault("a motor shuts down, too hot", lambda s: setattr(s.motor(4), "heat_c_per_s", 5000.0)),
-    Fault("a joint is blocked", _block, stops=False, blockable=True),
+    Fault("a joint is blocked", _block, cfg=BRIEF, blockable=True),
     Fault("a joint is blocked, goals far away", _block, cfg=WIDE, reach_rad=2.0, blockable=True),
+    Fault("a motor's bus watchdog trips", _put("bus_watchdog", WATCHDOG_TRIPPED, 3)),
+    Fault("the supply sags", _low),
     Fault("a motor shuts down, overload", _put("hardware_error_status", HardwareError.OVERLOAD, 5)),
     Fault("a motor restarts", lambda s: s.motor(-1).reboot()),
     Fault("a motor takes another ID", _renamed),
     Fault("the camera stops", _set(camera=False), camera=True),
+    Fault("the camera sees nothing", _set(blind="black"), camera=True),
     Fault("every step takes 0.15 s", _set(pause_s=0.15)),
     Fault("the loop stands", _set(pause_s=2.0)),
     Fault("an exception in the loop", _set(error=ArithmeticError("no such number"))),
@@ -235,6 +242,7 @@ BEFORE: dict[str, Inject] = {
     "two motors have the same ID": _twice,
     "a motor does not keep its limit": _stubborn,
     "a motor's direction was reversed": _put("drive_mode", 1, 3),
+    "a motor's firmware has no watchdog": _put("firmware_version", WATCHDOG_FIRMWARE - 1, 2),
     "a motor has an overload": _put("hardware_error_status", HardwareError.OVERLOAD, 5),
     "a motor is hot": lambda scene: setattr(scene.twin.motors[0], "temperature", 66.0),
     "the supply is low": _low,
@@ -345,7 +353,7 @@ def try_fault(fault: Fault, joints: Joints) -> Outcome:
         report = safe.report
         assert report is not None
         # At its largest current a motor whose mode keeps it may go on.
-        if not fault.stops or (fault.blockable and joints.capped.any()):
+        if not fault.stops or (fault.cfg is WIDE and joints.capped.any()):
             right = report.reason == FINISHED
             happened = f"went on; {safe.repeated} readings repeated" if right else report.reason
             return _outcome(scene, fault.name, happened, joints, right=right)
@@ -383,7 +391,7 @@ def _move(scene: Scene, safe: SafeHand, fault: Fault) -> None:
             way = np.sign(safe.limits.lower + safe.limits.upper - 2.0 * safe.read().position)
         safe.command(safe.read().position + reach * way)
         if scene.camera:
-            safe.image_at(time.monotonic())
+            safe.image_at(time.monotonic(), scene.blind)
         time.sleep(scene.pause_s)
         due += PERIOD_S
         now = time.monotonic()

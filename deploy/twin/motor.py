@@ -13,6 +13,7 @@ from vd.deploy.hardware.control_table import (
     RAD_S_PER_COUNT,
     SIZE,
     TICK_MODULUS,
+    WATCHDOG_TRIPPED,
     WATCHDOG_UNIT_S,
     HardwareError,
     Model,
@@ -152,8 +153,8 @@ class Motor:
             return Failure.RANGE
         if name == "torque_enable" and value and self.shut_down:
             return Failure.ACCESS
-        if name in GOALS and self.get("bus_watchdog") == -1:
-            return Failure.ACCESS
+        if name in GOALS and self.get("bus_watchdog") == WATCHDOG_TRIPPED:
+            return Failure.RANGE
         if name == "goal_position" and self.get("operating_mode") == POSITION_MODE:
             low, high = self.get("min_position_limit"), self.get("max_position_limit")
             return Failure.NONE if low <= value <= high else Failure.LIMIT
@@ -244,10 +245,10 @@ class Motor:
             self.put("torque_enable", 0)
 
     def _watch(self, seconds: float) -> None:
-        self._silence += seconds
+        self._silence = self._silence + seconds if self.get("torque_enable") else 0.0
         limit = self.get("bus_watchdog")
         if limit > 0 and self._silence > limit * WATCHDOG_UNIT_S:
-            self.put("bus_watchdog", -1)
+            self.put("bus_watchdog", WATCHDOG_TRIPPED)
             self.put("goal_position", self.get("present_position"))
 
 

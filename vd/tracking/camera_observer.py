@@ -55,6 +55,8 @@ class Found:
     """[m/s] [N, 3]; zero where it is not known."""
     spin: Array
     """Angular velocity [rad/s] [N, 3]; zero where it is not known."""
+    voxels: Array
+    """How much is seen of it: voxels of the camera's points that are not the hand's, int32 [N]."""
 
 
 class CameraObserver:
@@ -214,6 +216,7 @@ class CameraObserver:
             spin=moves
             * 2.0
             * rotated(turn, step[:, :3] * xp.sign(step[:, 3:])),  # of a small angle
+            voxels=count,
         )
         before[:] = pose
         return found
