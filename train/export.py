@@ -82,15 +82,11 @@ def _export_checkpoint(path: Path, output: Path) -> None:
     """Write a checkpoint without what it simulates."""
     from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
 
-    if has_suffix(path, SUFFIX):
-        raise ValueError(f"{path} is a policy, not a checkpoint; nothing can go on from it")
     save_checkpoint(output, without_worlds(load_checkpoint(path, flag="vd-train export")))
     print(output)
 
 
-def export_onnx(
-    policy: "TrainedPolicy | TrackingPolicy", path: Path, contract: "Contract"
-) -> None:
+def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path, contract: "Contract") -> None:
     """Write a policy's networks with its contract, and compare them with onnxruntime if that is installed.
 
     The layers of a teacher, or of that of a camera policy, take ``observation`` [N, O], which they
@@ -114,7 +110,9 @@ def export_onnx(
     drawn = torch.randn(
         CHECKED, teacher.num_observations, generator=torch.Generator().manual_seed(0)
     )
-    _export(teacher.network, {"observation": drawn}, ["action"], path, onnx_metadata(policy, contract))
+    _export(
+        teacher.network, {"observation": drawn}, ["action"], path, onnx_metadata(policy, contract)
+    )
     if not isinstance(policy, TrainedPolicy) and policy.alignment is not None:
         _have_exported(Residual)
         clouds = CLOUD_M * torch.randn(
@@ -220,4 +218,3 @@ def _compared(
 def _ms(call: Callable[[], object]) -> float:
     """Time of a call [ms], the shortest of some."""
     return 1e3 * min(timeit.repeat(call, number=1, repeat=TIMED))
-

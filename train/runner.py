@@ -96,12 +96,7 @@ class TeacherRunner(TrainingLoop):
         Raises:
             ValueError: The file is damaged, a policy only, or of another network.
         """
-        state = load_checkpoint(Path(path), self.device)
-        if "optimizer_state_dict" not in state:
-            raise ValueError(
-                f"{path} is a policy, which nothing can resume; --init begins a new run from it"
-            )
-        self._take(state, path)
+        self._take(load_checkpoint(Path(path), self.device), path)
 
     def begin_from(self, path: str | Path, stage: tuple[float, float] | None = None) -> None:
         """Begin with networks, optimiser, curriculum and counters of another run's checkpoint or policy.

@@ -147,7 +147,9 @@ class RunCfg(HandOptions):
                 raise FileExistsError(f"--log {self.log} is there; choose another name")
             interrupt.need(package)
         if self.policy is None and not (self.twin or self.ros2):
-            raise ValueError("name the policy: an installed one, or the file that vd-train tracker wrote")
+            raise ValueError(
+                "name the policy: an installed one, or the file that vd-train tracker wrote"
+            )
 
 
 def run(cfg: RunCfg) -> int:

@@ -19,6 +19,8 @@ ALIGNMENT_NAME = "alignment.pt"
 """The network of a run, in its folder."""
 RUNS = Path("runs/student")
 """Parent of the default folders stage0 and stage1."""
+
+
 @dataclass
 class AlignCfg:
     """Turning a goal's cloud onto what a camera sees, learned from shapes without simulation."""

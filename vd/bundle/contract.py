@@ -124,7 +124,9 @@ def contract_of(text: str, where: str | Path) -> Contract:
     try:
         values = json.loads(text)
         if values["format"] != POLICY_FORMAT:
-            raise ValueError(f"format is {values['format']!r}, this version reads {POLICY_FORMAT!r}")
+            raise ValueError(
+                f"format is {values['format']!r}, this version reads {POLICY_FORMAT!r}"
+            )
         contract = from_dict(Contract, values, where="contract")
         from_dict(ReorientCfg, contract.task, where="contract.task")
     except (ValueError, TypeError, KeyError) as error:
