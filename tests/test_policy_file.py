@@ -172,7 +172,6 @@ def test_another_hand_is_refused_by_field(hand, capsys):
 def test_an_evaluation_refuses_a_hand_that_changed_under_its_name(tmp_path, capsys):
     moved = tmp_path / "moved.usda"
     text = load_hand("dclaw4").path.read_text()
-    assert "float newton:armature" in text or "drive:angular:physics:maxForce" in text
     before = next(line for line in text.splitlines() if "vd:workspace:drop" in line)
     moved.write_text(text.replace(before, before.partition("=")[0] + "= (0, 0, 0.2)"))
     assert evaluate(["dclaw4", "--hand", str(moved), "--device", "cpu"]) == 1

@@ -12,7 +12,14 @@ import numpy as np
 
 from vd import interrupt
 from vd.bundle import SUFFIX
-from vd.bundle.contract import CONTRACT_KEY, Contract, contract_of, contract_text, read_sealed
+from vd.bundle.contract import (
+    CONTRACT_KEY,
+    Contract,
+    Contracted,
+    contract_of,
+    contract_text,
+    read_sealed,
+)
 from vd.tracking.policy import TrackingPolicy
 
 if TYPE_CHECKING:
@@ -52,32 +59,12 @@ class OnnxNetwork:
 
 
 @dataclass(frozen=True)
-class OnnxTeacher:
+class OnnxTeacher(Contracted):
     """What :class:`vd.policy.TrainedPolicy` is, without its weights."""
 
     network: OnnxNetwork
     contract: Contract
     kind: Literal["teacher"] = "teacher"
-
-    @property
-    def task(self) -> dict[str, Any]:
-        """Configuration of the environment it was trained in."""
-        return self.contract.task
-
-    @property
-    def hand(self) -> str:
-        """Name of the hand it moves."""
-        return str(self.task["hand"])
-
-    @property
-    def num_observations(self) -> int:
-        """Values O of an observation."""
-        return self.contract.network.num_observations
-
-    @property
-    def num_actions(self) -> int:
-        """Actions D."""
-        return self.contract.network.num_actions
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Mean actions [N, D] for observations [N, O]."""

@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import nn
 
-from vd.bundle.contract import Contract, PolicySpec
+from vd.bundle.contract import Contract, Contracted, PolicySpec
 from vd.config import from_dict
 from vd.envs.cfg import ReorientCfg
 from vd.versions import installed_versions
@@ -53,13 +53,14 @@ class MeanAction(nn.Module):
             scale = weights["obs_normalizer._std"] + _NORMALISER_EPSILON
         self.register_buffer("offset", offset)
         self.register_buffer("scale", scale)
-        self.layers = perceptron(spec)
+        with torch.device("meta"):  # drawn weights would take random numbers of a training
+            self.layers = perceptron(spec)
         inside = {
             key.removeprefix("mlp."): value
             for key, value in weights.items()
             if key.startswith("mlp.")
         }
-        self.layers.load_state_dict(inside)
+        self.layers.load_state_dict(inside, assign=True)
         self.eval().requires_grad_(False)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
@@ -69,7 +70,7 @@ class MeanAction(nn.Module):
         return output[:, : self.num_actions]
 
 
-class TrainedPolicy:
+class TrainedPolicy(Contracted):
     """The deterministic policy of a trained actor: the mean of its action distribution.
 
     Attributes:
@@ -90,26 +91,6 @@ class TrainedPolicy:
     ) -> None:
         self.contract, self.weights, self.critic = contract, weights, critic or {}
         self.network = MeanAction(contract.network, weights).to(device)
-
-    @property
-    def task(self) -> dict[str, Any]:
-        """Configuration of the environment it was trained in."""
-        return self.contract.task
-
-    @property
-    def hand(self) -> str:
-        """Name of the hand it moves."""
-        return str(self.task["hand"])
-
-    @property
-    def num_observations(self) -> int:
-        """Values O of an observation."""
-        return self.contract.network.num_observations
-
-    @property
-    def num_actions(self) -> int:
-        """Actions D."""
-        return self.contract.network.num_actions
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] for observations [N, O] on the policy's device.

@@ -110,6 +110,32 @@ class Contract:
         return "tracking" if self.tracking.alignment is None else "vision"
 
 
+class Contracted:
+    """A policy, of which its contract says this."""
+
+    contract: Contract
+
+    @property
+    def task(self) -> dict[str, Any]:
+        """Configuration of the environment it was trained in."""
+        return self.contract.task
+
+    @property
+    def hand(self) -> str:
+        """Name of the hand it moves."""
+        return str(self.task["hand"])
+
+    @property
+    def num_observations(self) -> int:
+        """Values O of an observation of its layers."""
+        return self.contract.network.num_observations
+
+    @property
+    def num_actions(self) -> int:
+        """Actions D."""
+        return self.contract.network.num_actions
+
+
 def contract_text(contract: Contract) -> str:
     """A contract as policies' files have it."""
     return json.dumps(to_dict(contract), indent=1, allow_nan=False)

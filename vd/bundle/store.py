@@ -141,8 +141,7 @@ def _golden_inputs(policy: AnyPolicy) -> Tensors:
     ``goal_points`` and ``seen_points`` [S, G, 3] about their means [m].
     """
     rng = np.random.default_rng(0)
-    teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
-    drawn = {"observation": rng.normal(size=(STATES, teacher.num_observations))}
+    drawn = {"observation": rng.normal(size=(STATES, policy.num_observations))}
     if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
         shape = (STATES, GOLDEN_POINTS, 3)
         for name in ("goal_points", "seen_points"):

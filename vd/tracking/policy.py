@@ -5,9 +5,9 @@ for it.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from vd.bundle.contract import Contract, Kind, TrackingSpec
+from vd.bundle.contract import Contract, Contracted, Kind, TrackingSpec
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class TrackingPolicy:
+class TrackingPolicy(Contracted):
     """A teacher that acts on a camera's view of an object.
 
     Its layers have learned nothing for that.
@@ -40,18 +40,3 @@ class TrackingPolicy:
     def kind(self) -> Kind:
         """What it is called."""
         return self.contract.kind
-
-    @property
-    def hand(self) -> str:
-        """Name of the hand it moves."""
-        return self.teacher.hand
-
-    @property
-    def num_actions(self) -> int:
-        """Actions D."""
-        return self.teacher.num_actions
-
-    @property
-    def task(self) -> dict[str, Any]:
-        """Configuration of the environment its teacher was trained in."""
-        return self.contract.task
