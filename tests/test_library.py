@@ -105,7 +105,7 @@ def test_what_is_no_file_of_ours_is_refused_with_file_and_remedy(tmp_path):
     for text in (b"", b"[]", b"\xff", b"{}", b'{"format": "visual-dexterity policies 1"}'):
         path.write_bytes(text)
         with pytest.raises(
-            ValueError, match=f"{path} has .*format.*; give the folder of a recording or log"
+            ValueError, match=f"{path} has .*format.*; give the folder of a recording or"
         ):
             vd.read(path)
     path.write_text('{"format": "visual-dexterity evaluation 7"}')

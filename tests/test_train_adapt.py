@@ -33,7 +33,7 @@ def test_it_goes_on_as_the_policy_was_trained_with_the_servos_of_the_layer_alone
     asked = {"hand_layer": str(cfg.hand_layer), "objects": ("cube",), "seed": 0}
     assert run.init_stage == (1.0, adapt.LOOSE), "it begins loosened"
     assert run.env == replace(before, randomisation=EXACT, curriculum=run.env.curriculum, **asked)
-    assert run.run.max_steps == policy.env_steps + cfg.steps
+    assert run.run.max_steps == policy.contract.env_steps + cfg.steps
     write_config(run)
     assert teacher_cfg(cfg) == run, "the same command goes on"
     with pytest.raises(FileExistsError, match="holds a run of other settings"):

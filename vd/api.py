@@ -228,7 +228,7 @@ def read(path: str | Path) -> Any:
     raise ValueError(
         f"{path} has {f'the format {found!r}' if found else 'no format'}; give the folder of a "
         f"recording, "
-        "or log, a policy.safetensors, report.json or eval.json (load_policy reads policies, load_hand and "
+        "log, policy.safetensors, report.json or eval.json (load_policy reads policies, load_hand and "
         "load_objects USD)"
     )
 

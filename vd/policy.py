@@ -56,7 +56,7 @@ class MeanAction(nn.Module):
         with torch.device("meta"):  # drawn weights would take random numbers of a training
             self.layers = perceptron(spec)
         inside = {
-            key.removeprefix("mlp."): value
+            key.removeprefix("mlp."): value.float()
             for key, value in weights.items()
             if key.startswith("mlp.")
         }
