@@ -227,9 +227,8 @@ def read(path: str | Path) -> Any:
             return kind.read(path)
     raise ValueError(
         f"{path} has {f'the format {found!r}' if found else 'no format'}; give the folder of a "
-        f"recording, "
-        "log, policy.safetensors, report.json or eval.json (load_policy reads policies, load_hand and "
-        "load_objects USD)"
+        f"recording or log, a policy.safetensors, report.json or eval.json (load_policy reads "
+        f"policies, load_hand and load_objects USD)"
     )
 
 
