@@ -71,5 +71,8 @@ def test_a_run_goes_on_bit_for_bit_and_another_sees_more_from_there(tmp_path):
     assert torch.allclose(acted, blind.act(observation["policy"][:, :before]), atol=1e-5)
     seeing.learn(1)
     policy = read_policy(tmp_path / "seeing" / "policy.safetensors")
-    assert policy.task["observation"]["shape"] == "full" and policy.trained_hand["name"] == "dclaw3"
+    assert (
+        policy.task["observation"]["shape"] == "full"
+        and policy.contract.interface["hand"]["name"] == "dclaw3"
+    )
     assert torch.isfinite(policy.act(seeing.env.get_observations()["policy"])).all()
