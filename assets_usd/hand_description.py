@@ -12,18 +12,6 @@ from pxr import Gf, Usd
 
 from vd.assets_usd.hand_data import HandError, MotorModel, Workspace
 
-EARLIER: dict[str, Any] = {
-    "vd:mount:position": (0.0, 0.0, 0.25),
-    "vd:mount:orientation": Gf.Quatd(0.0, 0.0, 1.0, 0.0),
-    "vd:palm": (0.0, 0.0, 1.0),
-    "vd:workspace:drop": (0.0, 0.0, 0.12),
-    "vd:workspace:goal": (0.0, 0.0, 0.08),
-    "vd:workspace:fall": 0.15,
-    "vd:workspace:size": (0.095, 0.165),
-}
-EARLIER_START = (0.0, 0.8, -1.1)
-EARLIER_MOTOR = "XH430-V210"
-"""What every hand had in earlier versions, whose files say nothing of it: that of D'Claws."""
 GAINS: dict[str, type] = {"p_gain": int, "d_gain": int, "current": float}
 """What a file need not say of a motor."""
 ROUNDING_RAD = 1e-5
@@ -39,8 +27,6 @@ class Described:
     def __init__(self, path: Path, stage: Usd.Stage, layer: Path | None):
         self.path, self.stage, self.layer = path, stage, layer
         self.root = stage.GetDefaultPrim()
-        self.earlier = not self.root.GetAuthoredPropertiesInNamespace("vd")
-        """Whether the file is of a version in which all hands were like D'Claws."""
 
     def fail(self, where: Any, what: str, remedy: str) -> HandError:
         """The error to raise for a prim or a path."""
@@ -59,8 +45,6 @@ class Described:
     def value(self, prim: Usd.Prim, attribute: str) -> Any:
         """The value of an attribute, which must have been authored."""
         found = prim.GetAttribute(attribute)
-        if self.earlier and attribute in EARLIER:
-            return EARLIER[attribute]
         if not found or not found.HasAuthoredValue():
             raise self.fail(prim, f"'{attribute}' is not authored", "give it a value")
         return found.Get()
@@ -108,8 +92,6 @@ class Described:
 
     def start(self, joints: list[Usd.Prim], drives: np.ndarray) -> np.ndarray:
         """Angles at the start [D] [rad]; they are within the limits."""
-        if self.earlier:
-            return np.tile(EARLIER_START, len(joints) // 3)
         start = np.array([self.number(joint, "vd:start") for joint in joints])
         for joint, angle, (low, high) in zip(joints, start, drives[:, :2], strict=True):
             if not low - ROUNDING_RAD <= angle <= high + ROUNDING_RAD:
@@ -147,10 +129,6 @@ class Described:
 
     def motors(self, joints: list[Usd.Prim]) -> tuple[MotorModel | None, ...]:
         """The motor of each joint that says which it has; no two have one ID."""
-        if self.earlier:
-            return tuple(
-                MotorModel(EARLIER_MOTOR, 10 * (n // 3 + 1) + n % 3) for n in range(len(joints))
-            )
         motors: list[MotorModel | None] = []
         for joint in joints:
             if not joint.GetAuthoredPropertiesInNamespace("vd:motor"):

@@ -26,7 +26,7 @@ from vd.assets_usd.hand_data import (
     HandModel,
     compose,
 )
-from vd.assets_usd.hand_description import EARLIER_START, Described, xyzw
+from vd.assets_usd.hand_description import Described, xyzw
 from vd.assets_usd.hand_layer import add_layer, read_servo
 from vd.kernels.servo.actuators import MAX_JOINTS
 
@@ -111,7 +111,6 @@ class _Reader(Described):
                 self.root, "PhysicsArticulationRootAPI is missing", "apply it to the root prim"
             )
         counts = self._fingers()
-        self.earlier = self.earlier and set(counts) == {len(EARLIER_START)}
         self._refuse_unknown(counts)
         order = [(f, i) for f, count in enumerate(counts) for i in range(1, count + 1)]
         links = ("base", *(f"f{f}_l{i}" for f, i in order))

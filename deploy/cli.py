@@ -22,15 +22,6 @@ COMMANDS = {
 }
 """Module of each command and what it does. A module has its options, such as RunCfg, and a function
 of the command's name, which takes them and returns a status."""
-GONE = {
-    "scan": "vd-deploy check names what is silent; ROBOTIS' DYNAMIXEL Wizard 2.0 tries other rates",
-    "reboot": "switch the motors' power off and on",
-    "set-id": "ROBOTIS' DYNAMIXEL Wizard 2.0 sets IDs",
-    "set-baud": "ROBOTIS' DYNAMIXEL Wizard 2.0 sets baud rates",
-    "shadow": "vd-play shows logs; tests hold that the loop sees what the simulator shows",
-}
-"""Commands that went, and what is there instead."""
-
 USAGE = """usage: vd-deploy [POLICY] [flags]   the same as vd-deploy run
        vd-deploy COMMAND [flags]
 
@@ -52,15 +43,13 @@ def _no_policy(text: str) -> str:
     """Why it is no file, no folder and no installed policy; "" if it is one."""
     if Path(text).exists():
         return ""
-    if text in GONE:
-        return f"there is no command {text} any more: {GONE[text]}"
     from vd.evaluate.agents import check_names
 
     try:
         check_names([text], [])
     except FileNotFoundError:
         return f"no command and no policy {text!r}; commands are {', '.join(COMMANDS)}"
-    except ValueError as error:  # it has another name now
+    except ValueError as error:  # it has to be pulled
         return str(error)
     return ""
 

@@ -1,4 +1,4 @@
-"""Read a recording that was written by hand, write it again, and a policy as a bundle."""
+"""Read a recording that was written by hand, write it again, and a policy."""
 
 import json
 from pathlib import Path
@@ -28,5 +28,5 @@ recording = vd.read("mine")  # checked: a mistake is named by file, row and colu
 print(recording.joints, recording.trajectories[0].position.shape)
 vd.write(recording, "again")
 
-vd.write(vd.load_policy("dclaw4", device="cpu"), "bundle")
-print(vd.read("bundle").hand)
+vd.write(vd.load_policy("dclaw4", device="cpu"), "mine.safetensors")
+print(vd.read("mine.safetensors").hand)

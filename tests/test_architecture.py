@@ -30,6 +30,7 @@ LEAVES = ("vd.paper", "vd.files", "vd.interrupt", "vd.device")
 SHARED = (
     "vd.config",
     "vd.policy",
+    "vd.bundle",
     "vd.arrays",
     "vd.clouds",
     "vd.quaternions",

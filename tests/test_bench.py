@@ -5,7 +5,7 @@ import json
 import pytest
 
 from vd.bench import depth
-from vd.bench.cli import DepthCommand, PhysicsCommand, SimCommand, main
+from vd.bench.cli import DepthCommand, PhysicsCommand, SimCommand
 from vd.bench.sim import own_share
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
@@ -40,11 +40,6 @@ def test_physics_report_names_what_moves(tmp_path):
     (report,) = json.loads(out.read_text())["rows"]
     assert report["objects"] == 1 and report["at_rest_share"] == 1.0 and report["moving"] == []
     assert report["pinch"]["creep"] < 0.2e-3
-
-
-def test_measurements_of_earlier_versions_are_told(capsys):
-    assert main(["replay", "none.json"]) == 2
-    assert "'replay' is no more" in capsys.readouterr().err
 
 
 def test_depth_images_and_clouds_are_counted(tmp_path, capsys, monkeypatch):

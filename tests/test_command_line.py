@@ -23,7 +23,7 @@ LINES = {
     "vd-train teacher": "--preset gpu --hand dclaw3 --ppo.actor-learning-rate 3e-5 --randomise",
     "vd-train student": "--preset cpu-demo --validate cube --camera 0 0 0 0 0 0 1",
     "vd-train tracker": "dclaw3 --objects cube",
-    "vd-train bundle": "a.pt b",
+    "vd-train export": "a.pt b.safetensors",
     "vd-gap run": "rec --effects backlash --model a.usda",
     "vd-gap hide": "servo --out rec --effect backlash:width_rad=0.06 --effect dead_zone",
     "vd-bench sim": "--envs 16 32",

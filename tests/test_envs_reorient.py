@@ -289,13 +289,6 @@ def test_saved_state_continues_exactly():
     run(other, 3, seed=9)
     other.load_state_dict(state)
     assert np.array_equal(run(other, 10, seed=2), expected)
-    older = {name: value for name, value in state["arrays"].items() if name != "goal_steps"}
-    for gone in ("goals_reached", "grasps", "grasp_count"):
-        older[gone] = np.zeros(WORLDS, dtype=np.int32)  # of earlier versions
-    other.load_state_dict(state | {"arrays": older})
-    assert np.array_equal(other.goal_steps.numpy(), state["arrays"]["step_count"]), (
-        "no goal is older"
-    )
     with pytest.raises(ValueError, match="num_envs"):
         make(num_envs=2, **cfg).load_state_dict(state)
 

@@ -1,26 +1,32 @@
 """Which policy a name means, and the task it is evaluated in."""
 
 import math
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
 
+import vd
 from vd.assets_usd.hands import hand_usd
+from vd.bundle.store import read_policy
 from vd.evaluate.agents import (
     POLICY_FOLDER,
     SHIPPED_POLICIES,
     find_policy,
     open_policy,
+    policy_at,
     policy_name,
     task_for,
 )
 from vd.evaluate.cli import main
 from vd.evaluate.conditions import CONDITIONS
 from vd.evaluate.result import SUCCESS, Result
-from vd.policy import load_policy
 from vd.policy_store import describe, read_store
+from vd.train.begin import find_start
+from vd.train.cli import main as train
 
 
 def task_of(policy, **changes):
@@ -33,7 +39,7 @@ def task_of(policy, **changes):
 def test_installed_policies_load_act_and_are_listed(name):
     policy, listed = open_policy(name, "cpu"), read_store(POLICY_FOLDER).policies
     assert (
-        listed[name] == describe(name, SHIPPED_POLICIES[name])
+        listed[name] == describe(SHIPPED_POLICIES[name])
         and listed.keys() == SHIPPED_POLICIES.keys()
     )
     assert name.split("-")[0] == policy.task["hand"], "the name begins with the hand"
@@ -51,14 +57,42 @@ def test_names_mean_files_and_files_have_names(tmp_path, monkeypatch):
     assert (
         policy_name(path) == policy_name(path.name) == policy_name("dclaw4-cube") == "dclaw4-cube"
     )
-    assert policy_name(tmp_path / "dclaw4-cube.pt") == str(tmp_path / "dclaw4-cube.pt")
-    with pytest.raises(FileNotFoundError, match=r"holds no policy\.pt"):
+    assert policy_name(tmp_path / path.name) == str(tmp_path / path.name)
+    with pytest.raises(FileNotFoundError, match=r"holds no policy\.safetensors"):
         find_policy(tmp_path)
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints/best.pt").touch()
     assert find_policy(tmp_path) == tmp_path / "checkpoints/best.pt"
-    (tmp_path / "policy.pt").touch()
-    assert find_policy(tmp_path) == find_policy(tmp_path / "policy.pt") == tmp_path / "policy.pt"
+    (tmp_path / "policy.safetensors").touch()
+    assert (
+        find_policy(tmp_path)
+        == find_policy(tmp_path / "policy.safetensors")
+        == tmp_path / "policy.safetensors"
+    )
+
+
+@pytest.mark.parametrize("own", ["./dclaw4", Path("dclaw4"), Path("./dclaw4")], ids=repr)
+def test_a_path_is_a_path_where_a_policy_is_called_the_same(own, tmp_path, monkeypatch):
+    """The folder of a run, called like an installed policy."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "dclaw4"
+    folder.mkdir()
+    shutil.copy(SHIPPED_POLICIES["dclaw4-cube"], folder / "policy.safetensors")
+    cube = open_policy("dclaw4-cube", "cpu").contract
+    assert find_policy("dclaw4") == SHIPPED_POLICIES["dclaw4"], "a bare name is an installed policy"
+    assert find_policy(own).resolve() == folder / "policy.safetensors"
+    assert vd.load_policy(own, device="cpu").contract == cube
+    assert (
+        train(["export", str(own) if isinstance(own, str) else policy_at(own), "o.safetensors"])
+        == 0
+    )
+    assert vd.load_policy("o.safetensors", device="cpu").contract == cube
+    assert find_start("./dclaw4").resolve() == folder / "policy.safetensors"
+    with pytest.raises(ValueError, match="nosuchset"):
+        vd.evaluate_policies(own, objects=("nosuchset",))
+    (folder / "policy.safetensors").unlink()
+    with pytest.raises(FileNotFoundError, match="dclaw4 holds no policy"):
+        vd.evaluate_policies(own, objects=("cube",))
 
 
 @pytest.mark.parametrize("policy", ["dclaw4", "dclaw4-tracking"])
@@ -81,7 +115,7 @@ def test_another_hand_is_refused_before_anything_is_built(policy, tmp_path, caps
 
 
 def test_start_goals_and_layer_are_as_trained_unless_asked_otherwise():
-    trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
+    trained = read_policy(SHIPPED_POLICIES["dclaw4-cube"])
     assert task_of(trained).start.at_rest and not task_of(None).start.at_rest
     assert not task_of(trained, at_rest=False).start.at_rest
     assert task_of(None, at_rest=True).start.at_rest
@@ -96,8 +130,8 @@ def test_start_goals_and_layer_are_as_trained_unless_asked_otherwise():
 
 
 def test_conditions_replace_what_a_policy_was_trained_in_and_nobody_tells_a_critic():
-    trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
-    trained.task["observation"] = {"dynamics": "critic", "history": 0, "canonical": True}
+    trained = read_policy(SHIPPED_POLICIES["dclaw4-cube"])
+    trained.task["observation"] = {"dynamics": "critic", "canonical": True}
     for condition in CONDITIONS.values():
         task = task_of(trained, condition=condition)
         task.validate()

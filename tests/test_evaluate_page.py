@@ -81,6 +81,6 @@ def test_curves_end_at_one_minus_the_share_of_lost_objects(found):
 
 
 def test_names_are_as_short_as_they_can_be():
-    names = ("runs/a/stage1/policy.pt", "runs/a/stage2/policy.pt", "dclaw3")
+    names = ("runs/a/stage1/policy.safetensors", "runs/a/stage2/policy.safetensors", "dclaw3")
     assert list(labels(names).values()) == ["stage1", "stage2", "dclaw3"]
-    assert labels(("runs/a/policy.pt",)) == {"runs/a/policy.pt": "a"}
+    assert labels(("runs/a/policy.safetensors",)) == {"runs/a/policy.safetensors": "a"}

@@ -305,7 +305,7 @@ def test_settings_that_cannot_be_are_refused(flags, message, capsys, tmp_path):
 
 
 def test_a_policy_is_known_by_its_weights(tmp_path):
-    paths = [tmp_path / name for name in ("a.pt", "copy.pt", "b.pt")]
+    paths = [tmp_path / name for name in ("a.safetensors", "copy.safetensors", "b.safetensors")]
     for path, content in zip(paths, (b"one", b"one", b"two"), strict=True):
         path.write_bytes(content)
     first, copy, other = (suite_run.fingerprint(str(path)) for path in paths)

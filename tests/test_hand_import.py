@@ -24,9 +24,9 @@ from vd.assets_usd.hand_import.importer import import_hand
 from vd.assets_usd.hand_import.source import read_source
 from vd.assets_usd.hand_model import open_stage
 from vd.assets_usd.hands import load_hand
+from vd.bundle.store import read_policy
 from vd.envs.cfg import ObservationCfg, ReorientCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
-from vd.policy import load_policy
 from vd.train.cli import main as train
 
 REAL = ("leap", "allegro")
@@ -520,7 +520,7 @@ def test_a_hand_of_five_motors_trains_and_its_objects_fit(tmp_path):
         json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()
     ]
     assert len(rows) > 1 and all(row["loss/kl"] > 0.0 and row["loss/value"] > 0.0 for row in rows)
-    policy = load_policy(tmp_path / "run" / "policy.pt")
+    policy = read_policy(tmp_path / "run" / "policy.safetensors")
     assert policy.num_actions == 5
     env = ReorientEnv(ReorientCfg.of(policy), "cpu")
     assert env.objects[0].longest_side == pytest.approx(0.05)

@@ -315,21 +315,6 @@ def test_fingers_may_differ_and_joints_follow_others(
     assert builder.joint_mimic_coeffs[5] == pytest.approx((np.radians(10.0), 0.5))
 
 
-def test_a_file_of_an_earlier_version_is_mounted_as_it_was(
-    tmp_path: Path, four_fingers: HandModel
-) -> None:
-    def older(stage: Usd.Stage, root: str) -> None:
-        for prim in stage.Traverse():
-            for found in prim.GetAuthoredPropertiesInNamespace("vd"):
-                if prim.GetName() != "camera":
-                    prim.RemoveProperty(found.GetName())
-
-    hand = read_hand(edited(four_fingers.path, tmp_path, older))
-    for name in ("mount", "palm", "start"):
-        np.testing.assert_array_equal(getattr(hand, name), getattr(four_fingers, name))
-    assert hand.workspace == four_fingers.workspace and hand.motors == four_fingers.motors
-
-
 def test_a_camera_is_optional_until_it_is_needed(tmp_path: Path, four_fingers: HandModel) -> None:
     blind = read_hand(edited(four_fingers.path, tmp_path, removing("base/camera")))
     with pytest.raises(HandError, match=r"broken\.usda: dclaw4 has no camera; add the prim"):

@@ -48,16 +48,6 @@ def test_a_signal_that_arrives_in_a_finaliser_is_not_lost(number):
     assert works() == STATUS[number]
 
 
-def test_a_flag_of_an_earlier_version_is_refused_with_its_name_of_today(capsys):
-    @interrupt.command("vd-some")
-    def never() -> None:
-        raise AssertionError
-
-    assert never(["thing", "--run_dir=x", "--num-worlds", "3"]) == interrupt.USAGE_ERROR
-    said = capsys.readouterr().err
-    assert "--run-dir is --out now" in said and "--num-worlds is --num-envs now" in said
-
-
 def test_an_error_is_one_line_and_with_vd_debug_the_place_in_the_code(monkeypatch, capsys):
     @interrupt.command("vd-some")
     def fails() -> None:

@@ -105,7 +105,7 @@ def test_what_is_no_file_of_ours_is_refused_with_file_and_remedy(tmp_path):
     for text in (b"", b"[]", b"\xff", b"{}", b'{"format": "visual-dexterity policies 1"}'):
         path.write_bytes(text)
         with pytest.raises(
-            ValueError, match=f"{path} has .*format.*; give the folder of a recording, bundle"
+            ValueError, match=f"{path} has .*format.*; give the folder of a recording or"
         ):
             vd.read(path)
     path.write_text('{"format": "visual-dexterity evaluation 7"}')
@@ -149,5 +149,5 @@ def test_the_tutorials_run_logs_its_terms_and_its_policy_knows_them(
         "run", episodes=1, episode_s=0.5, device="cpu", out=tmp_path / "eval"
     )
     assert result.rows[0].overall.episodes == 1
-    assert main(["tracker", "run", "--objects", "cube", "--out", "tracking.pt"]) == 1
+    assert main(["tracker", "run", "--objects", "cube", "--out", "tracking.safetensors"]) == 1
     assert "observes own_terms:height, which no camera shows" in capsys.readouterr().err

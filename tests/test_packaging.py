@@ -92,8 +92,8 @@ def test_wheel_holds_modules_policies_and_what_else_is_read(wheel):
     } <= sizes.keys()
     assert "vd/py.typed" in sizes and any(name.endswith("licenses/LICENSE") for name in sizes)
     shipped = {DEFAULT_POLICY, CAMERA_POLICY}  # others are pulled
-    assert {name for name in sizes if name.endswith(".pt")} == {
-        f"vd/policies/{name}.pt" for name in shipped
+    assert {name for name in sizes if name.endswith(".safetensors")} == {
+        f"vd/policies/{name}.safetensors" for name in shipped
     }
     assert f"vd/policies/{POLICY_LIST}" in sizes
     for (

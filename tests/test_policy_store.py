@@ -39,7 +39,7 @@ def served(place):
             self.send_response(200)
             self.send_header("Content-Length", str(len(data)))
             self.end_headers()
-            self.wfile.write(data[: how["most"]] if self.path.endswith(".pt") else data)
+            self.wfile.write(data[: how["most"]] if self.path.endswith(".safetensors") else data)
 
     server = HTTPServer(("127.0.0.1", 0), Handler)
     Thread(target=server.serve_forever, daemon=True).start()
@@ -61,7 +61,7 @@ def test_a_pulled_policy_has_a_name_and_nothing_takes_its_place_unasked(place, c
     assert main(pull) == 0
     (pulled_folder() / "policies.json").unlink()
     assert main(pull) == main(["list", "--at", str(place)]) == 0
-    assert find_policy("mine") == pulled_folder() / "mine.pt"
+    assert find_policy("mine") == pulled_folder() / "mine.safetensors"
     assert re.search(
         r"^mine +teacher +dclaw4 +0\.5 MB  installed$", capsys.readouterr().out, re.MULTILINE
     )
@@ -90,11 +90,13 @@ def test_a_download_that_broke_off_leaves_nothing_and_sizes_of_a_list_do_not_mat
 
 def test_what_is_not_as_listed_or_has_no_name_is_refused(place, capsys, monkeypatch):
     said, at = functools.partial(refused, capsys), ("--at", str(place))
-    shutil.copy(SHIPPED_POLICIES["dclaw4"], place / "mine.pt")
+    shutil.copy(SHIPPED_POLICIES["dclaw4"], place / "mine.safetensors")
     assert "SHA-256 differs" in said("pull", "mine", *at) and not pulled_folder().exists()
     assert "has no policy yours; it has mine" in said("pull", "yours", *at)
-    assert "--name says how" in said("push", str(place / "mine.pt"), *at)
-    assert "no .pt at its end" in said("push", "dclaw4", *at, "--name", "yours.pt")
+    assert "--name says how" in said("push", str(place / "mine.safetensors"), *at)
+    assert "no .safetensors at its end" in said(
+        "push", "dclaw4", *at, "--name", "yours.safetensors"
+    )
     assert "a URL can only be read" in said("push", "dclaw4", "--at", "http://127.0.0.1:1")
     listed = place / "policies.json"
     listed.write_text(listed.read_text().replace('"mine"', '"../mine"'))
@@ -116,7 +118,10 @@ def test_a_repository_of_hugging_face_is_read_and_gets_policy_and_list_at_once(
     monkeypatch.setenv("HF_TOKEN", "secret")
     assert main(["pull", "mine", "--at", "hf://me/hands"]) == 0
     path, headers = asked[-1]
-    assert path == "/me/hands/resolve/main/mine.pt" and headers["Authorization"] == "Bearer secret"
+    assert (
+        path == "/me/hands/resolve/main/mine.safetensors"
+        and headers["Authorization"] == "Bearer secret"
+    )
     push = ["push", "dclaw4", "--at", "hf://me/hands"]
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     assert "pip install huggingface_hub" in refused(capsys, *push)
@@ -125,5 +130,5 @@ def test_a_repository_of_hugging_face_is_read_and_gets_policy_and_list_at_once(
     assert main(push) == 0
     commit = hub.HfApi().create_commit.call_args.kwargs
     (file, path), (listed, text) = commit["operations"]
-    assert (commit["repo_id"], file, listed) == ("me/hands", "dclaw4.pt", "policies.json")
+    assert (commit["repo_id"], file, listed) == ("me/hands", "dclaw4.safetensors", "policies.json")
     assert Path(path) == SHIPPED_POLICIES["dclaw4"] and b'"mine"' in text and b'"dclaw4"' in text

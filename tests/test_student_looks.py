@@ -5,17 +5,19 @@ import os
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from test_alignment import TINY
 
+from vd.bundle.contract import TrackingSpec
+from vd.bundle.store import read_policy, write_policy
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import SHIPPED_POLICIES, find_policy
-from vd.policy import load_policy
-from vd.tracking.policy import TrackingPolicy, TrackingSpec
+from vd.tracking.policy import TrackingPolicy
 from vd.train.cli import main
 from vd.train.metrics import read_progress
 from vd.train.student.align import mesh_points
@@ -37,8 +39,9 @@ def make_looks(points: int) -> SimulatedLooks:
     )
     env = ReorientEnv(cfg, "cpu")
     network = AlignmentNetwork(TINY)
-    teacher = load_policy(find_policy("dclaw3"))
-    policy = TrackingPolicy(teacher, TrackingSpec(alignment=TINY), network)
+    teacher = read_policy(find_policy("dclaw3"))
+    contract = replace(teacher.contract, tracking=TrackingSpec(alignment=TINY))
+    policy = TrackingPolicy(teacher, contract, network)
     surfaces = mesh_points(env.objects, points, torch.device("cpu"))[..., :3]
     return SimulatedLooks(ReorientVecEnv(env), policy, surfaces, LooksCfg(steps=1, kept=6), seed=0)
 
@@ -141,8 +144,6 @@ def test_two_processes_share_gradients_and_draw_their_own(tmp_path):
 def test_with_its_network_set_to_zero_success_falls_to_chance(name, tmp_path):
     from vd.evaluate.cli import main as evaluate
     from vd.evaluate.result import Result
-    from vd.tracking.policy import read_policy, tracking_export
-    from vd.train.checkpoint import save_checkpoint
 
     policy, rates = read_policy(find_policy(name)), []
     for blind in (False, True):
@@ -151,7 +152,7 @@ def test_with_its_network_set_to_zero_success_falls_to_chance(name, tmp_path):
                 0.0 * torch.nn.utils.parameters_to_vector(policy.alignment.parameters()),
                 policy.alignment.parameters(),
             )
-        save_checkpoint(tmp_path / f"{blind}.pt", tracking_export(policy))
+        write_policy(policy, tmp_path / f"{blind}.safetensors")
         flags = [
             "--objects",
             "cuboid",
@@ -162,6 +163,6 @@ def test_with_its_network_set_to_zero_success_falls_to_chance(name, tmp_path):
             "--out",
             str(tmp_path),
         ]
-        assert evaluate([str(tmp_path / f"{blind}.pt"), *flags]) == 0
+        assert evaluate([str(tmp_path / f"{blind}.safetensors"), *flags]) == 0
         rates.append(Result.read(tmp_path / "eval.json").rows[0].overall.outcomes["success"].value)
     assert rates[1] < 0.3 * rates[0]

@@ -8,10 +8,10 @@ from test_evaluate_trace import FakeObject, judged, traced
 
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hands import load_hand
+from vd.bundle.store import read_policy
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.conditions import EXACT
 from vd.evaluate.result import Result
-from vd.policy import load_policy
 from vd.train import adapt
 from vd.train.adapt import AdaptCfg, teacher_cfg
 from vd.train.flags import write_config
@@ -28,12 +28,12 @@ def cfg(tmp_path) -> AdaptCfg:
 
 
 def test_it_goes_on_as_the_policy_was_trained_with_the_servos_of_the_layer_alone(cfg):
-    policy, run = load_policy(adapt.find_start("dclaw4")), teacher_cfg(cfg)
+    policy, run = read_policy(adapt.find_start("dclaw4")), teacher_cfg(cfg)
     before = ReorientCfg.of(policy)
     asked = {"hand_layer": str(cfg.hand_layer), "objects": ("cube",), "seed": 0}
     assert run.init_stage == (1.0, adapt.LOOSE), "it begins loosened"
     assert run.env == replace(before, randomisation=EXACT, curriculum=run.env.curriculum, **asked)
-    assert run.run.max_steps == policy.env_steps + cfg.steps
+    assert run.run.max_steps == policy.contract.env_steps + cfg.steps
     write_config(run)
     assert teacher_cfg(cfg) == run, "the same command goes on"
     with pytest.raises(FileExistsError, match="holds a run of other settings"):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from train_dummy import SMALL_PPO, DummyEnv, make_runner
 
-from vd.policy import load_policy
+from vd.bundle.store import read_policy
 from vd.train.checkpoint import find_checkpoint
 from vd.train.cli import main
 from vd.train.config import PolicyCfg
@@ -65,7 +65,7 @@ def taught(tmp_path_factory):
     folder = tmp_path_factory.mktemp("teacher")
     runner = make_runner(folder, env=PromptEnv(num_envs=32), policy=NETWORK)
     runner.learn(60)
-    return folder / "policy.pt"
+    return folder / "policy.safetensors"
 
 
 def test_an_actor_that_sees_late_comes_to_what_its_teacher_does(taught, tmp_path):
@@ -77,7 +77,7 @@ def test_an_actor_that_sees_late_comes_to_what_its_teacher_does(taught, tmp_path
     runner.learn(60)
     losses = [row["loss/imitation"] for row in read_progress(tmp_path / "progress.jsonl")]
     assert losses[-1] < 0.4 * losses[0]
-    seen, teacher = runner.env.get_observations(), load_policy(taught)
+    seen, teacher = runner.env.get_observations(), read_policy(taught)
     with torch.no_grad():
         wanted = teacher.act(seen["privileged"][:, -5:])
         apart, unaware = (

@@ -6,17 +6,19 @@ What is taken over, what the critic learns, what is refused.
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
+from vd.bundle.store import read_contract, read_policy, write_policy
 from vd.config import to_dict
 from vd.envs.cfg import CurriculumCfg, ReorientCfg, TighteningCfg
 from vd.evaluate.agents import SHIPPED_POLICIES
-from vd.policy import MeanAction, load_policy, policy_export
+from vd.policy import MeanAction
 from vd.train import begin
 from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start
-from vd.train.checkpoint import BEST_NAME, find_checkpoint, load_checkpoint, save_checkpoint
+from vd.train.checkpoint import BEST_NAME, find_checkpoint
 from vd.train.cli import main
 from vd.train.flags import parse_teacher
 from vd.train.metrics import read_progress
@@ -27,14 +29,22 @@ LEARNED = replace(SMALL_PPO, minibatch_size=128)
 
 
 def _export(folder: Path, *, critic: bool = True, learner: bool = True) -> Path:
-    """A policy of a short run on the dummy, as ``vd-train export`` writes it, or wrote it once."""
+    """A policy of a short run on the dummy, and one that says less of its training."""
     runner = make_runner(folder, policy=NORMALISING, ppo=LEARNED)
     runner.learn(3)
-    state = policy_export(load_checkpoint(find_checkpoint(folder, "latest")))
-    dropped = (() if critic else ("critic_state_dict",)) + (() if learner else ("learner", "stage"))
-    path = folder / "exported.pt"
-    save_checkpoint(path, {key: value for key, value in state.items() if key not in dropped})
+    policy = read_policy(find_checkpoint(folder, "latest"))
+    if not critic:
+        policy.critic = {}
+    path = folder / "exported.safetensors"
+    kept = {} if learner else {"learner": {}, "stage": {}}
+    write_policy(policy, path, replace(policy.contract, **kept))
     return path
+
+
+def _changed(path: Path, **changes) -> None:
+    """Say other things in a policy's contract."""
+    policy = read_policy(path)
+    write_policy(policy, path, replace(policy.contract, **changes))
 
 
 def _begun(folder: Path, policy: Path, **options):
@@ -65,15 +75,15 @@ def test_a_run_begun_from_a_policy_acts_as_it_and_says_how_long_the_critic_learn
     observation = runner.env.get_observations()
     with torch.no_grad():
         assert torch.allclose(
-            runner.alg.actor(observation), load_policy(path).act(observation["policy"]), atol=1e-6
+            runner.alg.actor(observation), read_policy(path).act(observation["policy"]), atol=1e-6
         )
-    actor, learned = _state(runner.alg.actor), load_checkpoint(path)["actor_state_dict"]
+    actor, learned = _state(runner.alg.actor), read_policy(path).weights
     assert _same(actor, learned) == list(actor), "its normaliser and its std belong to it"
     assert runner.env.env.stage.difficulty == pytest.approx(0.03)
     assert not runner.alg.optimizer.state_dict()["state"], "moments would be another network's"
     values = _state(runner.alg.critic)
     if critic:
-        assert _same(values, load_checkpoint(path)["critic_state_dict"]) == list(values)
+        assert _same(values, read_policy(path).critic) == list(values)
     else:
         normaliser = [name for name in values if name.startswith("obs_normalizer")]
         assert normaliser and set(_same(values, actor)) >= set(normaliser), (
@@ -118,16 +128,10 @@ def test_only_the_critic_learns_while_it_warms_up(tmp_path, monkeypatch, schedul
 def test_a_policy_that_does_not_say_how_far_it_came_has_come_to_the_end(
     tmp_path, tightened, asked, wanted
 ):
-    """The installed policies of old have no stage.
-
-    Whether stillness tightened stands in their task.
-    """
+    """Some installed ones do not; whether stillness tightened stands in their task."""
     path = _export(tmp_path / "first", learner=False)
-    state = load_checkpoint(path)
-    state["task"]["curriculum"] = to_dict(
-        CurriculumCfg(tightening=TighteningCfg(enabled=tightened))
-    )
-    save_checkpoint(path, state)
+    curriculum = CurriculumCfg(tightening=TighteningCfg(enabled=tightened))
+    _changed(path, task={"hand": "dummy", "curriculum": to_dict(curriculum)})
     env = DummyEnv(num_envs=16)
     env.cfg = replace(
         env.cfg, curriculum=CurriculumCfg(enabled=True, tightening=TighteningCfg(enabled=True))
@@ -137,6 +141,16 @@ def test_a_policy_that_does_not_say_how_far_it_came_has_come_to_the_end(
     assert (env.stage.difficulty, env.stage.tightness) == wanted
     with pytest.raises(ValueError, match=r"--init-stage is 1\.5 0"):
         runner.begin_from(str(path), (1.5, 0.0))
+
+
+class Seeing(DummyEnv):
+    """The dummy with two values more for its actor."""
+
+    num_observations = 7
+
+    def _observe(self) -> None:
+        more = np.ones((self.num_envs, 2), dtype=np.float32)
+        self.observation.assign(np.hstack([self._target, np.abs(self._target), more, more[:, :1]]))
 
 
 def test_what_does_not_fit_is_named_with_the_flag_that_would(tmp_path):
@@ -166,12 +180,11 @@ def test_what_does_not_fit_is_named_with_the_flag_that_would(tmp_path):
         ValueError, match="moves 2 joints of dummy, and this run's hand, dummy, has 3"
     ):
         runner.begin_from(str(path))
-    state = load_checkpoint(path)
-    state["policy"]["num_observations"] = 9
-    save_checkpoint(path, state)
+    make_runner(tmp_path / "more", env=Seeing(num_envs=16), policy=NORMALISING).learn(1)
+    path = tmp_path / "more" / "policy.safetensors"
     runner = make_runner(tmp_path / "less", policy=NORMALISING)
     with pytest.raises(
-        ValueError, match=r"reads 9 values and this run observes 5.*leave --preset out"
+        ValueError, match=r"reads 7 values and this run observes 5.*leave --preset out"
     ):
         runner.begin_from(str(path))
 
@@ -196,20 +209,22 @@ def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it
     )
     runner.begin_from(str(path))
     assert runner.new_inputs == 2 * critic and runner.num_observations == 5
-    observation, plain = runner.env.get_observations(), load_policy(path)
+    observation, plain = runner.env.get_observations(), read_policy(path)
     with torch.no_grad():
         actions, values = runner.alg.actor(observation), runner.alg.critic(observation)[:, 0]
     assert torch.allclose(actions, plain.act(observation["policy"]), atol=1e-6)
     if critic:
-        weights = load_checkpoint(path)["critic_state_dict"]
-        before = MeanAction(replace(plain.spec, num_actions=1, distribution="gaussian"), weights)
+        weights = read_policy(path).critic
+        before = MeanAction(
+            replace(plain.contract.network, num_actions=1, distribution="gaussian"), weights
+        )
         assert torch.allclose(values, before(observation["policy"])[:, 0], atol=1e-5)
     runner.critic_warmup = 0
     runner.learn(2)
     assert runner.alg.critic.state_dict()["mlp.0.weight"][:, 5:].abs().max() > 0.0, (
         "it was not told"
     )
-    ended = load_policy(tmp_path / "told" / "policy.pt")
+    ended = read_policy(tmp_path / "told" / "policy.safetensors")
     assert ended.act(observation["policy"]).shape == (16, 2)
     again = make_runner(
         tmp_path / "told", env=Telling(num_envs=16), policy=NORMALISING, ppo=LEARNED
@@ -224,7 +239,7 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert find_start("dclaw3") == SHIPPED_POLICIES["dclaw3"]
     make_runner(tmp_path).learn(1)
     assert find_start(str(tmp_path)) == tmp_path / "checkpoints" / BEST_NAME, "it has the optimiser"
-    assert find_start(str(tmp_path / "policy.pt")) == tmp_path / "policy.pt"
+    assert find_start(str(tmp_path / "policy.safetensors")) == tmp_path / "policy.safetensors"
     with pytest.raises(
         FileNotFoundError, match=r"--init: no policy at .*installed policy: .*dclaw3"
     ):
@@ -242,7 +257,7 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert main(["teacher", *start, "--out", str(tmp_path / "run")]) == 1
     assert "--init: no policy at" in capsys.readouterr().err
     assert main(["teacher", "--init", "dclaw3-tracking", "--out", str(tmp_path / "run")]) == 1
-    assert "holds no actor; give --init" in capsys.readouterr().err
+    assert "sees by camera; give its teacher, dclaw3" in capsys.readouterr().err
     assert main(["teacher", "--init-stage", "1", "0", "--out", str(tmp_path / "run")]) == 1
     assert "--init-stage says where a run with --init begins" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
@@ -252,26 +267,22 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
 def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
     drawn = ["--env.randomisation.effects", "dead_zone.width_rad", "0", "0.1"]
     cfg = parse_teacher(["--init", name, "--objects", "cube", "--num-envs", "8", *drawn])
-    state = load_checkpoint(SHIPPED_POLICIES[name])
+    network = read_contract(SHIPPED_POLICIES[name]).network
     assert cfg.env.objects == ("cube",) and cfg.env.num_envs == 8
-    trained = ReorientCfg.of(load_policy(SHIPPED_POLICIES[name]))
+    trained = ReorientCfg.of(read_policy(SHIPPED_POLICIES[name]))
     drawn = replace(trained.randomisation, effects={"dead_zone.width_rad": (0, 0.1)})
     trained = replace(trained, randomisation=drawn)
     assert replace(cfg.env, objects=trained.objects, num_envs=trained.num_envs) == trained
     for field in ("hidden", "distribution", "normalise_observations"):
-        wanted = state["policy"][field]
-        assert getattr(cfg.policy, field) == (tuple(wanted) if isinstance(wanted, list) else wanted)
+        assert getattr(cfg.policy, field) == getattr(network, field)
     assert parse_teacher(["--init", name, "--preset", "gpu"]).env == PRESETS["gpu"]().env
 
 
 def test_without_a_preset_the_learner_is_the_policys_if_it_says(tmp_path):
-    path = _export(tmp_path / "first")
-    state = load_checkpoint(path)
-    state["task"] = to_dict(PRESETS["gpu"]().env)
-    save_checkpoint(path, state)
+    path, task = _export(tmp_path / "first"), to_dict(PRESETS["gpu"]().env)
+    _changed(path, task=task)
     cfg = parse_teacher(["--init", str(path)])
     assert cfg.ppo == LEARNED and cfg.policy == NORMALISING and cfg.env == PRESETS["gpu"]().env
-    state["task"]["wind"] = 3.0
-    save_checkpoint(path, state)
-    with pytest.raises(ValueError, match=r"task has no field wind.*add --preset"):
+    _changed(path, learner={"ppo": {"wind": 3.0}, "policy": {}})
+    with pytest.raises(ValueError, match=r"learner.ppo has no field wind.*add --preset"):
         parse_teacher(["--init", str(path)])

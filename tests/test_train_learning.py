@@ -183,15 +183,15 @@ def test_policy_equals_the_actor_it_came_from(tmp_path, distribution, normalise)
     )
     runner = make_runner(tmp_path, policy=policy)
     runner.learn(3)
-    from vd.policy import load_policy
+    from vd.bundle.store import read_policy
 
     observation = runner.env.get_observations()
     wanted = runner.alg.get_policy()(observation)
-    for file in (tmp_path / "checkpoints" / "model_0000003.pt", tmp_path / "policy.pt"):
-        loaded = load_policy(file)
+    for file in (tmp_path / "checkpoints" / "model_0000003.pt", tmp_path / "policy.safetensors"):
+        loaded = read_policy(file)
         assert isinstance(loaded, TrainedPolicy)
         assert torch.allclose(loaded.act(observation["policy"]), wanted, atol=1e-6)
-        assert loaded.hand == "dummy" and loaded.iteration == 3
+        assert loaded.hand == "dummy" and loaded.contract.iterations == 3
 
 
 def _after_a_rollout(runner):

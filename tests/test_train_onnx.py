@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from vd.bundle.store import read_policy
 from vd.evaluate.agents import SHIPPED_POLICIES, open_policy
 from vd.onnx_policy import read_onnx
-from vd.policy import load_policy
 from vd.train.cli import main
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="pip install 'visual-dexterity[export]'")
@@ -16,7 +16,7 @@ onnxruntime = pytest.importorskip("onnxruntime", reason="pip install 'visual-dex
 def test_onnxruntime_gives_the_same_actions_for_any_number_of_worlds(tmp_path, name, capsys):
     assert main(["export", str(SHIPPED_POLICIES[name]), str(tmp_path / "policy.onnx")]) == 0
     assert "gives the same within" in capsys.readouterr().out
-    policy = load_policy(SHIPPED_POLICIES[name])
+    policy = read_policy(SHIPPED_POLICIES[name])
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
     for envs in (1, 7):
         # observations of the size they have, not of size 1
@@ -52,3 +52,18 @@ def test_a_file_with_other_actions_is_not_written(tmp_path, monkeypatch):
     path = tmp_path / "policy.onnx"
     assert main(["export", str(SHIPPED_POLICIES["dclaw4-cube"]), str(path)]) == 1
     assert not path.exists()
+
+
+def test_an_onnx_file_has_the_contract_of_its_policy_and_its_seal(tmp_path):
+    path, policy = tmp_path / "policy.onnx", open_policy("dclaw3-tracking", "cpu")
+    assert main(["export", "dclaw3-tracking", str(path)]) == 0
+    assert read_onnx(path).contract == policy.contract
+    whole = path.read_bytes()
+    for place in np.linspace(0, len(whole) - 1, 40).astype(int):
+        data = bytearray(whole)
+        data[place] ^= 1
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=r"policy\.onnx is damaged"):
+            read_onnx(path)
+    with pytest.raises(FileNotFoundError, match=r"there is no policy .*none\.onnx"):
+        read_onnx(tmp_path / "none.onnx")

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from vd.bundle.store import read_policy
 from vd.envs.cfg import ReorientCfg
-from vd.policy import load_policy
 from vd.sim.cfg import SimCfg, coarser
 from vd.train.checkpoint import checkpoint_path
 from vd.train.metrics import PROGRESS_FILE, read_progress
@@ -42,7 +42,7 @@ def test_a_run_goes_on_bit_for_bit_and_another_sees_more_from_there(tmp_path):
     """It learns in coarser physics; what it learned is judged in the default."""
     whole = _train(tmp_path / "whole", 4)
     assert whole.env.env.cfg.sim == coarser(SimCfg()) != SimCfg()
-    assert ReorientCfg.of(load_policy(tmp_path / "whole" / "policy.pt")).sim == SimCfg()
+    assert ReorientCfg.of(read_policy(tmp_path / "whole" / "policy.safetensors")).sim == SimCfg()
     resumed = _train(tmp_path / "part", 2, resume=str(checkpoint_path(tmp_path / "whole", 2)))
     for one, two in ((whole.alg.actor, resumed.alg.actor), (whole.alg.critic, resumed.alg.critic)):
         weights, again = one.state_dict(), two.state_dict()
@@ -57,7 +57,7 @@ def test_a_run_goes_on_bit_for_bit_and_another_sees_more_from_there(tmp_path):
     assert rows[0][2:] == rows[1]
     assert rows[1][-1]["task/difficulty"] > 0.0
 
-    blind = load_policy(checkpoint_path(tmp_path / "part", 4))
+    blind = read_policy(checkpoint_path(tmp_path / "part", 4))
     seen = replace(smoke().env.observation, shape="full", dynamics="critic")
     seeing = _train(
         tmp_path / "seeing", 0, init=str(checkpoint_path(tmp_path / "part", 4)), observation=seen
@@ -70,6 +70,9 @@ def test_a_run_goes_on_bit_for_bit_and_another_sees_more_from_there(tmp_path):
         acted = seeing.alg.actor(observation)
     assert torch.allclose(acted, blind.act(observation["policy"][:, :before]), atol=1e-5)
     seeing.learn(1)
-    policy = load_policy(tmp_path / "seeing" / "policy.pt")
-    assert policy.task["observation"]["shape"] == "full" and policy.trained_hand["name"] == "dclaw3"
+    policy = read_policy(tmp_path / "seeing" / "policy.safetensors")
+    assert (
+        policy.task["observation"]["shape"] == "full"
+        and policy.contract.interface["hand"]["name"] == "dclaw3"
+    )
     assert torch.isfinite(policy.act(seeing.env.get_observations()["policy"])).all()

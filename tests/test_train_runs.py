@@ -11,8 +11,8 @@ import pytest
 import torch
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
+from vd.bundle.store import read_policy
 from vd.envs.curriculum import Stage
-from vd.policy import load_policy
 from vd.train.checkpoint import find_checkpoint, list_checkpoints, load_checkpoint
 from vd.train.loop import Interrupted, TrainingDivergedError
 from vd.train.metrics import GoalWindow, read_progress
@@ -73,8 +73,8 @@ def test_keeps_the_last_and_the_best_since_two_episodes_are_over(tmp_path):
         for row in _rows(tmp_path)
     ]
     assert best["iter"] == 2 + scores[1:].index(max(scores[1:]))
-    policy = load_policy(tmp_path / "policy.pt")
-    assert policy.iteration == best["iter"]
+    policy = read_policy(tmp_path / "policy.safetensors")
+    assert policy.contract.iterations == best["iter"]
     with pytest.raises(ValueError, match=r"trained on observations \[N, 5\]"):
         policy.act(torch.zeros(3, 6))
     with pytest.raises(FileExistsError, match="add --resume"):
@@ -248,7 +248,7 @@ def test_a_new_run_can_begin_from_anothers_checkpoint_at_its_own_rates(tmp_path)
     second.learn(1)
     assert [row["iteration"] for row in _rows(tmp_path / "second")] == [4]
     with pytest.raises(ValueError, match="is a policy, which nothing can resume; --init"):
-        second.load(str(tmp_path / "first" / "policy.pt"))
+        second.load(str(tmp_path / "first" / "policy.safetensors"))
     second.load(str(checkpoint))
     assert second.alg.learning_rate == first.alg.learning_rate, (
         "a resumed run goes on with those it had"

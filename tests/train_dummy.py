@@ -9,7 +9,6 @@ import warp as wp
 
 from vd.envs.cfg import CurriculumCfg
 from vd.envs.curriculum import Stage
-from vd.paper import PAPER
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 from vd.train.runner import TeacherRunner
 from vd.train.vec_env import ReorientVecEnv
@@ -194,7 +193,7 @@ def make_runner(
     torch.manual_seed(seed)
     env = env or DummyEnv(num_envs=16, seed=seed, device=device)
     settings = RunCfg(out=run_dir, device=device, **{"save_every": 3, "logger": "none", **run})
-    task = {"hand": "dummy", "tolerance": PAPER.success.rotation_rad}
+    task = {"hand": "dummy"}
     return TeacherRunner(
         ReorientVecEnv(env), ppo, policy, settings, task=task, device=device, deadline=deadline
     )

@@ -10,10 +10,10 @@ import tyro
 
 from vd.command_line import parse
 from vd.config import require
-from vd.evaluate.agents import NO_LAYER, check_names
+from vd.evaluate.agents import NO_LAYER, check_names, policy_at
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.conditions import EXACT
-from vd.train.begin import find_start, settings_of
+from vd.train.begin import find_start, read_start, settings_of
 from vd.train.flags import saved_config
 from vd.train.presets import PRESETS, TeacherCfg
 from vd.train.teacher import say_of_main, train
@@ -50,7 +50,7 @@ class AdaptCfg:
     """
 
     policy: Annotated[str, tyro.conf.Positional]
-    """The teacher: an installed policy, a policy.pt, a checkpoint, or a run's folder."""
+    """The teacher: an installed policy, a policy.safetensors, a checkpoint, or a run's folder."""
     hand_layer: Path = field()
     """The identified model: identified.usda, or identified-all-fingers.usda, of vd-gap."""
     out: Path = Path("runs/adapted")
@@ -108,7 +108,6 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
             f"--hand-layer {cfg.hand_layer} --preset ..."
         ) from error
     from vd.assets_usd.hands import load_hand
-    from vd.train.checkpoint import load_checkpoint
 
     load_hand(base.env.hand, base.env.fingertip, cfg.hand_layer)
     curriculum = base.env.curriculum
@@ -126,7 +125,7 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
         randomisation=EXACT,
     )
     check_names([], env.objects)
-    done = load_checkpoint(find_start(cfg.policy))["env_steps"]
+    done = read_start(find_start(cfg.policy))["env_steps"]
     how = replace(base.run, out=cfg.out, device=cfg.device, max_minutes=cfg.max_minutes)
     run = replace(
         base,
@@ -167,7 +166,7 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
     from vd.evaluate.result import SUCCESS, Result
 
     say("comparing the policy before and after, in the nominal and in the identified model ...")
-    before, after = cfg.policy, str(cfg.out)
+    before, after = cfg.policy, policy_at(cfg.out)
     evaluation = EvalCfg(
         policies=(before, after),
         objects=run.env.objects,

@@ -13,7 +13,7 @@ from vd.config import from_dict, leaves, to_dict
 if TYPE_CHECKING:
     from torch import nn
 
-    from vd.policy import PolicySpec
+    from vd.bundle.contract import PolicySpec
     from vd.train.presets import TeacherCfg
 
 CRITIC_WARMUP = 50
@@ -33,6 +33,18 @@ NEW_INPUTS = {
     "obs_normalizer._std": 1.0,
 }
 """What reads or normalises the inputs, and what it has for new ones."""
+_OF_POLICY = {
+    "policy",
+    "task",
+    "interface",
+    "learner",
+    "stage",
+    "iter",
+    "env_steps",
+    "actor_state_dict",
+    "critic_state_dict",
+}
+"""What a policy has of a checkpoint."""
 _SENSES = ("hand", "fingertip", "hand_layer", "sim", "action", "observation")
 """Parts of a task that say what a policy's observations and actions mean."""
 
@@ -44,24 +56,49 @@ def find_start(name: str) -> Path:
 
     Raises:
         FileNotFoundError: There is none.
-        ValueError: It is a bundle.
     """
-    from vd.bundle import is_bundle
-    from vd.evaluate.agents import find_policy, installed_policies
+    from vd.evaluate.agents import find_policy
     from vd.train.checkpoint import BEST_NAME, CHECKPOINT_FOLDER
 
-    best = Path(name) / CHECKPOINT_FOLDER / BEST_NAME
-    if name not in installed_policies() and best.is_file():
-        return best
     try:
         path = find_policy(name)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"--init: {error}") from error
-    if is_bundle(path):
-        raise ValueError(
-            f"--init: {name} is a bundle; give the policy or checkpoint that it was made from"
-        )
-    return path
+    best = Path(name) / CHECKPOINT_FOLDER / BEST_NAME
+    return best if path.is_relative_to(name) and best.is_file() else path
+
+
+def read_start(path: Path, device: str = "cpu") -> dict[str, Any]:
+    """What a run begins from: a checkpoint, or a policy as one without its optimiser.
+
+    Beside what a checkpoint has, ``stage`` says how far its curriculum had come.
+
+    Raises:
+        ValueError: The file is damaged, no teacher, or of another version.
+    """
+    from vd.bundle import SUFFIX, has_suffix
+    from vd.bundle.store import read_policy
+    from vd.policy import TrainedPolicy, stage_of
+    from vd.train.checkpoint import load_checkpoint
+
+    if not has_suffix(path, SUFFIX):
+        state = load_checkpoint(path, device, flag="--init")
+        return state | {"stage": stage_of(state)}
+    policy = read_policy(path, device)
+    if not isinstance(policy, TrainedPolicy):
+        raise ValueError(f"--init: {path} sees by camera; give its teacher, {policy.spec.teacher}")
+    contract = policy.contract
+    state = {
+        "policy": to_dict(contract.network),
+        "task": contract.task,
+        "interface": contract.interface,
+        "learner": contract.learner,
+        "stage": contract.stage,
+        "iter": contract.iterations,
+        "env_steps": contract.env_steps,
+        "actor_state_dict": policy.weights,
+    }
+    return state | ({"critic_state_dict": policy.critic} if policy.critic else {})
 
 
 def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
@@ -72,22 +109,17 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
         ValueError: It is no teacher, or its settings are not of this version.
     """
     from vd.envs.cfg import ReorientCfg
-    from vd.train.checkpoint import load_checkpoint
     from vd.train.config import PolicyCfg, PpoCfg
 
     path = find_start(name)
-    state = load_checkpoint(path, flag="--init")
-    if "learner" not in state:
+    state = read_start(path)
+    if not state["learner"]:
         raise ValueError(f"--init: {path} does not say how it was trained; add --preset")
     try:
         env = from_dict(ReorientCfg, state["task"], where="task")
-        learner, how = (
-            state["learner"],
-            {"critic_warmup_iterations": None, "imitation_iterations": 0},
-        )
-        ppo = from_dict(
-            PpoCfg, learner["ppo"] | how, where="learner.ppo"
-        )  # how it began is its own
+        learner = state["learner"]
+        ppo = from_dict(PpoCfg, learner["ppo"], where="learner.ppo")
+        ppo = replace(ppo, imitation_iterations=0)  # how it began is its own
         policy = from_dict(PolicyCfg, learner["policy"], where="learner.policy")
     except ValueError as error:
         raise ValueError(
@@ -127,8 +159,6 @@ def widen(
     """
     from torch.nn.functional import pad
 
-    from vd.policy import policy_export
-
     widened, most = {}, 0
     before, now = (
         w["mlp.0.weight"].shape[1] for w in (state["actor_state_dict"], actor.state_dict())
@@ -147,8 +177,10 @@ def widen(
             weights[name] = pad(weights[name], (0, extra), value=NEW_INPUTS[name])
             most = max(most, extra)
         widened[key] = weights
-    kept = policy_export(state) if most else state
-    return kept | {key: weights for key, weights in widened.items() if key in kept}, most
+    if most:
+        warming = {"critic_state_dict"} if state.get("critic_warmup", 0) else set()
+        state = {key: state[key] for key in state.keys() & _OF_POLICY - warming}
+    return state | {key: weights for key, weights in widened.items() if key in state}, most
 
 
 def completed(
@@ -179,9 +211,8 @@ def completed(
         state = state | {"critic_state_dict": critic | (normaliser if len(normaliser) == 4 else {})}
     if "optimizer_state_dict" not in state:
         tightening = state["task"].get("curriculum", {}).get("tightening", {}).get("enabled", False)
-        reached = state.get(
-            "stage", {"difficulty": 1.0, "tightness": 1.0, "tightening": tightening}
-        )
+        ended = {"difficulty": 1.0, "tightness": 1.0, "tightening": tightening}
+        reached = state["stage"] or ended
         state = state | {
             "optimizer_state_dict": own["optimizer_state_dict"],
             "elapsed_s": 0.0,
@@ -211,8 +242,8 @@ def check_fit(
         ValueError: Another hand, an actor of another shape, or one that observes what is no more;
             with the remedy.
     """
+    from vd.bundle.contract import PolicySpec
     from vd.envs.cfg import ObservationCfg
-    from vd.policy import PolicySpec
 
     found = from_dict(PolicySpec, state["policy"], where="policy")
     hand, here = state["task"].get("hand"), task.get("hand")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from vd.bundle import SUFFIX, has_suffix
 from vd.files import atomic_path
 from vd.policy import read_state
 
@@ -127,6 +128,10 @@ def load_checkpoint(
     Raises:
         ValueError: The file is damaged or not a checkpoint.
     """
+    if has_suffix(path, SUFFIX):
+        raise ValueError(
+            f"{path} is a policy, which nothing can resume; --init begins a new run from it"
+        )
     state = read_state(path, device, remedy=f"give {flag} another file of its folder")
     if not {f"{network}_state_dict", *_NEEDED[network]} <= state.keys():
         command = "teacher" if network == "actor" else network

@@ -15,10 +15,9 @@ commands:
   adapt      go on in an identified model         vd-train adapt dclaw3 --hand-layer identified.usda
   student    learn to see without a mesh          vd-train student --teacher dclaw3 --objects SET
   tracker    let it act by a camera, learn nothing vd-train tracker dclaw3 --objects SET
-  export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
+  export     write a policy for others            vd-train export runs/first policy.safetensors
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
-             or any policy's networks as ONNX     vd-train export POLICY policy.onnx
-  bundle     write a policy as it is deployed     vd-train bundle tracking.pt bundles/first
+             or its networks as ONNX              vd-train export POLICY policy.onnx
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset gpu
 Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
@@ -32,26 +31,12 @@ small.pt
 
 vd-train COMMAND --help lists the flags of a command."""
 
-_TRACKER = "vd-train tracker TEACHER --objects SET writes a tracking policy and its stopping rules"
-GONE = {
-    "calibrate": _TRACKER,
-    "follow": _TRACKER,
-    "noise": "no training needed it",
-    "profile": "no training needed it",
-    "average": "it gained too little (docs/lessons.md)",
-    "curves": "tensorboard --logdir RUN draws the curves of runs",
-    "precompile": "kernels stay in the folder that WARP_CACHE_PATH names, from one start to the next",
-}
-"""Commands that are no more, and what to do, or why."""
-
-
 COMMANDS = {
     "teacher": ("vd.train.teacher", "teacher_command"),
     "adapt": ("vd.train.adapt", "adapt_command"),
     "student": ("vd.train.student.cli", "student_command"),
     "tracker": ("vd.train.tracker", "tracker_command"),
     "export": ("vd.train.export", "export_command"),
-    "bundle": ("vd.train.export", "bundle_command"),
 }
 """Module and function of each command: it takes its flags and ``time.monotonic()`` of the start,
 and returns the exit status."""
@@ -71,11 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0 if arguments else interrupt.USAGE_ERROR
     name = arguments.pop(0)
     if name not in COMMANDS:
-        known = f"no command '{name}'; one of {', '.join(COMMANDS)}\n\n{USAGE}"
-        print(
-            f"vd-train: {f'{name!r} is no more; {GONE[name]}' if name in GONE else known}",
-            file=sys.stderr,
-        )
+        known = ", ".join(COMMANDS)
+        print(f"vd-train: no command '{name}'; one of {known}\n\n{USAGE}", file=sys.stderr)
         return interrupt.USAGE_ERROR
     module, function = COMMANDS[name]
     if name in ("teacher", "adapt", "student") and not {"-h", "--help"} & set(arguments):

@@ -8,9 +8,9 @@ import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
-from vd.config import Dropped, Renamed, require
+from vd.config import require
 from vd.paper import PAPER
 
 
@@ -18,11 +18,6 @@ from vd.paper import PAPER
 class PpoCfg:
     """Proximal policy optimisation, with Adam as in the paper."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "optimizer": "adam",
-        "critic_warmup_iterations": Dropped(None),
-        "imitation_learning_rate": Dropped(1e-3),
-    }
     rollout_steps: int = PAPER.teacher.rollout_steps
     """Control steps of every environment between two updates."""
     minibatch_size: int = PAPER.teacher.minibatch_size
@@ -69,7 +64,6 @@ class PpoCfg:
 class PolicyCfg:
     """Networks of actor and critic."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"activation": "elu"}
     hidden: tuple[int, ...] = PAPER.teacher.hidden
     """Width of the hidden layers, the same for actor and critic."""
     distribution: Literal["gaussian", "state-dependent"] = "gaussian"
@@ -91,13 +85,6 @@ class PolicyCfg:
 class RunCfg:
     """Where, how long and how reproducibly."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "run_dir": Renamed("out"),
-        "keep_last": 3,
-        "keep_every": Dropped(None),
-        "stagger": True,
-        "tensorboard": Renamed("logger", {True: "tensorboard", False: "none"}),
-    }
     out: Path = Path("runs/teacher")
     """Folder for configuration, checkpoints and TensorBoard files."""
     device: str = "auto"

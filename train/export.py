@@ -1,7 +1,4 @@
-"""``vd-train export`` and ``vd-train bundle``.
-
-Policies without their training, for others to use.
-"""
+"""``vd-train export``: policies without their training, for others to use."""
 
 import logging
 import timeit
@@ -17,14 +14,15 @@ import numpy as np
 import tyro
 
 from vd import interrupt
+from vd.bundle import ONNX_SUFFIX, SUFFIX, check_suffix, has_suffix
 from vd.command_line import parse
-from vd.files import atomic_path, check_file, check_folder
-from vd.onnx_policy import ONNX
+from vd.files import atomic_path, check_file
 
 if TYPE_CHECKING:
     from torch import Tensor
     from torch.nn import Module
 
+    from vd.bundle.contract import Contract
     from vd.policy import TrainedPolicy
     from vd.tracking.policy import TrackingPolicy
 
@@ -40,15 +38,15 @@ TIMED = 50
 
 @dataclass
 class ExportCfg:
-    """Write the policy of a checkpoint without its training state, as ONNX, or a small checkpoint.
+    """Write a policy for others: as a file with its contract, or as ONNX.
 
-    A policy keeps its critic, so that --init can go on from it.
+    What is written names no folders of this machine. A policy keeps its critic, so that --init can
+    go on from it.
     """
 
-    checkpoint: Annotated[Path, tyro.conf.Positional]
-    """Checkpoint of vd-train teacher, its policy.pt, its run's folder, or a policy's name; for ONNX
-    by camera too."""
-    output: Annotated[Path, tyro.conf.Positional] = Path("policy.pt")
+    policy: Annotated[str, tyro.conf.Positional]
+    """Checkpoint of vd-train teacher, a policy.safetensors, a run's folder, or a policy's name."""
+    output: Annotated[Path, tyro.conf.Positional] = Path(f"policy{SUFFIX}")
     """File to write. A name that ends in .onnx gets the layers from observation to mean action, and
     NAME-alignment.onnx beside it the network of a vision policy. They are checked against
     onnxruntime where that is installed."""
@@ -57,61 +55,39 @@ class ExportCfg:
     moves to another machine or number of GPUs starts its episodes anew anyway."""
 
 
-@dataclass
-class BundleCfg:
-    """Write a policy as it is deployed.
-
-    Weights, a contract in JSON, golden inputs and outputs, in a folder.
-
-    vd-eval takes the folder in place of a policy, and refuses it for a hand that it was not made
-    for.
-    """
-
-    policy: Annotated[str, tyro.conf.Positional]
-    """policy.pt, tracking.pt, a checkpoint, a run's folder, or the name of an installed policy."""
-    output: Annotated[Path, tyro.conf.Positional]
-    """Folder to write; a bundle that is there is replaced."""
-
-
 def export_command(arguments: list[str], _started: float) -> int:
     """``vd-train export``; the exit status."""
     cfg: ExportCfg = parse(ExportCfg, arguments, prog="vd-train export")
+    check_suffix(cfg.output, *([".pt"] if cfg.resumable else [SUFFIX, ONNX_SUFFIX]))
     check_file(cfg.output)
-    if cfg.resumable and cfg.output.suffix == ONNX:
-        raise ValueError(
-            f"--resumable writes a checkpoint, which {cfg.output} is not; leave one of them out"
-        )
-    from vd.train.checkpoint import save_checkpoint
+    if cfg.resumable:
+        _export_checkpoint(Path(cfg.policy), cfg.output)
+        return 0
+    from vd.bundle.contract import without_folders
+    from vd.bundle.store import write_policy
+    from vd.evaluate.agents import find_policy, open_policy
 
-    if cfg.output.suffix == ONNX:
-        from vd.evaluate.agents import find_policy, open_policy
-
-        policy = open_policy(str(find_policy(cfg.checkpoint)), "cpu")
-        assert policy is not None  # a file was found
-        export_onnx(policy, cfg.output)
+    policy = open_policy(find_policy(cfg.policy), "cpu")
+    assert policy is not None  # a file was found
+    contract = without_folders(policy.contract)
+    if has_suffix(cfg.output, ONNX_SUFFIX):
+        export_onnx(policy, cfg.output, contract)
     else:
-        save_checkpoint(cfg.output, _exported(cfg))
-    print(cfg.output)
+        write_policy(policy, cfg.output, contract)
+    print(f"{cfg.output}: {contract.kind} for {policy.hand}, {policy.num_actions} motors")
     return 0
 
 
-def _exported(cfg: ExportCfg) -> dict[str, Any]:
-    """What the file gets."""
-    from vd.evaluate.agents import find_policy
-    from vd.policy import policy_export
-    from vd.train.checkpoint import load_checkpoint, without_worlds
+def _export_checkpoint(path: Path, output: Path) -> None:
+    """Write a checkpoint without what it simulates."""
+    from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
 
-    path = cfg.checkpoint if cfg.resumable else find_policy(cfg.checkpoint)
-    state = load_checkpoint(path, flag="vd-train export")
-    if cfg.resumable and "optimizer_state_dict" not in state:
-        raise ValueError(
-            f"{cfg.checkpoint} is a policy, not a checkpoint; nothing can go on from it"
-        )
-    return without_worlds(state) if cfg.resumable else policy_export(state)
+    save_checkpoint(output, without_worlds(load_checkpoint(path, flag="vd-train export")))
+    print(output)
 
 
-def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path) -> None:
-    """Write a policy's networks, and compare them with onnxruntime if that is installed.
+def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path, contract: "Contract") -> None:
+    """Write a policy's networks with its contract, and compare them with onnxruntime if that is installed.
 
     The layers of a teacher, or of that of a camera policy, take ``observation`` [N, O], which they
     normalise, to the mean ``action`` [N, D]. The network of a vision policy goes to
@@ -134,7 +110,9 @@ def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path) -> None:
     drawn = torch.randn(
         CHECKED, teacher.num_observations, generator=torch.Generator().manual_seed(0)
     )
-    _export(teacher.network, {"observation": drawn}, ["action"], path, onnx_metadata(policy))
+    _export(
+        teacher.network, {"observation": drawn}, ["action"], path, onnx_metadata(policy, contract)
+    )
     if not isinstance(policy, TrainedPolicy) and policy.alignment is not None:
         _have_exported(Residual)
         clouds = CLOUD_M * torch.randn(
@@ -167,6 +145,8 @@ def _export(
     import onnx
     import torch
 
+    from vd.bundle.contract import SEAL_KEY, UNSEALED, sealed
+
     network = network.eval().requires_grad_(False)
     number = torch.export.Dim("environments")
     shapes = tuple(
@@ -191,8 +171,8 @@ def _export(
             verbose=False,
         )
         model = onnx.load(temporary)
-        onnx.helper.set_model_props(model, metadata or {})
-        onnx.save(model, temporary)
+        onnx.helper.set_model_props(model, (metadata or {}) | {SEAL_KEY: UNSEALED.decode()})
+        temporary.write_bytes(sealed(model.SerializeToString()))
         if find_spec("onnxruntime") is None:
             print(
                 f"{path}: onnxruntime is not installed: not checked "
@@ -238,19 +218,3 @@ def _compared(
 def _ms(call: Callable[[], object]) -> float:
     """Time of a call [ms], the shortest of some."""
     return 1e3 * min(timeit.repeat(call, number=1, repeat=TIMED))
-
-
-def bundle_command(arguments: list[str], _started: float) -> int:
-    """``vd-train bundle``; the exit status."""
-    cfg: BundleCfg = parse(BundleCfg, arguments, prog="vd-train bundle")
-    check_folder(cfg.output.parent)
-
-    from vd.bundle.store import write_bundle
-    from vd.evaluate.agents import find_policy, open_policy
-
-    policy = open_policy(str(find_policy(cfg.policy)), "cpu")
-    assert policy is not None  # a file was found
-    contract = write_bundle(policy, cfg.output)
-    hand = contract.interface["hand"]
-    print(f"{cfg.output}: {contract.kind} for {hand['name']}, {len(hand['joint_names'])} joints")
-    return 0

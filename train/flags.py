@@ -15,7 +15,7 @@ from vd.device import resolve_device
 from vd.evaluate.agents import check_names
 from vd.files import write_json
 from vd.train.begin import settings_of
-from vd.train.presets import GONE, PRESETS, TeacherCfg, for_hand, smoke
+from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
 
 if TYPE_CHECKING:
     from vd.train.student.config import StudentTrainCfg
@@ -77,15 +77,14 @@ def parse_teacher(
         ValueError: There is no such preset, the run's configuration is not one of this version, or
             ``--init`` is no teacher.
     """
-    arguments, file = starting(normalise(arguments, SHORT_FORMS), GONE)
+    arguments, file = starting(normalise(arguments, SHORT_FORMS))
     preset, init, resume = (
         value_of(arguments, flag) for flag in ("--preset", "--init", "--resume")
     )
     out = value_of(arguments, "--out")
     saved = resume is not None and out is not None and (Path(out) / CONFIG_NAME).is_file()
     if preset is not None and preset not in PRESETS:
-        instead = GONE.get(preset, f"one of {', '.join(PRESETS)}")
-        raise ValueError(f"--preset {preset} is none; {instead}")
+        raise ValueError(f"--preset {preset} is none; one of {', '.join(PRESETS)}")
     reason = ""
     if "--smoke" in arguments:
         start = smoke(PRESETS[preset or "cpu-demo"]())
@@ -107,12 +106,8 @@ def parse_teacher(
     return cfg
 
 
-def starting(
-    arguments: list[str], gone: Collection[str] = ()
-) -> tuple[list[str], ConfigFile | None]:
+def starting(arguments: list[str]) -> tuple[list[str], ConfigFile | None]:
     """A command line with what a ``--config`` says of where to start from before it, and that file.
-
-    A file of a preset that is ``gone`` was written by an earlier version, and has all settings.
 
     Raises:
         ValueError: The file and ``--preset`` name two presets.
@@ -126,8 +121,6 @@ def starting(
         raise ValueError(
             f"--preset {asked}: the settings of {file.path} are those of {own}; name one of the two"
         )
-    if own in gone:
-        words[:2] = ["--preset", "gpu"]
     return words + arguments, file
 
 

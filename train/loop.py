@@ -16,6 +16,7 @@ import torch
 from torch import nn
 
 from vd import interrupt
+from vd.policy import CHECKPOINT_FORMAT
 from vd.train.checkpoint import (
     CHECKPOINT_FOLDER,
     checkpoint_path,
@@ -264,7 +265,7 @@ class TrainingLoop:
             "env_steps": self.env_steps,
             "elapsed_s": self._elapsed_s,
         }
-        return self._shared_state() | counters | {"ranks": ranks}
+        return {"format": CHECKPOINT_FORMAT} | self._shared_state() | counters | {"ranks": ranks}
 
     def _restore(self, state: dict[str, Any]) -> None:
         """Take over counters, environments and random state, all but the first only if they fit this run."""

@@ -4,11 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import tyro
 
-from vd.config import Dropped
 from vd.envs.cfg import (
     CurriculumCfg,
     GoalCfg,
@@ -32,7 +31,6 @@ TRAINING_SET = ("procedural-150-seed0",)
 class TeacherCfg:
     """Train the teacher: PPO on the simulator's state."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None, "second_view": Dropped(False)}
     preset: Annotated[
         str, tyro.conf.arg(metavar="{paper,gpu,cpu-demo,leap-cube,leap-objects,allegro-cube}")
     ] = "paper"
@@ -241,13 +239,6 @@ PRESETS: dict[str, Callable[[], TeacherCfg]] = {
     "allegro-cube": partial(in_palm, "allegro-cube", "allegro"),
 }
 """Presets by name."""
-
-GONE = {
-    "multi-gpu": "gpu is the same, under torchrun too",
-    "cube": "give --preset gpu --objects cube",
-}
-"""Presets of earlier versions, and what to take; their runs go on by their own configuration."""
-
 
 SMOKE_RUN = Path("runs/smoke")
 """Where no other folder is named, nothing is left of a smoke test."""

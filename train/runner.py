@@ -11,10 +11,13 @@ from typing import Any
 import torch
 from torch import nn
 
+from vd.bundle import SUFFIX
+from vd.bundle.contract import PolicySpec
+from vd.bundle.store import write_policy
 from vd.config import to_dict
 from vd.envs.curriculum import blend
-from vd.policy import PolicySpec, policy_export
-from vd.train.begin import check_fit, completed, unlike, warmup_iterations, widen
+from vd.policy import teacher_in
+from vd.train.begin import check_fit, completed, read_start, unlike, warmup_iterations, widen
 from vd.train.checkpoint import (
     BEST_NAME,
     load_checkpoint,
@@ -28,7 +31,7 @@ from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.ppo import make_learner
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 
-POLICY_NAME = "policy.pt"
+POLICY_NAME = f"policy{SUFFIX}"
 """The best policy so far, in the run's folder: what vd-eval, vd-play and deployment read."""
 LOWER_RATES = "lower --ppo.actor-learning-rate, --ppo.critic-learning-rate or --ppo.grad-norm"
 """Remedy for networks that diverge."""
@@ -37,8 +40,8 @@ LOWER_RATES = "lower --ppo.actor-learning-rate, --ppo.critic-learning-rate or --
 class TeacherRunner(TrainingLoop):
     """Trains the teacher with rsl-rl's PPO.
 
-    ``task`` is the configuration of the environment, kept with every policy, as is ``trained_hand``
-    (:func:`vd.bundle.contract.trained_hand`); others as of TrainingLoop.
+    ``task`` is the configuration of the environment, kept with every policy, as is ``interface``
+    (:func:`vd.bundle.contract.derive_interface`); others as of TrainingLoop.
 
     Attributes:
         new_inputs: Observed values that the networks of the policy that it began from did not read.
@@ -59,12 +62,12 @@ class TeacherRunner(TrainingLoop):
         run: RunCfg,
         *,
         task: dict[str, Any],
-        trained_hand: dict[str, Any] | None = None,
+        interface: dict[str, Any] | None = None,
         device: str,
         deadline: float | None = None,
     ) -> None:
         super().__init__(run, device=device, deadline=deadline, env=env)
-        self.ppo, self.policy_cfg, self.task, self.trained_hand = ppo, policy, task, trained_hand
+        self.ppo, self.policy_cfg, self.task, self.interface = ppo, policy, task, interface or {}
         self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
         self._means, self._window = StepMeans(), self._new_window()
@@ -93,12 +96,7 @@ class TeacherRunner(TrainingLoop):
         Raises:
             ValueError: The file is damaged, a policy only, or of another network.
         """
-        state = load_checkpoint(Path(path), self.device)
-        if "optimizer_state_dict" not in state:
-            raise ValueError(
-                f"{path} is a policy, which nothing can resume; --init begins a new run from it"
-            )
-        self._take(state, path)
+        self._take(load_checkpoint(Path(path), self.device), path)
 
     def begin_from(self, path: str | Path, stage: tuple[float, float] | None = None) -> None:
         """Begin with networks, optimiser, curriculum and counters of another run's checkpoint or policy.
@@ -111,7 +109,7 @@ class TeacherRunner(TrainingLoop):
         Raises:
             ValueError: The file is damaged, of another hand or of another network.
         """
-        found = load_checkpoint(Path(path), self.device, flag="--init")
+        found = read_start(Path(path), self.device)
         check_fit(found, self._spec(), self.task, path)
         present, read = self.env.env.num_present, found["policy"]["num_observations"]
         if self.ppo.imitation_iterations and present != read:
@@ -152,7 +150,7 @@ class TeacherRunner(TrainingLoop):
         if self._better:
             save_checkpoint(path.with_name(BEST_NAME), state)
         if self._better or not (self.run.out / POLICY_NAME).exists():
-            save_checkpoint(self.run.out / POLICY_NAME, policy_export(state))
+            write_policy(teacher_in(state, path, self.device), self.run.out / POLICY_NAME)
 
     def _samples(self) -> int:
         return self.ppo.rollout_steps * self.env.num_envs
@@ -260,7 +258,7 @@ class TeacherRunner(TrainingLoop):
             "policy": to_dict(self._spec()),
             "learner": {"ppo": to_dict(self.ppo), "policy": to_dict(self.policy_cfg)},
             "task": self.task,
-            "trained_hand": self.trained_hand,
+            "interface": self.interface,
         }
         if self.imitation is not None and self.critic_warmup:
             state[IMITATED] = self.imitation.teacher.state_dict()

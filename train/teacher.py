@@ -12,7 +12,7 @@ from vd import interrupt
 from vd.config import to_dict
 from vd.device import resolve_device
 from vd.files import check_folder
-from vd.train.begin import find_start
+from vd.train.begin import find_start, read_start
 from vd.train.config import validate
 from vd.train.flags import parse_teacher, write_config
 from vd.train.presets import SMOKE_RUN, TeacherCfg
@@ -38,7 +38,7 @@ def build_teacher(
         FileExistsError: The run folder holds another run and ``resume`` is not set.
         FileNotFoundError: There is nothing to resume or to begin from.
     """
-    from vd.train.checkpoint import find_checkpoint, load_checkpoint
+    from vd.train.checkpoint import find_checkpoint
 
     validate(cfg.ppo, cfg.policy, cfg.run)
     check_folder(cfg.run.out)
@@ -46,7 +46,7 @@ def build_teacher(
     checkpoint = find_checkpoint(cfg.run.out, cfg.resume)
     init = find_start(cfg.init) if checkpoint is None and cfg.init is not None else None
     if init is not None:
-        load_checkpoint(init, flag="--init")  # a damaged one is refused before anything is built
+        read_start(init)  # a damaged one is refused before anything is built
     if cfg.init is None and cfg.init_stage is not None:
         raise ValueError(
             "--init-stage says where a run with --init begins; leave it out, or give --init"
@@ -67,7 +67,7 @@ def build_teacher(
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
     from vd.assets_usd.hands import load_hand
-    from vd.bundle.contract import trained_hand
+    from vd.bundle.contract import derive_interface
     from vd.envs.reorient import ReorientEnv
     from vd.sim.cfg import coarser
     from vd.train.runner import TeacherRunner
@@ -85,7 +85,7 @@ def build_teacher(
         cfg.policy,
         cfg.run,
         task=to_dict(cfg.env),
-        trained_hand=trained_hand(load_hand(cfg.env.hand, cfg.env.fingertip)),
+        interface=derive_interface(cfg.env, load_hand(cfg.env.hand, cfg.env.fingertip)),
         device=device,
         deadline=cfg.run.deadline(started),
     )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vd.bundle import SUFFIX, check_suffix, has_suffix
 from vd.command_line import parse
 from vd.evaluate.cfg import EpisodeFlags, EvalCfg
 from vd.evaluate.goals import Goals
@@ -19,6 +20,7 @@ from vd.files import check_file
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
+    from vd.bundle.contract import Contract, TrackingSpec
     from vd.evaluate.trace import Trace
     from vd.tracking.policy import TrackingPolicy
     from vd.vision.alignment import AlignmentNetwork
@@ -38,13 +40,13 @@ class TrackerCfg(EpisodeFlags):
     """
 
     teacher: Annotated[str, tyro.conf.Positional]
-    """The teacher: a policy.pt, a run's folder, or the name of an installed one."""
+    """The teacher: a policy.safetensors, a run's folder, or the name of an installed one."""
     objects: tuple[str, ...] = field()
     """Object sets to choose the stopping rules on, not those of the training."""
     alignment: str | None = None
-    """Network that finds objects by their goals' points: the alignment.pt of vd-train student, or
-    the name of an installed vision policy, for that of it."""
-    out: Path = Path("tracking.pt")
+    """Network that finds objects by their goals' points: the alignment.pt of vd-train student, or a
+    vision policy, for that of it: its name or file."""
+    out: Path = Path("tracking.safetensors")
     """File to write."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m]
@@ -67,15 +69,17 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     """
     cfg: TrackerCfg = parse(TrackerCfg, arguments, prog="vd-train tracker")
     cfg.validate()
+    check_suffix(cfg.out, SUFFIX)
     check_file(cfg.out)
     from vd.evaluate.agents import check_names, open_teacher, policy_name
 
     check_names([cfg.teacher], cfg.objects)
     print("running the episodes ...", flush=True)
+    from vd.bundle.contract import TrackingSpec
+    from vd.bundle.store import write_policy
     from vd.device import resolve_device
     from vd.stopping import calibrate
-    from vd.tracking.policy import TrackingPolicy, TrackingSpec, tracking_export
-    from vd.train.checkpoint import save_checkpoint
+    from vd.tracking.policy import TrackingPolicy
     from vd.warp_quiet import quiet_warp
 
     quiet_warp()
@@ -88,11 +92,11 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
             f"{cfg.teacher} observes {', '.join(own)}, which no camera shows; give another"
         )
     spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
-    policy = TrackingPolicy(teacher, spec)
+    network = None
     if cfg.alignment is not None:
         network, sizes, camera = _network(cfg.alignment, device)
         spec = replace(spec, camera=cfg.camera or camera, alignment=sizes)
-        policy = TrackingPolicy(teacher, spec, network)
+    policy = TrackingPolicy(teacher, replace(teacher.contract, tracking=spec), network)
     trace = _episodes(cfg, policy, device)
     assert trace.predicted is not None
     predicted, norm, true = (
@@ -112,7 +116,7 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
         precise=None if precise is None else precise.rule,
         calibrated_on=_conditions(cfg, found.episodes),
     )
-    save_checkpoint(cfg.out, tracking_export(replace(policy, spec=spec)))
+    write_policy(policy, cfg.out, _contract(policy, spec))
     for result in (found, precise):
         if result is None:
             print(
@@ -131,6 +135,17 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     return 0
 
 
+def _contract(policy: "TrackingPolicy", spec: "TrackingSpec") -> "Contract":
+    """What the file says of a policy that sees so, with the hand of its teacher."""
+    from vd.assets_usd.hands import load_hand
+    from vd.bundle.contract import derive_interface
+    from vd.envs.cfg import ReorientCfg
+
+    task = ReorientCfg.of(policy)
+    interface = derive_interface(task, load_hand(task.hand, task.fingertip), spec)
+    return replace(policy.contract, tracking=spec, interface=interface)
+
+
 def _network(
     name: str, device: str
 ) -> "tuple[AlignmentNetwork, AlignmentCfg, tuple[float, ...] | None]":
@@ -142,7 +157,7 @@ def _network(
     from vd.tracking.policy import TrackingPolicy
     from vd.vision.saved import load_alignment
 
-    if name not in installed_policies():
+    if name not in installed_policies() and not has_suffix(name, SUFFIX):
         network, learned = load_alignment(name, device)
         return network, learned.network, learned.camera
     policy = open_policy(name, device)

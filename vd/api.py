@@ -20,8 +20,9 @@ def load_policy(name: str | Path, env: "ReorientEnv | None" = None, device: str 
     """A policy from a file, to look at, or to act in an environment.
 
     Args:
-        name: An installed policy such as ``dclaw4``, a ``policy.pt``, a bundle's or a run's folder;
-            with an environment also ``zero`` and ``random``.
+        name: An installed policy such as ``dclaw4``, the path of a ``policy.safetensors`` or of a
+            run's folder; with an environment also ``zero`` and ``random``. A ``Path``, and text
+            with a slash, are paths.
         env: Where it acts. A policy that sees by a camera opens its eyes in there, and acts there
             alone.
         device: Of the policy, without an environment: auto, cpu or cuda:N.
@@ -40,7 +41,7 @@ def load_policy(name: str | Path, env: "ReorientEnv | None" = None, device: str 
     from vd.evaluate.agents import open_policy
     from vd.evaluate.compare import actor_of
 
-    policy = open_policy(str(name), resolve_device(device) if env is None else env.device)
+    policy = open_policy(name, resolve_device(device) if env is None else env.device)
     if env is not None:
         return actor_of(str(name), policy, env)[0]
     if policy is None:
@@ -48,7 +49,7 @@ def load_policy(name: str | Path, env: "ReorientEnv | None" = None, device: str 
     return policy
 
 
-def evaluate_policies(*policies: str, **settings: Any) -> "Result":
+def evaluate_policies(*policies: str | Path, **settings: Any) -> "Result":
     """Run policies through the same episodes, as ``vd-eval`` does, and write ``eval.json`` into ``out``.
 
     Args:
@@ -63,11 +64,12 @@ def evaluate_policies(*policies: str, **settings: Any) -> "Result":
         ValueError: A setting or a set of objects cannot be used.
     """
     from vd.config import from_dict
-    from vd.evaluate.agents import check_names
+    from vd.evaluate.agents import check_names, policy_at
     from vd.evaluate.cfg import EvalCfg, parse_groups
     from vd.evaluate.compare import compare
 
-    cfg = from_dict(EvalCfg, {"policies": policies, **settings})
+    names = [name if isinstance(name, str) else policy_at(name) for name in policies]
+    cfg = from_dict(EvalCfg, {"policies": names, **settings})
     cfg.validate()
     check_names(
         cfg.agent_names,
@@ -202,8 +204,8 @@ def read(path: str | Path) -> Any:
     """Read a file or folder of any of the formats, as its own content says which.
 
     Args:
-        path: Folder of a recording, a bundle, or the log of a run; ``report.json`` of ``vd-gap``;
-            ``eval.json`` of ``vd-eval``.
+        path: Folder of a recording, or the log of a run; a ``policy.safetensors``;
+            ``report.json`` of ``vd-gap``; ``eval.json`` of ``vd-eval``.
 
     Returns:
         A recording, a policy, a log, a report or a result.
@@ -212,7 +214,7 @@ def read(path: str | Path) -> Any:
         FileNotFoundError: There is no such file.
         ValueError: It is none of these, damaged, or of another version.
     """
-    from vd.bundle import is_bundle
+    from vd.bundle import SUFFIX, has_suffix
     from vd.evaluate.result import Result
     from vd.gap.result import Report
     from vd.hand_log import is_log, read_log
@@ -221,10 +223,10 @@ def read(path: str | Path) -> Any:
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"there is no {path}")
-    if is_bundle(path):
-        from vd.bundle.store import read_bundle
+    if has_suffix(path, SUFFIX):
+        from vd.bundle.store import read_policy
 
-        return read_bundle(path)
+        return read_policy(path)
     if is_log(path):
         return read_log(path)
     if path.is_dir():
@@ -237,21 +239,20 @@ def read(path: str | Path) -> Any:
             return kind.read(path)
     raise ValueError(
         f"{path} has {f'the format {found!r}' if found else 'no format'}; give the folder of a "
-        f"recording, "
-        "bundle or log, report.json or eval.json (load_policy reads policies, load_hand and "
-        "load_objects USD)"
+        f"recording or log, a policy.safetensors, report.json or eval.json (load_policy reads "
+        f"policies, load_hand and load_objects USD)"
     )
 
 
 def write(value: Any, path: str | Path) -> None:
     """Write what :func:`read` reads.
 
-    A recording or a policy into a folder, a report or result into a file.
+    A recording into a folder, a policy, report or result into a file.
 
     Raises:
-        FileExistsError: The folder for a bundle holds something else.
         OutputError: It cannot be written.
         TypeError: There is no format for such a value.
+        ValueError: The name is not that of a policy's file.
     """
     from vd.evaluate.result import Result
     from vd.gap.result import Report
@@ -262,9 +263,10 @@ def write(value: Any, path: str | Path) -> None:
     elif isinstance(value, Report | Result):
         value.write(Path(path))
     elif hasattr(value, "task"):
-        from vd.bundle.store import write_bundle
+        from vd.bundle.contract import without_folders
+        from vd.bundle.store import write_policy
 
-        write_bundle(value, Path(path))
+        write_policy(value, Path(path), without_folders(value.contract))
     else:
         raise TypeError(
             f"there is no format for a {type(value).__name__}; give a recording, policy or result"

@@ -4,30 +4,12 @@ import dataclasses
 import difflib
 import types
 import typing
-import warnings
 from collections.abc import Iterator, Mapping, MutableMapping
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-
-
-@dataclasses.dataclass(frozen=True)
-class Dropped:
-    """In ``RETIRED``: a field that changed nothing of what a file is. Other values leave a note."""
-
-    value: Any
-    installed: Any = None
-    """What an installed policy has there."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Renamed:
-    """In ``RETIRED``: a field that has another name now, and what became of its values where they changed."""
-
-    name: str
-    values: Mapping[Any, Any] = dataclasses.field(default_factory=dict)
 
 
 def to_dict(value: Any) -> Any:
@@ -62,15 +44,10 @@ def from_dict(
 
     With ``over`` they are as in that one, in groups too.
 
-    A class that lost a field says so in ``RETIRED``: by name the value that means what is now
-    always so, of a group that went the values of those fields that say so. Others are refused, but
-    for :class:`Dropped`. A field that has another name is :class:`Renamed`.
-
     Raises:
         ValueError: A field that ``cls`` does not have, one that is needed and absent, or a value of
             the wrong type, named by its path, which begins with ``where``.
     """
-    values = without_retired(values, getattr(cls, "RETIRED", {}), where or cls.__name__)
     hints = typing.get_type_hints(cls)
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     names = {field.name for field in fields}
@@ -110,34 +87,6 @@ def _meant(name: str, names: set[str], hints: Mapping[str, Any]) -> str:
     ]
     found = inside + difflib.get_close_matches(name, sorted(names), 1)
     return f"is it {found[0]}? " if found else ""
-
-
-def without_retired(
-    values: Mapping[str, Any], retired: Mapping[str, Any], where: str
-) -> dict[str, Any]:
-    """``values`` without fields that are no more, and with today's names.
-
-    ``retired`` is as ``RETIRED``.
-    """
-    new = {old: to for old, to in retired.items() if isinstance(to, Renamed) and old in values}
-    values = {name: value for name, value in values.items() if name not in new} | {
-        to.name: to.values.get(values[old], values[old]) if to.values else values[old]
-        for old, to in new.items()
-    }
-    for name in retired.keys() & values.keys():
-        value, wanted = values[name], retired[name]
-        if isinstance(wanted, Mapping) and wanted and isinstance(value, Mapping):
-            without_retired(value, wanted, f"{where}.{name}")
-        elif isinstance(wanted, Dropped):
-            if value not in (wanted.value, wanted.installed):
-                warnings.warn(f"{where}.{name} is {value!r}; this version ignores it", stacklevel=2)
-        elif to_dict(value) != wanted:
-            raise ValueError(
-                f"{where}.{name} is {value!r}, and this version has only {wanted!r}; take the "
-                f"version that "
-                "wrote it"
-            )
-    return {name: value for name, value in values.items() if name not in retired}
 
 
 def _convert(hint: Any, value: Any, where: str, over: Any = None) -> Any:

@@ -34,32 +34,6 @@ ENDING_S = 5.0
 AGAIN_S = 0.1
 """Until a signal that a finaliser swallowed comes again [s]."""
 
-RENAMED = {
-    "--output": "--out",
-    "--run-dir": "--out",
-    "--goal-s": "--episode-s",
-    "--air": "--in-air",
-    "--num-worlds": "--num-envs",
-    "--tolerance-rad": "--stop-tolerance",
-    "--tensorboard": "--logger tensorboard",
-    "--no-tensorboard": "--logger none",
-}
-"""Flags of earlier versions, and what they are called in all commands."""
-GONE = {
-    "--from-scratch": "stage 1 begins from what --init names",
-    "--env.table.handed-share": "beginning in grasps cost 3 points (docs/lessons.md)",
-    "--env.observation.history": "a memory of past steps cost 2 points (docs/results.md#robustness)",
-    "--ppo.optimizer": "Adam is the only one",
-    "--agent": "name zero or random in place of a policy",
-    "--allegro": "vd-assets hand import makes an Allegro of its URDF",
-    "--env.randomisation.restitution": "contacts are damped springs (docs/limitations.md)",
-    "--keep-every": "weight averaging gained too little (docs/lessons.md)",
-    "--collect": "give the same command again: it runs what is missing and prints the tables",
-    "--depth.focal-noise": "a calibrated camera knows its focal length",
-    "--second-view": "symmetry-view selection gained too little (docs/lessons.md)",
-}
-"""Flags of earlier versions that are no more, and what to do, or why."""
-
 EXTRAS = {
     "train": ("rsl_rl", "tensordict", "tensorboard"),
     "video": ("imageio_ffmpeg",),
@@ -120,10 +94,6 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
         @functools.wraps(main)
         def run(*args: P.args, **kwargs: P.kwargs) -> Any:
             given = args[0] if args and isinstance(args[0], Sequence) else sys.argv[1:]
-            renamed = _renamed(given)
-            if renamed:
-                print(f"{name}: {renamed}", file=sys.stderr)
-                return USAGE_ERROR
             if given and not {"-h", "--help", "--help-all"} & set(given):
                 print(
                     f"{name}: starting", file=sys.stderr, flush=True
@@ -158,13 +128,6 @@ def _failed(name: str, error: Exception) -> int:
     print(f"{name}: {error}", file=sys.stderr)
     asked = int(getattr(error, "signal", 0))  # a moving hand is stopped first
     return 128 + asked if asked else FAILED
-
-
-def _renamed(arguments: Sequence[str]) -> str:
-    """What became of flags of earlier versions; empty without such flags."""
-    flags = [str(argument).partition("=")[0].replace("_", "-") for argument in arguments]
-    words = [f"{flag} is {RENAMED[flag]} now" for flag in flags if flag in RENAMED]
-    return ", ".join(words + [f"{flag} is no more: {GONE[flag]}" for flag in flags if flag in GONE])
 
 
 def _status(status: Any) -> Any:

@@ -1,4 +1,7 @@
-"""Teachers and tracking policies that ``vd-train export`` wrote as ONNX, by onnxruntime, without torch."""
+"""Teachers and tracking policies that ``vd-train export`` wrote as ONNX, by onnxruntime, without torch.
+
+Such a file has the contract of the policy it was made of among its metadata, and its seal.
+"""
 
 import json
 from dataclasses import dataclass
@@ -8,34 +11,41 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 
 from vd import interrupt
-from vd.config import from_dict, to_dict
-from vd.tracking.policy import TrackingPolicy, TrackingSpec
+from vd.bundle import SUFFIX
+from vd.bundle.contract import (
+    CONTRACT_KEY,
+    Contract,
+    Contracted,
+    contract_of,
+    contract_text,
+    read_sealed,
+)
+from vd.tracking.policy import TrackingPolicy
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
 
-ONNX = ".onnx"
-ONNX_FORMAT = "visual-dexterity onnx 1"
-METADATA = "visual-dexterity"
-"""Key under which a file says what policy it is, in JSON."""
+OFFSET_KEY = "offset"
+"""Key of the mean of observations in training, in JSON, among the metadata."""
 
 
 class OnnxNetwork:
     """A policy's layers on the CPU, in one thread.
 
     Attributes:
+        metadata: What the file says of itself, by key.
         offset: Mean of observations in training [1, O].
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, data: bytes):
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1  # of several, some would wait for one that has no core
+        options.intra_op_num_threads = 1  # as several would wait for one that has no core
         providers = ["CPUExecutionProvider"]
-        self._session = onnxruntime.InferenceSession(str(path), options, providers=providers)
-        self.told = json.loads(self._session.get_modelmeta().custom_metadata_map[METADATA])
-        self.offset = np.array(self.told["offset"], dtype=np.float32)[None]
+        self._session = onnxruntime.InferenceSession(data, options, providers=providers)
+        self.metadata = self._session.get_modelmeta().custom_metadata_map
+        self.offset = np.array(json.loads(self.metadata[OFFSET_KEY]), dtype=np.float32)[None]
 
     def to(self, device: str) -> "OnnxNetwork":
         """Itself, on the CPU."""
@@ -49,67 +59,50 @@ class OnnxNetwork:
 
 
 @dataclass(frozen=True)
-class OnnxTeacher:
+class OnnxTeacher(Contracted):
     """What :class:`vd.policy.TrainedPolicy` is, without its weights."""
 
     network: OnnxNetwork
-    task: dict[str, Any]
-    trained_hand: dict[str, Any]
-    num_observations: int
-    num_actions: int
+    contract: Contract
     kind: Literal["teacher"] = "teacher"
-
-    @property
-    def hand(self) -> str:
-        """Name of the hand it moves."""
-        return str(self.task.get("hand", ""))
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Mean actions [N, D] for observations [N, O]."""
         return self.network(observation)
 
 
-def onnx_metadata(policy: "TrainedPolicy | TrackingPolicy") -> dict[str, str]:
+def onnx_metadata(policy: "TrainedPolicy | TrackingPolicy", contract: Contract) -> dict[str, str]:
     """What a policy's ONNX file says of it, besides its layers."""
     teacher: Any = policy.teacher if isinstance(policy, TrackingPolicy) else policy
-    told = {
-        "format": ONNX_FORMAT,
-        "task": teacher.task,
-        "trained_hand": teacher.trained_hand,
-        "num_observations": teacher.num_observations,
-        "num_actions": teacher.num_actions,
-        "offset": teacher.network.offset[0].tolist(),
-        **({"tracking": to_dict(policy.spec)} if isinstance(policy, TrackingPolicy) else {}),
-    }
-    return {METADATA: json.dumps(told)}
+    offset = json.dumps(teacher.network.offset[0].tolist())
+    return {CONTRACT_KEY: contract_text(contract), OFFSET_KEY: offset}
 
 
 def read_onnx(path: Path) -> "OnnxTeacher | TrackingPolicy":
     """The policy in a file.
 
     Raises:
+        FileNotFoundError: There is no such file.
         ModuleNotFoundError: onnxruntime is not installed.
-        ValueError: It is damaged, of a vision policy, or no file of ``vd-train export``.
+        ValueError: It is damaged, of a vision policy, of another version, or no file of
+            ``vd-train export``.
     """
     interrupt.need("onnxruntime")
+    data = read_sealed(path)
     try:
-        network = OnnxNetwork(path)
-        told = network.told
-        if told["format"] != ONNX_FORMAT:
-            raise ValueError(
-                f"its format is {told['format']!r}, this version reads {ONNX_FORMAT!r}"
-            )
-        names = ("task", "trained_hand", "num_observations", "num_actions")
-        teacher = OnnxTeacher(network, **{name: told[name] for name in names})
-        spec = from_dict(TrackingSpec, told["tracking"]) if "tracking" in told else None
+        network = OnnxNetwork(data)
+        text = network.metadata[CONTRACT_KEY]
     except Exception as error:  # onnxruntime has many of its own
         raise ValueError(
-            f"{path} cannot be read ({error}); write it anew with vd-train export"
+            f"{path} holds no policy ({error}); write it anew with vd-train export"
         ) from error
-    if spec is None:
+    contract = contract_of(text, path)
+    teacher = OnnxTeacher(network, contract)
+    if contract.tracking is None:
         return teacher
-    if spec.alignment is not None:
+    if contract.tracking.alignment is not None:
         raise ValueError(
-            f"{path} is of a vision policy, whose search computes with torch; give policy.pt"
+            f"{path} is of a vision policy, whose search computes with torch; give the policy's "
+            f"{SUFFIX} file"
         )
-    return TrackingPolicy(cast(Any, teacher), spec)
+    return TrackingPolicy(cast(Any, teacher), contract)

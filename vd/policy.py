@@ -1,24 +1,26 @@
 """Policies for evaluation, the viewer and the robot.
 
-A trained actor from a file, zero or random actions.
-
-Reading a policy needs torch only, no simulator and no rsl-rl, and executes nothing in the file.
+A trained actor, zero or random actions. They need torch only, no simulator and no rsl-rl.
 """
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import nn
 
+from vd.bundle.contract import Contract, Contracted, PolicySpec
 from vd.config import from_dict
+from vd.envs.cfg import ReorientCfg
+from vd.versions import installed_versions
 
-POLICY_FORMAT = "visual-dexterity policy 1"
+CHECKPOINT_FORMAT = "visual-dexterity checkpoint 1"
 _STAGE = ("difficulty", "tightness", "tightening")
 """What says how far the curriculum has come, in the state of an environment."""
+_PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
+"""Those of which a policy notes the versions."""
 _WEIGHTS = "_state_dict"
 """How the names of what holds weights end."""
 REMEDY = "copy it again, or give another file of its run"
@@ -39,21 +41,6 @@ class Policy(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class PolicySpec:
-    """What is needed to rebuild an actor around its weights: O observations, D actions."""
-
-    RETIRED: ClassVar[dict[str, Any]] = {"activation": "elu"}
-    num_observations: int
-    num_actions: int
-    hidden: tuple[int, ...]
-    """Widths of the hidden layers."""
-    distribution: str
-    """``gaussian``, the network gives the mean, or ``state-dependent``: mean, then std."""
-    normalise_observations: bool
-    """Whether a running normalisation belongs to the actor."""
-
-
 class MeanAction(nn.Module):
     """Normalisation of observations, if it belongs to the actor, its perceptron, and the mean it gives."""
 
@@ -66,13 +53,14 @@ class MeanAction(nn.Module):
             scale = weights["obs_normalizer._std"] + _NORMALISER_EPSILON
         self.register_buffer("offset", offset)
         self.register_buffer("scale", scale)
-        self.layers = perceptron(spec)
+        with torch.device("meta"):  # drawn weights would take random numbers of a training
+            self.layers = perceptron(spec)
         inside = {
-            key.removeprefix("mlp."): value
+            key.removeprefix("mlp."): value.float()
             for key, value in weights.items()
             if key.startswith("mlp.")
         }
-        self.layers.load_state_dict(inside)
+        self.layers.load_state_dict(inside, assign=True)
         self.eval().requires_grad_(False)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
@@ -82,17 +70,13 @@ class MeanAction(nn.Module):
         return output[:, : self.num_actions]
 
 
-class TrainedPolicy:
+class TrainedPolicy(Contracted):
     """The deterministic policy of a trained actor: the mean of its action distribution.
 
-    ``weights`` are the state of rsl-rl's actor: ``mlp.*`` and, if it normalises,
-    ``obs_normalizer.*``; ``task`` is the configuration of the environment it was trained in, as a
-    dictionary.
-
     Attributes:
-        hand: Name of the hand it moves, as ``task`` says ("" if it does not).
-        trained_hand: What that was in training (:func:`vd.bundle.contract.trained_hand`); empty in
-            files of earlier versions.
+        contract: What it is and was made for.
+        weights: State of rsl-rl's actor: ``mlp.*`` and, if it normalises, ``obs_normalizer.*``.
+        critic: State of its critic, for a run that goes on from it; empty where there is none.
         network: From observations [N, O] to mean actions [N, D]; what an exporter needs.
     """
 
@@ -100,21 +84,13 @@ class TrainedPolicy:
 
     def __init__(
         self,
-        spec: PolicySpec,
+        contract: Contract,
         weights: dict[str, torch.Tensor],
-        *,
-        task: dict[str, Any],
-        iteration: int = 0,
-        env_steps: int = 0,
-        trained_hand: dict[str, Any] | None = None,
+        critic: dict[str, torch.Tensor] | None = None,
         device: str = "cpu",
     ) -> None:
-        self.trained_hand = trained_hand or {}
-        self.spec, self.task, self.iteration, self.env_steps = spec, task, iteration, env_steps
-        self.hand = str(task.get("hand", ""))
-        self.num_observations, self.num_actions = spec.num_observations, spec.num_actions
-        self.weights = weights
-        self.network = MeanAction(spec, weights).to(device)
+        self.contract, self.weights, self.critic = contract, weights, critic or {}
+        self.network = MeanAction(contract.network, weights).to(device)
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] for observations [N, O] on the policy's device.
@@ -150,12 +126,15 @@ class BuiltIn:
         return torch.rand(shape, generator=self._generator, device=observation.device) * 2.0 - 1.0
 
 
-def read_state(path: str | Path, device: str = "cpu", *, remedy: str) -> dict[str, Any]:
-    """What torch saved in a file, its weights whole. Nothing in it is executed.
+def read_state(
+    path: str | Path, device: str = "cpu", *, remedy: str, wanted: str = CHECKPOINT_FORMAT
+) -> dict[str, Any]:
+    """What torch saved in a file of the format ``wanted``, its weights whole; executes nothing in it.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It cannot be read, or has weights that are not finite; with ``remedy``.
+        ValueError: It cannot be read, is of another format, or has weights that are not finite;
+            with ``remedy``.
     """
     path = Path(path)
     try:
@@ -166,8 +145,9 @@ def read_state(path: str | Path, device: str = "cpu", *, remedy: str) -> dict[st
         raise FileNotFoundError(f"there is no file {path}; {remedy}") from error
     except Exception as error:
         raise ValueError(f"{path} {_damage(path, error)}; {remedy}") from error
-    if not isinstance(state, dict):
-        raise ValueError(f"{path} is no file that vd-train wrote; {remedy}")
+    found = state.get("format") if isinstance(state, dict) else None
+    if found != wanted:
+        raise ValueError(f"{path}: format is {found!r}, not {wanted!r}; {remedy}")
     for part, weights in state.items():
         if str(part).endswith(_WEIGHTS) and not all(_tensors_finite(weights)):
             raise ValueError(f"{path} is damaged: {part} has weights that are not finite; {remedy}")
@@ -192,67 +172,42 @@ def _tensors_finite(value: Any) -> Iterator[bool]:
             yield from _tensors_finite(item)
 
 
-def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
-    """Rebuild the actor from a checkpoint of ``vd-train`` or from an exported ``policy.pt``.
+def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedPolicy:
+    """The teacher of a checkpoint, whose ``state`` was read from ``path``.
+
+    A critic that is still warming up is worth nothing, and left out.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is damaged, or not a policy.
+        ValueError: It is a student's, no checkpoint, or of another version.
     """
-    return teacher_in(read_state(path, device, remedy=REMEDY), path, device)
-
-
-def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedPolicy:
-    """The same from what was read of ``path``."""
-    if "student_state_dict" in state and "spec" in state:
+    if "student_state_dict" in state:
         raise ValueError(
             f"{path} is a student or its checkpoint, which does not act by itself; vd-train "
-            f"tracker TEACHER "
-            "--alignment alignment.pt makes a policy of a student that vd-train student trained"
+            f"tracker TEACHER --alignment alignment.pt makes a policy of a student that vd-train "
+            "student trained"
         )
-    if not {"policy", "actor_state_dict", "task"} <= state.keys():
-        raise ValueError(f"{path} holds no policy; give a file that vd-train wrote")
+    critic = {} if state.get("critic_warmup", 0) else state.get("critic_state_dict", {})
     try:
-        return policy_of(state, device)
+        contract = Contract(
+            interface=state["interface"],
+            network=from_dict(PolicySpec, state["policy"], where="policy"),
+            task=state["task"],
+            iterations=int(state["iter"]),
+            env_steps=int(state["env_steps"]),
+            learner=state["learner"],
+            stage=stage_of(state),
+            software=installed_versions(_PACKAGES),
+        )
+        from_dict(ReorientCfg, contract.task, where="task")
+        return TrainedPolicy(contract, state["actor_state_dict"], critic, device)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"{path}: the weights do not fit the network it describes ({error})"
-        ) from error
+        raise ValueError(f"{path}: {error}; take the version that wrote it") from error
 
 
-def policy_of(state: dict[str, Any], device: str) -> TrainedPolicy:
-    """The policy in the contents of a file; raises what the reading of a wrong one raises."""
-    return TrainedPolicy(
-        from_dict(PolicySpec, state["policy"], where="policy"),
-        state["actor_state_dict"],
-        task=state["task"],
-        iteration=int(state["iter"]),
-        env_steps=int(state["env_steps"]),
-        trained_hand=state.get("trained_hand"),
-        device=device,
-    )
-
-
-def policy_export(state: dict[str, Any]) -> dict[str, Any]:
-    """The part of a checkpoint that others need: networks, task, how it was trained; no optimiser.
-
-    :func:`load_policy` reads the actor. The rest is for a run that begins from it (``vd-train
-    teacher --init``): the critic, unless it is still warming up and so worth nothing, the stage of
-    the curriculum and the settings of the learner. ``state`` is a checkpoint, or what this function
-    gave.
-    """
-    exported = {"format": POLICY_FORMAT} | {
-        key: state[key] for key in ("policy", "task", "iter", "env_steps")
-    }
-    for key in ("actor_state_dict", "critic_state_dict"):
-        if key == "actor_state_dict" or (key in state and not state.get("critic_warmup", 0)):
-            exported[key] = {name: value.detach().cpu() for name, value in state[key].items()}
-    if "ranks" in state:
-        environment = state["ranks"][0]["env"]
-        exported["stage"] = {key: environment[key] for key in _STAGE if key in environment}
-    return exported | {
-        key: state[key] for key in ("stage", "learner", "trained_hand") if key in state
-    }
+def stage_of(state: dict[str, Any]) -> dict[str, Any]:
+    """How far the curriculum of a checkpoint has come."""
+    environment = state["ranks"][0]["env"]
+    return {key: environment[key] for key in _STAGE if key in environment}
 
 
 def perceptron(spec: PolicySpec) -> nn.Sequential:

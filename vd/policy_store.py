@@ -1,6 +1,6 @@
 """``vd-policies``: policies in folders, at URLs and in Hugging Face repositories, with their SHA-256.
 
-Such a place holds ``NAME.pt`` for each policy, and ``policies.json``, which tells of them all.
+Such a place holds ``NAME.safetensors`` for each policy, and ``policies.json``, which tells of them all.
 """
 
 import dataclasses
@@ -14,12 +14,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from http.client import HTTPException
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 from urllib.request import Request, urlopen
 
 import tyro
 
 from vd import interrupt
+from vd.bundle import SUFFIX, has_suffix
 from vd.command_line import parse
 from vd.config import from_dict, to_dict
 from vd.evaluate.agents import (
@@ -29,7 +30,6 @@ from vd.evaluate.agents import (
     SHIPPED_POLICIES,
     find_policy,
     installed_policies,
-    open_policy,
     policy_name,
     pulled_folder,
 )
@@ -106,10 +106,10 @@ def check_name(name: str) -> None:
     Raises:
         ValueError: It cannot.
     """
-    if not _NAME.fullmatch(name) or name in BUILT_IN or name.endswith(".pt"):
+    if not _NAME.fullmatch(name) or name in BUILT_IN or name.endswith(SUFFIX):
         raise ValueError(
-            f"{name!r} is no name of a policy: letters, digits, and . _ - between them; no .pt at "
-            f"its end"
+            f"{name!r} is no name of a policy: letters, digits, and . _ - between them; no {SUFFIX} "
+            f"at its end"
         )
 
 
@@ -124,7 +124,7 @@ def pull(name: str, place: str, *, replace: bool = False) -> Path:
     found = read_store(place).policies
     if name not in found:
         raise ValueError(f"{place} has no policy {name}; it has {', '.join(found) or 'none'}")
-    entry, target = found[name], pulled_folder() / f"{name}.pt"
+    entry, target = found[name], pulled_folder() / f"{name}{SUFFIX}"
     here = SHIPPED_POLICIES.get(name, target)
     if here.exists() and _digest(here) == entry.sha256:
         if here == target:  # its list may be lost
@@ -133,10 +133,10 @@ def pull(name: str, place: str, *, replace: bool = False) -> Path:
     if here.exists() and (name in SHIPPED_POLICIES or not replace):
         remedy = "which stays" if name in SHIPPED_POLICIES else "--replace takes the one there"
         raise FileExistsError(f"{here} is another policy than {name} at {place}; {remedy}")
-    data = _read(place, f"{name}.pt")
+    data = _read(place, f"{name}{SUFFIX}")
     if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise ValueError(
-            f"{place}/{name}.pt is not the file that {POLICY_LIST} there tells of (SHA-256 differs)"
+            f"{place}/{name}{SUFFIX} is not the file that {POLICY_LIST} there tells of (SHA-256 differs)"
         )
     with atomic_path(target) as temporary:
         temporary.write_bytes(data)
@@ -171,7 +171,7 @@ def push(path: Path, name: str, place: str, entry: Entry, *, replace: bool = Fal
     if place.startswith(HUB):
         _commit(place.removeprefix(HUB), path, name, Store(there.policies | {name: entry}))
         return True
-    target = Path(place) / path.with_name(f"{name}.pt").name
+    target = Path(place) / f"{name}{SUFFIX}"
     if not (target.exists() and _digest(target) == entry.sha256):
         with atomic_path(target) as temporary:
             shutil.copyfile(path, temporary)
@@ -179,15 +179,21 @@ def push(path: Path, name: str, place: str, entry: Entry, *, replace: bool = Fal
     return True
 
 
-def describe(name: str, path: Path) -> Entry:
+def describe(path: Path) -> Entry:
     """What is to be told of a policy that can be read.
 
     Raises:
-        ValueError: It is no policy, or a bundle.
+        ValueError: It is no policy's file, or names a folder of this machine.
     """
-    if not path.is_file():
-        raise ValueError(f"{path} is a bundle; push the policy it was made of")
-    policy: Any = open_policy(name, "cpu")
+    from vd.bundle.contract import without_folders
+    from vd.bundle.store import read_policy
+
+    remedy = f"vd-train export {path} FILE{SUFFIX} writes one without that, for others"
+    if not has_suffix(path, SUFFIX):
+        raise ValueError(f"{path} has the state of a training; {remedy}")
+    policy = read_policy(path)
+    if without_folders(policy.contract) != policy.contract:
+        raise ValueError(f"{path} names folders of this machine; {remedy}")
     return Entry(_digest(path), path.stat().st_size, policy.kind, policy.hand)
 
 
@@ -215,7 +221,7 @@ def _commit(repository: str, path: Path, name: str, store: Store) -> None:
     HfApi().create_commit(
         repo_id=repository,
         operations=[
-            CommitOperationAdd(f"{name}.pt", str(path)),
+            CommitOperationAdd(f"{name}{SUFFIX}", str(path)),
             CommitOperationAdd(POLICY_LIST, text.encode()),
         ],
         commit_message=f"Add {name}",
@@ -289,7 +295,7 @@ class Push:
     """Give a policy to others: its file, and its SHA-256 in policies.json beside it."""
 
     policy: Annotated[str, tyro.conf.Positional]
-    """A policy.pt or tracking.pt, a run's folder, or the name of an installed policy."""
+    """A policy.safetensors, a run's folder, or the name of an installed policy."""
     at: str
     """Folder, made if it is not there, or hf://OWNER/NAME, a repository of Hugging Face that is
     there.
@@ -305,7 +311,7 @@ class Push:
         name = self.name or policy_name(path)
         if self.name is None and name not in installed_policies():
             raise ValueError(f"--name says how others call {path}; give one")
-        done = push(path, name, self.at, describe(self.policy, path), replace=self.replace)
+        done = push(path, name, self.at, describe(path), replace=self.replace)
         print(f"{self.at}: {name} {'is written' if done else 'is there already'}")
         return 0
 

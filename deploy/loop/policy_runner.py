@@ -11,10 +11,11 @@ import warp as wp
 from vd.arrays import Array, as_warp, library_of, of_warp
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
+from vd.bundle import ONNX_SUFFIX, has_suffix
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.agents import check_fits, open_policy, task_for
 from vd.evaluate.statistics import symmetric_error
-from vd.onnx_policy import ONNX, read_onnx
+from vd.onnx_policy import read_onnx
 from vd.paper import PAPER
 from vd.senses import Senses
 from vd.sensors.depth_cloud import CameraCloud
@@ -229,7 +230,7 @@ def load_runner(
     """Load a policy for the loop.
 
     Args:
-        name: Bundle, file of a policy, installed policy, or ``zero``.
+        name: File of a policy, installed policy, or ``zero``.
         hand_name: Name of the hand or its USD.
         hand: The hand.
         item: The object.
@@ -240,14 +241,12 @@ def load_runner(
     Raises:
         ValueError: It is for another hand, or a teacher for a real one.
     """
-    onnx = Path(name).suffix == ONNX
-    policy: Any = (
-        None if name == ZERO else read_onnx(Path(name)) if onnx else open_policy(name, "cpu")
-    )
-    if policy is None:
-        if name != ZERO:
-            raise ValueError(f"{name} is not for a hand; give a bundle, a policy's file, or {ZERO}")
+    if name == ZERO:
         return PolicyRunner(ReorientCfg(hand=hand_name), StoppingRule())
+    onnx = has_suffix(name, ONNX_SUFFIX)
+    policy: Any = read_onnx(Path(name)) if onnx else open_policy(name, "cpu")
+    if policy is None:
+        raise ValueError(f"{name} is not for a hand; give a policy, or {ZERO}")
     check_fits(name, policy, hand_name)
     if isinstance(policy, TrackingPolicy):
         return TrackingRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)

@@ -68,7 +68,7 @@ class RunCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """Bundle, file or name of a policy that sees by camera, with --twin a teacher too, and by
+    """File or name of a policy that sees by camera, with --twin a teacher too, and by
     default the installed tracking policy of the hand. "zero" is the zero-action baseline."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj,
@@ -147,7 +147,9 @@ class RunCfg(HandOptions):
                 raise FileExistsError(f"--log {self.log} is there; choose another name")
             interrupt.need(package)
         if self.policy is None and not (self.twin or self.ros2):
-            raise ValueError("name the policy: the folder of a bundle that vd-train bundle wrote")
+            raise ValueError(
+                "name the policy: an installed one, or the file that vd-train tracker wrote"
+            )
 
 
 def run(cfg: RunCfg) -> int:

@@ -63,8 +63,8 @@ def build_student(
     checkpoint = find_checkpoint(cfg.run.out, cfg.resume, "student")
     if cfg.teacher is None:
         raise ValueError(
-            "--teacher is missing; give the policy that acts: a policy.pt, a run's folder, or a "
-            "name"
+            "--teacher is missing; give the policy that acts: a policy.safetensors, a run's folder, "
+            "or a name"
         )
     if cfg.stage == SIMULATED and cfg.init is None and checkpoint is None:
         raise ValueError(
@@ -76,14 +76,15 @@ def build_student(
 
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
-    from vd.evaluate.agents import find_policy
-    from vd.policy import load_policy
+    from vd.evaluate.agents import open_teacher
     from vd.vision.alignment import AlignmentNetwork
     from vd.vision.saved import load_alignment
     from vd.workers import one_thread_without_gpu
 
     rank = int(os.environ.get("RANK", "0"))
-    teacher = load_policy(find_policy(cfg.teacher), device)
+    teacher = open_teacher(cfg.teacher, device)
+    if teacher is None:
+        raise ValueError(f"--teacher {cfg.teacher} has no layers; give a trained teacher")
     task = student_task(teacher, cfg)
     one_thread_without_gpu(device)
     # The network is the same in all processes, what they draw is not.
@@ -140,8 +141,9 @@ def _looks(
     """Environments in which the teacher acts by the network."""
     import torch
 
+    from vd.bundle.contract import TrackingSpec
     from vd.envs.reorient import ReorientEnv
-    from vd.tracking.policy import TrackingPolicy, TrackingSpec
+    from vd.tracking.policy import TrackingPolicy
     from vd.train.student.align import CLOUDS, mesh_points
     from vd.train.student.looks import SimulatedLooks
     from vd.train.vec_env import ReorientVecEnv
@@ -150,8 +152,7 @@ def _looks(
     env = ReorientVecEnv(simulation)
     # Or all episodes would time out at once.
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, env.max_episode_length)
-    policy = TrackingPolicy(
-        teacher, TrackingSpec(camera=cfg.camera, alignment=network.cfg), network
-    )
+    spec = TrackingSpec(camera=cfg.camera, alignment=network.cfg)
+    policy = TrackingPolicy(teacher, replace(teacher.contract, tracking=spec), network)
     surfaces = mesh_points(simulation.objects, CLOUDS * cfg.align.points, network.summary.device)
     return SimulatedLooks(env, policy, surfaces[..., :3].contiguous(), cfg.looks, task.seed)

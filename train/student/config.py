@@ -3,11 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from vd.config import Dropped, Renamed
 from vd.train.config import RunCfg, require
 from vd.vision.cfg import SEEN_POINTS, AlignmentCfg
 
@@ -20,17 +19,12 @@ ALIGNMENT_NAME = "alignment.pt"
 """The network of a run, in its folder."""
 RUNS = Path("runs/student")
 """Parent of the default folders stage0 and stage1."""
-WHATEVER: dict[str, Any] = {"": Dropped(None)}
-"""Of a retired field all values."""
 
 
 @dataclass
 class AlignCfg:
     """Turning a goal's cloud onto what a camera sees, learned from shapes without simulation."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "search": {"passes": Dropped(2), "kept": Dropped(2), "restart_looks": Dropped(3)}
-    }
     batch: int = 768
     """Pairs of clouds of an optimiser step on one GPU."""
     steps: int = 50
@@ -118,12 +112,6 @@ class LooksCfg:
 class StudentTaskCfg:
     """The environments; all else of them is as in the teacher's training, without its noise."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "num_worlds": Renamed("num_envs"),
-        "randomise": Dropped(None),
-        "at_rest": Dropped(None),
-        "max_goal_angle_rad": Dropped(None),
-    }
     objects: tuple[str, ...] = ()
     """Object sets: names or folders of object USDs; the teacher's by default."""
     num_envs: int = 2048
@@ -136,21 +124,13 @@ class StudentTaskCfg:
 class StudentTrainCfg:
     """Train the student."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "from_scratch": Dropped(False),
-        "pretrain": WHATEVER,
-        "dagger": WHATEVER,
-        "network": WHATEVER,
-        "noise": WHATEVER,
-        "depth": WHATEVER,
-    }
     preset: PresetName = "gpu"
     """Settings to start from; every other flag overrides one of them."""
     stage: Stage = 0
     """0: learn to turn a goal's cloud onto a seen one, without simulation; 1: also from what a
     depth camera sees while the teacher acts by the network of --init."""
     teacher: str | None = None
-    """Policy that acts, also the source of hand and task: a policy.pt, a run's folder, or the name
+    """Policy that acts, also the source of hand and task: a policy.safetensors, a run's folder, or the name
     of an installed one."""
     init: Path | None = None
     """Network to begin from, the alignment.pt of a run; stage 1 needs one."""

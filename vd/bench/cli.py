@@ -19,12 +19,6 @@ from vd.device import resolve_device
 from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
 
-GONE = {
-    "student": "vd-deploy POLICY --twin tells its times",
-    "replay": "the message names the setting to change",
-}
-"""Measurements that are no more, and what is there instead."""
-
 
 def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> None:
     """Print rows as they come, a line of JSON each, and write a file after each.
@@ -239,10 +233,6 @@ Command = (
 @interrupt.command("vd-bench")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-bench``; returns the exit status."""
-    given = sys.argv[1:] if arguments is None else arguments
-    if given and given[0] in GONE:
-        print(f"vd-bench: {given[0]!r} is no more: {GONE[given[0]]}", file=sys.stderr)
-        return interrupt.USAGE_ERROR
     command = parse(Command, arguments, prog="vd-bench", description=__doc__)
     if isinstance(command, GapCommand | ContactCommand):
         check_folder(command.out)

@@ -1,11 +1,21 @@
-"""Deployable bundles: a policy's weights, the contract it was made under, and golden values, without code."""
+"""Policies in files: weights, the contract they were made under, and golden values, without code."""
 
 from pathlib import Path
 
-CONTRACT_FILE = "contract.json"
-"""The file that makes a folder a bundle."""
+SUFFIX, ONNX_SUFFIX = ".safetensors", ".onnx"
+"""How names of policies end, and of what :mod:`vd.onnx_policy` runs."""
 
 
-def is_bundle(path: str | Path) -> bool:
-    """Whether a path is the folder of a bundle."""
-    return (Path(path) / CONTRACT_FILE).is_file()
+def has_suffix(path: str | Path, suffix: str) -> bool:
+    """Whether a file's name ends so, in small letters or capital ones."""
+    return Path(path).suffix.lower() == suffix
+
+
+def check_suffix(path: Path, *suffixes: str) -> None:
+    """Refuse a name for a file that ends otherwise.
+
+    Raises:
+        ValueError: It ends otherwise.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path} has to end in {' or '.join(suffixes)}; choose such a name")

@@ -1,14 +1,16 @@
-"""What a policy was made for, in words and numbers, and whether a hand is that.
+"""What a policy is and what it was made for, and whether a hand is that.
 
 A contract's ``interface`` follows from the policy's training and a hand's USD alone, so that a
 check derives it again from the hand at hand and compares field by field. SI units, radians;
-quaternions are xyzw.
+quaternions are xyzw. Nothing here needs torch.
 """
 
+import hashlib
+import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from vd.assets_usd.hand_data import HandModel
 from vd.config import from_dict, leaves, to_dict
@@ -18,8 +20,13 @@ from vd.kernels.task.shapes import shape_observation_size
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
+from vd.vision.cfg import AlignmentCfg
 
-BUNDLE_FORMAT = "visual-dexterity bundle 1"
+POLICY_FORMAT = "visual-dexterity policy 1"
+CONTRACT_KEY = "contract"
+"""Key of the contract, in JSON, among the metadata of a policy's file."""
+SEAL_KEY, UNSEALED = "seal", b"-" * 64
+"""Name of what stands last in a policy's file, and what it is before the file is sealed."""
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-4, 1e-5
 """Differences of numbers that are no difference: a hand that was measured again differs by more."""
 CONVENTIONS = {
@@ -31,88 +38,175 @@ CONVENTIONS = {
     "optical_frame": "x right, y down, z forward",
 }
 """How numbers are to be read."""
-BEFORE: dict[str, dict[str, Any]] = {
-    "observation": {"view": "world", "file_axes": True},
-}
-"""By part of the interface the fields that bundles of earlier versions lack, with what is so
-there.
-"""
 Kind = Literal["teacher", "tracking", "vision"]
 
 
 class ContractError(ValueError):
-    """A bundle that does not fit the hand or this version.
+    """A policy that is damaged, or does not fit the hand or this version.
 
     Names field, found, expected and remedy.
     """
 
 
 @dataclass(frozen=True)
-class Provenance:
-    """Where a policy comes from."""
+class PolicySpec:
+    """What is needed to rebuild an actor around its weights: O observations, D actions."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"stage": None}
-    teacher: str
-    """Whose layers act by what a camera shows; empty for a teacher."""
-    objects: tuple[str, ...]
-    """Names of the object sets it was trained on."""
-    iterations: int
-    env_steps: int
-    task: dict[str, Any]
-    """Configuration of the environment of its training."""
-    depth: dict[str, Any] = field(default_factory=dict)
-    """Configuration of the depth camera of its training."""
+    num_observations: int
+    num_actions: int
+    hidden: tuple[int, ...]
+    """Widths of the hidden layers."""
+    distribution: str
+    """``gaussian``, the network gives the mean, or ``state-dependent``: mean, then std."""
+    normalise_observations: bool
+    """Whether a running normalisation belongs to the actor."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackingSpec(StoppingRules):
+    """What a policy that sees by camera is besides its teacher."""
+
+    teacher: str = ""
+    """Name of that teacher."""
+    camera: tuple[float, ...] | None = None
+    """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the
+    hand's.
+    """
+    depth: DepthCameraCfg = field(default_factory=DepthCameraCfg)
+    """Points and crop of the camera's clouds."""
+    alignment: AlignmentCfg | None = None
+    """Sizes of the network that finds the object by the cloud of its goal; None: it is found by its
+    shape.
+    """
 
 
 @dataclass(frozen=True)
 class Contract:
-    """The whole of contract.json."""
+    """All that a policy's file says beside its weights."""
 
-    kind: Kind
     interface: dict[str, Any]
-    """As :func:`derive_interface` gives it."""
-    network: dict[str, Any]
-    """What rebuilds the network: PolicySpec; of a tracking or vision policy as ``policy``, and of a
-    vision policy AlignmentCfg beside it, as ``alignment``."""
-    stopping: StoppingRules | None
-    """When a policy that sees clouds stops."""
-    provenance: Provenance
-    software: dict[str, str]
+    """As :func:`derive_interface` gave it for the hand of the training."""
+    network: PolicySpec
+    """What rebuilds the actor."""
+    task: dict[str, Any]
+    """Configuration of the environment of its training."""
+    iterations: int
+    env_steps: int
+    tracking: TrackingSpec | None = None
+    """How the actor is let act on what a camera shows; None for a teacher."""
+    learner: dict[str, Any] = field(default_factory=dict)
+    """Configuration of the learner, with which a run may go on; empty where it is not known."""
+    stage: dict[str, Any] = field(default_factory=dict)
+    """How far the curriculum had come; empty: to its end."""
+    software: dict[str, str] = field(default_factory=dict)
     """Versions with which it was written."""
-    files: dict[str, str] = field(default_factory=dict)
-    """SHA-256 of the other files of the bundle, by name."""
-    format: str = BUNDLE_FORMAT
+    format: str = POLICY_FORMAT
 
     @property
-    def task(self) -> ReorientCfg:
-        """The environment of the training."""
-        return from_dict(ReorientCfg, self.provenance.task, where="provenance.task")
+    def kind(self) -> Kind:
+        """What a policy of this contract is called."""
+        if self.tracking is None:
+            return "teacher"
+        return "tracking" if self.tracking.alignment is None else "vision"
+
+
+class Contracted:
+    """A policy, of which its contract says this."""
+
+    contract: Contract
 
     @property
-    def own_camera(self) -> tuple[float, ...] | None:
-        """Where the training put the camera, optical frame in the base frame [7].
+    def task(self) -> dict[str, Any]:
+        """Configuration of the environment it was trained in."""
+        return self.contract.task
 
-        None: the hand's own.
-        """
-        camera = self.interface.get("camera")
-        return tuple(camera["pose_in_base"]) if camera and camera["source"] == "policy" else None
+    @property
+    def hand(self) -> str:
+        """Name of the hand it moves."""
+        return str(self.task["hand"])
+
+    @property
+    def num_observations(self) -> int:
+        """Values O of an observation of its layers."""
+        return self.contract.network.num_observations
+
+    @property
+    def num_actions(self) -> int:
+        """Actions D."""
+        return self.contract.network.num_actions
+
+
+def contract_text(contract: Contract) -> str:
+    """A contract as policies' files have it."""
+    return json.dumps(to_dict(contract), indent=1, allow_nan=False)
+
+
+def contract_of(text: str, where: str | Path) -> Contract:
+    """The contract of the policy ``where``.
+
+    Raises:
+        ContractError: It is of another format, or says what this version does not know.
+    """
+    try:
+        values = json.loads(text)
+        if values["format"] != POLICY_FORMAT:
+            raise ValueError(
+                f"format is {values['format']!r}, this version reads {POLICY_FORMAT!r}"
+            )
+        contract = from_dict(Contract, values, where="contract")
+        from_dict(ReorientCfg, contract.task, where="contract.task")
+    except (ValueError, TypeError, KeyError) as error:
+        raise ContractError(f"{where}: {error}; take the version that wrote it") from error
+    return contract
+
+
+def without_folders(contract: Contract) -> Contract:
+    """A contract for others: without folders of the machine on which the policy was trained."""
+    objects = [Path(name).name for name in contract.task.get("objects", ())]
+    tracking = contract.tracking
+    if tracking is not None:
+        tracking = replace(tracking, teacher=Path(tracking.teacher).name)
+    return replace(contract, task=contract.task | {"objects": objects}, tracking=tracking)
+
+
+def sealed(data: bytes) -> bytes:
+    """The content of a policy's file, whose last 64 bytes become the SHA-256 of all before them."""
+    assert data.endswith(UNSEALED), "the seal has to stand last"
+    body = data.removesuffix(UNSEALED)
+    return body + hashlib.sha256(body).hexdigest().encode()
+
+
+def read_sealed(path: Path) -> bytes:
+    """The content of a policy's file, once its seal was compared.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ContractError: It cannot be read, is damaged, or is no policy.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"there is no policy {path}") from error
+    except OSError as error:
+        raise ContractError(f"{path} cannot be read ({error.strerror})") from error
+    if sealed(data[: -len(UNSEALED)] + UNSEALED) != data:
+        raise ContractError(
+            f"{path} is damaged, or no policy: it does not end with the SHA-256 of its content; "
+            "copy it again, or write it with vd-train export"
+        )
+    return data
 
 
 def derive_interface(
-    hand: HandModel, source: Provenance, camera: tuple[float, ...] | None = None
+    task: ReorientCfg, hand: HandModel, tracking: TrackingSpec | None = None
 ) -> dict[str, Any]:
-    """What a policy of such a training and this hand have to agree on, as JSON has it, by part.
+    """What a policy and a hand have to agree on, as JSON has it, by part.
 
     Args:
-        hand: The hand.
-        source: Where it comes from; ``depth`` is empty for one that sees by no camera.
-        camera: Where the training put that, optical frame in the base frame [7]; None: the hand's
-            own.
+        task: The environment of the policy's training.
+        hand: The hand without a layer, whose servo model was identified later.
+        tracking: How the policy sees; None for a teacher.
     """
-    task = from_dict(ReorientCfg, source.task, where="provenance.task")
-    depth = (
-        from_dict(DepthCameraCfg, source.depth, where="provenance.depth") if source.depth else None
-    )
     parts = {
         "conventions": CONVENTIONS,
         "hand": _hand(hand),
@@ -125,36 +219,24 @@ def derive_interface(
             "clip": (-1.0, 1.0),
         },
         "observation": _observation(hand, task),
-        "camera": None if depth is None else _camera(hand, depth, camera),
+        "camera": None if tracking is None else _camera(hand, tracking),
     }
     found: dict[str, Any] = to_dict(parts)
     return found
 
 
 def _hand(hand: HandModel) -> dict[str, Any]:
-    """The hand as a bundle's interface has it."""
+    """The hand as an interface has it."""
     return {
         "name": hand.name,  # of the root prim of its USD
         "joint_names": hand.joint_names,  # in the order of joint positions and actions
         "lower_rad": _floats(hand.lower),
         "upper_rad": _floats(hand.upper),
         "base_in_world": _floats(hand.mount),
-    }
-
-
-def trained_hand(hand: HandModel) -> dict[str, Any]:
-    """What a policy's file says of the hand of its training, as JSON has it.
-
-    Args:
-        hand: The hand without a layer, whose servo model was identified later.
-    """
-    own = {
         "effort_nm": _floats(hand.effort),
         "drop_m": _floats(hand.workspace.drop_m),
-        "tips_in_base": [_floats(tip[:3]) for tip in hand.tip_poses(hand.start)],
+        "tips_in_base": [_floats(tip[:3]) for tip in hand.tip_poses(hand.start)],  # at the start
     }
-    found: dict[str, Any] = to_dict(_hand(hand) | own)
-    return found
 
 
 def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
@@ -179,13 +261,11 @@ def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
     }
 
 
-def _camera(
-    hand: HandModel, depth: DepthCameraCfg, pose: tuple[float, ...] | None
-) -> dict[str, Any]:
+def _camera(hand: HandModel, tracking: TrackingSpec) -> dict[str, Any]:
     """The depth camera: the one of the hand's USD, or one that the training placed elsewhere."""
-    camera = hand.camera.at(pose)
+    camera, depth = hand.camera.at(tracking.camera), tracking.depth
     return {
-        "source": "hand" if pose is None else "policy",
+        "source": "hand" if tracking.camera is None else "policy",
         **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         "pose_in_base": _floats([*camera.position, *camera.quaternion]),
         "points": depth.points,  # of a cloud at most
@@ -198,36 +278,20 @@ def _floats(values: Any) -> list[float]:
 
 
 _REMEDY = {
-    "conventions": "export the policy again with this version",
-    "hand": "use the hand it was trained for (if imported, import it again), or train a policy for this one",
-    "action": "export the policy again; its contract was changed after the export",
-    "observation": "export the policy again with this version",
-    "camera": "use the camera it was made for, or write it for this one (vd-train, --camera)",
+    "hand": "use the hand it was trained for (if imported, import it again), or train a policy for "
+    "this one",
+    "camera": "use the camera it was made for, or write it for this one (vd-train tracker, "
+    "--camera)",
 }
-"""What to do about a difference in each part of the interface."""
+"""What to do about a difference in a part of the interface."""
+_OTHERWISE = "train it again, or take the version that wrote it"
 
 
 def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
-    """Refuse a hand that is not the one of the contract of the bundle at ``where``.
-
-    Raises:
-        ContractError: The first field that differs, what the hand has, what the bundle wants, what
-            to do.
-    """
-    found = derive_interface(hand, contract.provenance, contract.own_camera)
-    wanted = {
-        part: values and BEFORE.get(part, {}) | values
-        for part, values in contract.interface.items()
-        if part != "cloud"  # none, in bundles of earlier versions
-    }
-    _check_same(found, wanted, hand, where, "in the bundle")
-
-
-def check_trained_hand(wanted: dict[str, Any], hand: HandModel, where: str | Path) -> None:
-    """Refuse a hand that is called like the one of a policy's training, and is another one.
+    """Refuse a hand that is not the one of a policy's contract.
 
     Args:
-        wanted: What the policy's file says (:func:`trained_hand`).
+        contract: The contract.
         hand: The hand without a layer.
         where: The policy.
 
@@ -235,22 +299,16 @@ def check_trained_hand(wanted: dict[str, Any], hand: HandModel, where: str | Pat
         ContractError: The first field that differs, what the hand has, what the policy wants, what
             to do.
     """
-    if wanted and wanted["name"] == hand.name:
-        _check_same({"hand": trained_hand(hand)}, {"hand": wanted}, hand, where, "in its training")
-
-
-def _check_same(
-    found: dict[str, Any], wanted: dict[str, Any], hand: HandModel, where: str | Path, said: str
-) -> None:
-    """Refuse the first field of ``wanted``, which is ``said``, that is another one in ``found``."""
-    have, want = dict(leaves(found)), dict(leaves(wanted))
+    task = from_dict(ReorientCfg, contract.task, where="contract.task")
+    have = dict(leaves(derive_interface(task, hand, contract.tracking)))
+    want = dict(leaves(contract.interface))
     for name in dict.fromkeys((*want, *have)):
         here, there = have.get(name), want.get(name)
         if not _same(here, there):
             raise ContractError(
                 f"{where} does not fit the hand {hand.name} ({hand.path}): {name} is "
-                f"{_short(here)} here, "
-                f"but {_short(there)} {said}; {_REMEDY[name.split('.')[0]]}"
+                f"{_short(here)} here, but {_short(there)} in the policy's contract; "
+                f"{_REMEDY.get(name.split('.')[0], _OTHERWISE)}"
             )
 
 

@@ -3,9 +3,9 @@
 from collections.abc import MutableMapping
 from dataclasses import dataclass, field, replace
 from math import pi
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from vd.config import Dropped, Renamed, from_dict, require
+from vd.config import from_dict, require
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
@@ -34,10 +34,6 @@ class ActionCfg:
 class RewardCfg:
     """Coefficients of equations 1-5, 7 and 8, and of our own shaping (off by default)."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "fingertip_height": PAPER.reward.fingertip_height,
-        "lift_m": 0.02,
-    }
     success: float = PAPER.reward.success
     """c1: once for each goal reached."""
     rotation: float = PAPER.reward.rotation
@@ -74,10 +70,6 @@ class RewardCfg:
 class SuccessCfg:
     """When a goal counts as reached, and when the object counts as lost."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"no_table_contact": False}
-    """Fields of older files (:func:`vd.config.from_dict`); table.lift_share 1 asks the same
-    everywhere.
-    """
     rotation_rad: float = PAPER.success.rotation_rad
     """Largest rotation error [rad]."""
     joint_speed_rad_s: float = PAPER.success.joint_speed_rad_s
@@ -100,7 +92,6 @@ class SuccessCfg:
 class ObservationCfg:
     """What the teacher sees besides the paper's state."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"goal_time": False, "history": 0}
     shape: Literal["none", "full"] = "none"
     """none: nothing of the object's shape, as in the paper. full: the vector from each fingertip to
     the nearest point of the surface, and how far the object extends in 9 directions for each
@@ -119,8 +110,7 @@ class ObservationCfg:
     them a teacher sees zeros in their place, and knows no more of them than a camera shows."""
     canonical: bool = False
     """Of the two quaternions of a rotation see always the same, of object, goal and the rotation
-    between them. On in all presets; off where a policy's file does not say: those policies have
-    learned the signs.
+    between them. On in all presets; policies that were trained without have learned the signs.
     """
     dynamics: Literal["none", "critic"] = "none"
     """Ours, privileged: whether the critic is told what was drawn (gains, delay, friction and
@@ -159,7 +149,6 @@ class GoalCfg:
 class StartCfg:
     """How the object starts."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"settle_s": 1.5}
     at_rest: bool = False
     """Start at rest on the table, turned about the vertical at random, rather than falling (paper).
     Goals near the start are then near a pose that lasts."""
@@ -176,7 +165,6 @@ class TableCfg:
     None by default.
     """
 
-    RETIRED: ClassVar[dict[str, Any]] = {"handed_share": Dropped(0.0, 0.25)}
     away_share: float = 0.0
     """Share of the environments whose episodes lose the table; the same environments throughout."""
     away_s: tuple[float, float] = (PAPER.scene.air_table_s, PAPER.scene.air_table_s)
@@ -256,13 +244,6 @@ class CurriculumCfg:
     task.
     """
 
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "stillness_start": 12.0,
-        "goal_start_rad": 1.0,
-        "stillness_span": [0.0, 1.0],
-        "goal_span": [0.0, 1.0],
-        "energy_start": 0.0,
-    }
     enabled: bool = False
     """Whether difficulty starts at 0 rather than 1."""
     raise_at: float = 0.6
@@ -287,7 +268,6 @@ class CurriculumCfg:
 class RandomisationCfg:
     """Table S3 and the disturbance force."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"nominal_share": Dropped(0.0), "restitution": [0.0, 0.0]}
     enabled: bool = True
     """Randomise at all."""
     stiffness_scale: tuple[float, float] = PAPER.randomisation.stiffness_scale
@@ -394,14 +374,6 @@ class ReorientCfg:
     Fields are those of ``--env`` in ``vd-train teacher --help-all``; :meth:`of` takes a policy's.
     """
 
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "num_worlds": Renamed("num_envs"),
-        "aim": {"enabled": Dropped(False)},
-        "caught": {"go_on_share": 0.0},
-        "nudge": {"enabled": False},
-        "explore": {"enabled": False},
-        "focus": {"success": {}},
-    }
     hand: str = "dclaw4"
     """Name of a hand (dclaw3, dclaw4) or path of a hand's USD."""
     fingertip: str = "rigid"

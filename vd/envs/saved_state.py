@@ -9,10 +9,6 @@ import warp as wp
 from vd.envs.cfg import CurriculumCfg
 from vd.envs.curriculum import Stage, first_stage
 from vd.envs.task_state import TaskState
-from vd.kernels.servo.actuators import COUPLING_0, PARAMETER_COLUMNS
-
-EARLIER_COLUMNS = 37
-"""Servo parameters of checkpoints from before fingers had up to six joints."""
 
 
 def save_state(
@@ -42,7 +38,7 @@ def saved_stage(state: dict[str, Any], cfg: CurriculumCfg) -> Stage:
     The tightness is that of the saved run only if it had one and this run has one too.
     """
     first = first_stage(cfg)
-    known = cfg.tightening.enabled and state.get("tightening", False)
+    known = cfg.tightening.enabled and state["tightening"]
     tightness = float(state["tightness"]) if known else first.tightness
     return Stage(float(state["difficulty"]), tightness)
 
@@ -60,16 +56,7 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
             servo
         model.
     """
-    # Checkpoints from before goals had an age: no goal is older than its episode.
-    arrays = {"goal_steps": state["arrays"]["step_count"]} | state["arrays"]
-    # Earlier ones counted goals, or remembered grasps.
-    for gone in ("goals_reached", "grasps", "grasp_count"):
-        arrays.pop(gone, None)
-    # And from before fingers had couplings for more than three joints: there are none.
-    rows = arrays.get("servo_parameters")
-    if rows is not None and rows.shape[1] == EARLIER_COLUMNS:
-        none = [COUPLING_0 + 3] * (PARAMETER_COLUMNS - EARLIER_COLUMNS)
-        arrays["servo_parameters"] = np.insert(rows, none, 0.0, axis=1)
+    arrays = state["arrays"]
     if arrays.keys() != here.keys():
         raise ValueError(
             "the saved environment has other servos, frames, memory or latency; resume with "
@@ -85,7 +72,7 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
                 f"this one {array.numpy().shape}; "
                 "resume with the num_envs and hand of the checkpoint"
             )
-    if state.get("objects", _objects(task)) != _objects(task):
+    if state["objects"] != _objects(task):
         raise ValueError(
             "the saved environments hold other objects; resume with objects of the checkpoint, "
             "or from one without environments (vd-train export --resumable)"

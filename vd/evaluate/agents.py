@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vd.assets_usd.cache import assets_dir
-from vd.bundle import is_bundle
+from vd.bundle import ONNX_SUFFIX, SUFFIX, has_suffix
 from vd.envs.cfg import (
     CurriculumCfg,
     ObservationCfg,
@@ -30,29 +30,17 @@ POLICY_LIST = "policies.json"
 """Tells of the policies of a folder (:mod:`vd.policy_store`), in a wheel also of those that it
 lacks.
 """
-SHIPPED_POLICIES = {path.stem: path for path in sorted(POLICY_FOLDER.glob("*.pt"))}
+SHIPPED_POLICIES = {path.stem: path for path in sorted(POLICY_FOLDER.glob(f"*{SUFFIX}"))}
 """Trained policies that are installed with the package, by name: ``<hand>`` or
 ``<hand>-<task>``.
 """
-
-REPLACED = {
-    "dclaw3-student": "dclaw3-tracking",
-    "dclaw4-table-student": "dclaw4-tracking",
-    "dclaw4-student": "dclaw4-tracking",
-    "dclaw4-air-tracking": "dclaw4-tracking",
-    "dclaw3-procedural": "dclaw3",
-    "dclaw3-table": "dclaw3",
-    "dclaw4-table": "dclaw4",
-    "dclaw4-air": "dclaw4",
-}
-"""Names of policies that were installed once, and what to take instead."""
 
 DEFAULT_POLICY = "dclaw4"
 DEFAULT_HAND = "dclaw4"
 NO_LAYER = "none"
 """What --hand-layer is to be for the hand as it is, whatever the training."""
 # What a run's folder holds, best first.
-_RUN_FILES = ("policy.pt", "checkpoints/best.pt")
+_RUN_FILES = (f"policy{SUFFIX}", "checkpoints/best.pt")
 
 
 def pulled_folder() -> Path:
@@ -62,46 +50,42 @@ def pulled_folder() -> Path:
 
 def installed_policies() -> dict[str, Path]:
     """Policies by name: those of the package, and those that were pulled."""
-    return {path.stem: path for path in sorted(pulled_folder().glob("[!.]*.pt"))} | SHIPPED_POLICIES
+    pulled = {path.stem: path for path in sorted(pulled_folder().glob(f"[!.]*{SUFFIX}"))}
+    return pulled | SHIPPED_POLICIES
 
 
 def find_policy(name: str | Path) -> Path:
-    """The policy file that ``name`` means.
+    """The file that ``name`` means: of an installed policy, itself, or the best of a run's folder.
 
-    One that is installed, a file, or the best one of a run's folder.
-
-    The name of an installed policy means that one; write ``./name`` for a folder called the same.
+    A ``Path``, and text with a slash, are paths. Other text is the name of an installed policy if
+    there is one, and a path otherwise.
 
     Raises:
         FileNotFoundError: There is none.
-        ValueError: A policy of that name was installed once, or has to be pulled.
+        ValueError: A policy of that name has to be pulled.
     """
-    if str(name) in REPLACED:
-        raise ValueError(f"the policy {name} is not installed any more; take {REPLACED[str(name)]}")
-    installed = installed_policies()
-    if str(name) in installed:
-        return installed[str(name)]
-    path = Path(name)
-    if path.is_file() or is_bundle(path):
+    installed, path = installed_policies(), Path(name)
+    bare = isinstance(name, str) and name == path.name
+    if bare and name in installed:
+        return installed[name]
+    if path.is_file():
         return path
     known = json.loads((POLICY_FOLDER / POLICY_LIST).read_text())["policies"]
-    if not path.exists() and str(name) in known:
+    if bare and not path.exists() and name in known:
         raise ValueError(
             f"the policy {name} is not on this machine: vd-policies pull {name} --at PLACE, such "
-            f"as the "
-            "folder vd/policies of a checkout"
+            f"as the folder vd/policies of a checkout"
         )
     if not path.is_dir():
         raise FileNotFoundError(
-            f"no policy at {path}; give a policy.pt, a bundle's folder, a file of a run's "
-            f"checkpoints folder, a run's folder, or the name of an installed policy: "
-            f"{', '.join(installed)}"
+            f"no policy at {path}; give a policy{SUFFIX}, a file of a run's checkpoints folder, a "
+            f"run's folder, or the name of an installed policy: {', '.join(installed)}"
         )
     for candidate in _RUN_FILES:
         if (path / candidate).is_file():
             return path / candidate
     raise FileNotFoundError(
-        f"{path} holds no {' or '.join(_RUN_FILES)}; give a policy.pt or a checkpoint"
+        f"{path} holds no {' or '.join(_RUN_FILES)}; give a policy{SUFFIX} or a checkpoint"
     )
 
 
@@ -118,6 +102,11 @@ def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None 
         check_hand_name(hand)
 
 
+def policy_at(path: Path) -> str:
+    """A path as text that is no policy's name."""
+    return str(path) if path.is_absolute() else f"./{path}"
+
+
 def policy_name(name: str | Path) -> str:
     """``name`` as it is told to others.
 
@@ -129,7 +118,7 @@ def policy_name(name: str | Path) -> str:
     )
 
 
-def open_policy(name: str, device: str) -> "TrainedPolicy | TrackingPolicy | None":
+def open_policy(name: str | Path, device: str) -> "TrainedPolicy | TrackingPolicy | None":
     """Load what :func:`find_policy` finds.
 
     None for a built-in agent, which has to know its task first.
@@ -141,13 +130,9 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | TrackingPolicy | Non
     if name in BUILT_IN:
         return None
     path = find_policy(name)
-    if is_bundle(path):
-        from vd.bundle.store import read_bundle
-
-        return read_bundle(path, device)
-    if path.suffix == ".onnx":
+    if has_suffix(path, ONNX_SUFFIX):
         raise ValueError(f"{path} is for vd-deploy; give the policy that it was made of")
-    from vd.tracking.policy import read_policy
+    from vd.bundle.store import read_policy
 
     return read_policy(path, device)
 
@@ -179,33 +164,26 @@ def check_fits(
     Agents without a file move any.
 
     Raises:
-        vd.bundle.contract.ContractError: A bundle of another hand, or a policy whose hand has
-            changed since; names field, found, expected and remedy.
-        ValueError: The hand has another name or number of joints, or cannot be read.
+        vd.bundle.contract.ContractError: The hand is not as in the policy's training; names field,
+            found, expected and remedy.
+        ValueError: The hand has another name, or cannot be read.
     """
     if policy is None:
         return
-    from vd.assets_usd.hands import load_hand, root_name
+    from vd.assets_usd.hands import load_hand
+    from vd.bundle.contract import check_hand
 
-    task = _on_hand(ReorientCfg.of(policy), hand, hand_layer)
-    model, path = load_hand(task.hand, task.fingertip, task.hand_layer), find_policy(name)
-    if is_bundle(path):
-        from vd.bundle.contract import check_hand
-        from vd.bundle.store import read_contract
-
-        return check_hand(read_contract(path), model, path)
-    own = ReorientCfg.of(policy).hand
-    if policy.num_actions != len(model.actuated) or (
-        task.hand != own and root_name(own) != model.name
-    ):
+    own = ReorientCfg.of(policy)
+    task = _on_hand(own, hand, hand_layer)
+    load_hand(task.hand, task.fingertip, task.hand_layer)
+    model = load_hand(task.hand, task.fingertip)
+    trained = policy.contract.interface["hand"]["name"]
+    if trained != model.name:
         raise ValueError(
-            f"{name} was trained for {own} ({policy.num_actions} motors), not for {model.name} "
-            f"({len(model.actuated)}); use the hand it was trained for: --hand {own}"
+            f"{name} was trained for {trained} ({policy.num_actions} motors), not for {model.name} "
+            f"({len(model.actuated)}); use the hand it was trained for: --hand {own.hand}"
         )
-    if policy.kind == "teacher" and policy.trained_hand:
-        from vd.bundle.contract import check_trained_hand
-
-        check_trained_hand(policy.trained_hand, load_hand(task.hand, task.fingertip), name)
+    check_hand(policy.contract, model, name)
 
 
 def _on_hand(task: ReorientCfg, hand: str | None, hand_layer: str | None) -> ReorientCfg:

@@ -44,8 +44,8 @@ EXCLUSIVE = (
 )
 """Settings that say different things of the same."""
 POLICY_HELP = (
-    "A policy.pt, a checkpoint, the folder of a bundle or of a run, the name of an installed "
-    f"policy ({', '.join(SHIPPED_POLICIES)}), or zero or random, which have no file."
+    "A policy.safetensors, a checkpoint, a run's folder, the name of an installed policy "
+    f" ({', '.join(SHIPPED_POLICIES)}), or zero or random, which have no file."
 )
 """What names a policy on a command line."""
 

@@ -22,7 +22,7 @@ Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 NOTHING = "–"  # noqa: RUF001
 WORDS = 3
 """Columns of the tables of rows that hold text."""
-_RUN_FILES = ("policy.pt",)
+_RUN_FILES = ("policy.safetensors",)
 """Files that are called the same in every run, so that their folder tells more."""
 _NAMES = ("policy", "objects", "stopped by")
 _HEADER = (*_NAMES, "success", f"and held {HOLD_S:g} s", "within 0.1 rad", "lost")

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from vd.bundle import CONTRACT_FILE
 from vd.config import to_dict
 from vd.evaluate.agents import BUILT_IN, find_policy, open_policy, sees_clouds
 from vd.evaluate.cfg import EvalCfg, parse_groups
@@ -260,11 +259,7 @@ def fingerprint(name: str) -> str:
     """
     if name in BUILT_IN:
         return name
-    path = find_policy(name)
-    # A bundle's contract has the digests of its other files.
-    return hashlib.sha256(
-        (path / CONTRACT_FILE if path.is_dir() else path).read_bytes()
-    ).hexdigest()
+    return hashlib.sha256(find_policy(name).read_bytes()).hexdigest()
 
 
 def _write(

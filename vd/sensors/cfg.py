@@ -4,9 +4,8 @@ By default a perfect camera at the hand's viewpoint.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
 
-from vd.config import Dropped, require
+from vd.config import require
 from vd.paper import PAPER
 
 BASELINE_M, FOCAL_PX = 0.055, 1024.2
@@ -25,7 +24,6 @@ an object half a metre away, as of 20 views of one finger."""
 class DepthSensorCfg:
     """Errors of a stereo depth camera. All are off: zero."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"imager": {"baseline_m": BASELINE_M, "focal_px": FOCAL_PX}}
     disparity_std_px: float = 0.0
     """Noise of the disparity [pixel]; in depth it is z^2 / (focal length * baseline) times that.
     Real cameras
@@ -88,11 +86,6 @@ class DepthSensorCfg:
 class DepthCameraCfg:
     """A depth camera on the hand's base in every environment."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "method": Dropped("raster"),
-        "block": 1,
-        "focal_noise": 0.0,
-    }
     points: int = PAPER.camera.points
     """Points of a cloud at most; 0 makes no clouds."""
     crop_m: tuple[float, float] = PAPER.camera.crop_m

@@ -1,9 +1,8 @@
 """Settings of the physics, each with the reason for its value."""
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
-from vd.config import Dropped
 from vd.paper import PAPER
 
 Engine = Literal["newton", "mujoco"]
@@ -43,19 +42,6 @@ class SimCfg:
 
     What is the same in every run is a constant of this module.
     """
-
-    RETIRED: ClassVar[dict[str, Any]] = {
-        "cone": CONE,
-        "impratio": IMPRATIO,
-        "tolerance": TOLERANCE,
-        "jacobian": Dropped(JACOBIAN),
-        "multiccd": False,
-        "contact_impedance": list(CONTACT_IMPEDANCE),
-        "table_impedance": list(TABLE_IMPEDANCE),
-        "contact_impedance_width_m": IMPEDANCE_WIDTH_M,
-        "gap_m": GAP_M,
-        "fingertip_torsion_m": FINGERTIP_TORSION_M,
-    }
 
     engine: Engine = "newton"
     """What steps the physics: Newton on MuJoCo Warp, or MuJoCo's own engine in C, on the CPU

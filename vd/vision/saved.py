@@ -10,6 +10,7 @@ from vd.vision.alignment import AlignmentNetwork
 from vd.vision.cfg import AlignmentCfg
 
 ALIGNMENT_FORMAT = "visual-dexterity alignment 1"
+REMEDY = "give an alignment.pt of vd-train student"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,26 +43,16 @@ def load_alignment(path: str | Path, device: str = "cpu") -> tuple[AlignmentNetw
         FileNotFoundError: There is no such file.
         ValueError: It is damaged, or of another kind or version.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no network at {path}; give an alignment.pt of vd-train student")
-    state = read_state(path, device, remedy="copy it again, or give another file of its run")
-    if state.get("format") != ALIGNMENT_FORMAT:
-        raise ValueError(
-            f"{path} holds no network of alignment; give an alignment.pt of vd-train student"
-        )
+    state = read_state(path, device, remedy=REMEDY, wanted=ALIGNMENT_FORMAT)
     try:
         spec = from_dict(AlignmentSpec, state["spec"], where="spec")
         return alignment_network(spec.network, state["alignment_state_dict"], device), spec
     except (ValueError, TypeError, RuntimeError) as error:
-        raise ValueError(f"{path}: {error}; it was written by another version") from error
+        raise ValueError(f"{path}: {error}; take the version that wrote it") from error
 
 
 def alignment_network(cfg: AlignmentCfg, weights: dict[str, Any], device: str) -> AlignmentNetwork:
     """A network of alignment with weights, in evaluation mode and without gradients."""
     network = AlignmentNetwork(cfg).to(device)
-    # Files of before have a head that predicted errors.
-    network.load_state_dict(
-        {name: v for name, v in weights.items() if not name.startswith("heads.error")}
-    )
+    network.load_state_dict(weights)
     return network.eval().requires_grad_(False)
