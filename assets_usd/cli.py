@@ -104,6 +104,8 @@ class Objects:
 
         if self.procedural < 1 or self.seed < 0:
             raise ValueError("--procedural must be at least 1 and --seed at least 0")
+        if self.out is not None:
+            sets.check_set_folder(self.out)
         kinds = "" if self.families == "training" else f"{self.families}-"
         name = f"procedural-{kinds}{self.procedural}-seed{self.seed}"
         folder = self.out or sets.built_in_folder(name)
@@ -119,11 +121,11 @@ class Objects:
 class Import:
     """Import meshes (OBJ, STL, PLY, GLB, USD): repair, scale, decompose, one USD per object.
 
-    A mesh is scaled as little as makes it fit the hand: longest side 0.095-0.165 m, mean width at
-    most 0.13 m, shortest side at least 0.025 m where the others let it. An object is called like
-    its file, or like the nearest folder that says something if the file's name does not
-    (mug/meshes/model.obj: mug). An import that was interrupted goes on where it stopped. The exit
-    status is 1 if any mesh was refused.
+    A mesh is scaled as little as makes it fit the hand, for D'Claws: longest side 0.095-0.165 m,
+    mean width at most 0.13 m, shortest side at least 0.025 m where the others let it. An object is
+    called like its file, or like the nearest folder that says something if the file's name does
+    not (mug/meshes/model.obj: mug). An import that was interrupted goes on where it stopped. The
+    exit status is 1 if any mesh was refused.
     """
 
     paths: tyro.conf.Positional[tuple[Path, ...]]

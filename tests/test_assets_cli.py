@@ -1,14 +1,17 @@
 """``vd-assets`` from end to end."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from vd.assets_usd import cli
 from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects import sheet
 from vd.assets_usd.objects.sets import load_set
 
 
@@ -62,13 +65,34 @@ def test_import_then_show(
         "warning dirty: removed 1 stray piece of surface, which made it" in out
     )  # unchanged, and still said
 
-    sheet = tmp_path / "sheet.png"
-    assert run(monkeypatch, "show", "things", "cube", "--out", sheet) == 0
-    image = picture(sheet)
+    drawing = tmp_path / "sheet.png"
+    assert run(monkeypatch, "show", "things", "cube", "--out", drawing) == 0
+    image = picture(drawing)
     drawn = np.abs(image - image[0, 0]).max(axis=2) > 0.1
     assert 0.05 < drawn.mean() < 0.7
     saturation = image.max(axis=2) - image.min(axis=2)
     assert (saturation > 0.3).mean() > 0.02, "the coloured parts are missing"
+
+
+def test_a_contact_sheet_says_all_there_is_to_say_and_within_its_edges(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    figures = []
+    monkeypatch.setattr(sheet, "save_figure", lambda figure, path: figures.append(figure))
+    words = (
+        "has a closed cavity of 53 % of its volume: mass and inertia are those of the hollow body"
+    )
+    cube = replace(load_set("cube")[0], warnings=(words, "its parts are full"))
+    sheet.contact_sheet([cube, cube], tmp_path / "sheet.png", "a set with a name that is long " * 3)
+    (figure,) = figures
+    caption, _, title = (text.get_text().split() for text in figure.texts)
+    assert " ".join(caption).endswith(f"{words} its parts are full")
+    assert title[-1].endswith("%")
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    for text in figure.texts:
+        box = text.get_window_extent(renderer)
+        assert box.x0 >= 0.0 and box.x1 <= figure.bbox.width, text.get_text()
+        assert box.y0 >= 0.0 and box.y1 <= figure.bbox.height, text.get_text()
 
 
 def test_objects(
@@ -78,6 +102,8 @@ def test_objects(
     assert "3 objects" in (said := capsys.readouterr().out) and "procedural-3-seed4" in said
     assert len(load_set("procedural-3-seed4")) == 3
     assert run(monkeypatch, "objects", "--procedural", 0) == 1
+    assert run(monkeypatch, "objects", "--out", tmp_path / "symmetric") == 1
+    assert "my-symmetric" in capsys.readouterr().err and not (tmp_path / "symmetric").exists()
 
 
 def test_an_imported_cube_is_not_taken_for_the_built_in_one(

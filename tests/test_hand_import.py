@@ -3,6 +3,7 @@
 What the USD says against what MuJoCo reads in the same file, and refusals.
 """
 
+import importlib.util
 import itertools
 import json
 import re
@@ -21,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd import cli
 from vd.assets_usd.hand_data import HandError, HandModel
 from vd.assets_usd.hand_import.importer import import_hand
+from vd.assets_usd.hand_import.sheet import joint_table
 from vd.assets_usd.hand_import.source import read_source
 from vd.assets_usd.hand_model import open_stage
 from vd.assets_usd.hands import load_hand
@@ -236,7 +238,8 @@ def test_what_an_mjcf_says_of_its_drives_is_taken(tmp_path):
     path = write_mjcf(tmp_path, oracle(write_urdf(tmp_path)))
     hand = import_hand(path, tmp_path / "out").hand
     np.testing.assert_allclose(hand.kp[hand.actuated], 2.0, rtol=1e-6)
-    np.testing.assert_allclose(hand.kd[hand.actuated], 0.11, rtol=1e-6)
+    followed = [0.0, 0.0, 0.0, 0.0, 0.8**2 * 0.01]  # the damping of b4, as b3 feels it
+    np.testing.assert_allclose(hand.kd[hand.actuated], 0.11 + np.array(followed), rtol=1e-6)
     np.testing.assert_allclose(hand.armature, 0.002, rtol=1e-6)
     np.testing.assert_allclose(hand.tip_frame[1, :3], [0.0, 0.0, 0.031], atol=1e-7)
     stage = open_stage(hand.path)
@@ -354,19 +357,26 @@ def test_a_mirrored_mesh_is_not_inside_out(tmp_path):
     )
 
 
-def test_a_tendon_over_two_joints_is_refused_until_it_is_described(tmp_path):
-    spec = mujoco.MjSpec.from_file(str(write_mjcf(tmp_path, oracle(write_urdf(tmp_path)))))
+def pulled(folder: Path, first: float, second: float) -> Path:
+    """The toy hand with a tendon over a1 and a2, which one position servo pulls."""
+    spec = mujoco.MjSpec.from_file(str(write_mjcf(folder, oracle(write_urdf(folder)))))
     tendon = spec.add_tendon(name="pull")
-    tendon.wrap_joint("a1", 1.0)
-    tendon.wrap_joint("a2", 1.0)
+    tendon.wrap_joint("a1", first)
+    tendon.wrap_joint("a2", second)
     for name in ("a1", "a2"):
         spec.delete(spec.actuator(f"motor {name}"))
     motor = spec.add_actuator(name="both", target="pull")
     motor.trntype = mujoco.mjtTrn.mjTRN_TENDON
+    motor.set_to_position(kp=2.0, kv=0.3)
     motor.forcelimited, motor.forcerange = 1, [-0.7, 0.7]
     spec.compile()
-    path = tmp_path / "pulled.xml"
+    path = folder / "pulled.xml"
     path.write_text(spec.to_xml())
+    return path
+
+
+def test_a_tendon_over_two_joints_is_refused_until_it_is_described(tmp_path):
+    path = pulled(tmp_path, 1.0, 1.0)
     with pytest.raises(
         HandError, match=r"tendon pull moves a1, a2 together.*say mimic: \{a2: \{joint: a1\}\}"
     ):
@@ -374,6 +384,126 @@ def test_a_tendon_over_two_joints_is_refused_until_it_is_described(tmp_path):
     (tmp_path / "said.yaml").write_text("mimic: {a2: {joint: a1}}")
     hand = import_hand(path, tmp_path / "out", tmp_path / "said.yaml").hand
     assert hand.mimic[1] == 0 and hand.actuated.tolist() == [0, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "factor"), [(1.0, 1.0, 1.0), (1.0, 1.0, 0.5), (0.8, 0.3, 1.2)]
+)
+def test_a_tendons_servo_is_as_stiff_and_strong_as_it_turns_its_joints(
+    tmp_path, first, second, factor
+):
+    """As Shadow's rh_FFJ0: by virtual work, with both joints moving."""
+    path = pulled(tmp_path, first, second)
+    (tmp_path / "said.yaml").write_text(f"mimic: {{a2: {{joint: a1, factor: {factor}}}}}")
+    hand = import_hand(path, tmp_path / "out", tmp_path / "said.yaml").hand
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    dofs = [model.joint(name).dofadr[0] for name in ("a1", "a2")]
+    way = np.array([1.0, factor])
+
+    def torque(angle: float, speed: float) -> float:
+        data.qpos[dofs], data.qvel[dofs] = angle * way, speed * way
+        mujoco.mj_forward(model, data)
+        return float((data.qfrc_actuator[dofs] + data.qfrc_passive[dofs]) @ way)
+
+    still = torque(0.0, 0.0)
+    assert hand.kp[0] == pytest.approx((still - torque(0.01, 0.0)) / 0.01, rel=1e-4)
+    assert hand.kd[0] == pytest.approx((still - torque(0.0, 0.01)) / 0.01, rel=1e-4)
+    assert hand.effort[0] == pytest.approx(abs(torque(100.0, 0.0)), rel=1e-4)
+
+
+def test_a_guessed_drive_has_the_damping_that_its_joint_needs(tmp_path):
+    """The file's damping is the joint's own; MuJoCo's mass matrix says what is critical."""
+    damped = replaced('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><dynamics damping="0.0002"/>')
+    path = write_urdf(tmp_path, damped)
+    done = import_hand(path, tmp_path / "out")
+    hand = done.hand
+    model = oracle(path).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    data.qpos[model.joint("b4").qposadr[0]] = 0.05
+    mujoco.mj_forward(model, data)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    inertia = mass + np.diag(np.full(model.nv, hand.armature[0]))
+    number = [model.joint(name).dofadr[0] for name in done.sources]
+    for joint in hand.actuated:
+        way = np.zeros(model.nv)
+        way[number[joint]] = 1.0
+        if joint == 4:
+            way[number[5]] = 0.8
+        ratio = hand.kd[joint] / (2.0 * np.sqrt(hand.kp[joint] * (way @ inertia @ way)))
+        assert ratio == pytest.approx(1.0, rel=1e-3), done.sources[joint]
+    assert not any("swing" in text for text in done.warnings)
+    (tmp_path / "said.yaml").write_text("drive: {kp: 2.0, kd: 0.001}")
+    (warning,) = import_hand(path, tmp_path / "out", tmp_path / "said.yaml").warnings
+    assert re.match(r"a1, a2, b1, b2, b3 swing: their damping is 0.0\d+ of the critical", warning)
+
+
+CARRIED = [
+    *PARTS,
+    link("carrier", 0.02),
+    joint("c", "palm", "carrier", 'xyz="0.01 0 0.08" rpy="0 0.3 0"', "1 0 0.3").replace(
+        "</joint>", '<mimic joint="a1" multiplier="0.9" offset="0.1"/></joint>'
+    ),
+    *itertools.chain.from_iterable(
+        [link(f"{finger}_1", 0.04), joint(f"{finger}1", "carrier", f"{finger}_1", place)]
+        for finger, place in (("d", 'xyz="0 0.03 0.02"'), ("e", 'xyz="0 -0.03 0.02"'))
+    ),
+]
+"""As SVH: a part of the palm follows the thumb and carries two fingers."""
+
+
+def test_fingers_on_a_part_that_follows_each_follow_with_it(tmp_path):
+    path = write_urdf(tmp_path, CARRIED)
+    done = import_hand(path, tmp_path / "out")
+    hand = done.hand
+    assert done.sources == ["a1", "a2", "b1", "b2", "b3", "b4", "c", "d1", "c", "e1"]
+    assert list(hand.mimic) == [-1, -1, -1, -1, -1, 4, 0, -1, 0, -1]
+    assert any("carrier carries the fingers of d1, e1" in note for note in done.notes)
+    model = oracle(path).compile()
+    data = mujoco.MjData(model)
+    base = data.body(1)
+    assert hand.link_mass.sum() == pytest.approx(model.body_subtreemass[1], rel=1e-5)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        q = rng.uniform(hand.lower, hand.upper)
+        q[5] = 0.8 * q[4] + 0.05
+        q[[6, 8]] = 0.9 * q[0] + 0.1
+        data.qpos[[model.joint(name).qposadr[0] for name in done.sources]] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        turn = Rotation.from_quat(base.xquat[[1, 2, 3, 0]])
+        links = hand.forward_kinematics(q)
+        for pose, name in zip(links[1:], done.sources, strict=True):
+            place = data.xpos[model.jnt_bodyid[model.joint(name).id]]
+            np.testing.assert_allclose(turn.apply(pose[:3]) + base.xpos, place, atol=1e-6)
+        places = links[:, :3] + Rotation.from_quat(links[:, 3:]).apply(hand.link_com)
+        centre = hand.link_mass @ places / hand.link_mass.sum()
+        np.testing.assert_allclose(turn.apply(centre) + base.xpos, data.subtree_com[1], atol=1e-5)
+    shapes = [shape.link for shape in hand.shapes]
+    assert 7 in shapes and 9 not in shapes, "what is carried collides once"
+    (tmp_path / "said.yaml").write_text("hold: {c: 0.1}")
+    warnings = import_hand(path, tmp_path / "out", tmp_path / "said.yaml").warnings
+    assert any("c follows a1 in the file, and is held" in warning for warning in warnings)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("collada") is not None, reason="pycollada is there")
+def test_a_mesh_that_needs_another_package_says_which(tmp_path):
+    (tmp_path / "knob.dae").write_text("<COLLADA/>")
+    path = write_urdf(tmp_path, replaced("knob.stl", "knob.dae"))
+    with pytest.raises(HandError, match=r"pip install pycollada.*COLLADA \(\.dae\).*OBJ or STL"):
+        import_hand(path, tmp_path / "out")
+
+
+def test_a_hand_that_policies_know_by_another_name_is_told_how_to_get_it(tmp_path):
+    path = write_urdf(tmp_path)
+    path.write_text(path.read_text().replace('robot name="toy"', 'robot name="leap_right"'))
+    done = import_hand(path, tmp_path / "out")
+    assert done.hand.name == "leap_right"
+    assert any(
+        "know this hand as leap" in text and "--describe leap" in text for text in done.warnings
+    )
 
 
 def test_what_is_seldom_meant_or_left_out_is_said(tmp_path):
@@ -392,6 +522,8 @@ def test_what_is_seldom_meant_or_left_out_is_said(tmp_path):
     ):
         assert words in said, words
     assert done.sources == ["hand/a1", "a2", "b1", "b2", "b3", "b4"]
+    long = "right_hand_of_the_robot/first_joint_of_the_index_finger"
+    assert long in joint_table(done.hand, [long, *done.sources[1:]])
     assert not any("replaces" in text for text in done.warnings)
     other = write_urdf(tmp_path).rename(tmp_path / "left.urdf")
     assert any(

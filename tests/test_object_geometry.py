@@ -1,5 +1,7 @@
 """Hulls, volumes, mass properties and surface samples against closed forms."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import trimesh
@@ -74,3 +76,35 @@ def test_coarsened_mesh_keeps_its_box_and_shape():
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, rtol=0.02)
     same = g.cluster_vertices(ball.vertices, ball.faces, len(ball.faces))
     assert same[1] is ball.faces
+
+
+def test_depths_in_a_hull_of_many_faces_take_little_memory():
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    hull = g.Hull(ball.vertices, ball.faces)
+    points = np.random.default_rng(0).uniform(-1.2, 1.2, (4000, 3))
+    tracemalloc.start()
+    depth = g.hull_depth(hull, points)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 200e6, "4000 points by 20 480 faces are 655 MB"
+    np.testing.assert_allclose(depth, np.linalg.norm(points, axis=1) - 1.0, atol=2e-3)
+
+
+def test_a_closed_surface_is_closed_when_it_is_coarser():
+    ring = trimesh.creation.torus(0.05, 0.02, major_sections=160, minor_sections=80)
+    noise = np.random.default_rng(0).normal(0.0, 3e-4, ring.vertices.shape)
+    vertices, faces = g.cluster_vertices(ring.vertices + noise, ring.faces, 8000, g.unfolded_faces)
+    assert 6000 < len(faces) <= 8000
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    there = np.unique(edges, axis=0, return_counts=True)
+    back = np.unique(edges[:, ::-1], axis=0, return_counts=True)
+    np.testing.assert_array_equal(there[0], back[0])
+    np.testing.assert_array_equal(there[1], back[1])
+    assert g.mesh_volume(vertices, faces) == pytest.approx(ring.volume, rel=0.03)
+
+
+def test_distances_from_a_mesh_are_those_from_its_faces():
+    cube = trimesh.creation.box((0.1, 0.1, 0.1))
+    points = np.array([[0.0, 0.0, 0.08], [0.08, 0.09, 0.0], [0.01, 0.0, 0.0]])
+    off = g.distances(cube.vertices, cube.faces, points)
+    np.testing.assert_allclose(off, [0.03, 0.05, 0.04], atol=1e-6)

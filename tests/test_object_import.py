@@ -15,6 +15,7 @@ import pytest
 import trimesh
 
 from vd.assets_usd.objects import decompose as d
+from vd.assets_usd.objects import importer
 from vd.assets_usd.objects import meshes as m
 from vd.assets_usd.objects.bodies import body_of, error_of_parts
 from vd.assets_usd.objects.geometry import Hull, hull_depth, union_depth
@@ -24,6 +25,7 @@ from vd.assets_usd.objects.plan import plan_jobs
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.settings import ImportSettings
 from vd.paper import PAPER
+from vd.tracking.symmetry import symmetries
 
 FAST = ImportSettings(threshold=0.05, mcts_iterations=20, time_limit=60.0)
 
@@ -327,6 +329,63 @@ def test_a_ring_gets_more_parts_and_a_bracket_does_not(imported):
     ring, bracket = (read_object(imported[1] / f"{name}.usd") for name in ("ring", "bracket"))
     assert ring.volume_error <= d.GOOD_ERROR and ring.warnings == ()
     assert 8 < len(ring.hulls) <= 16 and len(bracket.hulls) <= 8
+
+
+def test_a_mesh_of_many_faces_is_simplified_and_its_error_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=0.06)
+    ball.export(tmp_path / "ball.ply")
+    (job,) = plan_jobs([tmp_path / "ball.ply"], tmp_path, "MIT")
+    monkeypatch.setattr(importer, "MAX_FACES", 20_000)
+    result = import_mesh(job, FAST)
+    model = result.model
+    assert result.status == "imported", result.reason
+    note = next(note for note in model.notes if "simplified from 81920 to" in note)
+    said = float(note.partition("up to ")[2].partition(" %")[0])
+    assert 0.0 < said < 0.5
+    assert "exact mesh volume" in model.volume_method
+    off = np.abs(np.linalg.norm(model.surface_points, axis=1) / model.scale - 0.06)
+    assert off.max() < 1.5e-2 * said * 0.12
+
+
+def with_antenna(closed: bool = True) -> trimesh.Trimesh:
+    """A box of three different sides, and off its middle a rod 2 mm thick and 30 mm long."""
+    body = trimesh.creation.box((0.12, 0.06, 0.03))
+    rod = trimesh.creation.cylinder(0.001, 0.03, sections=12)
+    if not closed:
+        rod.update_faces(np.abs(rod.face_normals[:, 2]) < 0.5)
+    rod.apply_translation([0.05, 0.02, 0.0299])
+    return trimesh.util.concatenate([body, rod])
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_thin_part_that_touches_is_of_the_object(closed: bool, tmp_path: Path):
+    mesh = with_antenna(closed)
+    mesh.export(tmp_path / "radio.stl")
+    (job,) = plan_jobs([tmp_path / "radio.stl"], tmp_path, "MIT")
+    model = import_mesh(job, replace(FAST, units="m", keep_size=True)).model
+    np.testing.assert_allclose(np.ptp(model.vertices, axis=0), [0.12, 0.06, 0.0599], atol=1e-4)
+    (warning,) = model.warnings
+    assert "something thin, 30 mm long, does not collide" in warning
+    # A box alone is the same after half a turn about each axis.
+    assert len(symmetries([model], "cpu")[0]) == 1
+
+
+def test_what_is_left_out_and_long_is_a_warning():
+    body = trimesh.creation.box((0.12, 0.06, 0.05))
+    scrap = trimesh.Trimesh(
+        [[0.0, 0.0, 0.03], [0.01, 0.0, 0.03], [0.0, 0.001, 0.03]], [[0, 1, 2]], process=False
+    )
+    repaired = repair_mesh(trimesh.util.concatenate([body, scrap]))
+    assert repaired.notes[0].startswith("1 convex piece") and len(repaired.vertices) == 8
+    assert repaired.warnings == ("removed 1 stray piece of surface, up to 8 % as long as it is",)
+
+
+def test_parts_that_are_far_off_come_with_advice():
+    parts = d.Decomposition((), "coacd", error=2.32)
+    (warning,) = importer._parts_warnings(parts, 0.001)
+    assert "232 % of its volume: thicken its walls, or allow finer parts (--threshold" in warning
 
 
 def stuck(*_: object) -> list[np.ndarray]:

@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from vd.assets_usd.hands import hand_usd
 from vd.assets_usd.objects import importer
 from vd.assets_usd.objects import meshes as m
 from vd.assets_usd.objects.importer import import_meshes
-from vd.assets_usd.objects.model import read_object
+from vd.assets_usd.objects.model import ObjectError, read_object
 from vd.assets_usd.objects.plan import default_set, find_meshes, object_name
+from vd.assets_usd.objects.sets import load_set
 from vd.assets_usd.objects.settings import ImportSettings
 
 
@@ -57,10 +59,87 @@ def test_meshes_are_found_once_and_in_order(tmp_path: Path):
         ("shapenet/02691156/1015e71a/models/model_normalized.obj", "o_1015e71a"),
         ("duck/Mesh.STL", "duck"),
         ("bop/models/obj_000001.ply", "obj_000001"),
+        ("things/杯子.stl", "u676fu5b50"),
+        ("things/碗 2.stl", "u7897_2"),
+        ("things/Café.stl", "Cafe"),
     ],
 )
 def test_an_object_is_called_by_what_says_something(path: str, name: str, tmp_path: Path):
     assert object_name(tmp_path / path) == name
+
+
+def test_a_mesh_that_cannot_even_be_read_stops_no_other(
+    in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    read = importer.content_hash
+
+    def content_hash(job, settings):
+        if job.name == "huge":
+            raise MemoryError("40 GiB")
+        return read(job, settings)
+
+    monkeypatch.setattr(importer, "content_hash", content_hash)
+    meshes = [brick(tmp_path / f"{name}.stl") for name in ("huge", "mug")]
+    huge, mug = import_meshes(meshes, tmp_path / "out")
+    assert (huge.status, mug.status) == ("refused", "imported")
+    assert huge.reason == (
+        "MemoryError: 40 GiB; export it again with fewer faces, or import it alone (--jobs 1)"
+    )
+
+
+def test_what_fails_in_its_process_is_refused_with_a_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def run_tasks(work, tasks, finished, **_):
+        for task in tasks:
+            finished(task, None, "its process died: out of memory, or killed")
+
+    monkeypatch.setattr(importer, "run_tasks", run_tasks)
+    (result,) = import_meshes([brick(tmp_path / "mug.stl")], tmp_path / "out")
+    assert result.status == "refused"
+    assert "died: out of memory, or killed; export it again with fewer faces" in result.reason
+
+
+@pytest.mark.parametrize("place", ["cube", "cache/objects/cuboid", "procedural-7-seed3"])
+def test_no_set_gets_the_name_of_a_built_in_one(place: str, tmp_path: Path):
+    mesh = brick(tmp_path / "mug.stl")
+    out = tmp_path / place
+    with pytest.raises(ObjectError, match=f"built-in object set.*--out {tmp_path}.*/my-{out.name}"):
+        import_meshes([mesh], out)
+    assert not out.exists()
+
+
+def test_a_name_that_means_a_folder_here_and_a_set_is_refused(
+    in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    there = tmp_path / "cache" / "objects" / "things"
+    import_meshes([brick(tmp_path / "here.stl")], tmp_path / "things")
+    import_meshes([brick(tmp_path / "there.stl")], there)
+    with pytest.raises(
+        ObjectError, match=rf"both a folder here and a set; write \./things, or {there}"
+    ):
+        load_set("things")
+    assert [item.name for item in load_set("./things")] == ["here"]
+    assert [item.name for item in load_set(str(there))] == ["there"]
+
+
+def test_objects_fit_the_hand_that_is_named(in_process: None, tmp_path: Path):
+    text = hand_usd("dclaw3").read_text().replace("(0.095, 0.165)", "(0.055, 0.09)")
+    hand = tmp_path / "small.usda"
+    hand.write_text(text)
+    meshes = [
+        brick(tmp_path / "long.stl", (0.12, 0.03, 0.03)),
+        brick(tmp_path / "wide.stl", (0.12, 0.1, 0.04)),
+    ]
+    settings = ImportSettings(units="m", hand=str(hand))
+    long, wide = (result.model for result in import_meshes(meshes, tmp_path / "out", settings))
+    assert long.longest_side == pytest.approx(0.09, rel=1e-3)
+    # Of a D'Claw 0.13 m at 0.165 m.
+    assert m.mean_width(wide.vertices) == pytest.approx(0.13 * 0.09 / 0.165, rel=1e-3)
+    with pytest.raises(ValueError, match="no hand is called 'claw'"):
+        import_meshes(meshes, tmp_path / "other", ImportSettings(hand="claw"))
 
 
 def test_two_meshes_of_one_name_are_refused_whether_in_one_call_or_two(
@@ -120,7 +199,7 @@ def test_a_default_set_has_the_objects_of_one_folder(
     assert all(word in str(error.value) for word in (str(out), str(kits[0]), "--out"))
     for path in ("cube.stl", "procedural-7-seed3/a.stl"):
         reserved = brick(tmp_path / path)
-        with pytest.raises(m.MeshError, match="built-in object set; say where with --out"):
+        with pytest.raises(ObjectError, match=r"built-in object set.*say where with --out"):
             default_set([reserved if path == "cube.stl" else reserved.parent])
 
 

@@ -1,4 +1,4 @@
-"""Tasks of a battery: one that hangs or dies costs itself only."""
+"""Tasks of a battery: one that fails, hangs or dies costs itself only."""
 
 import os
 import time
@@ -12,22 +12,25 @@ def work(task):
         time.sleep(600)
     if what == "die":
         os._exit(9)
+    if what == "fail":
+        raise MemoryError("40 GiB")
     if what == "threads":
         return [os.environ.get(name) for name in (*SINGLE, "CUDA_VISIBLE_DEVICES")]
     return 2 * value
 
 
-def test_tasks_that_hang_or_die_cost_themselves_only():
-    tasks = [("double", 1), ("die", 2), ("hang", 3), ("double", 4), ("double", 5)]
+def test_tasks_that_fail_hang_or_die_cost_themselves_only():
+    tasks = [("double", 1), ("die", 2), ("hang", 3), ("double", 4), ("fail", 5)]
     results, reasons = {}, {}
 
     def finished(task, result, why):
         results[task], reasons[task] = result, why
 
     run_tasks(work, tasks, finished, jobs=2, limit_s=10.0)
-    assert [results[task] for task in tasks] == [2, None, None, 8, 10]
+    assert [results[task] for task in tasks] == [2, None, None, 8, None]
     assert "died" in reasons[tasks[1]] and "longer than 10 s" in reasons[tasks[2]]
-    assert not any(reasons[task] for task in (tasks[0], tasks[3], tasks[4]))
+    assert reasons[tasks[4]] == "MemoryError: 40 GiB"
+    assert not any(reasons[task] for task in (tasks[0], tasks[3]))
 
 
 def test_workers_have_one_thread_each_and_no_gpu():

@@ -68,10 +68,10 @@ def run_tasks(
     """Run ``work`` on every task in fresh processes, each with one thread of linear algebra.
 
     Args:
-        work: Function that can be pickled; it should not raise.
+        work: Function that can be pickled.
         tasks: Its arguments.
         finished: Called with a task, its result and ``""``, or with None and what became of the
-            task: it took longer than ``limit_s``, or its process died.
+            task: it took longer than ``limit_s``, raised an error, or its process died.
         jobs: Processes.
         limit_s: Longest time of a task [s].
         gpu: Whether the workers may see a GPU; a context each would fill it.
@@ -125,10 +125,12 @@ def _end(
     """
     why = f"it took longer than {limit_s:.0f} s"
     if future.done():
-        try:
+        error = future.exception()
+        if error is None:
             finished(task, future.result(), "")
             return worker
-        except BrokenProcessPool:
+        why = f"{type(error).__name__}: {error}"
+        if isinstance(error, BrokenProcessPool):
             why = "its process died: out of memory, or killed"
     end_worker(worker)
     finished(task, None, why)

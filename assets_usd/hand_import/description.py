@@ -27,7 +27,7 @@ class Drive:
     kp: float = math.nan
     """Stiffness [N m/rad]."""
     kd: float = math.nan
-    """Damping [N m s/rad]."""
+    """Damping [N m s/rad], in place of the file's."""
     effort: float = math.nan
     """Torque limit [N m]."""
     velocity: float = math.nan

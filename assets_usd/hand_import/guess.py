@@ -19,8 +19,8 @@ from vd.assets_usd.hand_import.tree import Tree, shape_box
 
 FULL_TORQUE_RAD = 0.3
 """Error at which a guessed gain reaches the torque limit: of a small servo's position mode."""
-SETTLE_S = 0.05
-"""Guessed damping over stiffness."""
+DAMPING_RATIO = 1.0
+"""Guessed damping over the critical one, of what a joint turns."""
 SPEED_RAD_S = 8.0
 ARMATURE_KG_M2 = 0.001
 """Of a Dynamixel of 50 g."""
@@ -57,9 +57,9 @@ class Stance:
 
 def take_stance(tree: Tree, said: Description) -> Stance:
     """Complete a hand by what is described, or else by guesses, which go into its notes."""
-    _complete_drives(tree)
     tips = _tips(tree)
     start = _start(tree, said)
+    _complete_drives(tree, start)
     palm = _palm(tree, tips, said)
     ends = _roots(tree), _tip_points(tree, tips, start)
     if said.mount is not None:
@@ -75,31 +75,77 @@ def _text(values: np.ndarray) -> str:
     return "(" + ", ".join(f"{round(float(v), 3) + 0.0:g}" for v in values) + ")"
 
 
-def _complete_drives(tree: Tree) -> None:
+def _complete_drives(tree: Tree, start: np.ndarray) -> None:
     """Gains, speed and inertia of the drives, where neither file nor description has them."""
-    guessed: dict[str, list[str]] = {}
     by_name = {joint.name: joint for joint in tree.joints}
     for joint in tree.joints:
         if joint.mimic is not None:
-            joint.effort = joint.effort if joint.effort > 0.0 else by_name[joint.mimic[0]].effort
-            joint.kp = joint.kd = 0.0
-        values = {
-            "kp": joint.effort / FULL_TORQUE_RAD,
-            "kd": SETTLE_S * (joint.effort / FULL_TORQUE_RAD if math.isnan(joint.kp) else joint.kp),
-            "velocity": SPEED_RAD_S,
-            "armature": ARMATURE_KG_M2,
-        }
-        for name, value in values.items():
-            if math.isnan(getattr(joint, name)):
-                setattr(joint, name, value)
-                guessed.setdefault(name, []).append(f"{value:.3g}")
-    for name, found in guessed.items():
-        span = (
-            found[0]
-            if len(set(found)) == 1
-            else f"{min(found, key=float)} to {max(found, key=float)}"
-        )
-        tree.notes.append(f"guess: {name} = {span} of {len(found)} joints (drive, drives)")
+            leader = by_name[joint.mimic[0]]
+            leader.damping += joint.mimic[1] ** 2 * joint.damping
+            joint.effort = joint.effort if joint.effort > 0.0 else leader.effort
+            joint.kp = joint.kd = joint.damping = 0.0
+    _fill(tree, "velocity", [SPEED_RAD_S for _ in tree.joints])
+    _fill(tree, "armature", [ARMATURE_KG_M2 for _ in tree.joints])
+    _fill(tree, "kp", [joint.effort / FULL_TORQUE_RAD for joint in tree.joints])
+    damping = []
+    for joint, critical in zip(tree.joints, critical_damping(tree, start), strict=True):
+        damping.append(max(DAMPING_RATIO * critical, joint.damping))
+        joint.kd += joint.damping
+    _fill(tree, "kd", damping)
+
+
+def _fill(tree: Tree, field: str, values: list[float]) -> None:
+    """Give the drives that lack a number the one that is guessed, which a note says."""
+    found = []
+    for joint, value in zip(tree.joints, values, strict=True):
+        if math.isnan(getattr(joint, field)):
+            setattr(joint, field, value)
+            found.append(value)
+    if found:
+        span = " to ".join(dict.fromkeys(f"{end:.3g}" for end in (min(found), max(found))))
+        tree.notes.append(f"guess: {field} = {span} of {len(found)} joints (drive, drives)")
+
+
+def critical_damping(tree: Tree, q: np.ndarray) -> np.ndarray:
+    """Damping with which the drives just do not swing at angles [D] [rad], 0 of what follows.
+
+    Each turns its rotor, the links beyond it and what follows it, while other joints stand still.
+
+    Returns:
+        Damping of each drive [D] [N m s/rad].
+    """
+    names = [joint.name for joint in tree.joints]
+    moves = np.eye(len(names))
+    for i, joint in enumerate(tree.joints):
+        if joint.mimic is not None:
+            moves[i, i] = 0.0
+            moves[i, names.index(joint.mimic[0])] = joint.mimic[1]
+    armature = np.array([joint.armature for joint in tree.joints])
+    inertia = ((_mass_matrix(tree, q) + np.diag(armature)) @ moves * moves).sum(axis=0)
+    kp = np.array([joint.kp for joint in tree.joints])
+    return np.asarray(2.0 * np.sqrt(kp * inertia))
+
+
+def _mass_matrix(tree: Tree, q: np.ndarray) -> np.ndarray:
+    """Of the links, without rotors, at angles [D] [rad]: [D, D] [kg m^2]."""
+    poses = tree.forward_kinematics(q)
+    total = np.zeros((len(q), len(q)))
+    for last, (link, pose) in enumerate(zip(tree.links[1:], poses[1:], strict=True)):
+        turn = Rotation.from_quat(pose[3:]).as_matrix()
+        com = pose[:3] + turn @ link.com
+        linear = np.zeros((3, len(q)))
+        angular = np.zeros((3, len(q)))
+        number = last
+        while number >= 0:
+            joint = tree.joints[number]
+            frame = compose(poses[joint.parent], joint.parent_frame)
+            axis = Rotation.from_quat(frame[3:]).apply(joint.axis)
+            angular[:, number] = axis
+            linear[:, number] = np.cross(axis, com - frame[:3])
+            number = joint.parent - 1
+        total += link.mass * linear.T @ linear
+        total += angular.T @ turn @ link.inertia @ turn.T @ angular
+    return total
 
 
 def _tips(tree: Tree) -> list[np.ndarray]:

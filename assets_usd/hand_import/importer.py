@@ -12,8 +12,8 @@ import numpy as np
 
 from vd.assets_usd.hand_data import HandError, HandModel, compose
 from vd.assets_usd.hand_import.author import Author
-from vd.assets_usd.hand_import.description import read_description
-from vd.assets_usd.hand_import.guess import Stance, take_stance
+from vd.assets_usd.hand_import.description import BUILT_IN, read_description
+from vd.assets_usd.hand_import.guess import Stance, critical_damping, take_stance
 from vd.assets_usd.hand_import.source import Source, read_source
 from vd.assets_usd.hand_import.tree import Tree, grow
 from vd.assets_usd.hand_model import open_stage, read_hand
@@ -29,6 +29,8 @@ unit.
 """
 BEYOND_RAD = 0.02
 """By which a joint may be led beyond its limits before it is said."""
+LEAST_DAMPING_RATIO = 0.2
+"""A drive that is damped less swings for long."""
 MOST_EFFORT_NM, MOST_MASS_KG = 5.0, 5.0
 """A joint that is stronger and a hand that is heavier are not believed without a warning."""
 
@@ -67,7 +69,12 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
     if name in HANDS:
         raise HandError(f"{path}: {name} is a hand of the package; give it another name (name)")
     folder = imported_folder(name) if out is None else out
-    warnings = _suspicious(tree)
+    warnings = [
+        *_unnamed(source, describe),
+        *tree.warnings,
+        *_swinging(tree, stance),
+        *_suspicious(tree),
+    ]
     with tempfile.TemporaryDirectory() as scratch:
         author = Author(tree, stance, said, name)
         near = _untouched(source, tree)
@@ -116,6 +123,30 @@ def _check_units(source: Source, tree: Tree, stance: Stance) -> None:
             )
 
 
+def _unnamed(source: Source, describe: str | Path | None) -> list[str]:
+    """What is said of a hand that comes without the description which the package has of it."""
+    return [
+        f"policies and presets know this hand as {name}, with what its file does not say: import "
+        f"it with --describe {name}"
+        for name in BUILT_IN
+        if describe is None and source.name == f"{name}_right"
+    ]
+
+
+def _swinging(tree: Tree, stance: Stance) -> list[str]:
+    """What is said of drives with so little damping that they swing."""
+    ratios = {}
+    for joint, critical in zip(tree.joints, critical_damping(tree, stance.start), strict=True):
+        if joint.kd < LEAST_DAMPING_RATIO * critical:
+            ratios[joint.name] = joint.kd / critical
+    if not ratios:
+        return []
+    return [
+        f"{', '.join(ratios)} swing: their damping is {min(ratios.values()):.2g} of the critical "
+        f"one; describe more (drive, drives: kd)"
+    ]
+
+
 def _suspicious(tree: Tree) -> list[str]:
     """What is possible but seldom meant."""
     said = []
@@ -158,16 +189,23 @@ def _suspicious(tree: Tree) -> list[str]:
 def _untouched(source: Source, tree: Tree) -> set[tuple[int, int]]:
     """Pairs of links whose contact is off.
 
-    Of one finger, the base and first links, and those of the source.
+    Of one finger, those that a joint joins, also by a copy, and those of the source.
 
     Each pair of links apart costs MuJoCo, which has 32 bits for who meets whom, so a finger is one
     in this.
     """
-    number = {link.name: i for i, link in enumerate(tree.links)}
+    number: dict[str, int] = {}
+    for i, link in enumerate(tree.links):
+        number.setdefault(link.name, i)  # of copies the first has the shapes
     number |= {
         name: i for i, link in enumerate(tree.links) for name in link.sites if name not in number
     }
-    pairs = {(0, joint.child) for joint in tree.joints if joint.parent == 0}
+    pairs = {
+        (min(link, joint.child), max(link, joint.child))
+        for joint in tree.joints
+        for link in range(len(tree.links))
+        if link != joint.child and tree.links[link].name == tree.links[joint.parent].name
+    }
     for joints in tree.finger_joints():
         pairs |= set(combinations([joint + 1 for joint in joints], 2))
     named = [sorted((number.get(a, 0), number.get(b, 0))) for a, b in source.apart]

@@ -67,8 +67,9 @@ def joint_table(hand: HandModel, sources: list[str]) -> str:
 
     Name, the source's, limits, start, drive, motor or the joint that it follows.
     """
+    width = max(map(len, ["source", *sources]))
     lines = [
-        "joint  source                     limits [rad]    start  N m    kp     kd    moves by"
+        f"joint  {'source':{width}}   limits [rad]    start  N m    kp     kd    moves by",
     ]
     for i, name in enumerate(hand.joint_names):
         motor, leader = hand.motors[i], hand.mimic[i]
@@ -77,7 +78,7 @@ def joint_table(hand: HandModel, sources: list[str]) -> str:
         else:
             moves = f"{motor.model} {motor.id}" if motor else "a motor"
         lines.append(
-            f"{name:6} {sources[i][:24]:24} {hand.lower[i]:7.3f} {hand.upper[i]:7.3f} "
+            f"{name:6} {sources[i]:{width}} {hand.lower[i]:7.3f} {hand.upper[i]:7.3f} "
             f"{hand.start[i]:8.3f} "
             f"{hand.effort[i]:5.2f} {hand.kp[i]:6.2f} {hand.kd[i]:6.3f}  {moves}"
         )

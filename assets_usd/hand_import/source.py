@@ -79,8 +79,24 @@ class Joint:
     armature: float = math.nan
     kp: float = math.nan
     kd: float = math.nan
+    """Of its drive."""
+    damping: float = 0.0
+    """Of the joint itself, whatever drives it."""
     mimic: tuple[str, float, float] | None = None
     """The joint that it follows, factor and offset."""
+
+
+@dataclass
+class Actuator:
+    """What turns one joint, or a tendon's, by the sum of their angles, each times a ratio."""
+
+    name: str
+    """Of the tendon, or of the actuator."""
+    ratios: dict[str, float]
+    """By the joints' names."""
+    kp: float = math.nan
+    kd: float = math.nan
+    effort: float = math.nan
 
 
 @dataclass
@@ -95,10 +111,21 @@ class Source:
     """What is said about the file."""
     problems: list[str] = field(default_factory=list)
     """What stands against it."""
-    coupled: list[tuple[str, list[str]]] = field(default_factory=list)
-    """Tendons, and the joints that each moves together."""
+    actuators: list[Actuator] = field(default_factory=list)
     apart: list[tuple[str, str]] = field(default_factory=list)
     """Links whose contact is off."""
+
+
+def lead(joints: dict[str, Joint], name: str) -> tuple[str, float, float]:
+    """The joint that moves another in the end, or that itself; factor and offset [rad]."""
+    factor, offset = 1.0, 0.0
+    for _ in joints:  # a joint that follows a follower follows what that does
+        if name not in joints or (above := joints[name].mimic) is None:
+            break
+        offset += factor * above[2]
+        factor *= above[1]
+        name = above[0]
+    return name, factor, offset
 
 
 def read_source(path: Path) -> Source:
@@ -124,6 +151,11 @@ def read_source(path: Path) -> Source:
         warnings.simplefilter("always")
         try:
             source = read(path)
+        except ImportError as error:  # of what reads a mesh
+            raise HandError(
+                f"{path}: a mesh cannot be read, {error}: COLLADA (.dae) needs it; or convert the "
+                f"mesh to OBJ or STL"
+            ) from error
         except Exception as error:  # whatever a parser raises: the file is at fault
             xacro = "<xacro:" in text or "${" in str(error)
             remedy = f"; expand it first: xacro {path.name} > hand.urdf" if xacro else ""
@@ -206,7 +238,7 @@ def _read_urdf(path: Path) -> Source:
         )
         joint.effort = _bounded(builder.joint_effort_limit[dof]) or math.nan
         joint.velocity = _bounded(builder.joint_velocity_limit[dof]) or math.nan
-        joint.kd = builder.joint_damping[dof] or math.nan
+        joint.damping = float(builder.joint_damping[dof])
         friction[name] = builder.joint_friction[dof]
         if (leader := builder.joint_mimic_joint[i]) >= 0:
             offset, factor = builder.joint_mimic_coeffs[i]
@@ -328,7 +360,7 @@ def _mjcf_joints(model: Any, body: int, source: Source) -> None:
     if model.jnt_limited[first]:
         joint.lower, joint.upper = (float(end - zero) for end in model.jnt_range[first])
     joint.armature = float(model.dof_armature[dof]) or math.nan
-    joint.kd = float(model.dof_damping[dof]) or math.nan
+    joint.damping = float(model.dof_damping[dof])
     if model.jnt_actfrclimited[first]:
         joint.effort = float(np.abs(model.jnt_actfrcrange[first]).max())
 
@@ -375,44 +407,45 @@ def _mjcf_equalities(model: Any, source: Source) -> None:
 
 
 def _mjcf_actuators(model: Any, source: Source) -> None:
-    """Gains and torque limits of the joints that actuators turn, by themselves or by a tendon of several."""
-    joints = {joint.name: joint for joint in source.joints}
+    """What turns joints, by themselves or by a tendon of several: gains and limits of force."""
     by_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
     idle = sorted(set(range(model.ntendon)) - set(model.actuator_trnid[by_tendon, 0]))
     if idle:
         names = ", ".join(model.tendon(i).name for i in idle)
         source.notes.append(f"tendons without a motor are left out: {names}")
     for i in range(model.nu):
-        gear, affine = (
-            abs(float(model.actuator_gear[i, 0])) or 1.0,
-            int(mujoco.mjtBias.mjBIAS_AFFINE),
-        )
-        strongest = math.nan
+        gear = float(model.actuator_gear[i, 0]) or 1.0
+        ratios = {joint: gear * ratio for joint, ratio in _moved(model, i, source).items()}
+        actuator = Actuator(_actuator_name(model, i), ratios)
         if model.actuator_forcelimited[i]:
-            strongest = float(np.abs(model.actuator_forcerange[i]).max())
+            actuator.effort = float(np.abs(model.actuator_forcerange[i]).max())
         elif (
             model.actuator_ctrllimited[i]
             and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
         ):
-            strongest = float(
+            actuator.effort = float(
                 np.abs(model.actuator_gainprm[i, 0] * model.actuator_ctrlrange[i]).max()
             )
-        for joint in (joints[name] for name in _moved(model, i, source) if name in joints):
-            if model.actuator_biastype[i] == affine:
-                stiffness, damping = (-float(b) * gear**2 for b in model.actuator_biasprm[i, 1:3])
-                joint.kp = float(np.nansum([joint.kp, stiffness])) or math.nan
-                joint.kd = float(np.nansum([joint.kd, damping])) or math.nan
-            joint.effort = float(np.fmin(strongest * gear, joint.effort))
+        if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE:
+            actuator.kp, actuator.kd = (-float(b) for b in model.actuator_biasprm[i, 1:3])
+        source.actuators.append(actuator)
 
 
-def _moved(model: Any, actuator: int, source: Source) -> list[str]:
-    """Joints that an actuator moves; those of a tendon go on the list of what is coupled."""
+def _actuator_name(model: Any, actuator: int) -> str:
+    """The name of the tendon that it pulls, or its own."""
+    if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_TENDON:
+        return str(model.tendon(model.actuator_trnid[actuator, 0]).name)
+    return str(model.actuator(actuator).name or f"actuator {actuator}")
+
+
+def _moved(model: Any, actuator: int, source: Source) -> dict[str, float]:
+    """Joints that an actuator moves, and the coefficient of each."""
     kind, target = model.actuator_trntype[actuator], model.actuator_trnid[actuator, 0]
     name = model.actuator(actuator).name or f"actuator {actuator}"
     if model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_MUSCLE:
         source.problems.append(f"{name} is a muscle, which only pulls; make it a motor")
     if kind == mujoco.mjtTrn.mjTRN_JOINT:
-        return [_joint_name(model, target)]
+        return {_joint_name(model, target): 1.0}
     wraps = range(0)
     if kind == mujoco.mjtTrn.mjTRN_TENDON:
         wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
@@ -420,8 +453,5 @@ def _moved(model: Any, actuator: int, source: Source) -> list[str]:
         source.problems.append(
             f"{name} pulls at no joint but over sites; give its joints motors of their own"
         )
-        return []
-    moved = [_joint_name(model, model.wrap_objid[w]) for w in wraps]
-    if len(moved) > 1:
-        source.coupled.append((model.tendon(target).name, moved))
-    return moved
+        return {}
+    return {_joint_name(model, model.wrap_objid[w]): float(model.wrap_prm[w]) for w in wraps}

@@ -1,6 +1,7 @@
 """A source welded to what a hand is: a base and fingers, each a chain of revolute joints."""
 
 import math
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandError, compose, invert
 from vd.assets_usd.hand_import.description import Description, Drive
-from vd.assets_usd.hand_import.source import IDENTITY, Joint, Link, Shape, Source
+from vd.assets_usd.hand_import.source import IDENTITY, Joint, Link, Shape, Source, lead
 from vd.assets_usd.objects.geometry import hull_volume
 from vd.kernels.servo.actuators import MAX_JOINTS
 
@@ -48,6 +49,7 @@ class Tree:
     tips: list[np.ndarray | None]
     """Fingertip in the last link of each finger [7], where the source marks one."""
     notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
     def forward_kinematics(self, q: np.ndarray) -> np.ndarray:
         """Poses of all links in the base [L, 7] for joint angles [D] [rad]."""
@@ -83,6 +85,8 @@ class _Grower:
     def __init__(self, source: Source, said: Description):
         self.source, self.said = source, said
         self.notes, self.problems = list(source.notes), list(source.problems)
+        self.warnings: list[str] = []
+        self.by_name = {joint.name: joint for joint in source.joints}
         self.out: dict[int, list[int]] = {}
         for number, joint in enumerate(source.joints):
             self.out.setdefault(joint.parent, []).append(number)
@@ -99,14 +103,16 @@ class _Grower:
     def grow(self) -> Tree:
         self._check_names()
         self.fail()
+        self._take_mimic()
+        self._take_actuators()
         self._take_said()
-        self._check_tendons()
         base, starts = self._palm()
         self.fail()
         links, joints = [self._welded(base)], []
-        counts, tips, moved = [], [], {base: 0}
-        for start in starts:
-            chain = self._chain(start)
+        counts, tips = [], []
+        chains = [chain for start in starts for chain in self._chains(start)]
+        copies = Counter(joint.name for chain in chains for joint in chain)
+        for chain in chains:
             counts.append(len(chain))
             if len(chain) > MAX_JOINTS:
                 self.problems.append(
@@ -124,8 +130,12 @@ class _Grower:
                         parent_frame=compose(offset, joint.parent_frame),
                     )
                 )
-                moved[joint.child] = parent = len(links)
-                links.append(self._welded(joint.child))
+                parent = len(links)
+                link = self._welded(joint.child)
+                number = copies[joint.name]
+                if any(link.name == other.name for other in links):
+                    link.shapes = []  # they are of the finger before
+                links.append(replace(link, mass=link.mass / number, inertia=link.inertia / number))
             tips.append(self._tip(chain[-1].child))
         self.fail()
         if self.raised:
@@ -138,7 +148,8 @@ class _Grower:
                 f"guess: meshes of {', '.join(self.hollow)} collide as their hulls, up to "
                 f"{max(self.hollow.values()):.1f} times their volume (parts)"
             )
-        tree = Tree(self.source.path.name, links, joints, counts, tips, self.notes)
+        name = self.source.path.name
+        tree = Tree(name, links, joints, counts, tips, self.notes, self.warnings)
         self._check_followers(tree)
         self._check_numbers(tree)
         self.fail()
@@ -158,27 +169,72 @@ class _Grower:
                 if name not in known
             ]
 
+    def _take_mimic(self) -> None:
+        """What follows what, by the description or the file."""
+        for joint in self.source.joints:
+            if joint.name in self.said.mimic:
+                follow = self.said.mimic[joint.name]
+                joint.mimic = follow.joint, follow.factor, follow.offset_rad
+        for name in self.held:
+            leader = lead(self.by_name, name)[0]
+            if leader not in self.held:
+                self.warnings.append(
+                    f"{name} follows {leader} in the file, and is held: what it carries is off "
+                    f"where {leader} moves; leave it out of hold"
+                )
+
+    def _take_actuators(self) -> None:
+        """Gains and torque limits of joints, of those that others follow with what moves these."""
+        limits = {name: joint.effort for name, joint in self.by_name.items()}
+        efforts: dict[str, float] = {}
+        for actuator in self.source.actuators:
+            ratios: dict[str, float] = {}
+            torques: dict[str, float] = {}
+            free: dict[str, str] = {}
+            for name, ratio in actuator.ratios.items():
+                leader, factor, _ = lead(self.by_name, name)
+                if leader in self.by_name and name not in self.held and leader not in self.held:
+                    torque = np.copysign(np.fmin(actuator.effort * abs(ratio), limits[name]), ratio)
+                    ratios[leader] = ratios.get(leader, 0.0) + factor * ratio
+                    torques[leader] = torques.get(leader, 0.0) + factor * torque
+                    free.setdefault(leader, name)
+            if len(ratios) > 1:
+                first, *rest = free.values()
+                lines = ", ".join(f"{name}: {{joint: {first}}}" for name in rest)
+                self.problems.append(
+                    f"the tendon {actuator.name} moves {', '.join(free.values())} together, which "
+                    f"no drive of a joint does; say mimic: {{{lines}}}, or hold: {{{rest[0]}: 0}}"
+                )
+            for name, ratio in ratios.items():
+                joint = self.by_name[name]
+                if actuator.kp > 0.0:
+                    joint.kp = float(np.nansum([joint.kp, actuator.kp * ratio**2]))
+                    joint.kd = float(np.nansum([joint.kd, actuator.kd * ratio**2]))
+                    if joint.kd + joint.damping == 0.0:
+                        joint.kd = math.nan  # nothing says it
+                efforts[name] = float(np.fmin(abs(torques[name]), efforts.get(name, math.nan)))
+        for name, effort in efforts.items():
+            self.by_name[name].effort = effort
+
     def _take_said(self) -> None:
         """Put what the description says of joints and links into the source."""
         said = self.said
         for joint in self.source.joints:
-            if joint.name in said.mimic:
-                follow = said.mimic[joint.name]
-                joint.mimic = follow.joint, follow.factor, follow.offset_rad
             if joint.name in said.limits:
                 joint.lower, joint.upper = said.limits[joint.name]
             for drive in (said.drive, said.drives.get(joint.name, Drive())):
                 for name, value in vars(drive).items():
                     if not math.isnan(value):
                         setattr(joint, name, value)
+                if not math.isnan(drive.kd):
+                    joint.damping = 0.0  # what is described is all of it
         for link in self.source.links:
             if link.name in said.mass:
                 scale = said.mass[link.name] / link.mass if link.mass > 0.0 else 0.0
                 link.mass, link.inertia = said.mass[link.name], link.inertia * scale
-        by_name = {joint.name: joint for joint in self.source.joints}
         for name, angle in said.hold.items():
             self.notes.append(f"{name} is held at {angle:g} rad, as described")
-            self._check_angle("hold", by_name[name], angle)
+            self._check_angle("hold", self.by_name[name], angle)
 
     def _check_angle(self, entry: str, joint: Joint, angle: float) -> None:
         """Refuse an angle that is described and beyond the limits."""
@@ -187,20 +243,6 @@ class _Grower:
                 f"{entry}: {angle:g} rad is beyond the limits of {joint.name}, {joint.lower:g} to "
                 f"{joint.upper:g} rad"
             )
-
-    def _check_tendons(self) -> None:
-        """Joints that a tendon moves together, unless the description says what they do."""
-        said = self.said
-        for tendon, names in self.source.coupled:
-            free = [n for n in names if n not in self.held and n not in said.mimic]
-            if len(free) > 1:
-                first, *rest = free
-                lines = ", ".join(f"{name}: {{joint: {first}}}" for name in rest)
-                self.problems.append(
-                    f"the tendon {tendon} moves {', '.join(free)} together, which no drive of a "
-                    f"joint does; "
-                    f"say mimic: {{{lines}}}, or hold: {{{rest[0]}: 0}}"
-                )
 
     def _is_welded(self, joint: Joint) -> bool:
         return joint.kind == "fixed" or joint.name in self.held
@@ -271,13 +313,19 @@ class _Grower:
         leaving = self._leaving(link)
         return len(leaving) > 1 or any(self._branches(joint.child) for joint in leaving)
 
-    def _chain(self, start: Joint) -> list[Joint]:
-        """The joints of a finger."""
+    def _chains(self, start: Joint) -> list[list[Joint]]:
+        """The joints of a finger; of several, each with a copy, where they share what follows."""
         chain = [start]
         while leaving := self._leaving(chain[-1].child):
             if len(leaving) > 1:
                 names = ", ".join(joint.name for joint in leaving)
                 link = self.source.links[chain[-1].child].name
+                if all(joint.mimic for joint in chain):
+                    self.notes.append(
+                        f"{link} carries the fingers of {names}; each gets a copy of what moves "
+                        f"it, and a share of its mass"
+                    )
+                    return [chain + rest for joint in leaving for rest in self._chains(joint)]
                 self.problems.append(
                     f"{link} moves, and carries the fingers of {names}; hold what moves it: "
                     f"hold: {{{', '.join(f'{joint.name}: 0' for joint in chain)}}}"
@@ -290,7 +338,7 @@ class _Grower:
                     f"{joint.name} is {joint.kind}; only revolute joints move: hold: "
                     f"{{{joint.name}: 0}}"
                 )
-        return chain
+        return [chain]
 
     def _welded(self, first: int) -> Link:
         """A link with all that is fixed to it."""
@@ -391,11 +439,8 @@ class _Grower:
         for joint in tree.joints:
             if joint.mimic is None:
                 continue
+            joint.mimic = lead(by_name, joint.name)
             leader, factor, offset = joint.mimic
-            for _ in tree.joints:  # a joint that follows a follower follows what that does
-                if leader in by_name and (above := by_name[leader].mimic):
-                    leader, factor, offset = above[0], factor * above[1], factor * above[2] + offset
-            joint.mimic = leader, factor, offset
             if leader in self.held:
                 angle = factor * self.held[leader] + offset
                 self.problems.append(

@@ -14,7 +14,6 @@ from vd.assets_usd.objects.geometry import (
     Solid,
     inside,
     mesh_volume,
-    solid_of_hulls,
     solid_of_mesh,
     solid_of_voxels,
     triangle_areas,
@@ -80,14 +79,9 @@ def body_of(mesh: RepairedMesh) -> Body:
 def _outer_body(mesh: RepairedMesh) -> Body:
     vertices, faces = mesh.vertices, mesh.faces
     within: Inside = partial(inside, vertices, faces)
-    if mesh.pieces:
-        within = partial(_in_hulls, mesh.pieces)
     if mesh.watertight:
         solid = solid_of_mesh(vertices, faces)
         return Body(within, solid.volume, solid, "exact mesh volume")
-    if mesh.pieces:
-        solid = solid_of_hulls(mesh.pieces)
-        return Body(within, solid.volume, solid, "union of the pieces by voxels")
     if mesh.closed or _open_share(vertices, faces) <= OPEN_SHARE:
         solid = _solid_by_points(vertices, within)
         return Body(within, solid.volume, solid, "winding numbers")

@@ -4,7 +4,7 @@ Plain NumPy and SciPy on small meshes. Lengths in metres, masses in kilograms; a
 ``[n, 3]``, triangles ``[t, 3]`` with outward (counter-clockwise) winding.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +14,9 @@ from scipy.spatial.transform import Rotation
 
 VOXELS = 96
 """Voxels along the longest side of a voxelised solid: about 1 % of volume error on thin shapes."""
+
+MOST_DISTANCES = 2**22
+"""Distances of points from planes that are computed at once: 32 MB."""
 
 CANDIDATES_PER_POINT = 8
 """Random candidates per surface point kept by farthest-point sampling: even cover at little
@@ -29,8 +32,9 @@ GRID_TURN = Rotation.from_euler("xyz", [0.37, 0.61, 0.23])
 have.
 """
 
-FINEST_GRID, COARSEST_GRID, GRID_BISECTIONS = 512.0, 8.0, 12
-"""Grids tried when a mesh is coarsened: cells along its longest side, and bisection steps."""
+FINEST_GRID, COARSEST_GRID, GRID_BISECTIONS = 65536.0, 8.0, 8
+"""Grids tried when a mesh is coarsened: cells along its longest side, and bisection steps.
+The finest has room for debris that makes the object itself small."""
 
 
 SLIVER_THICKNESS = 2e-3
@@ -110,7 +114,9 @@ def hull_planes(hull: Hull) -> tuple[np.ndarray, np.ndarray]:
 def hull_depth(hull: Hull, points: np.ndarray) -> np.ndarray:
     """Largest signed plane distance [n] of points [n, 3]: negative inside, 0 on the surface, m."""
     normal, offset = hull_planes(hull)
-    return (np.asarray(points, dtype=np.float64) @ normal.T - offset).max(axis=1)
+    points = np.asarray(points, dtype=np.float64)
+    chunks = np.array_split(points, 1 + len(points) * len(offset) // MOST_DISTANCES)
+    return np.concatenate([(chunk @ normal.T - offset).max(axis=1) for chunk in chunks])
 
 
 def union_depth(hulls: Sequence[Hull], points: np.ndarray) -> np.ndarray:
@@ -151,6 +157,26 @@ def inside(
         device="cpu",
     )
     return np.asarray(found.numpy(), dtype=bool)
+
+
+def distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Distances of points [n, 3] from a mesh [V, 3], [T, 3] at most its length away, [n]."""
+    import warp as wp
+
+    from vd.kernels.sensor.shape_grids import off_mesh_kernel
+
+    low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
+
+    def on_device(places: np.ndarray) -> Any:
+        return wp.array(((places - low) / size).astype(np.float32), dtype=wp.vec3, device="cpu")
+
+    corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
+    mesh = wp.Mesh(on_device(vertices), corners)
+    found = wp.zeros((1, len(points)), dtype=float, device="cpu")
+    number = wp.array([mesh.id], dtype=wp.uint64, device="cpu")
+    samples = on_device(points[None])
+    wp.launch(off_mesh_kernel, found.shape, [samples, number], [found], device="cpu")
+    return size * np.asarray(found.numpy()[0])
 
 
 def sides_along_axes(points: np.ndarray) -> np.ndarray:
@@ -363,24 +389,63 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
     return chosen
 
 
+def _alike(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles [T, 3] in an order in which those of the same corners follow each other.
+
+    Returns:
+        The order [T], where each group of them begins in it [G], and by triangle 1 where the
+        corners go round as their numbers rise, else -1 [T]; of a group those with -1 come first.
+    """
+    corners = np.sort(faces, axis=1)
+    side = 2 * (faces < np.roll(faces, -1, axis=1)).sum(axis=1) - 3
+    order = np.lexsort((side, *corners.T))
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = (np.diff(corners[order], axis=0) != 0).any(axis=1)
+    return order, np.flatnonzero(new), side
+
+
+def single_faces(faces: np.ndarray) -> np.ndarray:
+    """Each triangle [T, 3] once, whichever side it shows: a thin wall becomes a sheet."""
+    order, start, _ = _alike(faces)
+    return np.asarray(faces[np.sort(np.minimum.reduceat(order, start))])
+
+
+def unfolded_faces(faces: np.ndarray) -> np.ndarray:
+    """Triangles [T, 3] without those that show both sides: what is closed stays closed."""
+    order, start, side = _alike(faces)
+    total = np.add.reduceat(side[order], start)
+    last = np.append(start[1:], len(order)) - 1
+    kept = order[np.where(total < 0, start, last)][total != 0]
+    return np.asarray(faces[np.sort(kept)])
+
+
 def cluster_vertices(
-    vertices: np.ndarray, faces: np.ndarray, max_faces: int
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    max_faces: int,
+    tidied: Callable[[np.ndarray], np.ndarray] = single_faces,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coarsen a mesh to at most ``max_faces`` triangles by merging the vertices of a grid cell.
 
     The finest grid that meets the limit is found by bisection. A cell's vertex minimises the
     squared distance to the planes of the triangles around it (quadric error), which keeps edges
-    sharp; the
-    bounding box is kept. For pictures only: the solid and the hulls are computed before.
+    sharp; the bounding box is kept. ``tidied`` says what becomes of triangles with equal corners.
     """
     if len(faces) <= max_faces:
         return vertices, faces
     low, side = vertices.min(axis=0), np.ptp(vertices, axis=0)
     fine, coarse = FINEST_GRID, COARSEST_GRID
-    cluster, merged = _clustered(vertices, faces, coarse)
+    if len(vertices) > len(
+        faces
+    ):  # triangles with corners of their own: those at one place are one
+        same, faces = _clustered(vertices, faces, fine, tidied)
+        one = np.zeros(same.max() + 1, dtype=int)
+        one[same] = np.arange(len(same))
+        vertices = vertices[one]
+    cluster, merged = _clustered(vertices, faces, coarse, tidied)
     for _ in range(GRID_BISECTIONS):
-        cells = (fine + coarse) / 2.0
-        trial = _clustered(vertices, faces, cells)
+        cells = float(np.sqrt(fine * coarse))
+        trial = _clustered(vertices, faces, cells, tidied)
         if len(trial[1]) > max_faces:
             fine = cells
         else:
@@ -396,17 +461,19 @@ def cluster_vertices(
 
 
 def _clustered(
-    vertices: np.ndarray, faces: np.ndarray, cells: float
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cells: float,
+    tidied: Callable[[np.ndarray], np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cell of each vertex [V] on a grid of ``cells`` along the longest side, and the triangles left."""
     low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
-    key = np.floor((vertices - low) / size * cells).astype(np.int64)
-    cluster = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
+    x, y, z = np.floor((vertices - low) / size * cells).astype(np.int64).T
+    most = int(cells) + 1
+    cluster = np.unique((x * most + y) * most + z, return_inverse=True)[1].reshape(-1)
     merged = cluster[faces]
     a, b, c = merged.T
-    merged = merged[(a != b) & (b != c) & (c != a)]
-    first = np.unique(np.sort(merged, axis=1), axis=0, return_index=True)[1]
-    return cluster, merged[np.sort(first)]
+    return cluster, tidied(merged[(a != b) & (b != c) & (c != a)])
 
 
 def _quadric_vertices(
@@ -423,12 +490,15 @@ def _quadric_vertices(
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal /= np.maximum(length, 1e-30)
-    matrix, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
-    for k in range(3):
-        where = cluster[faces[:, k]]
-        offset = np.einsum("ij,ij->i", normal, corner[:, 0] - mean[where])
-        np.add.at(matrix, where, length[:, :, None] * normal[:, :, None] * normal[:, None, :])
-        np.add.at(right, where, length * normal * offset[:, None])
+    matrix = np.zeros((count, 3, 3))
+    right = np.zeros((count, 3))
+    for corners in cluster[faces].T:
+        offset = np.einsum("ij,ij->i", normal, corner[:, 0] - mean[corners])
+        for i in range(3):
+            weight = length[:, 0] * normal[:, i]
+            right[:, i] += np.bincount(corners, weight * offset, count)
+            for j in range(3):
+                matrix[:, i, j] += np.bincount(corners, weight * normal[:, j], count)
     # The mean pulls weakly where the planes leave a direction free.
     matrix += (1e-2 * np.trace(matrix, axis1=1, axis2=2) + 1e-30)[:, None, None] * np.eye(3)
     return mean + np.clip(np.linalg.solve(matrix, right[:, :, None])[:, :, 0], -cell, cell)

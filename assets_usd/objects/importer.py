@@ -3,13 +3,14 @@
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import trimesh
 
 from vd.assets_usd.objects.bodies import body_of, cavity_share, error_of_parts
 from vd.assets_usd.objects.decompose import (
@@ -20,8 +21,17 @@ from vd.assets_usd.objects.decompose import (
     best_decomposition,
     tidy_hulls,
 )
-from vd.assets_usd.objects.geometry import cluster_vertices, surface_points, triangle_areas
-from vd.assets_usd.objects.meshes import mass_of, scale_of
+from vd.assets_usd.objects.geometry import (
+    Hull,
+    cluster_vertices,
+    distances,
+    random_surface_points,
+    surface_points,
+    triangle_areas,
+    unfolded_faces,
+    union_depth,
+)
+from vd.assets_usd.objects.meshes import fit_of, mass_of, scale_of
 from vd.assets_usd.objects.model import (
     SURFACE_POINTS,
     ObjectError,
@@ -33,18 +43,28 @@ from vd.assets_usd.objects.model import (
 )
 from vd.assets_usd.objects.plan import Job, check_target, find_meshes, plan_jobs
 from vd.assets_usd.objects.reading import declared_unit, load_mesh, mesh_kind
-from vd.assets_usd.objects.repair import repair_mesh
+from vd.assets_usd.objects.repair import LONG, repair_mesh
+from vd.assets_usd.objects.sets import check_set_folder
 from vd.assets_usd.objects.settings import ImportSettings, MeshError
 from vd.assets_usd.objects.usd_mesh import usd_files
 from vd.files import make_folder
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
 
-IMPORT_VERSION = 5
+IMPORT_VERSION = 6
 """Part of every content hash: raise it when the import computes something else."""
 
 MAX_VISUAL_FACES = 3000
 """Faces of the visual mesh: files stay below 40 kB, and no picture here shows more."""
+
+MAX_FACES = 200_000
+"""Faces of a mesh that is repaired: of a scan they are a third of a millimetre long."""
+
+COMPARED = 20_000
+"""Points of a surface at which its error is measured."""
+
+MAX_DECOMPOSED_FACES = 12_000
+"""Faces of what is split into convex parts: CoACD's time grows with them, and parts are coarser."""
 
 MAX_ERROR, MAX_OFFSET = 1.0, 0.03
 """Parts are refused if they differ from the mesh by more than its volume, and are farther from its
@@ -54,6 +74,9 @@ mm. Of
 thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as parts differs by its
 volume.
 """
+
+LAST_REMEDY = "export it again with fewer faces, or import it alone (--jobs 1)"
+"""What helps where nothing is known of why an import failed."""
 
 HANG_S, OVERHEAD_S = 20.0, 600.0
 """Wall-clock time after which a mesh is taken to hang: for each second of processor time that CoACD
@@ -97,6 +120,7 @@ def content_hash(job: Job, settings: ImportSettings) -> str:
     size = {
         "units": settings.units,
         "keep_size": settings.keep_size,
+        "fit": asdict(fit_of(settings.hand)),
         "density": settings.density,
         "mass_kg": settings.mass,
     }
@@ -115,15 +139,23 @@ def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
     count = len(parts.hulls)
     which = f"{count} convex parts differ" if count > 1 else "one convex part differs"
     off = f"{which} from the mesh by {100 * parts.error:.0f} % of its volume"
+    advice = "thicken its walls, or allow finer parts (--threshold, --max-hulls)"
     if parts.error > MAX_ERROR and offset > MAX_OFFSET:
         raise MeshError(
             f"{off}, {100 * offset:.0f} % of its length off its surface on average"
-            f"{f' ({words})' if words else ''}: thicken its walls, or allow finer parts "
-            f"(--threshold, "
-            "--max-hulls)"
+            f"{f' ({words})' if words else ''}: {advice}"
         )
     warnings = [f"fall-back, tried again at the next import: {words}"] if words else []
-    return warnings + ([off] if parts.error > GOOD_ERROR else [])
+    return warnings + ([f"{off}: {advice}"] if parts.error > GOOD_ERROR else [])
+
+
+def _uncovered(vertices: np.ndarray, hulls: Sequence[Hull]) -> list[str]:
+    """What has to be said where a surface [V, 3] sticks far out of its convex parts [m]."""
+    length = float(np.ptp(vertices, axis=0).max())
+    out = float(union_depth(hulls, vertices).max())
+    if out <= LONG * length:
+        return []
+    return [f"something thin, {1e3 * out:.0f} mm long, does not collide: thicken it"]
 
 
 def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
@@ -147,7 +179,8 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
         MeshError: The mesh is refused; the message is the reason.
     """
     source = Path(job.source)
-    mesh = repair_mesh(load_mesh(source))
+    loaded, load_notes = _simplified(load_mesh(source))
+    mesh = repair_mesh(loaded)
     scale, size_notes, size_warnings = scale_of(settings, mesh.vertices, declared_unit(source))
     mesh = mesh.scaled(scale)
     body = body_of(mesh)
@@ -159,12 +192,15 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
         hulls = tidy_hulls([p.vertices for p in mesh.pieces], HULL_VERTICES)
         parts = Decomposition(hulls, "convex pieces", error=error_of(hulls))
     else:
-        parts = best_decomposition(mesh.vertices, mesh.faces, settings, error_of)
+        coarse = cluster_vertices(mesh.vertices, mesh.faces, MAX_DECOMPOSED_FACES)
+        parts = best_decomposition(*coarse, settings, error_of)
     offset = parts.error * body.volume / triangle_areas(mesh.vertices, mesh.faces).sum()
     made = _parts_warnings(parts, offset / np.ptp(mesh.vertices, axis=0).max())
+    drawn = cluster_vertices(mesh.vertices, mesh.faces, MAX_VISUAL_FACES)
+    made += _uncovered(drawn[0], parts.hulls)
     return build_model(
         job.name,
-        *cluster_vertices(mesh.vertices, mesh.faces, MAX_VISUAL_FACES),
+        *drawn,
         parts.hulls,
         body.solid,
         surface_points(mesh.vertices, mesh.faces, SURFACE_POINTS),
@@ -179,9 +215,23 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
         volume_method=f"{parts.method}; volume in which parts and solid differ; solid: {body.method}",
         # A fall-back forced by a limit may not be needed next time.
         content_hash="" if parts.fallback else content_hash(job, settings),
-        notes=(*mesh.notes, *size_notes, *mass_notes),
+        notes=(*load_notes, *mesh.notes, *size_notes, *mass_notes),
         warnings=(*mesh.warnings, *body.warnings, *made, *size_warnings, *mass_warnings),
     )
+
+
+def _simplified(mesh: Any) -> tuple[Any, list[str]]:
+    """A mesh of at most MAX_FACES faces, and what has to be said of it."""
+    vertices, faces = cluster_vertices(mesh.vertices, mesh.faces, MAX_FACES, unfolded_faces)
+    if len(faces) == len(mesh.faces):
+        return mesh, []
+    some = random_surface_points(mesh.vertices, mesh.faces, COMPARED, np.random.default_rng(0))
+    off = distances(vertices, faces, some).max() / mesh.extents.max()
+    note = (
+        f"simplified from {len(mesh.faces)} to {len(faces)} faces, up to {100 * off:.2g} % of its "
+        f"length off"
+    )
+    return trimesh.Trimesh(vertices, faces, process=False), [note]
 
 
 def import_meshes(
@@ -194,7 +244,7 @@ def import_meshes(
 ) -> list[ImportResult]:
     """Import meshes, several at a time, in processes of their own.
 
-    None that hangs or crashes stops others.
+    None that fails, hangs or crashes stops others.
 
     An object file whose content hash still holds is left alone, so that an interrupted import goes
     on where it stopped.
@@ -212,11 +262,13 @@ def import_meshes(
     Raises:
         MeshError: A path does not exist or holds no mesh, two meshes would have one name, or an
             object would be written over something else. Nothing has been written then.
+        ObjectError: The folder has the name of a built-in set.
         OutputError: The folder cannot be made.
     """
     settings = settings or ImportSettings()
     settings.check()
     out = Path(out)
+    check_set_folder(out)
     plan = plan_jobs(find_meshes([Path(p) for p in paths]), out, settings.licence)
     results: dict[str, ImportResult] = {}
 
@@ -236,7 +288,7 @@ def import_meshes(
         partial(import_mesh, settings=settings),
         todo,
         lambda job, result, why: finish(
-            result or ImportResult(job, "refused", f"no import: {why}")
+            result or ImportResult(job, "refused", f"no import: {why}; {LAST_REMEDY}")
         ),
         jobs=workers,
         # A busy machine is no reason: processor time is limited, this only ends what hangs.
@@ -260,6 +312,8 @@ def _without_work(job: Job, settings: ImportSettings) -> ImportResult | None:
         content = content_hash(job, settings)
     except MeshError as error:
         return ImportResult(job, "refused", str(error))
+    except Exception as error:  # whatever a file does to its readers stops no other
+        return ImportResult(job, "refused", f"{type(error).__name__}: {error}; {LAST_REMEDY}")
     if target.is_file() and stored_facts(target).get("contentHash") == content:
         return ImportResult(job, "cached", model=read_object(target))
     check_target(job)

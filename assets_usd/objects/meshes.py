@@ -1,6 +1,8 @@
 """Foreign meshes: the size and weight they are given."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import trimesh
@@ -49,20 +51,53 @@ def mean_width(vertices: np.ndarray) -> float:
     return float(trimesh.convex.convex_hull(vertices).integral_mean_curvature / (2.0 * np.pi))
 
 
-def scales_that_fit(sides: Sequence[float], width: float) -> tuple[float, float]:
-    """Least and largest factor to metres by which a shape fits the hand.
+@dataclass(frozen=True)
+class Fit:
+    """Sizes of objects that fit a hand [m]."""
 
-    Its longest side is then in ``LONGEST_SIDE_M``, its mean width at most ``MEAN_WIDTH_M`` and its
-    shortest side at least ``THINNEST_M``. A shape that fits at no size has a least factor above the
+    longest: tuple[float, float] = LONGEST_SIDE_M
+    """Range of the longest side."""
+    mean_width: float = MEAN_WIDTH_M
+    """Most of the mean width."""
+    thinnest: float = THINNEST_M
+    """Least of the shortest side."""
+
+
+@cache
+def fit_of(hand: str) -> Fit:
+    """Sizes that fit a hand: its longest sides, and of a D'Claw's bounds as large a share.
+
+    Args:
+        hand: Its name or USD file.
+
+    Raises:
+        ValueError: No hand has this name.
+    """
+    from vd.assets_usd.hands import load_hand
+
+    least, most = load_hand(hand).workspace.size_m
+    share = most / LONGEST_SIDE_M[1]
+    return Fit((least, most), share * MEAN_WIDTH_M, share * THINNEST_M)
+
+
+DCLAW = Fit()
+"""Sizes of the paper's hand."""
+
+
+def scales_that_fit(sides: Sequence[float], width: float, fit: Fit = DCLAW) -> tuple[float, float]:
+    """Least and largest factor to metres by which a shape fits a hand.
+
+    A shape that fits at no size has a least factor above the
     largest.
 
     Args:
         sides: Sides of the bounding box in the shape's units, in any order, none of them 0 [3].
         width: :func:`mean_width` in the shape's units.
+        fit: Sizes that fit the hand.
     """
-    low, high = LONGEST_SIDE_M
+    low, high = fit.longest
     longest, shortest = float(max(sides)), float(min(sides))
-    return max(low / longest, THINNEST_M / shortest), min(high / longest, MEAN_WIDTH_M / width)
+    return max(low / longest, fit.thinnest / shortest), min(high / longest, fit.mean_width / width)
 
 
 def scale_of(
@@ -73,17 +108,16 @@ def scale_of(
     Notes and warnings.
     """
     sides, width = np.ptp(vertices, axis=0), mean_width(vertices)
+    fit = fit_of(settings.hand)
     unit = UNITS_M.get(settings.units, declared)
     if not settings.keep_size or unit is None:
-        factor, note = choose_scale(sides, width, unit)
+        factor, note = choose_scale(sides, width, unit, fit)
         return factor, [note] if note else [], []
-    size, (least, most) = f"{sides.max() * unit:.3f} m", scales_that_fit(sides, width)
+    size, (least, most) = f"{sides.max() * unit:.3f} m", scales_that_fit(sides, width, fit)
     misfit = (
         f"does not fit the hand at its real size of {size}, mean width {width * unit:.3f} m: "
-        f"longest side "
-        f"{LONGEST_SIDE_M[0]:g} to {LONGEST_SIDE_M[1]:g} m, mean width at most {MEAN_WIDTH_M:g} m, "
-        f"shortest "
-        f"side at least {THINNEST_M:g} m"
+        f"longest side {fit.longest[0]:g} to {fit.longest[1]:g} m, mean width at most "
+        f"{fit.mean_width:.3g} m, shortest side at least {fit.thinnest:.3g} m"
     )
     notes = [f"taken as {unit_name(unit)}, real size kept: {size}"]
     return unit, notes, [] if least <= unit <= most else [misfit]
@@ -115,14 +149,13 @@ def unit_name(unit: float) -> str:
 
 
 def choose_scale(
-    sides: Sequence[float], width: float, unit: float | None = None
+    sides: Sequence[float], width: float, unit: float | None = None, fit: Fit = DCLAW
 ) -> tuple[float, str]:
-    """Factor from a mesh's units to metres, so that it fits the hand.
+    """Factor from a mesh's units to metres, so that it fits a hand.
 
     The paper scales each mesh by hand, "to a proper size compared to the robot hand size", with its
     longest side in ``LONGEST_SIDE_M`` (supplementary text on objects). Here a mesh stays as it is
-    where that holds, its mean width is at most ``MEAN_WIDTH_M`` and its shortest side at least
-    ``THINNEST_M``; otherwise it is scaled as little as possible. The range of the longest side is
+    where it fits; otherwise it is scaled as little as possible. The range of the longest side is
     kept first, thickness gives way first. A unit that is not known is the one of ``GUESSED_UNITS``
     that needs the least rescaling.
 
@@ -130,13 +163,14 @@ def choose_scale(
         sides: Sides of the bounding box in the mesh's units, in any order, none of them 0 [3].
         width: :func:`mean_width` in the mesh's units.
         unit: Unit of the mesh [m]; None if it is not known.
+        fit: Sizes that fit the hand.
 
     Returns:
         The factor and a note, empty if the mesh is taken as it is.
     """
-    least, most = scales_that_fit(sides, width)
+    least, most = scales_that_fit(sides, width, fit)
     longest = float(max(sides))
-    most = max(most, LONGEST_SIDE_M[0] / longest)
+    most = max(most, fit.longest[0] / longest)
     least = min(least, most)
 
     def fitting(unit: float) -> float:

@@ -3,13 +3,14 @@
 import csv
 import os
 import re
+import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from vd.assets_usd.objects.model import object_files, stored_facts
 from vd.assets_usd.objects.reading import MESH_SUFFIXES
-from vd.assets_usd.objects.sets import is_built_in, objects_dir
+from vd.assets_usd.objects.sets import check_set_folder, objects_dir
 from vd.assets_usd.objects.settings import MeshError
 from vd.assets_usd.objects.usd_mesh import usd_files
 
@@ -52,14 +53,22 @@ class Job:
 
 
 def prim_name(stem: str) -> str:
-    """A valid prim name from a file's stem: letters, digits and underscores, no leading digit."""
-    name = re.sub(r"[^0-9A-Za-z_]+", "_", stem).strip("_") or "object"
+    """A valid prim name from a file's stem: letters, digits and underscores, no leading digit.
+
+    Latin letters lose their accents; others become their code points, so that names stay apart.
+    """
+    bare = re.sub("[\u0300-\u036f]", "", unicodedata.normalize("NFD", stem))
+    spelled = [
+        f"u{ord(letter):04x}" if letter.isalnum() and not letter.isascii() else letter
+        for letter in unicodedata.normalize("NFC", bare)
+    ]
+    name = re.sub(r"[^0-9A-Za-z_]+", "_", "".join(spelled)).strip("_") or "object"
     return name if not name[0].isdigit() else f"o_{name}"
 
 
 def says_nothing(word: str) -> bool:
     """Whether a file's stem or a folder's name is of ``GENERIC_WORDS`` and resolutions (16k) alone."""
-    words = [part for part in re.split(r"[^0-9a-z]+", word.lower()) if part]
+    words = [part for part in re.split(r"[\W_]+", word.lower()) if part]
     return all(part in GENERIC_WORDS or re.fullmatch(r"\d+k", part) for part in words)
 
 
@@ -224,15 +233,15 @@ def default_set(paths: Sequence[Path]) -> Path:
     Named after the folder that holds them all.
 
     Raises:
-        MeshError: The name is that of a built-in set, or the set holds objects from elsewhere.
+        MeshError: The set holds objects from elsewhere.
+        ObjectError: The name is that of a built-in set.
     """
     above = Path(os.path.commonpath([absolute(path) for path in paths]))
     plain = re.sub(r"[^\w.-]+", "_", above.name).strip(".") or "objects"
     name = object_name(above) if above.is_file() else plain
     folder = objects_dir() / name
     other = f"say where with --out, such as --out {objects_dir() / f'my-{name}'}"
-    if is_built_in(name):
-        raise MeshError(f"{name!r} is the name of a built-in object set; {other}")
+    check_set_folder(folder)
     for path in object_files(folder) if folder.is_dir() else ():
         file = stored_facts(path).get("file")
         if file and not Path(file).is_relative_to(above):

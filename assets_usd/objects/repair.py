@@ -28,6 +28,10 @@ STRAY_AREA, STRAY_VOLUME = 0.01, 1e-3
 """A piece with less of the surface, which encloses nothing or less of the volume, is a stray: scans
 have single triangles inside and beside them."""
 
+LONG = 0.05
+"""What is longer than this share of the object is a part of it where it touches, and is never left
+out without a warning."""
+
 STRAYS_AREA = 0.05
 """Strays with more of the surface together are the surface itself, in pieces that do not join."""
 
@@ -202,11 +206,27 @@ def _kept(mesh: Any, keep: np.ndarray) -> Any:
     return mesh
 
 
+def _touching(low: np.ndarray, high: np.ndarray, gap: float) -> np.ndarray:
+    """Which of boxes between corners [P, 3] have at most a gap between them, bool [P, P]."""
+    high = high + gap
+    return np.asarray(((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2))
+
+
 def _without_strays(mesh: Any, notes: list[str], warnings: list[str]) -> Any:
-    """The mesh without its strays; there is a warning if these made it longer."""
+    """The mesh without its strays; there is a warning of long ones, or if they made it longer.
+
+    A long one that touches, as by their boxes, is a thin part: an antenna, a ring of wire.
+    """
     of_face, pieces = _pieces(mesh)
     area, volume = np.array([piece.area for piece in pieces]), np.abs(_volumes(pieces))
     stray = (area < STRAY_AREA * area.sum()) & (volume <= STRAY_VOLUME * volume.sum())
+    if stray.all():
+        return mesh
+    low, high = np.stack([piece.bounds for piece in pieces], axis=1)
+    length = (high - low).max(axis=1)
+    whole = np.ptp(mesh.triangles[~stray[of_face]].reshape(-1, 3), axis=0).max()
+    touches = _touching(low, high, APART * whole)[:, ~stray].any(axis=1)
+    stray &= (length <= LONG * whole) | ~touches
     if not stray.any() or area[stray].sum() > STRAYS_AREA * area.sum():
         return mesh
     kept = _kept(mesh, ~stray[of_face])
@@ -214,6 +234,8 @@ def _without_strays(mesh: Any, notes: list[str], warnings: list[str]) -> Any:
     longer = mesh.extents.max() / kept.extents.max()
     if longer > 1.0 + APART:
         warnings.append(f"{words}, which made it {longer:.3g} times as long")
+    elif (most := length[stray].max() / whole) > LONG:
+        warnings.append(f"{words}, up to {100 * most:.0f} % as long as it is")
     else:
         notes.append(words)
     return kept
@@ -229,8 +251,7 @@ def _largest_body(mesh: Any, warnings: list[str]) -> Any:
     """
     of_face, pieces = _pieces(mesh)
     low, high = np.stack([piece.bounds for piece in pieces], axis=1)
-    high = high + APART * mesh.extents.max()
-    near = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
+    near = _touching(low, high, APART * mesh.extents.max())
     of_face = trimesh.graph.connected_component_labels(np.argwhere(near), node_count=len(pieces))[
         of_face
     ]

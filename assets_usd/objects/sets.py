@@ -46,6 +46,20 @@ def is_built_in(name: str) -> bool:
     return name in BUILT_IN or _PROCEDURAL.fullmatch(name) is not None
 
 
+def check_set_folder(folder: Path) -> None:
+    """Refuse a folder for objects that commands would take for a built-in set by its name.
+
+    Raises:
+        ObjectError: Names it, and another folder.
+    """
+    if is_built_in(folder.name):
+        raise ObjectError(
+            f"{folder}: {folder.name!r} is the name of a built-in object set, which commands would "
+            f"take instead; say where with --out, such as --out "
+            f"{folder.with_name(f'my-{folder.name}')}"
+        )
+
+
 def _built_in_models(name: str) -> list[ObjectModel]:
     from vd.assets_usd.objects.procedural import cube, cuboid, procedural_set
 
@@ -97,18 +111,21 @@ def _place(entry: str | Path) -> Path:
     That of a built-in set may not be there yet.
 
     Raises:
-        ObjectError: There are none; the message lists the sets and the commands that make more.
+        ObjectError: There are none, and the message lists the sets and the commands that make
+            more; or the name means two places.
     """
     path, root = Path(entry).expanduser(), objects_dir()
     if isinstance(entry, str) and is_built_in(entry) and not path.is_file():
         return built_in_folder(entry)
     named = root / path.name if path.name == str(entry) else root
-    for place in (
-        path,
-        named,
-    ):  # a folder of meshes does not hide the set that was imported from it
-        if _holds_objects(place):
-            return place
+    # A folder of meshes does not hide the set that was imported from it.
+    places = [place for place in (path, named) if _holds_objects(place)]
+    if len(places) == 2 and not path.samefile(named):
+        raise ObjectError(
+            f"{str(entry)!r} is both a folder here and a set; write ./{entry}, or {named}"
+        )
+    if places:
+        return places[0]
     if path.is_dir():
         raise ObjectError(
             f"{path}: no object file (*.usd); make some of its meshes: vd-assets import {path}"

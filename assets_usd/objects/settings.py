@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from vd.assets_usd.hands import check_hand_name
 from vd.config import require
 
 LEAST_THRESHOLD = 0.01
@@ -25,6 +26,8 @@ class ImportSettings:
     units: Literal["auto", "mm", "cm", "m", "in"] = "auto"
     """Unit of the meshes. auto: what the file declares (GLB, USD), else m, mm or cm, whichever
     needs the least rescaling. Inches are never guessed."""
+    hand: str = "dclaw3"
+    """Hand that the objects have to fit: its name or USD file."""
     keep_size: bool = False
     """Keep the real size, also of what does not fit the hand. The unit must be known."""
     density: float | None = None
@@ -53,6 +56,7 @@ class ImportSettings:
         Raises:
             ValueError: Names the option.
         """
+        check_hand_name(self.hand)
         if self.density is not None and self.mass is not None:
             raise MeshError("--density and --mass both give the mass; leave one out")
         low, high = DENSITIES_KG_M3

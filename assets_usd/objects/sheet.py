@@ -1,6 +1,7 @@
 """Contact sheets: every object of a set beside its convex parts, drawn without a display."""
 
 import colorsys
+import textwrap
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,8 +23,14 @@ VIEW = {"elev": 24.0, "azim": -52.0}
 ZOOM = 1.6
 """Of matplotlib's boxes, so that a ball around the object fills its axes."""
 
-TILE_IN, CAPTION_IN = 1.7, 0.55
-"""Side of a picture, and height of what is written below it [inch]; 100 pixels each."""
+TILE_IN, MARGIN_IN = 1.7, 0.1
+"""Side of a picture, and what is left free about texts [inch]; 100 pixels each."""
+
+CAPTION_POINTS, TITLE_POINTS = 7, 11
+"""Sizes of the font."""
+
+LETTER, LINE = 0.6, 1.25
+"""Width of a usual letter and height of a line, as shares of the font's size."""
 
 
 def _draw(
@@ -54,6 +61,25 @@ def part_colour(number: int, saturation: float, value: float) -> tuple[float, fl
     return colorsys.hsv_to_rgb((0.58 + number * 0.381966) % 1.0, saturation, value)
 
 
+def _lines(text: str, points: float, width_in: float) -> list[str]:
+    """A text in lines that fit into a width."""
+    return textwrap.wrap(text, int(72.0 * (width_in - 2.0 * MARGIN_IN) / (LETTER * points)))
+
+
+def _height_in(lines: int, points: float) -> float:
+    """Height of lines of text and of a margin below them."""
+    return lines * LINE * points / 72.0 + MARGIN_IN
+
+
+def _caption(model: ObjectModel) -> str:
+    """What is written below an object: name, size, parts, error, warnings."""
+    facts = (
+        f"{model.longest_side * 1e3:.0f} mm, parts: {len(model.hulls)}, ±{model.volume_error:.1%}"
+    )
+    said = [model.name, facts, *model.warnings]
+    return "\n".join(line for text in said for line in _lines(text, CAPTION_POINTS, 2 * TILE_IN))
+
+
 def save_figure(figure: Any, path: Path) -> Path:
     """Write a figure, atomically; the suffix says which format."""
     with atomic_path(Path(path)) as temporary, warnings.catch_warnings():
@@ -76,13 +102,23 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
         The path.
     """
     errors = [model.volume_error for model in models]
-    title = f"{title}, objects: {len(models)}\nvolume error {np.median(errors):.1%}, worst {max(errors):.1%}"
     columns = max(1, round(np.sqrt(len(models) / 2)))
     rows = -(-len(models) // columns)
-    size = (columns * 2 * TILE_IN, rows * (TILE_IN + CAPTION_IN) + 0.5)
+    width = columns * 2 * TILE_IN
+    head = _lines(f"{title}, objects: {len(models)}", TITLE_POINTS, width)
+    errors_said = f"volume error {np.median(errors):.1%}, worst {max(errors):.1%}"
+    head += _lines(errors_said, TITLE_POINTS, width)
+    captions = [_caption(model) for model in models]
+    heights = []
+    for row in range(rows):
+        beside = captions[row * columns : (row + 1) * columns]
+        lines = max(caption.count("\n") + 1 for caption in beside)
+        heights.append(TILE_IN + _height_in(lines, CAPTION_POINTS))
+    size = (width, sum(heights) + _height_in(len(head), TITLE_POINTS) + MARGIN_IN)
     figure = Figure(size, dpi=100)
     for i, model in enumerate(models):
-        left, top = (i % columns) * 2 * TILE_IN, (rows - i // columns) * (TILE_IN + CAPTION_IN)
+        left = (i % columns) * 2 * TILE_IN
+        top = sum(heights[i // columns :])
         hulls = [(hull.vertices, hull.faces) for hull in model.hulls]
         hues = [part_colour(k, 0.52, 0.97) for k in range(len(hulls))]
         for k, (drawn, colours) in enumerate(
@@ -90,12 +126,9 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
         ):
             place = np.divide((left + k * TILE_IN, top - TILE_IN, TILE_IN, TILE_IN), (*size, *size))
             _draw(figure.add_axes(tuple(place), projection="3d"), drawn, colours)
-        said = [
-            f"{model.longest_side * 1e3:.0f} mm, parts: {len(hulls)}, ±{model.volume_error:.1%}"
-        ]
-        said += ["; ".join(model.warnings)[:50]] if model.warnings else []
-        at = ((left + 0.05) / size[0], (top - TILE_IN) / size[1])
+        at = ((left + MARGIN_IN) / size[0], (top - TILE_IN) / size[1])
         colour = WARNING_COLOUR if model.warnings else "black"
-        figure.text(*at, "\n".join([model.name, *said]), fontsize=7, va="top", color=colour)
-    figure.text(0.01, 1.0 - 0.1 / size[1], title, fontsize=11, va="top")
+        figure.text(*at, captions[i], fontsize=CAPTION_POINTS, va="top", color=colour)
+    at = (MARGIN_IN / size[0], 1.0 - MARGIN_IN / size[1])
+    figure.text(*at, "\n".join(head), fontsize=TITLE_POINTS, va="top")
     return save_figure(figure, path)

@@ -32,6 +32,8 @@ DENSE = 2000
 """Points of the surface that this is measured on: the share is then known to 0.4 % (two standard
 errors).
 """
+STICKS_OUT = 0.05
+"""Nothing thin that is off by more than this share of the shape's length may be left over."""
 STEPS, EVERY = 12, 2
 """Steps of each rotation that is tried, and every so many-th sample they look at."""
 APART_RAD = 0.12
@@ -140,10 +142,15 @@ class _Surface:
             wp.array(item.vertices, dtype=wp.vec3, device=device),
             wp.array(item.faces.ravel(), dtype=wp.int32, device=device),
         )
-        self._points = random_surface_points(item.vertices, item.faces, DENSE, rng)
+        samples = random_surface_points(item.vertices, item.faces, DENSE, rng)
+        self._points = np.concatenate([samples, item.vertices])
+        self._most_m = STICKS_OUT * item.longest_side
 
     def share_off(self, turns: np.ndarray) -> np.ndarray:
-        """Share of the surface that is more than :data:`OFF_M` from it when turned by turns [R, 4], [R]."""
+        """Share of the surface that is more than OFF_M from it when turned by turns [R, 4], [R].
+
+        All of it where something sticks out, however thin.
+        """
         if not len(turns):
             return np.zeros(0)
         turned = np.einsum("rij,pj->rpi", Rotation.from_quat(turns).as_matrix(), self._points)
@@ -153,7 +160,9 @@ class _Surface:
         wp.launch(
             off_mesh_kernel, off.shape, inputs=[points, mesh], outputs=[off], device=self._device
         )
-        return (off.numpy() > OFF_M).mean(axis=1)
+        found = off.numpy()
+        share = (found[:, :DENSE] > OFF_M).mean(axis=1)
+        return np.where(found.max(axis=1) > self._most_m, 1.0, share)
 
 
 def _distinct(turns: np.ndarray) -> np.ndarray:
