@@ -13,7 +13,7 @@ from vd.config import require
 from vd.envs.cfg import RandomisationCfg
 from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.evaluate.conditions import CONDITIONS, Condition
-from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, Goals, GoalSeries
+from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, ONE_GOAL, Goals, GoalSchedule
 from vd.paper import PAPER
 from vd.sim.cfg import Engine
 from vd.workers import shard
@@ -192,19 +192,15 @@ class EvalCfg(HandFlags, EpisodeFlags):
         return self.objects or ("cube",)
 
     @property
-    def series(self) -> GoalSeries | None:
-        """Goals in a row, if they are asked for."""
+    def schedule(self) -> GoalSchedule:
+        """The goals of an episode."""
         if self.air_goals:
             return AIR_GOALS
-        limit_s = episode_limit_s(self.episode_s, in_air=False)
-        return replace(CONSECUTIVE, goal_s=limit_s) if self.consecutive else None
-
-    @property
-    def limit_s(self) -> float:
-        """Time limit of an episode [s]."""
-        if self.series is not None:
-            return self.series.length_s
-        return episode_limit_s(self.episode_s, in_air=self.in_air)
+        goal_s = episode_limit_s(self.episode_s, in_air=self.in_air)
+        table_s = PAPER.scene.air_table_s if self.in_air else None
+        return replace(
+            CONSECUTIVE if self.consecutive else ONE_GOAL, goal_s=goal_s, table_s=table_s
+        )
 
     @property
     def rest(self) -> bool | None:

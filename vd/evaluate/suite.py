@@ -12,7 +12,6 @@ import numpy as np
 from vd.evaluate.conditions import CHANGED
 from vd.evaluate.result import Row, StoppedBy
 from vd.evaluate.statistics import Interval, choose_unit, rate_intervals
-from vd.evaluate.trace import air_table_steps
 from vd.paper import PAPER
 
 OWN_SETS: dict[str, str | None] = {
@@ -177,14 +176,14 @@ def share_text(value: float, *interval: float) -> str:
 
 def lost_at_once(row: Row) -> Interval:
     """Share of episodes that lost the object in the half second after the table went."""
-    gone = air_table_steps(row.protocol.control_hz)
+    gone = round(PAPER.scene.air_table_s * row.protocol.control_hz)
     soon = gone + round(0.5 * row.protocol.control_hz)
     return _share(row, [e.fell and gone < e.steps <= soon for e in row.episodes])
 
 
 def success_without_table(row: Row) -> Interval:
     """Share of episodes that were stopped within the tolerance when the table had gone."""
-    gone = air_table_steps(row.protocol.control_hz)
+    gone = round(PAPER.scene.air_table_s * row.protocol.control_hz)
     return _share(row, row.successes.ravel() & [e.steps > gone for e in row.episodes])
 
 
