@@ -1,4 +1,4 @@
-"""Run the suite: every condition with every policy, each into a folder of its own.
+"""Run a suite: every command line with every policy, each into a folder of its own.
 
 What a folder holds already, measured with the same settings and the same policy, is not run again.
 """
@@ -6,33 +6,37 @@ What a folder holds already, measured with the same settings and the same policy
 import hashlib
 import json
 import math
+import re
+import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from functools import cache, partial
+from itertools import chain
+from typing import Any, cast
 
 from vd.bundle import CONTRACT_FILE
+from vd.command_line import parse
 from vd.config import to_dict
 from vd.evaluate.agents import BUILT_IN, find_policy, open_policy, sees_clouds
 from vd.evaluate.cfg import EvalCfg, parse_groups
+from vd.evaluate.claims import CLAIMS, Claim, share_text
 from vd.evaluate.compare import compare
+from vd.evaluate.conditions import CHANGED
 from vd.evaluate.page import NOTHING, labels, number, points, shown_name, write_page
-from vd.evaluate.result import SUCCESS, Result
+from vd.evaluate.result import SUCCESS, Result, Row
 from vd.evaluate.statistics import Interval, paired_difference
 from vd.evaluate.suite import (
-    CLAIMS,
     OWN_SETS,
     QUICK_CAMERA_EPISODES,
     QUICK_EPISODES,
     QUICK_OBJECTS,
     QUICK_S,
-    SUITES,
-    Claim,
-    Condition,
-    share_text,
+    Entry,
+    Suite,
+    read_suite,
 )
 from vd.files import make_folder, write_json
 from vd.workers import run_tasks, shard
@@ -46,6 +50,9 @@ OUT_OF_TIME = "out of time; the same command goes on from here"
 NOT_RUN = "not run; the same command goes on from here"
 # Settings that say where and how an evaluation runs, not what it measures.
 _NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs", "shard")
+_PASSED_ON = ("seed", "device", "num_envs", "hand", "hand_layer", "engine", "randomise")
+"""Flags beside ``--suite`` that every line gets."""
+_GROUP = re.compile(r"([\w-]+)=SET\b")
 
 Objects = tuple[tuple[str, ...], str]
 """The objects of a group: what vd-eval is given, sets or chosen files of them, and the same for a
@@ -95,10 +102,14 @@ def run_suite(cfg: EvalCfg) -> Result:
     """
     begun = time.monotonic()
     assert cfg.suite is not None
-    suite = SUITES[cfg.suite]
-    groups = object_groups(cfg.objects, {c.objects for c in suite}, quick=cfg.quick)
-    conditions = tuple(c for c in suite if (c.quick or not cfg.quick) and c.objects in groups)
-    tasks = shard(make_tasks(cfg, conditions, groups), cfg.shard)
+    suite = read_suite(cfg.suite)
+    groups = object_groups(cfg.objects, groups_of(suite.lines), quick=cfg.quick)
+    entries = tuple(
+        entry
+        for entry in suite.lines
+        if (entry.quick or not cfg.quick) and groups.keys() >= set(groups_of([entry]))
+    )
+    tasks = shard(make_tasks(cfg, entries, groups), cfg.shard)
     found: dict[tuple[str, str], Result | str] = {
         task.key: task.there() or NOT_RUN for task in tasks
     }
@@ -124,7 +135,7 @@ def run_suite(cfg: EvalCfg) -> Result:
         left = tuple((*key, why) for key, why in found.items() if isinstance(why, str))
         result = Result(rows, measured[0].software if measured else {}, left)
         if cfg.shard is None:
-            _write(result, cfg, conditions, groups)
+            _write(result, cfg, replace(suite, lines=entries), groups)
     return result
 
 
@@ -179,49 +190,78 @@ def _measure_apart(task: Task, stop_at: float) -> str:
             return str(error)
 
 
-def make_tasks(
-    cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]
-) -> list[Task]:
+def make_tasks(cfg: EvalCfg, entries: Sequence[Entry], groups: dict[str, Objects]) -> list[Task]:
     """Everything that is to be measured, camera policies at the end if time is short, else first.
 
     All names are looked up here, before anything slow.
     """
     short = labels(cfg.agent_names)
-    camera = {name: sees_clouds(open_policy(name, "cpu")) for name in cfg.agent_names}
-    prints = {name: fingerprint(name) for name in cfg.agent_names}
     tasks = []
-    for condition in conditions:
-        for name in cfg.agent_names:
-            # A teacher's goals are orientations, whatever tells a camera policy of shapes.
-            if condition.by_camera if camera[name] else "goals" not in condition.settings:
-                one = settings(cfg, condition, name, groups[condition.objects], camera=camera[name])
-                one = replace(one, out=cfg.out / condition.name / short[name].replace("/", "-"))
-                tasks.append(Task(condition.name, name, one, prints[name]))
-    return sorted(tasks, key=lambda task: camera[task.policy] == cfg.quick)
+    for entry in entries:
+        for name in dict.fromkeys(chain(*(_policies(cfg, line) for line in entry.lines))):
+            line = entry.camera if _by_camera(name) else entry.teacher
+            if name in _policies(cfg, line):
+                folder = cfg.out / entry.name / short.get(name, name).replace("/", "-")
+                one = replace(settings(cfg, line, name, groups), out=folder)
+                tasks.append(Task(entry.name, name, one, fingerprint(name)))
+    return sorted(tasks, key=lambda task: _by_camera(task.policy) == cfg.quick)
 
 
-def settings(
-    cfg: EvalCfg, condition: Condition, policy: str, objects: Objects, *, camera: bool
-) -> EvalCfg:
-    """The evaluation of one policy under a condition: what ``vd-eval`` would be told."""
-    episodes = condition.camera_episodes if camera else condition.episodes
+def _policies(cfg: EvalCfg, line: str) -> tuple[str, ...]:
+    """The policies that a line of a suite is for: those that it names, or all that are asked for."""
+    named = _asked(line).policies if line else ()
+    return cfg.agent_names if named == ("POLICY",) else named
+
+
+@cache
+def _asked(line: str) -> EvalCfg:
+    """What a line of a suite asks for."""
+    return cast(EvalCfg, parse(EvalCfg, shlex.split(line)[1:], prog="vd-eval"))
+
+
+@cache
+def _by_camera(name: str) -> bool:
+    return sees_clouds(open_policy(name, "cpu"))
+
+
+def groups_of(entries: Sequence[Entry]) -> list[str]:
+    """The groups of objects that lines name."""
+    lines = " ".join(line for entry in entries for line in entry.lines)
+    return list(dict.fromkeys(_GROUP.findall(lines)))
+
+
+def settings(cfg: EvalCfg, line: str, policy: str, groups: dict[str, Objects]) -> EvalCfg:
+    """The evaluation of one policy by a line of a suite: what ``vd-eval`` would be told.
+
+    Flags beside ``--suite`` change it.
+    """
+    asked = _asked(line)
+    objects: list[str] = []
+    for item in asked.objects:
+        group, _, name = item.partition("=")
+        objects += [f"{group}={each}" for each in groups[group][0]] if name == "SET" else [item]
+    default = EvalCfg()
+    passed: dict[str, Any] = {
+        name: getattr(cfg, name)
+        for name in _PASSED_ON
+        if getattr(cfg, name) != getattr(default, name)
+    }
+    episodes = asked.episodes
     if cfg.quick:
-        episodes = min(episodes, QUICK_CAMERA_EPISODES if camera else QUICK_EPISODES)
-    return replace(
-        cfg,
-        suite=None,
-        quick=False,
-        jobs=1,
-        shard=None,
-        policies=(policy,),
-        objects=tuple(f"{condition.objects}={item}" for item in objects[0]),
-        episodes=episodes,
-        no_at_rest=True,  # the paper's objects fall into the hand, whatever a policy was trained with
-        **condition.settings,
-    )
+        episodes = min(episodes, QUICK_CAMERA_EPISODES if _by_camera(policy) else QUICK_EPISODES)
+    one = replace(asked, policies=(policy,), objects=tuple(objects), episodes=episodes, **passed)
+    one.validate()
+    return one
 
 
-def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> dict[str, Objects]:
+def shown(entry: Entry) -> str:
+    """Where the paper shows what an entry measures, or what it changes."""
+    return entry.shown or CHANGED.get(_asked(entry.lines[0]).condition or "", "")
+
+
+def object_groups(
+    objects: Sequence[str], wanted: Sequence[str], *, quick: bool
+) -> dict[str, Objects]:
     """The objects of each wanted group.
 
     Those given as ``GROUP=SET``, our procedural ones for the others.
@@ -232,7 +272,7 @@ def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> d
     from vd.assets_usd.objects.sets import set_files
 
     given = parse_groups(objects)
-    own_sets = {group: own for group, own in OWN_SETS.items() if group in wanted}
+    own_sets = {group: OWN_SETS.get(group) for group in wanted}
     if unknown := [name for name in given if name not in own_sets]:
         raise ValueError(
             f"--objects: '{unknown[0]}' is no group of the suite; {', '.join(own_sets)} are"
@@ -241,6 +281,7 @@ def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> d
     for group, own in own_sets.items():
         sets = given.get(group) or (() if own is None else (own,))
         if not sets:
+            print(f"left out: {group}; give --objects {group}=SET", file=sys.stderr)
             continue
         files = set_files(sets)
         text = f"{len(files)} of {shown_name(', '.join(sets))}"
@@ -267,17 +308,12 @@ def fingerprint(name: str) -> str:
     ).hexdigest()
 
 
-def _write(
-    result: Result, cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]
-) -> None:
+def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, Objects]) -> None:
     """The page and its figures, of what there is."""
-    short, of_paper = labels(result.policies), cfg.suite == "paper"
+    short = labels(result.policies)
+    of_paper = cfg.suite == "paper"
     if of_paper:
-        title, of, figures = (
-            "The paper's evaluations",
-            " beside the paper",
-            paper_figures(result, conditions),
-        )
+        figures = paper_figures(result, suite.lines)
         table = [
             {
                 "figure": row["figure"],
@@ -288,42 +324,39 @@ def _write(
             for row in figures
         ]
     else:
-        title, of, figures = "Robustness", "", robust_table(result, conditions, short)
+        figures = robust_table(result, suite.lines, short)
         table = figures
-    write_json(
-        cfg.out / f"{cfg.suite}.json", result.summary() | {"quick": cfg.quick, "figures": figures}
-    )
+    summary = result.summary() | {"quick": cfg.quick, "figures": figures}
+    write_json(cfg.out / f"{cfg.suite_name}.json", summary)
     notes = [f"Objects, {group}: {text}." for group, (_, text) in groups.items()]
     notes += ["Held-out objects judge, and nothing is chosen on them."]
     notes += [] if cfg.engine == "newton" else ["Physics by MuJoCo's own engine."]
+    beside = " beside the paper" if of_paper else ""
     write_page(
         result,
-        cfg.out / f"{cfg.suite}.html",
-        title=title,
-        lead=f"{', '.join(short.values())}{of}{', the reduced suite' if cfg.quick else ''}",
+        cfg.out / f"{cfg.suite_name}.html",
+        title=suite.title,
+        lead=f"{', '.join(short.values())}{beside}{', the reduced suite' if cfg.quick else ''}",
         figures=(list(table[0]), [list(row.values()) for row in table]) if table else None,
         notes=notes,
-        conditions=[(c.name, c.shown, c.flags) for c in conditions],
+        conditions=[(one.name, shown(one), "\n".join(one.lines)) for one in suite.lines],
         of_paper=of_paper,
     )
 
 
 def robust_table(
-    result: Result, conditions: Sequence[Condition], short: dict[str, str]
+    result: Result, entries: Sequence[Entry], short: dict[str, str]
 ) -> list[dict[str, str]]:
-    """A line for each condition and policy: what it changes, and how much success it costs."""
-    found = {
-        (condition, row.policy): row
-        for (condition, _), rows in result.headlines().items()
-        for row in rows.values()
-    }
+    """A line for each entry and policy: what it changes, and how much success it costs."""
+    by_name: dict[tuple[str, str], Row] = {}
+    for (condition, _), rows in result.headlines().items():
+        by_name |= {(condition, policy): row for policy, row in rows.items()}
+    first = entries[0].name
     table = []
-    for condition in conditions:
+    for entry in entries:
         for policy in result.policies:
-            row, nominal = (
-                found.get((condition.name, policy)),
-                found.get((conditions[0].name, policy)),
-            )
+            row = by_name.get((entry.name, policy))
+            nominal = by_name.get((first, policy))
             if row is None:
                 continue
             change = NOTHING
@@ -331,27 +364,27 @@ def robust_table(
                 change = points(
                     paired_difference(row.successes, nominal.successes, row.overall.unit)
                 )
-            rates = (
-                row.overall.outcomes["success"],
-                row.precise,
-                row.overall.outcomes["object falls"],
+            table.append(
+                {
+                    "condition": entry.name,
+                    "changed": shown(entry),
+                    "policy": short[policy],
+                    "success": _share(row.overall.outcomes["success"]),
+                    f"points from {first}": change,
+                    "within 0.1 rad": _share(row.precise),
+                    "lost": _share(row.overall.outcomes["object falls"]),
+                }
             )
-            success, precise, lost = (
-                NOTHING if r is None else share_text(r.value, r.low, r.high) for r in rates
-            )
-            told = {
-                "condition": condition.name,
-                "changed": condition.shown,
-                "policy": short[policy],
-            }
-            figures = {"success": success, "points from nominal": change, "within 0.1 rad": precise}
-            table.append(told | figures | {"lost": lost})
     return table
 
 
-def paper_figures(result: Result, conditions: Sequence[Condition]) -> list[dict[str, Any]]:
+def _share(rate: Interval | None) -> str:
+    return NOTHING if rate is None else share_text(rate.value, rate.low, rate.high)
+
+
+def paper_figures(result: Result, entries: Sequence[Entry]) -> list[dict[str, Any]]:
     """The paper's figures beside ours, as text."""
-    names = {condition.name for condition in conditions}
+    names = {entry.name for entry in entries}
     return [
         {
             "figure": claim.text,
