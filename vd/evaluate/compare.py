@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +49,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.result import Result, judge
     from vd.tracking.symmetry import with_symmetries
-    from vd.versions import installed_versions
+    from vd.versions import code_fingerprint, installed_versions
 
     groups = parse_groups(cfg.object_sets)
     everything = tuple(dict.fromkeys(s for sets in groups.values() for s in sets))
@@ -83,7 +84,11 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
                 trace.of(chosen), protocol, objects, agent, group=group, condition=condition
             )
     env.close()
-    software = {"device": wp.get_device(device).name} | installed_versions(_PACKAGES)
+    software = {
+        "device": wp.get_device(device).name,
+        "date": f"{date.today()}",
+        "code": code_fingerprint(),
+    } | installed_versions(_PACKAGES)
     result = Result(tuple(rows), software)
     result.write(cfg.out / "eval.json")
     return result

@@ -39,6 +39,7 @@ from vd.evaluate.suite import (
     read_suite,
 )
 from vd.files import make_folder, write_json
+from vd.versions import code_fingerprint
 from vd.workers import run_tasks, shard
 
 SETTINGS_FILE = "settings.json"
@@ -81,7 +82,7 @@ class Task:
         settings = {
             key: value for key, value in to_dict(self.cfg).items() if key not in _NOT_MEASURED
         }
-        return {"policy": self.weights} | settings
+        return {"policy": self.weights, "code": code_fingerprint()} | settings
 
     def there(self) -> Result | None:
         """What an earlier call measured with the same settings; None: nothing."""

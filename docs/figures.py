@@ -1,0 +1,213 @@
+"""``python docs/figures.py run|collect|tables``: the published figures, from their commands to the pages.
+
+The command lines are in docs/figures/NAME.yaml, suites of vd-eval. ``run`` measures what is not
+there yet, in hours on a GPU; ``collect`` takes what was measured into docs/figures/NAME.json, and
+``tables`` writes the tables of docs/figures/tables.yaml into the pages. A figure is marked where the
+policy or the code that measures is another since. Nothing but the installed package is needed, or
+this checkout's on PYTHONPATH.
+"""
+
+import argparse
+import json
+import re
+import shlex
+import subprocess
+import sys
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from vd.evaluate.claims import share_text
+from vd.evaluate.suite_run import fingerprint
+from vd.paper import PAPER
+from vd.versions import code_fingerprint
+
+ROOT = Path(__file__).resolve().parents[1]
+FIGURES = ROOT / "docs" / "figures"
+STALE = "†"
+STALE_NOTE = f"{STALE}: the policy or the code that measures has changed since, or is not known."
+KEEP = ("protocol", "stopped_by", "rule", "overall", "held", "precise", "in_air", "consecutive")
+"""What is stored of a row of a result."""
+MEASURES: dict[str, tuple[str | int, ...]] = {
+    "success": ("overall", "outcomes", "success"),
+    "lost": ("overall", "outcomes", "object falls"),
+    "symmetric": ("overall", "symmetric"),
+    "held": ("held",),
+    "precise": ("precise",),
+    "first": ("in_air", "first"),
+    "three": ("in_air", "in_a_row"),
+    "let_go": ("in_air", "let_go"),
+    "in_a_row": ("consecutive", 0, "mean"),
+    "steps": ("with_policy",),
+    "memory": ("memory_gb",),
+    "share": ("share",),
+}
+"""Where each measure of a table is in a row."""
+GROUP = re.compile(r"([\w-]+)=SET\b")
+"""Objects that a command line leaves open."""
+FIGURE = re.compile(r"\{(\w+)/([\w/-]+)\.(\w+)\}")
+"""A figure in a table: ``{suite/line/policy.measure}``."""
+
+
+def suites() -> list[str]:
+    """Names of the suites of figures."""
+    return sorted(path.stem for path in FIGURES.glob("*.yaml") if path.stem != "tables")
+
+
+def run(name: str, flags: argparse.Namespace) -> int:
+    """Measure what is not there of a suite; the exit status."""
+    file = FIGURES / f"{name}.yaml"
+    out = flags.out / name
+    text = file.read_text(encoding="utf-8")
+    entries = yaml.safe_load(text)["lines"]
+    given = {item.partition("=")[0] for item in flags.objects}
+    missing = sorted(set(GROUP.findall(text)) - given)
+    if missing:
+        print(f"{name}: name the objects: --objects {missing[0]}=FOLDER", file=sys.stderr)
+        return 1
+    commands = [entry for entry in entries if "command" in entry]
+    if commands:
+        return max(_run_command(entry, out, flags) for entry in commands)
+    objects = [item for item in flags.objects if f" {item.partition('=')[0]}=SET" in text]
+    words = ["--suite", str(file), "--out", str(out), "--device", flags.device]
+    words += ["--jobs", str(flags.jobs)]
+    words += ["--objects", *objects] if objects else []
+    words += ["--shard", flags.shard] if flags.shard else []
+    return subprocess.run([sys.executable, "-m", "vd.evaluate.cli", *words]).returncode
+
+
+def _run_command(entry: dict[str, str], out: Path, flags: argparse.Namespace) -> int:
+    """Measure by a command that writes JSON, unless this code has; the exit status."""
+    path = out / f"{entry['name']}.json"
+    told = out / f"{entry['name']}.settings.json"
+    key = {"command": entry["command"], "code": code_fingerprint()}
+    if path.is_file() and told.is_file() and json.loads(told.read_text())["key"] == key:
+        return 0
+    given = dict(item.split("=", 1) for item in flags.objects)
+    line = GROUP.sub(lambda group: given[group[1]], entry["command"])
+    script, *words = shlex.split(line.replace("OUT", shlex.quote(str(path))))
+    if "--device" not in words:
+        words += ["--device", flags.device]
+    out.mkdir(parents=True, exist_ok=True)
+    module = {"vd-bench": "vd.bench.cli"}[script]
+    status = subprocess.run([sys.executable, "-m", module, *words]).returncode
+    if status == 0:
+        told.write_text(json.dumps({"key": key, "date": f"{date.today()}"}))
+    return status
+
+
+def collect(name: str, out: Path) -> int:
+    """Take what was measured of a suite into its JSON; how many figures that were."""
+    path = FIGURES / f"{name}.json"
+    stored = json.loads(path.read_text()) if path.is_file() else {}
+    measured = {}
+    for entry in yaml.safe_load((FIGURES / f"{name}.yaml").read_text(encoding="utf-8"))["lines"]:
+        for settings in sorted(out.glob(f"{name}/{entry['name']}/*/settings.json")):
+            told = json.loads(settings.read_text())
+            result = json.loads((settings.parent / "eval.json").read_text())
+            software = result["software"]
+            measured[f"{entry['name']}/{settings.parent.name}"] = {
+                "command": entry.get("teacher") or entry["camera"],
+                "date": software.pop("date"),
+                "device": software.pop("device"),
+                "seed": told["seed"],
+                "policy": told["policy"],
+                "code": software.pop("code"),
+                "versions": software,
+                "rows": [{key: row[key] for key in KEEP} for row in result["rows"]],
+            }
+            for row in measured[f"{entry['name']}/{settings.parent.name}"]["rows"]:
+                row["consecutive"] = row["consecutive"][:1]
+        told_file = out / name / f"{entry['name']}.settings.json"
+        if told_file.is_file():
+            told = json.loads(told_file.read_text())
+            result = json.loads((out / name / f"{entry['name']}.json").read_text())
+            measured[entry["name"]] = told.pop("key") | told | result
+    path.write_text(json.dumps(stored | measured, indent=1) + "\n", encoding="utf-8")
+    return len(measured)
+
+
+def is_stale(name: str, figure: dict[str, Any]) -> bool:
+    """Whether the policy or the code that measures is another since, or is not known."""
+    if figure.get("code") != code_fingerprint():
+        return True
+    line, _, policy = name.rpartition("/")
+    return bool(line) and figure["policy"] != fingerprint(policy)
+
+
+def shown(suite: str, name: str, measure: str) -> str:
+    """A stored figure, or one of the paper, as a table shows it.
+
+    Raises:
+        ValueError: It is not stored; names the command that measures it.
+    """
+    if suite == "paper":
+        return share_text(*getattr(PAPER.results, name))
+    path = FIGURES / f"{suite}.json"
+    figures = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    try:
+        figure = figures[name]
+        value = figure["rows"][0]
+        for key in MEASURES[measure]:
+            value = value[key]
+    except (KeyError, IndexError, TypeError) as error:
+        raise ValueError(
+            f"{path}: no {measure} of {name}; python docs/figures.py run {suite}"
+        ) from error
+    mark = f" {STALE}" if is_stale(name, figure) else ""
+    if isinstance(value, dict):
+        return f"{share_text(value['value'], value['low'], value['high'])}{mark}"
+    if measure == "steps":
+        digits = 0 if value >= 10_000 else 2
+        return f"{value / 1e3:.{digits}f} k{mark}"
+    if measure in ("memory", "in_a_row"):
+        return f"{value:.1f}{mark}"
+    return f"{100 * value:.1f} %{mark}"
+
+
+def tables() -> dict[Path, str]:
+    """The pages that have tables, by path, as they have to be."""
+    pages: dict[Path, str] = {}
+    for table in yaml.safe_load((FIGURES / "tables.yaml").read_text(encoding="utf-8")):
+        path = ROOT / table["page"]
+        page = pages.get(path) or path.read_text(encoding="utf-8")
+        lines = [table["head"], ["---"] * len(table["head"]), *table["rows"]]
+        text = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+        text = FIGURE.sub(lambda figure: shown(*figure.groups()), text)
+        if STALE in text:
+            text += f"\n\n{STALE_NOTE}"
+        begin, end = f"<!-- figures: {table['name']} -->", "<!-- figures: end -->"
+        if begin not in page:
+            raise ValueError(f"{path}: there is no {begin}")
+        before, _, rest = page.partition(begin)
+        pages[path] = f"{before}{begin}\n{text}\n{end}{rest.partition(end)[2]}"
+    return pages
+
+
+def main() -> int:
+    """Run, collect or write; the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("step", choices=("run", "collect", "tables"))
+    parser.add_argument("names", nargs="*", help=f"suites, all by default: {', '.join(suites())}")
+    parser.add_argument("--objects", nargs="*", default=[], help="GROUP=SET, as of vd-eval --suite")
+    parser.add_argument("--device", default="auto", help="auto spreads --jobs over all GPUs")
+    parser.add_argument("--jobs", type=int, default=1, help="evaluations side by side")
+    parser.add_argument("--shard", help="I/N: every N-th evaluation from the I-th")
+    parser.add_argument("--out", type=Path, default=ROOT / "runs" / "figures")
+    flags = parser.parse_args()
+    names = flags.names or suites()
+    if flags.step == "run":
+        return max(run(name, flags) for name in names)
+    if flags.step == "collect":
+        for name in names:
+            print(f"{name}: {collect(name, flags.out)} figures")
+    for path, page in tables().items():
+        path.write_text(page, encoding="utf-8")
+        print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
