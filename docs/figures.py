@@ -19,7 +19,6 @@ from typing import Any
 
 import yaml
 
-from vd.evaluate.claims import share_text
 from vd.evaluate.suite_run import fingerprint
 from vd.paper import PAPER
 from vd.versions import code_fingerprint
@@ -28,6 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"
 STALE = "†"
 STALE_NOTE = f"{STALE}: the policy or the code that measures has changed since, or is not known."
+END = "<!-- figures: end -->"
 KEEP = ("protocol", "stopped_by", "rule", "overall", "held", "precise", "in_air", "consecutive")
 """What is stored of a row of a result."""
 MEASURES: dict[str, tuple[str | int, ...]] = {
@@ -45,6 +45,8 @@ MEASURES: dict[str, tuple[str | int, ...]] = {
     "share": ("share",),
 }
 """Where each measure of a table is in a row."""
+PLAIN = ("memory", "in_a_row")
+"""Measures that are no shares."""
 GROUP = re.compile(r"([\w-]+)=SET\b")
 """Objects that a command line leaves open."""
 FIGURE = re.compile(r"\{(\w+)/([\w/-]+)\.(\w+)\}")
@@ -144,7 +146,7 @@ def shown(suite: str, name: str, measure: str) -> str:
         ValueError: It is not stored; names the command that measures it.
     """
     if suite == "paper":
-        return share_text(*getattr(PAPER.results, name))
+        return _interval(*getattr(PAPER.results, name))
     path = FIGURES / f"{suite}.json"
     figures = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     try:
@@ -156,15 +158,20 @@ def shown(suite: str, name: str, measure: str) -> str:
         raise ValueError(
             f"{path}: no {measure} of {name}; python docs/figures.py run {suite}"
         ) from error
-    mark = f" {STALE}" if is_stale(name, figure) else ""
+    mark = STALE if is_stale(name, figure) else ""
     if isinstance(value, dict):
-        return f"{share_text(value['value'], value['low'], value['high'])}{mark}"
+        return _interval(value["value"], value["low"], value["high"]) + mark
     if measure == "steps":
-        digits = 0 if value >= 10_000 else 2
-        return f"{value / 1e3:.{digits}f} k{mark}"
-    if measure in ("memory", "in_a_row"):
-        return f"{value:.1f}{mark}"
-    return f"{100 * value:.1f} %{mark}"
+        return f"{value:.0f}{mark}"
+    return f"{value:.1f}{mark}" if measure in PLAIN else _interval(value) + mark
+
+
+def _interval(value: float, *bounds: float) -> str:
+    """A share in per cent: ``88.0``, or with its interval ``88 (82-92)``."""
+    if not bounds:
+        return f"{100 * value:.1f}"
+    low, high = bounds
+    return f"{100 * value:.0f} ({100 * low:.0f}-{100 * high:.0f})"
 
 
 def tables() -> dict[Path, str]:
@@ -174,15 +181,15 @@ def tables() -> dict[Path, str]:
         path = ROOT / table["page"]
         page = pages.get(path) or path.read_text(encoding="utf-8")
         lines = [table["head"], ["---"] * len(table["head"]), *table["rows"]]
-        text = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+        text = "\n".join(f"|{'|'.join(cells)}|" for cells in lines)
         text = FIGURE.sub(lambda figure: shown(*figure.groups()), text)
-        if STALE in text:
-            text += f"\n\n{STALE_NOTE}"
-        begin, end = f"<!-- figures: {table['name']} -->", "<!-- figures: end -->"
-        if begin not in page:
+        begin = f"<!-- figures: {table['name']} -->"
+        before, found, rest = page.partition(begin)
+        if not found:
             raise ValueError(f"{path}: there is no {begin}")
-        before, _, rest = page.partition(begin)
-        pages[path] = f"{before}{begin}\n{text}\n{end}{rest.partition(end)[2]}"
+        if STALE in text and STALE_NOTE not in before:
+            text += f"\n\n{STALE_NOTE}"
+        pages[path] = f"{before}{begin}\n{text}\n{END}{rest.partition(END)[2]}"
     return pages
 
 
