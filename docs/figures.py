@@ -13,7 +13,6 @@ import re
 import shlex
 import subprocess
 import sys
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -30,27 +29,12 @@ STALE_NOTE = f"{STALE}: the policy or the code that measures has changed since, 
 END = "<!-- figures: end -->"
 KEEP = ("protocol", "stopped_by", "rule", "overall", "held", "precise", "in_air", "consecutive")
 """What is stored of a row of a result."""
-MEASURES: dict[str, tuple[str | int, ...]] = {
-    "success": ("overall", "outcomes", "success"),
-    "lost": ("overall", "outcomes", "object falls"),
-    "symmetric": ("overall", "symmetric"),
-    "held": ("held",),
-    "precise": ("precise",),
-    "first": ("in_air", "first"),
-    "three": ("in_air", "in_a_row"),
-    "let_go": ("in_air", "let_go"),
-    "in_a_row": ("consecutive", 0, "mean"),
-    "steps": ("with_policy",),
-    "memory": ("memory_gb",),
-    "share": ("share",),
-}
-"""Where each measure of a table is in a row."""
-PLAIN = ("memory", "in_a_row")
-"""Measures that are no shares."""
+DIGITS = {"with_policy": 0, "memory_gb": 1, "mean": 1}
+"""Of measures that are no shares."""
 GROUP = re.compile(r"([\w-]+)=SET\b")
 """Objects that a command line leaves open."""
-FIGURE = re.compile(r"\{(\w+)/([\w/-]+)\.(\w+)\}")
-"""A figure in a table: ``{suite/line/policy.measure}``."""
+FIGURE = re.compile(r"\{(\w+)/([\w/-]+): ([^}]+)\}")
+"""A figure in a table: ``{suite/line/policy: measure}``, where it is in a row."""
 
 
 def suites() -> list[str]:
@@ -83,52 +67,42 @@ def run(name: str, flags: argparse.Namespace) -> int:
 def _run_command(entry: dict[str, str], out: Path, flags: argparse.Namespace) -> int:
     """Measure by a command that writes JSON, unless this code has; the exit status."""
     path = out / f"{entry['name']}.json"
-    told = out / f"{entry['name']}.settings.json"
-    key = {"command": entry["command"], "code": code_fingerprint()}
-    if path.is_file() and told.is_file() and json.loads(told.read_text())["key"] == key:
+    if path.is_file() and json.loads(path.read_text())["code"] == code_fingerprint():
         return 0
     given = dict(item.split("=", 1) for item in flags.objects)
     line = GROUP.sub(lambda group: given[group[1]], entry["command"])
-    script, *words = shlex.split(line.replace("OUT", shlex.quote(str(path))))
-    if "--device" not in words:
-        words += ["--device", flags.device]
-    out.mkdir(parents=True, exist_ok=True)
+    script, *words = shlex.split(line)
     module = {"vd-bench": "vd.bench.cli"}[script]
-    status = subprocess.run([sys.executable, "-m", module, *words]).returncode
-    if status == 0:
-        told.write_text(json.dumps({"key": key, "date": f"{date.today()}"}))
-    return status
+    words += ["--json", str(path)]
+    words += [] if "--device" in words else ["--device", flags.device]
+    out.mkdir(parents=True, exist_ok=True)
+    return subprocess.run([sys.executable, "-m", module, *words]).returncode
 
 
 def collect(name: str, out: Path) -> int:
     """Take what was measured of a suite into its JSON; how many figures that were."""
     path = FIGURES / f"{name}.json"
-    stored = json.loads(path.read_text()) if path.is_file() else {}
     measured = {}
     for entry in yaml.safe_load((FIGURES / f"{name}.yaml").read_text(encoding="utf-8"))["lines"]:
         for settings in sorted(out.glob(f"{name}/{entry['name']}/*/settings.json")):
-            told = json.loads(settings.read_text())
-            result = json.loads((settings.parent / "eval.json").read_text())
-            software = result["software"]
-            measured[f"{entry['name']}/{settings.parent.name}"] = {
-                "command": entry.get("teacher") or entry["camera"],
-                "date": software.pop("date"),
-                "device": software.pop("device"),
-                "seed": told["seed"],
-                "policy": told["policy"],
-                "code": software.pop("code"),
-                "versions": software,
-                "rows": [{key: row[key] for key in KEEP} for row in result["rows"]],
-            }
-            for row in measured[f"{entry['name']}/{settings.parent.name}"]["rows"]:
-                row["consecutive"] = row["consecutive"][:1]
-        told_file = out / name / f"{entry['name']}.settings.json"
-        if told_file.is_file():
-            told = json.loads(told_file.read_text())
-            result = json.loads((out / name / f"{entry['name']}.json").read_text())
-            measured[entry["name"]] = told.pop("key") | told | result
+            policy = settings.parent.name
+            command = entry.get("teacher") or entry["camera"]
+            measured[f"{entry['name']}/{policy}"] = {"command": command} | _evaluated(settings)
+        for file in out.glob(f"{name}/{entry['name']}.json"):
+            measured[entry["name"]] = {"command": entry["command"]} | json.loads(file.read_text())
+    stored = json.loads(path.read_text()) if path.is_file() else {}
     path.write_text(json.dumps(stored | measured, indent=1) + "\n", encoding="utf-8")
     return len(measured)
+
+
+def _evaluated(settings: Path) -> dict[str, Any]:
+    """What is stored of a finished evaluation, beside whose result ``settings`` are."""
+    told = json.loads(settings.read_text())
+    result = json.loads((settings.parent / "eval.json").read_text())
+    rows = [{key: row[key] for key in KEEP} for row in result["rows"]]
+    for row in rows:
+        row["consecutive"] = row["consecutive"][:1]
+    return {"seed": told["seed"], "policy": told["policy"]} | result["software"] | {"rows": rows}
 
 
 def is_stale(name: str, figure: dict[str, Any]) -> bool:
@@ -152,8 +126,8 @@ def shown(suite: str, name: str, measure: str) -> str:
     try:
         figure = figures[name]
         value = figure["rows"][0]
-        for key in MEASURES[measure]:
-            value = value[key]
+        for key in measure.split("/"):
+            value = value[int(key) if isinstance(value, list) else key]
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(
             f"{path}: no {measure} of {name}; python docs/figures.py run {suite}"
@@ -161,9 +135,8 @@ def shown(suite: str, name: str, measure: str) -> str:
     mark = STALE if is_stale(name, figure) else ""
     if isinstance(value, dict):
         return _interval(value["value"], value["low"], value["high"]) + mark
-    if measure == "steps":
-        return f"{value:.0f}{mark}"
-    return f"{value:.1f}{mark}" if measure in PLAIN else _interval(value) + mark
+    digits = DIGITS.get(measure.split("/")[-1])
+    return (_interval(value) if digits is None else f"{value:.{digits}f}") + mark
 
 
 def _interval(value: float, *bounds: float) -> str:

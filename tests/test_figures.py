@@ -87,7 +87,7 @@ def test_what_a_command_wrote_is_stored_and_shown_until_the_code_is_another(fold
     assert page.startswith("before\n") and page.endswith("after\n")
     stored = json.loads((folder / "x.json").read_text())["a/zero"]
     assert stored["seed"] == 0 and stored["device"] == "a double" and stored["date"] == "2026-11-28"
-    assert stored["command"].startswith("vd-eval zero") and stored["versions"] == {"torch": "2"}
+    assert stored["command"].startswith("vd-eval zero") and stored["torch"] == "2"
     assert "episodes" not in stored["rows"][0]
     for change in ({"code": "older"}, {"policy": "other weights"}, {"code": None}):
         (folder / "x.json").write_text(json.dumps({"a/zero": stored | change}))

@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from vd.config import from_dict
+from vd.paper import PAPER
 
 FOLDER = Path(__file__).with_name("suites")
 """Where the suites are that have a name."""
@@ -26,7 +28,7 @@ QUICK_S = 540.0
 
 
 @dataclass(frozen=True)
-class Entry:
+class SuiteEntry:
     """One evaluation of every policy, as ``vd-eval`` is told to run it."""
 
     name: str
@@ -48,11 +50,48 @@ class Entry:
 
 
 @dataclass(frozen=True)
+class Claim:
+    """A figure of the paper, and how ours beside it is measured."""
+
+    text: str
+    """What it is."""
+    entries: tuple[str, ...]
+    """Names of the evaluations that have it."""
+    measure: str
+    """Where it is in a row (:func:`vd.evaluate.claims.measured`)."""
+    paper: str | None = None
+    """Name of the paper's figure in ``PAPER.results``; None: it gives no number."""
+    unit: Literal["share", "rad", "s"] = "share"
+    stopped_by: str | None = None
+    """Whose rule; None: that of each policy."""
+
+    def paper_text(self) -> str:
+        """What the paper says: ``96 % (94 to 97)``, ``0.12 to 0.13``, ``below 7``.
+
+        Empty: nothing.
+        """
+        if self.paper is None:
+            return ""
+        value: tuple[float, ...] = getattr(PAPER.results, self.paper)
+        if self.unit == "share":
+            return share_text(*value)
+        return f"{value[0]:.2f} to {value[1]:.2f}" if self.unit == "rad" else f"below {value[0]:g}"
+
+
+@dataclass(frozen=True)
 class Suite:
-    """A list of evaluations."""
+    """A list of evaluations, and what the paper says of them."""
 
     title: str
-    lines: tuple[Entry, ...]
+    lines: tuple[SuiteEntry, ...]
+    claims: tuple[Claim, ...] = ()
+
+
+def share_text(value: float, *interval: float) -> str:
+    """``85 % (82 to 88)``, with a decimal where whole per cents would hide how small it is."""
+    digits = 0 if interval and value >= 0.1 else 1
+    texts = [f"{100.0 * part:.{digits}f}" for part in (value, *interval)]
+    return f"{texts[0]} %" + (f" ({texts[1]} to {texts[2]})" if interval else "")
 
 
 def read_suite(name: str) -> Suite:

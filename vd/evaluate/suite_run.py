@@ -22,7 +22,7 @@ from vd.command_line import parse
 from vd.config import to_dict
 from vd.evaluate.agents import BUILT_IN, find_policy, open_policy, sees_clouds
 from vd.evaluate.cfg import EvalCfg, parse_groups
-from vd.evaluate.claims import CLAIMS, Claim, share_text
+from vd.evaluate.claims import ours
 from vd.evaluate.compare import compare
 from vd.evaluate.conditions import CHANGED
 from vd.evaluate.page import NOTHING, labels, number, points, shown_name, write_page
@@ -34,9 +34,11 @@ from vd.evaluate.suite import (
     QUICK_EPISODES,
     QUICK_OBJECTS,
     QUICK_S,
-    Entry,
+    Claim,
     Suite,
+    SuiteEntry,
     read_suite,
+    share_text,
 )
 from vd.files import make_folder, write_json
 from vd.versions import code_fingerprint
@@ -191,7 +193,9 @@ def _measure_apart(task: Task, stop_at: float) -> str:
             return str(error)
 
 
-def make_tasks(cfg: EvalCfg, entries: Sequence[Entry], groups: dict[str, Objects]) -> list[Task]:
+def make_tasks(
+    cfg: EvalCfg, entries: Sequence[SuiteEntry], groups: dict[str, Objects]
+) -> list[Task]:
     """Everything that is to be measured, camera policies at the end if time is short, else first.
 
     All names are looked up here, before anything slow.
@@ -225,7 +229,7 @@ def _by_camera(name: str) -> bool:
     return sees_clouds(open_policy(name, "cpu"))
 
 
-def groups_of(entries: Sequence[Entry]) -> list[str]:
+def groups_of(entries: Sequence[SuiteEntry]) -> list[str]:
     """The groups of objects that lines name."""
     lines = " ".join(line for entry in entries for line in entry.lines)
     return list(dict.fromkeys(_GROUP.findall(lines)))
@@ -255,7 +259,7 @@ def settings(cfg: EvalCfg, line: str, policy: str, groups: dict[str, Objects]) -
     return one
 
 
-def shown(entry: Entry) -> str:
+def shown(entry: SuiteEntry) -> str:
     """Where the paper shows what an entry measures, or what it changes."""
     return entry.shown or CHANGED.get(_asked(entry.lines[0]).condition or "", "")
 
@@ -312,9 +316,9 @@ def fingerprint(name: str) -> str:
 def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, Objects]) -> None:
     """The page and its figures, of what there is."""
     short = labels(result.policies)
-    of_paper = cfg.suite == "paper"
+    of_paper = bool(suite.claims)
     if of_paper:
-        figures = paper_figures(result, suite.lines)
+        figures = paper_figures(result, suite)
         table = [
             {
                 "figure": row["figure"],
@@ -346,7 +350,7 @@ def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, Objects
 
 
 def robust_table(
-    result: Result, entries: Sequence[Entry], short: dict[str, str]
+    result: Result, entries: Sequence[SuiteEntry], short: dict[str, str]
 ) -> list[dict[str, str]]:
     """A line for each entry and policy: what it changes, and how much success it costs."""
     by_name: dict[tuple[str, str], Row] = {}
@@ -383,28 +387,29 @@ def _share(rate: Interval | None) -> str:
     return NOTHING if rate is None else share_text(rate.value, rate.low, rate.high)
 
 
-def paper_figures(result: Result, entries: Sequence[Entry]) -> list[dict[str, Any]]:
+def paper_figures(result: Result, suite: Suite) -> list[dict[str, Any]]:
     """The paper's figures beside ours, as text."""
-    names = {entry.name for entry in entries}
-    return [
-        {
-            "figure": claim.text,
-            "condition": claim.condition,
-            "paper": claim.paper_text(),
-            "ours": {policy: _ours(result, claim, policy) for policy in result.policies},
-        }
-        for claim in CLAIMS
-        if claim.condition in names
-    ]
+    figures = []
+    for entry in suite.lines:
+        for claim in suite.claims:
+            if entry.name in claim.entries:
+                own = {
+                    policy: _ours(result, claim, entry.name, policy) for policy in result.policies
+                }
+                paper = claim.paper_text()
+                figure = {
+                    "figure": claim.text,
+                    "condition": entry.name,
+                    "paper": paper,
+                    "ours": own,
+                }
+                figures.append(figure)
+    return figures
 
 
-def _ours(result: Result, claim: Claim, policy: str) -> str:
-    rows = [row for row in result.rows if (row.condition, row.policy) == (claim.condition, policy)]
-    value = claim.of(rows)
+def _ours(result: Result, claim: Claim, condition: str, policy: str) -> str:
+    rows = [row for row in result.rows if (row.condition, row.policy) == (condition, policy)]
+    value = ours(claim, rows)
     if isinstance(value, Interval):
-        return (
-            share_text(value.value, value.low, value.high)
-            if claim.unit == "share"
-            else number(value)
-        )
+        return number(value) if claim.unit != "share" else _share(value)
     return NOTHING if value is None else share_text(value)
