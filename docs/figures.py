@@ -156,6 +156,10 @@ def tables() -> dict[Path, str]:
         lines = [table["head"], ["---"] * len(table["head"]), *table["rows"]]
         text = "\n".join(f"|{'|'.join(cells)}|" for cells in lines)
         text = FIGURE.sub(lambda figure: shown(*figure.groups()), text)
+        if "{" in text:
+            raise ValueError(
+                f"tables.yaml: {table['name']} has a figure that cannot be read: {text}"
+            )
         begin = f"<!-- figures: {table['name']} -->"
         before, found, rest = page.partition(begin)
         if not found:

@@ -57,7 +57,8 @@ def folder(tmp_path, monkeypatch):
     line = "vd-eval zero --objects held-out=SET --episodes 4"
     (tmp_path / "x.yaml").write_text(f"title: X\nlines: [{{name: a, teacher: {line}}}]\n")
     (tmp_path / "tables.yaml").write_text(
-        "- {page: page.md, name: t, head: [what, zero], rows: [[a, '{x/a/zero.success}']]}\n"
+        "- {page: page.md, name: t, head: [what, zero],\n"
+        "   rows: [[a, '{x/a/zero: overall/outcomes/success}']]}\n"
     )
     (tmp_path / "page.md").write_text("before\n<!-- figures: t -->\n<!-- figures: end -->\nafter\n")
     return tmp_path
@@ -79,7 +80,9 @@ def measured(folder, monkeypatch, code):
 
 
 def test_what_a_command_wrote_is_stored_and_shown_until_the_code_is_another(folder, monkeypatch):
-    with pytest.raises(ValueError, match=r"no success of a/zero; python docs/figures\.py run x"):
+    with pytest.raises(
+        ValueError, match=r"no overall/outcomes/success of a/zero; python docs/figures\.py run x"
+    ):
         figures.tables()
     assert measured(folder, monkeypatch, code_fingerprint()) == 1
     (page,) = figures.tables().values()
