@@ -430,7 +430,8 @@ class _Round:
             return
         place = self._place(envs)
         turn = Rotation.from_quat(turns[(*place, self._trace.reached[place])])
-        self._goal[envs] = (turn * Rotation.from_quat(quat[envs])).as_quat()
+        present = Rotation.from_quat(self._env.object_pose()[envs, 3:7])
+        self._goal[envs] = (turn * present).as_quat()
         self._env.give_goals(envs, self._goal[envs])
         self._given_at[envs] = step
         if step == self._trace.first_step:
