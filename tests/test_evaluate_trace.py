@@ -210,6 +210,21 @@ def test_errors_and_stops_are_up_to_symmetry_and_the_headline_is_of_the_very_goa
     assert row.per_object[0].symmetric.value == 1.0 and row.overall.success["0.4"].value == 0.0
 
 
+def test_up_to_symmetry_follows_the_stop_and_tolerance_by_object_too():
+    """It passes what looks like the goal, and turns on: away by 0.67 rad at the end."""
+    objects = (FakeObject("b", SQUARE),)
+    trace = traced(np.pi / 2 + 0.3, objects=objects, policy={"until": 12})
+    for row in judged(trace, objects)[:1]:
+        assert row.episodes[0].error_rad > 0.4 and not row.episodes[0].stopped
+        assert row.overall.symmetric.value == row.per_object[0].symmetric.value == 1.0
+    agent = Agent("p", "teacher", "state", lambda _: StoppingRule())
+    strict = replace(protocol(1), stop_tolerance_rad=0.01)
+    row = judge(trace, strict, list(objects), agent, group="training")[0]
+    assert row.per_object[0].symmetric.value == 1.0, "at the one step at which it looks like it"
+    other = judge(traced(0.95), strict, [FakeObject("a")], agent, group="training")[0]
+    assert other.per_object[0].symmetric.value == 0.0
+
+
 def test_what_was_stopped_is_held_and_looked_at_again():
     """The rule stops at 0.35 rad of 0.85.
 

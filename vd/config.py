@@ -257,7 +257,7 @@ def require(
         zero = what in ("zero or positive", "in [0, 1]") and value == 0
         if not (zero or 0 < value <= largest):
             shown = name.replace("_", "-") if prefix.startswith("--") else name
-            remedy = what
+            remedy: str = what
             if what == "an angle":
                 degrees = f"; {value:g} degrees are {math.radians(value):.3g}" if value > 0 else ""
                 remedy = f"positive and at most pi [rad]{degrees}"

@@ -331,9 +331,10 @@ class Agent:
         norm = ANY_ACTION if schedule.distance_alone else PAPER.success.action_norm
         true = StoppingRule(tolerance_rad, norm)
         predicts = self.sees.endswith("clouds")
-        ways: dict[tuple[StoppedBy, str], Way] = {("true distance", ""): (true, "exact")}
+        ways: dict[tuple[StoppedBy, str], Way] = {}
         if predicts:
-            ways = {("prediction", ""): (replace(own, action_norm=norm), "predicted")} | ways
+            ways["prediction", ""] = (replace(own, action_norm=norm), "predicted")
+        ways["true distance", ""] = (true, "exact")
         if schedule.most > 1:
             return dict([next(iter(ways.items()))])
         if not predicts:

@@ -337,7 +337,10 @@ class _Round:
             acted = envs[step > self._given_at[envs]]  # before an action there is nothing to stop
             stops = {}
             for rule, by in ways:
-                distance = predicted if by == "predicted" else self._exact
+                distance = self._exact
+                if by == "predicted":
+                    assert predicted is not None
+                    distance = predicted
                 stops[rule, by] = acted[rule.stops(distance, norm)[acted]]
             self._keep_stops(stops, step)
             due = np.array([], dtype=int)
