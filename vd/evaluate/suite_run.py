@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from itertools import chain
 from typing import Any, cast
 
 from vd.bundle import CONTRACT_FILE
@@ -203,19 +202,29 @@ def make_tasks(
     short = labels(cfg.agent_names)
     tasks = []
     for entry in entries:
-        for name in dict.fromkeys(chain(*(_policies(cfg, line) for line in entry.lines))):
-            line = entry.camera if _by_camera(name) else entry.teacher
-            if name in _policies(cfg, line):
+        for line in entry.lines:
+            for name in _policies(cfg, entry, line):
                 folder = cfg.out / entry.name / short.get(name, name).replace("/", "-")
                 one = replace(settings(cfg, line, name, groups), out=folder)
                 tasks.append(Task(entry.name, name, one, fingerprint(name)))
     return sorted(tasks, key=lambda task: _by_camera(task.policy) == cfg.quick)
 
 
-def _policies(cfg: EvalCfg, line: str) -> tuple[str, ...]:
-    """The policies that a line of a suite is for: those that it names, or all that are asked for."""
-    named = _asked(line).policies if line else ()
-    return cfg.agent_names if named == ("POLICY",) else named
+def _policies(cfg: EvalCfg, entry: SuiteEntry, line: str) -> list[str]:
+    """The policies that a line is for: those that it names, or all of its kind that are asked for.
+
+    Raises:
+        ValueError: It names one of the other kind.
+    """
+    named = _asked(line).agent_names
+    names = cfg.agent_names if named == ("POLICY",) else named
+    right = [name for name in names if _by_camera(name) == (line == entry.camera)]
+    if names == named != tuple(right):
+        raise ValueError(
+            f"--suite: {entry.name} has {', '.join(set(named) - set(right))} in the wrong line; "
+            "'camera' is for policies that see by one, 'teacher' for others"
+        )
+    return right
 
 
 @cache
