@@ -18,9 +18,13 @@ MESHES ?=
 DEMO_ARGS ?=
 TEST_ARGS ?=
 BENCH_ARGS ?=
+# Suites of published figures, all by default, and their objects: make figures FIGURES=teacher OBJECTS="held-out=TEST validation=VALIDATION".
+FIGURES ?=
+OBJECTS ?=
+FIGURES_ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test lint type format docs bench clean
+.PHONY: help env demo test lint type format docs bench figures clean
 
 help:
 	@echo 'make demo     turn unseen objects, close a gap, drive a simulated hand, train a little: demo/index.html'
@@ -29,6 +33,7 @@ help:
 	@echo 'make lint     ruff, without changing files      make format   the same, changing files'
 	@echo 'make type     mypy on the built package         make bench    simulation throughput'
 	@echo 'make docs     the documentation as a site, build/site/index.html'
+	@echo 'make figures  every published figure anew, hours on a GPU; FIGURES=teacher some, OBJECTS="held-out=DIR ..."'
 	@echo 'make env      only the environment (.venv)      make clean    remove build products'
 	@echo 'TORCH_INDEX=URL takes torch from another wheel index, such as its CPU-only one'
 
@@ -77,6 +82,11 @@ docs: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/vd-bench sim $(BENCH_ARGS)
+
+# What was measured by this code is not measured again; FIGURES_ARGS="--jobs 8" spreads it over the GPUs.
+figures: $(STAMP)
+	$(BIN)/python docs/figures.py run $(FIGURES) --objects $(OBJECTS) $(FIGURES_ARGS)
+	$(BIN)/python docs/figures.py collect $(FIGURES)
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -154,9 +154,7 @@ def test_an_environment_whose_physics_fails_costs_its_episode_alone(
         return policy.act(wp.to_torch(env.observation))
 
     monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
-    monkeypatch.setattr(
-        f"vd.evaluate.{'in_a_row' if '--consecutive' in extra else 'trace'}.act_in", act
-    )
+    monkeypatch.setattr("vd.evaluate.trace.act_in", act)
     flags = [
         "--objects",
         "cube",

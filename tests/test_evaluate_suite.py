@@ -15,29 +15,21 @@ from test_evaluate_trace import compared
 from vd.evaluate import suite_run
 from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.evaluate.cfg import EvalCfg
+from vd.evaluate.claims import lost_at_once, success_without_table
 from vd.evaluate.cli import main
 from vd.evaluate.conditions import Condition
 from vd.evaluate.result import Result
-from vd.evaluate.suite import (
-    CLAIMS,
-    CONDITIONS,
-    OWN_SETS,
-    QUICK_OBJECTS,
-    QUICK_S,
-    ROBUST,
-    lost_at_once,
-    success_without_table,
-)
+from vd.evaluate.suite import OWN_SETS, QUICK_OBJECTS, QUICK_S, Suite, read_suite
 from vd.evaluate.trace import Episode
 from vd.paper import ResultConstants
 
 TEACHER, CAMERA = "dclaw3", "dclaw3-tracking"
 OBJECTS = ("training=cube", "held-out=cube", "symmetric=cube")
 """Sets that need no authoring; the test double looks at none of them."""
-OF_TEACHERS = [
-    c.name for c in CONDITIONS if c.objects != "validation" and "goals" not in c.settings
-]
-"""Conditions of a teacher: its goals are no clouds, to be scanned or told by points."""
+PAPERS, ROBUST = read_suite("paper").lines, read_suite("robust").lines
+CLAIMS = read_suite("paper").claims
+OF_TEACHERS = [c.name for c in PAPERS if c.teacher and c.name != "validation"]
+"""Entries of a teacher: its goals are no clouds, to be scanned or told by points."""
 
 
 @pytest.fixture(scope="module")
@@ -76,26 +68,48 @@ def command(tmp_path, *flags):
 
 
 def test_every_figure_of_the_paper_is_claimed_under_its_conditions():
-    by_name = {condition.name: condition for condition in CONDITIONS}
-    assert len(by_name) == len(CONDITIONS)
+    by_name = {entry.name: entry for entry in PAPERS}
     assert {claim.paper for claim in CLAIMS} - {None} == {
         item.name for item in fields(ResultConstants)
     }
-    assert {claim.condition for claim in CLAIMS} <= by_name.keys()
+    assert {name for claim in CLAIMS for name in claim.entries} <= by_name.keys()
     texts = {claim.paper: claim.paper_text() for claim in CLAIMS}
     assert texts["table_held_out"] == "85 % (82 to 88)"
     assert texts["table_training_median_rad"] == "0.12 to 0.13"
     assert texts["air_time_s"] == "below 7" and texts["air_by_truth"] == "80.9 %"
-    for condition in CONDITIONS:
-        for camera in (False, True):
-            cfg = suite_run.settings(
-                EvalCfg(seed=3), condition, TEACHER, (("x",), "x"), camera=camera
-            )
-            assert cfg.sensor_errors and cfg.no_at_rest and cfg.seed == 3
-            assert cfg.objects == (f"{condition.objects}=x",)
-            assert cfg.episodes == (condition.camera_episodes if camera else condition.episodes)
-            assert cfg.limit_s == (15.0 if cfg.in_air else 10.0)
-    assert by_name["air-points"].flags.endswith("--no-at-rest --in-air --goals points")
+    groups = dict.fromkeys(suite_run.groups_of(PAPERS), (("x",), "x"))
+    for entry in PAPERS:
+        for line in entry.lines:
+            cfg = suite_run.settings(EvalCfg(seed=3), line, TEACHER, groups)
+            assert cfg.sensor_errors and cfg.no_at_rest and cfg.seed == 3 and not cfg.suite
+            assert cfg.objects[0].endswith("=x") and cfg.policies == (TEACHER,)
+            assert cfg.schedule.length_s == (15.0 if cfg.in_air else 10.0)
+
+
+def test_ones_own_suite_is_a_file_of_command_lines(tmp_path, asked, capsys):
+    own = tmp_path / "own.yaml"
+    own.write_text(
+        "title: Own\nlines:\n- name: far\n  teacher: vd-eval dclaw3 --objects desk=SET --seed 7\n"
+        "- {name: near, teacher: vd-eval POLICY --objects cube --max-goal-angle 1}\n"
+    )
+    (tmp_path / "near").mkdir()
+    flags = ["dclaw4", "--suite", str(own), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert main([*flags, "--objects", "desk=cube"]) == 0
+    assert asked == [("far", "dclaw3"), ("near", "dclaw4")], "a line may name its policy"
+    said = json.loads((tmp_path / "out" / "far" / "dclaw3" / "settings.json").read_text())
+    assert said["seed"] == 7 and said["objects"] == ["desk=cube"]
+    assert "Own" in (tmp_path / "out" / "own.html").read_text()
+    for text, message in (
+        ("title: x\nlines: [{name: a}]", "a has to have a line 'vd-eval POLICY ...'"),
+        ("title: x\nlines: [{name: a, camera: vd-eval dclaw3}]", "a has dclaw3 in the wrong line"),
+        ("title: x\nlines: [{name: a, camera: vd-eval --in-air}]", "name a policy"),
+        ("title: x\nlines: [{name: a, speed: b}]", "has no field speed"),
+        ("- a", "has no lines, title; name it"),
+    ):
+        own.write_text(text)
+        assert main(flags) == 1 and message in capsys.readouterr().err
+    assert main([*flags[:2], "nothing", "--out", str(tmp_path)]) == 1
+    assert "give paper, robust, or a YAML file" in capsys.readouterr().err
 
 
 def test_everything_is_run_once_and_only_what_changed_again(tmp_path, asked, monkeypatch):
@@ -253,7 +267,7 @@ def test_robustness_is_one_table_of_what_each_change_costs(tmp_path, asked, monk
 def test_our_objects_stand_for_the_papers_where_none_are_given_and_the_reduced_suite_takes_a_few(
     tmp_path,
 ):
-    groups = suite_run.object_groups((), set(OWN_SETS), quick=False)
+    groups = suite_run.object_groups((), list(OWN_SETS), quick=False)
     assert "validation" not in groups, "nothing stands in for it"
     assert groups["training"][0] == ("procedural-150-seed0",) and "our own" in groups["held-out"][1]
     left_out = set(SHIPPED_POLICIES) - set(EvalCfg(suite="paper").agent_names)
@@ -261,10 +275,10 @@ def test_our_objects_stand_for_the_papers_where_none_are_given_and_the_reduced_s
     with pytest.raises(
         ValueError, match="'table' is no group of the suite; training, validation, held-out"
     ):
-        suite_run.object_groups(("table=cube",), set(OWN_SETS), quick=False)
+        suite_run.object_groups(("table=cube",), list(OWN_SETS), quick=False)
     for index in range(QUICK_OBJECTS * 3):
         (tmp_path / f"{index:02}.usd").touch()
-    sets, text = suite_run.object_groups((f"training={tmp_path}",), {"training"}, quick=True)[
+    sets, text = suite_run.object_groups((f"training={tmp_path}",), ["training"], quick=True)[
         "training"
     ]
     assert [item[-6:] for item in sets] == [f"{i:02}.usd" for i in range(0, 18, 3)]
@@ -297,9 +311,15 @@ def test_our_objects_stand_for_the_papers_where_none_are_given_and_the_reduced_s
         ),
         (["nobody", "--suite", "paper"], "no policy at nobody"),
         (["dclaw4-cube", "--objects", "=a"], "NAME=SET"),
+        (["zero", "--stop-tolerance", "23"], "at most pi [rad]; 23 degrees are 0.401"),
+        (["zero", "--max-goal-angle", "90"], "at most pi [rad]; 90 degrees are 1.57"),
+        (["zero", "--seed", "-1"], "--seed is -1; it has to be zero or positive"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(flags, message, capsys, tmp_path):
+def test_settings_that_cannot_be_are_refused_before_anything_is_built(
+    flags, message, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("vd.evaluate.compare.compare", lambda cfg: pytest.fail("it began"))
     assert main([*flags, "--out", str(tmp_path), "--device", "cpu"]) == 1
     assert message in capsys.readouterr().err
 
@@ -331,8 +351,8 @@ def test_measures_count_what_they_say(found):
 
 @pytest.mark.slow
 def test_on_a_table_of_other_friction_and_in_the_air(tmp_path, monkeypatch, capsys):
-    chosen = tuple(c for c in CONDITIONS if c.name in ("symmetric", "friction-0.05", "air"))
-    monkeypatch.setitem(suite_run.SUITES, "paper", chosen)
+    chosen = tuple(c for c in PAPERS if c.name in ("symmetric", "friction-0.05", "air"))
+    monkeypatch.setattr(suite_run, "read_suite", lambda name: Suite("Part", chosen, CLAIMS))
     flags = ["dclaw4-cube", "--suite", "paper", "--quick", "--jobs", "2", "--device", "cpu"]
     assert main([*flags, "--objects", *OBJECTS[1:], "--out", str(tmp_path), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]

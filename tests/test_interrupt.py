@@ -1,6 +1,7 @@
 """How commands end by a signal: every entry point, whatever it was doing."""
 
 import importlib
+import io
 import os
 import signal
 import subprocess
@@ -58,6 +59,20 @@ def test_an_error_is_one_line_and_with_vd_debug_the_place_in_the_code(monkeypatc
         assert fails() == interrupt.FAILED
         said = capsys.readouterr().err
         assert said.endswith("vd-some: --flag is 3\n") and ("test_interrupt.py" in said) == shown
+
+
+def test_what_an_ascii_terminal_cannot_show_costs_no_result(monkeypatch):
+    shown = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", shown)
+
+    @interrupt.command("vd-x")
+    def main():
+        print("12.3 % \N{EN DASH}")
+        return 0
+
+    assert main() == 0
+    shown.flush()
+    assert shown.buffer.getvalue() == b"12.3 % ?\n"
 
 
 def test_what_a_command_forks_ends_by_the_signal_itself():

@@ -20,6 +20,7 @@ from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
 from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy, sees_clouds, task_for
+from vd.evaluate.goals import ONE_GOAL
 from vd.evaluate.result import Result
 from vd.evaluate.trace import Trace
 from vd.evaluate.tracking import TrackingActor, sensed
@@ -321,7 +322,9 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(
         seen = np.zeros((1, 1, 4))
         norms, quat = np.array([[[0.0, 0.5, 0.4, 0.3]]]), np.zeros((1, 1, 4))
         ends = np.full((1, 1), 4), np.zeros((1, 1), bool), np.zeros((1, 1), bool)
-        return Trace(quat, quat, seen, seen, norms, seen, *ends, still=seen == 0.0)
+        none = np.zeros((1, 1), int)
+        begin = ONE_GOAL, 0, quat, quat
+        return Trace(*begin, seen, seen, norms, seen, *ends, still=seen == 0.0, reached=none)
 
     monkeypatch.setattr("vd.evaluate.compare.run_episodes", spy)
     path = tmp_path / "tracking.safetensors"

@@ -75,7 +75,7 @@ def parse(
 
     Raises:
         FileNotFoundError: There is no such ``--config``.
-        ValueError: It is no file of these settings.
+        ValueError: It is no file of these settings, or the seed is negative.
     """
     arguments, file = take_config(sys.argv[1:] if words is None else words)
     commands = _subcommands(kind)
@@ -92,6 +92,8 @@ def parse(
         description=f"{description or inspect.getdoc(kind)}\n\n{HELP}",
         **({} if default is None else {"default": default}),
     )
+    if (getattr(cfg, "seed", None) or 0) < 0:  # NumPy would refuse it once all is built
+        raise ValueError(f"--seed is {cfg.seed}; it has to be zero or positive")
     if shown:
         import yaml
 
@@ -152,7 +154,7 @@ def _read(path: Path) -> ConfigFile:
 
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789"))
     try:
-        values = yaml.load(path.read_text(), Loader=Loader)  # a safe one
+        values = yaml.load(path.read_text(encoding="utf-8"), Loader=Loader)  # a safe one
     except FileNotFoundError as error:
         raise FileNotFoundError(
             f"{CONFIG}: there is no file {path}; {PRINT} prints settings to begin from"

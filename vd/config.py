@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from collections.abc import Iterator, Mapping, MutableMapping
@@ -183,7 +184,7 @@ def leaves(values: Any, where: str = "") -> Iterator[tuple[str, Any]]:
 def require(
     cfg: Any,
     prefix: str,
-    what: typing.Literal["positive", "zero or positive", "in [0, 1]"],
+    what: typing.Literal["positive", "zero or positive", "in [0, 1]", "an angle"],
     names: str,
 ) -> None:
     """Refuse fields that are not ``what``; those that are ``None`` are not set.
@@ -199,7 +200,14 @@ def require(
     """
     for name in names.split():
         value = getattr(cfg, name)
-        good = value is None or value > 0 or (what != "positive" and value == 0)
-        if not good or (what == "in [0, 1]" and value > 1):
+        if value is None:
+            continue
+        largest = {"in [0, 1]": 1.0, "an angle": math.pi + 1e-6}.get(what, math.inf)
+        zero = what in ("zero or positive", "in [0, 1]") and value == 0
+        if not (zero or 0 < value <= largest):
             shown = name.replace("_", "-") if prefix.startswith("--") else name
-            raise ValueError(f"{prefix}{shown} is {value}; it has to be {what}")
+            remedy: str = what
+            if what == "an angle":
+                degrees = f"; {value:g} degrees are {math.radians(value):.3g}" if value > 0 else ""
+                remedy = f"positive and at most pi [rad]{degrees}"
+            raise ValueError(f"{prefix}{shown} is {value}; it has to be {remedy}")

@@ -6,6 +6,7 @@ once the terminal is gone.
 
 import functools
 import importlib.util
+import io
 import os
 import signal
 import sys
@@ -93,6 +94,7 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
     def wrap(main: Callable[P, Any]) -> Callable[P, Any]:
         @functools.wraps(main)
         def run(*args: P.args, **kwargs: P.kwargs) -> Any:
+            _show_what_can_be_shown()
             given = args[0] if args and isinstance(args[0], Sequence) else sys.argv[1:]
             if given and not {"-h", "--help", "--help-all"} & set(given):
                 print(
@@ -115,6 +117,13 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
         return run
 
     return wrap
+
+
+def _show_what_can_be_shown() -> None:
+    """Have a terminal that lacks a letter, such as an ASCII one a dash, end no command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def _failed(name: str, error: Exception) -> int:

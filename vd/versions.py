@@ -1,7 +1,17 @@
-"""Versions of installed packages, to be written beside what they made."""
+"""What made a file: versions of installed packages, and of the code that measures."""
 
+import ast
+import hashlib
 from collections.abc import Iterable
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+
+MEASURING = ("kernels", "sim", "envs", "sensors", "tracking", "vision", "evaluate")
+"""Packages that decide what an evaluation gives."""
+SHOWING = ("cli.py", "page.py", "claims.py", "suite.py", "suite_run.py")
+"""Files in them that only ask and show."""
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
@@ -13,3 +23,38 @@ def installed_versions(packages: Iterable[str]) -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "not installed"
     return found
+
+
+@cache
+def code_fingerprint() -> str:
+    """What tells the code that measures from other code: a digest of its statements.
+
+    Comments, docstrings and empty lines do not count, nor does where it is installed.
+    """
+    digest = hashlib.sha256()
+    for package in MEASURING:
+        spec = find_spec(f"vd.{package}")
+        assert spec is not None
+        assert spec.submodule_search_locations is not None
+        (folder,) = spec.submodule_search_locations
+        for file in sorted(Path(folder).rglob("*.py")):
+            name = file.relative_to(folder).as_posix()
+            if name not in SHOWING:
+                statements = _statements(file.read_text(encoding="utf-8"))
+                digest.update(f"{package}/{name}\n{statements}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def _statements(text: str) -> str:
+    """The lines of a module without comments, docstrings and empty lines."""
+    documented: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            assert node.end_lineno is not None
+            documented.update(range(node.lineno, node.end_lineno + 1))
+    lines = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        statement = line.split("  # ")[0].rstrip()
+        if number not in documented and statement and not statement.lstrip().startswith("#"):
+            lines.append(statement)
+    return "\n".join(lines)

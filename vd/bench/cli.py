@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,13 +29,20 @@ def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> No
     import warp as wp
 
     from vd.files import write_json
+    from vd.versions import code_fingerprint
 
-    done = []
+    done: list[dict[str, Any]] = []
+    made = {
+        "device": str(wp.get_device(device).name),
+        "date": f"{date.today()}",
+        "code": code_fingerprint(),
+        "rows": done,
+    }
     for row in rows:
         done.append(row)
         print(json.dumps(row), flush=True)
         if path:
-            write_json(path, {"device": str(wp.get_device(device).name), "rows": done})
+            write_json(path, made)
 
 
 @dataclass(frozen=True)

@@ -443,9 +443,9 @@ class ReorientCfg:
         require(self, "", "positive", "num_envs")
         if self.max_episode_steps < 1:
             raise ValueError(f"episode_s = {self.episode_s} is shorter than one control step")
-        require(self, "", "zero or positive", "failures_per_million table_friction")
-        require(self.goal, "goal.", "positive", "max_angle_rad")
-        require(self.success, "success.", "positive", "rotation_rad")
+        require(self, "", "zero or positive", "failures_per_million table_friction seed")
+        require(self.goal, "goal.", "an angle", "max_angle_rad")
+        require(self.success, "success.", "an angle", "rotation_rad")
         if self.fingertip not in ("rigid", "soft"):
             raise ValueError(f"fingertip = {self.fingertip!r}; choose rigid or soft")
         self._check_tightening()

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -13,7 +13,7 @@ from vd.config import require
 from vd.envs.cfg import RandomisationCfg
 from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.evaluate.conditions import CONDITIONS, Condition
-from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, Goals, GoalSeries
+from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, ONE_GOAL, Goals, GoalSchedule
 from vd.paper import PAPER
 from vd.sim.cfg import Engine
 from vd.workers import shard
@@ -102,7 +102,9 @@ class EpisodeFlags(TaskFlags):
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
-        require(self, "--", "positive", "episodes stop_tolerance episode_s num_envs")
+        require(self, "--", "positive", "episodes episode_s num_envs")
+        require(self, "--", "zero or positive", "seed")
+        require(self, "--", "an angle", "stop_tolerance")
 
 
 @dataclass(kw_only=True)
@@ -124,10 +126,10 @@ class EvalCfg(HandFlags, EpisodeFlags):
     """
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = ()
-    suite: Literal["paper", "robust"] | None = None
-    """Run the paper's evaluations, or those of every --condition, on the D'Claw policies if none is
-    named. --objects training=FOLDER held-out=FOLDER names objects; without, our procedural sets
-    stand for them.
+    suite: str | None = None
+    """Run the command lines of a suite, paper, robust or a YAML file (docs/concepts/evaluation.md),
+    on the D'Claw policies if none is named. --objects training=FOLDER held-out=FOLDER names
+    objects; without, our procedural sets stand for them.
     """
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
     """Of the suite only a part, with few objects and episodes: minutes on two CPU cores."""
@@ -187,24 +189,25 @@ class EvalCfg(HandFlags, EpisodeFlags):
         return tuple(dict.fromkeys(self.policies or shipped))
 
     @property
+    def suite_name(self) -> str:
+        """What the files of the suite are called, or of the one evaluation."""
+        return "eval" if self.suite is None else Path(self.suite).stem
+
+    @property
     def object_sets(self) -> tuple[str, ...]:
         """The sets of ``objects``, the default included."""
         return self.objects or ("cube",)
 
     @property
-    def series(self) -> GoalSeries | None:
-        """Goals in a row, if they are asked for."""
+    def schedule(self) -> GoalSchedule:
+        """The goals of an episode."""
         if self.air_goals:
             return AIR_GOALS
-        limit_s = episode_limit_s(self.episode_s, in_air=False)
-        return replace(CONSECUTIVE, goal_s=limit_s) if self.consecutive else None
-
-    @property
-    def limit_s(self) -> float:
-        """Time limit of an episode [s]."""
-        if self.series is not None:
-            return self.series.length_s
-        return episode_limit_s(self.episode_s, in_air=self.in_air)
+        goal_s = episode_limit_s(self.episode_s, in_air=self.in_air)
+        table_s = PAPER.scene.air_table_s if self.in_air else None
+        return replace(
+            CONSECUTIVE if self.consecutive else ONE_GOAL, goal_s=goal_s, table_s=table_s
+        )
 
     @property
     def rest(self) -> bool | None:
@@ -221,12 +224,9 @@ class EvalCfg(HandFlags, EpisodeFlags):
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
         super().validate()
-        require(self, "--", "positive", "jobs max_goal_angle")
+        require(self, "--", "positive", "jobs")
+        require(self, "--", "an angle", "max_goal_angle")
         require(self, "--", "zero or positive", "table_friction")
-        if self.max_goal_angle > math.pi + 1e-6:
-            raise ValueError(
-                f"--max-goal-angle is {self.max_goal_angle}; it must be at most pi rad"
-            )
         if self.engine == "mujoco" and self.device.startswith("cuda"):
             raise ValueError(
                 f"--engine mujoco steps on the CPU, not on {self.device}; leave --device out"

@@ -9,6 +9,7 @@ from vd import interrupt
 from vd.command_line import parse
 from vd.evaluate.agents import check_names
 from vd.evaluate.cfg import EvalCfg, parse_groups
+from vd.evaluate.suite import read_suite
 from vd.files import check_file, check_folder
 
 
@@ -22,6 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_folder(cfg.out)
         if cfg.suite is None:
             check_file(cfg.out / "eval.json")
+        else:
+            read_suite(cfg.suite)
         return _evaluate(cfg)
     except KeyboardInterrupt:
         hint = "; the same command goes on from here" if cfg.suite else ""
@@ -34,7 +37,7 @@ def _evaluate(cfg: EvalCfg) -> int:
     from vd.evaluate.page import terminal_text, write_page
     from vd.evaluate.suite_run import OUT_OF_TIME, run_suite
 
-    written, page = (cfg.out / f"{cfg.suite or 'eval'}{suffix}" for suffix in (".json", ".html"))
+    written, page = (cfg.out / f"{cfg.suite_name}{suffix}" for suffix in (".json", ".html"))
     if cfg.suite is None:
         result = compare(cfg)
         write_page(result, page)

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
     from vd.evaluate.goals import Goals
     from vd.evaluate.result import Agent, Protocol, Result
+    from vd.evaluate.trace import Trace
 
 ENVS_CPU, ENVS_GPU, ENVS_CAMERA_GPU = 64, 8192, 1024
 """Environments simulated at once by default: enough to keep the device busy, few enough to fit
@@ -45,10 +47,9 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
 
     from vd.assets_usd.objects.sets import set_files
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.in_a_row import judge_series
     from vd.evaluate.result import Result, judge
     from vd.tracking.symmetry import with_symmetries
-    from vd.versions import installed_versions
+    from vd.versions import code_fingerprint, installed_versions
 
     groups = parse_groups(cfg.object_sets)
     everything = tuple(dict.fromkeys(s for sets in groups.values() for s in sets))
@@ -79,12 +80,15 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
             chosen = [files.index(file) for file in set_files(sets)]
             objects = [env.objects[number] for number in chosen]
             protocol = _protocol(cfg, wanted, sets, agent.sees)
-            judged = judge if cfg.series is None else judge_series
-            rows += judged(
+            rows += judge(
                 trace.of(chosen), protocol, objects, agent, group=group, condition=condition
             )
     env.close()
-    software = {"device": wp.get_device(device).name} | installed_versions(_PACKAGES)
+    software = {
+        "device": wp.get_device(device).name,
+        "date": f"{date.today()}",
+        "code": code_fingerprint(),
+    } | installed_versions(_PACKAGES)
     result = Result(tuple(rows), software)
     result.write(cfg.out / "eval.json")
     return result
@@ -102,7 +106,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         seed=cfg.seed,
         stop_tolerance_rad=NEVER_RAD,
         max_goal_angle_rad=cfg.max_goal_angle,
-        episode_s=cfg.limit_s,
+        episode_s=cfg.schedule.length_s,
         randomised=True,
         success_ends_episode=True,
         at_rest=cfg.rest,
@@ -132,7 +136,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
         seed=cfg.seed,
         max_goal_angle_rad=cfg.max_goal_angle,
         stop_tolerance_rad=cfg.stop_tolerance,
-        episode_s=cfg.series.goal_s if cfg.series and cfg.consecutive else task.episode_s,
+        episode_s=cfg.schedule.goal_s if cfg.consecutive else task.episode_s,
         control_hz=task.sim.control_hz,
         randomisation=cfg.condition or ("on" if cfg.randomise else "off"),
         at_rest=task.start.at_rest,
@@ -180,28 +184,30 @@ def actor_of(
     return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for)
 
 
-def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> Any:
-    """All episodes of one policy, with a progress bar.
+def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "Trace":
+    """All episodes of one policy, with a progress bar."""
+    from vd.evaluate.rollout import draw_turns
+    from vd.evaluate.trace import record
 
-    A Trace, or of goals in a row a SeriesTrace.
-    """
-    from vd.evaluate.in_a_row import draw_turns, record_series, way_of
-    from vd.evaluate.trace import air_table_steps, record
-
-    drawn, tolerance = _drawn(cfg, env), cfg.stop_tolerance
+    schedule = cfg.schedule
+    ways = agent.ways_to_stop(cfg.stop_tolerance, schedule).values()
+    turns = None
+    if schedule.most > 1:
+        names = [item.name for item in env.objects]
+        draw: dict[str, Any] = {"seed": cfg.seed, "max_goal_angle": cfg.max_goal_angle}
+        turns = draw_turns(names, cfg.episodes, schedule.most, **draw)
     with _progress(cfg, env, agent) as on_step:
-        trace: Any
-        if series := cfg.series:
-            names, (_, way) = [item.name for item in env.objects], way_of(agent, series, tolerance)
-            draw: dict[str, Any] = {"seed": cfg.seed, "max_goal_angle": cfg.max_goal_angle}
-            turns = draw_turns(names, cfg.episodes, series.most, **draw)
-            settings: dict[str, Any] = {"tolerance": tolerance, "on_step": on_step}
-            trace = record_series(env, actor, turns, way, series, **drawn, **settings)
-        else:
-            held = [way for way in agent.ways_to_stop(tolerance).values() if way[1] != "success"]
-            table_steps = air_table_steps(env.cfg.sim.control_hz) if cfg.in_air else None
-            settings = {"table_steps": table_steps, "held": held, "on_step": on_step}
-            trace = record(env, actor, cfg.episodes, **drawn, **settings)
+        trace = record(
+            env,
+            actor,
+            cfg.episodes,
+            schedule,
+            ways=[way for way in ways if way[1] != "success"],
+            tolerance=cfg.stop_tolerance,
+            turns=turns,
+            on_step=on_step,
+            **_drawn(cfg, env),
+        )
     env.check()
     return trace
 

@@ -6,12 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE
+from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, HOLD_S
 from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row
 from vd.evaluate.statistics import Interval
-from vd.evaluate.trace import HOLD_S
 from vd.page import write_html
-from vd.paper import PAPER
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -234,7 +232,7 @@ def _tables(result: Result, short: dict[str, str]) -> tuple[Table, Table]:
             )
         )
         median, time_s = number(row.overall.median_error_rad), number(row.overall.time_s)
-        beside.append((*names, percent(row.symmetric), median, time_s))
+        beside.append((*names, percent(row.overall.symmetric), median, time_s))
     return (_HEADER, success), (_BESIDE_HEADER, beside)
 
 
@@ -244,7 +242,7 @@ def _object_table(row: Row) -> Table:
         (
             one.name,
             *map(percent, one.outcomes.values()),
-            percent(one.symmetric[str(PAPER.success.rotation_rad)]),
+            percent(one.symmetric),
             number(one.median_error_rad),
         )
         for one in (row.overall, *row.per_object)

@@ -4,7 +4,7 @@ Angles are radians, times seconds, quaternions xyzw. K objects, M episodes of ea
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vd.config import from_dict, to_dict
-from vd.evaluate.goals import Goals
+from vd.evaluate.goals import ONE_GOAL, Goals, GoalSchedule
 from vd.evaluate.statistics import (
     TOLERANCES_RAD,
     Interval,
@@ -30,7 +30,7 @@ from vd.paper import PAPER
 from vd.sim.cfg import Engine
 from vd.stopping import StoppingRule
 
-RESULT_FORMAT = "visual-dexterity evaluation 7"
+RESULT_FORMAT = "visual-dexterity evaluation 8"
 BOUNDS_RAD = (PAPER.success.precise_rad, PAPER.success.rotation_rad)
 """Bounds on the distance at which predictions are judged, as in the paper."""
 OUTCOMES = ("success", "orientation error", "time-out", "object falls")
@@ -39,6 +39,8 @@ stopped, lost."""
 
 StoppedBy = Literal["prediction", "true distance", "success criteria of training"]
 SUCCESS: StoppedBy = "success criteria of training"
+ANY_ACTION = 100.0
+"""Bound that no norm of an action exceeds: others who count consecutive successes ask for none."""
 OWN_NORM = "its own bound of the action"
 """Mark of rows that are ours: stopped by the bound of the action's norm that a policy's file
 has.
@@ -106,8 +108,9 @@ class Summary:
     """By tolerance [rad] (as text): share of episodes that ended within it of the very goal, not
     lost.
     """
-    symmetric: dict[str, Interval]
-    """The same up to the object's symmetry."""
+    symmetric: Interval
+    """Share of episodes stopped within the tolerance of what looks like the goal; where the true
+    distance decides, it is that distance."""
     median_error_rad: Interval
     """Median final error to the very goal; a lost object counts as pi."""
     time_s: Interval | None
@@ -132,7 +135,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class InAir:
-    """Goal after goal in the air (:mod:`vd.evaluate.in_a_row`)."""
+    """Goal after goal in the air (``AIR_GOALS``)."""
 
     held: Interval
     """Share of episodes in which the object was still held when the first goal was drawn."""
@@ -148,7 +151,7 @@ class InAir:
 
 @dataclass(frozen=True)
 class Consecutive:
-    """Goals reached one after the other (:mod:`vd.evaluate.in_a_row`), of all objects or of one."""
+    """Goals reached one after the other (``CONSECUTIVE``), of all objects or of one."""
 
     name: str
     """Object, or ``all``."""
@@ -190,9 +193,6 @@ class Row:
     """Share of episodes stopped so, and still there after the hand has held for HOLD_S; None: not
     tried.
     """
-    symmetric: Interval
-    """Share of episodes stopped within the tolerance of what looks like the goal; where the true
-    distance decides, it is that distance."""
     precise: Interval | None = None
     """Share of episodes that stop within 0.1 rad of the very goal, by the rule for that; None: not
     tried.
@@ -317,32 +317,31 @@ class Agent:
     rules: Callable[[float], StoppingRule]
     """Its own rule for a tolerance [rad]."""
 
-    def ways_to_stop(self, tolerance_rad: float) -> dict[tuple[StoppedBy, str], Way]:
+    def ways_to_stop(
+        self, tolerance_rad: float, schedule: GoalSchedule = ONE_GOAL
+    ) -> dict[tuple[StoppedBy, str], Way]:
         """The ways to stop it within a tolerance [rad], the headline first, by name and what is ours of it.
 
         They are the bounds of the distance that it predicts, if it does, and of the true one, both
         with the released code's bound of the action's norm; and, as ours, its own bound of the norm
         where that is another. What predicts nothing is stopped by the success criteria of training,
-        too.
+        too. Goals in a row depend on what stops it: there the first way is the only one.
         """
-        own, norm = self.rules(tolerance_rad), PAPER.success.action_norm
+        own = self.rules(tolerance_rad)
+        norm = ANY_ACTION if schedule.distance_alone else PAPER.success.action_norm
         true = StoppingRule(tolerance_rad, norm)
-        if not self.sees.endswith("clouds"):  # nor predicts
-            return {("true distance", ""): (true, "exact"), (SUCCESS, ""): (true, "success")}
-        ways: dict[tuple[StoppedBy, str], Way] = {
-            ("prediction", ""): (replace(own, action_norm=norm), "predicted"),
-            ("true distance", ""): (true, "exact"),
-        }
-        return (
-            ways
-            if own.action_norm == norm
-            else ways | {("prediction", OWN_NORM): (own, "predicted")}
-        )
-
-    def own_way(self, tolerance_rad: float) -> tuple[StoppedBy, Way]:
-        """The way of the headline, and its name."""
-        (stopped_by, _), way = next(iter(self.ways_to_stop(tolerance_rad).items()))
-        return stopped_by, way
+        predicts = self.sees.endswith("clouds")
+        ways: dict[tuple[StoppedBy, str], Way] = {}
+        if predicts:
+            ways["prediction", ""] = (replace(own, action_norm=norm), "predicted")
+        ways["true distance", ""] = (true, "exact")
+        if schedule.most > 1:
+            return dict([next(iter(ways.items()))])
+        if not predicts:
+            ways[SUCCESS, ""] = (true, "success")
+        elif own.action_norm != norm:
+            ways["prediction", OWN_NORM] = (own, "predicted")
+        return ways
 
 
 def judge(
@@ -355,104 +354,141 @@ def judge(
     condition: str = "",
 ) -> list[Row]:
     """Rows of one policy, one for each way to stop, from its episodes with the objects of one group."""
-    rows, tolerance, precise = [], protocol.stop_tolerance_rad, PAPER.success.precise_rad
-    near, unit = agent.ways_to_stop(precise), choose_unit(len(objects))
-
-    def share(episodes: np.ndarray) -> Interval:
-        return rate_intervals(episodes[None], unit)[0]
-
-    for (stopped_by, ours), (rule, by) in agent.ways_to_stop(tolerance).items():
-        # A rule that has the paper's bound of the norm for 0.1 rad has no other of its own for it.
-        near_rule, _ = near.get((stopped_by, ours), (agent.rules(precise), by))
-        held = trace.held.get((rule, by))
+    tolerance = protocol.stop_tolerance_rad
+    schedule = trace.schedule
+    unit = choose_unit(len(objects))
+    names = tuple(item.name for item in objects)
+    rows = []
+    for (stopped_by, ours), way in agent.ways_to_stop(tolerance, schedule).items():
+        rule, by = way
+        alike = _stopped_within(
+            trace, rule, "error" if by == "exact" else by, trace.error, tolerance
+        )
+        episodes = trace.episodes(rule, by)
+        in_a_row = schedule.most > 1
         rows.append(
-            row_of(
-                trace.episodes(rule, by),
-                protocol,
-                objects,
-                agent,
-                trace.failed,
+            Row(
+                policy=agent.policy,
+                kind=agent.kind,
+                sees=agent.sees,
                 group=group,
                 condition=condition,
                 stopped_by=stopped_by,
                 rule=rule,
                 ours=ours,
-                held=None
-                if held is None
-                else share(
-                    _stopped_within(trace, rule, by, trace.exact, tolerance) & (held <= tolerance)
-                ),
-                symmetric=share(
-                    _stopped_within(
-                        trace, rule, "error" if by == "exact" else by, trace.error, tolerance
-                    )
-                ),
-                precise=share(_stopped_within(trace, near_rule, by, trace.exact, precise)),
-                prediction=_prediction(trace) if by == "predicted" else None,
+                protocol=protocol,
+                object_names=names,
+                overall=summarise("all", episodes, alike, protocol, unit),
+                per_object=_per_object(names, episodes, alike, protocol),
+                held=None if in_a_row else _held(trace, way, tolerance, unit),
+                precise=None if in_a_row else _precise(trace, agent, (stopped_by, ours), by, unit),
+                prediction=_prediction(trace) if by == "predicted" and not in_a_row else None,
+                warnings=_warnings(trace, agent, objects, condition),
+                episodes=episodes,
+                in_air=_in_air(trace, way, unit) if in_a_row and schedule.first_s else None,
+                consecutive=() if schedule.first_s or not in_a_row else _consecutive(trace, names),
             )
         )
     return rows
 
 
-def row_of(
+def _per_object(
+    names: Sequence[str], episodes: tuple[Episode, ...], alike: np.ndarray, protocol: Protocol
+) -> tuple[Summary, ...]:
+    count = protocol.episodes
+    summaries = []
+    for k, name in enumerate(names):
+        own = episodes[k * count : (k + 1) * count]
+        summaries.append(summarise(name, own, alike[k : k + 1], protocol, "episode"))
+    return tuple(summaries)
+
+
+def _held(trace: Trace, way: Way, tolerance: float, unit: Unit) -> Interval | None:
+    """Share of episodes stopped a way within a tolerance [rad], and held there."""
+    if way not in trace.held:
+        return None
+    stopped = _stopped_within(trace, *way, trace.exact, tolerance)
+    return rate_intervals((stopped & (trace.held[way] <= tolerance))[None], unit)[0]
+
+
+def _precise(
+    trace: Trace, agent: Agent, name: tuple[StoppedBy, str], by: StopsBy, unit: Unit
+) -> Interval:
+    """Share of episodes stopped within 0.1 rad by the rule for that."""
+    precise = PAPER.success.precise_rad
+    # A rule that has the paper's bound of the norm for 0.1 rad has no other of its own for it.
+    rule, _ = agent.ways_to_stop(precise).get(name, (agent.rules(precise), by))
+    return rate_intervals(_stopped_within(trace, rule, by, trace.exact, precise)[None], unit)[0]
+
+
+def _warnings(trace: Trace, agent: Agent, objects: list[Any], condition: str) -> dict[str, str]:
+    """What imports said of the objects, and in how many episodes the physics failed."""
+    warnings = {item.name: "; ".join(item.warnings) for item in objects if item.warnings}
+    count = trace.failed.shape[1]
+    for item, bad in zip(objects, trace.failed.sum(axis=1), strict=True):
+        if bad:
+            name = " ".join((agent.policy, item.name, condition)).strip()
+            warnings[name] = f"physics failed in {bad} of {count} episodes"
+    return warnings
+
+
+def _in_air(trace: Trace, way: Way, unit: Unit) -> InAir:
+    first = trace.reached > 0
+    in_a_row = trace.reached == trace.schedule.most
+    shares = rate_intervals(np.stack([trace.given, in_a_row]), unit)
+    return InAir(
+        held=shares[0],
+        first=share_among(first, trace.given),
+        in_a_row=shares[1],
+        lost=share_among(trace.fell, trace.given),
+        let_go=share_among(trace.held[way] >= np.pi, first),
+    )
+
+
+def _consecutive(trace: Trace, names: Sequence[str]) -> tuple[Consecutive, ...]:
+    """Of all objects, and of each."""
+    parts = {"all": slice(None)} | {name: slice(k, k + 1) for k, name in enumerate(names)}
+    rows = []
+    for name, part in parts.items():
+        reached = trace.reached[part]
+        full = reached == trace.schedule.most
+        rows.append(
+            Consecutive(
+                name,
+                mean=float(reached.mean()),
+                median=float(np.median(reached)),
+                goals=float(reached.sum() / (reached.sum() + (~full).sum())),
+                lost=float((trace.fell[part] & ~full).mean()),
+                full=float(full.mean()),
+            )
+        )
+    return tuple(rows)
+
+
+def summarise(
+    name: str,
     episodes: tuple[Episode, ...],
+    alike: np.ndarray,
     protocol: Protocol,
-    objects: list[Any],
-    agent: Agent,
-    failed: np.ndarray,
-    *,
-    condition: str,
-    **rest: Any,
-) -> Row:
-    """A row from its episodes, and which of them the physics failed [K, M].
+    unit: Unit,
+) -> Summary:
+    """Every rate, median and interval of some episodes, whole objects of them.
 
-    ``rest`` are its other fields.
+    ``alike`` says which were stopped within the tolerance of what looks like the goal, bool [K, M].
     """
-    names, count = tuple(item.name for item in objects), protocol.episodes
-    return Row(
-        policy=agent.policy,
-        kind=agent.kind,
-        sees=agent.sees,
-        protocol=protocol,
-        object_names=names,
-        overall=summarise("all", episodes, protocol, choose_unit(len(objects))),
-        per_object=tuple(
-            summarise(name, episodes[k * count : (k + 1) * count], protocol, "episode")
-            for k, name in enumerate(names)
-        ),
-        condition=condition,
-        warnings={item.name: "; ".join(item.warnings) for item in objects if item.warnings}
-        | {
-            " ".join(
-                (agent.policy, name, condition)
-            ).strip(): f"physics failed in {bad} of {count} episodes"
-            for name, bad in zip(names, failed.sum(axis=1), strict=True)
-            if bad
-        },
-        episodes=episodes,
-        **rest,
-    )
-
-
-def summarise(name: str, episodes: tuple[Episode, ...], protocol: Protocol, unit: Unit) -> Summary:
-    """Every rate, median and interval of some episodes, whole objects of them."""
     fell = _column(episodes, protocol, "fell")
-    errors, alike = (
-        np.where(fell, np.pi, _column(episodes, protocol, error))
-        for error in ("exact_error_rad", "error_rad")
-    )
+    errors = np.where(fell, np.pi, _column(episodes, protocol, "exact_error_rad"))
     outcomes = _outcomes(episodes, protocol)
-    within = [values <= tolerance for values in (errors, alike) for tolerance in TOLERANCES_RAD]
-    rates = rate_intervals(np.stack([*outcomes, *within]), unit)
-    labels, first = [str(tolerance) for tolerance in TOLERANCES_RAD], len(OUTCOMES)
+    within = [errors <= tolerance for tolerance in TOLERANCES_RAD]
+    rates = rate_intervals(np.stack([*outcomes, *within, alike]), unit)
     times = _column(episodes, protocol, "steps")[outcomes[0]] / protocol.control_hz
     return Summary(
         name=name,
         episodes=len(episodes),
         unit=unit,
         outcomes=dict(zip(OUTCOMES, rates, strict=False)),
-        success=dict(zip(labels, rates[first:], strict=False)),
-        symmetric=dict(zip(labels, rates[first + len(labels) :], strict=True)),
+        success=dict(zip(map(str, TOLERANCES_RAD), rates[len(OUTCOMES) :], strict=False)),
+        symmetric=rates[-1],
         median_error_rad=median_interval(errors, unit),
         time_s=order_interval(times) if times.size else None,
     )

@@ -1,6 +1,7 @@
 """Starts and goals of an evaluation, and the rounds in which many environments run them."""
 
 import zlib
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,6 +36,18 @@ def draw_goals(start: np.ndarray, rng: np.random.Generator, max_goal_angle: floa
     cumulative = grid - np.sin(grid)
     angle = np.interp(rng.random(len(start)) * cumulative[-1], cumulative, grid)
     return (Rotation.from_rotvec(axis * angle[:, None]) * Rotation.from_quat(start)).as_quat()
+
+
+def draw_turns(
+    names: Sequence[str], episodes: int, most: int, *, seed: int, max_goal_angle: float
+) -> np.ndarray:
+    """Rotations from where objects are to their goals in a row [K, M, most, 4], by name, seed and episode."""
+    turns = []
+    for name in names:
+        rng = np.random.default_rng([seed, zlib.crc32(name.encode()), most])
+        at = np.tile([0.0, 0.0, 0.0, 1.0], (episodes * most, 1))
+        turns.append(draw_goals(at, rng, max_goal_angle).reshape(episodes, most, 4))
+    return np.stack(turns)
 
 
 def episode_rounds(world_object: np.ndarray, objects: int, episodes: int) -> list[np.ndarray]:

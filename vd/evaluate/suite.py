@@ -1,20 +1,14 @@
-"""Suites: the paper's evaluations in simulation, with what the paper says of them (CLAIMS), and robustness.
+"""Suites: command lines of ``vd-eval`` in a file, which :mod:`vd.evaluate.suite_run` runs."""
 
-:mod:`vd.evaluate.suite_run` runs the lists.
-"""
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
-
-import numpy as np
-
-from vd.evaluate.conditions import CHANGED
-from vd.evaluate.result import Row, StoppedBy
-from vd.evaluate.statistics import Interval, choose_unit, rate_intervals
-from vd.evaluate.trace import air_table_steps
+from vd.config import from_dict
 from vd.paper import PAPER
 
+FOLDER = Path(__file__).with_name("suites")
+"""Where the suites are that have a name."""
 OWN_SETS: dict[str, str | None] = {
     "training": "procedural-150-seed0",
     "validation": None,
@@ -26,10 +20,6 @@ Choices are made on training and validation, held-out judges. For validation not
 is left out.
 """
 
-FRICTIONS = (*PAPER.randomisation.table_friction, 0.25, 0.75)
-"""Frictions of the table beside the nominal one. The paper's five materials have no published
-values; these span the range of its training."""
-
 QUICK_OBJECTS, QUICK_EPISODES, QUICK_CAMERA_EPISODES = 6, 4, 1
 """Objects of a group and episodes of each in the reduced suite; a control step of a camera policy
 takes a second and more on a CPU."""
@@ -38,97 +28,25 @@ QUICK_S = 540.0
 
 
 @dataclass(frozen=True)
-class Condition:
-    """One evaluation of every policy: an invocation of ``vd-eval`` with a name."""
+class SuiteEntry:
+    """One evaluation of every policy, as ``vd-eval`` is told to run it."""
 
     name: str
     """Of its folder."""
-    objects: str
-    """Group of objects."""
-    episodes: int
-    """Starts and goals of every object."""
-    camera_episodes: int
-    """The same for a camera policy, whose clouds and fits take most of the time."""
-    shown: str
+    teacher: str = ""
+    """The command line for policies that see the simulator's state; empty: they are left out.
+    POLICY stands for each policy, SET for the objects of a group."""
+    camera: str = ""
+    """The same for policies that see by a camera."""
+    shown: str = ""
     """Where the paper shows the same, or what is changed."""
-    settings: dict[str, Any] = field(default_factory=dict)
-    """Fields of ``EvalCfg`` beside these."""
-    quick: bool = True
+    quick: bool = False
     """Part of the reduced suite."""
-    by_camera: bool = True
-    """Whether camera policies meet it too; they look for themselves, as late as their images
-    are.
-    """
 
     @property
-    def flags(self) -> str:
-        """What ``vd-eval`` is told to do the same, policy and objects apart."""
-        said = [
-            f"--episodes {self.episodes} (camera policies {self.camera_episodes})",
-            "--no-at-rest",
-        ]
-        for name, value in self.settings.items():
-            text = f" {value:g}" if isinstance(value, float) else f" {value}"
-            said.append(f"--{name.replace('_', '-')}{'' if value is True else text}")
-        return " ".join(said)
-
-
-_TRAINING = Condition("training", "training", 50, 8, "Table 1, Figures 2D and 7D")
-_HELD_OUT = Condition("held-out", "held-out", 100, 50, "Table 1, Figures 2D, 4E, 7E-G")
-_AIR = Condition("air", "held-out", 100, 50, "Figures S12 to S14", {"in_air": True})
-CONDITIONS = (
-    _TRAINING,
-    replace(_TRAINING, name="training-points", settings={"goals": "points"}, quick=False),
-    _HELD_OUT,
-    replace(_HELD_OUT, name="held-out-points", settings={"goals": "points"}),
-    Condition("validation", "validation", 100, 50, ""),
-    Condition("symmetric", "symmetric", 100, 50, "Figure 4F"),
-    *(
-        Condition(
-            f"friction-{friction:g}",
-            "held-out",
-            100,
-            24,
-            "Figures 2F and 2G (real materials)",
-            {"table_friction": friction},
-            quick=friction in PAPER.randomisation.table_friction,
-        )
-        for friction in sorted(FRICTIONS)
-    ),
-    _AIR,
-    replace(_AIR, name="air-points", settings={"in_air": True, "goals": "points"}),
-    Condition(
-        "air-training", "training", 20, 4, "Figures S12 to S14", {"in_air": True}, quick=False
-    ),
-    Condition("scanned-goals", "held-out", 100, 24, "Figure 5", {"goals": "scan"}),
-)
-"""What the paper's suite runs, in this order."""
-ROBUST = tuple(
-    Condition(
-        name,
-        "held-out",
-        20,
-        4,
-        changed,
-        {"condition": name},
-        quick=name in ("nominal", "s3", "mixed"),
-        by_camera=name not in ("observation-late", "all-late", "pose-error"),
-    )
-    for name, changed in CHANGED.items()
-) + tuple(
-    Condition(
-        f"air-{name}",
-        "held-out",
-        20,
-        4,
-        f"goals in the air; {CHANGED[name][0].lower()}{CHANGED[name][1:]}",
-        {"air_goals": True, "condition": name},
-        quick=False,
-    )
-    for name in ("nominal", "mixed")
-)
-"""What ``--suite robust`` runs: one thing changed in each, but in the first four and the last."""
-SUITES = {"paper": CONDITIONS, "robust": ROBUST}
+    def lines(self) -> list[str]:
+        """Its command lines."""
+        return [line for line in (self.teacher, self.camera) if line]
 
 
 @dataclass(frozen=True)
@@ -137,23 +55,15 @@ class Claim:
 
     text: str
     """What it is."""
-    condition: str
-    """Name of the condition."""
-    measure: Callable[[Row], Interval | float | None]
-    """Takes it from a row; None where it has no meaning."""
-    paper: str | None
+    entries: tuple[str, ...]
+    """Names of the evaluations that have it."""
+    measure: str
+    """Where it is in a row (:func:`vd.evaluate.claims.measured`)."""
+    paper: str | None = None
     """Name of the paper's figure in ``PAPER.results``; None: it gives no number."""
     unit: Literal["share", "rad", "s"] = "share"
-    stopped_by: StoppedBy | None = None
+    stopped_by: str | None = None
     """Whose rule; None: that of each policy."""
-
-    def of(self, rows: Sequence[Row]) -> Interval | float | None:
-        """Ours, from the rows of one policy in the condition; None where it has no such figure."""
-        for row in rows:
-            own = row.headline if self.stopped_by is None else row.stopped_by == self.stopped_by
-            if own and not row.ours:
-                return self.measure(row)
-        return None
 
     def paper_text(self) -> str:
         """What the paper says: ``96 % (94 to 97)``, ``0.12 to 0.13``, ``below 7``.
@@ -168,6 +78,15 @@ class Claim:
         return f"{value[0]:.2f} to {value[1]:.2f}" if self.unit == "rad" else f"below {value[0]:g}"
 
 
+@dataclass(frozen=True)
+class Suite:
+    """A list of evaluations, and what the paper says of them."""
+
+    title: str
+    lines: tuple[SuiteEntry, ...]
+    claims: tuple[Claim, ...] = ()
+
+
 def share_text(value: float, *interval: float) -> str:
     """``85 % (82 to 88)``, with a decimal where whole per cents would hide how small it is."""
     digits = 0 if interval and value >= 0.1 else 1
@@ -175,96 +94,33 @@ def share_text(value: float, *interval: float) -> str:
     return f"{texts[0]} %" + (f" ({texts[1]} to {texts[2]})" if interval else "")
 
 
-def lost_at_once(row: Row) -> Interval:
-    """Share of episodes that lost the object in the half second after the table went."""
-    gone = air_table_steps(row.protocol.control_hz)
-    soon = gone + round(0.5 * row.protocol.control_hz)
-    return _share(row, [e.fell and gone < e.steps <= soon for e in row.episodes])
+def read_suite(name: str) -> Suite:
+    """A suite by name, or the file of one's own.
 
-
-def success_without_table(row: Row) -> Interval:
-    """Share of episodes that were stopped within the tolerance when the table had gone."""
-    gone = air_table_steps(row.protocol.control_hz)
-    return _share(row, row.successes.ravel() & [e.steps > gone for e in row.episodes])
-
-
-def _seen(row: Row, bound: str) -> float | None:
-    """Share of the states truly within a bound [rad] that a camera policy predicts within it."""
-    return None if row.prediction is None else row.prediction.seen[bound]
-
-
-def _share(row: Row, chosen: list[bool] | np.ndarray) -> Interval:
-    objects = len(row.object_names)
-    return rate_intervals(np.reshape(chosen, (1, objects, -1)), choose_unit(objects))[0]
-
-
-def _claims(name: str, *claims: tuple[Any, ...]) -> list[Claim]:
-    """Claims of a condition.
-
-    Their text, measure and figure of the paper, and what else they have.
+    Raises:
+        FileNotFoundError: There is none.
+        ValueError: It is no list of command lines of ``vd-eval``; names file, entry and remedy.
     """
-    return [Claim(text, name, *others) for text, *others in claims]
+    import yaml
 
-
-def _on_table(name: str, key: str) -> list[Claim]:
-    """The paper's figures on the table; ``key`` begins their names."""
-    return _claims(
-        name,
-        ("error at most 0.4 rad", lambda row: row.overall.success["0.4"], key),
-        ("error at most 0.8 rad", lambda row: row.overall.success["0.8"], f"{key}_rad08"),
-        (
-            "median error [rad]",
-            lambda row: row.overall.median_error_rad,
-            f"{key}_median_rad",
-            "rad",
-        ),
-    )
-
-
-def _in_air(name: str) -> list[Claim]:
-    """The paper's figures in the air."""
-
-    def share(outcome: str) -> Callable[[Row], Interval]:
-        return lambda row: row.overall.outcomes[outcome]
-
-    claims = []
-    for way, key in (("prediction", "prediction"), ("true distance", "truth")):
-        claims += _claims(
-            name,
-            (f"stopped within 0.4 rad by {way}", share("success"), f"air_by_{key}", "share", way),
-            (
-                f"stopped within 0.1 rad by {way}",
-                lambda row: row.precise,
-                f"air_by_{key}_rad01",
-                "share",
-                way,
-            ),
-        )
-    return claims + _claims(
-        name,
-        ("stopped within 0.4 rad without the table", success_without_table, None),
-        ("median time to success [s]", lambda row: row.overall.time_s, "air_time_s", "s"),
-        ("object lost", share("object falls"), "air_dropped"),
-        ("object lost within 0.5 s of the table", lost_at_once, "air_dropped_at_once"),
-        (
-            "states within 0.4 rad up to symmetry seen so",
-            lambda row: _seen(row, "0.4"),
-            "near_seen",
-        ),
-        (
-            "states within 0.1 rad up to symmetry seen so",
-            lambda row: _seen(row, "0.1"),
-            "near_seen_rad01",
-        ),
-    )
-
-
-CLAIMS = (
-    *_on_table("training", "table_training"),
-    *_on_table("training-points", "table_training"),
-    *_on_table("held-out", "table_held_out"),
-    *_on_table("held-out-points", "table_held_out"),
-    *_in_air("air"),
-    *_in_air("air-points"),
-)
-"""The paper's figures and what we measure beside them, in the order of the conditions."""
+    path = FOLDER / f"{name}.yaml"
+    if not path.is_file():
+        path = Path(name)
+    if not path.is_file():
+        known = ", ".join(file.stem for file in sorted(FOLDER.glob("*.yaml")))
+        raise FileNotFoundError(f"--suite: there is no {name}; give {known}, or a YAML file")
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        suite = from_dict(Suite, values if isinstance(values, dict) else {})
+    except (ValueError, yaml.YAMLError) as error:
+        raise ValueError(f"--suite {path}: {error}") from error
+    names = [entry.name for entry in suite.lines]
+    for entry in suite.lines:
+        if names.count(entry.name) > 1:
+            raise ValueError(f"--suite {path}: {entry.name} is there twice; rename one")
+        if not entry.lines or any(not line.startswith("vd-eval ") for line in entry.lines):
+            raise ValueError(
+                f"--suite {path}: {entry.name} has to have a line 'vd-eval POLICY ...' for teacher, "
+                "camera or both"
+            )
+    return suite

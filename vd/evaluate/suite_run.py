@@ -1,4 +1,4 @@
-"""Run the suite: every condition with every policy, each into a folder of its own.
+"""Run a suite: every command line with every policy, each into a folder of its own.
 
 What a folder holds already, measured with the same settings and the same policy, is not run again.
 """
@@ -6,34 +6,40 @@ What a folder holds already, measured with the same settings and the same policy
 import hashlib
 import json
 import math
+import re
+import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from functools import cache, partial
+from typing import Any, cast
 
+from vd.command_line import parse
 from vd.config import to_dict
 from vd.evaluate.agents import BUILT_IN, find_policy, open_policy, sees_clouds
 from vd.evaluate.cfg import EvalCfg, parse_groups
+from vd.evaluate.claims import ours
 from vd.evaluate.compare import compare
+from vd.evaluate.conditions import CHANGED
 from vd.evaluate.page import NOTHING, labels, number, points, shown_name, write_page
-from vd.evaluate.result import SUCCESS, Result
+from vd.evaluate.result import SUCCESS, Result, Row
 from vd.evaluate.statistics import Interval, paired_difference
 from vd.evaluate.suite import (
-    CLAIMS,
     OWN_SETS,
     QUICK_CAMERA_EPISODES,
     QUICK_EPISODES,
     QUICK_OBJECTS,
     QUICK_S,
-    SUITES,
     Claim,
-    Condition,
+    Suite,
+    SuiteEntry,
+    read_suite,
     share_text,
 )
 from vd.files import make_folder, write_json
+from vd.versions import code_fingerprint
 from vd.workers import run_tasks, shard
 
 SETTINGS_FILE = "settings.json"
@@ -45,6 +51,9 @@ OUT_OF_TIME = "out of time; the same command goes on from here"
 NOT_RUN = "not run; the same command goes on from here"
 # Settings that say where and how an evaluation runs, not what it measures.
 _NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs", "shard")
+_PASSED_ON = ("seed", "device", "num_envs", "hand", "hand_layer", "engine", "randomise")
+"""Flags beside ``--suite`` that every line gets."""
+_GROUP = re.compile(r"([\w-]+)=SET\b")
 
 Objects = tuple[tuple[str, ...], str]
 """The objects of a group: what vd-eval is given, sets or chosen files of them, and the same for a
@@ -73,7 +82,7 @@ class Task:
         settings = {
             key: value for key, value in to_dict(self.cfg).items() if key not in _NOT_MEASURED
         }
-        return {"policy": self.weights} | settings
+        return {"policy": self.weights, "code": code_fingerprint()} | settings
 
     def there(self) -> Result | None:
         """What an earlier call measured with the same settings; None: nothing."""
@@ -94,10 +103,14 @@ def run_suite(cfg: EvalCfg) -> Result:
     """
     begun = time.monotonic()
     assert cfg.suite is not None
-    suite = SUITES[cfg.suite]
-    groups = object_groups(cfg.objects, {c.objects for c in suite}, quick=cfg.quick)
-    conditions = tuple(c for c in suite if (c.quick or not cfg.quick) and c.objects in groups)
-    tasks = shard(make_tasks(cfg, conditions, groups), cfg.shard)
+    suite = read_suite(cfg.suite)
+    groups = object_groups(cfg.objects, groups_of(suite.lines), quick=cfg.quick)
+    entries = tuple(
+        entry
+        for entry in suite.lines
+        if (entry.quick or not cfg.quick) and groups.keys() >= set(groups_of([entry]))
+    )
+    tasks = shard(make_tasks(cfg, entries, groups), cfg.shard)
     found: dict[tuple[str, str], Result | str] = {
         task.key: task.there() or NOT_RUN for task in tasks
     }
@@ -123,7 +136,7 @@ def run_suite(cfg: EvalCfg) -> Result:
         left = tuple((*key, why) for key, why in found.items() if isinstance(why, str))
         result = Result(rows, measured[0].software if measured else {}, left)
         if cfg.shard is None:
-            _write(result, cfg, conditions, groups)
+            _write(result, cfg, replace(suite, lines=entries), groups)
     return result
 
 
@@ -179,48 +192,89 @@ def _measure_apart(task: Task, stop_at: float) -> str:
 
 
 def make_tasks(
-    cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]
+    cfg: EvalCfg, entries: Sequence[SuiteEntry], groups: dict[str, Objects]
 ) -> list[Task]:
     """Everything that is to be measured, camera policies at the end if time is short, else first.
 
     All names are looked up here, before anything slow.
     """
     short = labels(cfg.agent_names)
-    camera = {name: sees_clouds(open_policy(name, "cpu")) for name in cfg.agent_names}
-    prints = {name: fingerprint(name) for name in cfg.agent_names}
     tasks = []
-    for condition in conditions:
-        for name in cfg.agent_names:
-            # A teacher's goals are orientations, whatever tells a camera policy of shapes.
-            if condition.by_camera if camera[name] else "goals" not in condition.settings:
-                one = settings(cfg, condition, name, groups[condition.objects], camera=camera[name])
-                one = replace(one, out=cfg.out / condition.name / short[name].replace("/", "-"))
-                tasks.append(Task(condition.name, name, one, prints[name]))
-    return sorted(tasks, key=lambda task: camera[task.policy] == cfg.quick)
+    for entry in entries:
+        for line in entry.lines:
+            for name in _policies(cfg, entry, line):
+                folder = cfg.out / entry.name / short.get(name, name).replace("/", "-")
+                one = replace(settings(cfg, line, name, groups), out=folder)
+                tasks.append(Task(entry.name, name, one, fingerprint(name)))
+    return sorted(tasks, key=lambda task: _by_camera(task.policy) == cfg.quick)
 
 
-def settings(
-    cfg: EvalCfg, condition: Condition, policy: str, objects: Objects, *, camera: bool
-) -> EvalCfg:
-    """The evaluation of one policy under a condition: what ``vd-eval`` would be told."""
-    episodes = condition.camera_episodes if camera else condition.episodes
+def _policies(cfg: EvalCfg, entry: SuiteEntry, line: str) -> list[str]:
+    """The policies that a line is for: those that it names, or all of its kind that are asked for.
+
+    Raises:
+        ValueError: It names one of the other kind.
+    """
+    named = _asked(line).agent_names
+    names = cfg.agent_names if named == ("POLICY",) else named
+    right = [name for name in names if _by_camera(name) == (line == entry.camera)]
+    if names == named != tuple(right):
+        raise ValueError(
+            f"--suite: {entry.name} has {', '.join(set(named) - set(right))} in the wrong line; "
+            "'camera' is for policies that see by one, 'teacher' for others"
+        )
+    return right
+
+
+@cache
+def _asked(line: str) -> EvalCfg:
+    """What a line of a suite asks for."""
+    return cast(EvalCfg, parse(EvalCfg, shlex.split(line)[1:], prog="vd-eval"))
+
+
+@cache
+def _by_camera(name: str) -> bool:
+    return sees_clouds(open_policy(name, "cpu"))
+
+
+def groups_of(entries: Sequence[SuiteEntry]) -> list[str]:
+    """The groups of objects that lines name."""
+    lines = " ".join(line for entry in entries for line in entry.lines)
+    return list(dict.fromkeys(_GROUP.findall(lines)))
+
+
+def settings(cfg: EvalCfg, line: str, policy: str, groups: dict[str, Objects]) -> EvalCfg:
+    """The evaluation of one policy by a line of a suite: what ``vd-eval`` would be told.
+
+    Flags beside ``--suite`` change it.
+    """
+    asked = _asked(line)
+    objects: list[str] = []
+    for item in asked.objects:
+        group, _, name = item.partition("=")
+        objects += [f"{group}={each}" for each in groups[group][0]] if name == "SET" else [item]
+    default = EvalCfg()
+    passed: dict[str, Any] = {
+        name: getattr(cfg, name)
+        for name in _PASSED_ON
+        if getattr(cfg, name) != getattr(default, name)
+    }
+    episodes = asked.episodes
     if cfg.quick:
-        episodes = min(episodes, QUICK_CAMERA_EPISODES if camera else QUICK_EPISODES)
-    return replace(
-        cfg,
-        suite=None,
-        quick=False,
-        jobs=1,
-        shard=None,
-        policies=(policy,),
-        objects=tuple(f"{condition.objects}={item}" for item in objects[0]),
-        episodes=episodes,
-        no_at_rest=True,  # the paper's objects fall into the hand, whatever a policy was trained with
-        **condition.settings,
-    )
+        episodes = min(episodes, QUICK_CAMERA_EPISODES if _by_camera(policy) else QUICK_EPISODES)
+    one = replace(asked, policies=(policy,), objects=tuple(objects), episodes=episodes, **passed)
+    one.validate()
+    return one
 
 
-def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> dict[str, Objects]:
+def shown(entry: SuiteEntry) -> str:
+    """Where the paper shows what an entry measures, or what it changes."""
+    return entry.shown or CHANGED.get(_asked(entry.lines[0]).condition or "", "")
+
+
+def object_groups(
+    objects: Sequence[str], wanted: Sequence[str], *, quick: bool
+) -> dict[str, Objects]:
     """The objects of each wanted group.
 
     Those given as ``GROUP=SET``, our procedural ones for the others.
@@ -231,7 +285,7 @@ def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> d
     from vd.assets_usd.objects.sets import set_files
 
     given = parse_groups(objects)
-    own_sets = {group: own for group, own in OWN_SETS.items() if group in wanted}
+    own_sets = {group: OWN_SETS.get(group) for group in wanted}
     if unknown := [name for name in given if name not in own_sets]:
         raise ValueError(
             f"--objects: '{unknown[0]}' is no group of the suite; {', '.join(own_sets)} are"
@@ -240,6 +294,7 @@ def object_groups(objects: Sequence[str], wanted: set[str], *, quick: bool) -> d
     for group, own in own_sets.items():
         sets = given.get(group) or (() if own is None else (own,))
         if not sets:
+            print(f"left out: {group}; give --objects {group}=SET", file=sys.stderr)
             continue
         files = set_files(sets)
         text = f"{len(files)} of {shown_name(', '.join(sets))}"
@@ -262,17 +317,12 @@ def fingerprint(name: str) -> str:
     return hashlib.sha256(find_policy(name).read_bytes()).hexdigest()
 
 
-def _write(
-    result: Result, cfg: EvalCfg, conditions: Sequence[Condition], groups: dict[str, Objects]
-) -> None:
+def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, Objects]) -> None:
     """The page and its figures, of what there is."""
-    short, of_paper = labels(result.policies), cfg.suite == "paper"
+    short = labels(result.policies)
+    of_paper = bool(suite.claims)
     if of_paper:
-        title, of, figures = (
-            "The paper's evaluations",
-            " beside the paper",
-            paper_figures(result, conditions),
-        )
+        figures = paper_figures(result, suite)
         table = [
             {
                 "figure": row["figure"],
@@ -283,42 +333,39 @@ def _write(
             for row in figures
         ]
     else:
-        title, of, figures = "Robustness", "", robust_table(result, conditions, short)
+        figures = robust_table(result, suite.lines, short)
         table = figures
-    write_json(
-        cfg.out / f"{cfg.suite}.json", result.summary() | {"quick": cfg.quick, "figures": figures}
-    )
+    summary = result.summary() | {"quick": cfg.quick, "figures": figures}
+    write_json(cfg.out / f"{cfg.suite_name}.json", summary)
     notes = [f"Objects, {group}: {text}." for group, (_, text) in groups.items()]
     notes += ["Held-out objects judge, and nothing is chosen on them."]
     notes += [] if cfg.engine == "newton" else ["Physics by MuJoCo's own engine."]
+    beside = " beside the paper" if of_paper else ""
     write_page(
         result,
-        cfg.out / f"{cfg.suite}.html",
-        title=title,
-        lead=f"{', '.join(short.values())}{of}{', the reduced suite' if cfg.quick else ''}",
+        cfg.out / f"{cfg.suite_name}.html",
+        title=suite.title,
+        lead=f"{', '.join(short.values())}{beside}{', the reduced suite' if cfg.quick else ''}",
         figures=(list(table[0]), [list(row.values()) for row in table]) if table else None,
         notes=notes,
-        conditions=[(c.name, c.shown, c.flags) for c in conditions],
+        conditions=[(one.name, shown(one), "\n".join(one.lines)) for one in suite.lines],
         of_paper=of_paper,
     )
 
 
 def robust_table(
-    result: Result, conditions: Sequence[Condition], short: dict[str, str]
+    result: Result, entries: Sequence[SuiteEntry], short: dict[str, str]
 ) -> list[dict[str, str]]:
-    """A line for each condition and policy: what it changes, and how much success it costs."""
-    found = {
-        (condition, row.policy): row
-        for (condition, _), rows in result.headlines().items()
-        for row in rows.values()
-    }
+    """A line for each entry and policy: what it changes, and how much success it costs."""
+    by_name: dict[tuple[str, str], Row] = {}
+    for (condition, _), rows in result.headlines().items():
+        by_name |= {(condition, policy): row for policy, row in rows.items()}
+    first = entries[0].name
     table = []
-    for condition in conditions:
+    for entry in entries:
         for policy in result.policies:
-            row, nominal = (
-                found.get((condition.name, policy)),
-                found.get((conditions[0].name, policy)),
-            )
+            row = by_name.get((entry.name, policy))
+            nominal = by_name.get((first, policy))
             if row is None:
                 continue
             change = NOTHING
@@ -326,46 +373,47 @@ def robust_table(
                 change = points(
                     paired_difference(row.successes, nominal.successes, row.overall.unit)
                 )
-            rates = (
-                row.overall.outcomes["success"],
-                row.precise,
-                row.overall.outcomes["object falls"],
+            table.append(
+                {
+                    "condition": entry.name,
+                    "changed": shown(entry),
+                    "policy": short[policy],
+                    "success": _share(row.overall.outcomes["success"]),
+                    f"points from {first}": change,
+                    "within 0.1 rad": _share(row.precise),
+                    "lost": _share(row.overall.outcomes["object falls"]),
+                }
             )
-            success, precise, lost = (
-                NOTHING if r is None else share_text(r.value, r.low, r.high) for r in rates
-            )
-            told = {
-                "condition": condition.name,
-                "changed": condition.shown,
-                "policy": short[policy],
-            }
-            figures = {"success": success, "points from nominal": change, "within 0.1 rad": precise}
-            table.append(told | figures | {"lost": lost})
     return table
 
 
-def paper_figures(result: Result, conditions: Sequence[Condition]) -> list[dict[str, Any]]:
+def _share(rate: Interval | None) -> str:
+    return NOTHING if rate is None else share_text(rate.value, rate.low, rate.high)
+
+
+def paper_figures(result: Result, suite: Suite) -> list[dict[str, Any]]:
     """The paper's figures beside ours, as text."""
-    names = {condition.name for condition in conditions}
-    return [
-        {
-            "figure": claim.text,
-            "condition": claim.condition,
-            "paper": claim.paper_text(),
-            "ours": {policy: _ours(result, claim, policy) for policy in result.policies},
-        }
-        for claim in CLAIMS
-        if claim.condition in names
-    ]
+    figures = []
+    for entry in suite.lines:
+        for claim in suite.claims:
+            if entry.name in claim.entries:
+                own = {
+                    policy: _ours(result, claim, entry.name, policy) for policy in result.policies
+                }
+                paper = claim.paper_text()
+                figure = {
+                    "figure": claim.text,
+                    "condition": entry.name,
+                    "paper": paper,
+                    "ours": own,
+                }
+                figures.append(figure)
+    return figures
 
 
-def _ours(result: Result, claim: Claim, policy: str) -> str:
-    rows = [row for row in result.rows if (row.condition, row.policy) == (claim.condition, policy)]
-    value = claim.of(rows)
+def _ours(result: Result, claim: Claim, condition: str, policy: str) -> str:
+    rows = [row for row in result.rows if (row.condition, row.policy) == (condition, policy)]
+    value = ours(claim, rows)
     if isinstance(value, Interval):
-        return (
-            share_text(value.value, value.low, value.high)
-            if claim.unit == "share"
-            else number(value)
-        )
+        return number(value) if claim.unit != "share" else _share(value)
     return NOTHING if value is None else share_text(value)

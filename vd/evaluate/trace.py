@@ -1,11 +1,10 @@
-"""Episodes that nothing stops.
+"""Episodes as they happened, so that any rule for stopping can be judged on the record.
 
-What happened at every step, so that any rule for stopping can be judged.
-
-Whoever stops a policy, its own prediction or the true distance, does not change what it does
-before: one run
-serves all rules. What comes after a stop is simulated apart: the hand keeps its last targets for
-HOLD_S. K objects, M episodes each, T steps; angles in radians, quaternions xyzw.
+Of one goal an episode goes on whatever happens: who stops a policy, its own prediction or the true
+distance, does not change what it does before, so one run serves all rules. Of goals in a row the
+record is that of the first; the next comes once a rule has stopped the policy near enough. What
+comes after a stop is simulated apart: the hand keeps its last targets. K objects, M episodes each,
+T steps; angles in radians, quaternions xyzw.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,14 +14,14 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import warp as wp
+from scipy.spatial.transform import Rotation
 
+from vd.evaluate.goals import ONE_GOAL, GoalSchedule
 from vd.evaluate.rollout import episode_rounds, unit_quats
 from vd.evaluate.statistics import rotation_angle, symmetric_error
 from vd.paper import PAPER
 from vd.stopping import StoppingRule
 
-HOLD_S = 2.0
-"""For how long a hand holds its object after a stop, before it is looked at again [s] (ours)."""
 StopsBy = Literal["predicted", "exact", "error", "success"]
 """What a rule asks for: a distance, which is a camera policy's prediction, or the true one to the
 very goal, or to what looks like it; or the success criteria of training, which are the true one and
@@ -32,11 +31,6 @@ Way = tuple[StoppingRule, StopsBy]
 """A rule, and what it asks for."""
 NEVER_RAD = 1e-9
 """Orientation tolerance that no state meets: an environment with it stops no episode."""
-
-
-def air_table_steps(control_hz: float) -> int:
-    """Control steps at this rate [Hz] after which the paper's in-air test takes the table away."""
-    return round(PAPER.scene.air_table_s * control_hz)
 
 
 @dataclass(frozen=True)
@@ -64,10 +58,12 @@ class Episode:
 
 @dataclass(frozen=True)
 class Trace:
-    """Episodes to their falls or time limits.
+    """Episodes to their falls or time limits, of goals in a row to the end of the first.
 
     Attributes:
-        start_quat: Orientation of the object at the reset [K, M, 4].
+        schedule: The goals.
+        first_step: Steps after which the first goal that counts was given.
+        start_quat: Orientation of the object there, at the reset if it was lost before [K, M, 4].
         goal_quat: Wanted orientation [K, M, 4].
         error: Orientation error after t steps, up to the object's symmetry, NaN after the end [K,
             M, T + 1].
@@ -75,14 +71,17 @@ class Trace:
         action_norm: Norm of the smoothed action that led there, NaN after the end [K, M, T + 1].
         predicted: What a camera policy predicts of ``error`` there; None for other policies [K, M,
             T + 1].
-        steps: Steps to the fall or the time limit [K, M].
-        fell: Whether the object was lost [K, M].
+        steps: Steps to the end of the record [K, M].
+        fell: Whether the object was lost, with whatever goal [K, M].
         failed: Whether the physics failed, which ends an episode like the time limit [K, M].
         still: Whether hand and object are as still after t steps as success asks [K, M, T + 1].
+        reached: Goals in a row that were reached [K, M].
         held: By the way to stop that was to be held: error to the very goal after the hold, pi
             where the object was lost, NaN where nothing stopped [K, M].
     """
 
+    schedule: GoalSchedule
+    first_step: int
     start_quat: np.ndarray
     goal_quat: np.ndarray
     error: np.ndarray
@@ -93,7 +92,13 @@ class Trace:
     fell: np.ndarray
     failed: np.ndarray
     still: np.ndarray
+    reached: np.ndarray
     held: dict[Way, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def given(self) -> np.ndarray:
+        """Whether the object was still there when the first goal was given, bool [K, M]."""
+        return self.steps > self.first_step
 
     def of(self, objects: Sequence[int]) -> "Trace":
         """The episodes of some objects."""
@@ -112,8 +117,8 @@ class Trace:
             by: What it asks for; of success the bound of the action's norm is the environment's.
 
         Returns:
-            Steps to the stop, fall or time limit, and whether the rule stopped it, shape [K, M]
-            each.
+            Steps to the stop or the end of the record, and whether the rule stopped it, shape
+            [K, M] each.
         """
         if by == "success":
             stops = (self.exact <= rule.distance_rad) & self.still
@@ -121,24 +126,33 @@ class Trace:
         else:
             stops = rule.stops(getattr(self, by), self.action_norm)
             last = self.steps - 1  # nobody acts on, or predicts, the state after the last step
-        stops[..., 0] = False  # before the first action there is nothing to stop
-        stops &= np.arange(stops.shape[-1]) <= last[..., None]
+        step = np.arange(stops.shape[-1])
+        stops &= step > self.first_step  # before an action there is nothing to stop
+        stops &= step <= last[..., None]
         stopped: np.ndarray = np.asarray(stops.any(axis=-1))
         return np.where(stopped, stops.argmax(axis=-1), self.steps), stopped
 
     def episodes(self, rule: StoppingRule, by: StopsBy) -> tuple[Episode, ...]:
         """The episodes as a rule ends them, object by object; arguments as of :meth:`ends`."""
         steps, stopped = self.ends(rule, by)
-        return episodes_of(
-            start_quat=self.start_quat,
-            goal_quat=self.goal_quat,
-            start_error_rad=self.error[..., 0],
-            error_rad=at_steps(self.error, steps),
-            exact_error_rad=at_steps(self.exact, steps),
-            steps=steps,
-            stopped=stopped,
-            fell=self.fell & ~stopped,
-        )
+        begin = np.minimum(self.first_step, self.steps)
+        columns = {
+            "start_quat": self.start_quat,
+            "goal_quat": self.goal_quat,
+            "start_error_rad": at_steps(self.error, begin),
+            "error_rad": at_steps(self.error, steps),
+            "exact_error_rad": at_steps(self.exact, steps),
+            "steps": steps - begin,
+            "stopped": stopped,
+            "fell": self.fell & ~stopped,
+        }
+        episodes = []
+        for k, m in np.ndindex(*steps.shape):
+            row: dict[str, Any] = {name: values[k, m].tolist() for name, values in columns.items()}
+            row["start_quat"] = tuple(row["start_quat"])
+            row["goal_quat"] = tuple(row["goal_quat"])
+            episodes.append(Episode(k, **row))
+        return tuple(episodes)
 
 
 def at_steps(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -146,27 +160,17 @@ def at_steps(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return np.take_along_axis(values, steps[..., None], axis=-1)[..., 0]
 
 
-def episodes_of(**columns: np.ndarray) -> tuple[Episode, ...]:
-    """Episodes, object by object, from columns [K, M, ..] of all their fields but the first."""
-    places = np.ndindex(*columns["steps"].shape)
-    rows = (
-        (k, {name: values[k, m].tolist() for name, values in columns.items()}) for k, m in places
-    )
-    return tuple(
-        Episode(k, **row | {name: tuple(row[name]) for name in ("start_quat", "goal_quat")})
-        for k, row in rows
-    )
-
-
 def record(
     env: Any,
     policy: Any,
     episodes: int,
+    schedule: GoalSchedule = ONE_GOAL,
     *,
+    ways: Sequence[Way] = (),
+    tolerance: float = PAPER.success.rotation_rad,
+    turns: np.ndarray | None = None,
     starts: np.ndarray | None = None,
     goals: np.ndarray | None = None,
-    table_steps: int | None = None,
-    held: Sequence[Way] = (),
     on_step: Callable[[], object] = lambda: None,
 ) -> Trace:
     """Run a policy and write down what happens.
@@ -178,39 +182,49 @@ def record(
 
     Args:
         env: An environment that no state ends (``success.rotation_rad`` of NEVER_RAD), as it was
-            built.
+            built; it knows the length of an episode.
         policy: What acts; one with ``predicted`` is told where it need not act any more.
         episodes: M.
+        schedule: The goals.
+        ways: What they stop at the first goal is held. Of goals in a row the first of them says
+            when each is reached, if the true distance is within ``tolerance`` [rad].
+        tolerance: See ``ways``.
+        turns: Of goals in a row the rotations to each from where the object is then, ``draw_turns``
+            [K, M, most, 4].
         starts: Initial orientations [K, M, 4]; None: the environment draws them.
         goals: Goal orientations [K, M, 4], with ``starts``.
-        table_steps: Steps after which the table is taken away; None: never.
-        held: What stops is to be held for HOLD_S.
         on_step: Called after every control step.
     """
     shape = (len(env.objects), episodes)
+    hz = env.cfg.sim.control_hz
+    first_step = round(schedule.first_s * hz)
+    goal_steps = env.max_episode_steps if schedule.most == 1 else round(schedule.goal_s * hz)
 
     def blank() -> np.ndarray:
-        return np.full((*shape, env.max_episode_steps + 1), np.nan)
+        return np.full((*shape, first_step + goal_steps + 1), np.nan)
 
     trace = Trace(
+        schedule=schedule,
+        first_step=first_step,
         start_quat=np.empty((*shape, 4)),
         goal_quat=np.empty((*shape, 4)),
         error=blank(),
         exact=blank(),
         action_norm=blank(),
         predicted=blank() if hasattr(policy, "predicted") else None,
-        steps=np.full(shape, env.max_episode_steps),
+        steps=np.full(shape, first_step + goal_steps),
         fell=np.zeros(shape, dtype=bool),
         failed=np.zeros(shape, dtype=bool),
-        still=np.zeros((*shape, env.max_episode_steps + 1), dtype=bool),
-        held={way: np.full(shape, np.nan) for way in held},
+        still=np.zeros((*shape, first_step + goal_steps + 1), dtype=bool),
+        reached=np.zeros(shape, dtype=int),
+        held={way: np.full(shape, np.nan) for way in ways if schedule.hold_s},
     )
     for numbers, state in drawn_rounds(env, episodes, starts, goals):
-        if table_steps is not None:
+        if schedule.table_s is not None:
             env.sim.place_table(present=True)
         env.load_state_dict(state)
-        _Round(env, trace, numbers, table_steps).run(policy, on_step)
-    if table_steps is not None:
+        _Round(env, trace, numbers, goal_steps).run(policy, ways, tolerance, turns, on_step)
+    if schedule.table_s is not None:
         env.sim.place_table(present=True)
     return trace
 
@@ -281,42 +295,71 @@ class _Round:
     ``numbers`` [N], place among its object's, else -1.
     """
 
-    def __init__(
-        self, env: Any, trace: Trace, numbers: np.ndarray, table_steps: int | None
-    ) -> None:
-        self._env, self._trace, self._numbers, self._table_steps = env, trace, numbers, table_steps
+    def __init__(self, env: Any, trace: Trace, numbers: np.ndarray, goal_steps: int) -> None:
+        self._env = env
+        self._trace = trace
+        self._numbers = numbers
         self._objects = np.asarray(env.world_object)
+        self._goal_steps = goal_steps
+        table_s = trace.schedule.table_s
+        self._table_step = None if table_s is None else round(table_s * env.cfg.sim.control_hz)
+        self._goal = unit_quats(env.goal_quat.numpy())
+        # When each environment's present goal was given, and the distance to it.
+        self._given_at = np.full(env.num_envs, trace.first_step)
+        self._exact = np.zeros(env.num_envs)
         # The state in which each way to stop ends an environment, after how many steps; -1: not
         # yet.
         self._stopped = {
             way: (np.full(env.num_envs, -1), motion_of(env, copy=True)) for way in trace.held
         }
 
-    def run(self, policy: Any, on_step: Callable[[], object]) -> None:
+    def run(
+        self,
+        policy: Any,
+        ways: Sequence[Way],
+        tolerance: float,
+        turns: np.ndarray | None,
+        on_step: Callable[[], object],
+    ) -> None:
         """Go to the ends, then go on from the stops that are to be held."""
-        env, trace = self._env, self._trace
+        env = self._env
+        trace = self._trace
         envs = np.flatnonzero(self._numbers >= 0)
-        trace.start_quat[self._place(envs)] = quat = unit_quats(env.object_pose()[envs, 3:7])
-        trace.goal_quat[self._place(envs)] = unit_quats(env.goal_quat.numpy()[envs])
-        self._write_errors(envs, 0, quat)
+        self._begin(envs, 0, unit_quats(env.object_pose()[:, 3:7]))
         smoothed = wp.to_torch(env.smoothed)
         for step in range(env.max_episode_steps):
-            if step == self._table_steps:
+            if step == self._table_step:
                 env.sim.place_table(present=False)
-            place = self._place(envs)
-            trace.action_norm[(*place, step)] = smoothed.norm(dim=-1).cpu().numpy()[envs]
+            norm = smoothed.norm(dim=-1).cpu().numpy()
             action = act_in(env, policy, envs)
-            if trace.predicted is not None:
-                trace.predicted[(*place, step)] = policy.predicted.cpu().numpy()[envs]
-            self._keep_stops(envs, step)
+            predicted = None if trace.predicted is None else policy.predicted.cpu().numpy()
+            self._write_decision(envs, step, norm, predicted)
+            acted = envs[step > self._given_at[envs]]  # before an action there is nothing to stop
+            stops = {}
+            for rule, by in ways:
+                distance = self._exact
+                if by == "predicted":
+                    assert predicted is not None
+                    distance = predicted
+                stops[rule, by] = acted[rule.stops(distance, norm)[acted]]
+            self._keep_stops(stops, step)
+            due = np.array([], dtype=int)
+            if trace.schedule.most > 1:
+                stopped = stops[ways[0]]
+                due = stopped[self._exact[stopped] <= tolerance]
+                self._close(stopped, step + 1)
+                trace.reached[self._place(due)] += 1
+                envs = np.setdiff1d(envs, np.setdiff1d(stopped, due))
             advance(env, action)
-            self._write_errors(envs, step + 1, unit_quats(env.object_pose_end.numpy()[envs, 3:7]))
-            trace.still[(*place, step + 1)] = env.still.numpy()[envs] != 0
-            trace.failed[place] = env.sim.failed.numpy()[envs] != 0
-            done = env.done.numpy()[envs] != 0
-            trace.fell[self._place(envs[done])] = env.fell.numpy()[envs[done]] != 0
-            trace.steps[self._place(envs[done])] = step + 1
-            envs = envs[~done]
+            quat = unit_quats(env.object_pose_end.numpy()[:, 3:7])
+            envs = self._write_outcome(envs, step + 1, quat)
+            if turns is not None:
+                if step + 1 == trace.first_step:
+                    due = envs
+                self._give(np.intersect1d(due, envs), step + 1, quat, turns)
+                late = envs[step + 1 - self._given_at[envs] >= self._goal_steps]
+                self._close(late, step + 1)
+                envs = np.setdiff1d(envs, late)
             on_step()
             if not len(envs):
                 break
@@ -327,46 +370,109 @@ class _Round:
         """Object and number of the episodes of environments."""
         return self._objects[envs], self._numbers[envs]
 
+    def _at_first(self, envs: np.ndarray) -> np.ndarray:
+        """The environments that have reached no goal yet: there is a record of these alone."""
+        return envs[self._trace.reached[self._place(envs)] == 0]
+
+    def _begin(self, envs: np.ndarray, step: int, quat: np.ndarray) -> None:
+        """Write down where the first goal begins, ``quat`` [N, 4] being the objects' orientations."""
+        self._trace.start_quat[self._place(envs)] = quat[envs]
+        self._trace.goal_quat[self._place(envs)] = self._goal[envs]
+        self._write_errors(envs, step, quat)
+
+    def _write_decision(
+        self, envs: np.ndarray, step: int, norm: np.ndarray, predicted: np.ndarray | None
+    ) -> None:
+        """Write what led to the state after ``step`` steps, and what a policy predicts there."""
+        envs = self._at_first(envs)
+        if not len(envs):
+            return
+        place = (*self._place(envs), step)
+        self._trace.action_norm[place] = norm[envs]
+        if predicted is not None:
+            assert self._trace.predicted is not None
+            self._trace.predicted[place] = predicted[envs]
+
     def _write_errors(self, envs: np.ndarray, step: int, quat: np.ndarray) -> None:
         """Write the errors of environments after ``step`` steps."""
-        trace, (objects, numbers) = self._trace, self._place(envs)
-        goal = trace.goal_quat[objects, numbers]
-        trace.exact[objects, numbers, step] = rotation_angle(quat, goal)
+        trace = self._trace
+        self._exact[envs] = rotation_angle(quat[envs], self._goal[envs])
+        envs = self._at_first(envs)
+        if not len(envs):
+            return
+        objects, numbers = self._place(envs)
+        trace.exact[objects, numbers, step] = self._exact[envs]
         for k in np.unique(objects):
             rows = objects == k
-            error = symmetric_error(quat[rows], goal[rows], self._env.objects[k].symmetry)
+            symmetry = self._env.objects[k].symmetry
+            error = symmetric_error(quat[envs[rows]], self._goal[envs[rows]], symmetry)
             trace.error[k, numbers[rows], step] = error
 
-    def _keep_stops(self, envs: np.ndarray, step: int) -> None:
-        """Keep the states of environments that are stopped after ``step`` steps."""
-        place = (*self._place(envs), step)
-        for (rule, by), (after, state) in self._stopped.items():
-            stops = rule.stops(getattr(self._trace, by)[place], self._trace.action_norm[place])
-            chosen = envs[stops & (after[envs] < 0)]
-            if step == 0 or not len(chosen):
-                continue
+    def _write_outcome(self, envs: np.ndarray, step: int, quat: np.ndarray) -> np.ndarray:
+        """Write what a step led to; the environments whose episodes go on."""
+        env = self._env
+        trace = self._trace
+        self._write_errors(envs, step, quat)
+        first = self._at_first(envs)
+        if len(first):
+            trace.still[(*self._place(first), step)] = env.still.numpy()[first] != 0
+        trace.failed[self._place(envs)] = env.sim.failed.numpy()[envs] != 0
+        done = envs[env.done.numpy()[envs] != 0]
+        trace.fell[self._place(done)] = env.fell.numpy()[done] != 0
+        self._close(done, step)
+        envs = np.setdiff1d(envs, done)
+        return envs[trace.reached[self._place(envs)] < trace.schedule.most]
+
+    def _close(self, envs: np.ndarray, step: int) -> None:
+        """End the records of the environments that have one, after ``step`` steps."""
+        self._trace.steps[self._place(self._at_first(envs))] = step
+
+    def _give(self, envs: np.ndarray, step: int, quat: np.ndarray, turns: np.ndarray) -> None:
+        """Give environments their next goals, each turned from where the object is."""
+        if not len(envs):
+            return
+        place = self._place(envs)
+        turn = Rotation.from_quat(turns[(*place, self._trace.reached[place])])
+        present = Rotation.from_quat(self._env.object_pose()[envs, 3:7])
+        self._goal[envs] = (turn * present).as_quat()
+        self._env.give_goals(envs, self._goal[envs])
+        self._given_at[envs] = step
+        if step == self._trace.first_step:
+            self._begin(envs, step, quat)
+        else:
+            self._write_errors(envs, step, quat)
+
+    def _keep_stops(self, stops: dict[Way, np.ndarray], step: int) -> None:
+        """Keep the states of environments that a way to stop ends after ``step`` steps."""
+        for way, (after, state) in self._stopped.items():
+            chosen = stops[way]
+            chosen = chosen[after[chosen] < 0]
             after[chosen] = step
-            copy_motion(state, motion_of(self._env), chosen)
+            if len(chosen):
+                copy_motion(state, motion_of(self._env), chosen)
 
     def _hold(self, way: Way) -> None:
         """Go on from the stops with the last targets, and write down what came of them."""
-        env, (after, state) = self._env, self._stopped[way]
+        env = self._env
+        after, state = self._stopped[way]
         envs = np.flatnonzero(after >= 0)
         if not len(envs):
             return
-        for name, live in motion_of(env).items():
-            live.copy_(state[name])
-        lost = np.zeros(len(envs), dtype=bool)
-        for step in range(round(HOLD_S * env.cfg.sim.control_hz)):
-            if self._table_steps is not None:
-                counts = (after + step, np.full(env.num_envs, self._table_steps))
+        live = motion_of(env)
+        everywhere = np.arange(env.num_envs)
+        copy_motion(live, state, everywhere)
+        lost = np.zeros(env.num_envs, dtype=bool)
+        for step in range(round(self._trace.schedule.hold_s * env.cfg.sim.control_hz)):
+            if self._table_step is not None:
+                counts = (after + step, np.full(env.num_envs, self._table_step))
                 env.sim.place_tables(
                     *(wp.array(count, dtype=wp.int32, device=env.device) for count in counts)
                 )
             env.hold()
-            lost |= out_of_hand(env)[envs]
+            away = out_of_hand(env)
+            lost |= away
+            copy_motion(live, state, np.flatnonzero(away))  # or it would fall for half a minute
         place = self._place(envs)
-        error = rotation_angle(
-            unit_quats(env.object_pose()[envs, 3:7]), self._trace.goal_quat[place]
-        )
-        self._trace.held[way][place] = np.where(lost, np.pi, error)
+        quat = unit_quats(env.object_pose()[envs, 3:7])
+        error = rotation_angle(quat, self._trace.goal_quat[place])
+        self._trace.held[way][place] = np.where(lost[envs], np.pi, error)

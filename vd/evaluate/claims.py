@@ -1,0 +1,55 @@
+"""What stands beside the paper's figures: measures of a row, by name."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vd.evaluate.result import Row
+from vd.evaluate.statistics import Interval, choose_unit, rate_intervals
+from vd.evaluate.suite import Claim
+from vd.paper import PAPER
+
+
+def ours(claim: Claim, rows: Sequence[Row]) -> Any:
+    """Ours, from the rows of one policy in an evaluation; None where it has no such figure."""
+    for row in rows:
+        own = row.headline if claim.stopped_by is None else row.stopped_by == claim.stopped_by
+        if own and not row.ours:
+            return measured(row, claim.measure)
+    return None
+
+
+def measured(row: Row, measure: str) -> Any:
+    """A measure of a row: fields and keys with ``/`` between, or the name of one of these functions.
+
+    None where it has no meaning.
+    """
+    if measure in OF_EPISODES:
+        return OF_EPISODES[measure](row)
+    value: Any = row
+    for name in measure.split("/"):
+        value = value.get(name) if isinstance(value, dict) else getattr(value, name, None)
+    return value
+
+
+def lost_at_once(row: Row) -> Interval:
+    """Share of episodes that lost the object in the half second after the table went."""
+    gone = round(PAPER.scene.air_table_s * row.protocol.control_hz)
+    soon = gone + round(0.5 * row.protocol.control_hz)
+    return _share(row, [e.fell and gone < e.steps <= soon for e in row.episodes])
+
+
+def success_without_table(row: Row) -> Interval:
+    """Share of episodes that were stopped within the tolerance when the table had gone."""
+    gone = round(PAPER.scene.air_table_s * row.protocol.control_hz)
+    return _share(row, row.successes.ravel() & [e.steps > gone for e in row.episodes])
+
+
+def _share(row: Row, chosen: list[bool] | np.ndarray) -> Interval:
+    objects = len(row.object_names)
+    return rate_intervals(np.reshape(chosen, (1, objects, -1)), choose_unit(objects))[0]
+
+
+OF_EPISODES = {"lost_at_once": lost_at_once, "success_without_table": success_without_table}
+"""Measures that look at each episode."""
