@@ -3,16 +3,21 @@
 import os
 import signal
 from collections import Counter
+from functools import wraps
 from pathlib import Path
+from typing import Any
 
 if (
     "PYTEST_XDIST_WORKER" in os.environ
 ):  # before anything reads it: of shared cores each gets one thread
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import numpy as np
 import pytest
+import torch
 import warp as wp
 
+from vd.kernels.rng import init_rng_kernel
 from vd.warp_quiet import quiet_warp
 
 quiet_warp()
@@ -26,6 +31,37 @@ def devices() -> list[str]:
     """Every Warp device present: the CPU and each CUDA device."""
     wp.init()
     return ["cpu", *(d.alias for d in wp.get_cuda_devices())]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--reseed N`` asks for other draws than those of the seeds that tests name."""
+    parser.addoption("--reseed", type=int, default=0, help="shift all seeds; failures test luck")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Shift the seeds of NumPy, torch and environments by ``--reseed``."""
+    shift = config.getoption("--reseed")
+    if not shift:
+        return
+    numpy_generator, launch = np.random.default_rng, wp.launch
+
+    @wraps(numpy_generator)
+    def default_rng(seed: Any = None) -> np.random.Generator:
+        named = isinstance(seed, int | np.integer | list | tuple)
+        return numpy_generator([shift, *np.atleast_1d(seed)] if named else seed)
+
+    def manual_seed(seed: int) -> torch.Generator:
+        return torch.default_generator.manual_seed(seed + shift)
+
+    @wraps(launch)
+    def shifted_launch(kernel: wp.Kernel, *args: Any, **kwargs: Any) -> Any:
+        if kernel is init_rng_kernel:
+            kwargs["inputs"] = [kwargs["inputs"][0] + shift]
+        return launch(kernel, *args, **kwargs)
+
+    np.random.default_rng = default_rng
+    torch.manual_seed = manual_seed
+    wp.launch = shifted_launch
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
