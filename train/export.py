@@ -73,7 +73,7 @@ class BundleCfg:
     """Folder to write; a bundle that is there is replaced."""
 
 
-def export_command(arguments: list[str], _started: float) -> int:
+def export_command(arguments: list[str]) -> int:
     """``vd-train export``; the exit status."""
     cfg: ExportCfg = parse(ExportCfg, arguments, prog="vd-train export")
     check_file(cfg.output)
@@ -240,7 +240,7 @@ def _ms(call: Callable[[], object]) -> float:
     return 1e3 * min(timeit.repeat(call, number=1, repeat=TIMED))
 
 
-def bundle_command(arguments: list[str], _started: float) -> int:
+def bundle_command(arguments: list[str]) -> int:
     """``vd-train bundle``; the exit status."""
     cfg: BundleCfg = parse(BundleCfg, arguments, prog="vd-train bundle")
     check_folder(cfg.output.parent)
