@@ -376,7 +376,7 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(
             "--hand dclaw4 --twin dclaw3-tracking",
             "was trained for dclaw3 (9 motors), not for dclaw4 (12)",
         ),
-        ("--hand dclaw3 --port /dev/none", "name the policy"),
+        ("--hand dclaw3 --port /dev/none", "/dev/none: there is no such device"),
         ("--hand dclaw3 --twin zero --goal 1,2,3", "give a quaternion"),
     ],
 )

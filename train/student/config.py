@@ -228,7 +228,17 @@ def smoke(stage: Stage) -> StudentTrainCfg:
     """All parts of a stage in at most a minute; it learns nothing."""
     cfg = cpu_demo(stage)
     run = replace(cfg.run, out=SMOKE_RUN, max_steps=32, max_minutes=1.0, logger="none")
-    align = replace(cfg.align, batch=8, steps=2, shapes=16, fresh_shapes=2, hands=4, views=1)
+    network = AlignmentCfg(width=32, layers=1, tokens=32, patch=16)  # of --init another
+    align = replace(
+        cfg.align,
+        batch=8,
+        steps=2,
+        shapes=16,
+        fresh_shapes=2,
+        hands=4,
+        views=1,
+        network=network,
+    )
     looks = replace(cfg.looks, steps=2)
     task = replace(cfg.task, num_envs=4)
     return replace(cfg, smoke=True, run=run, align=align, looks=looks, task=task)
