@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from collections import Counter
 from functools import wraps
 from pathlib import Path
@@ -27,6 +28,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
+_SHOWN: dict[str, Any] = {"started": time.monotonic()}
+"""The terminal's reporter, when the tests began [s], and files that have been named."""
+
+
 def devices() -> list[str]:
     """Every Warp device present: the CPU and each CUDA device."""
     wp.init()
@@ -38,8 +43,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--reseed", type=int, default=0, help="shift all seeds; failures test luck")
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_configure(config: pytest.Config) -> None:
-    """Shift the seeds of NumPy, torch and environments by ``--reseed``."""
+    """Find where progress is shown; shift the seeds of all generators by ``--reseed``."""
+    _SHOWN["reporter"] = config.pluginmanager.get_plugin("terminalreporter")
     shift = config.getoption("--reseed")
     if not shift:
         return
@@ -68,6 +75,16 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run every test that asks for ``device`` on each device present."""
     if "device" in metafunc.fixturenames:
         metafunc.parametrize("device", devices())
+
+
+def pytest_runtest_logstart(nodeid: str, location: tuple[str, int | None, str]) -> None:
+    """Name each file as its first test begins: some take minutes."""
+    if reporter := _SHOWN.get("reporter"):
+        file = nodeid.partition("::")[0]
+        if file not in _SHOWN:
+            _SHOWN[file] = True
+            reporter.ensure_newline()
+            reporter.write_line(f"{time.monotonic() - _SHOWN['started']:4.0f} s  {file}")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
