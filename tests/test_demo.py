@@ -192,6 +192,17 @@ def test_a_command_is_limited_by_processor_time_whatever_else_the_machine_does(t
     child = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'while True: pass'])"
     part.run(["python", "-c", child], cpu_s=1.0)
     assert time.monotonic() - began > 3.0, "what its child takes counts, and no more"
+    time.sleep(0.5)
+    left = [file for file in Path("/proc").glob("[0-9]*/cmdline") if child_is(file)]
+    assert not left, "what it started has ended too"
+
+
+def child_is(file: Path) -> bool:
+    """Whether a process is what the command above started."""
+    try:
+        return b"while True: pass" in file.read_bytes()
+    except OSError:  # it has ended meanwhile
+        return False
 
 
 def test_a_part_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch, capsys):

@@ -8,10 +8,12 @@ begins or ends. A part that fails says so there, and the others go on.
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -135,7 +137,7 @@ class Part:
             for process, line, log in running:
                 while cpu_s is not None and process.poll() is None:
                     if processor_seconds(process.pid) > cpu_s:
-                        process.terminate()
+                        end_session(process)
                         break
                     time.sleep(LOOK_S)
                 status = process.wait()
@@ -148,8 +150,14 @@ class Part:
                     )
         finally:
             for process, _, _ in running:
-                process.terminate()  # nothing to one that has ended; another saves first
+                end_session(process)
                 process.wait()
+
+
+def end_session(process: subprocess.Popen[bytes]) -> None:
+    """Ask a command and all that it started to end; nothing if they have."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGTERM)
 
 
 def processor_seconds(session: int) -> float:
