@@ -66,8 +66,8 @@ GOALS = [5.0, 4.5, 9.9]
 
 def leave_training(line: list[str]) -> None:
     rows = [
-        {"env_steps": 1000 * k, "goals_per_episode": goals}
-        for k, goals in enumerate((None, *GOALS))
+        {"env_steps": 20_000 * k, "goals_per_episode": goals}
+        for k, goals in enumerate((None, 99.0, *GOALS))
     ]
     option(line, "--out").mkdir()
     (option(line, "--out") / PROGRESS_FILE).write_text("\n".join(map(json.dumps, rows)))

@@ -40,7 +40,7 @@ class PlayCfg(HandFlags, TaskFlags):
 
     Starts and goals are as trained; without a policy objects drop, and goals are all of SO(3).
 
-    The folder of a log that vd-deploy wrote in place of the policy replays that run, all of it,
+    The folder of a log of vd-deploy, in place of the policy, replays that run, all of it,
     whatever the other settings of the simulation. Without a policy it shows the hand's teacher.
     """
 
