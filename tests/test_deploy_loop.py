@@ -329,7 +329,7 @@ def test_the_installed_policy_drives_a_twin(tmp_path, capsys, patient):
     status, out, words = driven([*flags, *patient, *goals], capsys)
     assert status == 0, words
     log = read_log(folder)
-    assert log.run["kind"] == "tracking" and log.run["end"]["reason"] == "all goals pursued"
+    assert log.run["kind"] == "vision" and log.run["end"]["reason"] == "all goals pursued"
     assert [stop.goal for stop in log.stops] == [0, 1]
     steps = len(log.columns["t"])
     assert log.run["end"]["steps"] == steps >= 10
