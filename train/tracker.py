@@ -52,7 +52,7 @@ class TrackerCfg(EpisodeFlags):
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m]
     and quaternion xyzw; that of the network's training or the hand's own camera by default."""
-    episodes: int | None = None
+    episodes: int | None = None  # type: ignore[assignment]  # who is told none chooses
     """Episodes; rounded up to as many of each object. 256 by default, 64 on a CPU."""
     smoke: bool = False
     """Check the installation: two episodes with a cube, on the CPU. Nothing is kept."""
@@ -76,8 +76,8 @@ def tracker_command(arguments: Sequence[str]) -> int:
     if not cfg.smoke:
         return _track(with_defaults(cfg))
     with TemporaryDirectory(prefix="vd-smoke-") as folder:
-        tiny = {"objects": ("cube",), "episodes": 2, "device": "cpu", "stop_tolerance": math.pi}
-        return _track(replace(cfg, out=Path(folder) / cfg.out.name, **tiny))
+        tiny = replace(cfg, objects=("cube",), episodes=2, device="cpu", stop_tolerance=math.pi)
+        return _track(replace(tiny, out=Path(folder) / cfg.out.name))
 
 
 def with_defaults(cfg: TrackerCfg) -> TrackerCfg:

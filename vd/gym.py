@@ -151,7 +151,7 @@ class ReorientVectorEnv(VectorEnv):
         self.env.close()
 
 
-def _single(**_: Any) -> None:
+def _single(**_: Any) -> Any:
     """What ``gymnasium.make`` calls, which asks for a single environment.
 
     Raises:

@@ -63,7 +63,14 @@ def student_command(arguments: list[str]) -> int:
     """``vd-train student``; the exit status."""
     cfg = parse_student(arguments)
     if is_main():
-        words = ["--stage", cfg.stage, "--preset", cfg.preset, "--teacher", cfg.teacher]
+        words: list[object] = [
+            "--stage",
+            cfg.stage,
+            "--preset",
+            cfg.preset,
+            "--teacher",
+            cfg.teacher,
+        ]
         words += [] if cfg.init is None else ["--init", cfg.init]
         say_same_as("vd-train", "student", *words, "--out", cfg.run.out)
     with run_folder(cfg) as own:
