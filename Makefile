@@ -5,8 +5,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 # An interpreter is asked for its version: some machines have launchers for versions they do not run.
-PYTHON ?= $(shell for p in python3.11 python3.12 python3; do \
-	"$$p" -c 'import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12)})' 2>/dev/null \
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
+	"$$p" -c 'import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12), (3, 13)})' 2>/dev/null \
 	&& command -v "$$p" && break; done)
 
 # Extra wheel index for torch alone, such as PyTorch's CPU index: make demo TORCH_INDEX=URL.
@@ -24,7 +24,7 @@ OBJECTS ?=
 FIGURES_ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test lint type format docs bench figures clean
+.PHONY: help env demo test lint type format reference docs bench figures clean
 
 help:
 	@echo 'make demo     turn unseen objects, close a gap, drive a simulated hand, train a little: demo/index.html'
@@ -34,6 +34,7 @@ help:
 	@echo 'make type     mypy on the built package         make bench    simulation throughput'
 	@echo 'make docs     the documentation as a site, build/site/index.html'
 	@echo 'make figures  every published figure anew, hours on a GPU; FIGURES=teacher some, OBJECTS="held-out=DIR ..."'
+	@echo 'make reference  the tables of docs/reference, from the code'
 	@echo 'make env      only the environment (.venv)      make clean    remove build products'
 	@echo 'TORCH_INDEX=URL takes torch from another wheel index, such as its CPU-only one'
 
@@ -42,7 +43,7 @@ env: $(STAMP)
 # torch comes first: where no GPU is found, its size is worth a word before the download starts.
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { \
-	  echo 'No Python 3.11 or 3.12 found. Install one (Debian, Ubuntu: apt install python3.11 python3.11-venv;' >&2; \
+	  echo 'No Python 3.11, 3.12 or 3.13 found. Install one (Debian, Ubuntu: apt install python3.11 python3.11-venv;' >&2; \
 	  echo 'elsewhere: pyenv install 3.11) or name it: make PYTHON=/path/to/python3.11' >&2; exit 1; }
 	@test -n "$(TORCH_INDEX)" || command -v nvidia-smi >/dev/null || \
 	  echo 'No GPU found. If pip chooses the CUDA build of torch below (gigabytes), stop it and set TORCH_INDEX, see docs/install.md.'
@@ -58,6 +59,7 @@ demo: $(STAMP)
 # A file's tests stay in one process: its fixtures build simulators, which is what takes the time.
 # Files keep the order of tests/conftest.py, which puts slow ones first.
 test: $(STAMP)
+	@echo 'all tests take about ten minutes on two cores; each file is named as it begins'
 	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
 
 lint: $(STAMP)
@@ -76,6 +78,9 @@ type: $(STAMP)
 	  "$(abspath $(BIN))/mypy" --config-file ../../pyproject.toml -p vd
 
 # Strict: a broken link or anchor, or a page that is nowhere listed, fails.
+reference: $(STAMP)
+	$(BIN)/python docs/site_pages.py
+
 docs: $(STAMP)
 	test -x $(BIN)/mkdocs || $(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -3,7 +3,9 @@
 import importlib
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from vd import interrupt
 from vd.command_line import behind_command, parse
@@ -28,8 +30,9 @@ USAGE = """usage: vd-deploy [POLICY] [flags]   the same as vd-deploy run
 commands:
 {}
 
-What talks to motors takes --hand HAND and either --port DEVICE or --twin, a simulated hand on a
-pseudo-terminal. Nothing moves before the preflight has passed and you have said yes (--yes says so at once).
+What talks to motors takes --hand HAND and --port DEVICE, by default the only serial adapter, or --twin, a
+simulated hand on a pseudo-terminal. Nothing moves before the preflight has passed and you have said yes
+(--yes says so at once).
 vd-deploy COMMAND --help lists the flags of a command, vd-deploy --hand dclaw3 --help those of a run."""
 
 
@@ -70,7 +73,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     module = importlib.import_module(f"vd.deploy.{COMMANDS[name][0]}")
     options_of = getattr(module, f"{name.capitalize()}Cfg")
     options = parse(options_of, arguments, prog=f"vd-deploy {name}", description=module.__doc__)
+    if hasattr(options, "port") and not (options.port or options.twin or _by_ros(options)):
+        from vd.deploy.hardware.port import find_port
+
+        options = replace(options, port=find_port())
+        print(f"vd-deploy: --port {options.port}, the only serial adapter", file=sys.stderr)
     return int(getattr(module, name)(options))
+
+
+def _by_ros(options: Any) -> bool:
+    """Whether the motors are behind ROS 2, and have no port here."""
+    return bool(getattr(options, "ros2", False))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""What the site has beyond the files of ``docs``.
+"""What the site has beyond the files of ``docs``, and the tables of the reference.
 
-Documents of the root, and tables made from the code.
-
-A hook of mkdocs (``mkdocs.yml``). The package has to be installed.
+A hook of mkdocs (``mkdocs.yml``), by which documents of the root are pages too. As a script (``make
+reference``) it writes anew what the pages of ``docs/reference`` have of the code, between two
+comments. The package has to be installed.
 """
 
 import contextlib
@@ -44,16 +44,25 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Fill in what is generated, and have links between root and ``docs`` lead to pages of the site."""
+    """Have links between root and ``docs`` lead to pages of the site."""
     uri = page.file.src_uri
     if uri in AT_ROOT.values():
         markdown = markdown.replace("](docs/", "](")
     names = "|".join(map(re.escape, AT_ROOT))
     up = "../" * uri.count("/")
-    markdown = re.sub(
+    return re.sub(
         rf"\]\((?:\.\./)*({names})(?=[)#])", lambda link: f"]({up}{AT_ROOT[link[1]]}", markdown
     )
-    return re.sub(r"<!-- generated: (\w+) -->", lambda mark: GENERATED[mark[1]](), markdown)
+
+
+def generated(markdown: str) -> str:
+    """A page with what it has of the code made anew, between ``generated`` and ``end`` comments."""
+    return re.sub(
+        r"<!-- generated: (\w+) -->\n.*?<!-- end -->",
+        lambda mark: f"<!-- generated: {mark[1]} -->\n{GENERATED[mark[1]]()}\n<!-- end -->",
+        markdown,
+        flags=re.DOTALL,
+    )
 
 
 def on_page_content(html: str, **_: Any) -> str:
@@ -170,6 +179,48 @@ def registers() -> str:
     return _table(("register", "with another value", "what we do"), rows)
 
 
+OBSERVED = {
+    "joint_position": "position of each joint, from its lower limit -1 to its upper limit 1",
+    "joint_velocity": "velocity of each joint, 0.2 of it [rad/s]",
+    "object_position": "position of the object, world frame [m]",
+    "object_orientation": "its orientation, xyzw, of the axes of its file",
+    "object_velocity": "its velocity [m/s]",
+    "object_spin": "its angular velocity, 0.2 of it [rad/s]",
+    "goal_orientation": "wanted orientation of the object, xyzw",
+    "relative_orientation": "rotation from the goal to the object, object times conjugate goal, xyzw",
+    "fingertips": "each fingertip: position [m], orientation xyzw, velocity [m/s], spin [rad/s]",
+    "previous_action": "moving average of the actions so far",
+    "surface": "each fingertip: vector to the nearest point of the surface [2 cm]",
+    "extent": "how far the object extends up, down and in three rings, less 5 cm [2 cm]",
+    "goal_extent": "the same as it would lie at the goal",
+    "critic/dynamics": "what was drawn: five values a joint, frictions, mass, latency; 0 is nominal",
+    "critic/present": "state and shape of this moment, without noise and latency",
+}
+"""What the values of an observation are, and their units."""
+
+
+def observation() -> str:
+    """The columns of an observation, of both D'Claws, with all parts that can be switched on."""
+    from vd.api import observation_layout
+    from vd.envs.cfg import ObservationCfg, ReorientCfg
+
+    seen = ObservationCfg(shape="full", dynamics="critic")
+    three, four = (
+        observation_layout(ReorientCfg(hand=hand, observation=seen))
+        for hand in ("dclaw3", "dclaw4")
+    )
+    rows = (
+        (
+            f"`{name}`",
+            f"{three[name].start}:{three[name].stop}",
+            f"{four[name].start}:{four[name].stop}",
+            OBSERVED[name],
+        )
+        for name in three
+    )
+    return _table(("name", "dclaw3", "dclaw4", "what it is [unit]"), rows)
+
+
 def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """A table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
@@ -178,6 +229,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 GENERATED = {
+    "observation": observation,
     "names": names,
     "own_terms": own_terms,
     "commands": commands,
@@ -185,4 +237,12 @@ GENERATED = {
     "effects": effects,
     "registers": registers,
 }
-"""What takes the place of a comment ``<!-- generated: name -->``."""
+"""What stands behind a comment ``<!-- generated: name -->``."""
+
+
+if __name__ == "__main__":
+    for path in sorted((ROOT / "docs").rglob("*.md")):
+        page = path.read_text()
+        if (anew := generated(page)) != page:
+            path.write_text(anew)
+            print(path.relative_to(ROOT))

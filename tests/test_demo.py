@@ -5,10 +5,12 @@ import json
 import signal
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 
 import pytest
+import trimesh
 import tyro
 from gap_reports import rubbing_servo, servo_report
 from test_evaluate_trace import compared
@@ -58,10 +60,14 @@ def leave_flight(line: list[str]) -> None:
     (option(line, "--log") / "run.mp4").write_bytes(b"no film")
 
 
+GOALS = [5.0, 4.5, 9.9]
+"""Goals an episode of the made-up training."""
+
+
 def leave_training(line: list[str]) -> None:
     rows = [
-        {"env_steps": 1000 * k, "goals_per_episode": goals}
-        for k, goals in enumerate((None, 5.0, 4.5, 9.9))
+        {"env_steps": 20_000 * k, "goals_per_episode": goals}
+        for k, goals in enumerate((None, 99.0, *GOALS))
     ]
     option(line, "--out").mkdir()
     (option(line, "--out") / PROGRESS_FILE).write_text("\n".join(map(json.dumps, rows)))
@@ -91,7 +97,7 @@ def played(monkeypatch):
         parse(*args, **kwargs)
         raise ParsedError
 
-    def run(self, *commands, seconds=None):
+    def run(self, *commands, cpu_s=None):
         monkeypatch.setattr(tyro, "cli", only_parse)
         for words in commands:
             line = [str(word) for word in words]
@@ -113,8 +119,15 @@ def test_the_page_shows_every_part(played, tmp_path):
     assert main(["--out", str(tmp_path / "demo"), "--seed", "3"]) == 0
     text = (tmp_path / "demo" / "index.html").read_text()
     assert text.count("<video") == 3 and "http-equiv" not in text
-    for words in ("The simulation lacks", "mug", "stopped", "9.9 goals an episode", "4.5"):
+    for words in (
+        "The simulation lacks",
+        "mug",
+        "stopped",
+        "9.9 goals an episode",
+        "up to symmetry",
+    ):
         assert words in text
+    assert "from 5.0 to" in text and "no learning" not in text
     assert [
         line[0] for line in played if "--seed" in line and option(line, "--seed").name != "3"
     ] == []
@@ -131,25 +144,65 @@ def test_quick_ends_after_the_first_part_and_a_demo_again_replaces_the_one_befor
     assert Result.read(tmp_path / "camera" / "eval.json").rows
 
 
-def test_meshes_are_turned_in_place_of_built_in_objects(played, tmp_path, monkeypatch):
+def test_a_training_that_learned_nothing_says_so(played, tmp_path, monkeypatch):
+    monkeypatch.setitem(globals(), "GOALS", [18.0, 12.0, 6.0])
+    assert main(["--out", str(tmp_path / "demo")]) == 0
+    text = (tmp_path / "demo" / "index.html").read_text()
+    assert "from 18.0 to" in text and "That is no learning." in text
+
+
+def test_compact_meshes_are_turned_and_built_in_objects_fill_up(played, tmp_path, monkeypatch):
+    """Small files of flat and long things, and of nothing, are passed over."""
     meshes = tmp_path / "meshes"
     meshes.mkdir()
-    for size, name in enumerate("dcbaef", start=1):
-        (meshes / f"{name}.obj").write_text("v 0 0 0\n" * size)
+    (meshes / "broken.stl").write_text("nothing")
+    for name, sides in {
+        "knife": (20, 2, 1),
+        "a": (2, 1, 1),
+        "b": (3, 2, 2),
+        "disc": (9, 9, 1),
+    }.items():
+        trimesh.creation.box(sides).export(meshes / f"{name}.stl")
+    trimesh.creation.icosphere(2).export(meshes / "c.stl")
 
     def leave_set(line):
         option(line, "--out").mkdir()
-        (option(line, "--out") / "d.usda").touch()
+        (option(line, "--out") / "a.usda").touch()
 
     monkeypatch.setitem(LEAVE, "vd-assets import", leave_set)
     assert main(["--out", str(tmp_path / "demo"), "--meshes", str(meshes)]) == 0
-    assert [Path(word).name for word in played[0][2:6]] == ["d.obj", "c.obj", "b.obj", "a.obj"]
+    words = played[0][2 : played[0].index("--out")]
+    assert [Path(word).name for word in words] == ["a.stl", "b.stl", "c.stl"]
     folder = tmp_path / "demo" / "camera" / "objects"
-    assert option(played[1], "--objects") == folder
-    assert (
-        option(next(line for line in played if line[0] == "vd-deploy"), "--object")
-        == folder / "d.usda"
-    )
+    at = played[1].index("--objects")
+    assert played[1][at + 1 : at + 3] == [str(folder), "procedural-heldout-3-seed0"]
+    flown = next(line for line in played if line[0] == "vd-deploy")
+    assert option(flown, "--object") == folder / "a.usda" and flown[1] == "dclaw4-vision"
+    assert "fewer than four could be imported" in (tmp_path / "demo" / "index.html").read_text()
+    monkeypatch.delitem(LEAVE, "vd-assets import")
+    assert main(["--out", str(tmp_path / "none"), "--meshes", str(meshes)]) == 0, "none in time"
+    flown = [line for line in played if line[0] == "vd-deploy"][-1]
+    assert flown[flown.index("--object") + 1] == "procedural-heldout-1-seed0"
+
+
+def test_a_command_is_limited_by_processor_time_whatever_else_the_machine_does(tmp_path):
+    part, began = Part("x", "X", tmp_path), time.monotonic()
+    part.run(["python", "-c", "import time; time.sleep(2.0); print('came to its end')"], cpu_s=1.0)
+    assert "came to its end" in (tmp_path / "1-python.txt").read_text()
+    child = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'while True: pass'])"
+    part.run(["python", "-c", child], cpu_s=1.0)
+    assert time.monotonic() - began > 3.0, "what its child takes counts, and no more"
+    time.sleep(0.5)
+    left = [file for file in Path("/proc").glob("[0-9]*/cmdline") if child_is(file)]
+    assert not left, "what it started has ended too"
+
+
+def child_is(file: Path) -> bool:
+    """Whether a process is what the command above started."""
+    try:
+        return b"while True: pass" in file.read_bytes()
+    except OSError:  # it has ended meanwhile
+        return False
 
 
 def test_a_part_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch, capsys):

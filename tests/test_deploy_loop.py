@@ -474,7 +474,7 @@ def test_the_installed_policy_drives_a_twin(tmp_path, capsys, patient):
     status, out, words = driven([*flags, *patient, *goals], capsys)
     assert status == 0, words
     log = read_log(folder)
-    assert log.run["kind"] == "tracking" and log.run["end"]["reason"] == "all goals pursued"
+    assert log.run["kind"] == "vision" and log.run["end"]["reason"] == "all goals pursued"
     assert [stop.goal for stop in log.stops] == [0, 1]
     steps = len(log.columns["t"])
     assert log.run["end"]["steps"] == steps >= 10
@@ -521,7 +521,7 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(
             "--hand dclaw4 --twin dclaw3-tracking",
             "was trained for dclaw3 (9 motors), not for dclaw4 (12)",
         ),
-        ("--hand dclaw3 --port /dev/none", "name the policy"),
+        ("--hand dclaw3 --port /dev/none", "/dev/none: there is no such device"),
         ("--hand dclaw3 --twin zero --goal 1,2,3", "give a quaternion"),
     ],
 )

@@ -4,6 +4,7 @@ Names that are wrong, quiet starts, and command lines of the documentation.
 """
 
 import importlib
+import importlib.util
 import json
 import re
 import shlex
@@ -120,3 +121,38 @@ def test_command_lines_of_the_documentation_are_understood(page, line, monkeypat
         importlib.import_module(SCRIPTS[command].partition(":")[0]).main()
     except (ParsedError, SystemExit) as end:
         assert isinstance(end, ParsedError) or end.code == 0, f"{page}: {line}"
+
+
+def test_pages_of_the_reference_are_what_the_code_says():
+    """``make reference`` writes them anew."""
+    spec = importlib.util.spec_from_file_location("site_pages", ROOT / "docs" / "site_pages.py")
+    pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pages)
+    written = {page: page.read_text() for page in (ROOT / "docs").rglob("*.md")}
+    stale = [page.name for page, text in written.items() if pages.generated(text) != text]
+    assert not stale, "make reference"
+    made = set(re.findall(r"<!-- generated: (\w+) -->", "".join(written.values())))
+    assert made == set(pages.GENERATED)
+    for name in ("cli", "constants", "effects", "python", "registers"):
+        assert len((ROOT / "docs" / "reference" / f"{name}.md").read_text()) > 1900, name
+
+
+def test_all_places_name_the_same_versions_of_python():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    versions = re.findall(r"Python :: (3\.\d+)", "\n".join(project["classifiers"]))
+    first, last = (int(version.partition(".")[2]) for version in (versions[0], versions[-1]))
+    assert [f"3.{minor}" for minor in range(first, last + 1)] == versions and last >= 13
+    assert project["requires-python"] == f">=3.{first},<3.{last + 1}"
+    workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text()
+    assert f"python: {json.dumps(versions)}" in workflow
+    makefile = (ROOT / "Makefile").read_text()
+    for version in versions:
+        assert f"python{version}" in makefile and f"(3, {version[2:]})" in makefile
+    for page in ("README.md", "docs/install.md", ".ci/run", "constraints.txt"):
+        assert f"Python {versions[0]} to {versions[-1]}" in (ROOT / page).read_text(), page
+
+
+def test_the_tests_say_which_file_they_are_in():
+    run = [sys.executable, "-m", "pytest", "-n", "1", "--dist", "loadfile", "tests/test_clouds.py"]
+    done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0 and re.search(r"\d s  tests/test_clouds\.py$", done.stdout, re.M)

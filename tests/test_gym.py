@@ -86,3 +86,8 @@ def test_widths_masks_devices_and_settings_that_cannot_be_are_refused():
     env.close()
     with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="after close"):
         env.step(np.zeros((2, 9)))
+
+
+def test_a_single_environment_is_refused_by_the_name_of_what_makes_them():
+    with pytest.raises(gymnasium.error.Error, match=r'make_vec\("vd\.gym:VisualDexterity-v0"'):
+        gymnasium.make("vd.gym:VisualDexterity-v0")

@@ -16,7 +16,7 @@ import torch
 import warp as wp
 
 import vd
-from vd.envs.cfg import ObservationCfg, ReorientCfg, RewardCfg
+from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg, RewardCfg
 from vd.train.cli import main
 from vd.train.metrics import PROGRESS_FILE, read_progress
 
@@ -37,7 +37,7 @@ def test_the_package_loads_no_name_before_it_is_used():
     assert said.startswith("set()") and all(f"'{name}'" in said for name in vd.__all__)
     stub = Path(vd.__file__).with_suffix(".pyi").read_text()  # for editors and type checkers
     assert set(re.findall(r'"(\w+)",', stub)) == set(vd.__all__)
-    assert len(vd.__all__) == 10 and all(getattr(vd, name).__doc__ for name in vd.__all__)
+    assert len(vd.__all__) == 11 and all(getattr(vd, name).__doc__ for name in vd.__all__)
 
 
 @pytest.mark.slow
@@ -70,6 +70,27 @@ def test_own_terms_pay_and_show_what_they_say_and_change_nothing_else(beside_exa
         )
         np.testing.assert_array_equal(env.observation.numpy()[:, width], env.object_pose()[:, 2])
         np.testing.assert_allclose(env.privileged.numpy()[:, -1], speeds, rtol=1e-5)
+
+
+def test_the_layout_says_where_each_value_of_an_observation_is():
+    seen = ObservationCfg(shape="full", dynamics="critic", canonical=True)
+    quiet = RandomisationCfg(enabled=False)  # or what is observed is noisy, and late
+    cfg = ReorientCfg(hand="dclaw3", num_envs=2, observation=seen, randomisation=quiet)
+    layout, env = vd.observation_layout(cfg), vd.ReorientEnv(cfg, "cpu")
+    env.step(wp.zeros((2, 9), dtype=float, device="cpu"))
+    values = np.hstack([env.observation.numpy(), env.privileged.numpy()])
+    ends = [columns.stop for columns in layout.values()]
+    assert [columns.start for columns in layout.values()] == [0, *ends[:-1]]
+    assert ends[-1] == values.shape[1]
+    actor = [name for name in layout if not name.startswith("critic/")]
+    assert layout[actor[-1]].stop == env.num_observations
+    pose = env.object_pose()
+    np.testing.assert_allclose(values[:, layout["object_position"]], pose[:, :3], atol=1e-6)
+    orientation = values[:, layout["object_orientation"]]
+    np.testing.assert_allclose(np.abs((orientation * pose[:, 3:]).sum(axis=1)), 1.0, atol=1e-5)
+    present = values[:, layout["critic/present"]]
+    assert present.shape[1] == layout["goal_extent"].stop
+    assert list(vd.observation_layout(replace(cfg, observation=ObservationCfg()))) == actor[:10]
 
 
 def test_a_term_that_is_none_or_gives_what_cannot_be_is_named(beside_examples, monkeypatch):

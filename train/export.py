@@ -55,7 +55,7 @@ class ExportCfg:
     moves to another machine or number of GPUs starts its episodes anew anyway."""
 
 
-def export_command(arguments: list[str], _started: float) -> int:
+def export_command(arguments: list[str]) -> int:
     """``vd-train export``; the exit status."""
     cfg: ExportCfg = parse(ExportCfg, arguments, prog="vd-train export")
     check_suffix(cfg.output, *([".pt"] if cfg.resumable else [SUFFIX, ONNX_SUFFIX]))

@@ -49,6 +49,11 @@ OF_HELP_ALL = frozenset(
 flags.
 """
 
+WHY = {
+    "cpu-demo": "there is no GPU: an easier task, turns about the vertical; --preset gpu is whole",
+    "gpu": "the recipe that learns; Ctrl-C or --max-minutes ends it",
+}
+"""Why the machine decides for a preset."""
 SHORT_FORMS = {
     name: f"env.{name}" for name in ("hand", "hand-layer", "objects", "num-envs", "seed")
 } | {"randomise": "env.randomisation.enabled"}
@@ -62,11 +67,11 @@ STARTS = {
 
 
 def parse_teacher(
-    arguments: Sequence[str], *, say: Callable[[str], object] | None = None
+    arguments: Sequence[str], *, say: Callable[..., object] | None = None
 ) -> TeacherCfg:
     """The configuration that command-line flags ask for.
 
-    ``say`` is told which preset the machine decided.
+    ``say`` (:func:`vd.defaults.say_same_as`) is told what the machine decided.
 
     The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins
     from, or the run's own configuration with ``--resume``), as flags and ``--config`` say; the
@@ -85,7 +90,7 @@ def parse_teacher(
     saved = resume is not None and out is not None and (Path(out) / CONFIG_NAME).is_file()
     if preset is not None and preset not in PRESETS:
         raise ValueError(f"--preset {preset} is none; one of {', '.join(PRESETS)}")
-    reason = ""
+    chosen = False
     if "--smoke" in arguments:
         start = smoke(PRESETS[preset or "cpu-demo"]())
     elif preset is None and init is not None:
@@ -93,7 +98,7 @@ def parse_teacher(
     elif preset is None and not saved:
         # Wrong flags and names, and --help, do not wait for torch.
         _parsed([word for word in arguments if word != PRINT], PRESETS["gpu"](), file)
-        preset, reason = machine_preset(value_of(arguments, "--device"))
+        preset, chosen = machine_preset(value_of(arguments, "--device")), True
         start = PRESETS[preset]()
     else:
         start = PRESETS[preset or "gpu"]()
@@ -101,8 +106,9 @@ def parse_teacher(
         start = for_hand(start, value_of(arguments, "--env.hand"))
     base = (saved_config(arguments, start) or start) if resume is not None else start
     cfg = _parsed(arguments, base, file)
-    if say is not None and reason:
-        say(f"preset {preset}, since none is named: {reason}")
+    if say is not None and chosen:
+        words = ("--preset", preset, "--hand", cfg.env.hand, "--objects", *cfg.env.objects)
+        say("vd-train", "teacher", *words, "--out", cfg.run.out, why=WHY[str(preset)])
     return cfg
 
 
@@ -124,15 +130,26 @@ def starting(arguments: list[str]) -> tuple[list[str], ConfigFile | None]:
     return words + arguments, file
 
 
-def machine_preset(device: str | None) -> tuple[str, str]:
-    """The preset that learns on this machine, or on what ``--device`` asks for, and why it is that."""
-    if resolve_device(device or "auto") == "cpu":
-        return "cpu-demo", (
-            "there is no GPU. It learns an easier task, turns of one object about the vertical, in "
-            "minutes; "
-            "the whole task is --preset gpu"
-        )
-    return "gpu", "the recipe that learns; Ctrl-C or --max-minutes ends it"
+def machine_preset(device: str | None) -> str:
+    """The preset that learns on this machine, or on what ``--device`` asks for."""
+    return "cpu-demo" if resolve_device(device or "auto") == "cpu" else "gpu"
+
+
+def check_begun_alike(arguments: list[str], saved: Cfg) -> None:
+    """Refuse flags by which a run that goes on would have begun otherwise.
+
+    Raises:
+        ValueError: Names the flag, what the run began with, and the remedy.
+    """
+    for name in ("preset", "init", "stage", "smoke"):
+        flag, begun = f"--{name}", getattr(saved, name, None)
+        asked = value_of(arguments, flag) if name != "smoke" else None
+        differs = asked is not None and asked != str(begun)
+        if differs or (name == "smoke" and flag in arguments and not begun):
+            raise ValueError(
+                f"{flag} {asked or ''}: the run in {saved.run.out} began with {begun}, and goes on "
+                f"so; leave {flag} out, or choose another --out"
+            )
 
 
 def normalise(arguments: Sequence[str], short_forms: Mapping[str, str]) -> list[str]:
@@ -226,7 +243,9 @@ def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:
         raise ValueError(
             f"{path}: {error}; it was written by another version, start anew or edit it"
         ) from error
-    return replace(cfg, run=replace(cfg.run, out=run_dir))
+    cfg = replace(cfg, run=replace(cfg.run, out=run_dir))
+    check_begun_alike(arguments, cfg)
+    return cfg
 
 
 def write_config(cfg: "TeacherCfg | StudentTrainCfg") -> None:

@@ -20,6 +20,7 @@ from vd.policy import CHECKPOINT_FORMAT
 from vd.train.checkpoint import (
     CHECKPOINT_FOLDER,
     checkpoint_path,
+    list_checkpoints,
     prune_checkpoints,
     random_state,
     save_checkpoint,
@@ -33,6 +34,10 @@ from vd.train.progress import ProgressLines
 
 if TYPE_CHECKING:
     from vd.train.vec_env import ReorientVecEnv
+
+
+RESUME_HINT = "; --resume goes on from the last checkpoint"
+"""What a run that is stopped at once says where it has a checkpoint."""
 
 
 class Interrupted(Exception):  # noqa: N818  # not an error: the run was asked to stop and has saved
@@ -69,7 +74,6 @@ class TrainingLoop:
     Args:
         run: Run settings.
         device: Torch device of networks and rollouts.
-        deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
         env: Environments that checkpoints hold, if any.
 
     Attributes:
@@ -85,14 +89,14 @@ class TrainingLoop:
         run: RunCfg,
         *,
         device: str,
-        deadline: float | None = None,
         env: "ReorientVecEnv | None" = None,
     ) -> None:
         self.run, self.device, self.env = run, device, env
         self.rank, self.world_size = join_processes(device)
         self.iteration, self.env_steps, self._elapsed_s = 0, 0, 0.0
         self.new_episodes = ""
-        self._deadline, self._signal = deadline, 0
+        self._deadline: float | None = None
+        self._signal = 0
 
     @property
     def is_distributed(self) -> bool:
@@ -138,6 +142,8 @@ class TrainingLoop:
             stack.enter_context(self._signals(lines))
             stack.enter_context(lines)
             while self.iteration < total and (row := self._row()) is not None:
+                if self._deadline is None and self.run.max_minutes is not None:
+                    self._deadline = time.monotonic() + 60.0 * self.run.max_minutes
                 if log is not None:
                     log.write(row)
                 pace = (time.monotonic() - started) / (self.iteration - first)
@@ -222,7 +228,8 @@ class TrainingLoop:
 
         def request(number: int, _frame: FrameType | None) -> None:
             if self._signal:
-                raise KeyboardInterrupt
+                saved = list_checkpoints(self.run.out)
+                raise KeyboardInterrupt(RESUME_HINT if saved else "")
             self._signal = number
             interrupt.note(number)
             lines.note("stopping: saving a checkpoint (again to stop at once, without saving)")

@@ -64,9 +64,8 @@ class TeacherRunner(TrainingLoop):
         task: dict[str, Any],
         interface: dict[str, Any] | None = None,
         device: str,
-        deadline: float | None = None,
     ) -> None:
-        super().__init__(run, device=device, deadline=deadline, env=env)
+        super().__init__(run, device=device, env=env)
         self.ppo, self.policy_cfg, self.task, self.interface = ppo, policy, task, interface or {}
         self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])

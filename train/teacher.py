@@ -2,16 +2,18 @@
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from vd import interrupt
 from vd.config import to_dict
+from vd.defaults import say_same_as
 from vd.device import resolve_device
-from vd.files import check_folder
+from vd.files import check_folder, locked
 from vd.train.begin import find_start, read_start
 from vd.train.config import validate
 from vd.train.flags import parse_teacher, write_config
@@ -20,6 +22,9 @@ from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.train.runner import TeacherRunner
+    from vd.train.student.config import StudentTrainCfg
+
+Cfg = TypeVar("Cfg", TeacherCfg, "StudentTrainCfg")
 
 CPU_ENVS = 1024
 """Most environments of which a CPU simulates an iteration within a minute."""
@@ -27,12 +32,10 @@ CPU_ENVS = 1024
 BUILDING = "building the environments (the first start compiles the kernels: a minute or two) ..."
 
 
-def build_teacher(
-    cfg: TeacherCfg, *, started: float | None = None, say: Callable[[str], object] = print
-) -> "TeacherRunner":
+def build_teacher(cfg: TeacherCfg, *, say: Callable[[str], object] = print) -> "TeacherRunner":
     """Build environment and learner as ``cfg`` says, save the resolved configuration, and resume if asked.
 
-    ``max_minutes`` counts from ``started``; ``say`` is told when the slow part begins.
+    ``say`` is told when the slow part begins.
 
     Raises:
         FileExistsError: The run folder holds another run and ``resume`` is not set.
@@ -87,7 +90,6 @@ def build_teacher(
         task=to_dict(cfg.env),
         interface=derive_interface(cfg.env, load_hand(cfg.env.hand, cfg.env.fingertip)),
         device=device,
-        deadline=cfg.run.deadline(started),
     )
     if checkpoint is not None:
         runner.load(checkpoint)
@@ -100,30 +102,46 @@ def build_teacher(
     return runner
 
 
-def teacher_command(arguments: list[str], started: float) -> int:
+def teacher_command(arguments: list[str]) -> int:
     """``vd-train teacher``; the exit status."""
-    say = say_of_main()
-    cfg = parse_teacher(arguments, say=say)
-    if not cfg.smoke or cfg.run.out != SMOKE_RUN:
-        return train(cfg, say, started)
-    with TemporaryDirectory(
-        prefix="vd-smoke-"
-    ) as folder:  # nobody needs what is in it, twice least of all
-        return train(replace(cfg, run=replace(cfg.run, out=Path(folder))), say, started)
+    cfg = parse_teacher(arguments, say=say_same_as if is_main() else None)
+    with run_folder(cfg) as own:
+        return train(own, say_of_main())
+
+
+def is_main() -> bool:
+    """Whether this is the first process of those of ``torchrun``, or the only one."""
+    return os.environ.get("RANK", "0") == "0"
 
 
 def say_of_main() -> Callable[[str], None]:
     """Prints at once, in the first process; nothing in the others."""
-    return partial(print, flush=True) if os.environ.get("RANK", "0") == "0" else lambda _: None
+    return partial(print, flush=True) if is_main() else lambda _: None
 
 
-def train(cfg: TeacherCfg, say: Callable[[str], None], started: float) -> int:
+@contextmanager
+def run_folder(cfg: Cfg) -> Iterator[Cfg]:
+    """``cfg`` with its folder for this run alone; that of a smoke test, if not named, goes again.
+
+    Raises:
+        FileExistsError: Another process trains into it; names that.
+    """
+    with ExitStack() as stack:
+        if cfg.smoke and cfg.run.out == SMOKE_RUN:
+            folder = stack.enter_context(TemporaryDirectory(prefix="vd-smoke-"))
+            cfg = replace(cfg, run=replace(cfg.run, out=Path(folder)))
+        if is_main():
+            stack.enter_context(locked(cfg.run.out))
+        yield cfg
+
+
+def train(cfg: TeacherCfg, say: Callable[[str], None]) -> int:
     """Train as ``cfg`` says; the exit status.
 
-    ``say`` and ``started`` as of :func:`build_teacher`.
+    ``say`` as of :func:`build_teacher`.
     """
     folder = cfg.run.out
-    runner = build_teacher(cfg, started=started, say=say)
+    runner = build_teacher(cfg, say=say)
     for line in _beginning(cfg, runner) if runner.iteration else []:
         say(line)
     if not runner.run_to_end():

@@ -5,15 +5,19 @@ Its layers stay.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from vd.bundle import SUFFIX, check_suffix, has_suffix
+from vd.bundle import SUFFIX, check_suffix
 from vd.command_line import parse
+from vd.defaults import say_same_as
+from vd.device import resolve_device
+from vd.evaluate.agents import DEFAULT_POLICY, check_names
 from vd.evaluate.cfg import EpisodeFlags, EvalCfg
 from vd.evaluate.goals import Goals
 from vd.files import check_file
@@ -23,8 +27,6 @@ if TYPE_CHECKING:
     from vd.bundle.contract import Contract, TrackingSpec
     from vd.evaluate.trace import Trace
     from vd.tracking.policy import TrackingPolicy
-    from vd.vision.alignment import AlignmentNetwork
-    from vd.vision.cfg import AlignmentCfg
 
 
 @dataclass(kw_only=True)
@@ -39,10 +41,11 @@ class TrackerCfg(EpisodeFlags):
     vd-eval with the same flags.
     """
 
-    teacher: Annotated[str, tyro.conf.Positional]
+    teacher: Annotated[str, tyro.conf.Positional] = DEFAULT_POLICY
     """The teacher: a policy.safetensors, a run's folder, or the name of an installed one."""
-    objects: tuple[str, ...] = field()
-    """Object sets to choose the stopping rules on, not those of the training."""
+    objects: tuple[str, ...] = ()
+    """Object sets to choose the stopping rules on, not those of the training; by default
+    procedural-heldout, and a few of its kinds on a CPU."""
     alignment: str | None = None
     """Network that finds objects by their goals' points: the alignment.pt of vd-train student, or a
     vision policy, for that of it: its name or file."""
@@ -51,13 +54,15 @@ class TrackerCfg(EpisodeFlags):
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m]
     and quaternion xyzw; that of the network's training or the hand's own camera by default."""
-    episodes: int = 256
-    """Episodes; rounded up to as many of each object."""
+    episodes: int | None = None  # type: ignore[assignment]  # who is told none chooses
+    """Episodes; rounded up to as many of each object. 256 by default, 64 on a CPU."""
+    smoke: bool = False
+    """Check the installation: two episodes with a cube, on the CPU. Nothing is kept."""
     goals: Goals = "points"
     seed: int = 1000
 
 
-def tracker_command(arguments: Sequence[str], _started: float) -> int:
+def tracker_command(arguments: Sequence[str]) -> int:
     """``vd-train tracker``; the exit status.
 
     One rule is for the tolerance, one for that of the paper's precise variant, from the same
@@ -70,16 +75,35 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     cfg: TrackerCfg = parse(TrackerCfg, arguments, prog="vd-train tracker")
     cfg.validate()
     check_suffix(cfg.out, SUFFIX)
-    check_file(cfg.out)
-    from vd.evaluate.agents import check_names, open_teacher, policy_name
-
     check_names([cfg.teacher], cfg.objects)
+    if not cfg.smoke:
+        return _track(with_defaults(cfg))
+    with TemporaryDirectory(prefix="vd-smoke-") as folder:
+        tiny = replace(cfg, objects=("cube",), episodes=2, device="cpu", stop_tolerance=math.pi)
+        return _track(replace(tiny, out=Path(folder) / cfg.out.name))
+
+
+def with_defaults(cfg: TrackerCfg) -> TrackerCfg:
+    """``cfg`` with objects and episodes for this machine where none are named, which are said."""
+    few = resolve_device(cfg.device) == "cpu"
+    objects = cfg.objects or (("procedural-heldout-8-seed0",) if few else ("procedural-heldout",))
+    episodes = cfg.episodes or (64 if few else 256)
+    if not (cfg.objects and cfg.episodes):
+        words = (cfg.teacher, "--objects", *objects, "--episodes", episodes, "--out", cfg.out)
+        say_same_as("vd-train", "tracker", *words)
+    return replace(cfg, objects=objects, episodes=episodes)
+
+
+def _track(cfg: TrackerCfg) -> int:
+    """Run the episodes, choose the rules and write the policy."""
+    check_file(cfg.out)
     print("running the episodes ...", flush=True)
     from vd.bundle.contract import TrackingSpec
     from vd.bundle.store import write_policy
-    from vd.device import resolve_device
+    from vd.evaluate.agents import open_teacher, policy_name
     from vd.stopping import calibrate
     from vd.tracking.policy import TrackingPolicy
+    from vd.train.student.network import open_network
     from vd.warp_quiet import quiet_warp
 
     quiet_warp()
@@ -94,7 +118,7 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
     network = None
     if cfg.alignment is not None:
-        network, sizes, camera = _network(cfg.alignment, device)
+        network, sizes, camera = open_network(cfg.alignment, device)
         spec = replace(spec, camera=cfg.camera or camera, alignment=sizes)
     policy = TrackingPolicy(teacher, replace(teacher.contract, tracking=spec), network)
     trace = _episodes(cfg, policy, device)
@@ -146,32 +170,6 @@ def _contract(policy: "TrackingPolicy", spec: "TrackingSpec") -> "Contract":
     return replace(policy.contract, tracking=spec, interface=interface)
 
 
-def _network(
-    name: str, device: str
-) -> "tuple[AlignmentNetwork, AlignmentCfg, tuple[float, ...] | None]":
-    """A network of alignment, its sizes, and the camera of its training.
-
-    Of a policy, or of a file.
-    """
-    from vd.evaluate.agents import installed_policies, open_policy
-    from vd.tracking.policy import TrackingPolicy
-    from vd.vision.saved import load_alignment
-
-    if name not in installed_policies() and not has_suffix(name, SUFFIX):
-        network, learned = load_alignment(name, device)
-        return network, learned.network, learned.camera
-    policy = open_policy(name, device)
-    if (
-        not isinstance(policy, TrackingPolicy)
-        or policy.alignment is None
-        or policy.spec.alignment is None
-    ):
-        raise ValueError(
-            f"--alignment: {name} finds nothing by its goal's points; name a vision policy"
-        )
-    return policy.alignment, policy.spec.alignment, policy.spec.camera
-
-
 def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace":
     """Episodes that nothing stops."""
     from vd.assets_usd.objects.sets import load_set
@@ -180,6 +178,7 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
     from vd.tracking.symmetry import with_symmetries
 
     count = len(load_set(list(cfg.objects)))
+    assert cfg.episodes is not None
     each = math.ceil(cfg.episodes / count)
     envs = cfg.num_envs or envs_for(count, each, device, camera=True)
     told = {one.name: getattr(cfg, one.name) for one in fields(EpisodeFlags)} | {"episodes": each}

@@ -13,6 +13,7 @@ _PLACES = {
     "ReorientEnv": "vd.envs.reorient:ReorientEnv",
     "load_policy": "vd.api:load_policy",
     "evaluate_policies": "vd.api:evaluate_policies",
+    "observation_layout": "vd.api:observation_layout",
     "ObjectTracker": "vd.api:ObjectTracker",
     "analyse_gap": "vd.api:analyse_gap",
     "read": "vd.api:read",

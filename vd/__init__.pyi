@@ -1,4 +1,12 @@
-from vd.api import ObjectTracker, analyse_gap, evaluate_policies, load_policy, read, write
+from vd.api import (
+    ObjectTracker,
+    analyse_gap,
+    evaluate_policies,
+    load_policy,
+    observation_layout,
+    read,
+    write,
+)
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set as load_objects
 from vd.envs.cfg import ReorientCfg
@@ -13,6 +21,7 @@ __all__ = [
     "load_hand",
     "load_objects",
     "load_policy",
+    "observation_layout",
     "read",
     "write",
 ]

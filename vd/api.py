@@ -11,6 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     from vd.assets_usd.hand_data import CameraModel, HandModel
     from vd.assets_usd.objects.model import ObjectModel
+    from vd.envs.cfg import ReorientCfg
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.result import Result
     from vd.gap.result import Report
@@ -77,6 +78,26 @@ def evaluate_policies(*policies: str | Path, **settings: Any) -> "Result":
         cfg.hand,
     )
     return compare(cfg)
+
+
+def observation_layout(cfg: "ReorientCfg") -> dict[str, slice]:
+    """Which columns of an observation hold what, by name, in order.
+
+    ``env.observation`` [N, O] has those that a policy reads, ``env.privileged`` what only the
+    critic reads besides; names of the latter begin with ``critic/``, and their columns go on
+    counting behind O. Meanings and units: the table of the reference.
+
+    Args:
+        cfg: The task; hand and ``observation`` decide.
+
+    Raises:
+        ValueError: There is no such hand.
+    """
+    from vd.assets_usd.hands import load_hand
+    from vd.envs.parts import observation_columns
+
+    hand = load_hand(cfg.hand, cfg.fingertip)
+    return observation_columns(cfg.observation, hand.num_fingers, hand.num_joints)
 
 
 class ObjectTracker:

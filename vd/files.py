@@ -4,17 +4,22 @@ What cannot be written is said.
 """
 
 import errno
+import fcntl
 import json
 import os
+import shlex
+import socket
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 """What can go wrong while a file grows."""
+LOCK = ".lock"
+"""File of a folder that a process has for itself; it names that."""
 PROBE_BYTES = 1 << 20
 """What is written to ask whether a disk still takes something. Writers give up within a block of
 the end.
@@ -76,6 +81,42 @@ def check_file(path: Path) -> None:
         raise output_error(path, error) from error
     if Path(path).exists():
         print(f"{path} is there, and will be replaced", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Have ``folder``, made if it is not there, for this process alone while the block lasts.
+
+    The system frees the folders of a process that died. One that stays empty goes again.
+
+    Raises:
+        FileExistsError: Another process has it; names that.
+    """
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    make_folder(folder)
+    path = folder / LOCK
+    with writing(path):
+        file = path.open("a+")
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            raise FileExistsError(
+                f"{folder} is in use by {file.read() or 'another process'}; wait for its end, or "
+                "choose another --out"
+            ) from None
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()} ({shlex.join(sys.argv)})")
+        file.flush()
+        try:
+            yield
+        finally:
+            if [*folder.iterdir()] == [path]:
+                path.unlink()
+                with suppress(OSError):
+                    for place in made:
+                        place.rmdir()
 
 
 @contextmanager

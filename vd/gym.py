@@ -151,4 +151,15 @@ class ReorientVectorEnv(VectorEnv):
         self.env.close()
 
 
-gymnasium.register(ID, vector_entry_point=ReorientVectorEnv)
+def _single(**_: Any) -> Any:
+    """What ``gymnasium.make`` calls, which asks for a single environment.
+
+    Raises:
+        gymnasium.error.Error: Names the function to call.
+    """
+    raise gymnasium.error.Error(
+        f'environments are simulated side by side: gymnasium.make_vec("vd.gym:{ID}", num_envs=1)'
+    )
+
+
+gymnasium.register(ID, entry_point=_single, vector_entry_point=ReorientVectorEnv)

@@ -21,6 +21,8 @@ WAIT_S = 0.002
 sleep but asks again and again, which takes a core, and keeps whatever shares it from answering."""
 FULL_S = 0.1
 """Longest wait for a port that takes no bytes any more: of a dead adapter, or a twin that hangs."""
+DEVICES = Path("/dev")
+"""Where the devices of serial adapters are."""
 PSEUDO_TERMINALS = "/dev/pts/"
 """A twin holds its own end of these open, so exclusive use by one program is for the lock alone."""
 
@@ -74,6 +76,29 @@ def pseudo(path: str) -> bool:
     return os.path.realpath(path).startswith(PSEUDO_TERMINALS)
 
 
+def serial_ports() -> list[str]:
+    """Devices of serial adapters that are plugged in, by name."""
+    kinds = ("ttyUSB*", "ttyACM*")
+    return sorted(str(device) for kind in kinds for device in DEVICES.glob(kind))
+
+
+def find_port() -> str:
+    """The port of the only serial adapter that is plugged in.
+
+    Raises:
+        BusError: There is none, or there are several; names the flag to give.
+    """
+    there = serial_ports()
+    if not there:
+        raise BusError(
+            f"no serial adapter in {DEVICES} (ttyUSB*, ttyACM*): plug the motors' in, name it by "
+            "--port, or give --twin for a simulated hand"
+        )
+    if len(there) > 1:
+        raise BusError(f"there are {', '.join(there)}: name the motors' by --port")
+    return there[0]
+
+
 def _why(path: str, error: OSError) -> str:
     """Why a port cannot be opened, with the remedy."""
     if error.errno in (errno.EBUSY, errno.EWOULDBLOCK):
@@ -85,8 +110,6 @@ def _why(path: str, error: OSError) -> str:
             f"`sudo usermod -aG {group} $USER`, then log out and in again"
         )
     if error.errno == errno.ENOENT:
-        there = sorted(
-            str(one) for kind in ("ttyUSB*", "ttyACM*") for one in Path("/dev").glob(kind)
-        )
-        return f"there is no such device; is the adapter plugged in? There are: {', '.join(there) or 'none'}"
+        there = ", ".join(serial_ports()) or "none"
+        return f"there is no such device; is the adapter plugged in? There are: {there}"
     return f"{error}; is it the motors' adapter?"

@@ -31,6 +31,7 @@ from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.scans import surface_of_scan
 from vd.assets_usd.objects.sets import load_set
 from vd.evaluate.rollout import draw_goals
+from vd.evaluate.statistics import symmetric_error
 
 SCAN_SUFFIXES = (".ply", ".obj", ".glb")
 """Files that are taken as scans."""
@@ -48,6 +49,10 @@ THINNEST = 1e-3
 """Thickness below which points are of one side only, as a share of the longest side."""
 LARGER = 1.5
 """How much larger or smaller than the objects of the paper an object may be."""
+
+
+SHOWN, DRAWS = 3, 16
+"""Goals in a row where none are asked for, and draws of each, of which the farthest is taken."""
 
 
 class GoalError(ValueError):
@@ -139,6 +144,28 @@ def make_goals(
         last = draw_goals(last[None], rng, max_angle)[0]
         goals.append(last)
     return goals
+
+
+def shown_goals(
+    symmetry: np.ndarray, max_angle: float = np.pi, *, seed: int = 0
+) -> list[np.ndarray]:
+    """Goals in a row that show something: of several draws the farthest from the one before.
+
+    Args:
+        symmetry: Rotations that map the object to itself, up to which two goals are apart [K, 4].
+        max_angle: Largest angle between two goals [rad]; the first from no rotation.
+        seed: Of the draws.
+
+    Returns:
+        SHOWN quaternions xyzw.
+    """
+    rng = np.random.default_rng(seed)
+    goals = [np.array([0.0, 0.0, 0.0, 1.0])]
+    for _ in range(SHOWN):
+        before = np.tile(goals[-1], (DRAWS, 1))
+        draws = draw_goals(before, rng, max_angle)
+        goals.append(draws[symmetric_error(before, draws, symmetry).argmax()])
+    return goals[1:]
 
 
 def _goal(text: str, where: str) -> np.ndarray:

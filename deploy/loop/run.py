@@ -20,6 +20,7 @@ import tyro
 
 from vd import interrupt
 from vd.config import require
+from vd.defaults import default_policy, say_same_as
 from vd.deploy.asking import answer, answered, ask, attended
 from vd.deploy.camera.camera import Camera
 from vd.deploy.camera.realsense import RealSenseCfg
@@ -69,7 +70,7 @@ class RunCfg(HandOptions):
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
     """File or name of a policy that sees by camera, with --twin a teacher too, and by
-    default the installed tracking policy of the hand. "zero" is the zero-action baseline."""
+    default the hand's installed vision or tracking policy. "zero" is the zero-action baseline."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj,
     .glb).
@@ -78,7 +79,8 @@ class RunCfg(HandOptions):
     """Orientations of the object to reach, one after the other, in the world frame: quaternions
     x,y,z,w, turns x,y,z@degrees about an axis, or files (.txt, .csv) with one on each line."""
     random_goals: int | None = None
-    """How many goals to draw, 1 by default, in place of --goal; with --ros2 none are drawn."""
+    """How many goals to draw, in place of --goal; by default three, each far from the one before.
+    With --ros2 none are drawn."""
     max_goal_angle: float = np.pi
     """Drawn goals lie within this angle [rad] of the one before."""
     episode_s: float = PAPER.scene.episode_s
@@ -120,14 +122,18 @@ class RunCfg(HandOptions):
         """Largest angle at which a goal is reached [rad]."""
         return PAPER.success.precise_rad if self.precise else PAPER.success.rotation_rad
 
+    @property
+    def policy_name(self) -> str:
+        """The policy, or the installed one of the hand; one that sees, on a twin a teacher too."""
+        kinds = ("vision", "tracking", "teacher") if self.twin else ("vision", "tracking")
+        return self.policy or default_policy(self.hand, *kinds)
+
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
         if self.random_goals is not None and (self.ros2 or self.goal):
             raise ValueError("--random-goals is in place of --ros2 and --goal; leave one out")
-        default = f"{self.hand}-tracking" if self.twin and not Path(self.hand).suffix else None
-        named = self.policy or default
         check_names([], [self.object], self.hand)
-        check_names([] if named is None else [named], [])
+        check_names([self.policy_name], [])
         from vd.deploy.loop.goals import SCAN_SUFFIXES
 
         require(self, "--", "positive", "random_goals episode_s")
@@ -146,10 +152,6 @@ class RunCfg(HandOptions):
             if self.log.exists():
                 raise FileExistsError(f"--log {self.log} is there; choose another name")
             interrupt.need(package)
-        if self.policy is None and not (self.twin or self.ros2):
-            raise ValueError(
-                "name the policy: an installed one, or the file that vd-train tracker wrote"
-            )
 
 
 def run(cfg: RunCfg) -> int:
@@ -168,15 +170,15 @@ def run(cfg: RunCfg) -> int:
         raise FileExistsError(f"{folder} holds a log; choose another folder")
     from vd.assets_usd.hands import load_hand
     from vd.deploy.hardware.connect import motors_of
-    from vd.deploy.loop.goals import make_goals, one_object
+    from vd.deploy.loop.goals import one_object
     from vd.deploy.loop.policy_runner import load_runner
     from vd.deploy.ros import connect_ros
 
     quiet_warp()
-    drawn = 0 if cfg.ros2 else cfg.random_goals or 1
-    goals = make_goals(cfg.goal, drawn, cfg.max_goal_angle, seed=cfg.seed)
     hand = load_hand(cfg.hand, layer=cfg.hand_layer) if cfg.ros2 else motors_of(cfg).hand
-    item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
+    item, name = one_object(cfg.object), cfg.policy_name
+    goals = _goals(cfg, item)
+    _say_chosen(cfg, len(goals))
     tolerance = cfg.tolerance_rad
     told = cfg.object if cfg.twin else None
     runner = load_runner(
@@ -219,6 +221,24 @@ def run(cfg: RunCfg) -> int:
         if fault is not None:
             raise fault
     return status
+
+
+def _say_chosen(cfg: RunCfg, goals: int) -> None:
+    """Say what a run takes that names no policy."""
+    if cfg.policy is None:
+        where = ["--ros2"] if cfg.ros2 else ["--port", cfg.port] if cfg.port else ["--twin"]
+        words = (cfg.policy_name, "--hand", cfg.hand, "--object", cfg.object, *where)
+        say_same_as("vd-deploy", *words, why=f"{goals} goals")
+
+
+def _goals(cfg: RunCfg, item: "ObjectModel") -> list[np.ndarray]:
+    """What was asked for, or where nothing was, what shows something; with ROS 2 none."""
+    from vd.deploy.loop.goals import make_goals, shown_goals
+
+    asked = make_goals(cfg.goal, cfg.random_goals or 0, cfg.max_goal_angle, seed=cfg.seed)
+    if asked or cfg.ros2:
+        return asked
+    return shown_goals(item.symmetry, cfg.max_goal_angle, seed=cfg.seed)
 
 
 def _pursue(

@@ -36,7 +36,7 @@ class ScoreCfg:
     """Score a run by motion capture."""
 
     log: Annotated[Path, tyro.conf.Positional]
-    """Folder that vd-deploy wrote."""
+    """Folder of the log of vd-deploy."""
     mocap: Path
     """Export of the motion capture: CSV with time, x, y, z, qx, qy, qz, qw, tracked; or
     OptiTrack's.

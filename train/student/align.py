@@ -6,7 +6,6 @@ simulation. In stage 1 others are what a camera saw in simulation while the poli
 """
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -166,7 +165,6 @@ class AlignTrainer(TrainingLoop):
         task: The environment's configuration as a dictionary, kept with it.
         looks: What is seen in simulation; None: all pairs are made.
         device: Torch device.
-        deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
     """
 
     def __init__(
@@ -180,9 +178,8 @@ class AlignTrainer(TrainingLoop):
         task: dict[str, Any],
         looks: SimulatedLooks | None = None,
         device: str,
-        deadline: float | None = None,
     ) -> None:
-        super().__init__(run, device=device, deadline=deadline)
+        super().__init__(run, device=device)
         self.scenes, self.cfg, self.network, self.looks = scenes, cfg, network, looks
         self.spec, self.task = spec, task
         self.optimizer = torch.optim.AdamW(network.parameters())
@@ -193,7 +190,6 @@ class AlignTrainer(TrainingLoop):
             torch.device(self.device).type, torch.bfloat16, enabled=cfg.precision == "bf16"
         )
         self._steps_done = 0
-        self._started = time.monotonic()
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint.
@@ -224,7 +220,6 @@ class AlignTrainer(TrainingLoop):
         if self.is_distributed:
             for value in self.network.state_dict().values():
                 torch.distributed.broadcast(value, 0)
-        self._started = time.monotonic()
 
     def _iterate(self) -> dict[str, Any] | None:
         cfg, seen = self.cfg, dict[str, float]()
@@ -331,9 +326,9 @@ class AlignTrainer(TrainingLoop):
         All processes agree.
         """
         share = self.env_steps / max(1, self.run.max_steps)
-        if self._deadline is not None:
-            length = max(1e-3, self._deadline - self._started)
-            share = max(share, (time.monotonic() - self._started) / length)
+        if self.run.max_minutes is not None:
+            length = 60.0 * self.run.max_minutes
+            share = max(share, 1.0 - self._time_left(length) / length)
         if self.is_distributed:
             agreed = torch.tensor(share, device=self.device)
             torch.distributed.all_reduce(agreed, op=torch.distributed.ReduceOp.MAX)

@@ -39,14 +39,11 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
     return replace(task, observation=ObservationCfg())  # who sees by a camera does not look at it
 
 
-def build_student(
-    cfg: StudentTrainCfg, *, started: float | None = None, say: Callable[[str], object] = print
-) -> "AlignTrainer":
+def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print) -> "AlignTrainer":
     """Build network, shapes and environments as ``cfg`` says, save the configuration, and resume if asked.
 
     Args:
         cfg: Configuration.
-        started: ``time.monotonic()`` from which ``max_minutes`` counts; now by default.
         say: Is told when the slow part begins.
 
     Raises:
@@ -77,8 +74,8 @@ def build_student(
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
     from vd.evaluate.agents import open_teacher
+    from vd.train.student.network import open_network
     from vd.vision.alignment import AlignmentNetwork
-    from vd.vision.saved import load_alignment
     from vd.workers import one_thread_without_gpu
 
     rank = int(os.environ.get("RANK", "0"))
@@ -92,10 +89,10 @@ def build_student(
     torch.set_float32_matmul_precision("high")
     network = AlignmentNetwork(cfg.align.network).to(device)
     if cfg.init is not None and checkpoint is None:
-        network.load_state_dict(load_alignment(cfg.init, device)[0].state_dict())
+        network.load_state_dict(open_network(str(cfg.init), device)[0].state_dict())
     own_task = replace(task, seed=cfg.task.seed + rank)
     torch.manual_seed(own_task.seed)
-    kept = {"task": to_dict(task), "device": device, "deadline": cfg.run.deadline(started)}
+    kept = {"task": to_dict(task), "device": device}
     runner = _trainer(cfg, own_task, teacher, network, kept)
     if checkpoint is not None:
         runner.load(checkpoint)

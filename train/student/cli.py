@@ -3,14 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 from vd import interrupt
-from vd.command_line import parse
-from vd.train.flags import normalise, saved_config, starting, value_of
+from vd.command_line import PRINT, ConfigFile, parse
+from vd.defaults import say_same_as
+from vd.evaluate.agents import DEFAULT_POLICY, check_names, find_policy, installed_policies
+from vd.train.flags import machine_preset, normalise, saved_config, starting, value_of
 from vd.train.student.build import build_student
-from vd.train.student.config import ALIGNMENT_NAME, PRESETS, Stage, StudentTrainCfg
-from vd.train.teacher import say_of_main
+from vd.train.student.config import ALIGNMENT_NAME, PRESETS, SIMULATED, StudentTrainCfg, smoke
+from vd.train.teacher import is_main, run_folder, say_of_main
 
 HELP = """Train the student: the network by which a teacher acts on what a camera sees, without a mesh.
 
@@ -30,62 +31,104 @@ def parse_student(flags: Sequence[str]) -> StudentTrainCfg:
     """The configuration that command-line flags ask for.
 
     The first pass finds where to start from (``--preset`` and ``--stage``, the run's own
-    configuration with ``--resume``, the network of ``--init``), as flags and ``--config`` say; the
+    configuration with ``--resume``, the network to begin from), as flags and ``--config`` say; the
     second reads every flag with those values, and over them those of the file, as defaults.
 
     Raises:
         FileNotFoundError: ``--resume`` or ``--init`` name what is not there.
-        ValueError: What they name is not of this version.
+        ValueError: What they name is not of this version, or nothing is installed to begin from.
     """
     arguments, file = starting(normalise(flags, SHORT_FORMS))
-    preset, stage = value_of(arguments, "--preset") or "gpu", value_of(arguments, "--stage") or "0"
-    # The second pass refuses unknown names.
-    number = cast(Stage, int(stage)) if stage in ("0", "1") else 0
-    base = PRESETS.get(preset, PRESETS["gpu"])(number)
-    if "--resume" in arguments:
-        base = saved_config(arguments, base) or _with_init(arguments, base)
-    elif "--help" not in arguments and "-h" not in arguments:
-        base = _with_init(arguments, base)
-    base = base if file is None else file.over(base)
-    cfg: StudentTrainCfg = parse(
-        StudentTrainCfg, arguments, default=base, prog="vd-train student", description=HELP
-    )
-    return cfg
+    if value_of(arguments, "--stage") == "2":
+        raise ValueError("--stage 2: this student has 0 (made clouds) and 1 (what a camera sees)")
+    # Wrong flags and names, and --help, do not wait for torch.
+    asked = _parsed([word for word in arguments if word != PRINT], PRESETS["gpu"](0), file)
+    preset = value_of(arguments, "--preset")
+    if "--smoke" in arguments:
+        base = smoke(asked.stage)
+    else:
+        base = PRESETS[preset or machine_preset(value_of(arguments, "--device"))](asked.stage)
+    if "--resume" in arguments and (saved := saved_config(arguments, base)) is not None:
+        return _parsed(arguments, saved, file)
+    base = replace(base, teacher=asked.teacher or _teacher(base))
+    init = value_of(arguments, "--init")
+    if init is None and base.stage == SIMULATED:
+        from vd.train.student.network import default_network
+
+        init = default_network(_hand(str(base.teacher)), base.preset)
+    return _parsed(arguments, base if init is None else _begun_from(base, init), file)
 
 
-def student_command(arguments: list[str], started: float) -> int:
+def student_command(arguments: list[str]) -> int:
     """``vd-train student``; the exit status."""
     cfg = parse_student(arguments)
+    if is_main():
+        words: list[object] = [
+            "--stage",
+            cfg.stage,
+            "--preset",
+            cfg.preset,
+            "--teacher",
+            cfg.teacher,
+        ]
+        words += [] if cfg.init is None else ["--init", cfg.init]
+        say_same_as("vd-train", "student", *words, "--out", cfg.run.out)
+    with run_folder(cfg) as own:
+        return _train(own)
 
-    from vd.evaluate.agents import check_names
 
-    check_names(
-        [] if cfg.teacher is None else [cfg.teacher], (*cfg.task.objects, *cfg.align.validation)
-    )
+def _train(cfg: StudentTrainCfg) -> int:
+    """Train as ``cfg`` says; the exit status."""
     folder, say = cfg.run.out, say_of_main()
-    runner = build_student(cfg, started=started, say=say)
+    runner = build_student(cfg, say=say)
     if runner.iteration:
         say(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
     elif cfg.init is not None:
         say(f"begins with the weights of {cfg.init}")
     if not runner.run_to_end():
-        say(f"saved in {folder}; go on with: vd-train student --out {folder} --resume")
+        if not cfg.smoke:
+            say(f"saved in {folder}; go on with: vd-train student --out {folder} --resume")
         return interrupt.INTERRUPTED
     say(
-        f"done: {folder}/{ALIGNMENT_NAME} is the network, tensorboard --logdir {folder} draws the "
-        f"curves"
+        "done: everything runs, and the network is of no use"
+        if cfg.smoke
+        else f"done: {folder}/{ALIGNMENT_NAME} is the network, tensorboard --logdir {folder} draws "
+        "the curves"
     )
     return 0
 
 
-def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
-    """``base`` with the network to begin from: its sizes, and its camera."""
-    given = value_of(arguments, "--init")
-    if given is None:
-        return base
-    from vd.vision.saved import load_alignment
+def _parsed(
+    arguments: list[str], base: StudentTrainCfg, file: ConfigFile | None
+) -> StudentTrainCfg:
+    """Every flag, with the values of ``file`` and ``base`` for the others."""
+    base = base if file is None else file.over(base)
+    cfg: StudentTrainCfg = parse(
+        StudentTrainCfg, arguments, default=base, prog="vd-train student", description=HELP
+    )
+    teacher = [] if cfg.teacher is None else [cfg.teacher]
+    check_names(teacher, (*cfg.task.objects, *cfg.align.validation))
+    return cfg
 
-    spec = load_alignment(given)[1]
-    assert spec.camera is None or len(spec.camera) == 7
-    align = replace(base.align, network=spec.network, points=spec.points)
-    return replace(base, init=Path(given), align=align, camera=spec.camera)
+
+def _teacher(base: StudentTrainCfg) -> str:
+    """The policy that acts where none is named: the preset's, if it is installed."""
+    installed = base.teacher is not None and base.teacher in installed_policies()
+    return str(base.teacher) if installed else DEFAULT_POLICY
+
+
+def _hand(teacher: str) -> str:
+    """The hand that a teacher moves."""
+    from vd.bundle.store import read_policy
+
+    return read_policy(find_policy(teacher)).hand
+
+
+def _begun_from(base: StudentTrainCfg, init: str) -> StudentTrainCfg:
+    """``base`` with the network to begin from: its sizes, and its camera."""
+    from vd.train.student.network import open_network
+
+    sizes, camera = open_network(init)[1:]
+    assert camera is None or len(camera) == 7
+    align = replace(base.align, network=sizes)
+    return replace(base, init=Path(init), align=align, camera=camera)

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from vd.train.config import RunCfg, require
+from vd.train.presets import SMOKE_RUN
 from vd.vision.cfg import SEEN_POINTS, AlignmentCfg
 
 Stage = Literal[0, 1]
@@ -125,15 +126,20 @@ class StudentTrainCfg:
     """Train the student."""
 
     preset: PresetName = "gpu"
-    """Settings to start from; every other flag overrides one of them."""
+    """Settings to start from; every other flag overrides one of them. By default gpu, and cpu-demo
+    where there is none."""
     stage: Stage = 0
     """0: learn to turn a goal's cloud onto a seen one, without simulation; 1: also from what a
     depth camera sees while the teacher acts by the network of --init."""
     teacher: str | None = None
     """Policy that acts, also the source of hand and task: a policy.safetensors, a run's folder, or the name
-    of an installed one."""
+    of an installed one; dclaw4 by default."""
     init: Path | None = None
-    """Network to begin from, the alignment.pt of a run; stage 1 needs one."""
+    """Network to begin from, the alignment.pt of a run or an installed vision policy. Of stage 1 by
+    default that of runs/student/stage0, or the one that is installed for the hand."""
+    smoke: bool = False
+    """Check the installation: the stage, tiny, on the CPU, for at most a minute. It learns nothing,
+    and keeps nothing unless --out is given."""
     resume: str | None = None
     """Go on from a checkpoint of --out: latest (a bare --resume), a file, or auto: the latest, and
     a new run where there is none."""
@@ -196,6 +202,26 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
         looks=LooksCfg(kept=2000),
         task=StudentTaskCfg(num_envs=16),
     )
+
+
+def smoke(stage: Stage) -> StudentTrainCfg:
+    """All parts of a stage in at most a minute; it learns nothing."""
+    cfg = cpu_demo(stage)
+    run = replace(cfg.run, out=SMOKE_RUN, max_steps=32, max_minutes=1.0, logger="none")
+    network = AlignmentCfg(width=32, layers=1, tokens=32, patch=16)  # of --init another
+    align = replace(
+        cfg.align,
+        batch=8,
+        steps=2,
+        shapes=16,
+        fresh_shapes=2,
+        hands=4,
+        views=1,
+        network=network,
+    )
+    looks = replace(cfg.looks, steps=2)
+    task = replace(cfg.task, num_envs=4)
+    return replace(cfg, smoke=True, run=run, align=align, looks=looks, task=task)
 
 
 PRESETS: dict[str, Callable[[Stage], StudentTrainCfg]] = {"gpu": gpu, "cpu-demo": cpu_demo}

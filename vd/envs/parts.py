@@ -3,8 +3,8 @@
 from vd.envs.cfg import ObservationCfg
 from vd.kernels.columns import consecutive
 from vd.kernels.task.dynamics import dynamics_size
-from vd.kernels.task.observations import teacher_observation_size
-from vd.kernels.task.shapes import shape_observation_size
+from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
+from vd.kernels.task.shapes import shape_observation_size, shape_observation_slices
 
 
 def observation_parts(cfg: ObservationCfg, fingers: int, joints: int) -> dict[str, slice]:
@@ -27,6 +27,26 @@ def observation_parts(cfg: ObservationCfg, fingers: int, joints: int) -> dict[st
         ),  # last, where a critic that goes on is widened
     }
     return consecutive({name: size for name, size in sizes.items() if size})
+
+
+def observation_columns(cfg: ObservationCfg, fingers: int, joints: int) -> dict[str, slice]:
+    """The same by single quantities: those of state and shape by their names, own terms by theirs.
+
+    Names of what only the critic reads begin with ``critic/``.
+    """
+    columns: dict[str, slice] = {}
+    parts = observation_parts(cfg, fingers, joints)
+    inside = {
+        "state": teacher_observation_slices(fingers, joints),
+        "shape": shape_observation_slices(fingers),
+        "terms": consecutive(dict(cfg.terms)),
+        "critic_terms": consecutive(dict(cfg.critic_terms)),
+    }
+    for part, where in parts.items():
+        for name, within in inside.get(part, {part: slice(0, where.stop - where.start)}).items():
+            told = "critic/" if part in CRITIC_ALONE else ""
+            columns[told + name] = slice(where.start + within.start, where.start + within.stop)
+    return columns
 
 
 CRITIC_ALONE = ("dynamics", "present", "critic_terms")

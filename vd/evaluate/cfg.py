@@ -10,8 +10,9 @@ import tyro
 
 from vd.assets_usd.hands import HANDS
 from vd.config import require
+from vd.defaults import default_policy
 from vd.envs.cfg import RandomisationCfg
-from vd.evaluate.agents import SHIPPED_POLICIES
+from vd.evaluate.agents import DEFAULT_HAND, SHIPPED_POLICIES
 from vd.evaluate.conditions import CONDITIONS, Condition
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, ONE_GOAL, Goals, GoalSchedule
 from vd.paper import PAPER
@@ -175,16 +176,13 @@ class EvalCfg(HandFlags, EpisodeFlags):
 
     @property
     def agent_names(self) -> tuple[str, ...]:
-        """What is evaluated, each once.
+        """What is evaluated, each once; by default the installed teacher of the hand.
 
         Raises:
-            ValueError: Nothing is named.
+            ValueError: The hand has none.
         """
         if not self.policies and self.suite is None:
-            raise ValueError(
-                f"name a policy: a file, zero, random, or an installed one "
-                f"({', '.join(SHIPPED_POLICIES)})"
-            )
+            return (default_policy(self.hand or DEFAULT_HAND, "teacher"),)
         shipped = (name for name in SHIPPED_POLICIES if name.partition("-")[0] in HANDS)
         return tuple(dict.fromkeys(self.policies or shipped))
 

@@ -7,6 +7,7 @@ from itertools import chain
 
 from vd import interrupt
 from vd.command_line import parse
+from vd.defaults import say_same_as
 from vd.evaluate.agents import check_names
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.suite import read_suite
@@ -21,6 +22,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cfg.validate()
         check_names(cfg.agent_names, chain(*parse_groups(cfg.object_sets).values()), cfg.hand)
         check_folder(cfg.out)
+        if not (cfg.policies or cfg.suite):
+            words = (*cfg.agent_names, "--objects", *cfg.object_sets, "--episodes", cfg.episodes)
+            say_same_as("vd-eval", *words, "--out", cfg.out)
         if cfg.suite is None:
             check_file(cfg.out / "eval.json")
         else:

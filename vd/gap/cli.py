@@ -11,6 +11,7 @@ import tyro
 
 from vd import interrupt
 from vd.command_line import parse
+from vd.defaults import say_same_as
 from vd.device import warp_device
 from vd.files import check_folder
 from vd.gap.contact_cli import Contact, HideContact
@@ -67,6 +68,16 @@ class _Step:
     def run(self) -> int:
         """Run the steps, and print the verdict or what the last one wrote."""
         analysis = self.analysis()
+        if self.hand is None and not self.json:
+            words = () if analysis.hand_name is None else ("--hand", analysis.hand_name)
+            say_same_as(
+                "vd-gap",
+                self.first if self.first == self.last else "run",
+                self.recording,
+                *words,
+                "--out",
+                self.out,
+            )
         analysis.run(self.last, first=self.first, fresh=self.fresh or self.first == "report")
         path = analysis.out / f"{self.last}.json"
         if self.json:

@@ -15,8 +15,9 @@ import tyro
 from vd import interrupt
 from vd.command_line import parse
 from vd.config import require
+from vd.defaults import default_policy, say_same_as
 from vd.device import resolve_device
-from vd.evaluate.agents import DEFAULT_POLICY, check_names
+from vd.evaluate.agents import DEFAULT_HAND, check_names
 from vd.evaluate.cfg import LOG_EVERY_S, POLICY_HELP, HandFlags, TaskFlags, episode_limit_s
 from vd.files import check_file
 from vd.hand_log import is_log
@@ -39,11 +40,11 @@ class PlayCfg(HandFlags, TaskFlags):
 
     Starts and goals are as trained; without a policy objects drop, and goals are all of SO(3).
 
-    The folder of a log that vd-deploy wrote in place of the policy replays that run, all of it,
-    whatever the other settings of the simulation. Without arguments it shows dclaw4.
+    The folder of a log of vd-deploy, in place of the policy, replays that run, all of it,
+    whatever the other settings of the simulation. Without a policy it shows the hand's teacher.
     """
 
-    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = DEFAULT_POLICY
+    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = ""
     video: Path | None = None
     """Write this file, .mp4, and exit."""
     seconds: float = VIDEO_SECONDS
@@ -69,6 +70,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-play``; returns the exit status."""
     cfg: PlayCfg = parse(PlayCfg, arguments, prog="vd-play")
     cfg.validate()
+    if not cfg.policy:
+        cfg = replace(cfg, policy=default_policy(cfg.hand or DEFAULT_HAND, "teacher"))
+        say_same_as("vd-play", cfg.policy, "--objects", *cfg.objects, "--port", cfg.port)
     if cfg.video is not None:
         interrupt.need("imageio_ffmpeg")
         check_file(cfg.video)
