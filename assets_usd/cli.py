@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from vd import interrupt
 from vd.assets_usd.objects.settings import ImportSettings
-from vd.command_line import parse
-from vd.files import check_file, check_folder
+from vd.command import interrupt
+from vd.command.files import check_file, check_folder
+from vd.command.line import parse
 
 if TYPE_CHECKING:
     from vd.assets_usd.objects.importer import ImportResult
@@ -35,7 +35,7 @@ class Hand:
     def run(self) -> int:
         """Name or copy hands."""
         from vd.assets_usd.hands import HANDS, hand_usd
-        from vd.files import write_text
+        from vd.command.files import write_text
 
         paths = [hand_usd(name) for name in self.names or HANDS]
         for path in paths:

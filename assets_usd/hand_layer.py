@@ -25,7 +25,7 @@ import numpy as np
 from pxr import Gf, Sdf, Tf, Usd
 
 from vd.assets_usd.hand_data import HandError, HandModel
-from vd.files import atomic_path
+from vd.command.files import atomic_path
 from vd.kernels.servo.actuators import PARAMETER_COLUMNS
 from vd.kernels.servo.effects import BASELINE, EFFECTS, Parameter, neutral_row
 

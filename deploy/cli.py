@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from vd import interrupt
-from vd.command_line import behind_command, parse
+from vd.command import interrupt
+from vd.command.line import behind_command, parse
 
 OK, FAILED = 0, interrupt.FAILED
 """Exit statuses: done, or not, with the reason; after a signal 128 and its number."""

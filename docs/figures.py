@@ -18,9 +18,9 @@ from typing import Any
 
 import yaml
 
+from vd.command.versions import code_fingerprint
 from vd.evaluate.suite_run import fingerprint
 from vd.paper import PAPER
-from vd.versions import code_fingerprint
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"

@@ -18,8 +18,8 @@ import pytest
 import torch
 import warp as wp
 
+from vd.command.warp_quiet import quiet_warp
 from vd.kernels.rng import init_rng_kernel
-from vd.warp_quiet import quiet_warp
 
 quiet_warp()
 # What a shell starts in the background, or nohup, is deaf to these; the tests and what they start

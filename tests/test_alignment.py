@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
-from vd.quaternions import relative_rotation, rotation_distance
+from vd.geometry.quaternions import relative_rotation, rotation_distance
 from vd.train.checkpoint import list_checkpoints
 from vd.train.config import RunCfg
 from vd.train.student.align import AlignTrainer, alignment_losses, make_scenes

@@ -8,7 +8,7 @@ import warp as wp
 
 from vd.assets_usd.hand_data import compose
 from vd.assets_usd.hands import load_hand
-from vd.clouds import HandCloud
+from vd.geometry.clouds import HandCloud
 
 
 @pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])

@@ -19,7 +19,7 @@ from vd.assets_usd.hands import load_hand
 from vd.deploy.loop.log import LogWriter
 from vd.evaluate.result import Result
 from vd.gap.report import write_report
-from vd.log_format import JOINT_CHANNELS
+from vd.logs.log_format import JOINT_CHANNELS
 from vd.train.demo import Demo, Part, main
 from vd.train.metrics import PROGRESS_FILE
 

@@ -36,8 +36,8 @@ from vd.gap.rollout import Rollouts
 from vd.gap.steps import Analysis, Settings
 from vd.kernels.servo.actuators import COMMAND_DELAY
 from vd.logs.recording import read_recording
+from vd.policy.stopping import StoppingRule
 from vd.sim.cfg import SimCfg
-from vd.stopping import StoppingRule
 
 DELAY_S = 0.04
 LAYER = """#usda 1.0

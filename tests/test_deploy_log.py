@@ -17,8 +17,8 @@ from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop import run_page
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.safety.safety import StopReport
-from vd.hand_log import is_log, read_log
-from vd.log_format import (
+from vd.logs.hand_log import is_log, read_log
+from vd.logs.log_format import (
     FOUND_COLUMNS,
     JOINT_CHANNELS,
     STEP_COLUMNS,
@@ -26,11 +26,11 @@ from vd.log_format import (
     TRUTH_COLUMNS,
     LogError,
 )
+from vd.logs.mcap_log import McapLog
 from vd.logs.recording import read_recording
-from vd.mcap_log import McapLog
 from vd.play.cli import main as play
+from vd.play.render import OUT_OF_SIGHT
 from vd.play.replay import Replay
-from vd.render import OUT_OF_SIGHT
 
 STEPS = 30
 SENT_S = 0.02

@@ -20,9 +20,9 @@ from vd.deploy.loop.policy_runner import Decision, PolicyRunner, TrackingRunner
 from vd.deploy.loop.run_page import FILM_FILE, PAGE_FILE, goal_results, summary_line
 from vd.deploy.safety.safety import SafeHand, StoppedError
 from vd.envs.cfg import ReorientCfg
-from vd.hand_log import read_log
+from vd.logs.hand_log import read_log
 from vd.paper import PAPER
-from vd.stopping import StoppingRule
+from vd.policy.stopping import StoppingRule
 
 HZ = PAPER.scene.control_hz
 GOAL = np.array([0.0, 0.0, 0.0, 1.0])

@@ -28,7 +28,7 @@ from vd.deploy.safety.safety import SafeHand, StoppedError
 from vd.deploy.twin.motor import Motor
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.envs.cfg import ReorientCfg
-from vd.stopping import StoppingRule
+from vd.policy.stopping import StoppingRule
 
 GOAL = np.array([0.0, 0.0, 0.0, 1.0])
 MIXED = (

@@ -19,7 +19,7 @@ from vd.deploy.camera.ros_camera import RosCamera
 from vd.deploy.hardware.answers import SilentError
 from vd.deploy.ros import RosHand
 from vd.deploy.safety.safety import SafeHand, StoppedError
-from vd.hand_log import read_log
+from vd.logs.hand_log import read_log
 
 HAND = load_hand("dclaw3")
 

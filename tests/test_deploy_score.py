@@ -11,8 +11,8 @@ from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.mocap import MocapError, read_mocap
 from vd.deploy.loop.score import ScoreCfg, in_world, score, score_run
 from vd.evaluate.statistics import rotation_angle
-from vd.hand_log import read_log
-from vd.log_format import JOINT_CHANNELS, STEP_COLUMNS
+from vd.logs.hand_log import read_log
+from vd.logs.log_format import JOINT_CHANNELS, STEP_COLUMNS
 
 GOALS = 6
 GOAL_S = 5.0

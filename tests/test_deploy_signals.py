@@ -14,8 +14,8 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
 from simulated_hand import energised
 
-from vd import interrupt
 from vd.assets_usd.hands import load_hand
+from vd.command import interrupt
 from vd.deploy import cli
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.joints import read_joints

@@ -11,7 +11,6 @@ import warp as wp
 
 import vd
 from vd.assets_usd.hands import hand_usd
-from vd.bundle.store import read_policy
 from vd.evaluate.agents import (
     POLICY_FOLDER,
     SHIPPED_POLICIES,
@@ -24,7 +23,8 @@ from vd.evaluate.agents import (
 from vd.evaluate.cli import main
 from vd.evaluate.conditions import CONDITIONS
 from vd.evaluate.result import SUCCESS, Result
-from vd.policy_store import describe, read_store
+from vd.policy.bundle import read_policy
+from vd.policy.store import describe, read_store
 from vd.train.begin import find_start
 from vd.train.cli import main as train
 

@@ -17,7 +17,7 @@ from vd.evaluate.result import Agent, Result, judge
 from vd.evaluate.rollout import draw_turns
 from vd.evaluate.statistics import rotation_angle
 from vd.evaluate.trace import record
-from vd.stopping import StoppingRule
+from vd.policy.stopping import StoppingRule
 
 OBJECTS = (FakeObject("a"), FakeObject("b"))
 EPISODES = 4

@@ -17,7 +17,7 @@ from vd.evaluate.result import OUTCOMES, OWN_NORM, SUCCESS, Agent, Protocol, Res
 from vd.evaluate.rollout import draw_starts_and_goals
 from vd.evaluate.statistics import TOLERANCES_RAD, rotation_angle
 from vd.evaluate.trace import NEVER_RAD, record
-from vd.stopping import StoppingRule
+from vd.policy.stopping import StoppingRule
 
 CUBE = Rotation.create_group("O").as_quat()
 SQUARE = Rotation.from_rotvec(np.outer(np.arange(4), [0.0, 0.0, np.pi / 2])).as_quat()

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from test_evaluate_trace import compared
 
+from vd.command.versions import code_fingerprint
 from vd.evaluate import suite_run
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.result import Result
 from vd.evaluate.suite import read_suite
-from vd.versions import code_fingerprint
 
 ROOT = Path(__file__).resolve().parents[1]
 SPEC = importlib.util.spec_from_file_location("figures", ROOT / "docs" / "figures.py")
@@ -117,7 +117,7 @@ def test_code_is_known_by_its_statements(tmp_path, monkeypatch):
     spec = ModuleSpec("x", None, is_package=True)
     spec.submodule_search_locations = [str(tmp_path)]
     with monkeypatch.context() as patch:
-        patch.setattr("vd.versions.find_spec", lambda name: spec)
+        patch.setattr("vd.command.versions.find_spec", lambda name: spec)
         first = digest("x = 1\n")
         assert digest('"""What it is."""\n\n# why\nx = 1  # because\n') == first
         assert digest("x = 2\n") != first

@@ -12,10 +12,17 @@ from full_disk import small_files, somebody_else
 
 from vd.assets_usd.objects.model import write_object
 from vd.assets_usd.objects.procedural import cube
-from vd.bundle.store import write_policy
+from vd.command.files import (
+    OutputError,
+    atomic_path,
+    check_file,
+    check_folder,
+    make_folder,
+    write_text,
+)
 from vd.evaluate.agents import open_policy
-from vd.files import OutputError, atomic_path, check_file, check_folder, make_folder, write_text
 from vd.play.video import write_frames
+from vd.policy.bundle import write_policy
 from vd.train.checkpoint import save_checkpoint
 
 LIMIT = 1 << 16

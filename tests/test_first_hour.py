@@ -75,7 +75,7 @@ def test_what_cannot_be_used_is_refused_before_anything_slow_is_imported(lines, 
 
 @pytest.mark.skipif(wp.is_cuda_available(), reason="this machine has a GPU driver")
 def test_warp_does_not_warn_of_the_gpu_that_a_cpu_machine_lacks():
-    code = "import warp, os, vd.warp_quiet as w; w.quiet_warp(); warp.init(); os.write(2, b'ours')"
+    code = "import warp, os, vd.command.warp_quiet as w; w.quiet_warp(); warp.init(); os.write(2, b'ours')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == "ours"
 

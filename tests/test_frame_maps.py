@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.frame_maps import FrameMaps
+from vd.geometry.frame_maps import FrameMaps
 from vd.kernels.task.observations import teacher_observation_slices
 
 WORLDS = 48

@@ -26,9 +26,9 @@ from vd.assets_usd.hand_import.sheet import joint_table
 from vd.assets_usd.hand_import.source import read_source
 from vd.assets_usd.hand_model import open_stage
 from vd.assets_usd.hands import load_hand
-from vd.bundle.store import read_policy
 from vd.envs.cfg import ObservationCfg, ReorientCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
+from vd.policy.bundle import read_policy
 from vd.train.cli import main as train
 
 REAL = ("leap", "allegro")

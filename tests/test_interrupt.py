@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from vd import interrupt
+from vd.command import interrupt
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[1] / "pyproject.toml").read_text())
 SCRIPTS: dict[str, str] = PROJECT["project"]["scripts"]
@@ -106,7 +106,7 @@ def test_a_child_whose_library_swallows_the_first_signal_ends_with_its_parent_st
     """Some catch everything, the exception of a signal's handler too."""
     script = """
 import signal, sys, time
-from vd import interrupt
+from vd.command import interrupt
 interrupt.ENDING_S = interrupt.PARENT_S = 0.1
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(3))
 interrupt.end_with_parent(-1)

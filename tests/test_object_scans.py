@@ -5,12 +5,12 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from vd.arrays import library_on
 from vd.assets_usd.objects.geometry import mesh_volume, random_surface_points
 from vd.assets_usd.objects.model import SURFACE_POINTS
 from vd.assets_usd.objects.scans import surface_of_scan
 from vd.assets_usd.objects.sets import load_set
 from vd.evaluate.scanned import MISSING, NOISE_M, known_by_points, known_objects, scan
+from vd.geometry.arrays import library_on
 from vd.tracking.registration import Registration
 from vd.tracking.symmetry import symmetries
 

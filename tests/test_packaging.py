@@ -13,8 +13,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from vd.command.interrupt import EXTRAS, command
 from vd.evaluate.agents import DEFAULT_POLICY, POLICY_LIST, SHIPPED_POLICIES
-from vd.interrupt import EXTRAS, command
 from vd.train.cli import main
 from vd.train.demo import CAMERA_POLICY
 
@@ -85,7 +85,7 @@ def test_wheel_holds_modules_policies_and_what_else_is_read(wheel):
     assert {name for name in sizes if name.endswith(".py")} == installed_names()
     assert {name.split("/")[0] for name in sizes if ".dist-info/" not in name} == {"vd"}
     assert {
-        f"vd/templates/{path.name}" for path in (ROOT / "vd/templates").iterdir()
+        f"vd/command/templates/{path.name}" for path in (ROOT / "vd/command/templates").iterdir()
     } <= sizes.keys()
     assert {
         f"vd/assets_usd/usd/{path.name}" for path in (ROOT / "assets_usd/usd").iterdir()

@@ -12,7 +12,11 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save
 
 from vd.assets_usd.hands import load_hand
-from vd.bundle.contract import (
+from vd.envs.cfg import ReorientCfg
+from vd.evaluate.agents import SHIPPED_POLICIES, open_policy
+from vd.evaluate.cli import main as evaluate
+from vd.policy.bundle import read_contract, read_policy, write_policy
+from vd.policy.contract import (
     CONTRACT_KEY,
     SEAL_KEY,
     UNSEALED,
@@ -22,10 +26,6 @@ from vd.bundle.contract import (
     derive_interface,
     sealed,
 )
-from vd.bundle.store import read_contract, read_policy, write_policy
-from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import SHIPPED_POLICIES, open_policy
-from vd.evaluate.cli import main as evaluate
 from vd.train.cli import main as train
 
 PLACED = (0.5, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)
@@ -195,10 +195,10 @@ def test_another_camera_is_refused_unless_the_policy_has_its_own(hand):
 def test_a_policy_is_read_without_simulator_and_its_contract_without_torch():
     code = """
 import sys
-from vd.bundle.contract import Contract
-from vd.onnx_policy import read_onnx
+from vd.policy.contract import Contract
+from vd.policy.onnx import read_onnx
 assert "torch" not in sys.modules
-from vd.bundle.store import read_policy
+from vd.policy.bundle import read_policy
 read_policy(sys.argv[1])
 loaded = {"newton", "mujoco", "rsl_rl", "pxr"} & set(sys.modules)
 assert not loaded, loaded

@@ -11,10 +11,9 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from vd import policy_store
 from vd.evaluate import agents
 from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, pulled_folder
-from vd.policy_store import main
+from vd.policy.store import main
 
 CUBE, OTHER = (SHIPPED_POLICIES[name].read_bytes() for name in ("dclaw4-cube", "dclaw4"))
 
@@ -114,7 +113,7 @@ def test_a_repository_of_hugging_face_is_read_and_gets_policy_and_list_at_once(
     served, monkeypatch, capsys
 ):
     url, asked, _ = served
-    monkeypatch.setattr(policy_store, "HUB_URL", url)
+    monkeypatch.setattr("vd.policy.store.HUB_URL", url)
     monkeypatch.setenv("HF_TOKEN", "secret")
     assert main(["pull", "mine", "--at", "hf://me/hands"]) == 0
     path, headers = asked[-1]

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.model import ObjectModel
-from vd.render import Camera, Renderer
+from vd.play.render import Camera, Renderer
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0]
 FACES = [[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6], [0, 4, 5], [0, 5, 1]]

@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from vd.stopping import StoppingRule, StoppingRules, calibrate
+from vd.policy.stopping import StoppingRule, StoppingRules, calibrate
 
 TOLERANCE = 0.4
 

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from vd.assets_usd.hands import load_hand
-from vd.senses import Senses
+from vd.policy.senses import Senses
 from vd.vision.cfg import StudentCfg
 from vd.vision.rotations import (
     matrices,

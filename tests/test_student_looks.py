@@ -12,11 +12,11 @@ import pytest
 import torch
 from test_alignment import TINY
 
-from vd.bundle.contract import TrackingSpec
-from vd.bundle.store import read_policy, write_policy
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import SHIPPED_POLICIES, find_policy
+from vd.policy.bundle import read_policy, write_policy
+from vd.policy.contract import TrackingSpec
 from vd.tracking.policy import TrackingPolicy
 from vd.train.cli import main
 from vd.train.metrics import read_progress

@@ -11,9 +11,7 @@ from sensed_world import state_of
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
-from vd.bundle.contract import Contract, PolicySpec, TrackingSpec
-from vd.bundle.store import read_policy, write_policy
-from vd.config import to_dict
+from vd.command.config import to_dict
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.policy_runner import TrackingRunner
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
@@ -26,7 +24,9 @@ from vd.evaluate.trace import Trace
 from vd.evaluate.tracking import TrackingActor, sensed
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
-from vd.policy import TrainedPolicy, perceptron
+from vd.policy.actor import TrainedPolicy, perceptron
+from vd.policy.bundle import read_policy, write_policy
+from vd.policy.contract import Contract, PolicySpec, TrackingSpec
 from vd.sensors.cfg import DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.tracking.camera_observer import UNSEEN, CameraObserver

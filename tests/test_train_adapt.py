@@ -8,10 +8,10 @@ from test_evaluate_trace import FakeObject, judged, traced
 
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hands import load_hand
-from vd.bundle.store import read_policy
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.conditions import EXACT
 from vd.evaluate.result import Result
+from vd.policy.bundle import read_policy
 from vd.train import adapt
 from vd.train.adapt import AdaptCfg, teacher_cfg
 from vd.train.flags import write_config

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from vd.assets_usd.hands import HANDS
-from vd.config import from_dict, to_dict
-from vd.device import resolve_device
+from vd.command.config import from_dict, to_dict
+from vd.command.device import resolve_device
 from vd.train.cli import main
 from vd.train.config import validate
 from vd.train.flags import OF_HELP_ALL, parse_teacher
@@ -180,7 +180,7 @@ def test_devices_that_do_not_exist_are_named(name):
 def test_export_commands(tmp_path, capsys):
     from train_dummy import make_runner
 
-    from vd.bundle.store import read_contract
+    from vd.policy.bundle import read_contract
 
     make_runner(tmp_path).learn(1)
     whole = tmp_path / "checkpoints" / "model_0000001.pt"

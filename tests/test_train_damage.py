@@ -10,8 +10,8 @@ import torch
 from full_disk import small_files
 from train_dummy import make_runner, simulating_the_dummy
 
-from vd.files import OutputError
-from vd.policy import read_state
+from vd.command.files import OutputError
+from vd.policy.actor import read_state
 from vd.train.checkpoint import checkpoint_path, find_checkpoint, list_checkpoints
 from vd.train.metrics import read_progress
 

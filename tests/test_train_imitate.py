@@ -7,7 +7,7 @@ import pytest
 import torch
 from train_dummy import SMALL_PPO, DummyEnv, make_runner
 
-from vd.bundle.store import read_policy
+from vd.policy.bundle import read_policy
 from vd.train.checkpoint import find_checkpoint
 from vd.train.cli import main
 from vd.train.config import PolicyCfg

@@ -11,11 +11,11 @@ import pytest
 import torch
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
-from vd.bundle.store import read_contract, read_policy, write_policy
-from vd.config import to_dict
+from vd.command.config import to_dict
 from vd.envs.cfg import CurriculumCfg, ReorientCfg, TighteningCfg
 from vd.evaluate.agents import SHIPPED_POLICIES
-from vd.policy import MeanAction
+from vd.policy.actor import MeanAction
+from vd.policy.bundle import read_contract, read_policy, write_policy
 from vd.train import begin
 from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start
 from vd.train.checkpoint import BEST_NAME, find_checkpoint

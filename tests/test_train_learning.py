@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
-from vd.policy import TrainedPolicy
+from vd.policy.actor import TrainedPolicy
 from vd.train.distribution import BoundedStdGaussian
 from vd.train.metrics import GoalWindow, StepMeans, read_progress
 from vd.train.ppo import RUNAWAY_KL
@@ -183,7 +183,7 @@ def test_policy_equals_the_actor_it_came_from(tmp_path, distribution, normalise)
     )
     runner = make_runner(tmp_path, policy=policy)
     runner.learn(3)
-    from vd.bundle.store import read_policy
+    from vd.policy.bundle import read_policy
 
     observation = runner.env.get_observations()
     wanted = runner.alg.get_policy()(observation)

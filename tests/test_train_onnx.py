@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from vd.bundle.store import read_policy
 from vd.evaluate.agents import SHIPPED_POLICIES, open_policy
-from vd.onnx_policy import read_onnx
+from vd.policy.bundle import read_policy
+from vd.policy.onnx import read_onnx
 from vd.train.cli import main
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="pip install 'visual-dexterity[export]'")

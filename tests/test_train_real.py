@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from vd.bundle.store import read_policy
 from vd.envs.cfg import ReorientCfg
+from vd.policy.bundle import read_policy
 from vd.sim.cfg import SimCfg, coarser
 from vd.train.checkpoint import checkpoint_path
 from vd.train.metrics import PROGRESS_FILE, read_progress

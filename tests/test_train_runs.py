@@ -10,8 +10,8 @@ import pytest
 import torch
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
-from vd.bundle.store import read_policy
 from vd.envs.curriculum import Stage
+from vd.policy.bundle import read_policy
 from vd.train.checkpoint import find_checkpoint, list_checkpoints, load_checkpoint
 from vd.train.loop import Interrupted, TrainingDivergedError
 from vd.train.metrics import GoalWindow, read_progress

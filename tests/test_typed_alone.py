@@ -17,11 +17,11 @@ from test_first_hour import SCRIPTS
 
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hands import load_hand
-from vd.defaults import default_policy
+from vd.command.files import locked
 from vd.deploy.loop.goals import SHOWN, shown_goals
 from vd.evaluate.statistics import symmetric_error
-from vd.files import locked
 from vd.gap.recording import write_recording
+from vd.policy.defaults import default_policy
 from vd.train import adapt, tracker
 from vd.train.flags import parse_teacher
 from vd.train.student.cli import parse_student
@@ -180,7 +180,7 @@ def test_default_goals_are_turns_that_can_be_seen():
 def test_a_folder_is_one_trainings_and_that_of_a_dead_one_is_free(tmp_path, typed):
     folder = tmp_path / "run"
     hold = (
-        "import sys, time, pathlib; from vd.files import locked\n"
+        "import sys, time, pathlib; from vd.command.files import locked\n"
         "with locked(pathlib.Path(sys.argv[1])): print('has it', flush=True); time.sleep(100)"
     )
     other = subprocess.Popen(

@@ -3,7 +3,7 @@
 import os
 import time
 
-from vd.workers import SINGLE, run_tasks
+from vd.command.workers import SINGLE, run_tasks
 
 
 def work(task):

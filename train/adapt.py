@@ -8,13 +8,13 @@ from typing import Annotated
 
 import tyro
 
-from vd.command_line import parse
-from vd.config import require
-from vd.defaults import default_policy, say_same_as
-from vd.device import resolve_device
+from vd.command.config import require
+from vd.command.device import resolve_device
+from vd.command.line import parse, say_same_as
 from vd.evaluate.agents import DEFAULT_HAND, DEFAULT_POLICY, NO_LAYER, check_names, policy_at
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.conditions import EXACT
+from vd.policy.defaults import default_policy
 from vd.train.begin import find_start, read_start, settings_of
 from vd.train.flags import saved_config
 from vd.train.presets import PRESETS, TeacherCfg

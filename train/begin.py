@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vd.config import from_dict, leaves, to_dict
+from vd.command.config import from_dict, leaves, to_dict
 
 if TYPE_CHECKING:
     from torch import nn
 
-    from vd.bundle.contract import PolicySpec
+    from vd.policy.contract import PolicySpec
     from vd.train.presets import TeacherCfg
 
 CRITIC_WARMUP = 50
@@ -76,9 +76,9 @@ def read_start(path: Path, device: str = "cpu") -> dict[str, Any]:
     Raises:
         ValueError: The file is damaged, no teacher, or of another version.
     """
-    from vd.bundle import SUFFIX, has_suffix
-    from vd.bundle.store import read_policy
-    from vd.policy import TrainedPolicy, stage_of
+    from vd.policy import SUFFIX, has_suffix
+    from vd.policy.actor import TrainedPolicy, stage_of
+    from vd.policy.bundle import read_policy
     from vd.train.checkpoint import load_checkpoint
 
     if not has_suffix(path, SUFFIX):
@@ -242,8 +242,8 @@ def check_fit(
         ValueError: Another hand, an actor of another shape, or one that observes what is no more;
             with the remedy.
     """
-    from vd.bundle.contract import PolicySpec
     from vd.envs.cfg import ObservationCfg
+    from vd.policy.contract import PolicySpec
 
     found = from_dict(PolicySpec, state["policy"], where="policy")
     hand, here = state["task"].get("hand"), task.get("hand")

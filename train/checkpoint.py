@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from vd.bundle import SUFFIX, has_suffix
-from vd.files import atomic_path
-from vd.policy import read_state
+from vd.command.files import atomic_path
+from vd.policy import SUFFIX, has_suffix
+from vd.policy.actor import read_state
 
 CHECKPOINT_FOLDER = "checkpoints"
 BEST_NAME = "best.pt"

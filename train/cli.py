@@ -4,8 +4,8 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from vd import interrupt
-from vd.command_line import behind_command
+from vd.command import interrupt
+from vd.command.line import behind_command
 
 USAGE = """usage: vd-train COMMAND [flags]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from vd.config import require
+from vd.command.config import require
 from vd.paper import PAPER
 
 

@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tyro
 
-from vd import interrupt
-from vd.command_line import parse
-from vd.config import require
-from vd.defaults import default_policy
-from vd.files import check_folder
+from vd.command import interrupt
+from vd.command.config import require
+from vd.command.files import check_folder
+from vd.command.line import parse
 from vd.paper import PAPER
+from vd.policy.defaults import default_policy
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -230,7 +230,7 @@ class Demo:
 
     def write(self, *, running: bool) -> None:
         """Write the page; one of a demo that is ``running`` is read again by the browser."""
-        from vd.page import write_html
+        from vd.command.page import write_html
 
         refresh = REFRESH_S if running else None
         write_html(self.page, "demo.html", parts=self.parts, refresh=refresh, minutes=self.minutes)
@@ -299,7 +299,7 @@ class Demo:
         ]
         words += ["--seed", str(self.cfg.seed), "--safety.misses", MISSES]
         part.run([*words, "--log", log])
-        from vd.hand_log import read_log
+        from vd.logs.hand_log import read_log
 
         run = read_log(log)
         sent, stops = (

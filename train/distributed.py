@@ -13,7 +13,7 @@ import torch
 from torch.distributed import PrefixStore
 from torch.distributed.rendezvous import rendezvous
 
-from vd.files import OutputError
+from vd.command.files import OutputError
 
 START_TIMEOUT = timedelta(minutes=20)
 """Longest wait for the slowest process to build its environments; compiling kernels takes 3

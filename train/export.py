@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from vd import interrupt
-from vd.bundle import ONNX_SUFFIX, SUFFIX, check_suffix, has_suffix
-from vd.command_line import parse
-from vd.files import atomic_path, check_file
+from vd.command import interrupt
+from vd.command.files import atomic_path, check_file
+from vd.command.line import parse
+from vd.policy import ONNX_SUFFIX, SUFFIX, check_suffix, has_suffix
 
 if TYPE_CHECKING:
     from torch import Tensor
     from torch.nn import Module
 
-    from vd.bundle.contract import Contract
-    from vd.policy import TrainedPolicy
+    from vd.policy.actor import TrainedPolicy
+    from vd.policy.contract import Contract
     from vd.tracking.policy import TrackingPolicy
 
 CHECKED = 64
@@ -63,9 +63,9 @@ def export_command(arguments: list[str]) -> int:
     if cfg.resumable:
         _export_checkpoint(Path(cfg.policy), cfg.output)
         return 0
-    from vd.bundle.contract import without_folders
-    from vd.bundle.store import write_policy
     from vd.evaluate.agents import find_policy, open_policy
+    from vd.policy.bundle import write_policy
+    from vd.policy.contract import without_folders
 
     policy = open_policy(find_policy(cfg.policy), "cpu")
     assert policy is not None  # a file was found
@@ -101,8 +101,8 @@ def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path, contract: 
     """
     import torch
 
-    from vd.onnx_policy import onnx_metadata
-    from vd.policy import TrainedPolicy
+    from vd.policy.actor import TrainedPolicy
+    from vd.policy.onnx import onnx_metadata
     from vd.vision.alignment import Residual
 
     interrupt.need("onnx", "onnxscript")
@@ -145,7 +145,7 @@ def _export(
     import onnx
     import torch
 
-    from vd.bundle.contract import SEAL_KEY, UNSEALED, sealed
+    from vd.policy.contract import SEAL_KEY, UNSEALED, sealed
 
     network = network.eval().requires_grad_(False)
     number = torch.export.Dim("environments")

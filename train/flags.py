@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 import tyro
 
-from vd.command_line import PRINT, ConfigFile, parse, take_config
-from vd.config import from_dict, to_dict
-from vd.device import resolve_device
+from vd.command.config import from_dict, to_dict
+from vd.command.device import resolve_device
+from vd.command.files import write_json
+from vd.command.line import PRINT, ConfigFile, parse, take_config
 from vd.evaluate.agents import check_names
-from vd.files import write_json
 from vd.train.begin import settings_of
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
 
@@ -71,7 +71,7 @@ def parse_teacher(
 ) -> TeacherCfg:
     """The configuration that command-line flags ask for.
 
-    ``say`` (:func:`vd.defaults.say_same_as`) is told what the machine decided.
+    ``say`` (:func:`vd.command.line.say_same_as`) is told what the machine decided.
 
     The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins
     from, or the run's own configuration with ``--resume``), as flags and ``--config`` say; the

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from vd import interrupt
-from vd.policy import CHECKPOINT_FORMAT
+from vd.command import interrupt
+from vd.policy.actor import CHECKPOINT_FORMAT
 from vd.train.checkpoint import (
     CHECKPOINT_FOLDER,
     checkpoint_path,

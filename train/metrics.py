@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from vd.files import make_folder, write_text, writing
+from vd.command.files import make_folder, write_text, writing
 from vd.train.flags import CONFIG_NAME
 
 PROGRESS_FILE = "progress.jsonl"

@@ -314,7 +314,7 @@ def make_learner(
         distribution |= {"class_name": BoundedStdGaussian}
     shape: dict[str, Any] = {
         "hidden_dims": policy.hidden,
-        "activation": "elu",  # as of vd.policy.perceptron
+        "activation": "elu",  # as of vd.policy.actor.perceptron
         "obs_normalization": policy.normalise_observations,
     }
     return TeacherPPO(

@@ -11,12 +11,12 @@ from typing import Any
 import torch
 from torch import nn
 
-from vd.bundle import SUFFIX
-from vd.bundle.contract import PolicySpec
-from vd.bundle.store import write_policy
-from vd.config import to_dict
+from vd.command.config import to_dict
 from vd.envs.curriculum import blend
-from vd.policy import teacher_in
+from vd.policy import SUFFIX
+from vd.policy.actor import teacher_in
+from vd.policy.bundle import write_policy
+from vd.policy.contract import PolicySpec
 from vd.train.begin import check_fit, completed, read_start, unlike, warmup_iterations, widen
 from vd.train.checkpoint import (
     BEST_NAME,
@@ -41,7 +41,7 @@ class TeacherRunner(TrainingLoop):
     """Trains the teacher with rsl-rl's PPO.
 
     ``task`` is the configuration of the environment, kept with every policy, as is ``interface``
-    (:func:`vd.bundle.contract.derive_interface`); others as of TrainingLoop.
+    (:func:`vd.policy.contract.derive_interface`); others as of TrainingLoop.
 
     Attributes:
         new_inputs: Observed values that the networks of the policy that it began from did not read.

@@ -9,16 +9,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeVar
 
-from vd import interrupt
-from vd.config import to_dict
-from vd.defaults import say_same_as
-from vd.device import resolve_device
-from vd.files import check_folder, locked
+from vd.command import interrupt
+from vd.command.config import to_dict
+from vd.command.device import resolve_device
+from vd.command.files import check_folder, locked
+from vd.command.line import say_same_as
+from vd.command.warp_quiet import quiet_warp
 from vd.train.begin import find_start, read_start
 from vd.train.config import validate
 from vd.train.flags import parse_teacher, write_config
 from vd.train.presets import SMOKE_RUN, TeacherCfg
-from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.train.runner import TeacherRunner
@@ -70,8 +70,8 @@ def build_teacher(cfg: TeacherCfg, *, say: Callable[[str], object] = print) -> "
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
     from vd.assets_usd.hands import load_hand
-    from vd.bundle.contract import derive_interface
     from vd.envs.reorient import ReorientEnv
+    from vd.policy.contract import derive_interface
     from vd.sim.cfg import coarser
     from vd.train.runner import TeacherRunner
     from vd.train.vec_env import ReorientVecEnv

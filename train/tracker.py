@@ -13,19 +13,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from vd.bundle import SUFFIX, check_suffix
-from vd.command_line import parse
-from vd.defaults import say_same_as
-from vd.device import resolve_device
+from vd.command.device import resolve_device
+from vd.command.files import check_file
+from vd.command.line import parse, say_same_as
 from vd.evaluate.agents import DEFAULT_POLICY, check_names
 from vd.evaluate.cfg import EpisodeFlags, EvalCfg
 from vd.evaluate.goals import Goals
-from vd.files import check_file
 from vd.paper import PAPER
+from vd.policy import SUFFIX, check_suffix
 
 if TYPE_CHECKING:
-    from vd.bundle.contract import Contract, TrackingSpec
     from vd.evaluate.trace import Trace
+    from vd.policy.contract import Contract, TrackingSpec
     from vd.tracking.policy import TrackingPolicy
 
 
@@ -98,13 +97,13 @@ def _track(cfg: TrackerCfg) -> int:
     """Run the episodes, choose the rules and write the policy."""
     check_file(cfg.out)
     print("running the episodes ...", flush=True)
-    from vd.bundle.contract import TrackingSpec
-    from vd.bundle.store import write_policy
+    from vd.command.warp_quiet import quiet_warp
     from vd.evaluate.agents import open_teacher, policy_name
-    from vd.stopping import calibrate
+    from vd.policy.bundle import write_policy
+    from vd.policy.contract import TrackingSpec
+    from vd.policy.stopping import calibrate
     from vd.tracking.policy import TrackingPolicy
     from vd.train.student.network import open_network
-    from vd.warp_quiet import quiet_warp
 
     quiet_warp()
     device = resolve_device(cfg.device)
@@ -162,8 +161,8 @@ def _track(cfg: TrackerCfg) -> int:
 def _contract(policy: "TrackingPolicy", spec: "TrackingSpec") -> "Contract":
     """What the file says of a policy that sees so, with the hand of its teacher."""
     from vd.assets_usd.hands import load_hand
-    from vd.bundle.contract import derive_interface
     from vd.envs.cfg import ReorientCfg
+    from vd.policy.contract import derive_interface
 
     task = ReorientCfg.of(policy)
     interface = derive_interface(task, load_hand(task.hand, task.fingertip), spec)

@@ -10,7 +10,7 @@ import warp as wp
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from vd.config import to_dict
+from vd.command.config import to_dict
 from vd.envs.saved_state import saved_stage
 from vd.paper import PAPER
 

@@ -38,7 +38,7 @@ def load_policy(name: str | Path, env: "ReorientEnv | None" = None, device: str 
         FileNotFoundError: There is no such file.
         ValueError: The file is no policy.
     """
-    from vd.device import resolve_device
+    from vd.command.device import resolve_device
     from vd.evaluate.agents import open_policy
     from vd.evaluate.compare import actor_of
 
@@ -64,7 +64,7 @@ def evaluate_policies(*policies: str | Path, **settings: Any) -> "Result":
         FileNotFoundError: There is no such policy.
         ValueError: A setting or a set of objects cannot be used.
     """
-    from vd.config import from_dict
+    from vd.command.config import from_dict
     from vd.evaluate.agents import check_names, policy_at
     from vd.evaluate.cfg import EvalCfg, parse_groups
     from vd.evaluate.compare import compare
@@ -124,7 +124,7 @@ class ObjectTracker:
         """
         import torch
 
-        from vd.device import resolve_device
+        from vd.command.device import resolve_device
         from vd.kernels.task.observations import teacher_observation_size
         from vd.paper import PAPER
         from vd.sensors.depth_cloud import CameraCloud
@@ -163,7 +163,7 @@ class ObjectTracker:
         import torch
         import warp as wp
 
-        from vd.senses import Senses
+        from vd.policy.senses import Senses
 
         points = wp.to_torch(self._cloud.seen(depth))
         joints = torch.as_tensor(joint_q, dtype=torch.float32, device=points.device)[None]
@@ -235,17 +235,17 @@ def read(path: str | Path) -> Any:
         FileNotFoundError: There is no such file.
         ValueError: It is none of these, damaged, or of another version.
     """
-    from vd.bundle import SUFFIX, has_suffix
     from vd.evaluate.result import Result
     from vd.gap.result import Report
-    from vd.hand_log import is_log, read_log
+    from vd.logs.hand_log import is_log, read_log
     from vd.logs.recording import read_recording
+    from vd.policy import SUFFIX, has_suffix
 
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"there is no {path}")
     if has_suffix(path, SUFFIX):
-        from vd.bundle.store import read_policy
+        from vd.policy.bundle import read_policy
 
         return read_policy(path)
     if is_log(path):
@@ -284,8 +284,8 @@ def write(value: Any, path: str | Path) -> None:
     elif isinstance(value, Report | Result):
         value.write(Path(path))
     elif hasattr(value, "task"):
-        from vd.bundle.contract import without_folders
-        from vd.bundle.store import write_policy
+        from vd.policy.bundle import write_policy
+        from vd.policy.contract import without_folders
 
         write_policy(value, Path(path), without_folders(value.contract))
     else:

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 import warp as wp
 
-from vd.config import from_dict, to_dict
+from vd.command.config import from_dict, to_dict
+from vd.command.interrupt import remedy
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.interrupt import remedy
 from vd.sim.simulator import CHECKED
 
 try:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vd.assets_usd.hand_data import HandError, MotorModel
-from vd.config import from_dict
+from vd.command.config import from_dict
 
 BUILT_IN = ("leap", "allegro")
 """Hands whose description comes with the package."""

@@ -19,7 +19,7 @@ from vd.assets_usd.hand_import.tree import Tree, grow
 from vd.assets_usd.hand_model import open_stage, read_hand
 from vd.assets_usd.hands import HANDS, imported_folder
 from vd.assets_usd.objects.plan import prim_name
-from vd.files import make_folder
+from vd.command.files import make_folder
 
 DEEP_M = 0.0005
 """Colliders that are less than this in each other touch."""

@@ -17,7 +17,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandError, compose
-from vd.warp_quiet import quiet_warp
+from vd.command.warp_quiet import quiet_warp
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 UNLIMITED = 1e4

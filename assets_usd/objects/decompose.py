@@ -24,8 +24,8 @@ from vd.assets_usd.objects.geometry import (
     simplify_hull,
 )
 from vd.assets_usd.objects.settings import LEAST_THRESHOLD, ImportSettings
-from vd.interrupt import end_with_parent
-from vd.workers import end_worker
+from vd.command.interrupt import end_with_parent
+from vd.command.workers import end_worker
 
 HULL_VERTICES = 32
 """Most vertices of a part."""

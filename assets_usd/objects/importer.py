@@ -47,9 +47,9 @@ from vd.assets_usd.objects.repair import LONG, repair_mesh
 from vd.assets_usd.objects.sets import check_set_folder
 from vd.assets_usd.objects.settings import ImportSettings, MeshError
 from vd.assets_usd.objects.usd_mesh import usd_files
-from vd.files import make_folder
-from vd.warp_quiet import quiet_warp
-from vd.workers import run_tasks
+from vd.command.files import make_folder
+from vd.command.warp_quiet import quiet_warp
+from vd.command.workers import run_tasks
 
 IMPORT_VERSION = 6
 """Part of every content hash: raise it when the import computes something else."""

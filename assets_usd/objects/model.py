@@ -30,7 +30,7 @@ from vd.assets_usd.objects.contact_layer import (
     read_contact,
 )
 from vd.assets_usd.objects.geometry import Hull, Solid, principal_axes
-from vd.files import atomic_path
+from vd.command.files import atomic_path
 from vd.paper import PAPER
 
 FORMAT_VERSION = 1

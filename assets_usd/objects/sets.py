@@ -14,7 +14,7 @@ from vd.assets_usd.objects.model import (
     stored_facts,
     write_object,
 )
-from vd.files import make_folder, writing
+from vd.command.files import make_folder, writing
 
 HELD_OUT_COUNT = 30
 """Objects of ``procedural-heldout``: a dozen worlds each in an evaluation of a few hundred."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from vd.assets_usd.hands import check_hand_name
-from vd.config import require
+from vd.command.config import require
 
 LEAST_THRESHOLD = 0.01
 """CoACD takes no smaller one."""

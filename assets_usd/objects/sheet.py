@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from vd.assets_usd.objects.model import ObjectModel
-from vd.files import atomic_path
+from vd.command.files import atomic_path
 
 MESH_COLOUR = (0.62, 0.68, 0.76)
 WARNING_COLOUR = "#be5014"

@@ -18,7 +18,8 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel, compose, invert
-from vd.config import require
+from vd.command.config import require
+from vd.command.files import check_file
 from vd.deploy.camera.camera import CameraError
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
@@ -28,7 +29,6 @@ from vd.deploy.hardware.answers import BusError
 from vd.deploy.hardware.check import confirm
 from vd.deploy.hardware.connect import HandOptions, connect, motors_of
 from vd.deploy.safety.signals import held
-from vd.files import check_file
 from vd.paper import PAPER
 
 SIDE_M = 0.020

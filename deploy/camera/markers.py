@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from vd import interrupt
+from vd.command import interrupt
+from vd.command.files import atomic_path
 from vd.deploy.camera.camera import CameraError
-from vd.files import atomic_path
 
 DICTIONARY = "DICT_4X4_50"
 """Few and large cells, since markers on fingertips are small in the image."""

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from vd import interrupt
 from vd.assets_usd.hand_data import Intrinsics
-from vd.config import require
+from vd.command import interrupt
+from vd.command.config import require
 from vd.deploy.camera.camera import CameraError, Frame, StaleCamera
 
 MILLISECOND = 1e-3

@@ -94,7 +94,7 @@ def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
         TwinError: The twin did not start.
         BusError: The port cannot be opened.
     """
-    from vd.command_line import parse
+    from vd.command.line import parse
     from vd.deploy.hardware.bus import MotorBus
     from vd.deploy.twin.child import TwinChild
     from vd.deploy.twin.twin import TwinCommand

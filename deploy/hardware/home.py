@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from vd.config import require
+from vd.command.config import require
 from vd.deploy.hardware.check import ready
 from vd.deploy.hardware.connect import HandOptions, connect
 from vd.deploy.safety.limits import SafetyCfg

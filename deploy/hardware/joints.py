@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel, MotorModel
-from vd.config import from_dict
+from vd.command.config import from_dict
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.control_table import RAD_S_PER_COUNT, Model, motor_model, to_angle
 from vd.deploy.hardware.packets import MAX_ID

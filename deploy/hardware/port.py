@@ -11,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vd import interrupt
+from vd.command import interrupt
 from vd.deploy.hardware.answers import BusError
 
 BAUD_RATE = 1_000_000

@@ -16,7 +16,8 @@ import numpy as np
 import tyro
 from scipy.stats import theilslopes
 
-from vd.config import require
+from vd.command.config import require
+from vd.command.files import check_folder
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.aside import aside
@@ -27,8 +28,7 @@ from vd.deploy.hardware.control_table import RAD_PER_COUNT, TICK_MODULUS
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
 from vd.deploy.timely import undisturbed
-from vd.files import check_folder
-from vd.hand_log import read_columns
+from vd.logs.hand_log import read_columns
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel

@@ -17,11 +17,11 @@ import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hands import called
+from vd.command.files import make_folder, write_json, writing
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.hardware.control_table import RAD_PER_COUNT
 from vd.deploy.safety.safety import StopReport
-from vd.files import make_folder, write_json, writing
-from vd.log_format import (
+from vd.logs.log_format import (
     EVENTS_FILE,
     FOUND_COLUMNS,
     JOINT_CHANNELS,

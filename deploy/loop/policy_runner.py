@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from vd.arrays import Array, as_warp, library_of, of_warp
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.bundle import ONNX_SUFFIX, has_suffix
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.agents import check_fits, open_policy, task_for
 from vd.evaluate.statistics import symmetric_error
-from vd.onnx_policy import read_onnx
+from vd.geometry.arrays import Array, as_warp, library_of, of_warp
 from vd.paper import PAPER
-from vd.senses import Senses
+from vd.policy import ONNX_SUFFIX, has_suffix
+from vd.policy.onnx import read_onnx
+from vd.policy.senses import Senses
+from vd.policy.stopping import StoppingRule
 from vd.sensors.depth_cloud import CameraCloud
-from vd.stopping import StoppingRule
 from vd.tracking.policy import TrackingPolicy
 from vd.tracking.tracker import Tracker
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.log_format import FOUND_COLUMNS, TRUTH_COLUMNS
+from vd.logs.log_format import FOUND_COLUMNS, TRUTH_COLUMNS
 
 CURVES = ("command", "position", "velocity", "current", "action")
 LATENCIES = ("late_s", "image_s", "sensed_s", "sent_s", "cpu_s")

@@ -18,9 +18,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from vd import interrupt
-from vd.config import require
-from vd.defaults import default_policy, say_same_as
+from vd.command import interrupt
+from vd.command.config import require
+from vd.command.files import check_folder
+from vd.command.line import say_same_as
+from vd.command.warp_quiet import quiet_warp
 from vd.deploy.asking import answer, answered, ask, attended
 from vd.deploy.camera.camera import Camera
 from vd.deploy.camera.realsense import RealSenseCfg
@@ -31,11 +33,10 @@ from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import MOVE_S, SafeHand
 from vd.deploy.timely import undisturbed
 from vd.evaluate.agents import check_names
-from vd.files import check_folder
-from vd.hand_log import is_log, read_log
-from vd.log_format import MCAP, LogError
+from vd.logs.hand_log import is_log, read_log
+from vd.logs.log_format import MCAP, LogError
 from vd.paper import PAPER
-from vd.warp_quiet import quiet_warp
+from vd.policy.defaults import default_policy
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_data import CameraModel, HandModel
@@ -333,7 +334,7 @@ def _sink(
 ) -> "Sink":
     """What writes the file of a log."""
     if file.suffix == MCAP:
-        from vd.mcap_log import McapLog
+        from vd.logs.mcap_log import McapLog
 
         return McapLog(file, run, np.asarray(hand.workspace.goal_m))
     from vd.deploy.loop.rerun_log import RerunLog

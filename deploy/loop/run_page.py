@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vd import interrupt
+from vd.command import interrupt
+from vd.command.page import write_html
 from vd.deploy.safety.safety import LEFT_ON
-from vd.hand_log import HandLog
-from vd.log_format import FINISHED
-from vd.page import write_html
+from vd.logs.hand_log import HandLog
+from vd.logs.log_format import FINISHED
 
 FILM_FILE, PAGE_FILE = "run.mp4", "run.html"
 ABORTED = "aborted"

@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.config import to_dict
+from vd.command.config import to_dict
 from vd.deploy.loop.mocap import Mocap, MocapError, read_mocap
 from vd.evaluate.statistics import (
     TOLERANCES_RAD,
@@ -23,7 +23,7 @@ from vd.evaluate.statistics import (
     rate_intervals,
     symmetric_error,
 )
-from vd.hand_log import HandLog, read_log
+from vd.logs.hand_log import HandLog, read_log
 
 NEAR_S = 0.1
 """Farthest sample [s] from a stop that counts for it: the object rests, and lost markers come back

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.config import require
+from vd.command.config import require
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.joints import Joints
 from vd.deploy.hardware.registers import RESTART

@@ -40,7 +40,7 @@ from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.joints import Joints
 from vd.deploy.safety.limits import PERIOD_S, Limits, SafetyCfg, out_of_range
 from vd.deploy.safety.signals import REASONS, Signals
-from vd.log_format import FINISHED
+from vd.logs.log_format import FINISHED
 
 MOVE_S = 0.04
 """Time between the goals of a slow movement."""

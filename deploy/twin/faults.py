@@ -21,6 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from vd.assets_usd.hands import called, load_hand
+from vd.command.files import write_json
+from vd.command.warp_quiet import quiet_warp
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import preflight, write_settings
 from vd.deploy.hardware.connect import Connection
@@ -33,9 +35,7 @@ from vd.deploy.twin.motor import Motor, make_motors
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.deploy.twin.plant import Drive, FirstOrderPlant, Plant
 from vd.deploy.twin.twin import Twin
-from vd.files import write_json
-from vd.log_format import FINISHED
-from vd.warp_quiet import quiet_warp
+from vd.logs.log_format import FINISHED
 
 PUSH_RAD = 0.29
 """Distance of the goals from the joints: what the policy asks for at most."""
@@ -486,7 +486,7 @@ class FaultsCommand:
 
 def main() -> int:
     """Entry point of ``python -m vd.deploy.twin.faults``."""
-    from vd.command_line import parse
+    from vd.command.line import parse
 
     return parse(FaultsCommand, prog="python -m vd.deploy.twin.faults", description=__doc__).run()
 

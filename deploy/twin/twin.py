@@ -28,14 +28,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from vd import interrupt
-from vd.command_line import parse
+from vd.command import interrupt
+from vd.command.line import parse
+from vd.command.warp_quiet import quiet_warp
 from vd.deploy.timely import undisturbed
 from vd.deploy.twin.line import Faults, MotorLine
 from vd.deploy.twin.motor import Motor, make_motors
 from vd.deploy.twin.plant import Plant
 from vd.paper import PAPER
-from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.deploy.twin.newton_hand import NewtonHand

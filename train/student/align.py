@@ -17,7 +17,7 @@ import trimesh
 from torch import nn
 
 from vd.assets_usd.objects.model import ObjectModel
-from vd.config import to_dict
+from vd.command.config import to_dict
 from vd.paper import PAPER
 from vd.train.checkpoint import load_checkpoint, save_checkpoint
 from vd.train.config import RunCfg

@@ -5,17 +5,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from vd.config import to_dict
+from vd.command.config import to_dict
+from vd.command.files import check_folder
+from vd.command.warp_quiet import quiet_warp
 from vd.envs.cfg import ObservationCfg, ReorientCfg
-from vd.files import check_folder
 from vd.paper import PAPER
 from vd.train.flags import write_config
 from vd.train.student.config import SIMULATED, StudentTrainCfg
 from vd.train.teacher import BUILDING
-from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
-    from vd.policy import TrainedPolicy
+    from vd.policy.actor import TrainedPolicy
     from vd.train.student.align import AlignTrainer
     from vd.train.student.looks import SimulatedLooks
     from vd.vision.alignment import AlignmentNetwork
@@ -51,7 +51,7 @@ def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print)
         FileNotFoundError: There is no such teacher, network or checkpoint.
         ValueError: The settings do not fit each other, or the network to begin from.
     """
-    from vd.device import resolve_device
+    from vd.command.device import resolve_device
     from vd.train.checkpoint import find_checkpoint
 
     cfg.validate()
@@ -73,10 +73,10 @@ def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print)
 
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
+    from vd.command.workers import one_thread_without_gpu
     from vd.evaluate.agents import open_teacher
     from vd.train.student.network import open_network
     from vd.vision.alignment import AlignmentNetwork
-    from vd.workers import one_thread_without_gpu
 
     rank = int(os.environ.get("RANK", "0"))
     teacher = open_teacher(cfg.teacher, device)
@@ -138,8 +138,8 @@ def _looks(
     """Environments in which the teacher acts by the network."""
     import torch
 
-    from vd.bundle.contract import TrackingSpec
     from vd.envs.reorient import ReorientEnv
+    from vd.policy.contract import TrackingSpec
     from vd.tracking.policy import TrackingPolicy
     from vd.train.student.align import CLOUDS, mesh_points
     from vd.train.student.looks import SimulatedLooks

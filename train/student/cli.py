@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from vd import interrupt
-from vd.command_line import PRINT, ConfigFile, parse
-from vd.defaults import say_same_as
+from vd.command import interrupt
+from vd.command.line import PRINT, ConfigFile, parse, say_same_as
 from vd.evaluate.agents import DEFAULT_POLICY, check_names, find_policy, installed_policies
 from vd.train.flags import machine_preset, normalise, saved_config, starting, value_of
 from vd.train.student.build import build_student
@@ -119,7 +118,7 @@ def _teacher(base: StudentTrainCfg) -> str:
 
 def _hand(teacher: str) -> str:
     """The hand that a teacher moves."""
-    from vd.bundle.store import read_policy
+    from vd.policy.bundle import read_policy
 
     return read_policy(find_policy(teacher)).hand
 

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from vd.evaluate.tracking import TrackingActor
-from vd.quaternions import product, rotated, rotation_distance
+from vd.geometry.quaternions import product, rotated, rotation_distance
 from vd.tracking.policy import TrackingPolicy
 from vd.train.student.config import LooksCfg
 from vd.train.student.views import Pairs, with_goals

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from vd.bundle import SUFFIX, has_suffix
+from vd.policy import SUFFIX, has_suffix
 from vd.train.student.config import ALIGNMENT_NAME, PRESETS
 from vd.vision.alignment import AlignmentNetwork
 from vd.vision.cfg import AlignmentCfg
@@ -45,7 +45,7 @@ def default_network(hand: str, preset: str) -> str:
     Raises:
         ValueError: There is neither.
     """
-    from vd.defaults import default_policy
+    from vd.policy.defaults import default_policy
 
     own = Path(PRESETS[preset](0).run.out) / ALIGNMENT_NAME
     if own.is_file() and load_alignment(own)[1].hand == hand:

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from torch.nn.functional import normalize
 
 from vd.assets_usd.hand_data import HandModel, compose, invert
-from vd.clouds import HandCloud
 from vd.evaluate.scanned import MISSING, NOISE_M
+from vd.geometry.clouds import HandCloud
 from vd.train.student.shapes import drawn, random_matrices, uniform
 from vd.vision.rotations import matrices, rotations_about, two_columns
 

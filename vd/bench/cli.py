@@ -14,11 +14,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from vd import interrupt
-from vd.command_line import parse
-from vd.device import resolve_device
-from vd.files import check_file, check_folder
-from vd.warp_quiet import quiet_warp
+from vd.command import interrupt
+from vd.command.device import resolve_device
+from vd.command.files import check_file, check_folder
+from vd.command.line import parse
+from vd.command.warp_quiet import quiet_warp
 
 
 def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> None:
@@ -28,8 +28,8 @@ def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> No
     """
     import warp as wp
 
-    from vd.files import write_json
-    from vd.versions import code_fingerprint
+    from vd.command.files import write_json
+    from vd.command.versions import code_fingerprint
 
     done: list[dict[str, Any]] = []
     made = {
@@ -180,10 +180,10 @@ class GapCommand:
 
     def run(self) -> int:
         """Run the cases, then write and print the tables."""
-        from vd.workers import shard
+        from vd.command.workers import shard
 
         shard((), self.shard)  # before anything slow
-        from vd.files import write_text
+        from vd.command.files import write_text
         from vd.gap.bench.battery import battery, run_battery
         from vd.gap.bench.score import markdown
 

@@ -20,7 +20,7 @@ import vd.kernels
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage
 from vd.envs.reorient import ReorientEnv
-from vd.policy import TrainedPolicy
+from vd.policy.actor import TrainedPolicy
 
 WARM_UP_STEPS = 36
 """Control steps before timing: objects have landed and fingers reached them (3 s)."""

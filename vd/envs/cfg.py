@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from math import pi
 from typing import TYPE_CHECKING, Any, Literal
 
-from vd.config import from_dict, require
+from vd.command.config import from_dict, require
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 

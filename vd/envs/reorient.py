@@ -11,7 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from vd.device import warp_device
+from vd.command.device import warp_device
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.followers import ActuatedActions

@@ -1,6 +1,6 @@
 """The symmetry frames of a hand and an observation: what they are made of, without a simulator.
 
-How they are used: :mod:`vd.envs.symmetry` and :mod:`vd.frame_maps`.
+How they are used: :mod:`vd.envs.symmetry` and :mod:`vd.geometry.frame_maps`.
 """
 
 from dataclasses import dataclass

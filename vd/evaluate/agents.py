@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vd.assets_usd.cache import assets_dir
-from vd.bundle import ONNX_SUFFIX, SUFFIX, has_suffix
 from vd.envs.cfg import (
     CurriculumCfg,
     ObservationCfg,
@@ -16,9 +15,10 @@ from vd.envs.cfg import (
     SuccessCfg,
     TableCfg,
 )
+from vd.policy import ONNX_SUFFIX, SUFFIX, has_suffix
 
 if TYPE_CHECKING:
-    from vd.policy import TrainedPolicy
+    from vd.policy.actor import TrainedPolicy
     from vd.tracking.policy import TrackingPolicy
 
 BUILT_IN = ("zero", "random")
@@ -27,7 +27,7 @@ BUILT_IN = ("zero", "random")
 POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 """Policies of the package, and POLICY_LIST. A wheel has two of them, a checkout all."""
 POLICY_LIST = "policies.json"
-"""Tells of the policies of a folder (:mod:`vd.policy_store`), in a wheel also of those that it
+"""Tells of the policies of a folder (:mod:`vd.policy.store`), in a wheel also of those that it
 lacks.
 """
 SHIPPED_POLICIES = {path.stem: path for path in sorted(POLICY_FOLDER.glob(f"*{SUFFIX}"))}
@@ -132,7 +132,7 @@ def open_policy(name: str | Path, device: str) -> "TrainedPolicy | TrackingPolic
     path = find_policy(name)
     if has_suffix(path, ONNX_SUFFIX):
         raise ValueError(f"{path} is for vd-deploy; give the policy that it was made of")
-    from vd.bundle.store import read_policy
+    from vd.policy.bundle import read_policy
 
     return read_policy(path, device)
 
@@ -148,7 +148,7 @@ def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
     Raises:
         ValueError: It sees point clouds.
     """
-    from vd.policy import TrainedPolicy
+    from vd.policy.actor import TrainedPolicy
 
     policy = open_policy(name, device)
     if not isinstance(policy, TrainedPolicy | None):
@@ -164,14 +164,14 @@ def check_fits(
     Agents without a file move any.
 
     Raises:
-        vd.bundle.contract.ContractError: The hand is not as in the policy's training; names field,
+        vd.policy.contract.ContractError: The hand is not as in the policy's training; names field,
             found, expected and remedy.
         ValueError: The hand has another name, or cannot be read.
     """
     if policy is None:
         return
     from vd.assets_usd.hands import load_hand
-    from vd.bundle.contract import check_hand
+    from vd.policy.contract import check_hand
 
     own = ReorientCfg.of(policy)
     task = _on_hand(own, hand, hand_layer)

@@ -9,15 +9,15 @@ from typing import Annotated
 import tyro
 
 from vd.assets_usd.hands import HANDS
-from vd.config import require
-from vd.defaults import default_policy
+from vd.command.config import require
+from vd.command.workers import shard
 from vd.envs.cfg import RandomisationCfg
 from vd.evaluate.agents import DEFAULT_HAND, SHIPPED_POLICIES
 from vd.evaluate.conditions import CONDITIONS, Condition
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, ONE_GOAL, Goals, GoalSchedule
 from vd.paper import PAPER
+from vd.policy.defaults import default_policy
 from vd.sim.cfg import Engine
-from vd.workers import shard
 
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0

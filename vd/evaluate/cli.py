@@ -5,13 +5,12 @@ import sys
 from collections.abc import Sequence
 from itertools import chain
 
-from vd import interrupt
-from vd.command_line import parse
-from vd.defaults import say_same_as
+from vd.command import interrupt
+from vd.command.files import check_file, check_folder
+from vd.command.line import parse, say_same_as
 from vd.evaluate.agents import check_names
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.suite import read_suite
-from vd.files import check_file, check_folder
 
 
 @interrupt.command("vd-eval")

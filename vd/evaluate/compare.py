@@ -9,11 +9,11 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vd.command.warp_quiet import quiet_warp
 from vd.evaluate.agents import check_fits, open_policy, sees_clouds, task_for
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
 from vd.evaluate.conditions import in_condition
 from vd.sim.cfg import in_mujoco
-from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
@@ -36,7 +36,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
         vd.sim.simulator.SimulationError: Contacts were lost.
     """
     quiet_warp()
-    from vd.device import resolve_device
+    from vd.command.device import resolve_device
 
     device = resolve_device("cpu" if cfg.engine == "mujoco" else cfg.device)
     # A file that cannot be used, or is of another hand, is told before the simulator is imported.
@@ -46,10 +46,10 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
     import warp as wp
 
     from vd.assets_usd.objects.sets import set_files
+    from vd.command.versions import code_fingerprint, installed_versions
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.result import Result, judge
     from vd.tracking.symmetry import with_symmetries
-    from vd.versions import code_fingerprint, installed_versions
 
     groups = parse_groups(cfg.object_sets)
     everything = tuple(dict.fromkeys(s for sets in groups.values() for s in sets))
@@ -166,15 +166,15 @@ def actor_of(
     A camera policy with ``goals`` and ``sensor_errors``.
     """
     from vd.evaluate.result import Agent
-    from vd.policy import BuiltIn
-    from vd.stopping import StoppingRule
+    from vd.policy.actor import BuiltIn
+    from vd.policy.stopping import StoppingRule
 
     if policy is None:
         actor = BuiltIn(name, env.num_actions, seed=seed, device=env.device)
         return actor, Agent(name, name, "nothing", StoppingRule)
     if not sees_clouds(policy):
         return policy, Agent(name, "teacher", "state", StoppingRule)
-    from vd.workers import one_thread_without_gpu
+    from vd.command.workers import one_thread_without_gpu
 
     one_thread_without_gpu(env.device)
     settings: dict[str, Any] = {"goals": goals, "sensor_errors": sensor_errors, "seed": seed}

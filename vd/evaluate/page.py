@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vd.command.page import write_html
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, HOLD_S
 from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row
 from vd.evaluate.statistics import Interval
-from vd.page import write_html
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

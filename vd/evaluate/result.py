@@ -11,7 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vd.config import from_dict, to_dict
+from vd.command.config import from_dict, to_dict
+from vd.command.files import write_json
 from vd.evaluate.goals import ONE_GOAL, Goals, GoalSchedule
 from vd.evaluate.statistics import (
     TOLERANCES_RAD,
@@ -25,10 +26,9 @@ from vd.evaluate.statistics import (
     share_among,
 )
 from vd.evaluate.trace import Episode, StopsBy, Trace, Way, at_steps
-from vd.files import write_json
 from vd.paper import PAPER
+from vd.policy.stopping import StoppingRule
 from vd.sim.cfg import Engine
-from vd.stopping import StoppingRule
 
 RESULT_FORMAT = "visual-dexterity evaluation 8"
 BOUNDS_RAD = (PAPER.success.precise_rad, PAPER.success.rotation_rad)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from vd.config import from_dict
+from vd.command.config import from_dict
 from vd.paper import PAPER
 
 FOLDER = Path(__file__).with_name("suites")

@@ -16,8 +16,11 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, cast
 
-from vd.command_line import parse
-from vd.config import to_dict
+from vd.command.config import to_dict
+from vd.command.files import make_folder, write_json
+from vd.command.line import parse
+from vd.command.versions import code_fingerprint
+from vd.command.workers import run_tasks, shard
 from vd.evaluate.agents import BUILT_IN, find_policy, open_policy, sees_clouds
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.claims import ours
@@ -38,9 +41,6 @@ from vd.evaluate.suite import (
     read_suite,
     share_text,
 )
-from vd.files import make_folder, write_json
-from vd.versions import code_fingerprint
-from vd.workers import run_tasks, shard
 
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""

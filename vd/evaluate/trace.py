@@ -20,7 +20,7 @@ from vd.evaluate.goals import ONE_GOAL, GoalSchedule
 from vd.evaluate.rollout import episode_rounds, unit_quats
 from vd.evaluate.statistics import rotation_angle, symmetric_error
 from vd.paper import PAPER
-from vd.stopping import StoppingRule
+from vd.policy.stopping import StoppingRule
 
 StopsBy = Literal["predicted", "exact", "error", "success"]
 """What a rule asks for: a distance, which is a camera policy's prediction, or the true one to the

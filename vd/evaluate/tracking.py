@@ -8,7 +8,7 @@ import warp as wp
 
 from vd.evaluate.goals import Goals
 from vd.evaluate.scanned import known_objects
-from vd.senses import Senses
+from vd.policy.senses import Senses
 from vd.sensors.depth_camera import DepthCamera
 from vd.tracking.policy import TrackingPolicy
 from vd.tracking.tracker import Tracker

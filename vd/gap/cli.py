@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from vd import interrupt
-from vd.command_line import parse
-from vd.defaults import say_same_as
-from vd.device import warp_device
-from vd.files import check_folder
+from vd.command import interrupt
+from vd.command.device import warp_device
+from vd.command.files import check_folder
+from vd.command.line import parse, say_same_as
+from vd.command.warp_quiet import quiet_warp
 from vd.gap.contact_cli import Contact, HideContact
 from vd.gap.convert import Convert
-from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis

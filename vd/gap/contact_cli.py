@@ -46,7 +46,7 @@ class Contact:
         recording, began = read_contact_recording(self.recording), time.perf_counter()
         from vd.assets_usd.objects.model import read_object, write_contact_layer
         from vd.assets_usd.objects.sets import set_files
-        from vd.files import make_folder, write_json
+        from vd.command.files import make_folder, write_json
         from vd.gap.contact import identify_contact
 
         file, *others = set_files([self.object])

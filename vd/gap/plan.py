@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vd.config import to_dict
-from vd.files import write_json
+from vd.command.config import to_dict
+from vd.command.files import write_json
 from vd.gap.chain import Chain, chains
 from vd.gap.coordinates import BASELINE_PARAMETERS
 from vd.gap.design import design, pieces

@@ -7,13 +7,13 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from vd.files import atomic_path
+from vd.command.files import atomic_path
+from vd.command.page import FIGURE_DPI, write_html
 from vd.gap import figures, words
 from vd.gap.coordinates import BASELINE_PARAMETERS
 from vd.gap.result import Candidate, JointGap, NamedEffect, Predictions, Report, parameters_of
 from vd.gap.words import amount, mrad, percent, plain
 from vd.kernels.servo.effects import EFFECTS
-from vd.page import FIGURE_DPI, write_html
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
 FIGURES = ("gap.png", "overlay_*.png", "residual_*.png")

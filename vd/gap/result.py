@@ -17,8 +17,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vd.config import from_dict, to_dict
-from vd.files import atomic_path, write_json
+from vd.command.config import from_dict, to_dict
+from vd.command.files import atomic_path, write_json
 from vd.kernels.servo.effects import EFFECTS, Parameter
 from vd.logs.motions import Recording
 

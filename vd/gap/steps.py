@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vd.config import from_dict, to_dict
-from vd.files import make_folder, write_json
+from vd.command.config import from_dict, to_dict
+from vd.command.files import make_folder, write_json
+from vd.command.versions import installed_versions
 from vd.gap.result import LAYER, Closing, Predictions, Report
 from vd.kernels.servo.effects import EFFECTS
 from vd.logs.recording import BARE_MODELS, Recording, model_path, read_recording
-from vd.versions import installed_versions
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel

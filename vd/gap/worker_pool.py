@@ -8,8 +8,8 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from typing import Any
 
-from vd.warp_quiet import quiet_warp
-from vd.workers import begin_worker, end_worker
+from vd.command.warp_quiet import quiet_warp
+from vd.command.workers import begin_worker, end_worker
 
 ProblemOf = Callable[[Any], Any]
 """The problem of a joint, by what specifies it."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.files import write_json
+from vd.command.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.chain import Chain, chains, relative_torques
 from vd.gap.coordinates import FREE_SPEED, Scales

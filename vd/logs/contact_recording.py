@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vd.files import atomic_path, write_json
+from vd.command.files import atomic_path, write_json
 from vd.logs.recording import CONTACT_MODEL, FORMAT, MIN_SAMPLES, numbers, read_header, read_table
 from vd.logs.recording_checks import RecordingError
 

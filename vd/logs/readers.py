@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.interrupt import need
+from vd.command.interrupt import need
 from vd.logs.recording import by_channel, numbers, read_table
 from vd.logs.recording_checks import RecordingError
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.files import atomic_path, write_json
+from vd.command.files import atomic_path, write_json
 from vd.logs.motions import CHANNELS, Recording, Trajectory
 from vd.logs.recording_checks import (
     COMMAND_TIME,

@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from vd import interrupt
-from vd.command_line import parse
-from vd.config import require
-from vd.defaults import default_policy, say_same_as
-from vd.device import resolve_device
+from vd.command import interrupt
+from vd.command.config import require
+from vd.command.device import resolve_device
+from vd.command.files import check_file
+from vd.command.line import parse, say_same_as
+from vd.command.warp_quiet import quiet_warp
 from vd.evaluate.agents import DEFAULT_HAND, check_names
 from vd.evaluate.cfg import LOG_EVERY_S, POLICY_HELP, HandFlags, TaskFlags, episode_limit_s
-from vd.files import check_file
-from vd.hand_log import is_log
+from vd.logs.hand_log import is_log
 from vd.paper import PAPER
+from vd.policy.defaults import default_policy
 from vd.sim.cfg import in_mujoco
-from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.play.replay import Replay
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_names([cfg.policy], cfg.objects, cfg.hand)
     quiet_warp()
     if recorded:
-        from vd.hand_log import read_log
+        from vd.logs.hand_log import read_log
         from vd.play.replay import Replay, film
 
         log = read_log(cfg.policy)
@@ -108,8 +108,8 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     env, policy = _open(cfg, num_envs=cfg.cells)
     from tqdm import tqdm
 
+    from vd.play.render import Renderer
     from vd.play.video import GRID_CELL, SINGLE_CELL, drawn, watched, write_frames
-    from vd.render import Renderer
 
     envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
@@ -157,7 +157,7 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
 def _policies() -> list[str]:
     """Policies that are installed, of hands that are."""
     from vd.assets_usd.hands import check_hand_name
-    from vd.policy_store import installed_entries
+    from vd.policy.store import installed_entries
 
     names = []
     try:

@@ -11,10 +11,10 @@ import numpy as np
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
-from vd.hand_log import HandLog
-from vd.log_format import LogError
+from vd.logs.hand_log import HandLog
+from vd.logs.log_format import LogError
+from vd.play.render import OUT_OF_SIGHT, Renderer
 from vd.play.video import SINGLE_CELL, Snapshot, drawn, write_frames
-from vd.render import OUT_OF_SIGHT, Renderer
 
 
 class Replay:

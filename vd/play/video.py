@@ -13,10 +13,10 @@ import numpy as np
 import warp as wp
 from PIL import Image, ImageDraw, ImageFont
 
+from vd.command.files import atomic_path
 from vd.evaluate.statistics import rotation_angle
-from vd.files import atomic_path
 from vd.paper import PAPER
-from vd.render import Picture, Renderer
+from vd.play.render import Picture, Renderer
 
 # Size of a cell's picture [pixel]: alone, and in a grid.
 SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)

@@ -17,10 +17,10 @@ import warp as wp
 from newton.viewer import ViewerViser
 
 from vd.paper import PAPER
+from vd.play.render import Camera, PictureModel
 from vd.play.replay import Replay
 from vd.play.session import Session
 from vd.play.video import Snapshot
-from vd.render import Camera, PictureModel
 
 # Where the goal's object floats, in the camera's right and up [m]: left of the hand, for panels are
 # right.

@@ -5,7 +5,7 @@ By default a perfect camera at the hand's viewpoint.
 
 from dataclasses import dataclass, field, replace
 
-from vd.config import require
+from vd.command.config import require
 from vd.paper import PAPER
 
 BASELINE_M, FOCAL_PX = 0.055, 1024.2

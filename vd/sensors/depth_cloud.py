@@ -165,7 +165,7 @@ class CameraCloud:
         return self.cloud.points, self.cloud.count
 
     def seen(self, depth: np.ndarray) -> wp.array:
-        """The points of an image as :class:`vd.senses.Senses` has them [1, K].
+        """The points of an image as :class:`vd.policy.senses.Senses` has them [1, K].
 
         The next call changes them.
 

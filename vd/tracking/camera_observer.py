@@ -16,15 +16,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from vd.arrays import Array, as_warp, library_of, of_warp
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.clouds import HandCloud
 from vd.envs.shapes import ShapeObserver
+from vd.geometry.arrays import Array, as_warp, library_of, of_warp
+from vd.geometry.clouds import HandCloud
+from vd.geometry.quaternions import (
+    canonical,
+    product,
+    relative_rotation,
+    rotated,
+    rotation_distance,
+)
 from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
 from vd.paper import PAPER
-from vd.quaternions import canonical, product, relative_rotation, rotated, rotation_distance
-from vd.senses import Senses
+from vd.policy.senses import Senses
 from vd.tracking.fingertips import Fingertips
 from vd.tracking.object_points import object_points
 from vd.tracking.registration import Registration

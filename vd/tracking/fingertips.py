@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from vd.arrays import Array, library_of
 from vd.assets_usd.hand_data import HandModel, compose, invert
+from vd.geometry.arrays import Array, library_of
+from vd.geometry.quaternions import product, rotated
 from vd.kernels.task.observations import FINGERTIP_VALUES
-from vd.quaternions import product, rotated
 
 
 class Fingertips:

@@ -5,7 +5,7 @@ Those of voxels that neither are the hand's nor touch one.
 
 import warp as wp
 
-from vd.arrays import Array, as_warp, library_of
+from vd.geometry.arrays import Array, as_warp, library_of
 from vd.kernels.launch import launch
 from vd.kernels.sensor.voxels import (
     CLOUD_SHIFT,

@@ -7,10 +7,10 @@ for it.
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from vd.bundle.contract import Contract, Contracted, Kind, TrackingSpec
+from vd.policy.contract import Contract, Contracted, Kind, TrackingSpec
 
 if TYPE_CHECKING:
-    from vd.policy import TrainedPolicy
+    from vd.policy.actor import TrainedPolicy
     from vd.vision.alignment import AlignmentNetwork
 
 

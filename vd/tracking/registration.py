@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from vd.arrays import Array, as_warp, of_warp, take_along
 from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.objects.model import ObjectModel
+from vd.geometry.arrays import Array, as_warp, of_warp, take_along
 from vd.kernels.launch import launch
 from vd.kernels.sensor.registration import (
     NEVER,

@@ -14,11 +14,11 @@ import warp as wp
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from vd.arrays import Array, library_of, library_on
 from vd.assets_usd.objects.geometry import random_surface_points
 from vd.assets_usd.objects.model import ObjectModel
+from vd.geometry.arrays import Array, library_of, library_on
+from vd.geometry.quaternions import product, rotation_distance
 from vd.kernels.sensor.shape_grids import off_mesh_kernel
-from vd.quaternions import product, rotation_distance
 from vd.tracking.registration import POINTS, Registration
 
 OFF_M, OFF_SHARE = 0.003, 0.01

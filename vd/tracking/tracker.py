@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from vd.arrays import Array, library_of
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
-from vd.frame_maps import FrameMaps
-from vd.senses import Senses
+from vd.geometry.arrays import Array, library_of
+from vd.geometry.frame_maps import FrameMaps
+from vd.policy.senses import Senses
 from vd.tracking.camera_observer import CameraObserver
 from vd.tracking.policy import TrackingPolicy
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vd.config import from_dict
-from vd.policy import read_state
+from vd.command.config import from_dict
+from vd.policy.actor import read_state
 from vd.vision.alignment import AlignmentNetwork
 from vd.vision.cfg import AlignmentCfg
 

@@ -19,7 +19,7 @@ import warp as wp
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from vd.arrays import as_warp
+from vd.geometry.arrays import as_warp
 from vd.kernels.launch import launch
 from vd.kernels.sensor.sparse_conv import KERNEL, kernel_map_kernel, voxel_feature_kernel
 from vd.kernels.sensor.voxels import CLOUD_SHIFT, coordinates_kernel, voxel_key_kernel

@@ -24,11 +24,11 @@ import torch
 import warp as wp
 from torch import nn
 
-from vd.arrays import as_warp
 from vd.assets_usd.hand_data import HandModel
-from vd.clouds import HandCloud
+from vd.geometry.arrays import as_warp
+from vd.geometry.clouds import HandCloud
 from vd.paper import PAPER
-from vd.senses import Senses
+from vd.policy.senses import Senses
 from vd.vision.cfg import StudentCfg
 from vd.vision.rotations import first_columns, matrices, two_columns
 from vd.vision.sparse import ResidualBlock, SparseTensor, StridedConv, global_pool, voxelise

@@ -20,7 +20,8 @@ from typing import Any
 import warp as wp
 
 from vd.assets_usd.hands import HANDS, load_hand
-from vd.files import write_json
+from vd.command.files import write_json
+from vd.command.warp_quiet import quiet_warp
 from vd.gap import workflow
 from vd.gap.bench.cases import run_cases
 from vd.gap.bench.hidden_plant import OUTSIDE
@@ -28,7 +29,6 @@ from vd.gap.bench.hide import hide
 from vd.gap.bench.score import KINDS, Case, said, score
 from vd.gap.bench.sizes import showing
 from vd.kernels.servo import chains
-from vd.warp_quiet import quiet_warp
 
 PAIR_SIZE = 2
 """Size of both effects of a pair, some six noise floors each: from there on single effects are told

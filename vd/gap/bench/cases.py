@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vd.files import make_folder, write_json
-from vd.workers import run_tasks
+from vd.command.files import make_folder, write_json
+from vd.command.workers import run_tasks
 
 
 def read_result(path: Path) -> dict[str, Any] | None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from vd.assets_usd.objects.contact_layer import CONTACT
 from vd.assets_usd.objects.sets import load_set
-from vd.files import write_json, write_text
+from vd.command.files import write_json, write_text
 from vd.gap.bench.cases import run_cases
 from vd.gap.bench.hidden_contact import OUTSIDE, ContactPlant, hide_contact
 from vd.gap.bench.score import Figure

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.contact_layer import CONTACT, damping_ratio
 from vd.assets_usd.objects.model import ObjectModel
-from vd.files import write_json
+from vd.command.files import write_json
 from vd.gap.bench.hidden_finger import GRAVITY_M_S2
 from vd.gap.bench.hide import truth_path
 from vd.logs.contact_recording import ContactMotion, Kind, write_contact_recording

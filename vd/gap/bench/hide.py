@@ -15,7 +15,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from vd.assets_usd.hands import load_hand
-from vd.files import write_json
+from vd.command.files import write_json
 from vd.gap.bench.hidden_finger import finger_of
 from vd.gap.bench.hidden_plant import (
     OUTSIDE,

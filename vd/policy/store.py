@@ -19,10 +19,10 @@ from urllib.request import Request, urlopen
 
 import tyro
 
-from vd import interrupt
-from vd.bundle import SUFFIX, has_suffix
-from vd.command_line import parse
-from vd.config import from_dict, to_dict
+from vd.command import interrupt
+from vd.command.config import from_dict, to_dict
+from vd.command.files import atomic_path, write_json
+from vd.command.line import parse
 from vd.evaluate.agents import (
     BUILT_IN,
     POLICY_FOLDER,
@@ -33,7 +33,7 @@ from vd.evaluate.agents import (
     policy_name,
     pulled_folder,
 )
-from vd.files import atomic_path, write_json
+from vd.policy import SUFFIX, has_suffix
 
 STORE_FORMAT = "visual-dexterity policies 1"
 HUB, HUB_URL = "hf://", "https://huggingface.co"
@@ -185,8 +185,8 @@ def describe(path: Path) -> Entry:
     Raises:
         ValueError: It is no policy's file, or names a folder of this machine.
     """
-    from vd.bundle.contract import without_folders
-    from vd.bundle.store import read_policy
+    from vd.policy.bundle import read_policy
+    from vd.policy.contract import without_folders
 
     remedy = f"vd-train export {path} FILE{SUFFIX} writes one without that, for others"
     if not has_suffix(path, SUFFIX):

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from vd.arrays import Array
+from vd.geometry.arrays import Array
 
 
 @dataclass(frozen=True)

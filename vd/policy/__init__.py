@@ -3,7 +3,7 @@
 from pathlib import Path
 
 SUFFIX, ONNX_SUFFIX = ".safetensors", ".onnx"
-"""How names of policies end, and of what :mod:`vd.onnx_policy` runs."""
+"""How names of policies end, and of what :mod:`vd.policy.onnx` runs."""
 
 
 def has_suffix(path: str | Path, suffix: str) -> bool:

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from vd.arrays import Array, library_of, take_along
 from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import ObservationCfg
 from vd.envs.symmetry_frames import symmetry_frames
+from vd.geometry.arrays import Array, library_of, take_along
 from vd.kernels.task.observations import teacher_observation_slices
 
 

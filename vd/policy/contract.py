@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vd.assets_usd.hand_data import HandModel
-from vd.config import from_dict, leaves, to_dict
+from vd.command.config import from_dict, leaves, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 from vd.paper import PAPER
+from vd.policy.stopping import StoppingRules
 from vd.sensors.cfg import DepthCameraCfg
-from vd.stopping import StoppingRules
 from vd.vision.cfg import AlignmentCfg
 
 POLICY_FORMAT = "visual-dexterity policy 1"

@@ -6,6 +6,7 @@ Flags over a file of settings, ``--config``, over defaults.
 import dataclasses
 import inspect
 import re
+import shlex
 import sys
 import typing
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,7 @@ from typing import Any, TypeVar
 
 import tyro
 
-from vd.config import from_dict, needed, to_dict
+from vd.command.config import from_dict, needed, to_dict
 
 T = TypeVar("T")
 
@@ -186,3 +187,9 @@ def _set_already(default: Any, words: Sequence[str]) -> set[str]:
         if getattr(default, f.name) is True
     ]
     return {f"--{name}" for name in names if f"--no-{name}" not in words}
+
+
+def say_same_as(*words: object, why: str = "") -> None:
+    """Say, as a command line that does the same, what a command takes where flags are left out."""
+    note = f"   ({why})" if why else ""
+    print(f"the same as: {shlex.join(map(str, words))}{note}", file=sys.stderr, flush=True)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.log_format import (
+from vd.logs.log_format import (
     EVENTS_FILE,
     FOUND_COLUMNS,
     LOG_FORMAT,
@@ -135,7 +135,7 @@ def read_log(path: str | Path) -> HandLog:
     """
     path = Path(path)
     if path.suffix == MCAP:
-        from vd.mcap_log import read_mcap
+        from vd.logs.mcap_log import read_mcap
 
         return HandLog(path, *read_mcap(path))
     try:

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vd.bundle import SUFFIX, check_suffix, has_suffix
-from vd.bundle.contract import (
+from vd.command.files import atomic_path
+from vd.policy import SUFFIX, check_suffix, has_suffix
+from vd.policy.actor import REMEDY, TrainedPolicy, read_state, teacher_in
+from vd.policy.contract import (
     CONTRACT_KEY,
     SEAL_KEY,
     UNSEALED,
@@ -18,8 +20,6 @@ from vd.bundle.contract import (
     read_sealed,
     sealed,
 )
-from vd.files import atomic_path
-from vd.policy import REMEDY, TrainedPolicy, read_state, teacher_in
 from vd.tracking.policy import TrackingPolicy
 from vd.vision.saved import alignment_network
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
-from vd import interrupt
-from vd.bundle import SUFFIX
-from vd.bundle.contract import (
+from vd.command import interrupt
+from vd.policy import SUFFIX
+from vd.policy.contract import (
     CONTRACT_KEY,
     Contract,
     Contracted,
@@ -23,7 +23,7 @@ from vd.bundle.contract import (
 from vd.tracking.policy import TrackingPolicy
 
 if TYPE_CHECKING:
-    from vd.policy import TrainedPolicy
+    from vd.policy.actor import TrainedPolicy
 
 OFFSET_KEY = "offset"
 """Key of the mean of observations in training, in JSON, among the metadata."""
@@ -60,7 +60,7 @@ class OnnxNetwork:
 
 @dataclass(frozen=True)
 class OnnxTeacher(Contracted):
-    """What :class:`vd.policy.TrainedPolicy` is, without its weights."""
+    """What :class:`vd.policy.actor.TrainedPolicy` is, without its weights."""
 
     network: OnnxNetwork
     contract: Contract

@@ -14,7 +14,7 @@ from multiprocessing import get_context
 from typing import Any
 from unittest.mock import patch
 
-from vd.interrupt import end_with_parent
+from vd.command.interrupt import end_with_parent
 
 SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 """Variables that keep the linear algebra of a worker to one thread; it reads them when it

@@ -1,7 +1,4 @@
-"""What commands take where nothing is named: an installed policy of the hand, said in one line."""
-
-import shlex
-import sys
+"""The policy that commands take where none is named."""
 
 
 def default_policy(hand: str, *kinds: str) -> str:
@@ -17,7 +14,7 @@ def default_policy(hand: str, *kinds: str) -> str:
         ValueError: The hand has none.
     """
     from vd.assets_usd.hands import root_name
-    from vd.policy_store import installed_entries
+    from vd.policy.store import installed_entries
 
     entries = installed_entries()
     own = [name for name, entry in entries.items() if entry.hand == root_name(hand)]
@@ -29,9 +26,3 @@ def default_policy(hand: str, *kinds: str) -> str:
         f"no {' or '.join(kinds)} policy of {hand} is installed ({there}); name a policy, or train "
         "one with vd-train"
     )
-
-
-def say_same_as(*words: object, why: str = "") -> None:
-    """Say, as a command line that does the same, what a command takes where flags are left out."""
-    note = f"   ({why})" if why else ""
-    print(f"the same as: {shlex.join(map(str, words))}{note}", file=sys.stderr, flush=True)

@@ -1,6 +1,6 @@
 """Rotations as quaternions xyzw [.., 4], tensors of torch or arrays of NumPy."""
 
-from vd.arrays import Array, library_of
+from vd.geometry.arrays import Array, library_of
 
 
 def product(first: Array, second: Array) -> Array:

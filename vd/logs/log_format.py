@@ -1,4 +1,4 @@
-"""Names in the log of a run on a hand (:mod:`vd.hand_log`), whichever file it is in."""
+"""Names in the log of a run on a hand (:mod:`vd.logs.hand_log`), whichever file it is in."""
 
 LOG_FORMAT = "vd-hand-log/1"
 MCAP = ".mcap"

@@ -1,7 +1,7 @@
 """The log of a run in one MCAP file of ROS 2 messages, which Foxglove, PlotJuggler and ``ros2 bag`` read too.
 
 For them are ``/joint_states``, ``/joint_commands``, ``/object_pose`` (a twin's), ``/found_pose``
-(as the policy finds it), ``/goal_pose`` and ``/depth`` [mm]. :func:`vd.hand_log.read_log` reads
+(as the policy finds it), ``/goal_pose`` and ``/depth`` [mm]. :func:`vd.logs.hand_log.read_log` reads
 ``/step``, each row of steps.csv whole, ``/events``, and the metadata ``run``, which is run.json.
 Needs the extra ``log``.
 """
@@ -14,8 +14,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from vd import interrupt
-from vd.log_format import (
+from vd.command import interrupt
+from vd.logs.log_format import (
     FOUND_COLUMNS,
     JOINT_CHANNELS,
     LOG_FORMAT,

@@ -11,10 +11,10 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import nn
 
-from vd.bundle.contract import Contract, Contracted, PolicySpec
-from vd.config import from_dict
+from vd.command.config import from_dict
+from vd.command.versions import installed_versions
 from vd.envs.cfg import ReorientCfg
-from vd.versions import installed_versions
+from vd.policy.contract import Contract, Contracted, PolicySpec
 
 CHECKPOINT_FORMAT = "visual-dexterity checkpoint 1"
 _STAGE = ("difficulty", "tightness", "tightening")

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages from the templates in ``vd/templates``: one file that needs no network.
+"""Self-contained HTML pages from the templates in ``vd/command/templates``: one file that needs no network.
 
 A page extends ``base.html`` and takes its parts from ``macros.html``. Templates get plain data and
 escape all text. Pictures and videos are embedded as base64, and there is no script: a page can be
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from vd.files import write_text
+from vd.command.files import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,7 +30,7 @@ _KINDS = {".gif": "image/gif", ".mp4": "video/mp4"}
 
 
 def write_html(path: Path, template: str, **data: Any) -> None:
-    """Write a page from a file of ``vd/templates``, atomically.
+    """Write a page from a file of ``vd/command/templates``, atomically.
 
     Raises:
         jinja2.UndefinedError: The template asks for something that was not given.

@@ -1,0 +1,1 @@
+"""Rotations, clouds and symmetry frames, without a simulator."""
