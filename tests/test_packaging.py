@@ -16,7 +16,6 @@ from packaging.utils import canonicalize_name
 from vd.command.interrupt import EXTRAS, command
 from vd.evaluate.agents import DEFAULT_POLICY, POLICY_LIST, SHIPPED_POLICIES
 from vd.train.cli import main
-from vd.train.demo import CAMERA_POLICY
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -91,7 +90,7 @@ def test_wheel_holds_modules_policies_and_what_else_is_read(wheel):
         f"vd/assets_usd/usd/{path.name}" for path in (ROOT / "assets_usd/usd").iterdir()
     } <= sizes.keys()
     assert "vd/py.typed" in sizes and any(name.endswith("licenses/LICENSE") for name in sizes)
-    shipped = {DEFAULT_POLICY, CAMERA_POLICY}  # others are pulled
+    shipped = {DEFAULT_POLICY, f"{DEFAULT_POLICY}-tracking"}  # others are pulled
     assert {name for name in sizes if name.endswith(".safetensors")} == {
         f"vd/policies/{name}.safetensors" for name in shipped
     }

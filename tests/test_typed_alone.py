@@ -20,7 +20,7 @@ from vd.assets_usd.hands import load_hand
 from vd.command.files import locked
 from vd.deploy.loop.goals import SHOWN, shown_goals
 from vd.evaluate.statistics import symmetric_error
-from vd.gap.recording import write_recording
+from vd.logs.recording import write_recording
 from vd.policy.defaults import default_policy
 from vd.train import adapt, tracker
 from vd.train.flags import parse_teacher

@@ -1,1 +1,1 @@
-"""What machines were told and what they did, as files: recordings of motions and their checks."""
+"""What machines were told and what they did, as files: recordings and logs of runs."""

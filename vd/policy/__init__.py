@@ -1,4 +1,4 @@
-"""Policies in files: weights, the contract they were made under, and golden values, without code."""
+"""Policies: layers, the contract they were made under, their files, and what they are told."""
 
 from pathlib import Path
 
