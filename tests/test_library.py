@@ -17,6 +17,7 @@ import warp as wp
 
 import vd
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg, RewardCfg
+from vd.evaluate.result import RESULT_FORMAT
 from vd.train.cli import main
 from vd.train.metrics import PROGRESS_FILE, read_progress
 
@@ -129,7 +130,7 @@ def test_what_is_no_file_of_ours_is_refused_with_file_and_remedy(tmp_path):
             ValueError, match=f"{path} has .*format.*; give the folder of a recording or"
         ):
             vd.read(path)
-    path.write_text('{"format": "visual-dexterity evaluation 7"}')
+    path.write_text(f'{{"format": "{RESULT_FORMAT}"}}')
     with pytest.raises(ValueError, match=f"{path}: Result has no .*; run vd-eval again"):
         vd.read(path)
     path.unlink()
