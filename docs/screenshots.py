@@ -39,7 +39,7 @@ HIDDEN = {
 """An extension that hides viser's note of a browser without a GPU."""
 UNSEEN = "procedural-heldout-4-seed0"
 PAGES: dict[str, tuple[tuple[str, ...], str, int]] = {
-    "play": ((f"vd-play dclaw4-tracking --objects {UNSEEN} --device cpu --port {PORT}",), "", 800),
+    "play": ((f"vd-play dclaw4-vision --objects {UNSEEN} --device cpu --port {PORT}",), "", 800),
     "eval": (
         (f"vd-eval dclaw4 dclaw4-cube --objects {UNSEEN} --episodes 6 --device cpu --out .",),
         "eval.html",
@@ -56,7 +56,7 @@ PAGES: dict[str, tuple[tuple[str, ...], str, int]] = {
     "deploy": (
         ("vd-deploy --hand dclaw3 --twin --random-goals 2 --seed 1 --safety.misses 99 --log run",),
         "run/run.html",
-        780,
+        880,
     ),
 }
 """Of each picture the commands, the page that they leave (the viewer is one itself), and its
