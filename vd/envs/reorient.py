@@ -549,17 +549,17 @@ class ReorientEnv:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue exactly, see :func:`vd.envs.saved_state.save_state`."""
-        return save_state(self.state, self._arrays(), self.stage, self.steps)
+        return save_state(self.state, self.changing_arrays(), self.stage, self.steps)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`, see :func:`vd.envs.saved_state.load_arrays`."""
-        load_arrays(self.state, self._arrays(), state)
+        load_arrays(self.state, self.changing_arrays(), state)
         self.steps = int(state["steps"])
         self.set_stage(saved_stage(state, self.cfg.curriculum))
         self.randomiser.write_model()
         self.sim.forward_kinematics()
 
-    def _arrays(self) -> dict[str, wp.array]:
+    def changing_arrays(self) -> dict[str, wp.array]:
         """What changes from step to step: simulation, episodes, randomisation, random streams."""
         return {
             **self.motion(),

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from vd.evaluate.result import Agent, Protocol, Result
     from vd.evaluate.trace import Trace
 
-ENVS_CPU, ENVS_GPU, ENVS_CAMERA_GPU = 64, 8192, 1024
+ENVS_CPU, ENVS_GPU, ENVS_CAMERA_GPU, ENVS_PLAN = 64, 8192, 1024, 128
 """Environments simulated at once by default: enough to keep the device busy, few enough to fit
-anywhere; images and clouds take memory."""
+anywhere; images and clouds take memory, and who plans simulates hundreds for each."""
 _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "mujoco", "torch")
 
 
@@ -55,7 +55,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
     everything = tuple(dict.fromkeys(s for sets in groups.values() for s in sets))
     files = set_files(everything)
     camera = any(map(sees_clouds, policies.values()))
-    envs = cfg.num_envs or envs_for(len(files), cfg.episodes, device, camera=camera)
+    envs = cfg.num_envs or envs_for(len(files), cfg.episodes, device, camera=camera, plan=cfg.plan)
     rows = []
     env: Any = None
     task, start = None, None
@@ -75,6 +75,8 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
         actor, agent = actor_of(
             name, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
         )
+        if cfg.plan:
+            actor, agent = planning(actor, agent, env, cfg.seed)
         trace = run_episodes(cfg, env, actor, agent)
         for group, sets in groups.items():
             chosen = [files.index(file) for file in set_files(sets)]
@@ -184,6 +186,21 @@ def actor_of(
     return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for)
 
 
+def planning(actor: Any, agent: "Agent", env: Any, seed: int) -> tuple[Any, "Agent"]:
+    """A controller that plans by sampling, to which a teacher proposes; ``zero`` proposes nothing.
+
+    Raises:
+        ValueError: The agent sees by camera, or acts at random.
+    """
+    from vd.evaluate.sampling import SamplingController
+
+    if agent.kind not in ("teacher", "zero"):
+        raise ValueError(f"--plan is for teachers and zero, not for {agent.policy}")
+    proposes = actor if agent.kind == "teacher" else None
+    planner = SamplingController(env, policy=proposes, seed=seed)
+    return planner, replace(agent, policy=f"{agent.policy} --plan", sees="state")
+
+
 def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "Trace":
     """All episodes of one policy, with a progress bar."""
     from vd.evaluate.rollout import draw_turns
@@ -248,10 +265,13 @@ def _progress(cfg: EvalCfg, env: Any, agent: "Agent") -> "Iterator[Callable[[], 
         yield bar.update
 
 
-def envs_for(num_objects: int, episodes: int, device: str, *, camera: bool = False) -> int:
+def envs_for(
+    num_objects: int, episodes: int, device: str, *, camera: bool = False, plan: bool = False
+) -> int:
     """Environments to simulate at once.
 
     The same number for every object, at most one for each episode.
     """
     limit = ENVS_CPU if device == "cpu" else ENVS_CAMERA_GPU if camera else ENVS_GPU
+    limit = min(limit, ENVS_PLAN) if plan else limit
     return num_objects * max(1, min(episodes, limit // num_objects))

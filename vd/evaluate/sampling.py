@@ -4,13 +4,14 @@ It needs no training, so what it can do tells what the hand, the object and the 
 what is left to learn. It sees the whole state and simulates hundreds of futures for every step.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 import warp as wp
 
-from vd.envs.cfg import CurriculumCfg, RewardCfg, SuccessCfg
+from vd.envs.cfg import CurriculumCfg, RandomisationCfg, RewardCfg, SuccessCfg
 from vd.envs.reorient import ReorientEnv
 
 NEVER_S = 1e6
@@ -21,7 +22,7 @@ NEVER_S = 1e6
 class SamplingCfg:
     """Sizes of model-predictive path integral control."""
 
-    samples: int = 512
+    samples: int = 256
     """Futures of every environment in every control step."""
     horizon: int = 12
     """Control steps of a future: one second."""
@@ -67,8 +68,8 @@ class SamplingController:
         """Build the model.
 
         Args:
-            env: What is controlled, without randomisation: N environments, a multiple of the number
-                of objects, so that the model's blocks of ``samples`` hold the same objects.
+            env: What is controlled: N environments, a multiple of the number of objects, so that the
+                model's blocks of ``samples`` hold the same objects. The model is nominal.
             cfg: Sizes.
             policy: A teacher that proposes half of the futures; None: all are about the plan.
             seed: Of the noise.
@@ -89,16 +90,25 @@ class SamplingController:
             success=replace(SuccessCfg(), rotation_rad=self.cfg.rotation_rad),
             reward=REWARD,
             curriculum=CurriculumCfg(),
+            randomisation=RandomisationCfg(enabled=False),
         )
         self._model = ReorientEnv(task, env.device)
-        self._pairs = [
-            (wp.to_torch(source), wp.to_torch(self._model._arrays()[name]))
-            for name, source in env._arrays().items()
-            if source.shape[0] == env.num_envs
-        ]
-        device = torch.device(str(env.device).replace("cuda", "cuda"))
+        self._pairs = list(self._state_pairs())
+        device = torch.device(env.device)
         self._generator = torch.Generator(device=device).manual_seed(seed)
         self._plan = torch.zeros(env.num_envs, self.cfg.horizon, env.num_actions, device=device)
+
+    def _state_pairs(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """What changes from step to step with a row for each environment, of task and model.
+
+        What the task alone has is drawn in it and unknown to the model, such as late commands.
+        """
+        known = self._model.changing_arrays()
+        for name, source in self._env.changing_arrays().items():
+            target = known.get(name)
+            per_environment = source.shape[0] == self._env.num_envs
+            if per_environment and target is not None and target.shape[1:] == source.shape[1:]:
+                yield wp.to_torch(source), wp.to_torch(target)
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """The first actions of the new plans, shape [N, A]; observations are not read."""
