@@ -93,8 +93,14 @@ def test_scans_of_no_use_are_refused_by_name(tmp_path):
     refused("flat.ply", "one side only")
     trimesh.creation.box((2.0, 1.0, 1.0)).export(tmp_path / "table.ply")
     refused("table.ply", "scale the file to metres")
-    with pytest.raises(GoalError, match="--object"):
-        one_object("procedural-150-seed0")
+
+
+def test_one_object_of_a_set_is_the_file_that_the_refusal_of_the_set_names():
+    with pytest.raises(
+        GoalError, match="--object symmetric holds 2 objects; name the file"
+    ) as said:
+        one_object("symmetric")
+    assert one_object(str(said.value).rsplit(": ", 1)[1]).name == "cube"
 
 
 def test_orientations_are_read_as_written(tmp_path):

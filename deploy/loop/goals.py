@@ -25,11 +25,17 @@ from vd.assets_usd.objects.geometry import (
     surface_points,
 )
 from vd.assets_usd.objects.meshes import GUESSED_UNITS, LONGEST_SIDE_M, UNITS_M, MeshError
-from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectError, ObjectModel, build_model
+from vd.assets_usd.objects.model import (
+    SURFACE_POINTS,
+    ObjectError,
+    ObjectModel,
+    build_model,
+    read_object,
+)
 from vd.assets_usd.objects.reading import load_points
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.scans import surface_of_scan
-from vd.assets_usd.objects.sets import load_set
+from vd.assets_usd.objects.sets import set_files
 from vd.evaluate.rollout import draw_goals
 from vd.evaluate.statistics import symmetric_error
 
@@ -68,10 +74,12 @@ def one_object(name: str) -> ObjectModel:
     """
     if Path(name).suffix.lower() in SCAN_SUFFIXES:
         return scan_object(Path(name))
-    found = load_set(name)
-    if len(found) > 1:
-        raise GoalError(f"--object {name} holds {len(found)} objects; name the file of one")
-    return found[0]
+    files = set_files([name])
+    if len(files) > 1:
+        raise GoalError(
+            f"--object {name} holds {len(files)} objects; name the file of one: {files[0]}"
+        )
+    return read_object(files[0])
 
 
 def scan_object(path: Path) -> ObjectModel:
