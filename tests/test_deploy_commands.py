@@ -158,6 +158,19 @@ def test_the_range_is_swept(line, hand, monkeypatch):
     assert (moved > 0.7).all() and (moved < 0.9).all()
 
 
+def test_a_wiggle_takes_fingertips_away_from_what_they_lean_on(hand):
+    def out_m(pose: np.ndarray, finger: int) -> float:
+        return np.linalg.norm(hand.tip_poses(pose)[finger, :3] - hand.goal_in_base)
+
+    leaning = np.tile([0.0, 0.28, -1.43], 3)  # of a twin without torque, on a cube
+    highest = np.array(hand.upper)
+    for axis in range(hand.num_joints):
+        finger = hand.joint_finger[axis]
+        turned = check._free_turn(hand, leaning, axis)
+        assert out_m(turned, finger) >= out_m(leaning, finger)
+        assert check._free_turn(hand, highest, axis)[axis] < highest[axis]
+
+
 def test_each_joint_wiggles_in_turn_as_it_is_told_and_only_after_a_yes(
     line, hand, monkeypatch, capsys
 ):

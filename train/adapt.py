@@ -245,7 +245,7 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
     from vd.evaluate.result import SUCCESS, Result
 
     say("comparing the policy before and after, in the nominal and in the identified model ...")
-    before, after = cfg.policy, policy_at(cfg.out)
+    before, after = str(cfg.policy), policy_at(cfg.out)
     evaluation = EvalCfg(
         policies=(before, after),
         objects=run.env.objects,

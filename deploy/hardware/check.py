@@ -272,11 +272,8 @@ def wiggle(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
     """
     hand, home = connection.hand, safe.arm().position
     for axis, name in enumerate(hand.joint_names):
-        # Away from the nearer end of its range.
-        way = 1.0 if home[axis] < 0.5 * (hand.lower[axis] + hand.upper[axis]) else -1.0
-        goal = home.copy()
-        goal[axis] += way * WIGGLE_RAD
-        motor, degrees = connection.joints.ids[axis], math.degrees(way * WIGGLE_RAD)
+        goal = _free_turn(hand, home, axis)
+        motor, degrees = connection.joints.ids[axis], math.degrees(goal[axis] - home[axis])
         where = _tip_goes(hand, home, goal, hand.joint_finger[axis])
         print(f"watch {name}, motor {motor}: {where}", file=sys.stderr, flush=True)
         before = safe.read().position[axis]
@@ -286,6 +283,24 @@ def wiggle(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
         ok = turned / degrees > 0.5
         found = f"turned by {turned:+.1f} of {degrees:+.0f} deg{'' if ok else ': blocked?'}"
         yield Finding(f"wiggle of {name}", ok, found)
+
+
+def _free_turn(hand: "HandModel", pose: np.ndarray, axis: int) -> np.ndarray:
+    """A pose [rad] [D] with one joint turned so that its fingertip goes outwards, where it is free.
+
+    Without torque fingers lean on what lies between them. At an end of its range a joint turns the
+    other way.
+    """
+    finger = hand.joint_finger[axis]
+
+    def reach_m(turned: np.ndarray) -> float:
+        return float(np.linalg.norm(hand.tip_poses(turned)[finger, :3] - hand.goal_in_base))
+
+    step = np.zeros(len(pose))
+    step[axis] = WIGGLE_RAD
+    turned = [pose + step, pose - step]
+    inside = [each for each in turned if hand.lower[axis] <= each[axis] <= hand.upper[axis]]
+    return max(inside or turned, key=reach_m)
 
 
 def _tip_goes(hand: "HandModel", before: np.ndarray, after: np.ndarray, finger: int) -> str:
