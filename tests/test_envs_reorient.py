@@ -110,7 +110,7 @@ def test_tables_leave_their_share_of_worlds_in_time():
 
 def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
     """Objects at rest on the table, each at its goal: half of the environments must lift theirs."""
-    loose = SuccessCfg(rotation_rad=4.0, joint_speed_rad_s=0.0, action_norm=0.0)
+    loose = SuccessCfg(rotation_rad=np.pi, joint_speed_rad_s=0.0, action_norm=0.0)
     env = make(table=TableCfg(lift_share=0.5), success=loose, num_envs=8)
     lift = chosen(env.cfg, 0.5) == 1
     reached = np.zeros(8, dtype=int)
@@ -122,7 +122,7 @@ def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
 
 
 ANYTHING = SuccessCfg(
-    rotation_rad=4.0,
+    rotation_rad=np.pi,
     joint_speed_rad_s=0.0,
     object_speed_m_s=0.0,
     object_spin_rad_s=0.0,

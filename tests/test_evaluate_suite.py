@@ -102,7 +102,10 @@ def test_ones_own_suite_is_a_file_of_command_lines(tmp_path, asked, capsys):
     for text, message in (
         ("title: x\nlines: [{name: a}]", "a has to have a line 'vd-eval POLICY ...'"),
         ("title: x\nlines: [{name: a, camera: vd-eval dclaw3}]", "a has dclaw3 in the wrong line"),
-        ("title: x\nlines: [{name: a, camera: vd-eval --in-air}]", "name a policy"),
+        (
+            "title: x\nlines: [{name: a, camera: vd-eval --in-air}]",
+            "a has dclaw4 in the wrong line",
+        ),
         ("title: x\nlines: [{name: a, speed: b}]", "has no field speed"),
         ("- a", "has no lines, title; name it"),
     ):
