@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from vd.envs.cfg import (
+    TOWARDS_GOAL,
     CurriculumCfg,
     GoalCfg,
     ObservationCfg,
@@ -68,20 +69,6 @@ def paper() -> TeacherCfg:
         ),
     )
 
-
-TOWARDS_GOAL = RewardCfg(
-    rotation_epsilon_rad=PAPER.reward.rotation_epsilon_rad_code,
-    fingertip=-10.0,
-    fingertip_mean_distance=True,
-    energy=-1.0,
-    energy_clip_w=PAPER.reward.energy_clip_w_code,
-    fall=-300.0,
-    table_contact=0.0,
-    progress=300.0,
-    scale=0.01,
-)
-"""Forms of the released code, and ours: a reward for turning towards the goal, dear falls, and
-cheap energy and table contact."""
 
 SHORT_ROLLOUTS = PpoCfg(
     rollout_steps=8,

@@ -66,6 +66,21 @@ class RewardCfg:
     """
 
 
+TOWARDS_GOAL = RewardCfg(
+    rotation_epsilon_rad=PAPER.reward.rotation_epsilon_rad_code,
+    fingertip=-10.0,
+    fingertip_mean_distance=True,
+    energy=-1.0,
+    energy_clip_w=PAPER.reward.energy_clip_w_code,
+    fall=-300.0,
+    table_contact=0.0,
+    progress=300.0,
+    scale=0.01,
+)
+"""Forms of the released code, and ours: a reward for turning towards the goal, dear falls, and
+cheap energy and table contact."""
+
+
 @dataclass(frozen=True)
 class SuccessCfg:
     """When a goal counts as reached, and when the object counts as lost."""
@@ -229,8 +244,7 @@ class TighteningCfg:
         if not 0.0 <= self.lower_at <= self.raise_at <= 1.0:
             raise ValueError(
                 f"curriculum.tightening.lower_at is {self.lower_at:g} and raise_at "
-                f"{self.raise_at:g}; "
-                "they have to rise within 0 and 1"
+                f"{self.raise_at:g}; they have to rise within 0 and 1"
             )
 
 
@@ -358,8 +372,7 @@ class RandomisationCfg:
         if not 0.0 <= self.observation_jitter_s <= MAX_LATENCY_S:
             raise ValueError(
                 f"randomisation.observation_jitter_s is {self.observation_jitter_s:g}; it has to "
-                f"be in "
-                f"[0, {MAX_LATENCY_S:g}]"
+                f"be in [0, {MAX_LATENCY_S:g}]"
             )
         require(self, "randomisation.", "positive", "force_s")
         from vd.envs.effects import check_effects  # needs Warp, which settings alone do not
@@ -458,13 +471,12 @@ class ReorientCfg:
         if self.success.rotation_rad > tightening.rotation_rad:
             raise ValueError(
                 f"success.rotation_rad is {self.success.rotation_rad:g}, looser than where it "
-                f"begins, "
-                f"curriculum.tightening.rotation_rad {tightening.rotation_rad:g}; raise the latter"
+                f"begins, curriculum.tightening.rotation_rad {tightening.rotation_rad:g}; raise "
+                "the latter"
             )
         if tightening.object_weight != 1.0 and self.table.lift_share == 0.0:
             raise ValueError(
                 f"curriculum.tightening.object_weight is {tightening.object_weight:g}, but no "
-                f"environment "
-                "asks for objects off the table, and only there are they light; give "
+                "environment asks for objects off the table, and only there are they light; give "
                 "table.lift_share"
             )

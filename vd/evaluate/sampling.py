@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from vd.envs.cfg import CurriculumCfg, RandomisationCfg, RewardCfg, SuccessCfg
+from vd.envs.cfg import TOWARDS_GOAL, CurriculumCfg, RandomisationCfg, SuccessCfg
 from vd.envs.reorient import ReorientEnv
 
 NEVER_S = 1e6
@@ -20,7 +20,11 @@ NEVER_S = 1e6
 
 @dataclass(frozen=True)
 class SamplingCfg:
-    """Sizes of model-predictive path integral control."""
+    """Sizes of model-predictive path integral control.
+
+    Chosen once and not tuned. Half of the samples over twice the horizon does as well on validation
+    meshes; half and twice of the others were not tried.
+    """
 
     samples: int = 256
     """Futures of every environment in every control step."""
@@ -40,26 +44,13 @@ class SamplingCfg:
     """A future ends, paid, where the paper's test holds within this error [rad]."""
 
 
-REWARD = RewardCfg(
-    rotation_epsilon_rad=0.1,
-    fingertip=-10.0,
-    fingertip_mean_distance=True,
-    energy=-1.0,
-    energy_clip_w=10.0,
-    fall=-300.0,
-    table_contact=0.0,
-    progress=300.0,
-    scale=0.01,
-)
-"""What a future is worth: the reward from which teachers learn (vd.train.presets.TOWARDS_GOAL)."""
-
-
 class SamplingController:
     """Model-predictive path integral control (MPPI) of all environments side by side.
 
     Each control step it copies the state of every environment into ``samples`` environments of its
     model, simulates a future in each, and moves its plan to the average of the futures, weighted by
-    their returns. Source: Williams et al., Information Theoretic MPC, ICRA 2017.
+    their returns, of the reward from which teachers learn (``TOWARDS_GOAL``). Source: Williams et
+    al., Information Theoretic MPC, ICRA 2017.
     """
 
     def __init__(
@@ -88,7 +79,7 @@ class SamplingController:
             episode_s=NEVER_S,
             success_ends_episode=True,
             success=replace(SuccessCfg(), rotation_rad=self.cfg.rotation_rad),
-            reward=REWARD,
+            reward=TOWARDS_GOAL,
             curriculum=CurriculumCfg(),
             randomisation=RandomisationCfg(enabled=False),
         )
