@@ -231,8 +231,7 @@ def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
         scaled = sum("scaled by" in note for model in worst for note in model.notes)
         lines.append(
             f"longest side {_span([model.longest_side for model in worst])} m ({scaled} of "
-            f"{len(worst)} "
-            f"scaled), mass {_span([model.mass_kg for model in worst])} kg"
+            f"{len(worst)} scaled), mass {_span([model.mass_kg for model in worst])} kg"
         )
     lines += [
         f"warning {name}: {words}" for name, model in good.items() for words in model.warnings

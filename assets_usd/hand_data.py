@@ -284,9 +284,8 @@ class HandModel:
         if len(set(counts)) > 1:
             raise HandError(
                 f"{self.path}: the fingers of {self.name} have {counts} joints; what was asked for "
-                f"needs "
-                "equal fingers: observe goals in the world frame (observation.view), without a "
-                "camera"
+                "needs equal fingers: observe goals in the world frame (observation.view), "
+                "without a camera"
             )
         return counts[0]
 

@@ -119,9 +119,8 @@ def write_layer(
     layer.defaultPrim = root
     layer.documentation = (
         f"Servo model of {root}, identified by {tool} from {recording}. A layer over the hand: "
-        f"pass it with "
-        f"--hand-layer, or make it a sublayer. Drives are in USD's units (degrees), vd:* in SI and "
-        f"radians."
+        "pass it with --hand-layer, or make it a sublayer. Drives are in USD's units (degrees), "
+        "vd:* in SI and radians."
     )
     layer.customLayerData = {"format": LAYER_FORMAT, "tool": tool, "recording": recording}
     top = Sdf.PrimSpec(layer, root, Sdf.SpecifierOver)
@@ -157,8 +156,7 @@ def open_layer(path: Path) -> Sdf.Layer:
     if not Path(path).is_file():
         raise HandError(
             f"{path}: no such hand layer; name the identified.usda that vd-gap wrote, or, for a "
-            f"policy "
-            "trained with one that is not here, --hand-layer none"
+            "policy trained with one that is not here, --hand-layer none"
         )
     try:
         layer = Sdf.Layer.FindOrOpen(str(Path(path).resolve()))

@@ -48,8 +48,7 @@ def hand_usd(name: str) -> Path:
     how = f" URDF --describe {name}" if name in BUILT_IN else ""
     raise ValueError(
         f"no hand is called {name!r}: choose one of {', '.join(HANDS)}, give a hand's USD file, or "
-        f"import "
-        f"one (vd-assets hand import{how})"
+        f"import one (vd-assets hand import{how})"
     )
 
 

@@ -233,8 +233,7 @@ def _check_teacher(name: str) -> None:
         network = "" if policy.alignment is None else f" --alignment {name}"
         raise ValueError(
             f"{name} sees by camera; adapt its teacher, {policy.spec.teacher}, and let that see "
-            f"again: "
-            f"vd-train tracker runs/adapted --objects SET{network}"
+            f"again: vd-train tracker runs/adapted --objects SET{network}"
         )
 
 

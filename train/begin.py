@@ -124,8 +124,7 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     except ValueError as error:
         raise ValueError(
             f"--init: {path} was written by another version ({error}); add --preset and the "
-            f"settings that it "
-            "was trained with"
+            "settings that it was trained with"
         ) from error
     run = replace(base.run, out=Path("runs") / f"from-{Path(name).stem}")
     return replace(base, run=run, ppo=ppo, policy=policy, env=env)
@@ -250,8 +249,7 @@ def check_fit(
     if found.num_actions != spec.num_actions:
         raise ValueError(
             f"--init: {path} moves {found.num_actions} joints of {hand}, and this run's hand, "
-            f"{here}, has "
-            f"{spec.num_actions}; give --hand {hand}"
+            f"{here}, has {spec.num_actions}; give --hand {hand}"
         )
     from_dict(
         ObservationCfg,

@@ -137,14 +137,13 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
     if not 0.0 < low < policy.initial_std < high:
         raise ValueError(
             f"--policy.std-range is {low} {high}; it has to be positive and hold "
-            f"--policy.initial-std "
-            f"{policy.initial_std} inside"
+            f"--policy.initial-std {policy.initial_std} inside"
         )
     if policy.quiet_std is not None and (
         policy.distribution != "state-dependent" or not 0.0 < policy.quiet_std <= low
     ):
         raise ValueError(
             f"--policy.quiet-std is {policy.quiet_std}; it has to be positive and at most the "
-            f"lower end "
-            f"{low} of --policy.std-range, and needs --policy.distribution state-dependent"
+            f"lower end {low} of --policy.std-range, and needs --policy.distribution "
+            "state-dependent"
         )

@@ -42,8 +42,7 @@ def join_processes(device: str) -> tuple[int, int]:
     if cuda and device != f"cuda:{local_rank}":
         raise ValueError(
             f"--device is {device}, but this is process {local_rank} of its machine; leave "
-            f"--device out, "
-            "then each process takes its own GPU"
+            "--device out, then each process takes its own GPU"
         )
     # Environments are built by now, on some machines minutes later than on others. All wait here,
     # so that the short limit below is one of collectives alone.

@@ -39,8 +39,7 @@ _RARE = {
     "env.randomisation": "stiffness_scale damping_scale link_mass_scale friction table_friction "
     "object_scale object_scale_count object_mass_kg action_noise_std action_offset_std "
     "observation_noise_mean observation_noise_std observation_offset_std force_probability "
-    "force_n_per_kg "
-    "force_decay",
+    "force_n_per_kg force_decay",
 }
 OF_HELP_ALL = frozenset(
     f"{group}.{name}" for group, names in _RARE.items() for name in names.split()

@@ -114,10 +114,8 @@ class TeacherRunner(TrainingLoop):
         if self.ppo.imitation_iterations and present != read:
             raise ValueError(
                 f"--ppo.imitation-iterations: {path} reads {read} values, and the critic is told "
-                f"{present} "
-                "of the present; give --env.observation.dynamics critic, and --init a policy of "
-                "state and "
-                "shape"
+                f"{present} of the present; give --env.observation.dynamics critic, and --init a "
+                "policy of state and shape"
             )
         self.unlike = unlike(found["task"], self.task)
         found, self.new_inputs = widen(found, self.alg.actor, self.alg.critic)
@@ -270,8 +268,7 @@ class TeacherRunner(TrainingLoop):
         except (RuntimeError, ValueError, KeyError) as error:
             raise ValueError(
                 f"{path} does not fit this run's networks or hand; resume with the configuration "
-                f"it was "
-                f"trained with (its run folder's config.json), or start anew ({error})"
+                f"it was trained with (its run folder's config.json), or start anew ({error})"
             ) from error
         self.critic_warmup = state.get("critic_warmup", 0)
         self.imitation = None

@@ -164,8 +164,7 @@ def train(cfg: TeacherCfg, say: Callable[[str], None]) -> int:
     elif not (folder / POLICY_NAME).exists():
         say(
             f"done: nothing was trained, so {folder} has no {POLICY_NAME}: the {runner.env_steps} "
-            f"steps "
-            f"done before are more than --max-steps {cfg.run.max_steps}; raise it"
+            f"steps done before are more than --max-steps {cfg.run.max_steps}; raise it"
         )
     else:
         say(

@@ -151,9 +151,8 @@ def _track(cfg: TrackerCfg) -> int:
         print(
             f"{cfg.out}: stop below {rule.distance_rad:.3f} rad and an action norm of "
             f"{rule.action_norm:.3f}. Of {result.episodes} episodes {result.success:.1%} stop "
-            f"within "
-            f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} "
-            f"came that near"
+            f"within {result.tolerance_rad:g} rad, {result.wrong:.1%} outside; "
+            f"{result.reachable:.1%} came that near"
         )
     return 0
 

@@ -82,8 +82,7 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
         target = author.write(Path(scratch), near | deep.keys())
         warnings += [
             f"{tree.links[one].name} and {tree.links[other].name} are {1e3 * depth:.1f} mm in each "
-            f"other at "
-            "the start; their contact is off, unless another start keeps them apart"
+            "other at the start; their contact is off, unless another start keeps them apart"
             for (one, other), depth in sorted(deep.items())
         ]
         warnings += _replaced(folder / target.name, source)
@@ -117,9 +116,8 @@ def _check_units(source: Source, tree: Tree, stance: Stance) -> None:
         if not REACH_M[0] <= reach <= REACH_M[1]:
             raise HandError(
                 f"{source.path}: the finger of {tree.joints[joints[0]].name} is {reach:.3g} m "
-                f"long, not "
-                f"{REACH_M[0]:g} to {REACH_M[1]:g} m: convert the file to metres, or describe its "
-                f"tip (tips)"
+                f"long, not {REACH_M[0]:g} to {REACH_M[1]:g} m: convert the file to metres, or "
+                "describe its tip (tips)"
             )
 
 
@@ -176,8 +174,8 @@ def _suspicious(tree: Tree) -> list[str]:
             if ends[0] < joint.lower - BEYOND_RAD or ends[1] > joint.upper + BEYOND_RAD:
                 said.append(
                     f"{joint.name} follows {leader} to {ends[0]:.2f} and {ends[1]:.2f} rad, beyond "
-                    f"its "
-                    f"limits {joint.lower:.2f} and {joint.upper:.2f}, which hold both back (limits)"
+                    f"its limits {joint.lower:.2f} and {joint.upper:.2f}, which hold both back "
+                    "(limits)"
                 )
     return said + [
         f"zero is outside the limits of {joint.name}, {joint.lower:.2f} to {joint.upper:.2f} rad"

@@ -79,8 +79,8 @@ def joint_table(hand: HandModel, sources: list[str]) -> str:
             moves = f"{motor.model} {motor.id}" if motor else "a motor"
         lines.append(
             f"{name:6} {sources[i]:{width}} {hand.lower[i]:7.3f} {hand.upper[i]:7.3f} "
-            f"{hand.start[i]:8.3f} "
-            f"{hand.effort[i]:5.2f} {hand.kp[i]:6.2f} {hand.kd[i]:6.3f}  {moves}"
+            f"{hand.start[i]:8.3f} {hand.effort[i]:5.2f} {hand.kp[i]:6.2f} {hand.kd[i]:6.3f}  "
+            f"{moves}"
         )
     return "\n".join(lines)
 
@@ -105,10 +105,9 @@ def hand_sheet(hand: HandModel, sources: list[str], path: Path) -> Path:
     place = hand.workspace
     title = (
         f"{hand.name}: {hand.num_fingers} fingers, {hand.num_joints} joints, {len(hand.shapes)} "
-        f"colliders, "
-        f"{hand.link_mass.sum():.3f} kg, palm {'up' if hand.palm_up else 'down'}; objects of "
-        f"{1e3 * place.size_m[0]:.0f} to {1e3 * place.size_m[1]:.0f} mm; red: fingertips, green: "
-        f"drop point"
+        f"colliders, {hand.link_mass.sum():.3f} kg, palm {'up' if hand.palm_up else 'down'}; "
+        f"objects of {1e3 * place.size_m[0]:.0f} to {1e3 * place.size_m[1]:.0f} mm; red: "
+        "fingertips, green: drop point"
     )
     figure.text(0.01, 0.97, title, fontsize=9, va="top")
     figure.text(0.03, text, joint_table(hand, sources), fontsize=6.5, va="top", family="monospace")

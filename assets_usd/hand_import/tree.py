@@ -497,8 +497,7 @@ class _Grower:
         if not LEAST_M < 2.0 * half.max() < MOST_M:
             self.problems.append(
                 f"{what} is {2.0 * half.max():.3g} m long; give it its size in metres, a mesh by "
-                f"its scale, "
-                "such as 0.001"
+                "its scale, such as 0.001"
             )
         elif shape.collides and shape.kind == "mesh":
             hull = hull_volume(shape.vertices)

@@ -90,8 +90,7 @@ def _outer_body(mesh: RepairedMesh) -> Body:
     thickness = solid.volume / float(triangle_areas(vertices, faces).sum())
     warning = (
         f"open: the surface encloses nothing, and is taken as a sheet {1e3 * thickness:.1f} mm "
-        f"thick, empty "
-        "inside; close it, or give it thickness"
+        "thick, empty inside; close it, or give it thickness"
     )
     return Body(partial(_in_voxels, *grid), solid.volume, solid, "voxelised sheet", (warning,))
 

@@ -114,8 +114,7 @@ def find_meshes(paths: Iterable[Path]) -> list[Path]:
     if not found:
         raise MeshError(
             f"no mesh in {', '.join(map(str, paths))}; supported: {', '.join(MESH_SUFFIXES)}; to "
-            f"be told "
-            "what is wrong with a file, name it"
+            "be told what is wrong with a file, name it"
         )
     return list(dict.fromkeys(map(absolute, found)))
 
@@ -212,8 +211,7 @@ def check_target(job: Job) -> None:
     if not facts:
         raise MeshError(
             f"{target} is there and no object of vd-assets, or a damaged one; remove it, or import "
-            f"into "
-            "another folder (--out)"
+            "into another folder (--out)"
         )
     source, file = str(facts.get("source", "")), str(facts.get("file", ""))
     # Objects of versions that recorded no file are told by the name in their source.

@@ -51,8 +51,7 @@ def mesh_kind(path: Path) -> str:
     if suffix not in MESH_SUFFIXES:
         raise MeshError(
             f"unsupported type {suffix or '(no suffix)'}; use {', '.join(MESH_SUFFIXES)}: export a "
-            f"CAD or "
-            "scene file from the program that made it, and unpack an archive"
+            "CAD or scene file from the program that made it, and unpack an archive"
         )
     return suffix[1:4]  # usdz is a usd
 
@@ -122,8 +121,7 @@ def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
     if said and len(faces) < int(said.group(1)):
         raise MeshError(
             f"declares {int(said.group(1))} faces, of which {len(faces)} could be read: cut short "
-            f"or "
-            "damaged; get it again, or export it again"
+            "or damaged; get it again, or export it again"
         )
     return vertices, faces
 

@@ -130,8 +130,7 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
     if sides.min() < SLIVER_THICKNESS * sides.max():
         raise MeshError(
             f"degenerate: flat ({sides.min():.3g} thick for {sides.max():.3g} long); contacts need "
-            f"at "
-            f"least {100 * SLIVER_THICKNESS:g} % of the length: give it thickness"
+            f"at least {100 * SLIVER_THICKNESS:g} % of the length: give it thickness"
         )
     if not mesh.is_winding_consistent:
         notes.append("fixed winding")
@@ -348,14 +347,12 @@ def _turned_outward(
     if hollow > CAVITY * whole:
         warnings.append(
             f"has a closed cavity of {100 * hollow / whole:.0f} % of its volume: mass and inertia "
-            f"are "
-            "those of the hollow body, its convex parts are full"
+            "are those of the hollow body, its convex parts are full"
         )
     if np.abs(volume[within & ~border]).sum() > CAVITY * whole:
         warnings.append(
             "a closed surface inside of another is wound like it, and taken as solid: if it is a "
-            "cavity, "
-            "turn its faces round"
+            "cavity, turn its faces round"
         )
     kept = trimesh.Trimesh(mesh.vertices, faces[~within[of_face]], process=False)
     kept.remove_unreferenced_vertices()

@@ -90,11 +90,9 @@ def calibrate(cfg: CalibrateCfg) -> int:
         return 0
     print(
         f"WARNING: ill-conditioned: where objects are, the cloud may be off by {1e3 * error_m:.1f} "
-        f"mm, more "
-        f"than a voxel ({1e3 * LARGEST_ERROR_M:.0f} mm). The fingers turn too little for these "
-        f"pictures: "
-        "take more views (--count), put markers on more fingers, larger ones, or move the camera "
-        "nearer"
+        f"mm, more than a voxel ({1e3 * LARGEST_ERROR_M:.0f} mm). The fingers turn too little for "
+        "these pictures: take more views (--count), put markers on more fingers, larger ones, or "
+        "move the camera nearer"
     )
     return 1
 

@@ -140,10 +140,8 @@ def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -
         if len(rows) < max(LEAST_VIEWS, len(views) / 2):
             raise HandEyeError(
                 f"only {len(rows)} of {len(views)} views agree with each other; check the marker's "
-                f"side, "
-                "that it sits firmly, that fingers and motors are numbered as in the calibration, "
-                "light, and "
-                "that the camera is roughly where the hand's file has it"
+                "side, that it sits firmly, that fingers and motors are numbered as in the "
+                "calibration, light, and that the camera is roughly where the hand's file has it"
             )
         again = refine(views.chosen(rows), found.camera, found.markers)
         found = replace(again, markers=found.markers | again.markers, inliers=rows)

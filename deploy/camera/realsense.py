@@ -79,8 +79,7 @@ def find_device(serial: str = "") -> Any:
     if not devices:
         raise CameraError(
             "no RealSense camera answers; check its cable and port (USB 3), the udev rules of "
-            "librealsense, "
-            "and that no other program holds it"
+            "librealsense, and that no other program holds it"
         )
     if serial not in devices and (serial or len(devices) > 1):
         raise CameraError(
@@ -160,8 +159,7 @@ class RealSense:
         if frame.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock:
             raise CameraError(
                 "the camera stamps its images by a clock of its own, so nobody knows their age: "
-                "switch its "
-                "option global_time_enabled on (realsense-viewer)"
+                "switch its option global_time_enabled on (realsense-viewer)"
             )
         time_s = frame.get_timestamp() * MILLISECOND + time.monotonic() - time.time()
         if self._infrared:

@@ -179,9 +179,8 @@ class StateCheck:
                 # are gone.
                 raise BusError(
                     f"motor {id}: its clock differs from ours by {late:.3f} s since the last "
-                    f"state: that "
-                    "state was an old one; if this goes on, the motor restarted and has to be "
-                    "configured"
+                    "state: that state was an old one; if this goes on, the motor restarted and "
+                    "has to be configured"
                 )
         for axis, id in enumerate(self._ids):
             moved = abs(state.position[axis] - last.position[axis])

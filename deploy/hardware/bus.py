@@ -54,8 +54,7 @@ BUSY = (
 )
 TWICE = (
     "its answers are garbled: two motors have the ID {id} (unplug one, and give the other a new "
-    "one with "
-    "ROBOTIS' DYNAMIXEL Wizard 2.0), or a cable is bad"
+    "one with ROBOTIS' DYNAMIXEL Wizard 2.0), or a cable is bad"
 )
 """What garbled answers mean."""
 RETRIES, TWIN_RETRIES = 1, 3

@@ -204,8 +204,7 @@ def _holding(bus: "MotorBus") -> str:
     current = float(np.abs(bus.read_state().current[on]).max())
     return (
         f"motors {ids} hold, with up to {current:.2f} A: they let go when their settings are "
-        f"written; "
-        "support what the hand carries"
+        "written; support what the hand carries"
     )
 
 

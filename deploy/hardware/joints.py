@@ -71,8 +71,7 @@ class Joints:
             if capped and not model.senses_current:
                 raise CalibrationError(
                     f"{hand.name}: {name} has a largest current, which {model.name} does not "
-                    f"measure; "
-                    "take vd:motor:current away"
+                    "measure; take vd:motor:current away"
                 )
 
     def to_motor(self, joint: np.ndarray) -> np.ndarray:
@@ -132,10 +131,8 @@ class Joints:
             if low < first or high > last:
                 raise CalibrationError(
                     f"{self.names[axis]}, motor {motor.id}: its range is {low:.2f} to {high:.2f} "
-                    f"rad of the "
-                    f"motor, which turns from {first:.2f} to {last:.2f}; mount it nearer its "
-                    f"middle, or mend "
-                    "its offset"
+                    f"rad of the motor, which turns from {first:.2f} to {last:.2f}; mount it "
+                    "nearer its middle, or mend its offset"
                 )
             fastest = float(self.hand.velocity_limit[axis]) * motor.gear
             result[motor.id] = MotorSettings(
@@ -179,8 +176,7 @@ def read_joints(
         if said is None and (entry is None or model is None):
             raise CalibrationError(
                 f"{hand.path} does not say which motor turns {name}: describe motors when it is "
-                f"imported "
-                "(vd:motor), or give --motor and --calibration"
+                "imported (vd:motor), or give --motor and --calibration"
             )
         motor = said or MotorModel(str(model), 0)
         if entry is not None:

@@ -254,8 +254,7 @@ def load_runner(
         return TeacherRunner(policy, hand_name, object, tolerance_rad)
     raise ValueError(
         f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train "
-        f"tracker "
-        "makes a tracking policy of it"
+        "tracker makes a tracking policy of it"
     )
 
 

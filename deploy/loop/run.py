@@ -189,9 +189,8 @@ def run(cfg: RunCfg) -> int:
         sys.modules["torch"].set_num_threads(1)
     if not runner.calibrated:
         print(
-            f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that "
-            f"distance; "
-            "vd-train tracker finds a better one",
+            f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts "
+            "that distance; vd-train tracker finds a better one",
             file=sys.stderr,
         )
     fault: Exception | None = None

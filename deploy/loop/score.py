@@ -164,9 +164,8 @@ def score_run(
     if mocap.time_s[-1] < 0.0 or mocap.time_s[0] > end:
         raise MocapError(
             f"{mocap.path} covers {mocap.time_s[0]:.1f} to {mocap.time_s[-1]:.1f} s of the log's "
-            f"time, "
-            f"the log 0 to {end:.1f} s; name the clocks' offset with --offset-s, or export the "
-            f"right take"
+            f"time, the log 0 to {end:.1f} s; name the clocks' offset with --offset-s, or export "
+            "the right take"
         )
     trials = []
     for stop in log.stops:
@@ -214,8 +213,7 @@ def lines(result: Score) -> list[str]:
     for tolerance, share in result.within:
         rows.append(
             f"within {tolerance:.1f} rad: {100 * share.value:3.0f} %, 95 % {100 * share.low:.0f} "
-            f"to "
-            f"{100 * share.high:.0f} % of all that were scored"
+            f"to {100 * share.high:.0f} % of all that were scored"
         )
     return rows
 

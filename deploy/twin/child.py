@@ -94,8 +94,7 @@ class TwinChild:
         if not self._pipe.poll(START_S):
             raise TwinError(
                 f"the twin did not start within {START_S:g} s; what it has compiled is kept, so "
-                f"try again, "
-                "or with fewer other programs"
+                "try again, or with fewer other programs"
             )
         try:
             told = self._pipe.recv()

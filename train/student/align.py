@@ -209,8 +209,7 @@ class AlignTrainer(TrainingLoop):
         except (RuntimeError, ValueError, KeyError) as error:
             raise ValueError(
                 f"{path} does not fit this run's network; resume with the configuration it was "
-                f"trained with "
-                f"(its run folder's config.json), or start anew ({error})"
+                f"trained with (its run folder's config.json), or start anew ({error})"
             ) from error
 
     def _samples(self) -> int:

@@ -81,8 +81,7 @@ class AlignCfg:
         if self.points < max(self.network.tokens, self.network.neighbours):
             raise ValueError(
                 f"--align.points is {self.points}; it has to be at least the tokens and neighbours "
-                f"of "
-                "--align.network"
+                "of --align.network"
             )
 
 

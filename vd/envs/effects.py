@@ -26,6 +26,5 @@ def check_effects(effects: Mapping[str, tuple[float, float]]) -> None:
         if not lowest <= low <= high <= parameter.upper:
             raise ValueError(
                 f"randomisation.effects: {name} from {low:g} to {high:g}; the low end comes first, "
-                f"and both "
-                f"lie between {lowest:g} and {parameter.upper:g} {parameter.unit}"
+                f"and both lie between {lowest:g} and {parameter.upper:g} {parameter.unit}"
             )

@@ -114,8 +114,7 @@ def _function(name: str) -> Callable[[Any], torch.Tensor]:
     except Exception as error:
         raise ValueError(
             f"the own term {name!r} is not found ({error}); name it module:function, and run where "
-            f"that "
-            "module can be imported"
+            "that module can be imported"
         ) from error
     finally:
         sys.path.remove(here)

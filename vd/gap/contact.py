@@ -314,9 +314,8 @@ def _check_gravity(recording: ContactRecording, state: _State) -> None:
     if falls and not 0.8 < np.median(falls) / GRAVITY_M_S2 < 1.25:
         raise RecordingError(
             f"{recording.path}: dropped objects fall with {np.median(falls):.3g} m/s^2, not "
-            f"{GRAVITY_M_S2}: "
-            "z of the table's frame points up, positions are in m, t is in s: correct "
-            "table_pose or the columns"
+            f"{GRAVITY_M_S2}: z of the table's frame points up, positions are in m, t is in s: "
+            "correct table_pose or the columns"
         )
 
 

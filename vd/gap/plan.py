@@ -383,15 +383,13 @@ def _sentence(best: MenuScore, report: Report, joints: tuple[str, ...], kinds: i
             decide = f"but here are {kinds} kinds of motion: record {MIN_KINDS} at least"
         return (
             f"No motion of the menu would decide{between}: on all of them the models in question "
-            f"differ by "
-            f"less than {REPEATABLE:g} times the noise, {decide}. The best of the menu is in "
-            f"{PLAN_FOLDER}/."
+            f"differ by less than {REPEATABLE:g} times the noise, {decide}. The best of the menu "
+            f"is in {PLAN_FOLDER}/."
         )
     goal = f"to decide{between}" if sets else "to see what these motions do not show"
     return (
         f"Record the motions {best.name} on {joints_text(joints)}, {best.seconds:.0f} s, {goal}: "
-        f"there the "
-        f"models in question differ by {best.disagreement:.1f} times the noise. The commands are "
-        f"in "
-        f"{PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
+        f"there the models in question differ by {best.disagreement:.1f} times the noise. The "
+        f"commands are in {PLAN_FOLDER}/; add what was measured to the recording and run vd-gap "
+        "again."
     )

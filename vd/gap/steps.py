@@ -100,8 +100,7 @@ class Analysis:
         if named is not None:
             raise ValueError(
                 f"{recording.path} is of a bare {recording.model}, not of {named}: leave out "
-                f"--hand, or name "
-                "the hand as 'model' in recording.json"
+                "--hand, or name the hand as 'model' in recording.json"
             )
         return None
 

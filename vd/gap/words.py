@@ -108,14 +108,12 @@ def verdict_sentence(report: Report) -> str:
         )
         return (
             f"No gap: the {model} explains this recording. It leaves {sizes}: no more than noise, "
-            f"or "
-            "what no candidate explains."
+            "or what no candidate explains."
         )
     if report.verdict == "under_excited":
         return (
             "No verdict on effects: the motions in this recording do not determine the model. "
-            "Different "
-            "parameters fit equally well."
+            "Different parameters fit equally well."
         )
     return f"There is a gap: {sizes}. No effect that was tried explains it."
 
@@ -124,10 +122,8 @@ def _shrinks(report: Report) -> str:
     held, names = report.held_out, {one.name for one in report.effects}
     return (
         f"With {'it' if len(names) == 1 else 'them'} the error on motions that the fit has not "
-        f"seen falls "
-        f"from {mrad(held.baseline_rmse_rad)} to {mrad(held.identified_rmse_rad)} "
-        f"({percent(held.reduction)} "
-        f"less, 95 %: {percent_range(held.ci95)}); the noise floor is "
+        f"seen falls from {mrad(held.baseline_rmse_rad)} to {mrad(held.identified_rmse_rad)} "
+        f"({percent(held.reduction)} less, 95 %: {percent_range(held.ci95)}); the noise floor is "
         f"{mrad(report.noise_floor_rad)}."
     )
 
@@ -138,15 +134,13 @@ def _besides(report: Report) -> str:
     if any(effect.name == "encoder_bias" for effect in report.effects):
         text += (
             " An encoder bias is first of all a difference of zeros between command and reading: "
-            "compare "
-            "them before you use the model."
+            "compare them before you use the model."
         )
     for name, *others in report.ambiguous:
         if not any({name, *others} >= {*group} for group in report.open_sets):
             text += (
                 f" {plain(name).capitalize()} stands for {causes(others, 'and')} too: commands and "
-                f"positions "
-                "are the same, whichever it is."
+                "positions are the same, whichever it is."
             )
     return f"{text} More is missing. {_leaves(report)}" if report.open_sets else text
 
@@ -174,8 +168,7 @@ def next_step(report: Report) -> str:
         use = f"vd-train adapt POLICY --hand-layer {layer} goes on in it; vd-eval and vd-play take it too."
     return (
         f"Nothing is open. {use} To confirm that the gap is closed, run vd-gap on a new recording "
-        f"with "
-        f"--hand-layer {LAYER}."
+        f"with --hand-layer {LAYER}."
     )
 
 

@@ -76,8 +76,7 @@ class WorkerPool:
         except BrokenProcessPool as error:
             raise ChildProcessError(
                 f"one of {self.workers} processes was killed, most often since memory ran out: "
-                f"free "
-                "some, or give fewer processors (taskset), and run the same command again"
+                "free some, or give fewer processors (taskset), and run the same command again"
             ) from error
 
 

@@ -163,8 +163,7 @@ def read_bam(path: Path, told: Told) -> Iterator[SourceMotion]:
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(
                 f"{file}: no log of BAM ({error!r}); it has mass, length, kp, trajectory, and "
-                f"entries of "
-                "timestamp, position and goal_position"
+                "entries of timestamp, position and goal_position"
             ) from error
         joint = told.called("pendulum", "pendulum")
         values = {channel: of_joint[:, None] for channel, of_joint in channels.items()}
@@ -188,8 +187,7 @@ def read_lerobot(path: Path, told: Told) -> Iterator[SourceMotion]:
     if told.unit is None:
         raise RecordingError(
             f"{info}: LeRobot does not say the unit of joints; give --unit deg or rad. Values "
-            f"normalised to "
-            "-100 to 100 are no angles: record with use_degrees=True"
+            "normalised to -100 to 100 are no angles: record with use_degrees=True"
         )
     joints = [joint for joint in names[1] if joint in names[0]]
     if not joints:
@@ -343,8 +341,7 @@ def _goal(path: Path, message: Any, joints: list[str]) -> np.ndarray:
         if len(points) != 1:
             raise RecordingError(
                 f"{path}: a JointTrajectory of {len(points)} points says what a controller is to "
-                f"make of it, "
-                "not what was sent; give a --command-topic of positions"
+                "make of it, not what was sent; give a --command-topic of positions"
             )
         values = points[0].positions
     else:

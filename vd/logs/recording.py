@@ -65,8 +65,7 @@ def read_recording(path: str | Path) -> Recording:
     require(
         _is_number(resolution) and 0.0 < resolution < math.radians(1.0),
         f"{file}: 'encoder_resolution_rad' is {resolution!r}, as if in degrees; give the size of "
-        f"one "
-        "encoder count in rad, e.g. 0.001534 for 4096 counts a turn",
+        "one encoder count in rad, e.g. 0.001534 for 4096 counts a turn",
     )
     servo: Any = header.get("servo", {})
     entries: Any = header.get("trajectories")
@@ -188,8 +187,7 @@ def _check_stiffness(file: Path, told: Any, joints: tuple[str, ...]) -> None:
         require(
             joint in joints and _is_number(value) and value > 0.0,
             f"{file}: servo.{STIFFNESS} is {told!r}; give a positive number in N m/rad, or one by "
-            f"joint: "
-            f"{', '.join(joints)}",
+            f"joint: {', '.join(joints)}",
         )
 
 
@@ -310,8 +308,7 @@ def numbers(file: Path, name: str, cells: list[str]) -> np.ndarray:
         if not math.isfinite(values[i]):
             raise RecordingError(
                 f"{file}: row {i + 2}, column {name!r}: {cell.strip() or 'an empty cell'} is not a "
-                f"finite "
-                "number; drop the row, or the column if it is optional"
+                "finite number; drop the row, or the column if it is optional"
             )
     return values
 
@@ -323,8 +320,7 @@ def _read_columns(file: Path, joints: tuple[str, ...]) -> dict[str, np.ndarray]:
     require(
         len(rows) >= MIN_SAMPLES,
         f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, better some seconds at "
-        f"100 Hz: "
-        "record it again or drop it from 'trajectories'",
+        "100 Hz: record it again or drop it from 'trajectories'",
     )
     columns = {
         name: numbers(file, name, [row[index] for row in rows]) for name, index in kept.items()

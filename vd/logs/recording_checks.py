@@ -99,8 +99,7 @@ def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
     require(
         float(np.diff(sent).min()) >= 0.0 and abs(float(np.median(sent - time))) <= SLOWEST_S,
         f"{file}: {COMMAND_TIME!r} runs backward, or is of another unit or clock than 't'; write "
-        f"seconds "
-        "on that clock, in the order of the rows, or drop it",
+        "seconds on that clock, in the order of the rows, or drop it",
     )
     for name, values in columns.items():
         low, high, why = RANGES.get(name.partition(".")[0], (-np.inf, np.inf, ""))
@@ -113,8 +112,7 @@ def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
         require(
             not name.startswith("position.") or abs(values[i + 1] - values[i]) <= math.pi,
             f"{file}: row {i + 3}, column {name!r} jumps by a turn, as angles wrapped at pi do; "
-            f"unwrap it "
-            "and its command (numpy.unwrap)",
+            "unwrap it and its command (numpy.unwrap)",
         )
 
 
@@ -126,8 +124,7 @@ def check_motion(recording: Recording) -> None:
     require(
         any(np.ptp(t.command, axis=0).any() for t in recording.trajectories),
         f"{recording.path / 'recording.json'}: no 'command.' column moves in any trajectory, so "
-        f"nothing can "
-        "be identified; record steps and sines",
+        "nothing can be identified; record steps and sines",
     )
     count = recording.encoder_resolution_rad
     for j, joint in enumerate(recording.joints):
@@ -144,9 +141,8 @@ def check_motion(recording: Recording) -> None:
             answers.max() > FLICKER_COUNTS * count and answers.min() > 0.0,
             f"{recording.path / told[least].file}: column 'position.{joint}' only flickers, by "
             f"{answers[least]:.2g} rad, while 'command.{joint}' moves by "
-            f"{np.ptp(told[least].command[:, j]):.3g} rad: a dead encoder, or a servo that is off; "
-            f"record it "
-            "again",
+            f"{np.ptp(told[least].command[:, j]):.3g} rad: a dead encoder, or a servo that is "
+            "off; record it again",
         )
         why = _answer_fault(told, j, count)
         require(not why, f"{recording.path}: column 'position.{joint}' {why}")
@@ -167,8 +163,7 @@ def _answer_fault(told: list[Trajectory], j: int, count: float) -> str:
     if (lead := float(np.median([_lead(t, j) for t in told]))) > 0.0:
         return (
             f"moves {1e3 * lead:.0f} ms before its command: the two columns are swapped, or their "
-            f"stamps are "
-            "of two clocks; rename the columns, or correct the stamps"
+            "stamps are of two clocks; rename the columns, or correct the stamps"
         )
     return ""
 
@@ -219,14 +214,12 @@ def cautions(recording: Recording) -> tuple[str, ...]:
     if few:
         found.append(
             f"Fewer than {MIN_KINDS} kinds of motion move {', '.join(few)}: little is left to fit "
-            f"when one "
-            "is held out."
+            "when one is held out."
         )
     between = float(np.median(np.concatenate([np.diff(t.time) for t in recording.trajectories])))
     if between > SLOWEST_S / MIN_SAMPLES:
         found.append(
             f"Samples are {1e3 * between:.0f} ms apart: what a servo does at the beginning of a "
-            f"step is not "
-            f"resolved; record at {MIN_SAMPLES / SLOWEST_S:.0f} Hz or more."
+            f"step is not resolved; record at {MIN_SAMPLES / SLOWEST_S:.0f} Hz or more."
         )
     return tuple(found)

@@ -139,8 +139,7 @@ def calibrate(
         near = int(right.any(axis=1).sum())
         raise ValueError(
             f"no rule stops any of {len(true)} episodes within {tolerance_rad:g} rad ({near} came "
-            f"near); "
-            "train longer, or choose on more episodes (--episodes)"
+            "near); train longer, or choose on more episodes (--episodes)"
         )
     return Calibration(
         rule=StoppingRule(distance_rad=-best[2], action_norm=-best[3]),

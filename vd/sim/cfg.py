@@ -92,14 +92,12 @@ class SimCfg:
             raise ValueError(
                 f"sim.physics_hz = {self.physics_hz} must be an even multiple of sim.control_hz = "
                 f"{self.control_hz} (states are swapped every physics step and must end where they "
-                f"began); "
-                f"set sim.physics_hz to {self.control_hz * max(2, 2 * round(ratio / 2))}"
+                f"began); set sim.physics_hz to {self.control_hz * max(2, 2 * round(ratio / 2))}"
             )
         if self.contact_time_constant_s < 2.0 * self.physics_dt * (1.0 - 1e-6):
             raise ValueError(
                 f"sim.contact_time_constant_s = {self.contact_time_constant_s} is below two "
-                f"physics steps; "
-                f"set it to {2.0 * self.physics_dt} or raise sim.physics_hz"
+                f"physics steps; set it to {2.0 * self.physics_dt} or raise sim.physics_hz"
             )
 
 

@@ -171,8 +171,7 @@ class JointServo:
                 joint = int(np.argwhere(bad)[0][-1])
                 raise ValueError(
                     f"joint {joint}: {effect}:{parameter.name} = {values[bad][0]:g} "
-                    f"{parameter.unit}; "
-                    f"set a finite value of at most {limit:g}"
+                    f"{parameter.unit}; set a finite value of at most {limit:g}"
                 )
         self.parameters.assign(np.broadcast_to(rows, (n, d, PARAMETER_COLUMNS)).reshape(n * d, -1))
         self.push_inertia()
