@@ -24,12 +24,13 @@ OBJECTS ?=
 FIGURES_ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test lint type format reference docs bench figures clean
+.PHONY: help env demo test coverage lint type format reference docs bench figures clean
 
 help:
 	@echo 'make demo     turn unseen objects, close a gap, drive a simulated hand, train a little: demo/index.html'
 	@echo '              MESHES=DIR turns your own meshes; DEMO_ARGS=--quick ends after the first part'
 	@echo 'make test     all tests; TEST_ARGS="-k rewards" chooses some'
+	@echo 'make coverage  the same, and which lines no test runs'
 	@echo 'make lint     ruff, without changing files      make format   the same, changing files'
 	@echo 'make type     mypy on the package               make bench    simulation throughput'
 	@echo 'make docs     the documentation as a site, build/site/index.html'
@@ -61,6 +62,10 @@ demo: $(STAMP)
 test: $(STAMP)
 	@echo 'all tests take about ten minutes on two cores; each file is named as it begins'
 	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
+
+# Code in Warp kernels and in processes of their own is not counted.
+coverage: $(STAMP)
+	$(MAKE) --no-print-directory test TEST_ARGS='--cov=vd --cov-report=term:skip-covered $(TEST_ARGS)'
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
