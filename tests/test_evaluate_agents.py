@@ -11,7 +11,10 @@ import warp as wp
 
 import vd
 from vd.assets_usd.hands import hand_usd
-from vd.evaluate.agents import (
+from vd.evaluate.cli import main
+from vd.evaluate.conditions import CONDITIONS
+from vd.evaluate.result import SUCCESS, Result
+from vd.policy.agents import (
     POLICY_FOLDER,
     SHIPPED_POLICIES,
     find_policy,
@@ -20,9 +23,6 @@ from vd.evaluate.agents import (
     policy_name,
     task_for,
 )
-from vd.evaluate.cli import main
-from vd.evaluate.conditions import CONDITIONS
-from vd.evaluate.result import SUCCESS, Result
 from vd.policy.bundle import read_policy
 from vd.policy.store import describe, read_store
 from vd.train.begin import find_start

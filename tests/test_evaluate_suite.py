@@ -13,7 +13,6 @@ from test_evaluate_page import read_page
 from test_evaluate_trace import compared
 
 from vd.evaluate import suite_run
-from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.claims import lost_at_once, success_without_table
 from vd.evaluate.cli import main
@@ -22,6 +21,7 @@ from vd.evaluate.result import Result
 from vd.evaluate.suite import OWN_SETS, QUICK_OBJECTS, QUICK_S, Suite, read_suite
 from vd.evaluate.trace import Episode
 from vd.paper import ResultConstants
+from vd.policy.agents import SHIPPED_POLICIES
 
 TEACHER, CAMERA = "dclaw3", "dclaw3-tracking"
 OBJECTS = ("training=cube", "held-out=cube", "symmetric=cube")

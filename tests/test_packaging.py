@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from vd.command.interrupt import EXTRAS, command
-from vd.evaluate.agents import DEFAULT_POLICY, POLICY_LIST, SHIPPED_POLICIES
+from vd.policy.agents import DEFAULT_POLICY, POLICY_LIST, SHIPPED_POLICIES
 from vd.train.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -11,8 +11,8 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from vd.evaluate import agents
-from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, pulled_folder
+from vd.policy import agents
+from vd.policy.agents import SHIPPED_POLICIES, find_policy, pulled_folder
 from vd.policy.store import main
 
 CUBE, OTHER = (SHIPPED_POLICIES[name].read_bytes() for name in ("dclaw4-cube", "dclaw4"))

@@ -11,9 +11,9 @@ import tyro
 from vd.command.config import require
 from vd.command.device import resolve_device
 from vd.command.line import parse, say_same_as
-from vd.evaluate.agents import DEFAULT_HAND, DEFAULT_POLICY, NO_LAYER, check_names, policy_at
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.conditions import EXACT
+from vd.policy.agents import DEFAULT_HAND, DEFAULT_POLICY, NO_LAYER, check_names, policy_at
 from vd.policy.defaults import default_policy
 from vd.train.begin import find_start, read_start, settings_of
 from vd.train.flags import saved_config
@@ -223,7 +223,7 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
 
 def _check_teacher(name: str) -> None:
     """Refuse what sees by camera: its teacher learns, and sees again afterwards."""
-    from vd.evaluate.agents import open_policy
+    from vd.policy.agents import open_policy
     from vd.tracking.policy import TrackingPolicy
 
     policy = open_policy(name, "cpu")

@@ -22,7 +22,7 @@ def open_network(
         FileNotFoundError: There is no such file.
         ValueError: It holds no such network.
     """
-    from vd.evaluate.agents import installed_policies, open_policy
+    from vd.policy.agents import installed_policies, open_policy
     from vd.tracking.policy import TrackingPolicy
 
     if name not in installed_policies() and not has_suffix(name, SUFFIX):

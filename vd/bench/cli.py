@@ -68,7 +68,7 @@ class SimCommand(Measurement):
 
     def run(self) -> int:
         """Measure and print."""
-        from vd.evaluate.agents import open_teacher
+        from vd.policy.agents import open_teacher
 
         device = resolve_device(self.device)
         teacher = open_teacher(self.policy, device)

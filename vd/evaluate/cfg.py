@@ -12,10 +12,10 @@ from vd.assets_usd.hands import HANDS
 from vd.command.config import require
 from vd.command.workers import shard
 from vd.envs.cfg import RandomisationCfg
-from vd.evaluate.agents import DEFAULT_HAND, SHIPPED_POLICIES
 from vd.evaluate.conditions import CONDITIONS, Condition
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, ONE_GOAL, Goals, GoalSchedule
 from vd.paper import PAPER
+from vd.policy.agents import DEFAULT_HAND, SHIPPED_POLICIES
 from vd.policy.defaults import default_policy
 from vd.sim.cfg import Engine
 

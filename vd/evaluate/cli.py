@@ -8,9 +8,9 @@ from itertools import chain
 from vd.command import interrupt
 from vd.command.files import check_file, check_folder
 from vd.command.line import parse, say_same_as
-from vd.evaluate.agents import check_names
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.suite import read_suite
+from vd.policy.agents import check_names
 
 
 @interrupt.command("vd-eval")

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vd.command.warp_quiet import quiet_warp
-from vd.evaluate.agents import check_fits, open_policy, sees_clouds, task_for
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
 from vd.evaluate.conditions import in_condition
+from vd.policy.agents import check_fits, open_policy, sees_clouds, task_for
 from vd.sim.cfg import in_mujoco
 
 if TYPE_CHECKING:

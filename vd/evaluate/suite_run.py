@@ -21,7 +21,6 @@ from vd.command.files import make_folder, write_json
 from vd.command.line import parse
 from vd.command.versions import code_fingerprint
 from vd.command.workers import run_tasks, shard
-from vd.evaluate.agents import BUILT_IN, find_policy, open_policy, sees_clouds
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.claims import ours
 from vd.evaluate.compare import compare
@@ -41,6 +40,7 @@ from vd.evaluate.suite import (
     read_suite,
     share_text,
 )
+from vd.policy.agents import BUILT_IN, find_policy, open_policy, sees_clouds
 
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""

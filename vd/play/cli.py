@@ -18,10 +18,10 @@ from vd.command.device import resolve_device
 from vd.command.files import check_file
 from vd.command.line import parse, say_same_as
 from vd.command.warp_quiet import quiet_warp
-from vd.evaluate.agents import DEFAULT_HAND, check_names
 from vd.evaluate.cfg import LOG_EVERY_S, POLICY_HELP, HandFlags, TaskFlags, episode_limit_s
 from vd.logs.hand_log import is_log
 from vd.paper import PAPER
+from vd.policy.agents import DEFAULT_HAND, check_names
 from vd.policy.defaults import default_policy
 from vd.sim.cfg import in_mujoco
 
@@ -182,7 +182,7 @@ def _session(cfg: PlayCfg) -> "Session":
 
 def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any]:
     """Environment with at least one environment for each object, and what acts in it."""
-    from vd.evaluate.agents import check_fits, open_policy, task_for
+    from vd.policy.agents import check_fits, open_policy, task_for
 
     device = resolve_device(cfg.device)
     trained = open_policy(cfg.policy, device)

@@ -23,7 +23,8 @@ from vd.command import interrupt
 from vd.command.config import from_dict, to_dict
 from vd.command.files import atomic_path, write_json
 from vd.command.line import parse
-from vd.evaluate.agents import (
+from vd.policy import SUFFIX, has_suffix
+from vd.policy.agents import (
     BUILT_IN,
     POLICY_FOLDER,
     POLICY_LIST,
@@ -33,7 +34,6 @@ from vd.evaluate.agents import (
     policy_name,
     pulled_folder,
 )
-from vd.policy import SUFFIX, has_suffix
 
 STORE_FORMAT = "visual-dexterity policies 1"
 HUB, HUB_URL = "hf://", "https://huggingface.co"
