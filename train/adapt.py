@@ -13,8 +13,14 @@ from vd.command.device import resolve_device
 from vd.command.line import parse, say_same_as
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.conditions import EXACT
-from vd.policy.agents import DEFAULT_HAND, DEFAULT_POLICY, NO_LAYER, check_names, policy_at
-from vd.policy.defaults import default_policy
+from vd.policy.agents import (
+    DEFAULT_HAND,
+    DEFAULT_POLICY,
+    NO_LAYER,
+    check_names,
+    default_policy,
+    policy_at,
+)
 from vd.train.begin import find_start, read_start, settings_of
 from vd.train.flags import saved_config
 from vd.train.presets import PRESETS, TeacherCfg

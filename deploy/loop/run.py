@@ -35,8 +35,7 @@ from vd.deploy.timely import undisturbed
 from vd.logs.hand_log import is_log, read_log
 from vd.logs.log_format import MCAP, LogError
 from vd.paper import PAPER
-from vd.policy.agents import check_names
-from vd.policy.defaults import default_policy
+from vd.policy.agents import check_names, default_policy
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_data import CameraModel, HandModel

@@ -45,7 +45,7 @@ def default_network(hand: str, preset: str) -> str:
     Raises:
         ValueError: There is neither.
     """
-    from vd.policy.defaults import default_policy
+    from vd.policy.agents import default_policy
 
     own = Path(PRESETS[preset](0).run.out) / ALIGNMENT_NAME
     if own.is_file() and load_alignment(own)[1].hand == hand:

@@ -15,8 +15,7 @@ from vd.envs.cfg import RandomisationCfg
 from vd.evaluate.conditions import CONDITIONS, Condition
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, ONE_GOAL, Goals, GoalSchedule
 from vd.paper import PAPER
-from vd.policy.agents import DEFAULT_HAND, SHIPPED_POLICIES
-from vd.policy.defaults import default_policy
+from vd.policy.agents import DEFAULT_HAND, SHIPPED_POLICIES, default_policy
 from vd.sim.cfg import Engine
 
 # Seconds between progress lines where they go to a file.

@@ -21,8 +21,7 @@ from vd.command.warp_quiet import quiet_warp
 from vd.evaluate.cfg import LOG_EVERY_S, POLICY_HELP, HandFlags, TaskFlags, episode_limit_s
 from vd.logs.hand_log import is_log
 from vd.paper import PAPER
-from vd.policy.agents import DEFAULT_HAND, check_names
-from vd.policy.defaults import default_policy
+from vd.policy.agents import DEFAULT_HAND, check_names, default_policy, installed_policies
 from vd.sim.cfg import in_mujoco
 
 if TYPE_CHECKING:
@@ -155,21 +154,15 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
 
 
 def _policies() -> list[str]:
-    """Policies that are installed, of hands that are."""
+    """Names of the policies that are installed, of hands that are."""
     from vd.assets_usd.hands import check_hand_name
-    from vd.policy.store import installed_entries
+    from vd.policy.contract import installed_contract
 
     names = []
-    try:
-        for name, entry in installed_entries().items():
-            with suppress(ValueError):  # of a hand that has to be imported
-                check_hand_name(entry.hand)
-                names.append(name)
-    except (
-        OSError,
-        ValueError,
-    ) as error:  # of what was pulled; the policy that is asked for needs no list
-        print(f"vd-play: no menu of policies: {error}", file=sys.stderr)
+    for name, path in installed_policies().items():
+        with suppress(ValueError):  # it is damaged, or of a hand that has to be imported
+            check_hand_name(installed_contract(path).task["hand"])
+            names.append(name)
     return names
 
 

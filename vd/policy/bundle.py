@@ -1,6 +1,5 @@
 """Reading and writing policies. Reading one executes nothing in it."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from vd.policy.contract import (
     UNSEALED,
     Contract,
     ContractError,
-    contract_of,
+    contract_in,
     contract_text,
     read_sealed,
     sealed,
@@ -75,7 +74,7 @@ def read_contract(path: str | Path) -> Contract:
         FileNotFoundError: There is no such file.
         ContractError: It is damaged, no policy, or of another version.
     """
-    return _contract_in(read_sealed(Path(path)), path)
+    return contract_in(read_sealed(Path(path)), path)
 
 
 def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
@@ -93,7 +92,7 @@ def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
     if not has_suffix(path, SUFFIX):
         return teacher_in(read_state(path, device, remedy=REMEDY), path, device)
     data = read_sealed(Path(path))
-    contract = _contract_in(data, path)
+    contract = contract_in(data, path)
     tensors = load(data)
     golden = _part(tensors, "golden.")
     try:
@@ -112,13 +111,6 @@ def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
             f"most {TOLERANCE:g}); other software wrote it ({contract.software}): take that"
         )
     return policy
-
-
-def _contract_in(data: bytes, where: str | Path) -> Contract:
-    """The contract among the metadata of a safetensors file."""
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + length])
-    return contract_of(header["__metadata__"][CONTRACT_KEY], where)
 
 
 def _policy_of(contract: Contract, tensors: Tensors, device: str) -> AnyPolicy:
