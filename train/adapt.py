@@ -246,7 +246,7 @@ def _check_teacher(name: str) -> None:
 def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object]) -> None:
     """Compare the policy before and after, in the nominal and in the identified model, and write the page."""
     from vd.evaluate.compare import compare
-    from vd.evaluate.page import asked, percent, shown_name, write_page
+    from vd.evaluate.page import percent, settings_text, shown_name, write_page
     from vd.evaluate.result import SUCCESS, Result
 
     say("comparing the policy before and after, in the nominal and in the identified model ...")
@@ -274,6 +274,7 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
         f"{run.env.hand}, in {rate[IDENTIFIED, before]} in the identified one ({layer}), and "
         f"adapted to that in {rate[IDENTIFIED, after]}."
     )
-    title, how = f"{before}, adapted to an identified hand", asked([rows[0].protocol])
+    title = f"{before}, adapted to an identified hand"
+    how = settings_text([rows[0].protocol])
     write_page(result, page, title=title, lead=told, notes=(f"{how}.",))
     say(f"{told}\n{page}")
