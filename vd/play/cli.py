@@ -149,7 +149,11 @@ def serve(session: "Session | Replay", cfg: PlayCfg) -> None:
 
 def spread(world_object: Sequence[int], cells: int) -> list[int]:
     """Environments to show: of different objects first, then more of the same."""
-    rank = [list(world_object[:world]).count(index) for world, index in enumerate(world_object)]
+    count: dict[int, int] = {}
+    rank = []
+    for index in world_object:
+        count[index] = count.get(index, 0) + 1
+        rank.append(count[index])
     return sorted(sorted(range(len(rank)), key=rank.__getitem__)[:cells])
 
 
