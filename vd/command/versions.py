@@ -8,9 +8,9 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-MEASURING = ("kernels", "sim", "envs", "sensors", "tracking", "vision", "evaluate")
+MEASURING = ("kernels", "sim", "envs", "sensors", "tracking", "vision", "policy", "evaluate")
 """Packages that decide what an evaluation gives."""
-SHOWING = ("cli.py", "page.py", "claims.py", "suite.py", "suite_run.py")
+SHOWING = ("cli.py", "page.py", "claims.py", "suite.py", "suite_run.py", "store.py")
 """Files in them that only ask and show."""
 
 
