@@ -16,13 +16,13 @@ SHOWING = ("cli.py", "page.py", "claims.py", "suite.py", "suite_run.py", "store.
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
     """Version of each package by its distribution's name; ``not installed`` where there is none."""
-    found = {}
+    versions = {}
     for name in packages:
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            versions[name] = "not installed"
+    return versions
 
 
 @cache

@@ -272,7 +272,8 @@ def parse_groups(objects: Sequence[str]) -> dict[str, tuple[str, ...]]:
     for item in objects:
         name, equals, sets = item.partition("=")
         if not equals:
-            name, sets = "objects", item
+            name = "objects"
+            sets = item
         if not name or not sets:
             raise ValueError(
                 f"--objects: '{item}' has to be NAME=SET, such as training=procedural-150-seed0"

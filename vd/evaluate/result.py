@@ -321,8 +321,8 @@ class Agent:
         true = StoppingRule(tolerance_rad, norm)
         ways: dict[StoppedBy, Way] = {"true distance": (true, "exact")}
         if self.sees.endswith("clouds"):
-            own = replace(self.rules(tolerance_rad), action_norm=norm)
-            ways = {"prediction": (own, "predicted")} | ways
+            predicted = replace(self.rules(tolerance_rad), action_norm=norm)
+            ways = {"prediction": (predicted, "predicted")} | ways
         else:
             ways[SUCCESS] = (true, "success")
         if schedule.most > 1:

@@ -22,8 +22,10 @@ from vd.policy.contract import (
 from vd.tracking.policy import TrackingPolicy
 from vd.vision.saved import alignment_network
 
-STATES, GOLDEN_POINTS = 8, 500
-"""Golden observations of a teacher or pairs of clouds, and points of each cloud."""
+STATES = 8
+"""Golden observations of a teacher, or pairs of clouds."""
+GOLDEN_POINTS = 500
+"""Points of each cloud."""
 GOLDEN_M = 0.03
 """Standard deviation of the golden points of a network of alignment [m]: about that of an
 object's.
@@ -115,13 +117,14 @@ def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
 
 def _policy_of(contract: Contract, tensors: Tensors, device: str) -> AnyPolicy:
     """The policy of a contract with weights."""
-    own = {name: value.to(device) for name, value in tensors.items()}
-    teacher = TrainedPolicy(contract, _part(own, "actor."), _part(own, "critic."), device)
+    on_device = {name: value.to(device) for name, value in tensors.items()}
+    actor = _part(on_device, "actor.")
+    teacher = TrainedPolicy(contract, actor, _part(on_device, "critic."), device)
     if contract.tracking is None:
         return teacher
     alignment = None
     if contract.tracking.alignment is not None:
-        weights = _part(own, "alignment.")
+        weights = _part(on_device, "alignment.")
         alignment = alignment_network(contract.tracking.alignment, weights, device)
     return TrackingPolicy(teacher, contract, alignment)
 
