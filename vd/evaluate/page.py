@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -377,7 +377,7 @@ def settings_text(protocols: Sequence[Protocol]) -> str:
     """
     parts = []
     for setting in fields(Protocol):
-        values = []
+        values: list[Any] = []
         for protocol in protocols:
             value = getattr(protocol, setting.name)
             if isinstance(value, float):

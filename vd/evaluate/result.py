@@ -319,11 +319,12 @@ class Agent:
         """
         norm = ANY_ACTION if schedule.distance_alone else PAPER.success.action_norm
         true = StoppingRule(tolerance_rad, norm)
-        ways: dict[StoppedBy, Way] = {"true distance": (true, "exact")}
-        if self.sees.endswith("clouds"):
-            predicted = replace(self.rules(tolerance_rad), action_norm=norm)
-            ways = {"prediction": (predicted, "predicted")} | ways
-        else:
+        predicts = self.sees.endswith("clouds")
+        ways: dict[StoppedBy, Way] = {}
+        if predicts:
+            ways["prediction"] = (replace(self.rules(tolerance_rad), action_norm=norm), "predicted")
+        ways["true distance"] = (true, "exact")
+        if not predicts:
             ways[SUCCESS] = (true, "success")
         if schedule.most > 1:
             return dict([next(iter(ways.items()))])

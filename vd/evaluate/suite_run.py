@@ -202,8 +202,8 @@ def make_tasks(
     All names are looked up here, before anything slow.
     """
     short = labels(cfg.agent_names)
-    by_camera = []
-    others = []
+    by_camera: list[SuiteTask] = []
+    others: list[SuiteTask] = []
     for entry in entries:
         for line in entry.lines:
             for name in _policies(cfg, entry, line):

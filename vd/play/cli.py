@@ -164,7 +164,7 @@ def _policies() -> list[str]:
 
     names = []
     for name, path in installed_policies().items():
-        with suppress(ValueError):  # it is damaged, or of a hand that has to be imported
+        with suppress(ValueError, OSError):  # it is damaged, or of a hand to be imported
             check_hand_name(installed_contract(path).task["hand"])
             names.append(name)
     return names
