@@ -46,7 +46,7 @@ def _no_policy(text: str) -> str:
     """Why it is no file, no folder and no installed policy; "" if it is one."""
     if Path(text).exists():
         return ""
-    from vd.evaluate.agents import check_names
+    from vd.policy.agents import check_names
 
     try:
         check_names([text], [])

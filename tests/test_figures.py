@@ -48,7 +48,7 @@ def test_every_stored_figure_of_a_suite_has_its_command_line():
 
 
 def _any_objects(line):
-    return dict.fromkeys(figures.GROUP.findall(line), (("cube",), "cube"))
+    return dict.fromkeys(figures.GROUP.findall(line), suite_run.ObjectGroup(("cube",), "cube"))
 
 
 @pytest.fixture

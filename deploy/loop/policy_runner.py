@@ -11,11 +11,11 @@ import warp as wp
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import check_fits, open_policy, task_for
 from vd.evaluate.statistics import symmetric_error
 from vd.geometry.arrays import Array, as_warp, library_of, of_warp
 from vd.paper import PAPER
 from vd.policy import ONNX_SUFFIX, has_suffix
+from vd.policy.agents import check_fits, open_policy, task_for
 from vd.policy.onnx import read_onnx
 from vd.policy.senses import Senses
 from vd.policy.stopping import StoppingRule

@@ -32,11 +32,10 @@ from vd.deploy.loop.run_page import goal_results, summary_line, write_page
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import MOVE_S, SafeHand
 from vd.deploy.timely import undisturbed
-from vd.evaluate.agents import check_names
 from vd.logs.hand_log import is_log, read_log
 from vd.logs.log_format import MCAP, LogError
 from vd.paper import PAPER
-from vd.policy.defaults import default_policy
+from vd.policy.agents import check_names, default_policy
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_data import CameraModel, HandModel

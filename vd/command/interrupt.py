@@ -179,7 +179,8 @@ def _terminated() -> Iterator[None]:
         raise Terminated
 
     note(0)
-    before, sys.unraisablehook = sys.unraisablehook, _come_again
+    before = sys.unraisablehook
+    sys.unraisablehook = _come_again
     try:
         with handled(terminate, signal.SIGTERM, signal.SIGHUP):
             yield
