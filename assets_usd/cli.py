@@ -40,7 +40,8 @@ class Hand:
         paths = [hand_usd(name) for name in self.names or HANDS]
         for path in paths:
             if self.out is not None:
-                target, text = self.out / path.name, path.read_text()
+                target = self.out / path.name
+                text = path.read_text()
                 if target.exists() and target.read_text(errors="replace") != text:
                     raise ValueError(
                         f"{target} is there and another hand; write to another folder (--out)"
@@ -242,7 +243,8 @@ def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
 
 def _span(values: list[float]) -> str:
     """Least and largest of some values; one where they are equal."""
-    low, high = f"{min(values):.3g}", f"{max(values):.3g}"
+    low = f"{min(values):.3g}"
+    high = f"{max(values):.3g}"
     return low if low == high else f"{low}-{high}"
 
 

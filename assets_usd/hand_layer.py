@@ -372,7 +372,8 @@ def _write_numbers(
             raise HandError(
                 f"{where}: {group} has no parameter {name!r}; one of {', '.join(known)}"
             )
-        number, unit = known[name], known[name].parameter.unit
+        number = known[name]
+        unit = known[name].parameter.unit
         alone = isinstance(estimate, (int, float))
         value, *bounds = [float(estimate)] if alone else map(float, estimate)  # type: ignore[arg-type]
         checked = _checked(where, number.attribute, number.parameter, value)

@@ -39,7 +39,9 @@ class Author:
     """Writes one hand into a stage of two layers."""
 
     def __init__(self, tree: Tree, stance: Stance, said: Description, name: str):
-        self.tree, self.stance, self.said = tree, stance, said
+        self.tree = tree
+        self.stance = stance
+        self.said = said
         self.names = ["base"]
         self.joints = []
         for finger, joints in enumerate(tree.finger_joints()):
@@ -95,7 +97,8 @@ class Author:
         return path
 
     def _describe(self, root: Usd.Prim) -> None:
-        stance, place = self.stance, self.stance.workspace
+        stance = self.stance
+        place = self.stance.workspace
         kinds = Sdf.ValueTypeNames
         for name, kind, value in (
             ("vd:mount:position", kinds.Double3, Gf.Vec3d(*stance.mount[:3])),
@@ -276,7 +279,8 @@ def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and faces [T, 3] of any shape, in its link."""
     match shape.kind:
         case "mesh":
-            vertices, faces = shape.vertices, shape.faces
+            vertices = shape.vertices
+            faces = shape.faces
         case "box":
             made = trimesh.creation.box(2.0 * np.array(shape.size))
         case "sphere":
@@ -288,7 +292,8 @@ def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         case _:
             made = trimesh.creation.cylinder(shape.size[0], 2.0 * shape.size[1], sections=24)
     if shape.kind != "mesh":
-        vertices, faces = np.array(made.vertices), np.array(made.faces)
+        vertices = np.array(made.vertices)
+        faces = np.array(made.faces)
         if shape.kind == "capsule":
             vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
     return shape.frame[:3] + Rotation.from_quat(shape.frame[3:]).apply(vertices), faces

@@ -152,7 +152,8 @@ def _tips(tree: Tree) -> list[np.ndarray]:
     """Fingertips; of fingers without a mark the corner of a box that is farthest from the last joint."""
     tips = []
     for joints, marked in zip(tree.finger_joints(), tree.tips, strict=True):
-        link, joint = tree.links[joints[-1] + 1], tree.joints[joints[-1]]
+        link = tree.links[joints[-1] + 1]
+        joint = tree.joints[joints[-1]]
         if marked is None:
             marked = np.array([*_farthest(link, joint), 0.0, 0.0, 0.0, 1.0])
             where = _text(marked[:3])
@@ -180,7 +181,8 @@ def _farthest(link: Link, joint: Joint) -> np.ndarray:
 
 def followed(tree: Tree, q: np.ndarray) -> np.ndarray:
     """Angles with those joints where they are led that follow others [D]."""
-    q, names = q.copy(), [joint.name for joint in tree.joints]
+    q = q.copy()
+    names = [joint.name for joint in tree.joints]
     for i, joint in enumerate(tree.joints):
         if joint.mimic is not None:
             leader, factor, offset = joint.mimic
@@ -223,7 +225,8 @@ def _palm(tree: Tree, tips: list[np.ndarray], said: Description) -> np.ndarray:
     wider = np.where(np.abs(upper) > np.abs(lower), upper, lower)
     one_sided = np.abs(lower + upper) > 0.2 * (upper - lower)
     bent_q = followed(tree, np.where(one_sided, open_q + BENT * (wider - open_q), open_q))
-    opened, bent = _tip_points(tree, tips, open_q), _tip_points(tree, tips, bent_q)
+    opened = _tip_points(tree, tips, open_q)
+    bent = _tip_points(tree, tips, bent_q)
     along = opened - _roots(tree)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     ways = bent - opened
@@ -264,7 +267,8 @@ def _mount(tree: Tree, ends: Ends, start: np.ndarray, palm: np.ndarray) -> np.nd
     forward -= (forward @ palm) * palm
     forward /= np.linalg.norm(forward)
     turn = Rotation.from_matrix(np.stack([forward, np.cross(palm, forward), palm]))
-    lowest, poses = math.inf, tree.forward_kinematics(start)
+    lowest = math.inf
+    poses = tree.forward_kinematics(start)
     for link, pose in zip(tree.links, poses, strict=True):
         for box, half in (shape_box(shape) for shape in link.shapes if shape.collides):
             placed = compose(pose, box)
@@ -294,7 +298,8 @@ def _workspace(
     above = max(max(tops, default=0.0) + 0.5 * float(np.mean(size)) - palm @ middle, 0.0)
     goal = compose(mount, np.array([*(middle + above * palm), 0.0, 0.0, 0.0, 1.0]))[:3]
     x, y, z = said.goal or (float(v) for v in goal)
-    drop, fall = said.drop or (x, y, z + DROP_M), said.fall or FALL * reach
+    drop = said.drop or (x, y, z + DROP_M)
+    fall = said.fall or FALL * reach
     for name, value in {"drop": drop, "goal": (x, y, z), "size": size, "fall": (fall,)}.items():
         if getattr(said, name) is None:
             tree.notes.append(f"guess: {name} {_text(np.array(value))} m (workspace)")

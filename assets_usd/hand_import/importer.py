@@ -31,7 +31,8 @@ BEYOND_RAD = 0.02
 """By which a joint may be led beyond its limits before it is said."""
 LEAST_DAMPING_RATIO = 0.2
 """A drive that is damped less swings for long."""
-MOST_EFFORT_NM, MOST_MASS_KG = 5.0, 5.0
+MOST_EFFORT_NM = 5.0
+MOST_MASS_KG = 5.0
 """A joint that is stronger and a hand that is heavier are not believed without a warning."""
 
 
@@ -61,7 +62,8 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
     Raises:
         HandError: The file cannot be imported; says why and what to do.
     """
-    said, source = read_description(describe), read_source(path)
+    said = read_description(describe)
+    source = read_source(path)
     tree = grow(source, said)
     stance = take_stance(tree, said)
     _check_units(source, tree, stance)

@@ -19,7 +19,8 @@ from vd.assets_usd.objects.sheet import look_at, part_colour, save_figure
 
 VIEWS = {"from the front": (12.0, -60.0), "from above": (89.0, -90.0), "from the side": (0.0, 0.0)}
 """Name, elevation and azimuth [degrees] of the pictures, world frame."""
-AXIS_M, ARROW = 0.012, "#222222"
+AXIS_M = 0.012
+ARROW = "#222222"
 """Half a length of an axis, drawn through its joint."""
 TIP = "#c02020"
 
@@ -72,7 +73,8 @@ def joint_table(hand: HandModel, sources: list[str]) -> str:
         f"joint  {'source':{width}}   limits [rad]    start  N m    kp     kd    moves by",
     ]
     for i, name in enumerate(hand.joint_names):
-        motor, leader = hand.motors[i], hand.mimic[i]
+        motor = hand.motors[i]
+        leader = hand.mimic[i]
         if leader >= 0:
             moves = f"{hand.mimic_factor[i]:g} x {hand.joint_names[leader]}"
         else:

@@ -118,7 +118,8 @@ class Source:
 
 def lead(joints: dict[str, Joint], name: str) -> tuple[str, float, float]:
     """The joint that moves another in the end, or that itself; factor and offset [rad]."""
-    factor, offset = 1.0, 0.0
+    factor = 1.0
+    offset = 0.0
     for _ in joints:  # a joint that follows a follower follows what that does
         if name not in joints or (above := joints[name].mimic) is None:
             break
@@ -220,7 +221,8 @@ def _read_urdf(path: Path) -> Source:
     for i, name in enumerate(names):
         if builder.joint_parent[i] < 0:
             continue  # what fixes it to the world
-        kind, dof = newton.JointType(builder.joint_type[i]), builder.joint_qd_start[i]
+        kind = newton.JointType(builder.joint_type[i])
+        dof = builder.joint_qd_start[i]
         joint = Joint(name, kind.name.lower(), builder.joint_parent[i], builder.joint_child[i])
         joint.parent_frame = np.array(builder.joint_X_p[i], dtype=float)
         joint.child_frame = np.array(builder.joint_X_c[i], dtype=float)
@@ -324,11 +326,10 @@ def _joint_name(model: Any, joint: int) -> str:
 
 def _mjcf_joints(model: Any, body: int, source: Source) -> None:
     """The joint of a body: none is a fixed one, more than one are none that a hand has."""
-    first, count = model.body_jntadr[body], model.body_jntnum[body]
-    parent, place = (
-        model.body_parentid[body] - 1,
-        _pose(model.body_pos[body], model.body_quat[body]),
-    )
+    first = model.body_jntadr[body]
+    count = model.body_jntnum[body]
+    parent = model.body_parentid[body] - 1
+    place = _pose(model.body_pos[body], model.body_quat[body])
     link = source.links[body - 1].name
     names = [_joint_name(model, i) for i in range(first, first + count)]
     if parent < 0:
@@ -353,8 +354,10 @@ def _mjcf_joints(model: Any, body: int, source: Source) -> None:
     source.joints.append(joint)
     if kind != mujoco.mjtJoint.mjJNT_HINGE:
         return
-    joint.kind, joint.axis = "revolute", model.jnt_axis[first].copy()
-    zero, dof = model.qpos0[model.jnt_qposadr[first]], model.jnt_dofadr[first]
+    joint.kind = "revolute"
+    joint.axis = model.jnt_axis[first].copy()
+    zero = model.qpos0[model.jnt_qposadr[first]]
+    dof = model.jnt_dofadr[first]
     if zero:
         source.notes.append(f"{joint.name} counts from {zero:g} rad in the file (ref); here from 0")
     if model.jnt_limited[first]:
@@ -378,10 +381,13 @@ def _mjcf_shape(model: Any, geom: int) -> Shape:
     )
     if kind == "mesh":
         mesh = model.geom_dataid[geom]
-        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        first = model.mesh_vertadr[mesh]
+        count = model.mesh_vertnum[mesh]
         shape.vertices = model.mesh_vert[first : first + count].astype(float)
-        first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-        shape.faces, shape.size = model.mesh_face[first : first + count].copy(), ()
+        first = model.mesh_faceadr[mesh]
+        count = model.mesh_facenum[mesh]
+        shape.faces = model.mesh_face[first : first + count].copy()
+        shape.size = ()
     return shape
 
 
@@ -391,7 +397,8 @@ def _mjcf_equalities(model: Any, source: Source) -> None:
     for i in range(model.neq):
         if not model.eq_active0[i]:
             continue
-        kind, data = mujoco.mjtEq(model.eq_type[i]), model.eq_data[i]
+        kind = mujoco.mjtEq(model.eq_type[i])
+        data = model.eq_data[i]
         name = model.eq(i).name or f"equality {i}"
         if kind != mujoco.mjtEq.mjEQ_JOINT or model.eq_obj2id[i] < 0 or np.any(data[2:5]):
             text = kind.name[5:].lower()
@@ -440,7 +447,8 @@ def _actuator_name(model: Any, actuator: int) -> str:
 
 def _moved(model: Any, actuator: int, source: Source) -> dict[str, float]:
     """Joints that an actuator moves, and the coefficient of each."""
-    kind, target = model.actuator_trntype[actuator], model.actuator_trnid[actuator, 0]
+    kind = model.actuator_trntype[actuator]
+    target = model.actuator_trnid[actuator, 0]
     name = model.actuator(actuator).name or f"actuator {actuator}"
     if model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_MUSCLE:
         source.problems.append(f"{name} is a muscle, which only pulls; make it a motor")

@@ -23,7 +23,8 @@ MOST_RAD = 2.0 * math.pi + 0.01
 """Limits beyond a turn are in degrees, or none."""
 SLACK_RAD = 1e-3
 """By which a described angle may be rounded beyond a limit."""
-LEAST_M, MOST_M = 0.0005, 1.0
+LEAST_M = 0.0005
+MOST_M = 1.0
 """Lengths of shapes between which they are those of a hand in metres."""
 HOLLOW = 1.5
 """Volume of a hull over that of its mesh from which it closes a hollow that may matter."""
@@ -83,8 +84,10 @@ class _Grower:
     """One source; problems are collected and raised together."""
 
     def __init__(self, source: Source, said: Description):
-        self.source, self.said = source, said
-        self.notes, self.problems = list(source.notes), list(source.problems)
+        self.source = source
+        self.said = said
+        self.notes = list(source.notes)
+        self.problems = list(source.problems)
         self.warnings: list[str] = []
         self.by_name = {joint.name: joint for joint in source.joints}
         self.out: dict[int, list[int]] = {}
@@ -108,8 +111,10 @@ class _Grower:
         self._take_said()
         base, starts = self._palm()
         self.fail()
-        links, joints = [self._welded(base)], []
-        counts, tips = [], []
+        links = [self._welded(base)]
+        joints = []
+        counts = []
+        tips = []
         chains = [chain for start in starts for chain in self._chains(start)]
         copies = Counter(joint.name for chain in chains for joint in chain)
         for chain in chains:
@@ -231,7 +236,8 @@ class _Grower:
         for link in self.source.links:
             if link.name in said.mass:
                 scale = said.mass[link.name] / link.mass if link.mass > 0.0 else 0.0
-                link.mass, link.inertia = said.mass[link.name], link.inertia * scale
+                link.mass = said.mass[link.name]
+                link.inertia = link.inertia * scale
         for name, angle in said.hold.items():
             self.notes.append(f"{name} is held at {angle:g} rad, as described")
             self._check_angle("hold", self.by_name[name], angle)
@@ -249,7 +255,8 @@ class _Grower:
 
     def _group(self, first: int) -> dict[int, np.ndarray]:
         """Links that move with one, and their poses in it [7]."""
-        poses, queue = {first: IDENTITY}, [first]
+        poses = {first: IDENTITY}
+        queue = [first]
         for link in queue:
             for number in self.out.get(link, ()):
                 joint = self.source.joints[number]
@@ -387,10 +394,8 @@ class _Grower:
             return link
         parts = []
         for pose, half in boxes:
-            mass, turn = (
-                float(8.0 * np.prod(half) * DENSITY_KG_M3),
-                Rotation.from_quat(pose[3:]).as_matrix(),
-            )
+            mass = float(8.0 * np.prod(half) * DENSITY_KG_M3)
+            turn = Rotation.from_quat(pose[3:]).as_matrix()
             parts.append(
                 (mass, pose[:3], turn @ np.diag(mass / 3.0 * (half @ half - half**2)) @ turn.T)
             )
@@ -536,7 +541,8 @@ def shape_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         case "cylinder":
             return shape.frame, np.array([shape.size[0], shape.size[0], shape.size[1]])
         case "mesh":
-            low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
+            low = shape.vertices.min(axis=0)
+            high = shape.vertices.max(axis=0)
             middle = np.array([*(low + high) / 2.0, 0.0, 0.0, 0.0, 1.0])
             return compose(shape.frame, middle), (high - low) / 2.0
         case _:

@@ -168,5 +168,6 @@ def damping_ratio(restitution: float) -> float:
             - restitution
         )
 
-    low, high = 1e-6, 1.0 - 1e-6
+    low = 1e-6
+    high = 1.0 - 1e-6
     return float(brentq(kept, low, high)) if kept(low) > 0.0 > kept(high) else high

@@ -213,7 +213,8 @@ def check_target(job: Job) -> None:
             f"{target} is there and no object of vd-assets, or a damaged one; remove it, or import "
             "into another folder (--out)"
         )
-    source, file = str(facts.get("source", "")), str(facts.get("file", ""))
+    source = str(facts.get("source", ""))
+    file = str(facts.get("file", ""))
     # Objects of versions that recorded no file are told by the name in their source.
     if file and os.path.realpath(file) == os.path.realpath(job.source):
         return

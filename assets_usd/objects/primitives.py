@@ -80,7 +80,8 @@ def ellipsoid(centre: Vector, radii: Vector, *, euler: Vector = (0, 0, 0)) -> Hu
 
 def rod(start: Vector, end: Vector, radius: float, end_radius: float | None = None) -> Hull:
     """Capsule between two points, tapered if ``end_radius`` is given; 30 vertices."""
-    a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    a = np.asarray(start, dtype=float)
+    b = np.asarray(end, dtype=float)
     axis, u, v = _frame(a, b)
     points = []
     for centre, out, r in (
@@ -97,7 +98,8 @@ def cylinder(
     start: Vector, end: Vector, radius: float, end_radius: float | None = None, sides: int = SIDES
 ) -> Hull:
     """Cylinder or truncated cone between two points."""
-    a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    a = np.asarray(start, dtype=float)
+    b = np.asarray(end, dtype=float)
     _, u, v = _frame(a, b)
     ring = _ring(u, v, sides)
     return convex_hull(
@@ -119,8 +121,10 @@ def prism(outline: npt.ArrayLike, low: float, high: float, *, axis: str = "y") -
 
 def beam(start: npt.ArrayLike, end: npt.ArrayLike, width: float, depth: float) -> Hull:
     """Flat stroke between two points of the x-z plane, ``width`` wide in it and ``depth`` thick along y."""
-    a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    a = np.asarray(start, dtype=float)
+    b = np.asarray(end, dtype=float)
     along = (b - a) / np.linalg.norm(b - a)
     across = np.array([-along[1], along[0]]) * width / 2.0
-    a, b = a - along * width / 2.0, b + along * width / 2.0
+    a = a - along * width / 2.0
+    b = b + along * width / 2.0
     return prism([a + across, a - across, b - across, b + across], -depth / 2.0, depth / 2.0)

@@ -114,7 +114,8 @@ def _place(entry: str | Path) -> Path:
         ObjectError: There are none, and the message lists the sets and the commands that make
             more; or the name means two places.
     """
-    path, root = Path(entry).expanduser(), objects_dir()
+    path = Path(entry).expanduser()
+    root = objects_dir()
     if isinstance(entry, str) and is_built_in(entry) and not path.is_file():
         return built_in_folder(entry)
     named = root / path.name if path.name == str(entry) else root

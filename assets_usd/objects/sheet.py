@@ -23,13 +23,16 @@ VIEW = {"elev": 24.0, "azim": -52.0}
 ZOOM = 1.6
 """Of matplotlib's boxes, so that a ball around the object fills its axes."""
 
-TILE_IN, MARGIN_IN = 1.7, 0.1
+TILE_IN = 1.7
+MARGIN_IN = 0.1
 """Side of a picture, and what is left free about texts [inch]; 100 pixels each."""
 
-CAPTION_POINTS, TITLE_POINTS = 7, 11
+CAPTION_POINTS = 7
+TITLE_POINTS = 11
 """Sizes of the font."""
 
-LETTER, LINE = 0.6, 1.25
+LETTER = 0.6
+LINE = 1.25
 """Width of a usual letter and height of a line, as shares of the font's size."""
 
 
