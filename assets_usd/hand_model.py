@@ -299,7 +299,7 @@ class _Reader:
             fingers.append(slice(end, end + count))
             end += count
         links = {name for name in names if re.fullmatch(r"f\d+_l\d+", name)}
-        if not fingers or links > known:
+        if not fingers or links - known:
             raise self.fail(
                 self.root,
                 f"has the links {', '.join(sorted(links)) or 'of no finger'}",
