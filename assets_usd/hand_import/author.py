@@ -83,12 +83,10 @@ class Author:
             apart: Pairs of links whose contacts are off.
         """
         name = self.root[1:]
-        for one, pairs in groupby(sorted(apart), key=itemgetter(0)):
-            link = self.stage.GetPrimAtPath(f"{self.root}/{self.names[one]}")
+        for first, pairs in groupby(sorted(apart), key=itemgetter(0)):
+            link = self.stage.GetPrimAtPath(f"{self.root}/{self.names[first]}")
             others = UsdPhysics.FilteredPairsAPI.Apply(link).CreateFilteredPairsRel()
-            others.ClearTargets(removeSpec=False)
-            for _, other in pairs:
-                others.AddTarget(f"{self.root}/{self.names[other]}")
+            others.SetTargets([f"{self.root}/{self.names[second]}" for _, second in pairs])
         path = folder / f"{name}.usda"
         self.meshes.Export(str(folder / f"{name}_meshes.usdc"))
         numbers = Sdf.Layer.CreateAnonymous(".usda")

@@ -221,14 +221,14 @@ def best_decomposition(
     fine = decompose(vertices, faces, limits, 2 * HULL_VERTICES)
     if fine.fallback:
         return replace(first, fallback=("no finer parts", *fine.fallback))
-    found = [first]
+    candidates = [first]
     parts = [hull.vertices for hull in fine.hulls]
     for most in sorted((n for n in MERGED_HULLS if n <= settings.max_hulls), reverse=True):
         parts = merge_parts(parts, most)
         hulls = tidy_hulls(parts, HULL_VERTICES)
-        found.append(Decomposition(hulls, f"{fine.method}, merged", error=error_of(hulls)))
-    enough = max(GOOD_ERROR, NEARLY * min(each.error for each in found))
+        candidates.append(Decomposition(hulls, f"{fine.method}, merged", error=error_of(hulls)))
+    enough = max(GOOD_ERROR, NEARLY * min(candidate.error for candidate in candidates))
     return min(
-        (each for each in found if each.error <= enough),
-        key=lambda each: (len(each.hulls), each.error),
+        (candidate for candidate in candidates if candidate.error <= enough),
+        key=lambda candidate: (len(candidate.hulls), candidate.error),
     )

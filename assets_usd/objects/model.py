@@ -386,13 +386,15 @@ def read_object(path: Path) -> ObjectModel:
     )
 
 
-def write_contact_layer(path: Path, item_file: Path, found: Identified, recording: str) -> None:
+def write_contact_layer(
+    path: Path, item_file: Path, identified: Identified, recording: str
+) -> None:
     """Write what was identified as a layer over an object's file, atomically.
 
     Args:
         path: File to write, ``.usda``.
         item_file: The object's file, which becomes a sublayer.
-        found: What was identified.
+        identified: What was identified.
         recording: From which recording, for people.
 
     Raises:
@@ -413,14 +415,14 @@ def write_contact_layer(path: Path, item_file: Path, found: Identified, recordin
     layer.customLayerData = {"format": LAYER_FORMAT, "recording": recording}
     prim = Sdf.PrimSpec(layer, item.name, Sdf.SpecifierOver)
 
-    author_contact(prim, found)
-    if "mass" in found:
-        mass = found["mass"][0][0]
+    author_contact(prim, identified)
+    if "mass" in identified:
+        mass = identified["mass"][0][0]
         moments = Gf.Vec3f(*map(float, item.inertia * mass / item.mass_kg))
         author(prim, "physics:mass", Sdf.ValueTypeNames.Float, mass)
         author(prim, "physics:diagonalInertia", Sdf.ValueTypeNames.Float3, moments)
-    if "centre_of_mass" in found:
-        centre = Gf.Vec3f(*found["centre_of_mass"][0])
+    if "centre_of_mass" in identified:
+        centre = Gf.Vec3f(*identified["centre_of_mass"][0])
         author(prim, "physics:centerOfMass", Sdf.ValueTypeNames.Point3f, centre)
     save_layer(layer, path)
 
