@@ -106,19 +106,12 @@ def author_contact(prim: Any, identified: Identified) -> None:
     """Author what was identified on the spec of an object's root prim, USD's own attributes apart."""
     from pxr import Sdf
 
+    from vd.assets_usd.hand_layer import author
+
+    kind = Sdf.ValueTypeNames.DoubleArray
     for name, (value, low, high) in identified.items():
-        author(prim, f"{NAMESPACE}:{name}", Sdf.ValueTypeNames.DoubleArray, list(value))
-        author(prim, f"{NAMESPACE}:{name}:ci95", Sdf.ValueTypeNames.DoubleArray, [*low, *high])
-
-
-def author(prim: Any, name: str, kind: Any, value: Any) -> None:
-    """Author an attribute of a type of ``Sdf.ValueTypeNames`` on a prim's spec."""
-    from pxr import Sdf
-
-    custom = name.startswith(NAMESPACE)
-    Sdf.AttributeSpec(
-        prim, name, kind, Sdf.VariabilityVarying, declaresCustom=custom
-    ).default = value
+        author(prim, f"{NAMESPACE}:{name}", kind, list(value))
+        author(prim, f"{NAMESPACE}:{name}:ci95", kind, [*low, *high])
 
 
 def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ...]]:

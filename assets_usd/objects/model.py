@@ -25,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.objects.contact_layer import (
     LAYER_FORMAT,
     Identified,
-    author,
     author_contact,
     read_contact,
 )
@@ -402,7 +401,7 @@ def write_contact_layer(
     """
     from pxr import Gf, Sdf
 
-    from vd.assets_usd.hand_layer import save_layer
+    from vd.assets_usd.hand_layer import author, save_layer
 
     item = read_object(item_file)
     layer = Sdf.Layer.CreateAnonymous(".usda")
