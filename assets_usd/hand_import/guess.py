@@ -84,8 +84,8 @@ def _complete_drives(tree: Tree, start: np.ndarray) -> None:
             leader.damping += joint.mimic[1] ** 2 * joint.damping
             joint.effort = joint.effort if joint.effort > 0.0 else leader.effort
             joint.kp = joint.kd = joint.damping = 0.0
-    _fill(tree, "velocity", [SPEED_RAD_S for _ in tree.joints])
-    _fill(tree, "armature", [ARMATURE_KG_M2 for _ in tree.joints])
+    _fill(tree, "velocity", [SPEED_RAD_S] * len(tree.joints))
+    _fill(tree, "armature", [ARMATURE_KG_M2] * len(tree.joints))
     _fill(tree, "kp", [joint.effort / FULL_TORQUE_RAD for joint in tree.joints])
     damping = []
     for joint, critical in zip(tree.joints, critical_damping(tree, start), strict=True):

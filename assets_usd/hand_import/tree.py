@@ -1,7 +1,7 @@
 """A source welded to what a hand is: a base and fingers, each a chain of revolute joints."""
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -197,8 +197,8 @@ class _Grower:
         limits = {name: joint.effort for name, joint in self.by_name.items()}
         efforts: dict[str, float] = {}
         for actuator in self.source.actuators:
-            ratios: Counter[str] = Counter()
-            torques: Counter[str] = Counter()
+            ratios: dict[str, float] = defaultdict(float)
+            torques: dict[str, float] = defaultdict(float)
             free: dict[str, str] = {}
             for name, ratio in actuator.ratios.items():
                 leader, factor, _ = lead(self.by_name, name)
@@ -281,7 +281,8 @@ class _Grower:
     def _leaving(self, first: int) -> list[Joint]:
         """Joints that leave a group, in the order of the file."""
         group = self._group(first)
-        return [j for j in self.source.joints if j.parent in group and not self._is_welded(j)]
+        joints = self.source.joints
+        return [joint for joint in joints if joint.parent in group and not self._is_welded(joint)]
 
     def _palm(self) -> tuple[int, list[Joint]]:
         """The root and the first joints of the fingers; joints of a wrist become held."""
@@ -468,20 +469,18 @@ class _Grower:
                 )
             elif joint.name in self.said.start:
                 self._check_angle("start", joint, self.said.start[joint.name])
-        weak = [
-            joint.name for joint in tree.joints if not joint.effort > 0.0 and joint.mimic is None
-        ]
+        weak = [j.name for j in tree.joints if not j.effort > 0.0 and j.mimic is None]
         if weak:
             self.problems.append(
                 f"{', '.join(weak)}: no torque limit in the file; say drive: {{effort: 1.0}} (N m) "
-                f"or "
-                f"drives: {{{weak[0]}: {{effort: 1.0}}}}; or mimic or hold, where there is no motor"
+                f"or drives: {{{weak[0]}: {{effort: 1.0}}}}; or mimic or hold, where there is no "
+                "motor"
             )
-        for end in np.cumsum(tree.counts):
-            if not any(shape.collides for shape in tree.links[end].shapes):
+        for joints in tree.finger_joints():
+            link = tree.links[joints[-1] + 1]
+            if not any(shape.collides for shape in link.shapes):
                 self.problems.append(
-                    f"nothing collides of {tree.links[end].name}, which has a fingertip; add a "
-                    f"collision"
+                    f"nothing collides of {link.name}, which has a fingertip; add a collision"
                 )
 
     def _check_shape(self, link: Link, shape: Shape, *, split: bool) -> None:

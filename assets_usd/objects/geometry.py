@@ -52,6 +52,10 @@ class Surface(NamedTuple):
     vertices: np.ndarray
     faces: np.ndarray
 
+    def times(self, factor: float) -> "Surface":
+        """The surface, larger by a factor."""
+        return self._replace(vertices=self.vertices * factor)
+
 
 Hull = Surface
 """A convex polyhedron."""
@@ -509,13 +513,13 @@ def _quadric_vertices(
     weighted = length * normal
     planes = (weighted[:, :, None] * normal[:, None, :]).reshape(-1, 9)
     first = vertices[faces[:, 0]]
-    matrix = np.zeros((count, 9))
+    sums = np.zeros((count, 9))
     right = np.zeros((count, 3))
     for corners in cluster[faces].T:
         offset = np.einsum("ij,ij->i", normal, first - mean[corners])
         right += _sums(corners, weighted * offset[:, None], count)
-        matrix += _sums(corners, planes, count)
-    matrix = matrix.reshape(-1, 3, 3)
+        sums += _sums(corners, planes, count)
+    matrix = sums.reshape(-1, 3, 3)
     # The mean pulls weakly where the planes leave a direction free.
     matrix += (1e-2 * np.trace(matrix, axis1=1, axis2=2) + 1e-30)[:, None, None] * np.eye(3)
     return mean + np.clip(np.linalg.solve(matrix, right[:, :, None])[:, :, 0], -cell, cell)

@@ -36,7 +36,7 @@ def _unit_sphere() -> np.ndarray:
     points = []
     for i, j, k in product((-1, 1), (-1, 1), range(3)):
         points.append(np.roll([0.0, i, j * GOLDEN], k))
-    points += product((-1.0, 1.0), repeat=3)
+    points += map(np.array, product((-1.0, 1.0), repeat=3))
     for i, j, k in product((-1, 1), (-1, 1), range(3)):
         points.append(np.roll([0.0, i * GOLDEN, j / GOLDEN], k))
     sphere = np.array(points)

@@ -136,7 +136,7 @@ def model_of_parts(
     """
     everything = np.concatenate([h.vertices for h in hulls])
     scale = 1.0 if longest_side is None else longest_side / float(np.ptp(everything, axis=0).max())
-    parts = [Hull(h.vertices * scale, h.faces) for h in hulls]
+    parts = [hull.times(scale) for hull in hulls]
     vertices, faces = union_surface(parts)
     points = surface_points(vertices, faces, SURFACE_POINTS, outside=parts)
     return build_model(

@@ -94,7 +94,7 @@ class RepairedMesh:
         return replace(
             self,
             vertices=self.vertices * factor,
-            pieces=tuple(Hull(p.vertices * factor, p.faces) for p in self.pieces),
+            pieces=tuple(hull.times(factor) for hull in self.pieces),
             cavity_vertices=self.cavity_vertices * factor,
         )
 
