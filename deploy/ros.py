@@ -19,14 +19,14 @@ import json
 import shlex
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel, MotorModel
 from vd.assets_usd.hands import load_hand
 from vd.deploy.camera.ros_camera import FIRST_S, monotonic
-from vd.deploy.clock import MONOTONIC, from_future
+from vd.deploy.clock import MONOTONIC, Clock, from_future
 from vd.deploy.finding import Finding, finding
 from vd.deploy.hardware.answers import HandState, SilentError
 from vd.deploy.hardware.connect import Connection, HandOptions
@@ -60,7 +60,7 @@ class _Joints(Joints):
 
 
 class RosHand:
-    """What :class:`vd.deploy.safety.safety.SafeHand` asks of a bus, over topics.
+    """A hand behind topics, as :class:`vd.deploy.hardware.motors.Motors`.
 
     Stops hold, torque stays on.
 
@@ -69,19 +69,21 @@ class RosHand:
         node: Of rclpy.
     """
 
-    clock = MONOTONIC
+    clock: Clock = MONOTONIC
 
     def __init__(self, hand: HandModel, node: Any):
         from rclpy.qos import qos_profile_sensor_data
         from sensor_msgs.msg import JointState
         from std_msgs.msg import Float64MultiArray
 
-        self.hand, self.ids, self._message = (
-            hand,
-            tuple(range(len(hand.joint_names))),
-            Float64MultiArray,
-        )
-        self._node, self._state, self._wrong, self.count = node, cast(HandState | None, None), "", 0
+        self.hand = hand
+        self.ids = tuple(range(len(hand.joint_names)))
+        self.count = 0
+        """JointStates so far."""
+        self._message = Float64MultiArray
+        self._node = node
+        self._state: HandState | None = None
+        self._wrong = ""
         self._arrived = threading.Condition()
         self._commands = node.create_publisher(Float64MultiArray, COMMANDS, 1)
         node.create_subscription(JointState, STATES, self._take, qos_profile_sensor_data)
@@ -184,7 +186,7 @@ class RosHand:
         if self._state is not None:
             self.write_goals(self._state.position)
 
-    def stiffen(self, share: float) -> None:
+    def stiffen(self, share: float, ids: Sequence[int] | None = None) -> None:
         """The driver's."""
 
     def torque(self, on: bool, ids: Sequence[int] | None = None) -> dict[int, str]:
@@ -292,7 +294,7 @@ def connect_ros(options: HandOptions, arguments: str = "") -> Iterator[Connectio
     try:
         bus = RosHand(hand, node)
         thread.start()
-        yield Connection(_Joints(hand), cast(Any, bus), ros=node)
+        yield Connection(_Joints(hand), bus, ros=node)
     finally:
         executor.shutdown()
         node.destroy_node()

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from motor_plant import Drive, NewtonPlant
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.hardware.control_table import MODELS
 from vd.deploy.hardware.joints import CalibrationError, Joints, read_joints
-from vd.deploy.twin.newton_hand import NewtonHand
-from vd.deploy.twin.plant import Drive
 from vd.kernels.servo.actuators import COULOMB_TORQUE
 from vd.sim.cfg import SimCfg
 
@@ -46,7 +45,7 @@ def drives(joints: Joints, goal: np.ndarray | None) -> list[Drive]:
 
 
 def test_the_hand_goes_where_its_motors_drive_and_falls_without_them(hand, turned):
-    plant = NewtonHand(hand, turned)
+    plant = NewtonPlant(turned)
     reset = hand.start
     np.testing.assert_allclose(turned.to_joint(plant.read()[0]), reset, atol=1e-6)
     goal = reset + np.tile([0.1, 0.2, 0.3], 3)
@@ -135,7 +134,7 @@ def test_goals_and_readings_do_not_wait_for_steps(hand, effect):
         servo = hand.servo.copy()
         servo[:, effect] = 0.1
         hand = replace(hand, servo=servo)
-    coarse, fine = (NewtonHand(hand, joints, SimCfg(physics_hz=hz)) for hz in (480.0, 3840.0))
+    coarse, fine = (NewtonPlant(joints, SimCfg(physics_hz=hz)) for hz in (480.0, 3840.0))
     rng = np.random.default_rng(0)
     reset = hand.start
     errors, speeds = [], []
@@ -158,7 +157,7 @@ def test_the_recorded_steps_are_the_solvers(hand):
     Contacts come and go, and the solver's iterations differ.
     """
     joints = read_joints(hand)
-    recorded, stepped = NewtonHand(hand, joints), NewtonHand(hand, joints)
+    recorded, stepped = NewtonPlant(joints), NewtonPlant(joints)
     goal = np.tile([0.3, hand.lower[1], hand.lower[2]], 3)
     contacts = []
     for _ in range(40):

@@ -358,7 +358,7 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
     truth = None if turned is None else Truth(quat=tuple(quat))
     if truth is None:
         log = LogWriter(
-            log.folder / "real", load_hand("dclaw3"), log._run, servo={}, clock=hand.clock
+            log.folder / "real", load_hand("dclaw3"), log.run, servo={}, clock=hand.clock
         )
     ControlLoop(hand, runner, actions, pacer, log, episode_s=limit_s, hold_s=0.2, twin=truth).run(
         [GOAL]

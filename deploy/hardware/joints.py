@@ -14,8 +14,7 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel, MotorModel
 from vd.command.config import from_dict
 from vd.deploy.hardware.answers import HandState
-from vd.deploy.hardware.control_table import RAD_S_PER_COUNT, Model, motor_model, to_angle
-from vd.deploy.hardware.packets import MAX_ID
+from vd.deploy.hardware.control_table import MAX_ID, RAD_S_PER_COUNT, Model, motor_model, to_angle
 from vd.deploy.hardware.registers import MotorSettings
 
 FORMAT = "vd-motors/1"

@@ -21,7 +21,6 @@ from vd.command.files import check_folder
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.aside import aside
-from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import ready
 from vd.deploy.hardware.connect import Connection, HandOptions, connect, motors_of
 from vd.deploy.hardware.control_table import RAD_PER_COUNT, TICK_MODULUS
@@ -83,7 +82,7 @@ class RecordCfg(HandOptions):
     safety: SafetyCfg = field(default_factory=lambda: WIDE)
     """Limits."""
     realtime: bool = True
-    """Run before all ordinary programs, the twin too, where that is permitted (root, ulimit -r)."""
+    """Run before all ordinary programs, where that is permitted (root, ulimit -r)."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves."""
 
@@ -235,8 +234,8 @@ def play(
     safe.move(motion.command[0], SPEED_RAD_S)
     # Of motors whose gains differ, each has the same share of its own.
     share = float(motion.conditions["p_gain"]) / safe.joints.p_gain
-    own = {bus.ids[column]: safe.joints.motors[column].p_gain for column in columns}
-    _set_gains(bus, {id: round(share * gain) for id, gain in own.items()})
+    ids = [bus.ids[column] for column in columns]
+    bus.stiffen(share, ids)
     samples = list[Sample]()
     pacer = Pacer(rate_hz, bus.clock)
     pacer.wait()
@@ -256,39 +255,35 @@ def play(
         pacer.wait()
     if not on.all():
         safe.switch(np.ones_like(on))
-    _set_gains(bus, own)
+    bus.stiffen(1.0, ids)
     return _trajectory(motion, columns, samples)
-
-
-def _set_gains(bus: MotorBus, gains: Mapping[int, int]) -> None:
-    for id, gain in gains.items():
-        if bus.read(id, "position_p_gain") != gain:
-            bus.write(id, "position_p_gain", gain)
 
 
 def _trajectory(
     motion: "Trajectory", columns: Sequence[int], samples: Sequence[Sample]
 ) -> "Trajectory":
     """What was measured, of some joints, at the times of the motors' clocks."""
+    states = [sample.state for sample in samples]
 
     def of(name: str) -> np.ndarray:
-        return np.array([getattr(one.state, name) for one in samples])[:, columns]
+        return np.array([getattr(state, name) for state in states])[:, columns]
 
-    asked_s = np.array([one.state.time_s for one in samples])
-    sent_s = np.array([one.sent_s for one in samples])
-    measured_s = measured_at(asked_s, np.array([one.state.tick for one in samples]))
+    asked_s = np.array([state.time_s for state in states])
+    sent_s = np.array([sample.sent_s for sample in samples])
+    measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
     # A goal arrives with the question for its state, unless that was asked again.
     sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
-    measured: dict[str, Any] = {name: of(name) for name in STATE_CHANNELS}
+    channels = {name: of(name) for name in STATE_CHANNELS}
+    if not channels["pwm"].any():  # a motor that does not tell its duty cycle says zero
+        del channels["pwm"]
     return replace(
         motion,
         time=measured_s - measured_s[0],
         command_time=sent_s - measured_s[0],
-        command=np.array([one.goal for one in samples])[:, columns],
+        command=np.array([sample.goal for sample in samples])[:, columns],
         position=of("position"),
-        enabled=np.array([one.enabled for one in samples])[:, columns],
-        # A motor that does not tell its duty cycle says zero.
-        **{name: values for name, values in measured.items() if name != "pwm" or values.any()},
+        enabled=np.array([sample.enabled for sample in samples])[:, columns],
+        **channels,
     )
 
 
@@ -304,12 +299,8 @@ def record(cfg: RecordCfg) -> int:
         motions = motions_of(motors, cfg.fingers, cfg.excitations)
     else:
         motions = read_plan(cfg.plan, motors)
-    with (
-        connect(
-            cfg, physics_hz=TWIN_JOINT_HZ / motors.hand.num_joints, realtime=cfg.realtime
-        ) as connection,
-        undisturbed(cfg.realtime),
-    ):
+    physics_hz = TWIN_JOINT_HZ / motors.hand.num_joints
+    with connect(cfg, physics_hz=physics_hz) as connection, undisturbed(cfg.realtime):
         recording = _begun(cfg, connection, joints)
         done = {trajectory.file for trajectory in recording.trajectories}
         left = [motion for motion in motions if motion.file not in done]

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,9 +19,11 @@ from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import NOWHERE, LogWriter
 from vd.deploy.loop.policy_runner import Decision, PolicyRunner, Sensed
 from vd.deploy.safety.safety import SafeHand
-from vd.deploy.twin.child import TwinChild
 from vd.evaluate.statistics import symmetric_error
 from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.deploy.twin.twin import Twin
 
 CAMERA_SHARE = 0.5
 """Share of a control period for which an image is waited for."""
@@ -73,7 +76,7 @@ class ControlLoop:
         episode_s: float = PAPER.scene.episode_s,
         hold_s: float = 1.0,
         camera: Camera | None = None,
-        twin: TwinChild | None = None,
+        twin: "Twin | None" = None,
         symmetry: np.ndarray = NO_SYMMETRY,
         more: Callable[[], bool] = lambda: False,
     ):

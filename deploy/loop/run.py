@@ -9,7 +9,7 @@ truth.
 import contextlib
 import importlib.util
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -39,14 +39,10 @@ from vd.paper import PAPER
 from vd.policy.defaults import default_policy
 
 if TYPE_CHECKING:
-    from vd.assets_usd.hand_data import CameraModel, HandModel
     from vd.assets_usd.objects.model import ObjectModel
-    from vd.deploy.loop.log import Sink
     from vd.deploy.loop.policy_runner import PolicyRunner
-    from vd.deploy.twin.child import TwinChild
+    from vd.deploy.twin.twin import Twin
 
-LOG_FILES = {MCAP: "mcap_ros2", ".rrd": "rerun"}
-"""Endings of files that a log can be written to besides, and the package that each needs."""
 LOGS = Path("runs/deploy")
 """Folder of the logs that are not named."""
 HOME_RAD_S = 0.5
@@ -103,8 +99,8 @@ class RunCfg(HandOptions):
     safety: SafetyCfg = field(default_factory=SafetyCfg)
     """Limits."""
     log: Path | None = None
-    """Folder of the log; runs/deploy/ and the time by default. NAME.mcap (ROS 2 messages) or
-    NAME.rrd (Rerun) is written beside the folder NAME."""
+    """Folder of the log; runs/deploy/ and the time by default. NAME.mcap (ROS 2 messages) is
+    written beside the folder NAME."""
     ros2: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Drive a hand behind ROS 2 in place of --port. Goals come from a service too
     (vd.deploy.ros).
@@ -114,7 +110,7 @@ class RunCfg(HandOptions):
     seed: int = 0
     """Of drawn goals and of the choice of points."""
     realtime: bool = True
-    """Run before all ordinary programs, the twin too, where that is permitted (root, ulimit -r)."""
+    """Run before all ordinary programs, where that is permitted (root, ulimit -r)."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves; a twin is not asked for."""
 
@@ -149,10 +145,10 @@ class RunCfg(HandOptions):
             raise ValueError(
                 f"--object {self.object}: a twin cannot hold a scan; vd-assets import it first"
             )
-        if self.log is not None and (package := LOG_FILES.get(self.log.suffix)):
+        if self.log is not None and self.log.suffix == MCAP:
             if self.log.exists():
                 raise FileExistsError(f"--log {self.log} is there; choose another name")
-            interrupt.need(package)
+            interrupt.need("mcap_ros2")
 
 
 def run(cfg: RunCfg) -> int:
@@ -165,7 +161,7 @@ def run(cfg: RunCfg) -> int:
     cfg.validate()
     folder = LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
     if cfg.log is not None:
-        folder = cfg.log.with_suffix("") if cfg.log.suffix in LOG_FILES else cfg.log
+        folder = cfg.log.with_suffix("") if cfg.log.suffix == MCAP else cfg.log
     check_folder(folder)
     if is_log(folder):
         raise FileExistsError(f"{folder} holds a log; choose another folder")
@@ -195,13 +191,8 @@ def run(cfg: RunCfg) -> int:
         )
     fault: Exception | None = None
     status = 0
-    camera = runner.camera or hand.mounted_camera
-    camera_pose = (
-        None if camera is None else (*map(float, camera.position), *map(float, camera.quaternion))
-    )
-    twin: dict[str, Any] = {"object": cfg.object, "camera": camera_pose}
-    twin |= {"realistic": cfg.realistic, "realtime": cfg.realtime}
-    with connect_ros(cfg, cfg.ros2_args) if cfg.ros2 else connect(cfg, **twin) as connection:
+    opened = connect_ros(cfg, cfg.ros2_args) if cfg.ros2 else connect(cfg, item=item)
+    with opened as connection:
         try:
             status = _pursue(cfg, name, runner, connection, item, goals, folder)
         except Exception as error:  # the page says why, too
@@ -266,7 +257,7 @@ def _pursue(
         camera: Camera | None = None
         seen: Iterable[Finding] = ()
         if runner.camera is not None:
-            camera = open_camera(cfg.camera, connection, runner.camera)
+            camera = open_camera(cfg.camera, connection, runner.camera, realistic=cfg.realistic)
             stack.callback(camera.close)
             where = (
                 runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
@@ -282,12 +273,13 @@ def _pursue(
         said, servo = _description(cfg, name, runner, item, goals), connection.joints.servo()
         without = () if connection.ros is None else UNKNOWN
         log = LogWriter(folder, hand, said, servo=servo, truth=twin is not None, without=without)
-        file = cfg.log
-        if file is not None and file.suffix in LOG_FILES:
-            log.also_to(lambda run: _sink(file, run, hand, item, runner.camera))
+        if cfg.log is not None and cfg.log.suffix == MCAP:
+            from vd.logs.mcap_log import McapLog
+
+            log.also_to(McapLog(cfg.log, log.run, np.asarray(hand.workspace.goal_m)))
         served = None if connection.ros is None else RosGoals(connection.ros, goals)
         if served is not None:
-            log.also_to(lambda _: served)
+            log.also_to(served)
         pacer = Pacer(hz, latest=LATEST)
         reason, outcomes = "aborted", list[str]()
         loop: ControlLoop | None = None
@@ -324,23 +316,6 @@ def _pursue(
     return int(reason == "lost")
 
 
-def _sink(
-    file: Path,
-    run: Mapping[str, Any],
-    hand: "HandModel",
-    item: "ObjectModel",
-    camera: "CameraModel | None",
-) -> "Sink":
-    """What writes the file of a log."""
-    if file.suffix == MCAP:
-        from vd.logs.mcap_log import McapLog
-
-        return McapLog(file, run, np.asarray(hand.workspace.goal_m))
-    from vd.deploy.loop.rerun_log import RerunLog
-
-    return RerunLog(file, run, hand, item, camera)
-
-
 def warm_up(
     runner: "PolicyRunner", pose: np.ndarray, goal: np.ndarray, camera: Camera | None
 ) -> None:
@@ -373,7 +348,7 @@ def _description(
     }
 
 
-def place(safe: SafeHand, pose: np.ndarray, twin: "TwinChild | None", *, yes: bool) -> None:
+def place(safe: SafeHand, pose: np.ndarray, twin: "Twin | None", *, yes: bool) -> None:
     """Hold the pose until the object is between the fingers: a person's or the twin's doing.
 
     Raises:

@@ -36,8 +36,8 @@ import numpy as np
 from vd.deploy.clock import from_future
 from vd.deploy.finding import listed
 from vd.deploy.hardware.answers import BusError, HandState, LateError, SilentError
-from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.motors import Motors
 from vd.deploy.safety.limits import PERIOD_S, Limits, SafetyCfg, out_of_range
 from vd.deploy.safety.signals import REASONS, Signals
 from vd.logs.log_format import FINISHED
@@ -123,7 +123,7 @@ class SafeHand:
 
     def __init__(
         self,
-        bus: MotorBus,
+        bus: Motors,
         joints: Joints,
         cfg: SafetyCfg = DEFAULTS,
         say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
