@@ -30,7 +30,7 @@ from vd.deploy.clock import MONOTONIC, Clock, from_future
 from vd.deploy.finding import Finding, finding
 from vd.deploy.hardware.answers import HandState, SilentError
 from vd.deploy.hardware.connect import Connection, HandOptions
-from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.joints import JointMotors
 from vd.deploy.loop.goals import GoalError, make_goals
 from vd.deploy.safety.limits import out_of_range
 from vd.paper import PAPER
@@ -47,7 +47,7 @@ FEWEST = 2.0
 """States for each control step, at least."""
 
 
-class _Joints(Joints):
+class _Joints(JointMotors):
     """Joints whose motors nobody here knows: of each angles and limits are the joint's own."""
 
     def __init__(self, hand: HandModel):
@@ -138,12 +138,15 @@ class RosHand:
             )
             yield Finding("joint states", False, why)
             return
-        begin, first, ages = self.clock.now(), self.count, []
+        begin = self.clock.now()
+        first = self.count
+        ages = []
         while self.clock.now() < begin + LOOK_S:
             assert self._state is not None
             ages.append(self.clock.now() - self._state.time_s)
             self.clock.sleep(STATE_S)
-        rate, age = (self.count - first) / LOOK_S, float(np.median(ages))
+        rate = (self.count - first) / LOOK_S
+        age = float(np.median(ages))
         wrong = []
         if rate < FEWEST * PAPER.scene.control_hz:
             wrong.append(f"{rate:.0f} a second, fewer than {FEWEST * PAPER.scene.control_hz:.0f}")
@@ -223,7 +226,9 @@ class RosGoals:
         from std_msgs.msg import String
         from std_srvs.srv import Trigger
 
-        self._goals, self._result, self._string = goals, SetParametersResult, String
+        self._goals = goals
+        self._result = SetParametersResult
+        self._string = String
         self._finished = threading.Event()
         self._events = node.create_publisher(String, "~/events", 10)
         node.declare_parameter("goal", [0.0, 0.0, 0.0, 1.0])
@@ -248,7 +253,8 @@ class RosGoals:
 
     def _finish(self, _: Any, answer: Any) -> Any:
         self._finished.set()
-        answer.success, answer.message = True, "ends after the last goal"
+        answer.success = True
+        answer.message = "ends after the last goal"
         return answer
 
     def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:

@@ -25,7 +25,7 @@ from vd.deploy.hardware.control_table import (
     to_angle,
     to_counts,
 )
-from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.joints import JointMotors
 
 FULL_PWM = 885
 
@@ -351,6 +351,6 @@ class Motor:
             self.put("goal_position", self.get("present_position"))
 
 
-def make_motors(joints: Joints) -> list[Motor]:
+def make_motors(joints: JointMotors) -> list[Motor]:
     """A hand's motors, as they come from the factory but for their IDs."""
     return [Motor(model, id) for model, id in zip(joints.models, joints.ids, strict=True)]

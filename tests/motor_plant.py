@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from vd.assets_usd.objects.model import ObjectModel
-from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.joints import JointMotors
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.sim.cfg import SimCfg
 
@@ -86,7 +86,9 @@ class NewtonPlant(NewtonHand):
     gain. In current-based mode its current limits the torque.
     """
 
-    def __init__(self, joints: Joints, cfg: SimCfg | None = None, item: ObjectModel | None = None):
+    def __init__(
+        self, joints: JointMotors, cfg: SimCfg | None = None, item: ObjectModel | None = None
+    ):
         self.joints = joints
         super().__init__(joints.hand, cfg, item)
 

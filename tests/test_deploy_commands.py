@@ -23,7 +23,7 @@ from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.hardware import check, home, record
 from vd.deploy.hardware.connect import Connection
 from vd.deploy.hardware.control_table import WATCHDOG_FIRMWARE, HardwareError
-from vd.deploy.hardware.joints import Joints, read_joints
+from vd.deploy.hardware.joints import JointMotors, read_joints
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
 from vd.deploy.twin.twin import Twin
@@ -388,7 +388,7 @@ def test_a_payload_needs_somebody_to_hang_it(line, hand, tmp_path):
 def twin(hand):
     """A twin on a simulated clock, of motors that turn the other way and are mounted elsewhere."""
     turned = [replace(motor, sign=-1.0, offset_rad=0.2) for motor in hand.motors]
-    return Twin(Joints(hand, tuple(turned)), clock=SimulatedClock())
+    return Twin(JointMotors(hand, tuple(turned)), clock=SimulatedClock())
 
 
 def test_a_twin_does_what_motors_do(twin, hand):

@@ -28,7 +28,7 @@ from vd.deploy.hardware.joints import read_joints
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop
-from vd.deploy.loop.policy_runner import Decision, PolicyRunner
+from vd.deploy.loop.policy_runner import PolicyDecision, PolicyRunner
 from vd.deploy.safety.safety import SafeHand
 from vd.envs.cfg import ReorientCfg
 from vd.gap.chain import chains
@@ -124,7 +124,7 @@ class Waving(PolicyRunner):
         """After a while."""
         self._clock.sleep(THINKING_S)
         self._step += 1
-        return Decision(0.8 * np.sin(0.4 * self._step + np.arange(9.0)), float("nan"))
+        return PolicyDecision(0.8 * np.sin(0.4 * self._step + np.arange(9.0)), float("nan"))
 
 
 def rollout(folder, plant_hand, episode_s):

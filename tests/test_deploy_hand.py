@@ -9,7 +9,7 @@ from motor_plant import Drive, NewtonPlant
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.hardware.control_table import MODELS
-from vd.deploy.hardware.joints import CalibrationError, Joints, read_joints
+from vd.deploy.hardware.joints import CalibrationError, JointMotors, read_joints
 from vd.kernels.servo.actuators import COULOMB_TORQUE
 from vd.sim.cfg import SimCfg
 
@@ -22,15 +22,15 @@ def hand():
 
 
 @pytest.fixture
-def turned(hand) -> Joints:
+def turned(hand) -> JointMotors:
     """Motors mounted every which way."""
     rng = np.random.default_rng(0)
     signs, angles = rng.choice([-1.0, 1.0], 9), rng.uniform(-0.5, 0.5, 9)
     turned = zip(hand.motors, signs, angles, strict=True)
-    return Joints(hand, tuple(replace(motor, sign=s, offset_rad=o) for motor, s, o in turned))
+    return JointMotors(hand, tuple(replace(motor, sign=s, offset_rad=o) for motor, s, o in turned))
 
 
-def save(joints: Joints, path, hand: str) -> dict:
+def save(joints: JointMotors, path, hand: str) -> dict:
     """Write a calibration file."""
     rows = zip(joints.names, joints.ids, joints.sign, joints.offset, strict=True)
     motors = [{"joint": n, "id": i, "sign": int(s), "offset_rad": float(o)} for n, i, s, o in rows]
@@ -39,7 +39,7 @@ def save(joints: Joints, path, hand: str) -> dict:
     return record
 
 
-def drives(joints: Joints, goal: np.ndarray | None) -> list[Drive]:
+def drives(joints: JointMotors, goal: np.ndarray | None) -> list[Drive]:
     angles = [None] * len(joints.ids) if goal is None else list(joints.to_motor(goal))
     return [Drive(angle, 200.0, 6.0, 2.6) for angle in angles]
 
@@ -65,14 +65,14 @@ def test_the_hand_goes_where_its_motors_drive_and_falls_without_them(hand, turne
 
 
 def test_limits_are_the_hands_in_the_motors_frame(hand, turned):
-    turned = Joints(hand, tuple(replace(motor, model=MODEL) for motor in turned.motors))
+    turned = JointMotors(hand, tuple(replace(motor, model=MODEL) for motor in turned.motors))
     settings = turned.settings()
     for axis, id in enumerate(turned.ids):
         ends = turned.to_motor(np.stack([hand.lower, hand.upper]))[:, axis]
         assert settings[id].lower_rad == min(ends) and settings[id].upper_rad == max(ends)
         torque = settings[id].current_limit_a * MODELS[MODEL].torque_nm_per_a
         assert torque == pytest.approx(hand.effort[axis], rel=1e-6)
-    far = Joints(
+    far = JointMotors(
         hand, tuple(replace(motor, offset_rad=motor.offset_rad + 3.0) for motor in turned.motors)
     )
     with pytest.raises(CalibrationError, match=r"f0_j1, motor 10: its range"):

@@ -25,7 +25,7 @@ from vd.deploy.hardware.joints import CalibrationError, read_joints
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop
-from vd.deploy.loop.policy_runner import Decision, PolicyRunner
+from vd.deploy.loop.policy_runner import PolicyDecision, PolicyRunner
 from vd.deploy.safety.safety import SafeHand, StoppedError
 from vd.envs.cfg import ReorientCfg
 from vd.policy.stopping import StoppingRule
@@ -55,7 +55,7 @@ class Bending(PolicyRunner):
         """One action of one joint."""
         action = np.zeros(len(sensed.joint_q))
         action[2] = 1.0
-        return Decision(action, float("nan"))
+        return PolicyDecision(action, float("nan"))
 
 
 def fly(hand: HandModel, folder) -> tuple[np.ndarray, list[Motor]]:

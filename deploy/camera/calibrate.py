@@ -124,7 +124,9 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
         camera = RealSense(find_device(cfg.camera.serial), cfg.camera, infrared=True)
         stack.callback(camera.close)
         connection = stack.enter_context(connect(cfg))
-        hand, bus, joints = connection.hand, connection.bus, connection.joints
+        hand = connection.hand
+        bus = connection.bus
+        joints = connection.joints
         confirm("The torque goes off, and the hand lets go.", yes=cfg.yes)
         with held():  # else some motors would keep their torque
             failed = bus.torque(False)
@@ -135,7 +137,9 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
             "still."
         )
         poses: dict[int, list[np.ndarray]] = {number: [] for number in fingers}
-        tip, finger, corners = [], [], []
+        tip = []
+        finger = []
+        corners = []
         while min(map(len, poses.values())) < cfg.count:
             before = joints.to_joint(bus.read_state().position)
             image = camera.read(IMAGE_S).image

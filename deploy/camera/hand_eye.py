@@ -128,7 +128,8 @@ def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -
     rows = _enough(views.finger, np.arange(len(views)))
     if len(rows) < LEAST_VIEWS:
         raise HandEyeError(f"{len(rows)} views of a marker; take at least {LEAST_VIEWS}, better 30")
-    views, turned = views.chosen(rows), {}
+    views = views.chosen(rows)
+    turned = {}
     for finger in np.unique(views.finger):
         options = [_turned(markers[int(finger)], quarter) for quarter in range(4)]
         mine = views.chosen(np.flatnonzero(views.finger == finger))
@@ -182,7 +183,8 @@ def refine(
 
     loss = {"loss": "soft_l1", "f_scale": ROBUST_PX} if robust else {}
     result = least_squares(residual, np.zeros(6 * len(start)), x_scale="jac", **loss)
-    now, count = poses(result.x), len(views)
+    now = poses(result.x)
+    count = len(views)
     covariance, freedom = _scatter(result.jac, result.fun, count)
     # Steps of the camera's place are in the base, turns about its own axes: as HandEye has them.
     return HandEye(

@@ -124,7 +124,8 @@ class RealSense:
             if self._sensor.supports(option):  # a D405 has no projector
                 self._sensor.set_option(option, value)
         side = 1 if infrared else cfg.decimation
-        self._infrared, self._decimate = infrared, rs.decimation_filter(side) if side > 1 else None
+        self._infrared = infrared
+        self._decimate = rs.decimation_filter(side) if side > 1 else None
         lens = _intrinsics(profile.as_video_stream_profile())
         self.intrinsics = Intrinsics(
             lens.width // side,
@@ -155,7 +156,8 @@ class RealSense:
                     f"no image from the camera within {timeout_s:.2f} s; check its cable (USB 3) "
                     f"and power"
                 )
-            frame, self._newest = self._newest, None
+            frame = self._newest
+            self._newest = None
         if frame.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock:
             raise CameraError(
                 "the camera stamps its images by a clock of its own, so nobody knows their age: "

@@ -61,7 +61,7 @@ class GarbledError(BusError):
 
 @dataclass(frozen=True)
 class HandState:
-    """State at one reading of all motors, or by :meth:`Joints.state` of their joints.
+    """State at one reading of all motors, or by :meth:`JointMotors.state` of their joints.
 
     Arrays have shape [D].
     """

@@ -32,8 +32,8 @@ from vd.paper import PAPER
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
-    from vd.deploy.camera.camera import Camera
-    from vd.deploy.hardware.joints import Joints
+    from vd.deploy.camera.camera import ImageSource
+    from vd.deploy.hardware.joints import JointMotors
 
 USB_SERIAL = Path("/sys/bus/usb-serial/devices")
 """Where the kernel tells of adapters of the FTDI kind, the U2D2 among them."""
@@ -160,7 +160,7 @@ def _read_tables(bus: MotorBus) -> tuple[dict[int, dict[str, int]], list[str]]:
     return tables, wrong
 
 
-def register_findings(joints: "Joints", tables: Tables) -> Iterator[Finding]:
+def register_findings(joints: "JointMotors", tables: Tables) -> Iterator[Finding]:
     """Compare control tables with what is wanted of them.
 
     A finding for each register that differs.
@@ -371,7 +371,7 @@ def confirm(question: str, *, yes: bool) -> None:
 
 def open_camera(
     cfg: RealSenseCfg, connection: Connection, place: CameraModel, *, realistic: bool = False
-) -> "Camera":
+) -> "ImageSource":
     """The depth camera, that of ROS, or one before the twin at this place.
 
     Raises:

@@ -13,7 +13,7 @@ from vd.deploy.hardware.port import BAUD_RATE
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
-    from vd.deploy.hardware.joints import Joints
+    from vd.deploy.hardware.joints import JointMotors
     from vd.deploy.hardware.motors import Motors
     from vd.deploy.twin.twin import Twin
 
@@ -46,7 +46,7 @@ class HandOptions:
 class Connection:
     """A hand and its motors."""
 
-    joints: "Joints"
+    joints: "JointMotors"
     """Which motor turns which joint of the hand."""
     bus: "Motors"
     """Its motors, in the joints' order."""
@@ -61,7 +61,7 @@ class Connection:
         return self.joints.hand
 
 
-def motors_of(options: HandOptions) -> "Joints":
+def motors_of(options: HandOptions) -> "JointMotors":
     """The motors of the options' hand.
 
     Raises:

@@ -43,7 +43,7 @@ class CalibrationError(ValueError):
     """Motors that cannot be used; names file or hand, joint and remedy."""
 
 
-class Joints:
+class JointMotors:
     """The motors of a hand's joints, in the joints' order.
 
     Raises:
@@ -51,7 +51,9 @@ class Joints:
     """
 
     def __init__(self, hand: HandModel, motors: tuple[MotorModel, ...]):
-        self.hand, self.names, self.motors = hand, hand.joint_names, motors
+        self.hand = hand
+        self.names = hand.joint_names
+        self.motors = motors
         self.ids = tuple(motor.id for motor in motors)
         """Motor of each joint [D]."""
         self.sign = np.array([motor.sign for motor in motors])
@@ -123,7 +125,9 @@ class Joints:
         ends = np.sort(
             np.stack([self.to_motor(self.hand.lower), self.to_motor(self.hand.upper)]), axis=0
         )
-        first, last, currents = to_angle(0), to_angle(4095), self.currents()
+        first = to_angle(0)
+        last = to_angle(4095)
+        currents = self.currents()
         result = {}
         for axis, (motor, model) in enumerate(zip(self.motors, self.models, strict=True)):
             low, high = float(ends[0, axis]), float(ends[1, axis])
@@ -148,7 +152,7 @@ class Joints:
 
 def read_joints(
     hand: HandModel, calibration: Path | None = None, model: str | None = None
-) -> Joints:
+) -> JointMotors:
     """The motors of a hand.
 
     Args:
@@ -181,7 +185,7 @@ def read_joints(
         if entry is not None:
             motor = replace(motor, id=entry.id, sign=entry.sign, offset_rad=entry.offset_rad)
         motors.append(motor if model is None else replace(motor, model=model))
-    return Joints(hand, tuple(motors))
+    return JointMotors(hand, tuple(motors))
 
 
 def _read_calibration(path: Path, hand: HandModel) -> dict[str, _Motor]:

@@ -31,7 +31,7 @@ from vd.logs.hand_log import read_columns
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
-    from vd.deploy.hardware.joints import Joints
+    from vd.deploy.hardware.joints import JointMotors
     from vd.logs.recording import Recording, Trajectory
 
 RATE_HZ = 100.0
@@ -102,7 +102,9 @@ class Sample(NamedTuple):
     enabled: np.ndarray
 
 
-def motions_of(motors: "Joints", fingers: Sequence[int], sets: Sequence[str]) -> list["Trajectory"]:
+def motions_of(
+    motors: "JointMotors", fingers: Sequence[int], sets: Sequence[str]
+) -> list["Trajectory"]:
     """The motions of excitation sets, finger by finger.
 
     Raises:
@@ -124,9 +126,10 @@ def _finger(joint: str) -> str:
     return joint.partition("_")[0]
 
 
-def _of_hand(motion: "Trajectory", motors: "Joints") -> "Trajectory":
+def _of_hand(motion: "Trajectory", motors: "JointMotors") -> "Trajectory":
     """A motion with the fingers aside that it does not move, and the usual gain if it names none."""
-    hand, command = motors.hand, motion.command.copy()
+    hand = motors.hand
+    command = motion.command.copy()
     moving = hand.joint_finger[hand.joint_names.index(motion.joints[0])]
     others = hand.joint_finger != moving
     command[:, others] = aside(hand, int(moving))[others]
@@ -134,7 +137,7 @@ def _of_hand(motion: "Trajectory", motors: "Joints") -> "Trajectory":
     return replace(motion, command=command, conditions=conditions)
 
 
-def read_plan(path: Path, motors: "Joints") -> list["Trajectory"]:
+def read_plan(path: Path, motors: "JointMotors") -> list["Trajectory"]:
     """The motions of a plan that ``vd-gap plan`` wrote; joints that it does not name are straight.
 
     ``path`` is next_experiment.json, or the folder with it.
@@ -157,12 +160,13 @@ def read_plan(path: Path, motors: "Joints") -> list["Trajectory"]:
 
 
 def _planned(
-    folder: Path, entry: Mapping[str, Any], joints: Sequence[str], motors: "Joints"
+    folder: Path, entry: Mapping[str, Any], joints: Sequence[str], motors: "JointMotors"
 ) -> "Trajectory":
     """The motion of a plan's entry, whose file is in ``folder``."""
     from vd.logs.recording import Trajectory
 
-    hand, columns = motors.hand, read_columns(folder / entry["file"])
+    hand = motors.hand
+    columns = read_columns(folder / entry["file"])
     command = np.tile(0.5 * (hand.lower + hand.upper), (len(columns["t"]), 1))
     enabled = np.ones(command.shape, dtype=bool)
     for name in joints:
@@ -171,11 +175,9 @@ def _planned(
         column = hand.joint_names.index(name)
         command[:, column] = columns[f"command.{name}"]
         enabled[:, column] = columns.get(f"enabled.{name}", np.ones(len(command))) > 0.0
-    file, kind, joints = (
-        "plan_" + Path(entry["file"]).name,
-        entry["excitation"],
-        tuple(entry["joints"]),
-    )
+    file = "plan_" + Path(entry["file"]).name
+    kind = entry["excitation"]
+    joints = tuple(entry["joints"])
     motion = Trajectory(
         file, kind, joints, entry["conditions"], columns["t"], command, command, enabled
     )

@@ -142,7 +142,8 @@ def different(
         model: Its model.
         settings: What its joint wants; the factory's values otherwise.
     """
-    items, own = table(model), settings.values(model)
+    items = table(model)
+    own = settings.values(model)
     compared = [one for one in REGISTERS if one.name in own or one.name not in OWN]
     wanted = {one: own.get(one.name, items[one.name].initial) for one in compared}
     return {

@@ -15,7 +15,8 @@ class ActionFilter:
 
     def __init__(self, hand: HandModel, task: ReorientCfg):
         params = ActionParams()
-        params.alpha, params.noise_std = task.action.ema_alpha, 0.0
+        params.alpha = task.action.ema_alpha
+        params.noise_std = 0.0
         params.step_rad = task.action.scale_rad_s * task.sim.control_dt
         count = hand.num_joints
 

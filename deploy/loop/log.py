@@ -85,8 +85,10 @@ class LogWriter:
         if (folder / RUN_FILE).exists():
             raise FileExistsError(f"{folder} holds a log; choose another folder")
         make_folder(folder)
-        self.folder, self._joints = folder, hand.joint_names
-        self._clock, self.started_s = clock, clock.now()
+        self.folder = folder
+        self._joints = hand.joint_names
+        self._clock = clock
+        self.started_s = clock.now()
         self.run: dict[str, Any] = {
             "format": LOG_FORMAT,
             "hand": called(hand),

@@ -98,7 +98,8 @@ def _optitrack(rows: list[list[str]], body: str | None) -> np.ndarray:
     head = {
         key.lower(): value.lower() for key, value in zip(rows[0][::2], rows[0][1::2], strict=False)
     }
-    turns, unit = head.get("rotation type", "quaternion"), head.get("length units", "meters")
+    turns = head.get("rotation type", "quaternion")
+    unit = head.get("length units", "meters")
     if turns != "quaternion":
         raise ValueError(f"rotations are {turns}; export them as quaternions")
     if unit not in UNITS_M:

@@ -24,7 +24,7 @@ from vd.command.files import check_folder
 from vd.command.line import say_same_as
 from vd.command.warp_quiet import quiet_warp
 from vd.deploy.asking import answer, answered, ask, attended
-from vd.deploy.camera.camera import Camera
+from vd.deploy.camera.camera import ImageSource
 from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.finding import Finding
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
@@ -62,7 +62,7 @@ DRAWING = "drawing the film (the first one compiles its kernels) ..."
 
 
 @dataclass(frozen=True)
-class RunCfg(HandOptions):
+class DriveCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
@@ -151,7 +151,7 @@ class RunCfg(HandOptions):
             interrupt.need("mcap_ros2")
 
 
-def run(cfg: RunCfg) -> int:
+def run(cfg: DriveCfg) -> int:
     """Run the policy; 0 if all goals were pursued, 1 if the object was lost.
 
     Raises:
@@ -173,7 +173,8 @@ def run(cfg: RunCfg) -> int:
 
     quiet_warp()
     hand = load_hand(cfg.hand, layer=cfg.hand_layer) if cfg.ros2 else motors_of(cfg).hand
-    item, name = one_object(cfg.object), cfg.policy_name
+    item = one_object(cfg.object)
+    name = cfg.policy_name
     goals = _goals(cfg, item)
     _say_chosen(cfg, len(goals))
     tolerance = cfg.tolerance_rad
@@ -214,7 +215,7 @@ def run(cfg: RunCfg) -> int:
     return status
 
 
-def _say_chosen(cfg: RunCfg, goals: int) -> None:
+def _say_chosen(cfg: DriveCfg, goals: int) -> None:
     """Say what a run takes that names no policy."""
     if cfg.policy is None:
         where = ["--ros2"] if cfg.ros2 else ["--port", cfg.port] if cfg.port else ["--twin"]
@@ -222,7 +223,7 @@ def _say_chosen(cfg: RunCfg, goals: int) -> None:
         say_same_as("vd-deploy", *words, why=f"{goals} goals")
 
 
-def _goals(cfg: RunCfg, item: "ObjectModel") -> list[np.ndarray]:
+def _goals(cfg: DriveCfg, item: "ObjectModel") -> list[np.ndarray]:
     """What was asked for, or where nothing was, what shows something; with ROS 2 none."""
     from vd.deploy.loop.goals import make_goals, shown_goals
 
@@ -233,7 +234,7 @@ def _goals(cfg: RunCfg, item: "ObjectModel") -> list[np.ndarray]:
 
 
 def _pursue(
-    cfg: RunCfg,
+    cfg: DriveCfg,
     name: str,
     runner: "PolicyRunner",
     connection: Connection,
@@ -251,10 +252,12 @@ def _pursue(
     from vd.deploy.loop.loop import NO_SYMMETRY, ControlLoop, summary
     from vd.deploy.ros import UNKNOWN, RosGoals
 
-    hand, twin, hz = connection.hand, connection.twin, runner.task.sim.control_hz
+    hand = connection.hand
+    twin = connection.twin
+    hz = runner.task.sim.control_hz
     pose = hand.start
     with contextlib.ExitStack() as stack:
-        camera: Camera | None = None
+        camera: ImageSource | None = None
         seen: Iterable[Finding] = ()
         if runner.camera is not None:
             camera = open_camera(cfg.camera, connection, runner.camera, realistic=cfg.realistic)
@@ -270,7 +273,8 @@ def _pursue(
         stack.enter_context(undisturbed(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals{', and those it is given' * cfg.ros2}."
         ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=seen)
-        said, servo = _description(cfg, name, runner, item, goals), connection.joints.servo()
+        said = _description(cfg, name, runner, item, goals)
+        servo = connection.joints.servo()
         without = () if connection.ros is None else UNKNOWN
         log = LogWriter(folder, hand, said, servo=servo, truth=twin is not None, without=without)
         if cfg.log is not None and cfg.log.suffix == MCAP:
@@ -281,7 +285,8 @@ def _pursue(
         if served is not None:
             log.also_to(served)
         pacer = Pacer(hz, latest=LATEST)
-        reason, outcomes = "aborted", list[str]()
+        reason = "aborted"
+        outcomes = list[str]()
         loop: ControlLoop | None = None
         try:
             # With ROS 2 torque is the driver's.
@@ -317,7 +322,7 @@ def _pursue(
 
 
 def warm_up(
-    runner: "PolicyRunner", pose: np.ndarray, goal: np.ndarray, camera: Camera | None
+    runner: "PolicyRunner", pose: np.ndarray, goal: np.ndarray, camera: ImageSource | None
 ) -> None:
     """Let the policy decide a few times on what is seen now; the run begins without that.
 
@@ -332,7 +337,11 @@ def warm_up(
 
 
 def _description(
-    cfg: RunCfg, name: str, runner: "PolicyRunner", item: "ObjectModel", goals: Sequence[np.ndarray]
+    cfg: DriveCfg,
+    name: str,
+    runner: "PolicyRunner",
+    item: "ObjectModel",
+    goals: Sequence[np.ndarray],
 ) -> dict[str, Any]:
     """What a run's log says of it beside its steps."""
     return {

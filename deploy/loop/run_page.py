@@ -49,7 +49,8 @@ class GoalResult:
 
 def goal_results(log: HandLog) -> list[GoalResult]:
     """How each goal ended that was pursued."""
-    columns, stops = log.columns, {stop.goal: stop for stop in log.stops}
+    columns = log.columns
+    stops = {stop.goal: stop for stop in log.stops}
     results = []
     for goal in np.unique(columns["goal"][columns["acting"] > 0.0]).astype(int):
         rows = np.flatnonzero((columns["goal"] == goal) & (columns["acting"] > 0.0))

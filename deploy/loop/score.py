@@ -136,7 +136,8 @@ def in_world(
     frame = Rotation.from_quat(world)
     if up == "y":
         frame = frame * Rotation.from_euler("x", 90, degrees=True)
-    pose, rows = mocap.pose.copy(), mocap.tracked
+    pose = mocap.pose.copy()
+    rows = mocap.tracked
     turn = frame * Rotation.from_quat(pose[rows, 3:]) * Rotation.from_quat(marker)
     pose[rows] = np.concatenate([frame.apply(pose[rows, :3]), turn.as_quat()], axis=1)
     return replace(mocap, pose=pose)
@@ -205,7 +206,8 @@ def lines(result: Score) -> list[str]:
         f"stop"
     )
     if result.median is not None:
-        m, stops = result.median, sum(trial.error_rad is not None for trial in result.trials)
+        m = result.median
+        stops = sum(trial.error_rad is not None for trial in result.trials)
         rows.append(
             f"median error at {stops} stops: {m.value:.2f} rad ({np.degrees(m.value):.0f} deg), "
             f"95 % {m.low:.2f} to {m.high:.2f}"

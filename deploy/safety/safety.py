@@ -36,7 +36,7 @@ import numpy as np
 from vd.deploy.clock import from_future
 from vd.deploy.finding import listed
 from vd.deploy.hardware.answers import BusError, HandState, LateError, SilentError
-from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.joints import JointMotors
 from vd.deploy.hardware.motors import Motors
 from vd.deploy.safety.limits import PERIOD_S, Limits, SafetyCfg, out_of_range
 from vd.deploy.safety.signals import REASONS, Signals
@@ -124,14 +124,18 @@ class SafeHand:
     def __init__(
         self,
         bus: Motors,
-        joints: Joints,
+        joints: JointMotors,
         cfg: SafetyCfg = DEFAULTS,
         say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
         ended: Callable[[StopReport], None] = lambda report: None,
     ):
         """Nothing is sent before :meth:`arm`."""
-        self.bus, self.joints, self.hand, self.cfg = bus, joints, joints.hand, cfg
-        self._say, self._ended = say, ended
+        self.bus = bus
+        self.joints = joints
+        self.hand = joints.hand
+        self.cfg = cfg
+        self._say = say
+        self._ended = ended
         self._names = [
             f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)
         ]
@@ -377,7 +381,8 @@ class SafeHand:
     def _due(self) -> str:
         """Why the hand has to stop now, whatever its motors say; empty if it has not."""
         now = self.bus.clock.now()
-        silent, age = now - self._beat_s, now - self._image_s
+        silent = now - self._beat_s
+        age = now - self._image_s
         if came := self._signals.came():
             return REASONS[signal.Signals(came[0])]
         if silent > self.cfg.misses * PERIOD_S:

@@ -12,7 +12,7 @@ from vd.deploy.camera.camera import Frame
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.control_table import RAD_PER_COUNT, RAD_S_PER_COUNT, TICK_MODULUS
-from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.joints import JointMotors
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
@@ -38,7 +38,7 @@ class Twin:
 
     def __init__(
         self,
-        joints: Joints,
+        joints: JointMotors,
         item: ObjectModel | None = None,
         *,
         physics_hz: float = PAPER.scene.physics_hz,
