@@ -241,11 +241,10 @@ class RosGoals:
 
     def _set(self, parameters: Sequence[Any]) -> Any:
         try:
-            new = [
-                make_goals([",".join(map(str, one.value))])[0]
-                for one in parameters
-                if one.name == "goal"
-            ]
+            new = []
+            for parameter in parameters:
+                if parameter.name == "goal":
+                    new += make_goals([",".join(map(str, parameter.value))])
         except (GoalError, TypeError) as error:
             return self._result(successful=False, reason=str(error))
         self._goals.extend(new)

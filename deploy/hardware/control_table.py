@@ -94,11 +94,9 @@ class Model:
     """Whether it measures and limits its current. Others tell a load, in 0.1 % of the largest, by
     which the current is guessed, and have no current-based mode."""
 
-    def current_of(self, torque_nm: np.ndarray) -> np.ndarray:
-        """Currents for torques [A], no larger than the motor's largest."""
-        return np.minimum(
-            torque_nm / self.torque_nm_per_a, self.current_limit * self.current_unit_a
-        )
+    def current_of(self, torque_nm: float) -> float:
+        """Current for a torque [A], no larger than the motor's largest."""
+        return min(torque_nm / self.torque_nm_per_a, self.current_limit * self.current_unit_a)
 
 
 _MODELS = (

@@ -64,16 +64,19 @@ class JointMotors:
         """Angle of the motor where the joint is at zero [rad], shape [D]."""
         self.capped = np.array([motor.current > 0.0 for motor in motors])
         """Whether its mode keeps the motor below its largest current [D]."""
-        try:
-            self.models: tuple[Model, ...] = tuple(motor_model(motor.model) for motor in motors)
-        except ValueError as error:
-            raise CalibrationError(f"{hand.name}: {error}") from error
-        for name, model, capped in zip(self.names, self.models, self.capped, strict=True):
-            if capped and not model.senses_current:
+        self.models: list[Model] = []
+        """Model of each motor [D]."""
+        for name, motor in zip(self.names, motors, strict=True):
+            try:
+                model = motor_model(motor.model)
+            except ValueError as error:
+                raise CalibrationError(f"{hand.name}: {error}") from error
+            if motor.current > 0.0 and not model.senses_current:
                 raise CalibrationError(
                     f"{hand.name}: {name} has a largest current, which {model.name} does not "
                     "measure; take vd:motor:current away"
                 )
+            self.models.append(model)
 
     def to_motor(self, joint: np.ndarray) -> np.ndarray:
         """Angles of the motors [rad] from those of the joints, shape [..., D]."""
@@ -98,9 +101,11 @@ class JointMotors:
 
         What it is said to have, or needs for its joint's torque.
         """
-        torque = self.hand.effort / self.gear
-        needed = [float(model.current_of(t)) for model, t in zip(self.models, torque, strict=True)]
-        return np.where(self.capped, [motor.current for motor in self.motors], needed)
+        currents = np.zeros(len(self.motors))
+        for axis, (motor, model) in enumerate(zip(self.motors, self.models, strict=True)):
+            needed = model.current_of(self.hand.effort[axis] / motor.gear)
+            currents[axis] = motor.current if motor.current > 0.0 else needed
+        return currents
 
     @property
     def p_gain(self) -> int:
@@ -215,7 +220,8 @@ def _by_joint(file: _File, hand: HandModel) -> dict[str, _Motor]:
             f"its field hand names {file.hand!r}: zeros and directions of another hand's motors "
             f"are not this one's; calibrate {hand.name}"
         )
-    named, ids = ([getattr(motor, name) for motor in file.motors] for name in ("joint", "id"))
+    named = [motor.joint for motor in file.motors]
+    ids = [motor.id for motor in file.motors]
     for name in hand.joint_names:
         if named.count(name) != 1:
             raise ValueError(f"motors has {named.count(name) or 'no'} entries of {name}; give one")

@@ -114,11 +114,10 @@ def motions_of(
 
     hand = motors.hand
     reach = JointRange(hand.joint_names, hand.lower, hand.upper, p_gain=float(motors.p_gain))
-    every = excitation_set(reach, sets)
     joints = joints_of(hand, fingers)
-    chosen = [motion for motion in every if motion.joints[0] in joints]
-    ordered = sorted(chosen, key=lambda motion: _finger(motion.joints[0]))
-    return [_of_hand(motion, motors) for motion in numbered(ordered)]
+    chosen = [motion for motion in excitation_set(reach, sets) if motion.joints[0] in joints]
+    chosen.sort(key=lambda motion: _finger(motion.joints[0]))
+    return [_of_hand(motion, motors) for motion in numbered(chosen)]
 
 
 def _finger(joint: str) -> str:
@@ -148,11 +147,8 @@ def read_plan(path: Path, motors: "JointMotors") -> list["Trajectory"]:
     file = path / "next_experiment.json" if path.is_dir() else path
     try:
         plan: dict[str, Any] = json.loads(file.read_text())
-        return [
-            _planned(file.parent, entry, plan["joints"], motors) for entry in plan["trajectories"]
-        ]
-    except RecordError:
-        raise
+        entries = plan["trajectories"]
+        return [_planned(file.parent, entry, plan["joints"], motors) for entry in entries]
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise RecordError(
             f"{file} is no plan for {motors.hand.name}: {error}; vd-gap plan writes one"
@@ -190,13 +186,14 @@ def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
     Raises:
         ValueError: The hand lacks a finger.
     """
-    wrong = [finger for finger in fingers if not 0 <= finger < hand.num_fingers]
-    if wrong:
-        raise ValueError(
-            f"--fingers {wrong[0]}: {hand.name} has fingers 0 to {hand.num_fingers - 1}"
-        )
-    chosen = sorted(set(fingers)) or range(hand.num_fingers)
-    return tuple(name for f in chosen for name in hand.joint_names[hand.fingers[f]])
+    names: list[str] = []
+    for finger in sorted(set(fingers)) or range(hand.num_fingers):
+        if not 0 <= finger < hand.num_fingers:
+            raise ValueError(
+                f"--fingers {finger}: {hand.name} has fingers 0 to {hand.num_fingers - 1}"
+            )
+        names.extend(hand.joint_names[hand.fingers[finger]])
+    return tuple(names)
 
 
 def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
@@ -215,12 +212,12 @@ def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
         When each was measured [T] [s]: as long after it was asked for as most of them were.
     """
     gone = np.diff(ticks, axis=0) % TICK_MODULUS
-    own = np.concatenate([[0.0], 1e-3 * gone.mean(axis=1).cumsum()])
+    motor_s = np.concatenate([[0.0], 1e-3 * gone.mean(axis=1).cumsum()])
     # The rates of two clocks differ; a share of the packets that comes late must not count. All
     # pairs of some samples: those of all take longer than a hand may wait for its loop.
-    some = np.unique(np.linspace(0, len(own) - 1, CLOCK_SAMPLES).astype(int))
-    rate, begin, *_ = theilslopes((asked_s - own)[some], own[some])
-    return np.asarray(own * (1.0 + rate) + begin)
+    rows = np.unique(np.linspace(0, len(motor_s) - 1, CLOCK_SAMPLES).astype(int))
+    rate, begin, *_ = theilslopes((asked_s - motor_s)[rows], motor_s[rows])
+    return np.asarray(motor_s * (1.0 + rate) + begin)
 
 
 def play(
@@ -322,8 +319,8 @@ def record(cfg: RecordCfg) -> int:
             left.sort(key=payload_of)
             for payload, group in itertools.groupby(left, key=payload_of):
                 _session(cfg, connection, joints, list(group), payload, keep)
-        for one in written:
-            one.result()
+        for writing in written:
+            writing.result()
     print(f"{cfg.out}: {len(recording.trajectories)} motions; vd-gap run {cfg.out} --out gap")
     return 0
 
@@ -372,10 +369,10 @@ def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "
 
     model = called(connection.hand)
     if (cfg.out / "recording.json").exists():
-        found = read_recording(cfg.out)
-        if found.joints != joints or found.model != model:
+        begun = read_recording(cfg.out)
+        if begun.joints != joints or begun.model != model:
             raise RecordError(
-                f"{cfg.out} is of {found.model}, {', '.join(found.joints)}; choose another --out"
+                f"{cfg.out} is of {begun.model}, {', '.join(begun.joints)}; choose another --out"
             )
-        return found
+        return begun
     return Recording(cfg.out, model, joints, connection.joints.servo(), RAD_PER_COUNT, ())

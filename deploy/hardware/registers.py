@@ -94,7 +94,7 @@ REGISTERS = (
 """The table."""
 ROUNDING = 1e-6
 """Of a count: 0.35 A are 350 counts of 1 mA, not 349."""
-OWN = ("current_limit", "goal_current")
+OPTIONAL = ("current_limit", "goal_current")
 """Registers that not every motor and mode has: they are compared where the settings name them."""
 
 
@@ -143,14 +143,16 @@ def different(
         settings: What its joint wants; the factory's values otherwise.
     """
     items = table(model)
-    own = settings.values(model)
-    compared = [one for one in REGISTERS if one.name in own or one.name not in OWN]
-    wanted = {one: own.get(one.name, items[one.name].initial) for one in compared}
-    return {
-        one: (found[one.name], value)
-        for one, value in wanted.items()
-        if not one.right(found[one.name], value)
-    }
+    values = settings.values(model)
+    differences = {}
+    for register in REGISTERS:
+        name = register.name
+        if name in OPTIONAL and name not in values:
+            continue
+        wanted = values.get(name, items[name].initial)
+        if not register.right(found[name], wanted):
+            differences[register] = (found[name], wanted)
+    return differences
 
 
 def kept(register: Register) -> bool:

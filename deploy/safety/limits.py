@@ -126,8 +126,8 @@ class Limits:
                 f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider"
             )
         self._current = np.where(joints.capped, np.inf, cfg.current_share * joints.currents())
-        most = [model.temperature_limit - SHUTDOWN_C for model in joints.models]
-        self._temperature = np.minimum(cfg.temperature_c, most)
+        shutdown_c = np.array([model.temperature_limit for model in joints.models])
+        self._temperature = np.minimum(cfg.temperature_c, shutdown_c - SHUTDOWN_C)
         self._velocity = cfg.velocity_share * hand.velocity_limit
         self._supply = np.array([model.supply_v for model in joints.models])
         self._blocked = Lasting(cfg.blocked_s)
