@@ -6,7 +6,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from vd.command import interrupt
 from vd.command.line import behind_command, parse
@@ -75,17 +74,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = getattr(module, name)
     options_of = inspect.get_annotations(command)["cfg"]
     options = parse(options_of, arguments, prog=f"vd-deploy {name}", description=module.__doc__)
-    if hasattr(options, "port") and not (options.port or options.twin or _by_ros(options)):
+    by_ros = getattr(options, "ros2", False)
+    if hasattr(options, "port") and not (options.port or options.twin or by_ros):
         from vd.deploy.hardware.port import find_port
 
         options = replace(options, port=find_port())
         print(f"vd-deploy: --port {options.port}, the only serial adapter", file=sys.stderr)
     return int(command(options))
-
-
-def _by_ros(options: Any) -> bool:
-    """Whether the motors are behind ROS 2, and have no port here."""
-    return bool(getattr(options, "ros2", False))
 
 
 if __name__ == "__main__":

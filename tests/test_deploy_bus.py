@@ -30,6 +30,7 @@ from vd.deploy.hardware.registers import MotorSettings  # noqa: E402
 
 IDS = (10, 11, 12)
 MODEL = "XH430-V210"
+MODELS_OF_ALL = [MODELS[MODEL]] * len(IDS)
 LIMITS = MotorSettings(current_limit_a=0.5, velocity_limit_rad_s=1.0, lower_rad=-1.0, upper_rad=1.2)
 
 
@@ -42,7 +43,7 @@ def twin():
 @pytest.fixture
 def bus(twin):
     # The SDK waits 34 ms for an answer; on a busy machine the twin may not run for longer.
-    with MotorBus(twin.path, IDS, MODEL, retries=20) as opened:
+    with MotorBus(twin.path, IDS, MODELS_OF_ALL, retries=20) as opened:
         yield opened
 
 
@@ -67,13 +68,13 @@ def test_the_sdk_finds_the_motors(bus, twin):
 
 def test_a_port_is_for_one_program_at_a_time_and_says_why_it_cannot_be_opened(bus, twin):
     with pytest.raises(BusError, match=f"in use; .*`fuser -v {twin.path}`"):
-        MotorBus(twin.path, IDS, MODEL)
+        MotorBus(twin.path, IDS, MODELS_OF_ALL)
     with pytest.raises(BusError, match=r"no such device; is the adapter plugged in\? There are: "):
-        MotorBus("/dev/ttyUSB99", IDS, MODEL)
+        MotorBus("/dev/ttyUSB99", IDS, MODELS_OF_ALL)
     bus.close()
     with pytest.raises(BusError, match="is lost"):
         bus.read_state()
-    with MotorBus(twin.path, IDS, MODEL, retries=20) as again:
+    with MotorBus(twin.path, IDS, MODELS_OF_ALL, retries=20) as again:
         again.read_state()
 
 

@@ -36,7 +36,6 @@ from vd.deploy.hardware.control_table import (
     Model,
     describe_hardware_error,
     model_name,
-    motor_model,
     table,
     to_counts,
 )
@@ -75,7 +74,7 @@ class MotorBus:
     Args:
         port: Device, such as /dev/ttyUSB0, or an open port of the SDK's kind.
         ids: Motors in the order of the arrays.
-        models: Model of each, or the name of that of all.
+        models: Model of each.
         baud_rate: To open the device with.
         retries: How often to ask again where no sound answer came.
         clock: Time.
@@ -88,7 +87,7 @@ class MotorBus:
         self,
         port: Any,
         ids: Sequence[int],
-        models: str | Sequence[Model],
+        models: Sequence[Model],
         *,
         baud_rate: int = BAUD_RATE,
         retries: int = RETRIES,
@@ -97,8 +96,6 @@ class MotorBus:
         """Open the port."""
         self.ids = tuple(ids)
         self.clock = clock
-        if isinstance(models, str):
-            models = [motor_model(models)] * len(self.ids)
         self._model = dict(zip(self.ids, models, strict=True))
         self._items = {id: table(model) for id, model in self._model.items()}
         self._sdk = sdk()

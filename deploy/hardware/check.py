@@ -5,11 +5,10 @@ With --wiggle it moves, after asking.
 
 import contextlib
 import itertools
-import json
 import math
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -86,8 +85,6 @@ class CheckCfg(HandOptions):
     the one that is named, and turns the way that is said."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print JSON."""
 
 
 def preflight(connection: Connection) -> Iterator[Finding]:
@@ -415,17 +412,13 @@ def check(cfg: CheckCfg) -> int:
 
     item = one_object(TWIN_OBJECT) if cfg.twin and not cfg.no_camera else None
     with connect(cfg, item=item) as connection:
-        findings = show(preflight(connection), quiet=cfg.json)
+        findings = show(preflight(connection))
         if not cfg.no_camera:
-            findings += show(camera_preflight(cfg, connection), quiet=cfg.json)
+            findings += show(camera_preflight(cfg, connection))
         if cfg.wiggle and all(row.ok for row in findings):
             confirm(WIGGLES, yes=cfg.yes)
-            findings += show(settings_findings(connection), quiet=cfg.json)
+            findings += show(settings_findings(connection))
             _stop_at_wrong(findings)
             with SafeHand(connection.bus, connection.joints, SafetyCfg()) as safe:
-                findings += show(wiggle(connection, safe), quiet=cfg.json)
-    right = all(row.ok for row in findings)
-    if cfg.json:
-        rows = [asdict(row) for row in findings]
-        print(json.dumps({"ok": right, "findings": rows}, indent=1))
-    return 0 if right else 1
+                findings += show(wiggle(connection, safe))
+    return 0 if all(row.ok for row in findings) else 1

@@ -272,7 +272,7 @@ def _trajectory(
     measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
     # A goal arrives with the question for its state, unless that was asked again.
     sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
-    channels = {name: of(name) for name in STATE_CHANNELS}
+    channels: dict[str, Any] = {name: of(name) for name in STATE_CHANNELS}
     if not channels["pwm"].any():  # a motor that does not tell its duty cycle says zero
         del channels["pwm"]
     return replace(

@@ -39,10 +39,6 @@ class ActionFilter:
         """Forget the actions so far, as at the start of an episode."""
         self._smoothed.zero_()
 
-    def put(self, smoothed: np.ndarray) -> None:
-        """Go on from another average [D]."""
-        self._smoothed.assign(np.asarray(smoothed, dtype=np.float32)[None])
-
     def goal(self, action: np.ndarray, joint_q: np.ndarray) -> np.ndarray:
         """Joint goals [rad] [D] for an action [D] taken at joint positions [rad] [D]."""
         self._action.assign(np.asarray(action, dtype=np.float32)[None])

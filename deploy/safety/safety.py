@@ -140,8 +140,6 @@ class SafeHand:
             f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)
         ]
         self.limits = Limits(joints, self._names, self.cfg)
-        self.repeated = 0
-        """Readings without a sound answer, for which the last state stood in."""
         self.report: StopReport | None = None
         """How the stop went, once there was one."""
         self._state: HandState | None = None
@@ -232,7 +230,6 @@ class SafeHand:
             last = self._state
             if last is None or self.bus.clock.now() - last.time_s > self.cfg.lost_s:
                 raise self.stop(unheard(error), lost=True) from error
-            self.repeated += 1
             self._check()
             return last
         self._state = state
@@ -478,7 +475,7 @@ class SafeHand:
                 self.bus.release()  # one packet for all; each is asked afterwards
             except BusError as error:
                 return dict.fromkeys(left, str(error))
-            left = self.bus.torque(False, left)
+            left = self.bus.torque(False, list(left))
             if not left:
                 with contextlib.suppress(BusError):
                     self.bus.watch(
