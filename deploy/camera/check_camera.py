@@ -169,11 +169,11 @@ def camera_findings(
     height, width = frames[-1].image.shape
     yield Finding("camera streams", True, f"{len(frames)} images of {width} x {height}")
     yield _rate(np.array([frame.time_s for frame in frames]), float(np.median(ages)), fps)
-    seen = camera.intrinsics.seen_from(place)
-    place_seen = ObjectPlace(seen, around)
-    yield _lens(seen, place_seen.spot)
+    lens = camera.intrinsics.seen_from(place)
+    place_seen = ObjectPlace(lens, around)
+    yield _lens(lens, place_seen.spot)
     images = [frame.image for frame in frames]
-    valid = np.mean([(image >= seen.near) & (image <= seen.far) for image in images])
+    valid = np.mean([(image >= lens.near) & (image <= lens.far) for image in images])
     share = float(np.mean([place_seen.seen(image) for image in images]))
     if share < DEPTH_SHARE:
         yield Finding("camera depth", False, _unseen(share, DEPTH_SHARE))

@@ -187,17 +187,17 @@ def _choose(device: Any, stream: Any, pixels: Any, cfg: RealSenseCfg) -> tuple[A
     Raises:
         CameraError: There is none; names those that there are.
     """
-    found = []
+    offered = []
     for sensor in device.query_sensors():
         for profile in sensor.get_stream_profiles():
             wanted = profile.stream_type() == stream and profile.format() == pixels
             if not wanted or profile.stream_index() > 1:
                 continue
             video = profile.as_video_stream_profile()
-            found.append((video.width(), video.height(), video.fps()))
-            if found[-1] == (cfg.width, cfg.height, cfg.fps):
+            offered.append((video.width(), video.height(), video.fps()))
+            if offered[-1] == (cfg.width, cfg.height, cfg.fps):
                 return sensor, profile
-    sizes = ", ".join(f"{w} x {h} at {fps} Hz" for w, h, fps in sorted(set(found), reverse=True))
+    sizes = ", ".join(f"{w} x {h} at {fps} Hz" for w, h, fps in sorted(set(offered), reverse=True))
     raise CameraError(
         f"the camera has no {stream.name} images of {cfg.width} x {cfg.height} at {cfg.fps} Hz; "
         f"it has {sizes or 'none at all'}. On USB 2 it has fewer: use a USB 3 cable and port"

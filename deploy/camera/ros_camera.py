@@ -95,5 +95,5 @@ class RosCamera:
 
     def close(self) -> None:
         """Listen no more."""
-        for one in self._held:
-            self._node.destroy_subscription(one)
+        for subscription in self._held:
+            self._node.destroy_subscription(subscription)

@@ -175,18 +175,18 @@ def read_joints(
     if calibration is not None:
         entries = _read_calibration(Path(calibration), hand)
     motors = []
-    for name, leader, said in zip(hand.joint_names, hand.mimic, hand.motors, strict=True):
+    for name, leader, described in zip(hand.joint_names, hand.mimic, hand.motors, strict=True):
         entry = entries.get(name)
         if leader >= 0:
             raise CalibrationError(
                 f"{hand.name}: {name} follows another joint; each needs a motor here"
             )
-        if said is None and (entry is None or model is None):
+        if described is None and (entry is None or model is None):
             raise CalibrationError(
                 f"{hand.path} does not say which motor turns {name}: describe motors when it is "
                 "imported (vd:motor), or give --motor and --calibration"
             )
-        motor = said or MotorModel(str(model), 0)
+        motor = described or MotorModel(str(model), 0)
         if entry is not None:
             motor = replace(motor, id=entry.id, sign=entry.sign, offset_rad=entry.offset_rad)
         motors.append(motor if model is None else replace(motor, model=model))

@@ -351,14 +351,14 @@ def _session(
             trajectory = play(safe, motion, columns, cfg.rate_hz)
             rate = (len(trajectory.time) - 1) / trajectory.time[-1]
             what = f"{number}/{len(motions)} {Path(motion.file).stem}"
-            said = f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz"
+            line = f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz"
             if rate < RATE_SHARE * cfg.rate_hz:
                 look = "" if cfg.twin else "look at the adapter's latency timer and the baud rate, "
-                said += (
+                line += (
                     f", not {cfg.rate_hz:g}: a sample takes {1e3 / rate:.1f} ms; {look}"
                     f"end other programs, or ask for --rate-hz {rate:.0f}"
                 )
-            print(said, file=sys.stderr, flush=True)
+            print(line, file=sys.stderr, flush=True)
             keep(trajectory)
 
 

@@ -42,11 +42,11 @@ class Register:
     least: bool = False
     """Whether a larger value will do, too."""
 
-    def right(self, found: int, wanted: int) -> bool:
+    def right(self, value: int, wanted: int) -> bool:
         """Whether a value will do."""
         if self.least:
-            return found >= wanted
-        return found & wanted == wanted if self.bits else found == wanted
+            return value >= wanted
+        return value & wanted == wanted if self.bits else value == wanted
 
 
 REGISTERS = (
@@ -133,12 +133,12 @@ class MotorSettings:
 
 
 def different(
-    found: Mapping[str, int], model: Model, settings: MotorSettings
+    values_found: Mapping[str, int], model: Model, settings: MotorSettings
 ) -> dict[Register, tuple[int, int]]:
     """Registers that are not as they should be: the value of each, and the wanted one.
 
     Args:
-        found: Control table of a motor.
+        values_found: Control table of a motor.
         model: Its model.
         settings: What its joint wants; the factory's values otherwise.
     """
@@ -150,8 +150,8 @@ def different(
         if name in OPTIONAL and name not in values:
             continue
         wanted = values.get(name, items[name].initial)
-        if not register.right(found[name], wanted):
-            differences[register] = (found[name], wanted)
+        if not register.right(values_found[name], wanted):
+            differences[register] = (values_found[name], wanted)
     return differences
 
 

@@ -142,12 +142,12 @@ def make_goals(
             rows = [line.split("#")[0].strip() for line in Path(text).read_text().splitlines()]
         except (OSError, UnicodeDecodeError) as error:
             raise GoalError(f"--goal {text} cannot be read ({error})") from error
-        found = [_goal(row, f"{text}, line {i + 1}: {row}") for i, row in enumerate(rows) if row]
-        if not found:
+        listed = [_goal(row, f"{text}, line {i + 1}: {row}") for i, row in enumerate(rows) if row]
+        if not listed:
             raise GoalError(
                 f"--goal {text} holds no orientation; write one on each line, such as 0,0,1@90"
             )
-        goals += found
+        goals += listed
     rng = np.random.default_rng(seed)
     last = np.array([0.0, 0.0, 0.0, 1.0])
     for _ in range(0 if goals else drawn):

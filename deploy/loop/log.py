@@ -167,8 +167,8 @@ class LogWriter:
         self._append(self._steps, ",".join(f"{value:.{DIGITS}f}" for value in row))
         if self._sinks:
             image = depth.copy() if depth is not None and self._count % DEPTH_STEPS == 0 else None
-            told = dict(zip(self._columns, map(float, row), strict=True))
-            self._tell(lambda sink: sink.step(told, image))
+            values_by_name = dict(zip(self._columns, map(float, row), strict=True))
+            self._tell(lambda sink: sink.step(values_by_name, image))
         self._count += 1
 
     def goal(self, number: int, goal: np.ndarray) -> None:

@@ -130,9 +130,9 @@ class ControlLoop:
         self._runner.begin()
         sensed, *_ = self._sense(goal)
         clock = self._pacer.clock
-        found = clock.beside(lambda: self._runner.decide(sensed))
+        decided = clock.beside(lambda: self._runner.decide(sensed))
         end = clock.now() + LOOK_S
-        while not found():
+        while not decided():
             if clock.now() > end:
                 raise self._safe.stop(f"the policy has not decided for {LOOK_S:g} s")
             self.step(number, goal, acting=False)
@@ -255,9 +255,9 @@ class ControlLoop:
             "smoothed": sensed.smoothed,
         }
         values = [number, acting, decision.distance, *vars(times).values(), self._pacer.missed]
-        found = NOWHERE if decision.found is None else decision.found.tolist()
+        found_pose = NOWHERE if decision.found is None else decision.found.tolist()
         sent_s = self._pacer.due_s + times.sent_s
-        self._log.step(state.time_s, sent_s, joints, values, truth, found, sensed.depth)
+        self._log.step(state.time_s, sent_s, joints, values, truth, found_pose, sensed.depth)
         self.times.append(times)
         if len(self.times) % STATUS_STEPS == 0:
             doing = f"distance {decision.distance:.2f} rad" if acting else "holding"
@@ -280,16 +280,17 @@ def summary(times: Sequence[StepTimes]) -> dict[str, dict[str, float]]:
     ``command_delay.delay_s`` has the motors' own delay besides). What no step has is left out.
     """
     values = {
-        name: np.array([getattr(one, name) for one in times]) for name in StepTimes.__annotations__
+        name: np.array([getattr(step, name) for step in times])
+        for name in StepTimes.__annotations__
     }
     values["observation_latency_s"] = values["sensed_s"] - values["image_s"]
     values["command_delay_s"] = values["sent_s"] - values["sensed_s"]
-    found = {}
+    table = {}
     for name, seconds in values.items():
         ms = 1e3 * seconds[np.isfinite(seconds)]
         if len(ms):
             figures = {"median": np.median(ms), "p99": np.percentile(ms, 99), "max": ms.max()}
-            found[name.replace("_s", "_ms")] = {
+            table[name.replace("_s", "_ms")] = {
                 key: round(float(value), 3) for key, value in figures.items()
             }
-    return found
+    return table

@@ -160,8 +160,8 @@ class TwinTeacher(PolicyRunner):
             env.give_goals(np.zeros(1, int), sensed.goal_quat[None])
             self._begins = False
         env.observe()
-        seen = of_warp(env.observation, library_of(self._policy.network.offset))
-        action = as_warp(self._policy.act(seen))
+        observation = of_warp(env.observation, library_of(self._policy.network.offset))
+        action = as_warp(self._policy.act(observation))
         if env.symmetry_frames is not None:
             action = env.symmetry_frames.world_action(action)
         error = symmetric_error(truth[None, 3:7], sensed.goal_quat[None], env.objects[0].symmetry)
@@ -219,12 +219,14 @@ class TrackingRunner(PolicyRunner):
         senses = senses_of(sensed, of_warp(points, self._library), fresh=self._fresh)
         decided = self._tracker.step(senses)
         self._fresh = False
-        found = self._tracker.observer.found
-        assert found is not None
-        pose = np.concatenate([np.asarray(found.position[0]), np.asarray(found.orientation[0])])
+        estimate = self._tracker.observer.found
+        assert estimate is not None
+        pose = np.concatenate(
+            [np.asarray(estimate.position[0]), np.asarray(estimate.orientation[0])]
+        )
         action = np.array(decided.action[0])
         angle = float(decided.angle[0])
-        return PolicyDecision(action, angle, pose, int(found.voxels[0]))
+        return PolicyDecision(action, angle, pose, int(estimate.voxels[0]))
 
 
 def load_runner(

@@ -178,9 +178,9 @@ def run(cfg: DriveCfg) -> int:
     goals = _goals(cfg, item)
     _say_chosen(cfg, len(goals))
     tolerance = cfg.tolerance_rad
-    told = cfg.object if cfg.twin else None
+    true_object = cfg.object if cfg.twin else None
     runner = load_runner(
-        name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told
+        name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=true_object
     )
     if "torch" in sys.modules:  # of several threads, some would wait for one that has no core
         sys.modules["torch"].set_num_threads(1)
@@ -258,7 +258,7 @@ def _pursue(
     pose = hand.start
     with contextlib.ExitStack() as stack:
         camera: ImageSource | None = None
-        seen: Iterable[Finding] = ()
+        looks: Iterable[Finding] = ()
         if runner.camera is not None:
             camera = open_camera(cfg.camera, connection, runner.camera, realistic=cfg.realistic)
             stack.callback(camera.close)
@@ -266,17 +266,19 @@ def _pursue(
                 runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
             )
             runner.look_by(camera.intrinsics.seen_from(where))
-            seen = camera_findings(
+            looks = camera_findings(
                 camera, runner.camera, hand.goal_in_base, fps=cfg.camera.fps if twin is None else hz
             )
         warm_up(runner, pose, [*goals, NO_SYMMETRY[0]][0], camera)
         stack.enter_context(undisturbed(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals{', and those it is given' * cfg.ros2}."
-        ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=seen)
-        said = _description(cfg, name, runner, item, goals)
+        ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=looks)
+        description = _description(cfg, name, runner, item, goals)
         servo = connection.joints.servo()
         without = () if connection.ros is None else UNKNOWN
-        log = LogWriter(folder, hand, said, servo=servo, truth=twin is not None, without=without)
+        log = LogWriter(
+            folder, hand, description, servo=servo, truth=twin is not None, without=without
+        )
         if cfg.log is not None and cfg.log.suffix == MCAP:
             from vd.logs.mcap_log import McapLog
 

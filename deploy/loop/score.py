@@ -178,7 +178,7 @@ def score_run(
         trials.append(Trial(stop.goal, stop.time_s, stop.outcome, tracked, error, stop.distance))
     kept = [trial.error_rad for trial in trials if not trial.discarded]
     errors = np.array([np.inf if error is None else error for error in kept])
-    found = errors[np.isfinite(errors)]
+    stop_errors = errors[np.isfinite(errors)]
     within = errors <= np.array(TOLERANCES_RAD)[:, None]
     rates = rate_intervals(within[:, None, :], "episode") if kept else []
     return Score(
@@ -186,7 +186,7 @@ def score_run(
         mocap.path,
         offset_s,
         tuple(trials),
-        median_interval(found[None], "episode") if len(found) else None,
+        median_interval(stop_errors[None], "episode") if len(stop_errors) else None,
         tuple(zip(TOLERANCES_RAD, rates, strict=False)),
     )
 
