@@ -23,8 +23,8 @@ from vd.evaluate.statistics import symmetric_error
 from vd.logs.recording import write_recording
 from vd.policy.defaults import default_policy
 from vd.train import adapt, tracker
+from vd.train.alignment.cli import parse_alignment
 from vd.train.flags import parse_teacher
-from vd.train.student.cli import parse_student
 
 
 class ReachedError(Exception):
@@ -33,9 +33,9 @@ class ReachedError(Exception):
 
 LONG = {
     "vd-train teacher": "vd.train.teacher.train",
-    "vd-train student": "vd.train.student.cli._train",
-    "vd-train student --stage 0": "vd.train.student.cli._train",
-    "vd-train student --stage 1": "vd.train.student.cli._train",
+    "vd-train student": "vd.train.alignment.cli._train",
+    "vd-train student --stage 0": "vd.train.alignment.cli._train",
+    "vd-train student --stage 1": "vd.train.alignment.cli._train",
     "vd-train adapt": "vd.train.adapt._adapt",
     "vd-train tracker": "vd.train.tracker._track",
     "vd-deploy --twin": "vd.deploy.loop.policy_runner.load_runner",
@@ -112,9 +112,9 @@ def test_what_is_said_asks_for_the_same(typed, monkeypatch):
     said: list[str] = []
     alone = parse_teacher([], say=lambda *words, why: said.extend(map(str, words)))
     assert parse_teacher(said[2:]) == alone and alone.run.device == "cpu"
-    alone = parse_student(["--stage", "1"])
+    alone = parse_alignment(["--stage", "1"])
     flags = ["--preset", "cpu-demo", "--teacher", "dclaw4-cube", "--init", "dclaw4-vision"]
-    assert parse_student(["--stage", "1", *flags]) == alone
+    assert parse_alignment(["--stage", "1", *flags]) == alone
 
 
 def test_where_there_is_nothing_to_take_the_remedy_is_named(typed, tmp_path, monkeypatch):
@@ -145,7 +145,7 @@ def test_every_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
 
     for place in ("train.teacher.train", "train.adapt._adapt", "train.tracker._track"):
         monkeypatch.setattr(f"vd.{place}", note)
-    monkeypatch.setattr("vd.train.student.cli._train", note)
+    monkeypatch.setattr("vd.train.alignment.cli._train", note)
     assert typed(f"vd-train {command} --smoke")[0] == 0
     assert not list(tmp_path.iterdir())
     (cfg,) = given
@@ -219,9 +219,9 @@ def test_a_folder_that_a_lock_made_goes_if_nothing_is_put_there(tmp_path):
 def test_a_run_that_goes_on_refuses_to_have_begun_otherwise(flags, message, tmp_path):
     from dataclasses import replace
 
+    from vd.train.alignment.config import PRESETS as STUDENTS
     from vd.train.flags import write_config
     from vd.train.presets import PRESETS
-    from vd.train.student.config import PRESETS as STUDENTS
 
     cfg = PRESETS["cpu-demo"]()
     write_config(replace(cfg, run=replace(cfg.run, out=tmp_path)))
@@ -233,7 +233,7 @@ def test_a_run_that_goes_on_refuses_to_have_begun_otherwise(flags, message, tmp_
     cfg = STUDENTS["cpu-demo"](0)
     write_config(replace(cfg, run=replace(cfg.run, out=tmp_path)))
     with pytest.raises(ValueError, match=r"--stage 1: the run in .* began with 0"):
-        parse_student(["--out", str(tmp_path), "--resume", "--stage", "1"])
+        parse_alignment(["--out", str(tmp_path), "--resume", "--stage", "1"])
 
 
 def test_ctrl_c_promises_to_go_on_only_where_that_is_possible(typed, tmp_path, monkeypatch):

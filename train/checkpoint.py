@@ -22,9 +22,10 @@ AUTO = "auto"
 """``--resume auto`` goes on with a run where there is one, and starts it otherwise."""
 _NEEDED = {
     "actor": ("policy", "task", "iter", "env_steps"),
-    "student": ("spec", "task", "iter", "env_steps"),
+    "alignment": ("spec", "task", "iter", "env_steps"),
+    "student": ("contract", "task", "iter", "env_steps"),
 }
-"""What belongs to the weights of a teacher or a student. Other projects' files have an actor
+"""What belongs to the weights of each network. Other projects' files have an actor
 too.
 """
 _ARRAY = "__numpy__"
@@ -121,9 +122,10 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 def load_checkpoint(
     path: Path, device: str = "cpu", *, network: str = "actor", flag: str = "--resume"
 ) -> dict[str, Any]:
-    """Read a checkpoint, with weights of an ``actor`` (teacher) or ``student``, executing nothing in it.
+    """Read a checkpoint with weights of a network, executing nothing in it.
 
-    ``flag`` is what asked for it, for messages.
+    ``network`` is ``actor`` (of a teacher), ``alignment`` or ``student``; ``flag`` is what asked
+    for it, for messages.
 
     Raises:
         ValueError: The file is damaged or not a checkpoint.

@@ -18,9 +18,9 @@ from vd.train.begin import settings_of
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
 
 if TYPE_CHECKING:
-    from vd.train.student.config import StudentTrainCfg
+    from vd.train.alignment.config import AlignmentTrainCfg
 
-Cfg = TypeVar("Cfg", TeacherCfg, "StudentTrainCfg")
+Cfg = TypeVar("Cfg", TeacherCfg, "AlignmentTrainCfg")
 CONFIG_NAME = "config.json"
 """The resolved configuration, in the run's folder, written before the first iteration."""
 
@@ -247,7 +247,7 @@ def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:
     return cfg
 
 
-def write_config(cfg: "TeacherCfg | StudentTrainCfg") -> None:
+def write_config(cfg: "TeacherCfg | AlignmentTrainCfg") -> None:
     """Save the resolved configuration in the run's folder, as ``--resume`` takes it, on any machine."""
     run = replace(cfg.run, device="auto")
     write_json(cfg.run.out / CONFIG_NAME, to_dict(replace(cfg, resume=None, run=run)))

@@ -21,10 +21,10 @@ from vd.train.flags import parse_teacher, write_config
 from vd.train.presets import SMOKE_RUN, TeacherCfg
 
 if TYPE_CHECKING:
+    from vd.train.alignment.config import AlignmentTrainCfg
     from vd.train.runner import TeacherRunner
-    from vd.train.student.config import StudentTrainCfg
 
-Cfg = TypeVar("Cfg", TeacherCfg, "StudentTrainCfg")
+Cfg = TypeVar("Cfg", TeacherCfg, "AlignmentTrainCfg")
 
 CPU_ENVS = 1024
 """Most environments of which a CPU simulates an iteration within a minute."""

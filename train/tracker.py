@@ -46,7 +46,7 @@ class TrackerCfg(EpisodeFlags):
     """Object sets to choose the stopping rules on, not those of the training; by default
     procedural-heldout, and a few of its kinds on a CPU."""
     alignment: str | None = None
-    """Network that finds objects by their goals' points: the alignment.pt of vd-train student, or a
+    """Network that finds objects by their goals' points: the alignment.pt of vd-train alignment, or a
     vision policy, for that of it: its name or file."""
     out: Path = Path("tracking.safetensors")
     """File to write."""
@@ -103,7 +103,7 @@ def _track(cfg: TrackerCfg) -> int:
     from vd.policy.contract import TrackingSpec
     from vd.policy.stopping import calibrate
     from vd.tracking.policy import TrackingPolicy
-    from vd.train.student.network import open_network
+    from vd.train.alignment.network import open_network
 
     quiet_warp()
     device = resolve_device(cfg.device)

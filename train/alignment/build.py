@@ -10,19 +10,19 @@ from vd.command.files import check_folder
 from vd.command.warp_quiet import quiet_warp
 from vd.envs.cfg import ObservationCfg, ReorientCfg
 from vd.paper import PAPER
+from vd.train.alignment.config import SIMULATED, AlignmentTrainCfg
 from vd.train.flags import write_config
-from vd.train.student.config import SIMULATED, StudentTrainCfg
 from vd.train.teacher import BUILDING
 
 if TYPE_CHECKING:
     from vd.policy.actor import TrainedPolicy
-    from vd.train.student.align import AlignTrainer
-    from vd.train.student.looks import SimulatedLooks
+    from vd.train.alignment.align import AlignTrainer
+    from vd.train.alignment.looks import SimulatedLooks
     from vd.vision.alignment import AlignmentNetwork
 
 
-def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
-    """The environments of the student: those of the teacher's training."""
+def alignment_task(policy: "TrainedPolicy", cfg: AlignmentTrainCfg) -> ReorientCfg:
+    """The environments of alignment: those of the teacher's training."""
     from vd.evaluate.agents import task_for
 
     trained, chosen = ReorientCfg.of(policy), cfg.task
@@ -39,7 +39,9 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
     return replace(task, observation=ObservationCfg())  # who sees by a camera does not look at it
 
 
-def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print) -> "AlignTrainer":
+def build_alignment(
+    cfg: AlignmentTrainCfg, *, say: Callable[[str], object] = print
+) -> "AlignTrainer":
     """Build network, shapes and environments as ``cfg`` says, save the configuration, and resume if asked.
 
     Args:
@@ -57,7 +59,7 @@ def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print)
     cfg.validate()
     check_folder(cfg.run.out)
     device = resolve_device(cfg.run.device)
-    checkpoint = find_checkpoint(cfg.run.out, cfg.resume, "student")
+    checkpoint = find_checkpoint(cfg.run.out, cfg.resume, "alignment")
     if cfg.teacher is None:
         raise ValueError(
             "--teacher is missing; give the policy that acts: a policy.safetensors, a run's folder, "
@@ -75,14 +77,14 @@ def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print)
     quiet_warp()
     from vd.command.workers import one_thread_without_gpu
     from vd.evaluate.agents import open_teacher
-    from vd.train.student.network import open_network
+    from vd.train.alignment.network import open_network
     from vd.vision.alignment import AlignmentNetwork
 
     rank = int(os.environ.get("RANK", "0"))
     teacher = open_teacher(cfg.teacher, device)
     if teacher is None:
         raise ValueError(f"--teacher {cfg.teacher} has no layers; give a trained teacher")
-    task = student_task(teacher, cfg)
+    task = alignment_task(teacher, cfg)
     one_thread_without_gpu(device)
     # The network is the same in all processes, what they draw is not.
     torch.manual_seed(cfg.task.seed)
@@ -104,7 +106,7 @@ def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print)
 
 
 def _trainer(
-    cfg: StudentTrainCfg,
+    cfg: AlignmentTrainCfg,
     task: ReorientCfg,
     teacher: "TrainedPolicy",
     network: "AlignmentNetwork",
@@ -112,7 +114,7 @@ def _trainer(
 ) -> "AlignTrainer":
     from vd.assets_usd.hands import load_hand
     from vd.assets_usd.objects.sets import load_set
-    from vd.train.student.align import AlignTrainer, make_scenes
+    from vd.train.alignment.align import AlignTrainer, make_scenes
     from vd.train.student.views import Hands
     from vd.vision.saved import AlignmentSpec
 
@@ -129,7 +131,7 @@ def _trainer(
 
 
 def _looks(
-    cfg: StudentTrainCfg,
+    cfg: AlignmentTrainCfg,
     task: ReorientCfg,
     teacher: "TrainedPolicy",
     network: "AlignmentNetwork",
@@ -141,8 +143,9 @@ def _looks(
     from vd.envs.reorient import ReorientEnv
     from vd.policy.contract import TrackingSpec
     from vd.tracking.policy import TrackingPolicy
-    from vd.train.student.align import CLOUDS, mesh_points
-    from vd.train.student.looks import SimulatedLooks
+    from vd.train.alignment.align import CLOUDS
+    from vd.train.alignment.looks import SimulatedLooks
+    from vd.train.student.bank import mesh_points
     from vd.train.vec_env import ReorientVecEnv
 
     simulation = ReorientEnv(task, device)

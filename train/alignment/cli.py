@@ -1,4 +1,4 @@
-"""Command line of the student: ``vd-train student``."""
+"""Command line of alignment: ``vd-train alignment``."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,12 +7,12 @@ from pathlib import Path
 from vd.command import interrupt
 from vd.command.line import PRINT, ConfigFile, parse, say_same_as
 from vd.evaluate.agents import DEFAULT_POLICY, check_names, find_policy, installed_policies
+from vd.train.alignment.build import build_alignment
+from vd.train.alignment.config import ALIGNMENT_NAME, PRESETS, SIMULATED, AlignmentTrainCfg, smoke
 from vd.train.flags import machine_preset, normalise, saved_config, starting, value_of
-from vd.train.student.build import build_student
-from vd.train.student.config import ALIGNMENT_NAME, PRESETS, SIMULATED, StudentTrainCfg, smoke
 from vd.train.teacher import is_main, run_folder, say_of_main
 
-HELP = """Train the student: the network by which a teacher acts on what a camera sees, without a mesh.
+HELP = """Train alignment: the network by which a teacher acts on what a camera sees, without a mesh.
 
 Stage 0 learns to turn a goal's cloud onto what a camera sees, from clouds that are made; stage 1 also from
 what it sees in simulation. Flags start from --preset and --stage, or with --resume from the run's
@@ -26,7 +26,7 @@ SHORT_FORMS = {name: f"task.{name}" for name in ("objects", "num-envs", "seed")}
 """Flags that are short for others."""
 
 
-def parse_student(flags: Sequence[str]) -> StudentTrainCfg:
+def parse_alignment(flags: Sequence[str]) -> AlignmentTrainCfg:
     """The configuration that command-line flags ask for.
 
     The first pass finds where to start from (``--preset`` and ``--stage``, the run's own
@@ -52,15 +52,15 @@ def parse_student(flags: Sequence[str]) -> StudentTrainCfg:
     base = replace(base, teacher=asked.teacher or _teacher(base))
     init = value_of(arguments, "--init")
     if init is None and base.stage == SIMULATED:
-        from vd.train.student.network import default_network
+        from vd.train.alignment.network import default_network
 
         init = default_network(_hand(str(base.teacher)), base.preset)
     return _parsed(arguments, base if init is None else _begun_from(base, init), file)
 
 
-def student_command(arguments: list[str]) -> int:
-    """``vd-train student``; the exit status."""
-    cfg = parse_student(arguments)
+def alignment_command(arguments: list[str]) -> int:
+    """``vd-train alignment``; the exit status."""
+    cfg = parse_alignment(arguments)
     if is_main():
         words: list[object] = [
             "--stage",
@@ -71,22 +71,22 @@ def student_command(arguments: list[str]) -> int:
             cfg.teacher,
         ]
         words += [] if cfg.init is None else ["--init", cfg.init]
-        say_same_as("vd-train", "student", *words, "--out", cfg.run.out)
+        say_same_as("vd-train", "alignment", *words, "--out", cfg.run.out)
     with run_folder(cfg) as own:
         return _train(own)
 
 
-def _train(cfg: StudentTrainCfg) -> int:
+def _train(cfg: AlignmentTrainCfg) -> int:
     """Train as ``cfg`` says; the exit status."""
     folder, say = cfg.run.out, say_of_main()
-    runner = build_student(cfg, say=say)
+    runner = build_alignment(cfg, say=say)
     if runner.iteration:
         say(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
     elif cfg.init is not None:
         say(f"begins with the weights of {cfg.init}")
     if not runner.run_to_end():
         if not cfg.smoke:
-            say(f"saved in {folder}; go on with: vd-train student --out {folder} --resume")
+            say(f"saved in {folder}; go on with: vd-train alignment --out {folder} --resume")
         return interrupt.INTERRUPTED
     say(
         "done: everything runs, and the network is of no use"
@@ -98,19 +98,19 @@ def _train(cfg: StudentTrainCfg) -> int:
 
 
 def _parsed(
-    arguments: list[str], base: StudentTrainCfg, file: ConfigFile | None
-) -> StudentTrainCfg:
+    arguments: list[str], base: AlignmentTrainCfg, file: ConfigFile | None
+) -> AlignmentTrainCfg:
     """Every flag, with the values of ``file`` and ``base`` for the others."""
     base = base if file is None else file.over(base)
-    cfg: StudentTrainCfg = parse(
-        StudentTrainCfg, arguments, default=base, prog="vd-train student", description=HELP
+    cfg: AlignmentTrainCfg = parse(
+        AlignmentTrainCfg, arguments, default=base, prog="vd-train alignment", description=HELP
     )
     teacher = [] if cfg.teacher is None else [cfg.teacher]
     check_names(teacher, (*cfg.task.objects, *cfg.align.validation))
     return cfg
 
 
-def _teacher(base: StudentTrainCfg) -> str:
+def _teacher(base: AlignmentTrainCfg) -> str:
     """The policy that acts where none is named: the preset's, if it is installed."""
     installed = base.teacher is not None and base.teacher in installed_policies()
     return str(base.teacher) if installed else DEFAULT_POLICY
@@ -123,9 +123,9 @@ def _hand(teacher: str) -> str:
     return read_policy(find_policy(teacher)).hand
 
 
-def _begun_from(base: StudentTrainCfg, init: str) -> StudentTrainCfg:
+def _begun_from(base: AlignmentTrainCfg, init: str) -> AlignmentTrainCfg:
     """``base`` with the network to begin from: its sizes, and its camera."""
-    from vd.train.student.network import open_network
+    from vd.train.alignment.network import open_network
 
     sizes, camera = open_network(init)[1:]
     assert camera is None or len(camera) == 7

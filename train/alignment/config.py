@@ -1,4 +1,4 @@
-"""Settings of the student's training and their presets. Pure data, cheap to import."""
+"""Settings of the training of alignment and their presets. Pure data, cheap to import."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ MADE, SIMULATED = 0, 1
 """Stages: of clouds without simulation; of what a camera sees while the policy acts, besides."""
 ALIGNMENT_NAME = "alignment.pt"
 """The network of a run, in its folder."""
-RUNS = Path("runs/student")
+RUNS = Path("runs/alignment")
 """Parent of the default folders stage0 and stage1."""
 
 
@@ -109,7 +109,7 @@ class LooksCfg:
 
 
 @dataclass
-class StudentTaskCfg:
+class AlignmentTaskCfg:
     """The environments; all else of them is as in the teacher's training, without its noise."""
 
     objects: tuple[str, ...] = ()
@@ -121,8 +121,8 @@ class StudentTaskCfg:
 
 
 @dataclass
-class StudentTrainCfg:
-    """Train the student."""
+class AlignmentTrainCfg:
+    """Train the network of alignment."""
 
     preset: PresetName = "gpu"
     """Settings to start from; every other flag overrides one of them. By default gpu, and cpu-demo
@@ -135,7 +135,7 @@ class StudentTrainCfg:
     of an installed one; dclaw4 by default."""
     init: Path | None = None
     """Network to begin from, the alignment.pt of a run or an installed vision policy. Of stage 1 by
-    default that of runs/student/stage0, or the one that is installed for the hand."""
+    default that of runs/alignment/stage0, or the one that is installed for the hand."""
     smoke: bool = False
     """Check the installation: the stage, tiny, on the CPU, for at most a minute. It learns nothing,
     and keeps nothing unless --out is given."""
@@ -148,7 +148,7 @@ class StudentTrainCfg:
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     align: AlignCfg = field(default_factory=AlignCfg)
     looks: LooksCfg = field(default_factory=LooksCfg)
-    task: StudentTaskCfg = field(default_factory=StudentTaskCfg)
+    task: AlignmentTaskCfg = field(default_factory=AlignmentTaskCfg)
 
     def validate(self) -> None:
         """Refuse settings that cannot train.
@@ -166,18 +166,18 @@ class StudentTrainCfg:
             )
 
 
-def gpu(stage: Stage) -> StudentTrainCfg:
+def gpu(stage: Stage) -> AlignmentTrainCfg:
     """One GPU or several, half precision."""
     run = RunCfg(out=RUNS / f"stage{stage}", save_every=20, max_steps=1_000_000_000)
-    cfg = StudentTrainCfg(preset="gpu", stage=stage, run=run, align=AlignCfg(precision="bf16"))
+    cfg = AlignmentTrainCfg(preset="gpu", stage=stage, run=run, align=AlignCfg(precision="bf16"))
     if stage == SIMULATED:  # it begins from a network that sees already
         return replace(cfg, align=replace(cfg.align, learning_rate=2e-4))
     return cfg
 
 
-def cpu_demo(stage: Stage) -> StudentTrainCfg:
+def cpu_demo(stage: Stage) -> AlignmentTrainCfg:
     """Two CPU cores and minutes: a cube, small batches, few shapes."""
-    return StudentTrainCfg(
+    return AlignmentTrainCfg(
         preset="cpu-demo",
         stage=stage,
         teacher="dclaw4-cube",
@@ -199,11 +199,11 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
             views=4,
         ),
         looks=LooksCfg(kept=2000),
-        task=StudentTaskCfg(num_envs=16),
+        task=AlignmentTaskCfg(num_envs=16),
     )
 
 
-def smoke(stage: Stage) -> StudentTrainCfg:
+def smoke(stage: Stage) -> AlignmentTrainCfg:
     """All parts of a stage in at most a minute; it learns nothing."""
     cfg = cpu_demo(stage)
     run = replace(cfg.run, out=SMOKE_RUN, max_steps=32, max_minutes=1.0, logger="none")
@@ -223,4 +223,4 @@ def smoke(stage: Stage) -> StudentTrainCfg:
     return replace(cfg, smoke=True, run=run, align=align, looks=looks, task=task)
 
 
-PRESETS: dict[str, Callable[[Stage], StudentTrainCfg]] = {"gpu": gpu, "cpu-demo": cpu_demo}
+PRESETS: dict[str, Callable[[Stage], AlignmentTrainCfg]] = {"gpu": gpu, "cpu-demo": cpu_demo}

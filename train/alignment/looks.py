@@ -14,7 +14,7 @@ import warp as wp
 from vd.evaluate.tracking import TrackingActor
 from vd.geometry.quaternions import product, rotated, rotation_distance
 from vd.tracking.policy import TrackingPolicy
-from vd.train.student.config import LooksCfg
+from vd.train.alignment.config import LooksCfg
 from vd.train.student.views import Pairs, with_goals
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 from vd.vision.cfg import SEEN_POINTS
