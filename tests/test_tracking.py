@@ -13,7 +13,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.command.config import to_dict
 from vd.deploy.loop.action import ActionFilter
-from vd.deploy.loop.policy_runner import TrackingRunner
+from vd.deploy.loop.policy_runner import CameraRunner
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
@@ -21,7 +21,7 @@ from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy, sees_
 from vd.evaluate.goals import ONE_GOAL
 from vd.evaluate.result import Result
 from vd.evaluate.trace import Trace
-from vd.evaluate.tracking import TrackingActor, sensed
+from vd.evaluate.tracking import CameraActor, sensed
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 from vd.policy.actor import TrainedPolicy, perceptron
@@ -245,7 +245,7 @@ def test_a_vision_policy_comes_back(tmp_path):
 def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
     policy = read_policy(find_policy("dclaw3-tracking"))
     plain, real = (
-        TrackingActor(env, policy, sensor_errors=errs).camera.cfg for errs in (False, True)
+        CameraActor(env, policy, sensor_errors=errs).camera.cfg for errs in (False, True)
     )
     assert (
         not plain.sensor.enabled and plain.latency_s == (0.0, 0.0) and plain.position_noise_m == 0.0
@@ -273,7 +273,7 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
         success_ends_episode=False,
     )
     env = ReorientEnv(task, "cpu")
-    actor, runner = TrackingActor(env, policy), TrackingRunner(policy, env.hand, env.objects[0])
+    actor, runner = CameraActor(env, policy), CameraRunner(policy, env.hand, env.objects[0])
     runner.begin()
     assert runner.kind == kind
     actions = ActionFilter(env.hand, task)

@@ -14,6 +14,8 @@ from vd.policy.actor import read_state
 
 CHECKPOINT_FOLDER = "checkpoints"
 BEST_NAME = "best.pt"
+POLICY_NAME = f"policy{SUFFIX}"
+"""The policy of a run, in its folder: what vd-eval, vd-play and deployment read."""
 KEEP_LAST = 3
 """Periodic checkpoints to keep besides the best: one to go on from, and others should it be
 damaged.

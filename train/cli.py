@@ -59,7 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"vd-train: no command '{name}'; one of {known}\n\n{USAGE}", file=sys.stderr)
         return interrupt.USAGE_ERROR
     module, function = COMMANDS[name]
-    if name in ("teacher", "adapt", "student", "alignment") and not {"-h", "--help"} & set(arguments):
+    if name in ("teacher", "adapt", "student", "alignment") and not {"-h", "--help"} & set(
+        arguments
+    ):
         interrupt.need("rsl_rl", "tensordict")
     try:
         return int(getattr(importlib.import_module(module), function)(arguments))

@@ -28,7 +28,7 @@ from vd.train.student.shapes import made_shapes
 from vd.train.student.views import Hands, Pairs, draw_pairs, joined
 from vd.train.supervised import SupervisedLoop
 from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
-from vd.vision.rotations import turn_angle
+from vd.vision.rotations import chord, turn_angle
 from vd.vision.saved import AlignmentSpec, alignment_export
 
 MESH_POINTS = 6000
@@ -80,16 +80,11 @@ def make_scenes(
 
 
 def alignment_losses(found: Residual, pairs: Pairs) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-    """Losses by name, means over the batch, and the angles by which rotations are wrong [rad] [B].
-
-    The chord between rotations is robust: of goals that look alike it chooses one, and gives no
-    mean of them.
-    """
+    """Losses by name, means over the batch, and the angles by which rotations are wrong [rad] [B]."""
     wrong = found.rotation.detach().transpose(-1, -2) @ pairs.rotation
     error = turn_angle(wrong)
-    chord = ((found.rotation - pairs.rotation).square().sum((-1, -2)) + 1e-6).sqrt()
     losses = {
-        "rotation": chord.mean(),
+        "rotation": chord(found.rotation, pairs.rotation).mean(),
         "offset": OFFSET_WEIGHT * (found.offset - pairs.offset).norm(dim=-1).mean(),
     }
     return losses, error

@@ -6,10 +6,17 @@ from pathlib import Path
 
 from vd.command import interrupt
 from vd.command.line import PRINT, ConfigFile, parse, say_same_as
-from vd.evaluate.agents import DEFAULT_POLICY, check_names, find_policy, installed_policies
+from vd.evaluate.agents import check_names, find_policy
 from vd.train.alignment.build import build_alignment
 from vd.train.alignment.config import ALIGNMENT_NAME, PRESETS, SIMULATED, AlignmentTrainCfg, smoke
-from vd.train.flags import machine_preset, normalise, saved_config, starting, value_of
+from vd.train.flags import (
+    installed_teacher,
+    machine_preset,
+    normalise,
+    saved_config,
+    starting,
+    value_of,
+)
 from vd.train.teacher import is_main, run_folder, say_of_main
 
 HELP = """Train alignment: the network by which a teacher acts on what a camera sees, without a mesh.
@@ -38,8 +45,6 @@ def parse_alignment(flags: Sequence[str]) -> AlignmentTrainCfg:
         ValueError: What they name is not of this version, or nothing is installed to begin from.
     """
     arguments, file = starting(normalise(flags, SHORT_FORMS))
-    if value_of(arguments, "--stage") == "2":
-        raise ValueError("--stage 2: this student has 0 (made clouds) and 1 (what a camera sees)")
     # Wrong flags and names, and --help, do not wait for torch.
     asked = _parsed([word for word in arguments if word != PRINT], PRESETS["gpu"](0), file)
     preset = value_of(arguments, "--preset")
@@ -49,7 +54,7 @@ def parse_alignment(flags: Sequence[str]) -> AlignmentTrainCfg:
         base = PRESETS[preset or machine_preset(value_of(arguments, "--device"))](asked.stage)
     if "--resume" in arguments and (saved := saved_config(arguments, base)) is not None:
         return _parsed(arguments, saved, file)
-    base = replace(base, teacher=asked.teacher or _teacher(base))
+    base = replace(base, teacher=asked.teacher or installed_teacher(base.teacher))
     init = value_of(arguments, "--init")
     if init is None and base.stage == SIMULATED:
         from vd.train.alignment.network import default_network
@@ -108,12 +113,6 @@ def _parsed(
     teacher = [] if cfg.teacher is None else [cfg.teacher]
     check_names(teacher, (*cfg.task.objects, *cfg.align.validation))
     return cfg
-
-
-def _teacher(base: AlignmentTrainCfg) -> str:
-    """The policy that acts where none is named: the preset's, if it is installed."""
-    installed = base.teacher is not None and base.teacher in installed_policies()
-    return str(base.teacher) if installed else DEFAULT_POLICY
 
 
 def _hand(teacher: str) -> str:

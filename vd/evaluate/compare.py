@@ -180,9 +180,9 @@ def actor_of(
 
     one_thread_without_gpu(env.device)
     settings: dict[str, Any] = {"goals": goals, "sensor_errors": sensor_errors, "seed": seed}
-    from vd.evaluate.tracking import TrackingActor
+    from vd.evaluate.tracking import CameraActor
 
-    eyes = TrackingActor(env, policy, **settings)
+    eyes = CameraActor(env, policy, **settings)
     return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for)
 
 

@@ -17,7 +17,7 @@ def camera_view(actor: Any, world: int) -> np.ndarray:
     """The depth image about the hand, near is bright, with surface points and axes of the believed pose.
 
     Args:
-        actor: A :class:`vd.evaluate.tracking.TrackingActor` that has acted.
+        actor: A :class:`vd.evaluate.tracking.CameraActor` that has acted.
         world: Environment.
 
     Returns:
@@ -28,7 +28,7 @@ def camera_view(actor: Any, world: int) -> np.ndarray:
     model = camera.camera
     shade = np.where(depth > 0.0, 235.0 - 180.0 * _share(depth), 20.0)
     picture = Image.fromarray(np.repeat(shade.astype(np.uint8)[..., None], 3, axis=2))
-    pose = actor.tracker.observer.finder.pose[world, 0].cpu().numpy().astype(float)
+    pose = actor.tracker.pose[world].cpu().numpy().astype(float)
     turn, draw = Rotation.from_quat(pose[3:]), ImageDraw.Draw(picture)
     for u, v, ahead in model.project(pose[:3] + turn.apply(actor.surface(world))):
         if ahead > 0.0:

@@ -1,0 +1,216 @@
+"""Settings of the student's training and their presets. Pure data, cheap to import."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from vd.evaluate.conditions import OBSERVATION_LATENCY_S
+from vd.paper import PAPER
+from vd.sensors.cfg import LATENCY_S
+from vd.train.config import RunCfg, require
+from vd.train.presets import SMOKE_RUN
+from vd.vision.cfg import StudentCfg
+
+Stage = Literal[0, 1, 2]
+PresetName = Literal["gpu", "cpu-demo"]
+
+MADE, COMPLETE, RENDERED = 0, 1, 2
+"""Stages: of shapes without simulation; in simulation by complete clouds; by rendered depth."""
+RUNS = Path("runs/student")
+"""Parent of the default folders stage0, stage1 and stage2."""
+
+
+@dataclass
+class LearnCfg:
+    """What all stages learn, and how. Nothing here is tuned yet."""
+
+    window: int = 16
+    """Steps of a sequence, through which gradients flow."""
+    batch: int = 128
+    """Sequences of an optimiser step on one GPU."""
+    learning_rate: float = 3e-4
+    """Of AdamW, after the warm-up; it falls to nearly 0 along a cosine until --max-steps or
+    --max-minutes.
+    """
+    warmup_steps: int = 300
+    """Optimiser steps over which the learning rate rises from 0, linearly."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """Of the convolutions' products."""
+    action_weight: float = 1.0
+    """Of the negative logarithm of the likelihood of the teacher's action, a mean over motors."""
+    rotation_weight: float = 1.0
+    """Of the chord between the believed rotation and the true one."""
+    position_weight: float = 10.0
+    """Of the distance between the believed place and the true one [1/m]."""
+    distance_weight: float = 0.1
+    """Of the squared error of the logarithm of the distance to the goal."""
+
+    def validate(self) -> None:
+        """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
+        require(self, "--learn.", "positive", "window batch learning_rate")
+        weights = "action_weight rotation_weight position_weight distance_weight"
+        require(self, "--learn.", "zero or positive", f"warmup_steps {weights}")
+
+
+@dataclass
+class CloudsCfg:
+    """Clouds of objects and goals, and stage 0, which has nothing else."""
+
+    points: int = PAPER.cloud.object_points
+    """Points of a cloud, of the goal as of the object."""
+    noise_m: float = 0.001
+    """Noise of the object's points in stages 0 and 1 [m]."""
+    scan_share: float = 0.25
+    """Share of goals as from scans: 4 mm of noise, and a fifth of the surface missing."""
+    seen_share: float = 0.5
+    """Stage 0: share of sequences in which a camera sees one side; in others the surface is whole."""
+    blank_share: float = 0.1
+    """Stage 0: share of steps in which nothing is seen."""
+    shapes: int = 1024
+    """Stage 0: shapes of an iteration, half made and half deformed objects."""
+    hands: int = 1024
+    """Stage 0: random postures of the hand; 0.15 GB."""
+    updates: int = 50
+    """Stage 0: optimiser steps of an iteration."""
+    validation: tuple[str, ...] = ()
+    """Stage 0: object sets to measure on, names or folders, that are not learned from."""
+    validate_every: int = 20
+    """Stage 0: iterations from one measurement to the next."""
+
+    def validate(self) -> None:
+        """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
+        require(self, "--clouds.", "positive", "points shapes hands updates validate_every")
+        require(self, "--clouds.", "zero or positive", "noise_m")
+        require(self, "--clouds.", "in [0, 1]", "scan_share seen_share blank_share")
+
+
+@dataclass
+class SimulatedCfg:
+    """Stages 1 and 2: what the student does in simulation, labelled by the teacher (DAgger)."""
+
+    epochs: int = 1
+    """Passes over what was done in an iteration."""
+    blank_probability: float = 0.02
+    """Stage 2: chance in a step that the camera goes blank for a while."""
+    blank_steps: int = 8
+    """Stage 2: longest such while [control steps]."""
+    latency_s: tuple[float, float] = (LATENCY_S[0], OBSERVATION_LATENCY_S)
+    """Stage 2: range of the images' age [s], from a D415's to that of *mixed*."""
+
+    def validate(self) -> None:
+        """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
+        require(self, "--simulated.", "positive", "epochs blank_steps")
+        require(self, "--simulated.", "in [0, 1]", "blank_probability")
+
+
+@dataclass
+class StudentTaskCfg:
+    """The environments; all else of them is as in the teacher's training, without its noise."""
+
+    objects: tuple[str, ...] = ()
+    """Object sets: names or folders of object USDs; the teacher's by default."""
+    num_envs: int = 2048
+    """Environments simulated side by side, in stages 1 and 2."""
+    seed: int = 0
+    """Seed of every random draw."""
+
+
+@dataclass
+class StudentTrainCfg:
+    """Train the student."""
+
+    preset: PresetName = "gpu"
+    """Settings to start from; every other flag overrides one of them. By default gpu, and cpu-demo
+    where there is none."""
+    stage: Stage = MADE
+    """0: learn where objects are, from clouds that are made; 1: learn to act from a teacher, on
+    complete clouds in simulation; 2: the same by a depth camera."""
+    teacher: str | None = None
+    """Policy that labels, also the source of hand and task: a policy.safetensors, a run's folder, or
+    the name of an installed one; dclaw4 by default."""
+    init: Path | None = None
+    """Student to begin from: a policy.safetensors or a run's folder. By default that of the stage
+    before in runs/student, if it is there."""
+    smoke: bool = False
+    """Check the installation: the stage, tiny, on the CPU, for at most a minute. It learns nothing,
+    and keeps nothing unless --out is given."""
+    resume: str | None = None
+    """Go on from a checkpoint of --out: latest (a bare --resume), a file, or auto: the latest, and
+    a new run where there is none."""
+    camera: tuple[float, float, float, float, float, float, float] | None = None
+    """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m]
+    and quaternion xyzw; the hand's own camera by default."""
+    run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
+    student: StudentCfg = field(default_factory=StudentCfg)
+    learn: LearnCfg = field(default_factory=LearnCfg)
+    clouds: CloudsCfg = field(default_factory=CloudsCfg)
+    simulated: SimulatedCfg = field(default_factory=SimulatedCfg)
+    task: StudentTaskCfg = field(default_factory=StudentTaskCfg)
+
+    def validate(self) -> None:
+        """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
+        self.run.validate()
+        self.student.validate()
+        self.learn.validate()
+        self.clouds.validate()
+        self.simulated.validate()
+        require(self.task, "--", "positive", "num_envs")
+
+
+def gpu(stage: Stage) -> StudentTrainCfg:
+    """One GPU or several, half precision; sizes for 140 GB, not measured."""
+    return StudentTrainCfg(
+        preset="gpu",
+        stage=stage,
+        run=RunCfg(out=RUNS / f"stage{stage}", save_every=20, max_steps=1_000_000_000),
+        learn=LearnCfg(precision="bf16", window=8 if stage == MADE else 16),
+        task=StudentTaskCfg(num_envs=1024 if stage == RENDERED else 2048),
+    )
+
+
+def cpu_demo(stage: Stage) -> StudentTrainCfg:
+    """Two CPU cores and minutes: a cube, a small network, few environments."""
+    return StudentTrainCfg(
+        preset="cpu-demo",
+        stage=stage,
+        teacher="dclaw4-cube",
+        run=RunCfg(
+            out=RUNS / f"cpu-stage{stage}",
+            device="cpu",
+            save_every=5,
+            max_minutes=7.0,
+            max_steps=50_000,
+        ),
+        student=StudentCfg(
+            channels=(16, 32, 64),
+            blocks=1,
+            embedding=64,
+            senses=64,
+            memory=64,
+            head=64,
+            voxel_m=0.008,
+        ),
+        learn=LearnCfg(window=8, batch=8, learning_rate=1e-3, warmup_steps=20),
+        clouds=CloudsCfg(shapes=64, hands=32, updates=10, validate_every=10),
+        task=StudentTaskCfg(num_envs=16),
+    )
+
+
+def smoke(stage: Stage) -> StudentTrainCfg:
+    """All parts of a stage in at most a minute; it learns nothing."""
+    cfg = cpu_demo(stage)
+    return replace(
+        cfg,
+        smoke=True,
+        run=replace(cfg.run, out=SMOKE_RUN, max_steps=32, max_minutes=1.0, logger="none"),
+        student=replace(cfg.student, channels=(8, 16), voxel_m=0.01),
+        learn=replace(cfg.learn, window=2, batch=4),
+        clouds=replace(cfg.clouds, shapes=4, hands=4, updates=2),
+        task=replace(cfg.task, num_envs=4),
+    )
+
+
+PRESETS: dict[str, Callable[[Stage], StudentTrainCfg]] = {"gpu": gpu, "cpu-demo": cpu_demo}
