@@ -22,6 +22,7 @@ LINES = {
     "vd-play": "zero --video a.mp4",
     "vd-train teacher": "--preset gpu --hand dclaw3 --ppo.actor-learning-rate 3e-5 --randomise",
     "vd-train alignment": "--preset cpu-demo --validate cube --camera 0 0 0 0 0 0 1",
+    "vd-train student": "--preset cpu-demo --validate cube --camera 0 0 0 0 0 0 1",
     "vd-train tracker": "dclaw3 --objects cube",
     "vd-train export": "a.pt b.safetensors",
     "vd-gap run": "rec --effects backlash --model a.usda",
