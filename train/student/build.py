@@ -100,6 +100,7 @@ def open_student(name: str, device: str = "cpu") -> "StudentPolicy":
         FileNotFoundError: There is no such file.
         ValueError: It is no student.
     """
+    quiet_warp()
     from vd.evaluate.agents import open_policy
     from vd.vision.acting import StudentPolicy
 
