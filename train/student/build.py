@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vd.assets_usd.hand_data import HandModel
     from vd.policy.actor import TrainedPolicy
     from vd.policy.contract import Contract
-    from vd.train.student.sequences import Source
+    from vd.train.student.sequences import SequenceSource
     from vd.train.student.trainer import StudentTrainer
     from vd.vision.acting import ActingStudent, StudentPolicy
     from vd.vision.student import Student
@@ -180,7 +180,9 @@ def build_student(
     return trainer
 
 
-def _made(cfg: StudentTrainCfg, task: ReorientCfg, hand: "HandModel", device: str) -> "Source":
+def _made(
+    cfg: StudentTrainCfg, task: ReorientCfg, hand: "HandModel", device: str
+) -> "SequenceSource":
     """Shapes without simulation."""
     from vd.assets_usd.objects.sets import load_set
     from vd.train.student.made import MadeSequences
@@ -197,7 +199,7 @@ def _simulated(
     teacher: "TrainedPolicy",
     network: "Student",
     device: str,
-) -> "tuple[Source, ActingStudent]":
+) -> "tuple[SequenceSource, ActingStudent]":
     """Environments, and the student at work in them."""
     import torch
     import warp as wp

@@ -35,7 +35,7 @@ class Sequences:
     """What the teacher does [T, B, D]; None: there is no teacher."""
 
 
-class Source(Protocol):
+class SequenceSource(Protocol):
     """Where sequences come from: one of the stages."""
 
     samples: int

@@ -12,7 +12,7 @@ from vd.policy.contract import Contract
 from vd.train.checkpoint import POLICY_NAME
 from vd.train.loop import check_update
 from vd.train.student.config import StudentTrainCfg
-from vd.train.student.sequences import Sequences, Source, belief_errors, student_losses
+from vd.train.student.sequences import Sequences, SequenceSource, belief_errors, student_losses
 from vd.train.supervised import SupervisedLoop
 from vd.vision.acting import ActingStudent, StudentPolicy
 from vd.vision.student import Belief, Student
@@ -40,7 +40,7 @@ class StudentTrainer(SupervisedLoop):
     def __init__(
         self,
         acting: ActingStudent,
-        source: Source,
+        source: SequenceSource,
         cfg: StudentTrainCfg,
         *,
         contract: Contract,
