@@ -345,7 +345,7 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(
     network, camera = vision_of("dclaw3-tracking").alignment, (0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)
     learned = AlignmentSpec(network=network.cfg, points=512, hand="dclaw4", camera=camera)
     state = {
-        "student_state_dict": network.state_dict(),
+        "alignment_state_dict": network.state_dict(),
         "spec": to_dict(learned),
         "iter": 1,
         "env_steps": 2,

@@ -14,6 +14,7 @@ import warp as wp
 from vd.evaluate.tracking import CameraActor
 from vd.geometry.quaternions import poses_in, rotation_distance
 from vd.tracking.policy import TrackingPolicy
+from vd.tracking.tracker import Tracker
 from vd.train.alignment.config import LooksCfg
 from vd.train.student.views import Pairs, with_goals
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
@@ -59,7 +60,10 @@ class SimulatedLooks:
     @torch.no_grad()
     def collect(self, stopping: Callable[[], bool]) -> dict[str, torch.Tensor] | None:
         """Some steps of every environment; figures of these, or ``None`` if they were cut short."""
-        finder, logs, errors = self._actor.tracker.observer.finder, [], []
+        logs = []
+        errors = []
+        assert isinstance(self._actor.tracker, Tracker)
+        finder = self._actor.tracker.observer.finder
         assert isinstance(finder, GoalFinder)  # the policy has a network
         observation = self._env.get_observations()[OBSERVATION_GROUP]
         for _ in range(self.cfg.steps):

@@ -16,7 +16,7 @@ from vd.train.flags import (
     value_of,
 )
 from vd.train.student.build import build_student, open_student
-from vd.train.student.config import PRESETS, StudentTrainCfg, smoke
+from vd.train.student.config import COMPLETE, MADE, PRESETS, Stage, StudentTrainCfg, smoke
 from vd.train.teacher import is_main, run_folder, say_of_main
 
 HELP = """Train the student: a network that acts on what a camera sees, and remembers.
@@ -118,7 +118,8 @@ def _stage_before(base: StudentTrainCfg) -> str | None:
     from vd.policy.bundle import read_contract, read_policy
 
     hand = read_policy(find_policy(str(base.teacher))).hand
-    for stage in reversed(range(base.stage)):
+    stages: tuple[Stage, ...] = (COMPLETE, MADE)
+    for stage in stages[-base.stage :] if base.stage else ():
         folder = PRESETS[base.preset](stage).run.out
         try:
             contract = read_contract(find_policy(folder))

@@ -17,7 +17,9 @@ from vd.vision.cfg import StudentCfg
 Stage = Literal[0, 1, 2]
 PresetName = Literal["gpu", "cpu-demo"]
 
-MADE, COMPLETE, RENDERED = 0, 1, 2
+MADE: Stage = 0
+COMPLETE: Stage = 1
+RENDERED: Stage = 2
 """Stages: of shapes without simulation; in simulation by complete clouds; by rendered depth."""
 RUNS = Path("runs/student")
 """Parent of the default folders stage0, stage1 and stage2."""

@@ -15,7 +15,7 @@ import warp as wp
 
 from vd.evaluate.tracking import sensed, sensed_with
 from vd.geometry.quaternions import poses_in
-from vd.policy.actor import Policy
+from vd.policy.actor import TrainedPolicy
 from vd.policy.senses import Senses
 from vd.sensors.depth_camera import DepthCamera
 from vd.train.metrics import GoalWindow, StepMeans
@@ -47,7 +47,7 @@ class SimulatedSequences:
     def __init__(
         self,
         env: ReorientVecEnv,
-        teacher: Policy,
+        teacher: TrainedPolicy,
         surfaces: torch.Tensor,
         cfg: StudentTrainCfg,
         camera: DepthCamera | None = None,

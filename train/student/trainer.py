@@ -131,6 +131,5 @@ class StudentTrainer(SupervisedLoop):
         network = Student(self.network.cfg, self.network.num_actions)
         network.load_state_dict(state["student_state_dict"])
         network.eval().requires_grad_(False)
-        counts = {"iterations": self.iteration, "env_steps": self.env_steps}
-        policy = StudentPolicy(network, replace(self.contract, **counts))
-        write_policy(policy, self.run.out / POLICY_NAME)
+        contract = replace(self.contract, iterations=self.iteration, env_steps=self.env_steps)
+        write_policy(StudentPolicy(network, contract), self.run.out / POLICY_NAME)
