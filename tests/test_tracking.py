@@ -184,6 +184,9 @@ def tracker_of(
         policy, hand, load_set("cube"), hand.camera, world_object=np.zeros(envs, dtype=int)
     )
     monkeypatch.setattr(CameraObserver, "__call__", lambda self, senses: (world, angle))
+    place = torch.zeros(envs, 3)
+    turn = torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(envs, 1)
+    tracker.observer.found = Found(turn, place, place, place, torch.zeros(envs))
     return tracker
 
 
