@@ -29,7 +29,7 @@ from vd.policy.bundle import read_policy, write_policy
 from vd.policy.contract import Contract, PolicySpec, TrackingSpec
 from vd.sensors.cfg import DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
-from vd.tracking.camera_observer import CameraObserver, Found
+from vd.tracking.camera_observer import UNSEEN, CameraObserver, Found
 from vd.tracking.policy import TrackingPolicy
 from vd.tracking.tracker import Tracker
 from vd.train.checkpoint import save_checkpoint
