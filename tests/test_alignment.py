@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.geometry.quaternions import relative_rotation, rotation_distance
+from vd.train.alignment.align import AlignTrainer, alignment_losses, make_scenes
+from vd.train.alignment.config import AlignCfg
 from vd.train.checkpoint import list_checkpoints
 from vd.train.config import RunCfg
-from vd.train.student.align import AlignTrainer, alignment_losses, make_scenes
-from vd.train.student.config import AlignCfg
 from vd.train.student.views import Hands
 from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
 from vd.vision.cfg import AlignmentCfg

@@ -10,10 +10,10 @@ from unittest.mock import MagicMock
 import pytest
 import yaml
 
+from vd.train.alignment.cli import parse_alignment
 from vd.train.config import RunCfg
 from vd.train.flags import parse_teacher
 from vd.train.presets import PRESETS
-from vd.train.student.cli import parse_student
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -21,6 +21,7 @@ LINES = {
     "vd-eval": "zero --objects cube cuboid --in-air --table-friction 3e-1",
     "vd-play": "zero --video a.mp4",
     "vd-train teacher": "--preset gpu --hand dclaw3 --ppo.actor-learning-rate 3e-5 --randomise",
+    "vd-train alignment": "--preset cpu-demo --validate cube --camera 0 0 0 0 0 0 1",
     "vd-train student": "--preset cpu-demo --validate cube --camera 0 0 0 0 0 0 1",
     "vd-train tracker": "dclaw3 --objects cube",
     "vd-train export": "a.pt b.safetensors",
@@ -108,7 +109,7 @@ def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
     for line in ("--config {} --print-config teacher", "--print-config teacher --config={}"):
         assert "epochs: 3" in run(f"vd-train {line.format(path)}")[1]
     path.write_text("stage: 1\npreset: cpu-demo")
-    assert parse_student(["--config", str(path)]).run.out.name == "cpu-stage1"
+    assert parse_alignment(["--config", str(path)]).run.out.name == "cpu-stage1"
 
 
 def test_a_logger_that_is_not_installed_is_refused_and_one_that_is_gets_the_curve(

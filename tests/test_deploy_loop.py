@@ -16,7 +16,7 @@ from vd.deploy.hardware.joints import read_joints
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop, summary
-from vd.deploy.loop.policy_runner import PolicyDecision, PolicyRunner, TrackingRunner
+from vd.deploy.loop.policy_runner import CameraRunner, PolicyDecision, PolicyRunner
 from vd.deploy.loop.run_page import FILM_FILE, PAGE_FILE, goal_results, summary_line
 from vd.deploy.safety.safety import SafeHand, StoppedError
 from vd.envs.cfg import ReorientCfg
@@ -493,7 +493,7 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(
     tmp_path, capsys, patient, monkeypatch
 ):
     folder = tmp_path / "log"
-    decide, seen = TrackingRunner.decide, []
+    decide, seen = CameraRunner.decide, []
 
     def until_hot(runner, sensed):
         seen.append(sensed.depth)
@@ -501,7 +501,7 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(
             raise StoppedError("f0_j0, motor 10: 81 deg C, over 70")
         return decide(runner, sensed)
 
-    monkeypatch.setattr(TrackingRunner, "decide", until_hot)
+    monkeypatch.setattr(CameraRunner, "decide", until_hot)
     flags = ["dclaw4-tracking", "--hand", "dclaw4", "--twin", "--goal", "0,0,0.84147,0.5403"]
     status, out, words = driven([*flags, *patient, "--log", str(folder)], capsys)
     assert status == 1 and "81 deg C" in words

@@ -20,7 +20,7 @@ from vd.vision.rotations import (
     two_columns,
 )
 from vd.vision.sparse import voxelise
-from vd.vision.student import Belief, Sight, SightBuilder, Student, carried, each
+from vd.vision.student import Belief, InputBuilder, Student, StudentInput, carried, each
 
 JOINTS = 9
 SMALL = StudentCfg(
@@ -39,7 +39,7 @@ def box_clouds(count: int, points: int, generator: torch.Generator) -> torch.Ten
     return 0.5 * size * torch.where(bump, 0.5 * surface + middle, surface)
 
 
-def sights(lead: tuple[int, ...], seed: int = 0, points: int = 60) -> Sight:
+def sights(lead: tuple[int, ...], seed: int = 0, points: int = 60) -> StudentInput:
     """Sights of objects turned by up to half a radian from where they are believed to be."""
     generator = torch.Generator().manual_seed(seed)
     count = int(np.prod(lead))
@@ -51,7 +51,7 @@ def sights(lead: tuple[int, ...], seed: int = 0, points: int = 60) -> Sight:
     axis = torch.randn((count, 3), generator=generator)
     off = matrices(two_columns(rotations_about(axis, 0.5 * torch.ones(count))))
     position = 0.02 * torch.randn((count, 3), generator=generator) + torch.tensor([0.0, 0, 0.17])
-    sight = Sight(
+    sight = StudentInput(
         camera=carried(goal, off @ believed, position[:, None]),
         hand=0.05 * torch.randn((count, points, 3), generator=generator),
         goal=goal,
@@ -86,7 +86,7 @@ def test_what_it_says_depends_on_every_thing_that_it_reads():
     sight = sights((2,))
     output = network.act(sight, network.first_hidden(2))
     other = sights((2,), seed=1)
-    for field in dataclasses.fields(Sight):
+    for field in dataclasses.fields(StudentInput):
         changed = dataclasses.replace(sight, **{field.name: getattr(other, field.name)})
         found = network.act(changed, network.first_hidden(2))
         assert (found.mean != output.mean).any(dim=1).all(), field.name
@@ -121,21 +121,24 @@ def test_a_scene_moved_with_the_belief_looks_the_same():
     moved = dataclasses.replace(
         sight, camera=sight.camera + shift, hand=sight.hand + shift, belief=belief
     )
-    torch.testing.assert_close(network.encode(moved), network.encode(sight), atol=2e-3, rtol=0.0)
+    torch.testing.assert_close(
+        network.encode(moved)[0], network.encode(sight)[0], atol=2e-3, rtol=0.0
+    )
     aside = dataclasses.replace(sight, belief=belief)
-    assert (network.encode(aside) - network.encode(sight)).abs().max() > 0.05
+    assert (network.encode(aside)[0] - network.encode(sight)[0]).abs().max() > 0.05
 
 
 def test_it_reads_nothing_out_of_reach():
     network = student()
     sight = sights((2,))
     far = sight.belief.position[:, None] + torch.tensor([0.0, 0.0, SMALL.reach_m])
-    read = network.encode(sight)
+    read, count = network.encode(sight)
     for step, seen in ((1.01, False), (0.95, True)):
         points = sight.belief.position[:, None] + step * (far - sight.belief.position[:, None])
         camera = torch.cat([sight.camera, points], dim=1)
-        found = network.encode(dataclasses.replace(sight, camera=camera))
+        found, voxels = network.encode(dataclasses.replace(sight, camera=camera))
         assert torch.allclose(found, read, atol=1e-6) != seen
+        assert (voxels == count + seen).all()
 
 
 def senses_of(hand, envs: int, place: torch.device) -> Senses:
@@ -164,7 +167,7 @@ def test_it_reads_the_hand_by_its_joints_and_the_goal_where_it_is_believed(devic
     place = torch.device(wp.device_to_torch(device))
     generator = torch.Generator().manual_seed(0)
     goals = (box_clouds(2, 300, generator) + 0.01).to(place)
-    build = SightBuilder(hand, goals)
+    build = InputBuilder(hand, goals)
     senses = senses_of(hand, 2, place)
     belief = build.first_belief(senses.goal_quat)
     # In the world's axes, about where objects are handled: 8 cm above the table.
@@ -247,10 +250,10 @@ def test_a_robot_needs_no_simulator():
     code = """
 import sys, torch
 from vd.vision.cfg import StudentCfg
-from vd.vision.student import Belief, Sight, Student
+from vd.vision.student import Belief, StudentInput, Student
 belief = Belief(torch.eye(3)[None], torch.zeros(1, 3))
 points = torch.rand(1, 5, 3)
-sight = Sight(points, points, points, belief.rotation, torch.zeros(1, 9), belief)
+sight = StudentInput(points, points, points, belief.rotation, torch.zeros(1, 9), belief)
 student = Student(StudentCfg(channels=(8,), blocks=0), 3).eval()
 print(student.act(sight, student.first_hidden(1)).mean.shape[1], *sys.modules)
 """

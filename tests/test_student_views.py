@@ -18,6 +18,7 @@ from vd.train.student.views import (
     draw_pairs,
     goal_points,
     posture_points,
+    random_joints,
     visible,
 )
 from vd.vision.rotations import turn_angle
@@ -81,7 +82,7 @@ def test_the_hand_hides_what_is_behind_it_and_takes_what_it_touches(hand):
     torch.manual_seed(3)
     one = Hands(hand, 1, device="cpu")
     torch.manual_seed(3)
-    own = posture_points(hand, 1, "cpu")[0].double().numpy()
+    own = posture_points(hand, random_joints(hand, 1, "cpu"))[0].double().numpy()
     points = one.box[0] - 0.05 + (one.box[1] - one.box[0] + 0.1) * torch.rand(1, 1500, 3)
     cell, depth = one.project(points)
     free = one.free(torch.zeros(1, dtype=torch.long), points, cell, depth)[0].numpy()

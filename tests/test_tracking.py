@@ -13,14 +13,14 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.command.config import to_dict
 from vd.deploy.loop.action import ActionFilter
-from vd.deploy.loop.policy_runner import TrackingRunner
+from vd.deploy.loop.policy_runner import CameraRunner
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
 from vd.evaluate.goals import ONE_GOAL
 from vd.evaluate.result import Result
 from vd.evaluate.trace import Trace
-from vd.evaluate.tracking import TrackingActor, sensed
+from vd.evaluate.tracking import CameraActor, sensed
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 from vd.policy.actor import TrainedPolicy, perceptron
@@ -29,7 +29,7 @@ from vd.policy.bundle import read_policy, write_policy
 from vd.policy.contract import Contract, PolicySpec, TrackingSpec
 from vd.sensors.cfg import DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
-from vd.tracking.camera_observer import UNSEEN, CameraObserver
+from vd.tracking.camera_observer import UNSEEN, CameraObserver, Found
 from vd.tracking.policy import TrackingPolicy
 from vd.tracking.tracker import Tracker
 from vd.train.checkpoint import save_checkpoint
@@ -184,6 +184,9 @@ def tracker_of(
         policy, hand, load_set("cube"), hand.camera, world_object=np.zeros(envs, dtype=int)
     )
     monkeypatch.setattr(CameraObserver, "__call__", lambda self, senses: (world, angle))
+    place = torch.zeros(envs, 3)
+    turn = torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(envs, 1)
+    tracker.observer.found = Found(turn, place, place, place, torch.zeros(envs))
     return tracker
 
 
@@ -245,7 +248,7 @@ def test_a_vision_policy_comes_back(tmp_path):
 def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
     policy = read_policy(find_policy("dclaw3-tracking"))
     plain, real = (
-        TrackingActor(env, policy, sensor_errors=errs).camera.cfg for errs in (False, True)
+        CameraActor(env, policy, sensor_errors=errs).camera.cfg for errs in (False, True)
     )
     assert (
         not plain.sensor.enabled and plain.latency_s == (0.0, 0.0) and plain.position_noise_m == 0.0
@@ -273,7 +276,7 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
         success_ends_episode=False,
     )
     env = ReorientEnv(task, "cpu")
-    actor, runner = TrackingActor(env, policy), TrackingRunner(policy, env.hand, env.objects[0])
+    actor, runner = CameraActor(env, policy), CameraRunner(policy, env.hand, env.objects[0])
     runner.begin()
     assert runner.kind == kind
     actions = ActionFilter(env.hand, task)
@@ -345,7 +348,7 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(
     network, camera = vision_of("dclaw3-tracking").alignment, (0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)
     learned = AlignmentSpec(network=network.cfg, points=512, hand="dclaw4", camera=camera)
     state = {
-        "student_state_dict": network.state_dict(),
+        "alignment_state_dict": network.state_dict(),
         "spec": to_dict(learned),
         "iter": 1,
         "env_steps": 2,

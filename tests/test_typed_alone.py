@@ -23,6 +23,7 @@ from vd.evaluate.statistics import symmetric_error
 from vd.logs.recording import write_recording
 from vd.policy.agents import default_policy
 from vd.train import adapt, tracker
+from vd.train.alignment.cli import parse_alignment
 from vd.train.flags import parse_teacher
 from vd.train.student.cli import parse_student
 
@@ -36,6 +37,9 @@ LONG = {
     "vd-train student": "vd.train.student.cli._train",
     "vd-train student --stage 0": "vd.train.student.cli._train",
     "vd-train student --stage 1": "vd.train.student.cli._train",
+    "vd-train student --stage 2": "vd.train.student.cli._train",
+    "vd-train alignment": "vd.train.alignment.cli._train",
+    "vd-train alignment --stage 1": "vd.train.alignment.cli._train",
     "vd-train adapt": "vd.train.adapt._adapt",
     "vd-train tracker": "vd.train.tracker._track",
     "vd-deploy --twin": "vd.deploy.loop.policy_runner.load_runner",
@@ -52,7 +56,10 @@ TAKEN = {
     "vd-train teacher": "teacher --preset cpu-demo --hand dclaw3 --objects cube --out runs/cpu-demo",
     "vd-train student": "--stage 0 --preset cpu-demo --teacher dclaw4-cube --out runs/student/cpu",
     "vd-train student --stage 0": "--stage 0 --preset cpu-demo --teacher dclaw4-cube",
-    "vd-train student --stage 1": "--stage 1 --preset cpu-demo --teacher dclaw4-cube --init dclaw4-vision",
+    "vd-train student --stage 1": "--stage 1 --preset cpu-demo --teacher dclaw4-cube --out runs/",
+    "vd-train student --stage 2": "--stage 2 --preset cpu-demo --teacher dclaw4-cube --out runs/",
+    "vd-train alignment": "--stage 0 --preset cpu-demo --teacher dclaw4-cube --out runs/alignment/cpu",
+    "vd-train alignment --stage 1": "--preset cpu-demo --teacher dclaw4-cube --init dclaw4-vision",
     "vd-train adapt": "adapt dclaw3 --hand-layer gap/identified.usda --objects cube --num-envs 256",
     "vd-train tracker": "tracker dclaw4 --objects procedural-heldout-8-seed0 --episodes 64",
     "vd-deploy --twin": "dclaw3-vision --hand dclaw3 --object cube --twin   (3 goals)",
@@ -112,9 +119,9 @@ def test_what_is_said_asks_for_the_same(typed, monkeypatch):
     said: list[str] = []
     alone = parse_teacher([], say=lambda *words, why: said.extend(map(str, words)))
     assert parse_teacher(said[2:]) == alone and alone.run.device == "cpu"
-    alone = parse_student(["--stage", "1"])
+    alone = parse_alignment(["--stage", "1"])
     flags = ["--preset", "cpu-demo", "--teacher", "dclaw4-cube", "--init", "dclaw4-vision"]
-    assert parse_student(["--stage", "1", *flags]) == alone
+    assert parse_alignment(["--stage", "1", *flags]) == alone
 
 
 def test_where_there_is_nothing_to_take_the_remedy_is_named(typed, tmp_path, monkeypatch):
@@ -127,13 +134,15 @@ def test_where_there_is_nothing_to_take_the_remedy_is_named(typed, tmp_path, mon
     assert "vd-assets hand import URDF --describe leap" in typed("vd-deploy --hand leap --twin")[1]
     status, said = typed("vd-train adapt")
     assert status == 1 and "there is no gap/identified.usda, which vd-gap run RECORDING" in said
-    assert "this student has 0 (made clouds) and 1" in typed("vd-train student --stage 2")[1]
     assert default_policy("leap", "vision", "tracking", "teacher") == "leap-cube"
     with pytest.raises(ValueError, match=r"no vision or tracking policy of leap .*leap-objects"):
         default_policy("leap", "vision", "tracking")
 
 
-@pytest.mark.parametrize("command", ["teacher", "student", "student --stage 1", "adapt", "tracker"])
+@pytest.mark.parametrize(
+    "command",
+    ["teacher", "student --stage 2", "alignment", "alignment --stage 1", "adapt", "tracker"],
+)
 def test_every_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
     command, typed, tmp_path, monkeypatch
 ):
@@ -145,7 +154,8 @@ def test_every_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
 
     for place in ("train.teacher.train", "train.adapt._adapt", "train.tracker._track"):
         monkeypatch.setattr(f"vd.{place}", note)
-    monkeypatch.setattr("vd.train.student.cli._train", note)
+    for place in ("alignment", "student"):
+        monkeypatch.setattr(f"vd.train.{place}.cli._train", note)
     assert typed(f"vd-train {command} --smoke")[0] == 0
     assert not list(tmp_path.iterdir())
     (cfg,) = given
@@ -158,8 +168,25 @@ def test_every_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
 
 
 @pytest.mark.slow
-def test_the_smoke_test_of_a_student_runs(typed):
-    assert typed("vd-train student --smoke")[0] == 0
+@pytest.mark.parametrize("command", ["alignment", "student"])
+def test_smoke_tests_run(command, typed):
+    assert typed(f"vd-train {command} --smoke")[0] == 0
+
+
+def test_a_stage_begins_from_the_one_before_if_it_was_trained(typed, tmp_path):
+    alone = parse_student(["--stage", "1"])
+    assert alone.init is None
+    before = tmp_path / parse_student([]).run.out
+    small = "--learn.window 2 --learn.batch 2 --clouds.updates 1 --clouds.shapes 2 --clouds.hands 2"
+    small += " --student.channels 4 8 --max-steps 4 --logger none"
+    assert typed(f"vd-train student --stage 0 {small}")[0] == 0
+    assert (before / "policy.safetensors").is_file()
+    begun = parse_student(["--stage", "2"])
+    assert begun.init == before.relative_to(tmp_path) and begun.student.channels == (4, 8)
+    # A network of another hand is not taken.
+    assert parse_student(["--stage", "1", "--teacher", "dclaw3"]).init is None
+    status, said = typed("vd-train student --stage 1 --init dclaw3")
+    assert status == 1 and "dclaw3 is no student" in said
 
 
 def test_default_goals_are_turns_that_can_be_seen():
@@ -188,7 +215,7 @@ def test_a_folder_is_one_trainings_and_that_of_a_dead_one_is_free(tmp_path, type
     )
     try:
         assert other.stdout.readline() == "has it\n"
-        for command in ("teacher --smoke", "student --smoke"):
+        for command in ("teacher --smoke", "student --smoke", "alignment --smoke"):
             status, said = typed(f"vd-train {command} --out {folder}")
             assert status == 1 and f"is in use by process {other.pid} on" in said
     finally:

@@ -229,14 +229,14 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
 
 def _check_teacher(name: str) -> None:
     """Refuse what sees by camera: its teacher learns, and sees again afterwards."""
+    from vd.policy.actor import TrainedPolicy
     from vd.policy.agents import open_policy
-    from vd.tracking.policy import TrackingPolicy
 
     policy = open_policy(name, "cpu")
     if policy is None:
         raise ValueError(f"{name} has learned nothing; name a trained teacher")
-    if isinstance(policy, TrackingPolicy):
-        network = "" if policy.alignment is None else f" --alignment {name}"
+    if not isinstance(policy, TrainedPolicy):
+        network = f" --alignment {name}" if policy.kind == "vision" else ""
         raise ValueError(
             f"{name} sees by camera; adapt its teacher, {policy.spec.teacher}, and let that see "
             f"again: vd-train tracker runs/adapted --objects SET{network}"

@@ -14,6 +14,8 @@ from vd.policy.actor import read_state
 
 CHECKPOINT_FOLDER = "checkpoints"
 BEST_NAME = "best.pt"
+POLICY_NAME = f"policy{SUFFIX}"
+"""The policy of a run, in its folder: what vd-eval, vd-play and deployment read."""
 KEEP_LAST = 3
 """Periodic checkpoints to keep besides the best: one to go on from, and others should it be
 damaged.
@@ -22,9 +24,10 @@ AUTO = "auto"
 """``--resume auto`` goes on with a run where there is one, and starts it otherwise."""
 _NEEDED = {
     "actor": ("policy", "task", "iter", "env_steps"),
-    "student": ("spec", "task", "iter", "env_steps"),
+    "alignment": ("spec", "task", "iter", "env_steps"),
+    "student": ("contract", "task", "iter", "env_steps"),
 }
-"""What belongs to the weights of a teacher or a student. Other projects' files have an actor
+"""What belongs to the weights of each network. Other projects' files have an actor
 too.
 """
 _ARRAY = "__numpy__"
@@ -121,9 +124,10 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 def load_checkpoint(
     path: Path, device: str = "cpu", *, network: str = "actor", flag: str = "--resume"
 ) -> dict[str, Any]:
-    """Read a checkpoint, with weights of an ``actor`` (teacher) or ``student``, executing nothing in it.
+    """Read a checkpoint with weights of a network, executing nothing in it.
 
-    ``flag`` is what asked for it, for messages.
+    ``network`` is ``actor`` (of a teacher), ``alignment`` or ``student``; ``flag`` is what asked
+    for it, for messages.
 
     Raises:
         ValueError: The file is damaged or not a checkpoint.

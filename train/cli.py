@@ -12,8 +12,9 @@ USAGE = """usage: vd-train COMMAND [flags]
 commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --out runs/first
   adapt      go on in an identified model         vd-train adapt dclaw3 --hand-layer identified.usda
-  student    learn to see without a mesh          vd-train student --teacher dclaw3 --objects SET
-  tracker    let it act by a camera, learn nothing vd-train tracker dclaw3 --objects SET
+  student    learn to act by a camera             vd-train student --stage 1 --teacher dclaw3
+  alignment  learn where an object is             vd-train alignment --teacher dclaw3 --objects SET
+  tracker    let a teacher act by a camera         vd-train tracker dclaw3 --objects SET
   export     write a policy for others            vd-train export runs/first policy.safetensors
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or its networks as ONNX              vd-train export POLICY policy.onnx
@@ -34,6 +35,7 @@ COMMANDS = {
     "teacher": ("vd.train.teacher", "teacher_command"),
     "adapt": ("vd.train.adapt", "adapt_command"),
     "student": ("vd.train.student.cli", "student_command"),
+    "alignment": ("vd.train.alignment.cli", "alignment_command"),
     "tracker": ("vd.train.tracker", "tracker_command"),
     "export": ("vd.train.export", "export_command"),
 }
@@ -57,7 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"vd-train: no command '{name}'; one of {known}\n\n{USAGE}", file=sys.stderr)
         return interrupt.USAGE_ERROR
     module, function = COMMANDS[name]
-    if name in ("teacher", "adapt", "student") and not {"-h", "--help"} & set(arguments):
+    if name in ("teacher", "adapt", "student", "alignment") and not {"-h", "--help"} & set(
+        arguments
+    ):
         interrupt.need("rsl_rl", "tensordict")
     try:
         return int(getattr(importlib.import_module(module), function)(arguments))

@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.nn import Module
 
-    from vd.policy.actor import TrainedPolicy
+    from vd.policy.bundle import AnyPolicy
     from vd.policy.contract import Contract
-    from vd.tracking.policy import TrackingPolicy
 
 CHECKED = 64
 """Random observations, or pairs of clouds, on which the runtime of ONNX is compared."""
@@ -86,7 +85,7 @@ def _export_checkpoint(path: Path, output: Path) -> None:
     print(output)
 
 
-def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path, contract: "Contract") -> None:
+def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
     """Write a policy's networks with its contract, and compare them with onnxruntime if that is installed.
 
     The layers of a teacher, or of that of a camera policy, take ``observation`` [N, O], which they
@@ -98,13 +97,17 @@ def export_onnx(policy: "TrainedPolicy | TrackingPolicy", path: Path, contract: 
     Raises:
         ModuleNotFoundError: What the export needs is not installed.
         RuntimeError: Outputs differ by more than rounding.
+        ValueError: It is a student.
     """
     import torch
 
     from vd.policy.actor import TrainedPolicy
     from vd.policy.onnx import onnx_metadata
+    from vd.vision.acting import StudentPolicy
     from vd.vision.alignment import Residual
 
+    if isinstance(policy, StudentPolicy):
+        raise ValueError(f"{path}: sparse convolutions are not exported to ONNX; name a {SUFFIX}")
     interrupt.need("onnx", "onnxscript")
     teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
     drawn = torch.randn(

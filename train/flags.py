@@ -13,14 +13,15 @@ from vd.command.config import from_dict, to_dict
 from vd.command.device import resolve_device
 from vd.command.files import write_json
 from vd.command.line import PRINT, ConfigFile, parse, take_config
-from vd.policy.agents import check_names
+from vd.policy.agents import DEFAULT_POLICY, check_names, installed_policies
 from vd.train.begin import settings_of
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
 
 if TYPE_CHECKING:
+    from vd.train.alignment.config import AlignmentTrainCfg
     from vd.train.student.config import StudentTrainCfg
 
-Cfg = TypeVar("Cfg", TeacherCfg, "StudentTrainCfg")
+Cfg = TypeVar("Cfg", TeacherCfg, "AlignmentTrainCfg", "StudentTrainCfg")
 CONFIG_NAME = "config.json"
 """The resolved configuration, in the run's folder, written before the first iteration."""
 
@@ -134,6 +135,11 @@ def machine_preset(device: str | None) -> str:
     return "cpu-demo" if resolve_device(device or "auto") == "cpu" else "gpu"
 
 
+def installed_teacher(name: str | None) -> str:
+    """The teacher that is taken where none is named: the preset's, if it is installed."""
+    return name if name is not None and name in installed_policies() else DEFAULT_POLICY
+
+
 def check_begun_alike(arguments: list[str], saved: Cfg) -> None:
     """Refuse flags by which a run that goes on would have begun otherwise.
 
@@ -222,7 +228,7 @@ def _without(kind: type, hidden: Collection[str], where: str = "") -> type:
 
 
 def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:
-    """Configuration of the run that ``--resume`` goes on with, a teacher's or student's as ``start`` is.
+    """Configuration of the run that ``--resume`` goes on with, of the kind that ``start`` is.
 
     None where ``auto`` finds no run.
 
@@ -247,7 +253,7 @@ def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:
     return cfg
 
 
-def write_config(cfg: "TeacherCfg | StudentTrainCfg") -> None:
+def write_config(cfg: "TeacherCfg | AlignmentTrainCfg | StudentTrainCfg") -> None:
     """Save the resolved configuration in the run's folder, as ``--resume`` takes it, on any machine."""
     run = replace(cfg.run, device="auto")
     write_json(cfg.run.out / CONFIG_NAME, to_dict(replace(cfg, resume=None, run=run)))

@@ -1,4 +1,4 @@
-"""The training loop of teachers and students.
+"""The training loop of teachers, students and alignment.
 
 Iterations, curves, checkpoints, and all ways to end.
 """
@@ -78,7 +78,7 @@ class TrainingLoop:
 
     Attributes:
         iteration: Iterations completed, over all resumed runs.
-        env_steps: Control steps (of a student clouds) completed, over all environments and
+        env_steps: Control steps (of others clouds) completed, over all environments and
             processes.
         new_episodes: Why the checkpoint that was loaded could not restore the environments; empty
             if it did.
@@ -260,9 +260,7 @@ class TrainingLoop:
 
     def _state(self) -> dict[str, Any]:
         """Everything a checkpoint holds."""
-        mine = {"random": random_state(self.device)}
-        if self.env is not None:
-            mine["env"] = self.env.env.state_dict()
+        mine = {"random": random_state(self.device)} | self._process_state()
         ranks: list[Any] = [mine]
         if self.is_distributed:
             ranks = [None] * self.world_size
@@ -281,8 +279,7 @@ class TrainingLoop:
         self.new_episodes = self._misfit(state["ranks"])
         if not self.new_episodes:
             mine = state["ranks"][self.rank]
-            if self.env is not None:
-                self.env.env.load_state_dict(mine["env"])
+            self._restore_process(mine)
             set_random_state(mine["random"], self.device)
         elif self.env is not None:
             self.env.start_anew(state["ranks"][0]["env"])
@@ -316,6 +313,15 @@ class TrainingLoop:
     def _shared_state(self) -> dict[str, Any]:
         """What all processes have alike."""
         raise NotImplementedError
+
+    def _process_state(self) -> dict[str, Any]:
+        """What this process alone has, beside its random state."""
+        return {} if self.env is None else {"env": self.env.env.state_dict()}
+
+    def _restore_process(self, state: dict[str, Any]) -> None:
+        """Take over what :meth:`_process_state` gave."""
+        if self.env is not None:
+            self.env.env.load_state_dict(state["env"])
 
     def _close(self) -> None:
         """Release the environments."""

@@ -14,7 +14,8 @@ FIGURES = {
     "mean_reward": "reward {:.3f}",
     "task/rotation_error": "error {:.2f} rad",
     "action_std": "std {:.3f}",
-    "student/rotation_error": "rotation {:.2f} rad",
+    "alignment/rotation_error": "rotation {:.2f} rad",
+    "learn/rotation_error": "rotation {:.2f} rad",
     "looks/success_per_goal": "success {:.1%} of goals",
 }
 """What the first line says of an iteration, as far as its row has it."""

@@ -13,13 +13,13 @@ from torch import nn
 
 from vd.command.config import to_dict
 from vd.envs.curriculum import blend
-from vd.policy import SUFFIX
 from vd.policy.actor import teacher_in
 from vd.policy.bundle import write_policy
 from vd.policy.contract import PolicySpec
 from vd.train.begin import check_fit, completed, read_start, unlike, warmup_iterations, widen
 from vd.train.checkpoint import (
     BEST_NAME,
+    POLICY_NAME,
     load_checkpoint,
     save_checkpoint,
     without_worlds,
@@ -31,8 +31,6 @@ from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.ppo import make_learner
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 
-POLICY_NAME = f"policy{SUFFIX}"
-"""The best policy so far, in the run's folder: what vd-eval, vd-play and deployment read."""
 LOWER_RATES = "lower --ppo.actor-learning-rate, --ppo.critic-learning-rate or --ppo.grad-norm"
 """Remedy for networks that diverge."""
 

@@ -21,10 +21,11 @@ from vd.train.flags import parse_teacher, write_config
 from vd.train.presets import SMOKE_RUN, TeacherCfg
 
 if TYPE_CHECKING:
+    from vd.train.alignment.config import AlignmentTrainCfg
     from vd.train.runner import TeacherRunner
     from vd.train.student.config import StudentTrainCfg
 
-Cfg = TypeVar("Cfg", TeacherCfg, "StudentTrainCfg")
+Cfg = TypeVar("Cfg", TeacherCfg, "AlignmentTrainCfg", "StudentTrainCfg")
 
 CPU_ENVS = 1024
 """Most environments of which a CPU simulates an iteration within a minute."""
@@ -152,7 +153,7 @@ def train(cfg: TeacherCfg, say: Callable[[str], None]) -> int:
                 f"{'the same command' if cfg.resume == 'auto' else again}"
             )
         return interrupt.INTERRUPTED
-    from vd.train.runner import (
+    from vd.train.checkpoint import (
         POLICY_NAME,
     )  # loads torch, which the first message should not wait for
 

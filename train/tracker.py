@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -24,8 +24,8 @@ from vd.policy.agents import DEFAULT_POLICY, check_names
 
 if TYPE_CHECKING:
     from vd.evaluate.trace import Trace
-    from vd.policy.contract import Contract, TrackingSpec
-    from vd.tracking.policy import TrackingPolicy
+    from vd.evaluate.tracking import AnyCameraPolicy
+    from vd.policy.contract import Contract
 
 
 @dataclass(kw_only=True)
@@ -41,12 +41,13 @@ class TrackerCfg(EpisodeFlags):
     """
 
     teacher: Annotated[str, tyro.conf.Positional] = DEFAULT_POLICY
-    """The teacher: a policy.safetensors, a run's folder, or the name of an installed one."""
+    """The teacher: a policy.safetensors, a run's folder, or the name of an installed one. Of a
+    student the stopping rules alone are chosen."""
     objects: tuple[str, ...] = ()
     """Object sets to choose the stopping rules on, not those of the training; by default
     procedural-heldout, and a few of its kinds on a CPU."""
     alignment: str | None = None
-    """Network that finds objects by their goals' points: the alignment.pt of vd-train student, or a
+    """Network that finds objects by their goals' points: the alignment.pt of vd-train alignment, or a
     vision policy, for that of it: its name or file."""
     out: Path = Path("tracking.safetensors")
     """File to write."""
@@ -98,28 +99,12 @@ def _track(cfg: TrackerCfg) -> int:
     check_file(cfg.out)
     print("running the episodes ...", flush=True)
     from vd.command.warp_quiet import quiet_warp
-    from vd.policy.agents import open_teacher, policy_name
     from vd.policy.bundle import write_policy
-    from vd.policy.contract import TrackingSpec
     from vd.policy.stopping import calibrate
-    from vd.tracking.policy import TrackingPolicy
-    from vd.train.student.network import open_network
 
     quiet_warp()
     device = resolve_device(cfg.device)
-    teacher = open_teacher(cfg.teacher, device)
-    if teacher is None:
-        raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
-    if own := teacher.task["observation"].get("terms"):
-        raise ValueError(
-            f"{cfg.teacher} observes {', '.join(own)}, which no camera shows; give another"
-        )
-    spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
-    network = None
-    if cfg.alignment is not None:
-        network, sizes, camera = open_network(cfg.alignment, device)
-        spec = replace(spec, camera=cfg.camera or camera, alignment=sizes)
-    policy = TrackingPolicy(teacher, replace(teacher.contract, tracking=spec), network)
+    policy = _seeing(cfg, device)
     trace = _episodes(cfg, policy, device)
     assert trace.predicted is not None
     predicted, norm, true = (
@@ -133,7 +118,7 @@ def _track(cfg: TrackerCfg) -> int:
     except ValueError:  # of a policy that never came so near there is nothing to learn
         precise = None
     spec = replace(
-        spec,
+        policy.spec,
         stopping=found.rule,
         tolerance_rad=cfg.stop_tolerance,
         precise=None if precise is None else precise.rule,
@@ -157,18 +142,52 @@ def _track(cfg: TrackerCfg) -> int:
     return 0
 
 
-def _contract(policy: "TrackingPolicy", spec: "TrackingSpec") -> "Contract":
+def _seeing(cfg: TrackerCfg, device: str) -> "AnyCameraPolicy":
+    """The student that is named, or the teacher, let act by a camera.
+
+    Raises:
+        ValueError: It is neither, or observes what no camera shows.
+    """
+    from vd.policy.agents import open_policy, open_teacher, policy_name
+    from vd.policy.contract import TrackingSpec
+    from vd.tracking.policy import TrackingPolicy
+    from vd.train.alignment.network import open_network
+    from vd.vision.acting import StudentPolicy
+
+    student = open_policy(cfg.teacher, device)
+    if isinstance(student, StudentPolicy):
+        if cfg.alignment is not None or cfg.camera is not None:
+            raise ValueError(f"{cfg.teacher} sees by itself; leave out --alignment and --camera")
+        return student
+    teacher = open_teacher(cfg.teacher, device)
+    if teacher is None:
+        raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
+    if own := teacher.task["observation"].get("terms"):
+        raise ValueError(
+            f"{cfg.teacher} observes {', '.join(own)}, which no camera shows; give another"
+        )
+    spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
+    network = None
+    if cfg.alignment is not None:
+        network, sizes, camera = open_network(cfg.alignment, device)
+        spec = replace(spec, camera=cfg.camera or camera, alignment=sizes)
+    return TrackingPolicy(teacher, replace(teacher.contract, tracking=spec), network)
+
+
+def _contract(policy: "AnyCameraPolicy", spec: Any) -> "Contract":
     """What the file says of a policy that sees so, with the hand of its teacher."""
     from vd.assets_usd.hands import load_hand
     from vd.envs.cfg import ReorientCfg
     from vd.policy.contract import derive_interface
 
+    if policy.kind == "student":
+        return replace(policy.contract, student=spec)
     task = ReorientCfg.of(policy)
     interface = derive_interface(task, load_hand(task.hand, task.fingertip), spec)
     return replace(policy.contract, tracking=spec, interface=interface)
 
 
-def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace":
+def _episodes(cfg: TrackerCfg, policy: "AnyCameraPolicy", device: str) -> "Trace":
     """Episodes that nothing stops."""
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.reorient import ReorientEnv

@@ -1,9 +1,8 @@
 """Policies in the control loop: from what is sensed to an action and the distance to the goal."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -22,6 +21,9 @@ from vd.policy.stopping import StoppingRule
 from vd.sensors.depth_cloud import CameraCloud
 from vd.tracking.policy import TrackingPolicy
 from vd.tracking.tracker import Tracker
+
+if TYPE_CHECKING:
+    from vd.vision.acting import StudentPolicy
 
 ZERO = "zero"
 """Name of the zero-action baseline."""
@@ -77,7 +79,7 @@ class PolicyRunner:
         rule: When it has arrived.
 
     Attributes:
-        kind: tracking, vision or zero.
+        kind: tracking, vision, student, teacher or zero.
         camera: Where its depth camera has to be; None: it has none.
         calibrated: Whether its rule to stop comes from episodes.
     """
@@ -168,10 +170,8 @@ class TwinTeacher(PolicyRunner):
         return PolicyDecision(action.numpy()[0].copy(), float(error[0]))
 
 
-class TrackingRunner(PolicyRunner):
-    """A tracking or vision policy.
-
-    Finds the object in the camera's images, and lets its teacher act.
+class CameraRunner(PolicyRunner):
+    """A policy that sees by a camera: tracking, vision or student.
 
     Arguments are those of :func:`load_runner`.
 
@@ -184,7 +184,7 @@ class TrackingRunner(PolicyRunner):
 
     def __init__(
         self,
-        policy: TrackingPolicy,
+        policy: "TrackingPolicy | StudentPolicy",
         hand: HandModel,
         item: ObjectModel,
         *,
@@ -194,20 +194,35 @@ class TrackingRunner(PolicyRunner):
         super().__init__(ReorientCfg.of(policy), policy.spec.rule_for(tolerance_rad))
         self.kind = policy.kind
         self.calibrated = policy.spec.calibrated_for(tolerance_rad)
-        depth = policy.spec.depth
-        self._cloud = partial(
-            CameraCloud, mount=hand.mount, points=depth.points, crop_m=depth.crop_m, seed=seed
-        )
-        self._tracker_of = partial(Tracker, policy, hand, [item])
+        self._policy = policy
+        self._hand = hand
+        self._item = item
+        self._seed = seed
         self._fresh = True
-        self._library = library_of(policy.teacher.network.offset)
         self.look_by(hand.camera.at(policy.spec.camera))
 
     def look_by(self, camera: CameraModel) -> None:
         """See by another camera."""
+        depth = self._policy.spec.depth
         self.camera = camera
-        self.eye = self._cloud(camera)
-        self._tracker = self._tracker_of(camera)
+        self.eye = CameraCloud(
+            camera,
+            mount=self._hand.mount,
+            points=depth.points,
+            crop_m=depth.crop_m,
+            seed=self._seed,
+        )
+        if isinstance(self._policy, TrackingPolicy):
+            self._tracker: Any = Tracker(self._policy, self._hand, [self._item], camera)
+            self._library = library_of(self._policy.teacher.network.offset)
+            return
+        import torch
+
+        from vd.vision.acting import ActingStudent
+
+        goal = torch.tensor(self._item.surface_points, dtype=torch.float32)
+        self._tracker = ActingStudent(self._policy.network, self._hand, goal[None])
+        self._library = torch
 
     def begin(self) -> None:
         """The object is looked for anew, which takes several times as long as a step."""
@@ -219,14 +234,13 @@ class TrackingRunner(PolicyRunner):
         senses = senses_of(sensed, of_warp(points, self._library), fresh=self._fresh)
         decided = self._tracker.step(senses)
         self._fresh = False
-        estimate = self._tracker.observer.found
-        assert estimate is not None
-        pose = np.concatenate(
-            [np.asarray(estimate.position[0]), np.asarray(estimate.orientation[0])]
+        place = [np.asarray(decided.position[0]), np.asarray(decided.orientation[0])]
+        return PolicyDecision(
+            action=np.array(decided.action[0]),
+            distance=float(decided.angle[0]),
+            found=np.concatenate(place),
+            voxels=int(decided.voxels[0]),
         )
-        action = np.array(decided.action[0])
-        angle = float(decided.angle[0])
-        return PolicyDecision(action, angle, pose, int(estimate.voxels[0]))
 
 
 def load_runner(
@@ -260,8 +274,8 @@ def load_runner(
     if policy is None:
         raise ValueError(f"{name} is not for a hand; give a policy, or {ZERO}")
     check_fits(name, policy, hand_name)
-    if isinstance(policy, TrackingPolicy):
-        return TrackingRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
+    if policy.kind != "teacher":
+        return CameraRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     if object is not None:
         return TwinTeacher(policy, hand_name, object, tolerance_rad)
     raise ValueError(

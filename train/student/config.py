@@ -7,105 +7,105 @@ from typing import Annotated, Literal
 
 import tyro
 
+from vd.evaluate.conditions import OBSERVATION_LATENCY_S
+from vd.paper import PAPER
+from vd.sensors.cfg import LATENCY_S
 from vd.train.config import RunCfg, require
 from vd.train.presets import SMOKE_RUN
-from vd.vision.cfg import SEEN_POINTS, AlignmentCfg
+from vd.vision.cfg import StudentCfg
 
-Stage = Literal[0, 1]
+Stage = Literal[0, 1, 2]
 PresetName = Literal["gpu", "cpu-demo"]
 
-MADE, SIMULATED = 0, 1
-"""Stages: of clouds without simulation; of what a camera sees while the policy acts, besides."""
-ALIGNMENT_NAME = "alignment.pt"
-"""The network of a run, in its folder."""
+MADE: Stage = 0
+COMPLETE: Stage = 1
+RENDERED: Stage = 2
+"""Stages: of shapes without simulation; in simulation by complete clouds; by rendered depth."""
 RUNS = Path("runs/student")
-"""Parent of the default folders stage0 and stage1."""
+"""Parent of the default folders stage0, stage1 and stage2."""
 
 
 @dataclass
-class AlignCfg:
-    """Turning a goal's cloud onto what a camera sees, learned from shapes without simulation."""
+class LearnCfg:
+    """What all stages learn, and how. Nothing here is tuned yet."""
 
-    batch: int = 768
-    """Pairs of clouds of an optimiser step on one GPU."""
-    steps: int = 50
-    """Optimiser steps of an iteration."""
-    learning_rate: float = 6e-4
+    window: int = 16
+    """Steps of a sequence, through which gradients flow."""
+    batch: int = 128
+    """Sequences of an optimiser step on one GPU."""
+    learning_rate: float = 3e-4
     """Of AdamW, after the warm-up; it falls to nearly 0 along a cosine until --max-steps or
     --max-minutes.
     """
     warmup_steps: int = 300
     """Optimiser steps over which the learning rate rises from 0, linearly."""
     precision: Literal["fp32", "bf16"] = "fp32"
-    """Of the network's products."""
-    compile: bool = False
-    """Compile the network first, which takes a minute and a C compiler; then steps are shorter."""
-    shapes: int = 40_000
-    """Shapes in memory, half made and half deformed objects; 0.6 GB. With 159 the errors of shapes
-    that were not learned from are half as large again."""
-    fresh_shapes: int = 256
-    """Of these, how many are replaced in each iteration."""
-    hands: int = 1024
-    """Random postures of the hand that hide shapes; 0.15 GB."""
-    points: int = 512
-    """Points of each cloud."""
-    near_share: float = 0.5
-    """Share of pairs that are less than 0.9 rad apart, as in later passes; others are anywhere."""
-    searched_share: float = 0.5
-    """Share of pairs whose goals are first turned as the network says, half of them twice, as later
-    passes meet them. Without, 1.8 M pairs after the same start, first looks within 0.4 rad were
-    57.5 instead of 61.8 % (difference 1.0 to 7.3), when the network chose among ends itself."""
-    scan_share: float = 0.25
-    """Share of goals as from scans: 4 mm of noise, and a fifth of the surface missing."""
-    validation: tuple[str, ...] = ()
-    """Object sets to measure on, names or folders, that are not learned from; besides made
-    shapes.
-    """
-    validate_every: int = 20
-    """Iterations from one measurement to the next."""
-    views: int = 64
-    """Views of each object that is measured on."""
-    network: AlignmentCfg = field(default_factory=AlignmentCfg)
+    """Of the convolutions' products."""
+    action_weight: float = 1.0
+    """Of the negative logarithm of the likelihood of the teacher's action, a mean over motors."""
+    rotation_weight: float = 1.0
+    """Of the chord between the believed rotation and the true one."""
+    position_weight: float = 10.0
+    """Of the distance between the believed place and the true one [1/m]."""
+    distance_weight: float = 0.1
+    """Of the squared error of the logarithm of the distance to the goal."""
 
     def validate(self) -> None:
-        """Refuse settings that cannot train.
-
-        Raises:
-            ValueError: The flag, its value and what it has to be.
-        """
-        positive = "batch steps learning_rate shapes hands points validate_every views"
-        require(self, "--align.", "positive", positive)
-        require(self, "--align.", "zero or positive", "warmup_steps fresh_shapes")
-        require(self, "--align.", "in [0, 1]", "near_share searched_share scan_share")
-        self.network.validate()
-        if self.points < max(self.network.tokens, self.network.neighbours):
-            raise ValueError(
-                f"--align.points is {self.points}; it has to be at least the tokens and neighbours "
-                "of --align.network"
-            )
+        """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
+        require(self, "--learn.", "positive", "window batch learning_rate")
+        weights = "action_weight rotation_weight position_weight distance_weight"
+        require(self, "--learn.", "zero or positive", f"warmup_steps {weights}")
 
 
 @dataclass
-class LooksCfg:
-    """Stage 1: what a camera sees in simulation while the policy acts by the network (DAgger)."""
+class CloudsCfg:
+    """Clouds of objects and goals, and stage 0, which has nothing else."""
 
-    steps: int = 8
-    """Control steps of every environment before an iteration's optimiser steps."""
-    kept: int = 400_000
-    """Latest looks in memory, to learn from: those of the last 25 iterations of 2048 environments;
-    1.3 GB.
-    """
-    share: float = 0.5
-    """Share of pairs that are of these; others are made."""
+    points: int = PAPER.cloud.object_points
+    """Points of a cloud, of the goal as of the object."""
+    noise_m: float = 0.001
+    """Noise of the object's points in stages 0 and 1 [m]."""
+    scan_share: float = 0.25
+    """Share of goals as from scans: 4 mm of noise, and a fifth of the surface missing."""
+    seen_share: float = 0.5
+    """Stage 0: share of sequences in which a camera sees one side; in others the surface is whole."""
+    blank_share: float = 0.1
+    """Stage 0: share of steps in which nothing is seen."""
+    shapes: int = 1024
+    """Stage 0: shapes of an iteration, half made and half deformed objects."""
+    hands: int = 1024
+    """Stage 0: random postures of the hand; 0.15 GB."""
+    updates: int = 50
+    """Stage 0: optimiser steps of an iteration."""
+    validation: tuple[str, ...] = ()
+    """Stage 0: object sets to measure on, names or folders, that are not learned from."""
+    validate_every: int = 20
+    """Stage 0: iterations from one measurement to the next."""
 
     def validate(self) -> None:
-        """Refuse settings that cannot train.
+        """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
+        require(self, "--clouds.", "positive", "points shapes hands updates validate_every")
+        require(self, "--clouds.", "zero or positive", "noise_m")
+        require(self, "--clouds.", "in [0, 1]", "scan_share seen_share blank_share")
 
-        Raises:
-            ValueError: The flag, its value and what it has to be.
-        """
-        require(self, "--looks.", "positive", "steps kept")
-        require(self, "--looks.", "in [0, 1]", "share")
+
+@dataclass
+class SimulatedCfg:
+    """Stages 1 and 2: what the student does in simulation, labelled by the teacher (DAgger)."""
+
+    epochs: int = 1
+    """Passes over what was done in an iteration."""
+    blank_probability: float = 0.02
+    """Stage 2: chance in a step that the camera goes blank for a while."""
+    blank_steps: int = 8
+    """Stage 2: longest such while [control steps]."""
+    latency_s: tuple[float, float] = (LATENCY_S[0], OBSERVATION_LATENCY_S)
+    """Stage 2: range of the images' age [s], from a D415's to that of *mixed*."""
+
+    def validate(self) -> None:
+        """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
+        require(self, "--simulated.", "positive", "epochs blank_steps")
+        require(self, "--simulated.", "in [0, 1]", "blank_probability")
 
 
 @dataclass
@@ -115,7 +115,7 @@ class StudentTaskCfg:
     objects: tuple[str, ...] = ()
     """Object sets: names or folders of object USDs; the teacher's by default."""
     num_envs: int = 2048
-    """Environments simulated side by side, in stage 1."""
+    """Environments simulated side by side, in stages 1 and 2."""
     seed: int = 0
     """Seed of every random draw."""
 
@@ -127,15 +127,15 @@ class StudentTrainCfg:
     preset: PresetName = "gpu"
     """Settings to start from; every other flag overrides one of them. By default gpu, and cpu-demo
     where there is none."""
-    stage: Stage = 0
-    """0: learn to turn a goal's cloud onto a seen one, without simulation; 1: also from what a
-    depth camera sees while the teacher acts by the network of --init."""
+    stage: Stage = MADE
+    """0: learn where objects are, from clouds that are made; 1: learn to act from a teacher, on
+    complete clouds in simulation; 2: the same by a depth camera."""
     teacher: str | None = None
-    """Policy that acts, also the source of hand and task: a policy.safetensors, a run's folder, or the name
-    of an installed one; dclaw4 by default."""
+    """Policy that labels, also the source of hand and task: a policy.safetensors, a run's folder, or
+    the name of an installed one; dclaw4 by default."""
     init: Path | None = None
-    """Network to begin from, the alignment.pt of a run or an installed vision policy. Of stage 1 by
-    default that of runs/student/stage0, or the one that is installed for the hand."""
+    """Student to begin from: a policy.safetensors or a run's folder. By default that of the stage
+    before in runs/student, if it is there."""
     smoke: bool = False
     """Check the installation: the stage, tiny, on the CPU, for at most a minute. It learns nothing,
     and keeps nothing unless --out is given."""
@@ -146,37 +146,35 @@ class StudentTrainCfg:
     """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m]
     and quaternion xyzw; the hand's own camera by default."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
-    align: AlignCfg = field(default_factory=AlignCfg)
-    looks: LooksCfg = field(default_factory=LooksCfg)
+    student: StudentCfg = field(default_factory=StudentCfg)
+    learn: LearnCfg = field(default_factory=LearnCfg)
+    clouds: CloudsCfg = field(default_factory=CloudsCfg)
+    simulated: SimulatedCfg = field(default_factory=SimulatedCfg)
     task: StudentTaskCfg = field(default_factory=StudentTaskCfg)
 
     def validate(self) -> None:
-        """Refuse settings that cannot train.
-
-        Raises:
-            ValueError: The flag, its value and what it has to be.
-        """
+        """Refuse settings that cannot train, naming the flag, its value and what it has to be."""
         self.run.validate()
-        self.align.validate()
-        self.looks.validate()
+        self.student.validate()
+        self.learn.validate()
+        self.clouds.validate()
+        self.simulated.validate()
         require(self.task, "--", "positive", "num_envs")
-        if self.stage == SIMULATED and self.align.points > SEEN_POINTS:
-            raise ValueError(
-                f"--align.points is {self.align.points}; policies look at {SEEN_POINTS}, at most"
-            )
 
 
 def gpu(stage: Stage) -> StudentTrainCfg:
-    """One GPU or several, half precision."""
-    run = RunCfg(out=RUNS / f"stage{stage}", save_every=20, max_steps=1_000_000_000)
-    cfg = StudentTrainCfg(preset="gpu", stage=stage, run=run, align=AlignCfg(precision="bf16"))
-    if stage == SIMULATED:  # it begins from a network that sees already
-        return replace(cfg, align=replace(cfg.align, learning_rate=2e-4))
-    return cfg
+    """One GPU or several, half precision; sizes for 140 GB, not measured."""
+    return StudentTrainCfg(
+        preset="gpu",
+        stage=stage,
+        run=RunCfg(out=RUNS / f"stage{stage}", save_every=20, max_steps=1_000_000_000),
+        learn=LearnCfg(precision="bf16", window=8 if stage == MADE else 16),
+        task=StudentTaskCfg(num_envs=1024 if stage == RENDERED else 2048),
+    )
 
 
 def cpu_demo(stage: Stage) -> StudentTrainCfg:
-    """Two CPU cores and minutes: a cube, small batches, few shapes."""
+    """Two CPU cores and minutes: a cube, a small network, few environments."""
     return StudentTrainCfg(
         preset="cpu-demo",
         stage=stage,
@@ -186,19 +184,19 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
             device="cpu",
             save_every=5,
             max_minutes=7.0,
-            max_steps=16_000,
+            max_steps=50_000,
         ),
-        align=AlignCfg(
-            batch=64,
-            steps=5,
-            shapes=256,
-            fresh_shapes=8,
-            hands=32,
-            points=256,
-            validate_every=10,
-            views=4,
+        student=StudentCfg(
+            channels=(16, 32, 64),
+            blocks=1,
+            embedding=64,
+            senses=64,
+            memory=64,
+            head=64,
+            voxel_m=0.008,
         ),
-        looks=LooksCfg(kept=2000),
+        learn=LearnCfg(window=8, batch=8, learning_rate=1e-3, warmup_steps=20),
+        clouds=CloudsCfg(shapes=64, hands=32, updates=10, validate_every=10),
         task=StudentTaskCfg(num_envs=16),
     )
 
@@ -206,21 +204,15 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
 def smoke(stage: Stage) -> StudentTrainCfg:
     """All parts of a stage in at most a minute; it learns nothing."""
     cfg = cpu_demo(stage)
-    run = replace(cfg.run, out=SMOKE_RUN, max_steps=32, max_minutes=1.0, logger="none")
-    network = AlignmentCfg(width=32, layers=1, tokens=32, patch=16)  # of --init another
-    align = replace(
-        cfg.align,
-        batch=8,
-        steps=2,
-        shapes=16,
-        fresh_shapes=2,
-        hands=4,
-        views=1,
-        network=network,
+    return replace(
+        cfg,
+        smoke=True,
+        run=replace(cfg.run, out=SMOKE_RUN, max_steps=32, max_minutes=1.0, logger="none"),
+        student=replace(cfg.student, channels=(8, 16), voxel_m=0.01),
+        learn=replace(cfg.learn, window=2, batch=4),
+        clouds=replace(cfg.clouds, shapes=4, hands=4, updates=2),
+        task=replace(cfg.task, num_envs=4),
     )
-    looks = replace(cfg.looks, steps=2)
-    task = replace(cfg.task, num_envs=4)
-    return replace(cfg, smoke=True, run=run, align=align, looks=looks, task=task)
 
 
 PRESETS: dict[str, Callable[[Stage], StudentTrainCfg]] = {"gpu": gpu, "cpu-demo": cpu_demo}

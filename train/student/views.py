@@ -18,6 +18,7 @@ from torch.nn.functional import normalize
 
 from vd.assets_usd.hand_data import HandModel, compose, invert
 from vd.evaluate.scanned import MISSING, NOISE_M
+from vd.geometry.arrays import as_warp
 from vd.geometry.clouds import HandCloud
 from vd.train.student.shapes import drawn, random_matrices, uniform
 from vd.vision.rotations import matrices, rotations_about, two_columns
@@ -119,8 +120,10 @@ class Hands:
         self._near = torch.zeros(
             (count, int(np.prod(self._voxels)) + 1), dtype=torch.bool, device=place
         )
+        self.joints = random_joints(hand, count, device)
+        """Joint positions of the postures [rad] [M, D]."""
         for rows in torch.arange(count, device=place).split(POSTURES_AT_ONCE):
-            points = posture_points(hand, len(rows), device)
+            points = posture_points(hand, self.joints[rows])
             cell, depth = self.project(points)
             self._depth[rows] = nearest(cell, depth, self.cells)
             voxel = self._voxel(points)
@@ -174,17 +177,21 @@ class Hands:
         return torch.where(inside, (at[..., 0] * y + at[..., 1]) * z + at[..., 2], x * y * z)
 
 
-def posture_points(hand: HandModel, count: int, device: str) -> torch.Tensor:
-    """The hand's own points at random joint positions within their limits, base frame [m] [count, P, 3]."""
-    links = np.arange(len(hand.link_names))
+def random_joints(hand: HandModel, count: int, device: str) -> torch.Tensor:
+    """Random joint positions within their limits [rad] [count, D]."""
     place = wp.device_to_torch(device)
-    lower, upper = torch.tensor(
-        np.stack([hand.lower, hand.upper]), dtype=torch.float32, device=place
-    )
-    joints = lower + (upper - lower) * torch.rand((count, len(lower)), device=place)
-    poses = wp.empty((count, len(links)), dtype=wp.transform, device=device)
+    lower = torch.tensor(hand.lower, dtype=torch.float32, device=place)
+    upper = torch.tensor(hand.upper, dtype=torch.float32, device=place)
+    return lower + (upper - lower) * torch.rand((count, len(lower)), device=place)
+
+
+def posture_points(hand: HandModel, joints: torch.Tensor) -> torch.Tensor:
+    """The hand's own points at joint positions [rad] [M, D], base frame [m] [M, H, 3]."""
+    links = np.arange(len(hand.link_names))
+    device = str(as_warp(joints).device)
+    poses = wp.empty((len(joints), len(links)), dtype=wp.transform, device=device)
     cloud = HandCloud(hand, link_body=links, device=device)
-    cloud.pose(wp.from_torch(joints), poses)
+    cloud.pose(as_warp(joints), poses)
     return wp.to_torch(cloud(poses))
 
 

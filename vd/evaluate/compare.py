@@ -181,10 +181,12 @@ def actor_of(
     if not sees_clouds(policy):
         return policy, Agent(name, "teacher", "state", StoppingRule)
     from vd.command.workers import one_thread_without_gpu
-    from vd.evaluate.tracking import TrackingActor
 
     one_thread_without_gpu(env.device)
-    eyes = TrackingActor(env, policy, goals=goals, sensor_errors=sensor_errors, seed=seed)
+    settings: dict[str, Any] = {"goals": goals, "sensor_errors": sensor_errors, "seed": seed}
+    from vd.evaluate.tracking import CameraActor
+
+    eyes = CameraActor(env, policy, **settings)
     return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for)
 
 

@@ -1,4 +1,4 @@
-"""A tracking or vision policy at work in an environment."""
+"""Policies that see by a camera at work in an environment."""
 
 from typing import Any
 
@@ -6,34 +6,76 @@ import numpy as np
 import torch
 import warp as wp
 
+from vd.assets_usd.hand_data import CameraModel
 from vd.evaluate.goals import Goals
 from vd.evaluate.scanned import known_objects
 from vd.policy.senses import Senses
 from vd.sensors.depth_camera import DepthCamera
 from vd.tracking.policy import TrackingPolicy
 from vd.tracking.tracker import Tracker
+from vd.vision.acting import ActingStudent, StudentPolicy
+
+AnyCameraPolicy = TrackingPolicy | StudentPolicy
 
 
 def sensed(env: Any, camera: DepthCamera) -> Senses:
     """What the hands of an environment sense now; later steps change all of it but the points."""
     fresh = wp.to_torch(env.step_count) == 0
-    joints = env.num_joints
     camera.reset(wp.from_torch(fresh.int()))  # a late image must not show what was before a reset
     camera.capture()
     # Without a pixel in the crop the cloud is one false point at the origin: it counts for nothing.
     unseen = (wp.to_torch(camera.count) == 0)[:, None, None]
+    return sensed_with(env, wp.to_torch(camera.points).masked_fill(unseen, torch.nan))
+
+
+def sensed_with(env: Any, points: torch.Tensor) -> Senses:
+    """What the hands of an environment sense now, with these points for those of a camera."""
+    joints = env.num_joints
     return Senses(
         joint_q=wp.to_torch(env.measured_q)[:, :joints],
         joint_qd=wp.to_torch(env.measured_qd)[:, :joints],
         action=wp.to_torch(env.smoothed),
         goal_quat=wp.to_torch(env.goal_quat),
-        points=wp.to_torch(camera.points).masked_fill(unseen, torch.nan),
-        fresh=fresh,
+        points=points,
+        fresh=wp.to_torch(env.step_count) == 0,
     )
 
 
-class TrackingActor:
-    """A tracking or vision policy in every environment of an environment.
+def acting_in(
+    env: Any, policy: AnyCameraPolicy, camera: CameraModel, *, goals: Goals, seed: int
+) -> Tracker | ActingStudent:
+    """A camera policy on the hands of an environment; arguments as of :class:`CameraActor`."""
+    objects = known_objects(
+        env.objects, goals, seed=seed, device=env.device, surfaces=policy.kind == "tracking"
+    )
+    scene = env.scene
+    if isinstance(policy, StudentPolicy):
+        clouds = np.stack([item.surface_points for item in objects])[scene.world_object]
+        scaled = clouds * np.asarray(scene.world_scale)[:, None, None]
+        place = str(wp.device_to_torch(env.device))
+        policy.network.half = place.startswith("cuda")
+        goal_clouds = torch.tensor(scaled, dtype=torch.float32, device=place)
+        return ActingStudent(policy.network, env.hand, goal_clouds)
+    return Tracker(
+        policy,
+        env.hand,
+        objects,
+        camera,
+        world_object=scene.world_object,
+        world_scale=scene.world_scale,
+        device=env.device,
+    )
+
+
+class CameraActor:
+    """A policy that sees by a camera in every environment of an environment.
+
+    Args:
+        env: The environment.
+        policy: The policy.
+        goals: What it knows of shapes and goals.
+        sensor_errors: See with the errors of a real camera.
+        seed: Of these, and of scans.
 
     Attributes:
         num_actions: D.
@@ -47,37 +89,29 @@ class TrackingActor:
     def __init__(
         self,
         env: Any,
-        policy: TrackingPolicy,
+        policy: AnyCameraPolicy,
         *,
         goals: Goals = "mesh",
         sensor_errors: bool = False,
         seed: int = 0,
     ):
-        """Open its eyes in every environment, with ``sensor_errors`` those of a real camera."""
-        self._env = env
         self.hand = env.hand
         self.num_actions = policy.num_actions
+        self._env = env
         self._surfaces = [item.surface_points for item in env.objects]
-        env.acts_in_frame = False  # a camera policy acts in the world, whatever its teacher does
-        scene = env.scene
+        # Who sees by a camera acts in the world, whatever its teacher does.
+        env.acts_in_frame = False
         camera = env.hand.camera.at(policy.spec.camera)
         depth = policy.spec.depth
-        if sensor_errors:
-            depth = depth.with_errors()
         self.camera = DepthCamera.of_scene(
-            scene, env.sim.body_q, depth, camera, frame_s=env.cfg.sim.control_dt, seed=seed
-        )
-        self.tracker = Tracker(
-            policy,
-            env.hand,
-            known_objects(
-                env.objects, goals, seed=seed, device=env.device, surfaces=policy.alignment is None
-            ),
+            env.scene,
+            env.sim.body_q,
+            depth.with_errors() if sensor_errors else depth,
             camera,
-            world_object=scene.world_object,
-            world_scale=scene.world_scale,
-            device=env.device,
+            frame_s=env.cfg.sim.control_dt,
+            seed=seed,
         )
+        self.tracker = acting_in(env, policy, camera, goals=goals, seed=seed)
         place = wp.device_to_torch(env.device)
         self.predicted = torch.zeros(env.num_envs, device=place)
         self.active = torch.ones(env.num_envs, dtype=torch.bool, device=place)

@@ -47,3 +47,11 @@ def rotated(quat: Array, vector: Array) -> Array:
     axis = quat[..., :3]
     twice = 2.0 * cross(axis, vector)
     return vector + quat[..., 3:] * twice + cross(axis, twice)
+
+
+def poses_in(frame: Array, poses: Array) -> Array:
+    """Poses [N, 7], position and quaternion, as seen from a frame [7]; both given in one."""
+    xp = library_of(frame)
+    back = xp.broadcast_to(xp.concatenate([-frame[3:6], frame[6:]]), (len(poses), 4))
+    position = rotated(back, poses[:, :3] - frame[:3])
+    return xp.concatenate([position, product(back, poses[:, 3:])], axis=1)

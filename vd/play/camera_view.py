@@ -19,7 +19,7 @@ def camera_view(actor: Any, world: int) -> np.ndarray:
     """The depth image about the hand, near is bright, with surface points and axes of the believed pose.
 
     Args:
-        actor: A :class:`vd.evaluate.tracking.TrackingActor` that has acted.
+        actor: A :class:`vd.evaluate.tracking.CameraActor` that has acted.
         world: Environment.
 
     Returns:
@@ -30,11 +30,9 @@ def camera_view(actor: Any, world: int) -> np.ndarray:
     model = camera.camera
     shade = np.where(depth > 0.0, 235.0 - 180.0 * _share(depth), 20.0)
     picture = Image.fromarray(np.repeat(shade.astype(np.uint8)[..., None], 3, axis=2))
-    pose = actor.tracker.observer.finder.pose[world, 0].cpu().numpy().astype(float)
-    turn = Rotation.from_quat(pose[3:])
-    draw = ImageDraw.Draw(picture)
-    surface = pose[:3] + turn.apply(actor.surface(world))
-    for u, v, ahead in model.project(surface):
+    pose = actor.tracker.pose[world].cpu().numpy().astype(float)
+    turn, draw = Rotation.from_quat(pose[3:]), ImageDraw.Draw(picture)
+    for u, v, ahead in model.project(pose[:3] + turn.apply(actor.surface(world))):
         if ahead > 0.0:
             draw.ellipse((u - 1, v - 1, u + 1, v + 1), fill=SURFACE_COLOR)
     ends = pose[:3] + AXIS_M * turn.as_matrix().T

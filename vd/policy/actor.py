@@ -14,12 +14,13 @@ from torch import nn
 from vd.command.config import from_dict
 from vd.command.versions import installed_versions
 from vd.envs.cfg import ReorientCfg
+from vd.policy import SUFFIX
 from vd.policy.contract import Contract, Contracted, PolicySpec
 
 CHECKPOINT_FORMAT = "visual-dexterity checkpoint 1"
 _STAGE = ("difficulty", "tightness", "tightening")
 """What says how far the curriculum has come, in the state of an environment."""
-_PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
+PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
 """Those of which a policy notes the versions."""
 _WEIGHTS = "_state_dict"
 """How the names of what holds weights end."""
@@ -182,13 +183,13 @@ def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedP
     A critic that is still warming up is worth nothing, and left out.
 
     Raises:
-        ValueError: It is a student's, no checkpoint, or of another version.
+        ValueError: It is not a teacher's, no checkpoint, or of another version.
     """
-    if "student_state_dict" in state:
+    if "student_state_dict" in state or "alignment_state_dict" in state:
         raise ValueError(
-            f"{path} is a student or its checkpoint, which does not act by itself; vd-train "
-            f"tracker TEACHER --alignment alignment.pt makes a policy of a student that vd-train "
-            "student trained"
+            f"{path} is of vd-train student or alignment, and does not act by itself; give the "
+            f"student's policy{SUFFIX}, or make a policy: vd-train tracker TEACHER --alignment "
+            "alignment.pt"
         )
     critic = {} if state.get("critic_warmup", 0) else state.get("critic_state_dict", {})
     try:
@@ -200,7 +201,7 @@ def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedP
             env_steps=int(state["env_steps"]),
             learner=state["learner"],
             stage=stage_of(state),
-            software=installed_versions(_PACKAGES),
+            software=installed_versions(PACKAGES),
         )
         from_dict(ReorientCfg, contract.task, where="task")
         return TrainedPolicy(contract, state["actor_state_dict"], critic, device)

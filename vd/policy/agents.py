@@ -19,7 +19,7 @@ from vd.policy import ONNX_SUFFIX, SUFFIX, has_suffix
 
 if TYPE_CHECKING:
     from vd.policy.actor import TrainedPolicy
-    from vd.tracking.policy import TrackingPolicy
+    from vd.policy.bundle import AnyPolicy
 
 BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
@@ -151,7 +151,7 @@ def policy_name(name: str | Path) -> str:
     return str(name)
 
 
-def open_policy(name: str | Path, device: str) -> "TrainedPolicy | TrackingPolicy | None":
+def open_policy(name: str | Path, device: str) -> "AnyPolicy | None":
     """Load what :func:`find_policy` finds.
 
     None for a built-in agent, which has to know its task first.

@@ -20,7 +20,9 @@ from vd.policy.contract import (
     sealed,
 )
 from vd.tracking.policy import TrackingPolicy
+from vd.vision.acting import StudentPolicy
 from vd.vision.saved import alignment_network
+from vd.vision.student import Belief, Student, StudentInput
 
 STATES = 8
 """Golden observations of a teacher, or pairs of clouds."""
@@ -34,7 +36,7 @@ TOLERANCE = 5e-3
 """Largest difference of an output from the golden one. Actions are of size 1; processors, GPUs and
 other versions of torch differ by 1e-6 to 1e-3."""
 
-AnyPolicy = TrainedPolicy | TrackingPolicy
+AnyPolicy = TrainedPolicy | TrackingPolicy | StudentPolicy
 Tensors = dict[str, torch.Tensor]
 
 
@@ -53,10 +55,7 @@ def write_policy(policy: AnyPolicy, path: Path, contract: Contract | None = None
     from safetensors.torch import save
 
     check_suffix(path, SUFFIX)
-    teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
-    parts = {"actor": teacher.weights, "critic": teacher.critic}
-    if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
-        parts["alignment"] = policy.alignment.state_dict()
+    parts = _weights(policy)
     golden = _golden_inputs(policy)
     parts["golden"] = golden | _answers(policy, golden)
     tensors = {}
@@ -115,11 +114,28 @@ def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
     return policy
 
 
+def _weights(policy: AnyPolicy) -> dict[str, Tensors]:
+    """The weights of each part of a policy."""
+    if isinstance(policy, StudentPolicy):
+        return {"student": policy.network.state_dict()}
+    if isinstance(policy, TrainedPolicy):
+        return {"actor": policy.weights, "critic": policy.critic}
+    parts = {"actor": policy.teacher.weights, "critic": policy.teacher.critic}
+    if policy.alignment is not None:
+        parts["alignment"] = policy.alignment.state_dict()
+    return parts
+
+
 def _policy_of(contract: Contract, tensors: Tensors, device: str) -> AnyPolicy:
     """The policy of a contract with weights."""
     on_device = {name: value.to(device) for name, value in tensors.items()}
-    actor = _part(on_device, "actor.")
-    teacher = TrainedPolicy(contract, actor, _part(on_device, "critic."), device)
+    if contract.student is not None:
+        network = Student(contract.student.network, contract.network.num_actions).to(device)
+        network.load_state_dict(_part(on_device, "student."))
+        return StudentPolicy(network.eval().requires_grad_(False), contract)
+    teacher = TrainedPolicy(
+        contract, _part(on_device, "actor."), _part(on_device, "critic."), device
+    )
     if contract.tracking is None:
         return teacher
     alignment = None
@@ -133,10 +149,17 @@ def _golden_inputs(policy: AnyPolicy) -> Tensors:
     """Inputs to which the outputs are known.
 
     Of a teacher's layers ``observation`` [S, O] of size 1. Of a network of alignment
-    ``goal_points`` and ``seen_points`` [S, G, 3] about their means [m].
+    ``goal_points`` and ``seen_points`` [S, G, 3] about their means [m]. Of a student three clouds
+    and ``proprioception`` [S, 3 D].
     """
     rng = np.random.default_rng(0)
-    drawn = {"observation": rng.normal(size=(STATES, policy.num_observations))}
+    drawn: dict[str, np.ndarray] = {}
+    if isinstance(policy, StudentPolicy):
+        for name in ("camera", "hand", "goal"):
+            drawn[name] = rng.normal(scale=GOLDEN_M, size=(STATES, GOLDEN_POINTS, 3))
+        drawn["proprioception"] = rng.normal(size=(STATES, 3 * policy.num_actions))
+    else:
+        drawn["observation"] = rng.normal(size=(STATES, policy.num_observations))
     if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
         shape = (STATES, GOLDEN_POINTS, 3)
         for name in ("goal_points", "seen_points"):
@@ -147,8 +170,10 @@ def _golden_inputs(policy: AnyPolicy) -> Tensors:
 def _answers(policy: AnyPolicy, golden: Tensors) -> Tensors:
     """What a policy makes of golden inputs on its device: ``action`` [S, D].
 
-    Of a network of alignment ``rotation``, matrices [S, 3, 3].
+    Of a network of alignment and a student also ``rotation``, matrices [S, 3, 3].
     """
+    if isinstance(policy, StudentPolicy):
+        return _student_answers(policy.network, golden)
     teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
     answers = {"action": teacher.act(golden["observation"]).cpu()}
     if isinstance(policy, TrackingPolicy) and policy.alignment is not None:
@@ -156,6 +181,24 @@ def _answers(policy: AnyPolicy, golden: Tensors) -> Tensors:
             turn = policy.alignment(golden["goal_points"], golden["seen_points"]).rotation
         answers["rotation"] = turn.cpu()
     return answers
+
+
+def _student_answers(network: Student, golden: Tensors) -> Tensors:
+    """What a student makes of clouds of objects that are believed to be turned as wanted."""
+    device = next(network.parameters()).device
+    given = {name: value.to(device) for name, value in golden.items()}
+    rotation = torch.eye(3, device=device).repeat(STATES, 1, 1)
+    sight = StudentInput(
+        camera=given["camera"],
+        hand=given["hand"],
+        goal=given["goal"],
+        goal_rotation=rotation,
+        proprioception=given["proprioception"],
+        belief=Belief(rotation, torch.zeros((STATES, 3), device=device)),
+    )
+    with torch.no_grad():
+        output = network.act(sight, network.first_hidden(STATES))
+    return {"action": output.mean.cpu(), "rotation": output.belief.rotation.cpu()}
 
 
 def _part(tensors: Tensors, prefix: str) -> Tensors:

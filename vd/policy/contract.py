@@ -20,7 +20,7 @@ from vd.kernels.task.shapes import shape_observation_size
 from vd.paper import PAPER
 from vd.policy.stopping import StoppingRules
 from vd.sensors.cfg import DepthCameraCfg
-from vd.vision.cfg import AlignmentCfg
+from vd.vision.cfg import AlignmentCfg, StudentCfg
 
 POLICY_FORMAT = "visual-dexterity policy 1"
 CONTRACT_KEY = "contract"
@@ -41,7 +41,7 @@ CONVENTIONS = {
     "optical_frame": "x right, y down, z forward",
 }
 """How numbers are to be read."""
-Kind = Literal["teacher", "tracking", "vision"]
+Kind = Literal["teacher", "tracking", "vision", "student"]
 
 
 class ContractError(ValueError):
@@ -66,21 +66,35 @@ class PolicySpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackingSpec(StoppingRules):
-    """What a policy that sees by camera is besides its teacher."""
+class CameraSpec(StoppingRules):
+    """How a policy sees by a camera, and when it stops."""
 
     teacher: str = ""
-    """Name of that teacher."""
+    """Name of its teacher."""
     camera: tuple[float, ...] | None = None
     """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the
     hand's.
     """
     depth: DepthCameraCfg = field(default_factory=DepthCameraCfg)
     """Points and crop of the camera's clouds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackingSpec(CameraSpec):
+    """How a teacher is let act by a camera."""
+
     alignment: AlignmentCfg | None = None
     """Sizes of the network that finds the object by the cloud of its goal; None: it is found by its
     shape.
     """
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudentSpec(CameraSpec):
+    """What a student is besides its weights."""
+
+    network: StudentCfg
+    """Its sizes."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +104,15 @@ class Contract:
     interface: dict[str, Any]
     """As :func:`derive_interface` gave it for the hand of the training."""
     network: PolicySpec
-    """What rebuilds the actor."""
+    """What rebuilds the actor; of a student the number of actions alone counts."""
     task: dict[str, Any]
     """Configuration of the environment of its training."""
     iterations: int
     env_steps: int
     tracking: TrackingSpec | None = None
-    """How the actor is let act on what a camera shows; None for a teacher."""
+    """How the actor is let act on what a camera shows; None for teachers and students."""
+    student: StudentSpec | None = None
+    """What the student is; None for others."""
     learner: dict[str, Any] = field(default_factory=dict)
     """Configuration of the learner, with which a run may go on; empty where it is not known."""
     stage: dict[str, Any] = field(default_factory=dict)
@@ -108,9 +124,16 @@ class Contract:
     @property
     def kind(self) -> Kind:
         """What a policy of this contract is called."""
+        if self.student is not None:
+            return "student"
         if self.tracking is None:
             return "teacher"
         return "tracking" if self.tracking.alignment is None else "vision"
+
+    @property
+    def camera(self) -> CameraSpec | None:
+        """How it sees; None for a teacher."""
+        return self.student or self.tracking
 
 
 class Contracted:
@@ -194,10 +217,11 @@ def installed_contract(path: Path) -> Contract:
 def without_folders(contract: Contract) -> Contract:
     """A contract for others: without folders of the machine on which the policy was trained."""
     objects = [Path(name).name for name in contract.task.get("objects", ())]
-    tracking = contract.tracking
-    if tracking is not None:
-        tracking = replace(tracking, teacher=Path(tracking.teacher).name)
-    return replace(contract, task=contract.task | {"objects": objects}, tracking=tracking)
+    changes: dict[str, Any] = {"task": contract.task | {"objects": objects}}
+    if contract.camera is not None:
+        part = "tracking" if contract.student is None else "student"
+        changes[part] = replace(contract.camera, teacher=Path(contract.camera.teacher).name)
+    return replace(contract, **changes)
 
 
 def sealed(data: bytes) -> bytes:
@@ -229,14 +253,14 @@ def read_sealed(path: Path) -> bytes:
 
 
 def derive_interface(
-    task: ReorientCfg, hand: HandModel, tracking: TrackingSpec | None = None
+    task: ReorientCfg, hand: HandModel, camera: CameraSpec | None = None
 ) -> dict[str, Any]:
     """What a policy and a hand have to agree on, as JSON has it, by part.
 
     Args:
         task: The environment of the policy's training.
         hand: The hand without a layer, whose servo model was identified later.
-        tracking: How the policy sees; None for a teacher.
+        camera: How the policy sees; None for a teacher.
     """
     parts = {
         "conventions": CONVENTIONS,
@@ -250,7 +274,7 @@ def derive_interface(
             "clip": (-1.0, 1.0),
         },
         "observation": _observation(hand, task),
-        "camera": None if tracking is None else _camera(hand, tracking),
+        "camera": None if camera is None else _camera(hand, camera),
     }
     interface: dict[str, Any] = to_dict(parts)
     return interface
@@ -292,16 +316,15 @@ def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
     }
 
 
-def _camera(hand: HandModel, tracking: TrackingSpec) -> dict[str, Any]:
+def _camera(hand: HandModel, spec: CameraSpec) -> dict[str, Any]:
     """The depth camera: the one of the hand's USD, or one that the training placed elsewhere."""
-    camera = hand.camera.at(tracking.camera)
-    depth = tracking.depth
+    camera = hand.camera.at(spec.camera)
     return {
-        "source": "hand" if tracking.camera is None else "policy",
+        "source": "hand" if spec.camera is None else "policy",
         **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         "pose_in_base": _floats([*camera.position, *camera.quaternion]),
-        "points": depth.points,  # of a cloud at most
-        "crop_m": depth.crop_m,  # world heights that are kept
+        "points": spec.depth.points,  # of a cloud at most
+        "crop_m": spec.depth.crop_m,  # world heights that are kept
     }
 
 
@@ -332,7 +355,7 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
             to do.
     """
     task = from_dict(ReorientCfg, contract.task, where="contract.task")
-    have = dict(leaves(derive_interface(task, hand, contract.tracking)))
+    have = dict(leaves(derive_interface(task, hand, contract.camera)))
     want = dict(leaves(contract.interface))
     for name in dict.fromkeys((*want, *have)):
         here = have.get(name)

@@ -1,4 +1,4 @@
-"""What a policy that sees by a camera is told before an action, by a simulator or a robot's drivers."""
+"""What a policy that sees by a camera is told before an action, and what it says."""
 
 from dataclasses import dataclass
 
@@ -21,3 +21,19 @@ class Senses:
     """What the camera sees, base frame [m], NaN for none [N, K, 3]."""
     fresh: Array
     """Where an episode begins: where the object was before means nothing; bool [N]."""
+
+
+@dataclass(frozen=True)
+class CameraDecision:
+    """What a policy that sees by a camera says of N hands."""
+
+    action: Array
+    """Mean actions [N, D]."""
+    angle: Array
+    """How far the object is expected to be from its goal [rad] [N]: it is stopped by this."""
+    position: Array
+    """Where the object is believed to be, world frame [m] [N, 3]."""
+    orientation: Array
+    """How it is believed to be turned, world frame [N, 4]."""
+    voxels: Array
+    """How much is seen of it: voxels of the camera's points that are not the hand's [N]."""

@@ -1,7 +1,6 @@
 """A tracking policy at work, in a simulator or on a robot."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,21 +11,9 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
 from vd.geometry.arrays import Array, library_of
 from vd.geometry.frame_maps import FrameMaps
-from vd.policy.senses import Senses
+from vd.policy.senses import CameraDecision, Senses
 from vd.tracking.camera_observer import CameraObserver
 from vd.tracking.policy import TrackingPolicy
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What a tracking policy says of N hands."""
-
-    action: Array
-    """Mean actions [N, D]."""
-    angle: Array
-    """How far the object is expected to be from what looks like its goal [rad] [N]: it is stopped
-    by this.
-    """
 
 
 class Tracker:
@@ -78,14 +65,23 @@ class Tracker:
         if seen.view != "world":
             self._maps = FrameMaps(hand, seen, array)
 
-    def step(self, senses: Senses) -> Decision:
+    @property
+    def pose(self) -> Array:
+        """Where the objects' frames are believed to be, base frame [N, 7]."""
+        return self.observer.finder.pose[:, 0]
+
+    def step(self, senses: Senses) -> CameraDecision:
         """One control step: see, find, observe, choose a symmetry frame, act."""
         observation, angle = self.observer(senses)
         if self._maps is None:
-            return Decision(self._teacher(self._guessed(observation)), angle)
-        frame = self._maps.choose(observation)  # in whose sector the goal is believed to lie
-        action = self._teacher(self._guessed(self._maps.take(observation, frame)))
-        return Decision(self._maps.world_action(action, frame), angle)
+            action = self._teacher(self._guessed(observation))
+        else:
+            frame = self._maps.choose(observation)  # in whose sector the goal is believed to lie
+            action = self._teacher(self._guessed(self._maps.take(observation, frame)))
+            action = self._maps.world_action(action, frame)
+        found = self.observer.found
+        assert found is not None
+        return CameraDecision(action, angle, found.position, found.orientation, found.voxels)
 
     def _guessed(self, seen: Array) -> Array:
         """Observations as a frame shows them [N, O], with the teacher's mean for what no camera shows."""

@@ -10,7 +10,7 @@ from vd.vision.alignment import AlignmentNetwork
 from vd.vision.cfg import AlignmentCfg
 
 ALIGNMENT_FORMAT = "visual-dexterity alignment 1"
-REMEDY = "give an alignment.pt of vd-train student"
+REMEDY = "give an alignment.pt of vd-train alignment"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class AlignmentSpec:
 
 def alignment_export(state: dict[str, Any]) -> dict[str, Any]:
     """The part of a checkpoint that :func:`load_alignment` needs."""
-    weights = {name: value.detach().cpu() for name, value in state["student_state_dict"].items()}
+    weights = {name: value.detach().cpu() for name, value in state["alignment_state_dict"].items()}
     kept = {key: state[key] for key in ("spec", "iter", "env_steps")}
     return {"format": ALIGNMENT_FORMAT, **kept, "alignment_state_dict": weights}
 

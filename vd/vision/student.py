@@ -8,7 +8,7 @@ better one. A GRU carries over steps what one look does not show.
 
 The voxels of a step depend on the belief that the step before left. So a sequence can only be
 encoded at once if its beliefs are those of the rollout: training stores them beside the rest of a
-:class:`Sight`, as data through which no gradient flows, and teaches the residual from each stored
+:class:`StudentInput`, as data through which no gradient flows, and teaches the residual from each stored
 belief to the truth.
 
 N environments, T steps, D joints and actions, E the embedding, G the memory. Base frame of the
@@ -30,7 +30,7 @@ from vd.geometry.clouds import HandCloud
 from vd.paper import PAPER
 from vd.policy.senses import Senses
 from vd.vision.cfg import StudentCfg
-from vd.vision.rotations import first_columns, matrices, two_columns
+from vd.vision.rotations import first_columns, matrices, quaternions, two_columns
 from vd.vision.sparse import ResidualBlock, SparseTensor, StridedConv, global_pool, voxelise
 
 KINDS = 3
@@ -42,7 +42,7 @@ LOG_STD = (-4.0, 0.0)
 UNTURNED = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 """The identity as two columns: what a network that predicts zeros turns by."""
 
-Step = TypeVar("Step", "Sight", "Belief")
+Step = TypeVar("Step", "StudentInput", "Belief")
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Belief:
 
 
 @dataclass(frozen=True)
-class Sight:
+class StudentInput:
     """What a student reads of a step; leading axes [N] or [T, N]."""
 
     camera: torch.Tensor
@@ -85,6 +85,8 @@ class StudentOutput:
     """The better belief; detached it is the next step's."""
     log_distance: torch.Tensor
     """Logarithm of the angle to the goal [rad] [..]."""
+    voxels: torch.Tensor
+    """How many voxels hold points of the camera and none of the hand [..]."""
     hidden: torch.Tensor
     """Memory after the last step [N, G]."""
 
@@ -106,7 +108,7 @@ def carried(
     return points @ rotation.transpose(-1, -2) + position
 
 
-class SightBuilder:
+class InputBuilder:
     """Makes what a student reads of what N hands sense.
 
     Args:
@@ -117,7 +119,7 @@ class SightBuilder:
     def __init__(self, hand: HandModel, goals: torch.Tensor):
         device = goals.device
         links = np.arange(len(hand.link_names))
-        self._goals = goals - goals.mean(dim=1, keepdim=True)
+        self.set_goals(goals)
         self._cloud = HandCloud(hand, link_body=links, device=str(device))
         self._links = len(links)
 
@@ -129,9 +131,18 @@ class SightBuilder:
         self._lower = constant(hand.lower)
         self._range = constant(hand.upper - hand.lower)
 
+    def set_goals(self, goals: torch.Tensor) -> None:
+        """Take other clouds."""
+        self._middle = goals.mean(dim=1)
+        self._goals = goals - self._middle[:, None]
+
     def goal_rotation(self, goal_quat: torch.Tensor) -> torch.Tensor:
         """Wanted rotations in the base frame [R, 3, 3], of quaternions in the world's [R, 4]."""
         return self._to_base @ matrices(two_columns(goal_quat))
+
+    def goal_quat(self, rotation: torch.Tensor) -> torch.Tensor:
+        """The inverse of :meth:`goal_rotation`."""
+        return quaternions(self._to_base.T @ rotation)
 
     def first_belief(self, goal_quat: torch.Tensor) -> Belief:
         """What is believed of an object before it is seen.
@@ -140,7 +151,20 @@ class SightBuilder:
         """
         return Belief(self.goal_rotation(goal_quat), self._place.repeat(len(goal_quat), 1))
 
-    def __call__(self, senses: Senses, belief: Belief, rows: torch.Tensor | None = None) -> Sight:
+    def belief_of(self, pose: torch.Tensor, rows: torch.Tensor | None = None) -> Belief:
+        """What is to be believed of objects at poses in the base frame [R, 7]; ``rows`` as below."""
+        middle = self._middle if rows is None else self._middle[rows]
+        rotation = matrices(two_columns(pose[:, 3:]))
+        return Belief(rotation, pose[:, :3] + carried(middle[:, None], rotation)[:, 0])
+
+    def pose_of(self, belief: Belief) -> torch.Tensor:
+        """Where the frames of the objects of all environments are believed to be [N, 7]."""
+        middle = carried(self._middle[:, None], belief.rotation)[:, 0]
+        return torch.cat([belief.position - middle, quaternions(belief.rotation)], dim=1)
+
+    def __call__(
+        self, senses: Senses, belief: Belief, rows: torch.Tensor | None = None
+    ) -> StudentInput:
         """What is read of R steps.
 
         Args:
@@ -155,7 +179,7 @@ class SightBuilder:
         self._cloud.pose(as_warp(joint_q), links)
         position = 2.0 * (joint_q - self._lower) / self._range - 1.0
         velocity = PAPER.observation.velocity_scale * senses.joint_qd
-        return Sight(
+        return StudentInput(
             camera=senses.points,
             hand=wp.to_torch(self._cloud(links)),
             goal=self._goals if rows is None else self._goals[rows],
@@ -205,6 +229,7 @@ class Student(nn.Module):
         super().__init__()
         cfg.validate()
         self.cfg = cfg
+        self.num_actions = num_actions
         self.half = False
         widths = (4 * KINDS + 3, *cfg.channels)
         self.stages = nn.Sequential(
@@ -232,8 +257,11 @@ class Student(nn.Module):
         """The memory where an episode begins: zeros [N, G]."""
         return self.mean.weight.new_zeros((envs, self.cfg.memory))
 
-    def encode(self, sight: Sight) -> torch.Tensor:
-        """What one look shows [.., E]. Waits for the device."""
+    def encode(self, sight: StudentInput) -> tuple[torch.Tensor, torch.Tensor]:
+        """What one look shows [.., E], and voxels of the camera's points beside the hand's [..].
+
+        Waits for the device.
+        """
         lead = sight.camera.shape[:-2]
         place = sight.belief.position[..., None, :]
         laid = carried(sight.goal, sight.belief.rotation)
@@ -247,10 +275,13 @@ class Student(nn.Module):
         with torch.autocast(features.device.type, torch.bfloat16, enabled=self.half):
             cells = self.stages(SparseTensor(features, voxels.sites))
         pooled = global_pool(cells).to(place.dtype)
-        return self.project(pooled).unflatten(0, lead)
+        camera, hand = voxels.features[:, 0], voxels.features[:, 4]
+        beside = camera * (1.0 - hand)
+        count = torch.segment_reduce(beside, "sum", lengths=voxels.sites.lengths, unsafe=True)
+        return self.project(pooled).unflatten(0, lead), count.unflatten(0, lead)
 
     def forward(
-        self, sight: Sight, hidden: torch.Tensor, done: torch.Tensor | None = None
+        self, sight: StudentInput, hidden: torch.Tensor, done: torch.Tensor | None = None
     ) -> StudentOutput:
         """Read a sequence.
 
@@ -261,7 +292,8 @@ class Student(nn.Module):
         """
         belief = sight.belief
         known = [sight.proprioception, self._believed(belief, sight.goal_rotation)]
-        inputs = torch.cat([self.encode(sight), self.senses(torch.cat(known, dim=-1))], dim=-1)
+        look, voxels = self.encode(sight)
+        inputs = torch.cat([look, self.senses(torch.cat(known, dim=-1))], dim=-1)
         remembered, hidden = self._remember(inputs, hidden, done)
         turn, shift = self.residual(remembered).split([len(UNTURNED), 3], dim=-1)
         turned = matrices(self.unturned + turn) @ belief.rotation
@@ -277,10 +309,11 @@ class Student(nn.Module):
             log_std=low + (high - low) * torch.sigmoid(self.log_std(features)),
             belief=better,
             log_distance=self.log_distance(features).squeeze(-1),
+            voxels=voxels,
             hidden=hidden,
         )
 
-    def act(self, sight: Sight, hidden: torch.Tensor) -> StudentOutput:
+    def act(self, sight: StudentInput, hidden: torch.Tensor) -> StudentOutput:
         """One step of N hands: what :meth:`forward` says of it, leading axis [N]."""
         output = self(each(sight, lambda value: value[None]), hidden)
         return StudentOutput(
@@ -288,6 +321,7 @@ class Student(nn.Module):
             log_std=output.log_std[0],
             belief=each(output.belief, lambda value: value[0]),
             log_distance=output.log_distance[0],
+            voxels=output.voxels[0],
             hidden=output.hidden,
         )
 

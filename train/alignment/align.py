@@ -13,35 +13,30 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import trimesh
 from torch import nn
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.command.config import to_dict
 from vd.paper import PAPER
-from vd.train.checkpoint import load_checkpoint, save_checkpoint
+from vd.train.alignment.config import ALIGNMENT_NAME, AlignCfg
+from vd.train.alignment.looks import SimulatedLooks
+from vd.train.checkpoint import save_checkpoint
 from vd.train.config import RunCfg
-from vd.train.loop import TrainingLoop, check_update
-from vd.train.student.config import ALIGNMENT_NAME, AlignCfg
-from vd.train.student.looks import SimulatedLooks
-from vd.train.student.shapes import made_shapes, mesh_shapes
+from vd.train.loop import check_update
+from vd.train.student.bank import ShapeBank, centred, mesh_points
+from vd.train.student.shapes import made_shapes
 from vd.train.student.views import Hands, Pairs, draw_pairs, joined
+from vd.train.supervised import SupervisedLoop
 from vd.vision.alignment import Aligner, AlignmentNetwork, Residual
-from vd.vision.rotations import turn_angle
+from vd.vision.rotations import chord, turn_angle
 from vd.vision.saved import AlignmentSpec, alignment_export
 
 MESH_POINTS = 6000
 """Points kept of a mesh: of them each deformed copy draws its own."""
 CLOUDS = 5
 """Points of a shape, in clouds: one is the goal's, of the others the camera sees a part."""
-SHAPES_AT_ONCE = 128
-"""Shapes made at a time: their bodies' points take 0.5 GB."""
 OFFSET_WEIGHT = 10.0
 """Of the offset [1/m]: a centimetre counts as 0.1 rad, which moves the surface by about as much."""
-GRAD_NORM = 1.0
-"""Gradient norm is clipped to this."""
-LEAST_RATE = 0.02
-"""Of the learning rate, at the end of the run."""
 WITHIN_RAD = (PAPER.success.rotation_rad, PAPER.success.precise_rad)
 """Errors within which the paper counts a goal as reached."""
 SAME_SURFACE_M = 0.004
@@ -51,56 +46,6 @@ UNSEEN_SHAPES = 64
 """Made shapes that are never trained on."""
 LOWER_RATES = "lower --align.learning-rate, or take --align.precision fp32"
 """Remedy for a network that diverges."""
-
-
-def mesh_points(objects: Sequence[ObjectModel], count: int, device: torch.device) -> torch.Tensor:
-    """Points [m] and normals of objects' surfaces, even in area [O, count, 6]."""
-    rows = []
-    for item in objects:
-        mesh = trimesh.Trimesh(item.vertices, item.faces, process=False)
-        points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
-        both = [torch.as_tensor(x, dtype=torch.float32) for x in (points, mesh.face_normals[faces])]
-        rows.append(torch.cat(both, dim=1))
-    return torch.stack(rows).to(device)
-
-
-def centred(shapes: torch.Tensor) -> torch.Tensor:
-    """Shapes [O, P, 6] about the means of their points."""
-    mean = shapes[..., :3].mean(dim=1, keepdim=True)
-    return torch.cat([shapes[..., :3] - mean, shapes[..., 3:]], dim=-1)
-
-
-class ShapeBank:
-    """Shapes in memory, half of them made, half of them meshes deformed.
-
-    Some are replaced every so often.
-
-    Args:
-        meshes: Points and normals of objects [O, P', 6].
-        count: K.
-        points: P, points of each.
-    """
-
-    def __init__(self, meshes: torch.Tensor, count: int, points: int) -> None:
-        self._meshes, self._oldest = meshes, 0
-        self._shapes = torch.empty((count, points, 6), dtype=torch.half, device=meshes.device)
-        self.renew(count)
-
-    def renew(self, count: int) -> None:
-        """Replace the oldest ``count`` shapes."""
-        size, points = self._shapes.shape[:2]
-        while count > 0:
-            some = min(SHAPES_AT_ONCE, count)
-            half = (some + 1) // 2
-            made = made_shapes(half, points, self._meshes.device)
-            shapes = torch.cat([made, mesh_shapes(self._meshes, some - half, points)])
-            rows = (self._oldest + torch.arange(some, device=shapes.device)) % size
-            self._shapes[rows] = shapes.half()
-            self._oldest, count = (self._oldest + some) % size, count - some
-
-    def draw(self, count: int) -> torch.Tensor:
-        """Points [m] and normals of shapes drawn at random [count, P, 6]."""
-        return self._shapes[torch.randint(len(self._shapes), (count,), device=self._shapes.device)]
 
 
 @dataclass(frozen=True)
@@ -135,22 +80,17 @@ def make_scenes(
 
 
 def alignment_losses(found: Residual, pairs: Pairs) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-    """Losses by name, means over the batch, and the angles by which rotations are wrong [rad] [B].
-
-    The chord between rotations is robust: of goals that look alike it chooses one, and gives no
-    mean of them.
-    """
+    """Losses by name, means over the batch, and the angles by which rotations are wrong [rad] [B]."""
     wrong = found.rotation.detach().transpose(-1, -2) @ pairs.rotation
     error = turn_angle(wrong)
-    chord = ((found.rotation - pairs.rotation).square().sum((-1, -2)) + 1e-6).sqrt()
     losses = {
-        "rotation": chord.mean(),
+        "rotation": chord(found.rotation, pairs.rotation).mean(),
         "offset": OFFSET_WEIGHT * (found.offset - pairs.offset).norm(dim=-1).mean(),
     }
     return losses, error
 
 
-class AlignTrainer(TrainingLoop):
+class AlignTrainer(SupervisedLoop):
     """Trains the network of alignment.
 
     A run that goes on has its weights, optimiser and random state; its shapes, episodes and looks
@@ -167,6 +107,9 @@ class AlignTrainer(TrainingLoop):
         device: Torch device.
     """
 
+    kind = "alignment"
+    network: AlignmentNetwork
+
     def __init__(
         self,
         scenes: Scenes,
@@ -179,46 +122,27 @@ class AlignTrainer(TrainingLoop):
         looks: SimulatedLooks | None = None,
         device: str,
     ) -> None:
-        super().__init__(run, device=device)
-        self.scenes, self.cfg, self.network, self.looks = scenes, cfg, network, looks
-        self.spec, self.task = spec, task
-        self.optimizer = torch.optim.AdamW(network.parameters())
+        super().__init__(
+            network,
+            run,
+            learning_rate=cfg.learning_rate,
+            warmup_steps=cfg.warmup_steps,
+            task=task,
+            device=device,
+        )
+        self.scenes = scenes
+        self.cfg = cfg
+        self.looks = looks
+        self.spec = spec
         self._compare: nn.Module | Any = network
         if cfg.compile:  # for each size on its own: that of all, and that of the searched ones
             self._compare = torch.compile(network, dynamic=False)
         self._half = torch.autocast(
             torch.device(self.device).type, torch.bfloat16, enabled=cfg.precision == "bf16"
         )
-        self._steps_done = 0
-
-    def load(self, path: Path) -> None:
-        """Go on from a checkpoint.
-
-        Args:
-            path: The checkpoint.
-
-        Raises:
-            ValueError: The file is damaged, or of another network.
-        """
-        state = load_checkpoint(path, self.device, network="student")
-        try:
-            self.network.load_state_dict(state["student_state_dict"])
-            self.optimizer.load_state_dict(state["learner"]["optimizer"])
-            self._steps_done = state["learner"]["steps"]
-            self._restore(state)
-        except (RuntimeError, ValueError, KeyError) as error:
-            raise ValueError(
-                f"{path} does not fit this run's network; resume with the configuration it was "
-                f"trained with (its run folder's config.json), or start anew ({error})"
-            ) from error
 
     def _samples(self) -> int:
         return self.cfg.batch * self.cfg.steps
-
-    def _begin(self) -> None:
-        if self.is_distributed:
-            for value in self.network.state_dict().values():
-                torch.distributed.broadcast(value, 0)
 
     def _iterate(self) -> dict[str, Any] | None:
         cfg, seen = self.cfg, dict[str, float]()
@@ -281,58 +205,9 @@ class AlignTrainer(TrainingLoop):
         with self._half:
             found = self._compare(pairs.goal, pairs.seen, near)
         losses, error = alignment_losses(found, pairs)
-        warm = min(1.0, (self._steps_done + 1) / max(1, self.cfg.warmup_steps))
-        rate = (
-            self.cfg.learning_rate * warm * max(LEAST_RATE, 0.5 * (1.0 + math.cos(math.pi * done)))
-        )
-        norm = self._descend(torch.stack(tuple(losses.values())).sum(), rate)
+        norm = self._descend(torch.stack(tuple(losses.values())).sum(), done)
         logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
-        return logged | {"loss/grad_norm": norm, "student/rotation_error": error.median()}
-
-    def _descend(self, loss: torch.Tensor, rate: float) -> torch.Tensor:
-        """One optimiser step on the gradient of ``loss``, averaged over processes and clipped.
-
-        Returns:
-            Norm of the gradient before clipping, a scalar on the device.
-        """
-        self._steps_done += 1
-        self.optimizer.param_groups[0]["lr"] = rate
-        self.optimizer.zero_grad()
-        loss.backward()
-        parameters = list(self.network.parameters())
-        if self.is_distributed:
-            # Every process has to take part with every weight, also one whose loss does not reach
-            # it.
-            gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-            flat = nn.utils.parameters_to_vector(gradients)
-            torch.distributed.all_reduce(flat)
-            nn.utils.vector_to_parameters(flat / self.world_size, gradients)
-        norm = nn.utils.clip_grad_norm_(parameters, GRAD_NORM)
-        self.optimizer.step()
-        return norm.detach()
-
-    def _read(self, figures: dict[str, torch.Tensor]) -> dict[str, float]:
-        """Scalars, averaged over the processes; waits for the device."""
-        values = torch.stack(tuple(figures.values()))
-        if self.is_distributed:
-            torch.distributed.all_reduce(values)
-            values /= self.world_size
-        return dict(zip(figures, values.tolist(), strict=True))
-
-    def _done(self) -> float:
-        """Share of the run that is done, by clouds or by time, whichever is more.
-
-        All processes agree.
-        """
-        share = self.env_steps / max(1, self.run.max_steps)
-        if self.run.max_minutes is not None:
-            length = 60.0 * self.run.max_minutes
-            share = max(share, 1.0 - self._time_left(length) / length)
-        if self.is_distributed:
-            agreed = torch.tensor(share, device=self.device)
-            torch.distributed.all_reduce(agreed, op=torch.distributed.ReduceOp.MAX)
-            share = float(agreed)
-        return min(1.0, share)
+        return logged | {"loss/grad_norm": norm, "alignment/rotation_error": error.median()}
 
     @torch.no_grad()
     def measure(self) -> dict[str, torch.Tensor]:
@@ -374,12 +249,7 @@ class AlignTrainer(TrainingLoop):
         return error, offset, surface
 
     def _shared_state(self) -> dict[str, Any]:
-        return {
-            "student_state_dict": self.network.state_dict(),
-            "learner": {"optimizer": self.optimizer.state_dict(), "steps": self._steps_done},
-            "spec": to_dict(self.spec),
-            "task": self.task,
-        }
+        return super()._shared_state() | {"spec": to_dict(self.spec)}
 
     def _close(self) -> None:
         if self.looks is not None:

@@ -11,10 +11,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from vd.evaluate.tracking import TrackingActor
-from vd.geometry.quaternions import product, rotated, rotation_distance
+from vd.evaluate.tracking import CameraActor
+from vd.geometry.quaternions import poses_in, rotation_distance
 from vd.tracking.policy import TrackingPolicy
-from vd.train.student.config import LooksCfg
+from vd.tracking.tracker import Tracker
+from vd.train.alignment.config import LooksCfg
 from vd.train.student.views import Pairs, with_goals
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 from vd.vision.cfg import SEEN_POINTS
@@ -46,9 +47,7 @@ class SimulatedLooks:
     ):
         self.cfg, self._env, self._surfaces = cfg, env, surfaces
         simulation, place = env.env, surfaces.device
-        self._actor = TrackingActor(
-            simulation, policy, goals="points", sensor_errors=True, seed=seed
-        )
+        self._actor = CameraActor(simulation, policy, goals="points", sensor_errors=True, seed=seed)
         self._pose = wp.to_torch(simulation.sim.body_q)[:, simulation.scene.object_body]
         self._base = torch.tensor(simulation.hand.mount, dtype=torch.float32, device=place)
         self._object = torch.tensor(np.asarray(simulation.scene.world_object), device=place)
@@ -61,14 +60,17 @@ class SimulatedLooks:
     @torch.no_grad()
     def collect(self, stopping: Callable[[], bool]) -> dict[str, torch.Tensor] | None:
         """Some steps of every environment; figures of these, or ``None`` if they were cut short."""
-        finder, logs, errors = self._actor.tracker.observer.finder, [], []
+        logs = []
+        errors = []
+        assert isinstance(self._actor.tracker, Tracker)
+        finder = self._actor.tracker.observer.finder
         assert isinstance(finder, GoalFinder)  # the policy has a network
         observation = self._env.get_observations()[OBSERVATION_GROUP]
         for _ in range(self.cfg.steps):
             if stopping():
                 return None
             action = self._actor.act(observation)
-            pose = self._poses_in_base()
+            pose = poses_in(self._base, self._pose)
             rows = finder.seen_now.nonzero().flatten()
             self._keep(finder.seen[rows], pose[rows], rows)
             errors.append(rotation_distance(finder.pose[rows, 0, 3:], pose[rows, 3:]))
@@ -104,11 +106,3 @@ class SimulatedLooks:
         self._seen[place], self._poses[place], self._envs[place] = seen.half(), pose, envs
         self._full |= self._next + len(envs) >= len(self._seen)
         self._next = (self._next + len(envs)) % len(self._seen)
-
-    def _poses_in_base(self) -> torch.Tensor:
-        """True poses of the objects in the base frame [N, 7]."""
-        back = torch.cat([-self._base[3:6], self._base[6:]]).expand(len(self._pose), 4)
-        return torch.cat(
-            [rotated(back, self._pose[:, :3] - self._base[:3]), product(back, self._pose[:, 3:])],
-            dim=1,
-        )

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from vd.policy import SUFFIX, has_suffix
-from vd.train.student.config import ALIGNMENT_NAME, PRESETS
+from vd.train.alignment.config import ALIGNMENT_NAME, PRESETS
 from vd.vision.alignment import AlignmentNetwork
 from vd.vision.cfg import AlignmentCfg
 from vd.vision.saved import load_alignment
@@ -15,7 +15,7 @@ def open_network(
     """A network of alignment, its sizes, and the camera of its training (None: the hand's).
 
     Args:
-        name: An ``alignment.pt`` of vd-train student, or a vision policy, by its name or file.
+        name: An ``alignment.pt`` of vd-train alignment, or a vision policy, by its name or file.
         device: Torch device.
 
     Raises:

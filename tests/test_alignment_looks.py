@@ -18,11 +18,11 @@ from vd.policy.agents import SHIPPED_POLICIES, find_policy
 from vd.policy.bundle import read_policy, write_policy
 from vd.policy.contract import TrackingSpec
 from vd.tracking.policy import TrackingPolicy
+from vd.train.alignment.config import LooksCfg
+from vd.train.alignment.looks import SimulatedLooks
 from vd.train.cli import main
 from vd.train.metrics import read_progress
-from vd.train.student.align import mesh_points
-from vd.train.student.config import LooksCfg
-from vd.train.student.looks import SimulatedLooks
+from vd.train.student.bank import mesh_points
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.alignment import AlignmentNetwork
 from vd.vision.saved import load_alignment
@@ -91,11 +91,13 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     common = ["--preset", "cpu-demo", "--num-envs", "2", "--logger", "none", "--teacher", "dclaw3"]
     common += ["--objects", "cube", *small]
     folders = [tmp_path / f"stage{number}" for number in (0, 1)]
-    assert main(["student", *common, *network, "--out", str(folders[0]), "--max-steps", "32"]) == 0
+    assert (
+        main(["alignment", *common, *network, "--out", str(folders[0]), "--max-steps", "32"]) == 0
+    )
     init = ["--stage", "1", "--init", str(folders[0] / "alignment.pt"), "--looks.steps", "2"]
-    assert main(["student", *common, *init, "--out", str(folders[1]), "--max-steps", "32"]) == 0
+    assert main(["alignment", *common, *init, "--out", str(folders[1]), "--max-steps", "32"]) == 0
     assert "begins with the weights of" in capsys.readouterr().out
-    assert main(["student", "--out", str(folders[1]), "--resume", "--max-steps", "48"]) == 0
+    assert main(["alignment", "--out", str(folders[1]), "--resume", "--max-steps", "48"]) == 0
     assert "resumed after iteration 2 of 3" in capsys.readouterr().out
     rows = read_progress(folders[1] / "progress.jsonl")
     assert [row["iteration"] for row in rows] == [1, 2, 3]

@@ -1,0 +1,234 @@
+"""The student's training: what stages learn, that runs go on, and the policy that they leave at work."""
+
+import dataclasses
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from vd.assets_usd.hands import load_hand
+from vd.deploy.loop.policy_runner import CameraRunner, Sensed
+from vd.envs.cfg import ReorientCfg
+from vd.envs.reorient import ReorientEnv
+from vd.evaluate.compare import actor_of
+from vd.evaluate.trace import advance
+from vd.policy.bundle import read_policy, write_policy
+from vd.train.checkpoint import list_checkpoints
+from vd.train.student.build import build_student
+from vd.train.student.config import StudentTrainCfg, smoke
+from vd.train.student.sequences import student_losses
+from vd.vision.acting import StudentPolicy
+from vd.vision.cfg import StudentCfg
+from vd.vision.rotations import turn_angle
+from vd.vision.student import Belief, carried
+
+TINY = StudentCfg(
+    channels=(8, 16), blocks=1, embedding=32, senses=16, memory=32, head=32, voxel_m=0.01
+)
+
+
+def settings(stage: int, out: Path, **learn) -> StudentTrainCfg:
+    """A stage with a cube that is small enough to learn in seconds."""
+    cfg = smoke(stage)
+    learn = {"window": 3, "batch": 4, "learning_rate": 3e-3, "warmup_steps": 0} | learn
+    return replace(
+        cfg,
+        smoke=False,
+        teacher="dclaw3",
+        student=TINY,
+        run=replace(cfg.run, out=out, max_steps=10**6, save_every=10**6, max_minutes=None),
+        learn=replace(cfg.learn, **learn),
+        clouds=replace(cfg.clouds, points=200),
+        task=replace(cfg.task, objects=("cuboid",), num_envs=4),
+    )
+
+
+def trainer_of(cfg: StudentTrainCfg):
+    return build_student(cfg, say=lambda _: None)
+
+
+def weights(trainer) -> torch.Tensor:
+    return torch.nn.utils.parameters_to_vector(trainer.network.parameters()).detach().clone()
+
+
+@pytest.mark.parametrize("stage", [0, 1, 2])
+def test_every_stage_learns_what_it_is_shown(stage, tmp_path):
+    """The same few sequences again and again: their losses fall."""
+    trainer = trainer_of(settings(stage, tmp_path))
+    sequences = next(iter(trainer.source.minibatches(trainer.acting, lambda: False)))
+    first = {}
+    for _ in range(25):
+        figures = trainer._step(sequences, 0.0)
+        first = first or figures
+    names = {"loss/rotation", "loss/position", "loss/distance", "loss/action"}
+    assert names - {"loss/action"} <= figures.keys()
+    assert ("loss/action" in figures) == (stage > 0)
+    for name in names & figures.keys():
+        assert figures[name] < first[name], name
+    assert figures["loss/rotation"] < 0.8 * first["loss/rotation"]
+    trainer._close()
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_what_is_made_again_is_what_was_done(stage, tmp_path):
+    """In evaluation mode and without noise, a minibatch says what the rollout said."""
+    cfg = settings(stage, tmp_path)
+    cfg = replace(cfg, clouds=replace(cfg.clouds, noise_m=0.0))
+    cfg = replace(cfg, simulated=replace(cfg.simulated, blank_probability=0.3))
+    trainer = trainer_of(cfg)
+    source = trainer.source
+    acting = trainer.acting
+    trainer.network.eval()
+    if stage == 1:  # the same points of each surface in both
+        source._shapes = source._shapes[:, :200]
+    said = []
+    decide = acting.decide
+    acting.decide = lambda sight: said.append(decide(sight)) or said[-1]
+    env = source.env
+    env.episode_length_buf = torch.full((4,), env.max_episode_length - 2)  # ends inside
+    before = acting.hidden
+    hidden = source.collect(acting, lambda: False)
+    assert hidden is before
+    rows = torch.tensor([2, 0])
+    sequences = source.taken(acting, hidden, rows)
+    assert sequences.done.any()
+    with torch.no_grad():
+        output = trainer.network(sequences.sight, sequences.hidden, sequences.done)
+    for step, once in enumerate(said):
+        torch.testing.assert_close(output.mean[step], once.mean[rows], atol=1e-4, rtol=1e-3)
+        turn = once.belief.rotation[rows]
+        torch.testing.assert_close(output.belief.rotation[step], turn, atol=1e-4, rtol=1e-3)
+    if stage == 2:
+        assert source.blank.any() or torch.isnan(sequences.sight.camera).all(-1).all(-1).any()
+    trainer._close()
+
+
+def test_truth_is_where_the_objects_points_are(tmp_path):
+    trainer = trainer_of(settings(1, tmp_path))
+    sequences = next(iter(trainer.source.minibatches(trainer.acting, lambda: False)))
+    sight = sequences.sight
+    apart = []
+    for belief in (sequences.truth, sight.belief):
+        laid = carried(sight.goal, belief.rotation, belief.position[..., None, :])
+        apart.append(torch.cdist(laid, sight.camera).amin(dim=-1).median())
+    assert apart[0] < 0.008  # two clouds of 200 points of one surface
+    assert apart[1] > 1.5 * apart[0]
+    assert float(sequences.label.abs().max()) <= 1.0
+    trainer._close()
+
+
+def test_losses_are_least_at_the_truth(tmp_path):
+    trainer = trainer_of(settings(0, tmp_path))
+    sequences = next(iter(trainer.source.minibatches(trainer.acting, lambda: False)))
+    output = trainer.network(sequences.sight, sequences.hidden, sequences.done)
+    truth = sequences.truth
+    turn = truth.rotation.transpose(-1, -2) @ sequences.sight.goal_rotation
+    distance = turn_angle(turn).clamp(min=0.02).log()
+    label = torch.full_like(output.mean, 0.3)
+    right = replace(output, belief=truth, log_distance=distance, mean=label)
+    labelled = replace(sequences, label=label)
+    losses = student_losses(right, labelled, trainer.cfg.learn)
+    assert float(losses["rotation"]) < 2e-3
+    assert float(losses["position"]) == float(losses["distance"]) == 0.0
+    # The best deviation is the error that there is.
+    off = replace(right, mean=label + 0.1)
+    for std, least in ((0.05, False), (0.1, True), (0.2, False)):
+        at = replace(off, log_std=torch.full_like(label, float(np.log(std))))
+        loss = student_losses(at, labelled, trainer.cfg.learn)["action"]
+        assert (float(loss) < np.log(0.1) + 0.51) == least
+
+
+@pytest.mark.parametrize("stage", [0, 1, 2])
+def test_a_run_that_goes_on_is_the_run_that_was_not_stopped(stage, tmp_path):
+    whole = trainer_of(settings(stage, tmp_path / "whole"))
+    whole.learn(3)
+    whole._close()
+    part = trainer_of(settings(stage, tmp_path / "part"))
+    part.learn(2)
+    part._close()
+    checkpoint = list_checkpoints(tmp_path / "part")[-1]
+    again = trainer_of(replace(settings(stage, tmp_path / "part"), resume=str(checkpoint)))
+    assert again.iteration == 2
+    again.learn(1)
+    again._close()
+    if stage == 0:
+        torch.testing.assert_close(weights(again), weights(whole), atol=0.0, rtol=0.0)
+    else:
+        torch.testing.assert_close(weights(again), weights(whole), atol=1e-5, rtol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory) -> Path:
+    """A student that was trained for a moment."""
+    folder = tmp_path_factory.mktemp("student")
+    trainer = trainer_of(settings(1, folder))
+    trainer.learn(1)
+    trainer._close()
+    return folder / "policy.safetensors"
+
+
+def test_a_run_leaves_a_policy_that_is_the_network(policy):
+    student = read_policy(policy)
+    assert isinstance(student, StudentPolicy)
+    assert (student.kind, student.hand, student.num_actions) == ("student", "dclaw3", 9)
+    assert student.contract.env_steps == 12
+    with torch.no_grad():
+        student.network.mean.bias += 0.1
+    write_policy(student, policy.with_name("other.safetensors"))
+    other = read_policy(policy.with_name("other.safetensors"))
+    torch.testing.assert_close(other.network.mean.bias, student.network.mean.bias)
+
+
+def environment(policy) -> ReorientEnv:
+    task = replace(ReorientCfg.of(policy), num_envs=2, objects=("cuboid",))
+    return ReorientEnv(task, "cpu")
+
+
+def test_an_actor_forgets_where_episodes_begin_and_blind_weights_do_nothing(policy):
+    student = read_policy(policy)
+    env = environment(student)
+    actor, agent = actor_of(str(policy), student, env, goals="points", sensor_errors=True)
+    assert (agent.kind, agent.sees) == ("student", "rendered clouds")
+    for _ in range(2):
+        advance(env, actor.act(torch.empty(0)))
+    acting = actor.tracker
+    assert acting.hidden.any(dim=1).all()
+    assert torch.isfinite(actor.predicted).all()
+    env.reset()
+    actor.act(torch.empty(0))
+    hidden = acting.hidden.clone()
+    env.reset()
+    acting.belief = Belief(acting.belief.rotation, acting.belief.position + 1.0)
+    actor.act(torch.empty(0))
+    assert acting.belief.position.abs().max() < 0.5
+    assert hidden.any(dim=1).all()
+    actor.active[1] = False
+    for weight in student.network.parameters():
+        weight.zero_()
+    assert not actor.act(torch.empty(0)).any()
+    env.close()
+
+
+def test_a_runner_on_a_robot_does_as_the_actor_in_simulation(policy):
+    student = read_policy(policy)
+    env = environment(student)
+    actor, _ = actor_of(str(policy), student, env, goals="points")
+    runner = CameraRunner(student, load_hand("dclaw3"), env.objects[0])
+    assert runner.kind == "student" and not runner.calibrated
+    action = actor.act(torch.empty(0))
+    sensed = Sensed(
+        joint_q=env.measured_q.numpy()[0, :9],
+        joint_qd=env.measured_qd.numpy()[0, :9],
+        smoothed=env.smoothed.numpy()[0],
+        goal_quat=env.goal_quat.numpy()[0],
+        depth=actor.camera.depth.numpy()[0],
+    )
+    decision = runner.decide(sensed)
+    np.testing.assert_allclose(decision.action, action[0].numpy(), atol=0.02)
+    assert decision.distance == pytest.approx(float(actor.predicted[0]), rel=0.05)
+    assert decision.voxels > 20 and decision.found.shape == (7,)
+    blank = runner.decide(dataclasses.replace(sensed, depth=np.zeros_like(sensed.depth)))
+    assert blank.voxels == 0 and np.isfinite(blank.action).all()
+    env.close()

@@ -1,0 +1,191 @@
+"""Stage 0: shapes without end in hands that hold still, without simulation.
+
+Beliefs begin wrong, by any angle and some centimetres. What the student makes of them is what it
+believes in the next step, as at work. T steps, B sequences, P points.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import torch
+
+from vd.assets_usd.objects.model import ObjectModel
+from vd.policy.senses import Senses
+from vd.train.student.bank import ShapeBank, centred, mesh_points
+from vd.train.student.config import StudentTrainCfg
+from vd.train.student.sequences import Sequences, at_step, belief_errors, inputs_of
+from vd.train.student.shapes import random_matrices, uniform
+from vd.train.student.views import Hands, camera_points, goal_points
+from vd.vision.acting import ActingStudent
+from vd.vision.rotations import matrices, rotations_about, two_columns
+from vd.vision.student import Belief, carried
+
+CLOUDS = 4
+"""Points of a shape, in clouds: one is the goal's, of the others is seen what is to be seen."""
+MESH_POINTS = 6000
+"""Points kept of a mesh: of them each deformed copy draws its own."""
+SHIFT_M = 0.04
+"""First beliefs are off by up to this along each axis [m]."""
+TURN_RAD, MOVE_M = 0.25, 0.003
+"""Largest turn of an object in a step, as of teachers, and standard deviation of its motion."""
+
+
+def turned(rotation: torch.Tensor, most: float) -> torch.Tensor:
+    """Rotations [B, 3, 3] turned about any axis by angles that are uniform up to ``most`` [rad]."""
+    count = len(rotation)
+    axis = torch.randn((count, 3), device=rotation.device)
+    angle = most * torch.rand(count, device=rotation.device)
+    return matrices(two_columns(rotations_about(axis, angle))) @ rotation
+
+
+class MadeSequences:
+    """Draws sequences of shapes. Each iteration has new ones, so that a run that goes on is exact.
+
+    Args:
+        objects: Objects to learn from, deformed.
+        held_out: Objects to measure on, as they are; may be none.
+        hands: What hides shapes.
+        cfg: Settings.
+    """
+
+    env = None
+
+    def __init__(
+        self,
+        objects: Sequence[ObjectModel],
+        held_out: Sequence[ObjectModel],
+        hands: Hands,
+        cfg: StudentTrainCfg,
+    ):
+        self._hands = hands
+        self._learn = cfg.learn
+        self._clouds = cfg.clouds
+        self.samples = cfg.clouds.updates * cfg.learn.batch * cfg.learn.window
+        points = CLOUDS * cfg.clouds.points
+        device = hands.eye.device
+        meshes = centred(mesh_points(objects, max(MESH_POINTS, points), device))
+        self._bank = ShapeBank(meshes, cfg.clouds.shapes, points)
+        self._held_out = None
+        if held_out:
+            self._held_out = centred(mesh_points(held_out, points, device))
+
+    def minibatches(
+        self, acting: ActingStudent, stopping: Callable[[], bool]
+    ) -> Iterator[Sequences]:
+        """Sequences of new shapes."""
+        self._bank.renew(self._clouds.shapes)
+        for _ in range(self._clouds.updates):
+            if stopping():
+                return
+            yield self.draw(acting, self._bank.draw(self._learn.batch))
+
+    @torch.no_grad()
+    def draw(self, acting: ActingStudent, shapes: torch.Tensor) -> Sequences:
+        """Sequences of shapes, points [m] and normals [B, P, 6], with the student's own beliefs."""
+        steps = self._learn.window
+        count = len(shapes)
+        device = shapes.device
+        order = torch.randperm(shapes.shape[1], device=device)
+        shapes = shapes[:, order].float()
+        goal = goal_points(shapes[..., :3], self._clouds.points, self._clouds.scan_share)
+        acting.build.set_goals(goal)
+        place = self._motion(count)
+        begin = carried(shapes[..., :3], place.rotation[0], place.position[0, :, None])
+        posture = self._hands.holding(begin)
+        points = self._seen(shapes[:, self._clouds.points :], place, posture)
+        middle = carried(goal.mean(dim=1, keepdim=True), place.rotation)[..., 0, :]
+        truth = Belief(place.rotation, place.position + middle)
+
+        wanted = turned(truth.rotation[0], math.pi)
+        # At work the object is first believed to be turned as it is wanted.
+        as_wanted = torch.rand((count, 1, 1), device=device) < 0.5
+        acting.belief = Belief(
+            rotation=torch.where(as_wanted, wanted, turned(truth.rotation[0], math.pi)),
+            position=truth.position[0] + uniform(-SHIFT_M, SHIFT_M, count, 3, device=device),
+        )
+        acting.hidden = acting.network.first_hidden(count)
+        hidden = acting.hidden
+        joint_q = self._hands.joints[posture].expand(steps, -1, -1)
+        motors = steps, count, acting.network.num_actions
+        senses = Senses(
+            joint_q=joint_q,
+            joint_qd=torch.randn_like(joint_q),
+            action=uniform(-1.0, 1.0, *motors, device=device),
+            goal_quat=acting.build.goal_quat(wanted).expand(steps, -1, -1),
+            points=points,
+            fresh=torch.zeros((steps, count), dtype=torch.bool, device=device),
+        )
+        rotations = []
+        positions = []
+        for step in range(steps):
+            rotations.append(acting.belief.rotation)
+            positions.append(acting.belief.position)
+            acting.decide(acting.look(at_step(senses, step)))
+        belief = Belief(torch.stack(rotations), torch.stack(positions))
+        rows = torch.arange(count, device=device)
+        sight = inputs_of(acting.build, senses, belief, rows)
+        return Sequences(sight, truth, hidden, done=senses.fresh)
+
+    def figures(self) -> dict[str, Any]:
+        """None but those of the losses."""
+        return {}
+
+    @torch.no_grad()
+    def measure(self, acting: ActingStudent) -> dict[str, torch.Tensor]:
+        """Errors after a sequence of objects that are not learned from."""
+        if self._held_out is None:
+            return {}
+        shapes = self._held_out
+        sequences = self.draw(acting, shapes.repeat(1 + self._learn.batch // len(shapes), 1, 1))
+        last = Belief(sequences.truth.rotation[-1], sequences.truth.position[-1])
+        turn, shift = belief_errors(acting.belief, last)
+        return {
+            "validation/rotation_error": turn.median(),
+            "validation/position_error_mm": 1e3 * shift.median(),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: all is drawn anew."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Nothing."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+    def _motion(self, count: int) -> Belief:
+        """Where shapes are in each step, base frame [T, B]."""
+        device = self._hands.eye.device
+        low, high = self._hands.box
+        rotation = random_matrices(count, device)
+        position = low + (high - low) * torch.rand((count, 3), device=device)
+        rotations = []
+        positions = []
+        for _ in range(self._learn.window):
+            rotations.append(rotation)
+            positions.append(position)
+            rotation = turned(rotation, TURN_RAD)
+            position = position + MOVE_M * torch.randn_like(position)
+        return Belief(torch.stack(rotations), torch.stack(positions))
+
+    def _seen(self, shapes: torch.Tensor, place: Belief, posture: torch.Tensor) -> torch.Tensor:
+        """Points that a camera sees of shapes [B, P, 6] in each step, or whole surfaces [T, B, K, 3]."""
+        steps, count = place.position.shape[:2]
+        wanted = self._clouds.points
+        device = shapes.device
+        posed = torch.cat(
+            [
+                carried(shapes[..., :3], place.rotation, place.position[..., None, :]),
+                carried(shapes[..., 3:], place.rotation),
+            ],
+            dim=-1,
+        ).flatten(0, 1)
+        seen = camera_points(self._hands, posture.repeat(steps), posed, wanted)
+        whole = posed[:, :wanted, :3]
+        whole = whole + self._clouds.noise_m * torch.randn_like(whole)
+        by_camera = torch.rand((count, 1, 1), device=device) < self._clouds.seen_share
+        points = torch.where(by_camera.repeat(steps, 1, 1), seen, whole)
+        blank = torch.rand((steps * count, 1, 1), device=device) < self._clouds.blank_share
+        return points.masked_fill(blank, torch.nan).unflatten(0, (steps, count))

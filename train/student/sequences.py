@@ -1,0 +1,118 @@
+"""What a student learns from: sequences of steps, with the truth about each, and their losses.
+
+T steps, B sequences, N environments, D actions.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
+
+import torch
+
+from vd.policy.senses import Senses
+from vd.train.student.config import LearnCfg
+from vd.vision.acting import ActingStudent
+from vd.vision.rotations import chord, turn_angle
+from vd.vision.student import Belief, InputBuilder, StudentInput, StudentOutput, each
+
+LEAST_DISTANCE_RAD = 0.02
+"""Distances to the goal below this count as this: nothing is stopped as near."""
+
+
+@dataclass(frozen=True)
+class Sequences:
+    """Sequences to learn from."""
+
+    sight: StudentInput
+    """What was read in each step, with what was believed then [T, B]."""
+    truth: Belief
+    """What was to be believed [T, B]."""
+    hidden: torch.Tensor
+    """Memory before the first step [B, G]."""
+    done: torch.Tensor
+    """Whether an episode ended with a step, bool [T, B]."""
+    label: torch.Tensor | None = None
+    """What the teacher does [T, B, D]; None: there is no teacher."""
+
+
+class SequenceSource(Protocol):
+    """Where sequences come from: one of the stages."""
+
+    samples: int
+    """Steps of an iteration, over all sequences."""
+    env: Any
+    """The environments behind rsl-rl's interface; None without simulation."""
+
+    def minibatches(
+        self, acting: ActingStudent, stopping: Callable[[], bool]
+    ) -> Iterator[Sequences]:
+        """The sequences of an iteration, one optimiser step each; fewer where it is to stop."""
+        ...
+
+    def figures(self) -> dict[str, Any]:
+        """What else is to be logged of the iteration."""
+        ...
+
+    def measure(self, acting: ActingStudent) -> dict[str, torch.Tensor]:
+        """Errors on what is not learned from; empty for none."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """What is needed to go on exactly, but for environments and torch's random state."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over :meth:`state_dict`."""
+        ...
+
+    def close(self) -> None:
+        """Release the environments."""
+        ...
+
+
+def at_step(senses: Senses, step: int) -> Senses:
+    """One step of senses [T, B]."""
+    return Senses(**{field.name: getattr(senses, field.name)[step] for field in fields(Senses)})
+
+
+def inputs_of(
+    build: InputBuilder, senses: Senses, belief: Belief, rows: torch.Tensor
+) -> StudentInput:
+    """What was read in T steps of the environments ``rows`` [B], made again [T, B].
+
+    Args:
+        build: Makes it.
+        senses: What was sensed [T, B].
+        belief: What was believed [T, B].
+        rows: The environments.
+    """
+    steps = len(senses.fresh)
+    flat = Senses(**{f.name: getattr(senses, f.name).flatten(0, 1) for f in fields(Senses)})
+    believed = each(belief, lambda value: value.flatten(0, 1))
+    sight = build(flat, believed, rows.repeat(steps))
+    return each(sight, lambda value: value.unflatten(0, (steps, len(rows))))
+
+
+def belief_errors(belief: Belief, truth: Belief) -> tuple[torch.Tensor, torch.Tensor]:
+    """Angles [rad] and distances [m] by which beliefs are wrong [..]."""
+    turn = belief.rotation.transpose(-1, -2) @ truth.rotation
+    return turn_angle(turn), (belief.position - truth.position).norm(dim=-1)
+
+
+def student_losses(
+    output: StudentOutput, sequences: Sequences, cfg: LearnCfg
+) -> dict[str, torch.Tensor]:
+    """Weighted losses by name, means over all steps."""
+    truth = sequences.truth
+    to_goal = truth.rotation.transpose(-1, -2) @ sequences.sight.goal_rotation
+    distance = turn_angle(to_goal).clamp(min=LEAST_DISTANCE_RAD)
+    shift = (output.belief.position - truth.position).norm(dim=-1)
+    losses = {
+        "rotation": cfg.rotation_weight * chord(output.belief.rotation, truth.rotation).mean(),
+        "position": cfg.position_weight * shift.mean(),
+        "distance": cfg.distance_weight * (output.log_distance - distance.log()).square().mean(),
+    }
+    if sequences.label is not None:
+        off = (sequences.label - output.mean) * (-output.log_std).exp()
+        losses["action"] = cfg.action_weight * (0.5 * off.square() + output.log_std).mean()
+    return losses

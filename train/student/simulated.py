@@ -1,0 +1,239 @@
+"""Stages 1 and 2: the student acts in simulation, and the teacher says what it would have done (DAgger).
+
+In stage 1 the student is told complete surfaces where the objects truly are, and nothing is
+rendered; in stage 2 what a depth camera sees. Rollouts hold what clouds are made of rather than
+clouds (0.4 kB a step; with a camera also its points). T steps, N environments, D joints, K points.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from vd.evaluate.tracking import sensed, sensed_with
+from vd.geometry.quaternions import poses_in
+from vd.policy.actor import TrainedPolicy
+from vd.policy.senses import Senses
+from vd.sensors.depth_camera import DepthCamera
+from vd.train.metrics import GoalWindow, StepMeans
+from vd.train.student.config import StudentTrainCfg
+from vd.train.student.sequences import Sequences, belief_errors, inputs_of
+from vd.train.student.views import goal_points
+from vd.train.vec_env import ReorientVecEnv
+from vd.vision.acting import ActingStudent
+from vd.vision.rotations import matrices, two_columns
+from vd.vision.student import Belief, carried
+
+
+class SimulatedSequences:
+    """Lets a student act in environments, and labels what it comes to.
+
+    Args:
+        env: The environments, without noise of what the teacher observes.
+        teacher: What labels.
+        surfaces: Points of the objects' surfaces in their frames, in no order, unscaled [m] [O, P, 3]:
+            first those of the goal, then those that are seen.
+        cfg: Settings.
+        camera: A depth camera in every environment; None: complete surfaces are told.
+
+    Attributes:
+        goals: Clouds of the environments' goals [m] [N, K, 3].
+        blank: For how many more steps each camera shows nothing [N].
+    """
+
+    def __init__(
+        self,
+        env: ReorientVecEnv,
+        teacher: TrainedPolicy,
+        surfaces: torch.Tensor,
+        cfg: StudentTrainCfg,
+        camera: DepthCamera | None = None,
+    ):
+        self.env = env
+        self._teacher = teacher
+        self._camera = camera
+        self._cfg = cfg
+        self.samples = cfg.learn.window * env.num_envs
+        env.env.acts_in_frame = False  # who sees by a camera acts in the world
+        place = surfaces.device
+        scene = env.env.scene
+        objects = torch.tensor(np.asarray(scene.world_object), device=place)
+        self._scale = torch.tensor(
+            np.asarray(scene.world_scale), dtype=torch.float32, device=place
+        )[:, None, None]
+        points = cfg.clouds.points
+        self.goals = self._scale * goal_points(surfaces[objects], points, cfg.clouds.scan_share)
+        self._shapes = surfaces[:, points:]
+        self._object = objects
+        mount = env.env.hand.mount
+        self._base = torch.tensor(mount, dtype=torch.float32, device=place)
+        self._pose = wp.to_torch(env.env.sim.body_q)[:, env.env.scene.object_body]
+        self.blank = torch.zeros(env.num_envs, dtype=torch.int32, device=place)
+        self._store: dict[str, torch.Tensor] = {}
+        self._means = StepMeans()
+        length = math.ceil(2 * env.max_episode_length / cfg.learn.window)
+        self._window = GoalWindow(length)
+
+    def minibatches(
+        self, acting: ActingStudent, stopping: Callable[[], bool]
+    ) -> Iterator[Sequences]:
+        """Act, then give what was done, all of an environment at once."""
+        hidden = self.collect(acting, stopping)
+        if hidden is None:
+            return
+        envs = self.env.num_envs
+        for _ in range(self._cfg.simulated.epochs):
+            order = torch.randperm(envs, device=self.blank.device)
+            for rows in order.split(self._cfg.learn.batch):
+                yield self.taken(acting, hidden, rows)
+
+    @torch.no_grad()
+    def collect(self, acting: ActingStudent, stopping: Callable[[], bool]) -> torch.Tensor | None:
+        """Act for T steps; the memory before the first of them, or None if it was cut short."""
+        hidden = acting.hidden
+        for step in range(self._cfg.learn.window):
+            if stopping():
+                self._means.clear()
+                return None
+            pose = poses_in(self._base, self._pose)
+            senses = self.senses(pose)
+            sight = acting.look(senses)
+            label = self.labels()
+            self._keep(step, senses, acting.belief, pose, label)
+            output = acting.decide(sight)
+            turn, shift = belief_errors(output.belief, acting.build.belief_of(pose))
+            noise = torch.randn_like(output.mean)
+            _, _, _, extras = self.env.step(output.mean + output.log_std.exp() * noise)
+            wrong = {
+                "student/rotation_error": turn.mean(),
+                "student/position_error_mm": 1e3 * shift.mean(),
+                "student/action_error": (output.mean - label).abs().mean(),
+                "policy/std": output.log_std.exp().mean(),
+            }
+            self._means.add(wrong | extras["log"])
+        self.env.env.check()
+        return hidden
+
+    def senses(self, pose: torch.Tensor) -> Senses:
+        """What is sensed now, for true poses of the objects in the base frame [N, 7]."""
+        env = self.env.env
+        if self._camera is None:
+            rows = torch.arange(len(pose), device=pose.device)
+            return sensed_with(env, self._complete(pose, rows))
+        senses = sensed(env, self._camera)
+        settings = self._cfg.simulated
+        draw = torch.rand(len(pose), device=pose.device)
+        spans = torch.randint_like(self.blank, 1, settings.blank_steps + 1)
+        begins = (self.blank == 0) & (draw < settings.blank_probability)
+        self.blank = torch.where(begins, spans, (self.blank - 1).clamp(min=0))
+        # Rounded as it is kept, so that what is made again is the same.
+        points = senses.points.half().float()
+        return sensed_with(env, points.masked_fill((self.blank > 0)[:, None, None], torch.nan))
+
+    def labels(self) -> torch.Tensor:
+        """What the teacher does now, clipped as the environment clips actions [N, D]."""
+        env = self.env.env
+        action = self._teacher.act(wp.to_torch(env.observation))
+        if env.symmetry_frames is not None:
+            in_frames = wp.from_torch(action.contiguous())
+            action = wp.to_torch(env.symmetry_frames.world_action(in_frames))
+        return action.clamp(-1.0, 1.0)
+
+    def taken(self, acting: ActingStudent, hidden: torch.Tensor, rows: torch.Tensor) -> Sequences:
+        """What was done in the environments ``rows`` [B]; clouds are made again."""
+        kept = {name: values[:, rows] for name, values in self._store.items()}
+        steps = len(kept["pose"])
+        poses = kept["pose"].flatten(0, 1)
+        of_poses = rows.repeat(steps)
+        if self._camera is None:
+            points = self._complete(poses, of_poses).unflatten(0, (steps, len(rows)))
+        else:
+            points = kept["points"].float()
+        senses = Senses(
+            joint_q=kept["joint_q"],
+            joint_qd=kept["joint_qd"],
+            action=kept["action"],
+            goal_quat=kept["goal_quat"],
+            points=points,
+            fresh=kept["fresh"],
+        )
+        belief = Belief(kept["rotation"], kept["position"])
+        truth = acting.build.belief_of(poses, of_poses)
+        last = torch.zeros_like(kept["fresh"][:1])
+        return Sequences(
+            sight=inputs_of(acting.build, senses, belief, rows),
+            truth=Belief(
+                truth.rotation.unflatten(0, (steps, len(rows))),
+                truth.position.unflatten(0, (steps, len(rows))),
+            ),
+            hidden=hidden[rows].masked_fill(kept["fresh"][0, :, None], 0.0),
+            done=torch.cat([kept["fresh"][1:], last]),
+            label=kept["label"],
+        )
+
+    def figures(self) -> dict[str, Any]:
+        """How goals ended, and errors while acting."""
+        processes = 1
+        if torch.distributed.is_initialized():
+            processes = torch.distributed.get_world_size()
+        means = self._means.read(processes)
+        return {**self._window.add(means), **means, **self.env.end_iteration()}
+
+    def measure(self, acting: ActingStudent) -> dict[str, torch.Tensor]:
+        """Nothing: policies are judged by vd-eval."""
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The camera, its blank spans, and how goals ended."""
+        camera = {} if self._camera is None else self._camera.stateful()
+        return {
+            "blank": self.blank,
+            "window": self._window.state_dict(),
+            "camera": {name: array.numpy() for name, array in camera.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore :meth:`state_dict`."""
+        self.blank.copy_(state["blank"])
+        self._window.load_state_dict(state["window"])
+        if self._camera is not None:
+            for name, array in self._camera.stateful().items():
+                array.assign(state["camera"][name])
+
+    def close(self) -> None:
+        """Release the environments."""
+        self.env.env.close()
+
+    def _complete(self, pose: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        """Points all over the objects of environments ``rows`` at poses [R, 7], with noise [R, K, 3]."""
+        clouds = self._cfg.clouds
+        order = torch.randperm(self._shapes.shape[1], device=pose.device)[: clouds.points]
+        shapes = self._scale[rows] * self._shapes[self._object[rows]][:, order]
+        points = carried(shapes, matrices(two_columns(pose[:, 3:])), pose[:, None, :3])
+        return points + clouds.noise_m * torch.randn_like(points)
+
+    def _keep(
+        self, step: int, senses: Senses, belief: Belief, pose: torch.Tensor, label: torch.Tensor
+    ) -> None:
+        """Write a step into the store [T, N, ..]."""
+        values = {
+            "joint_q": senses.joint_q,
+            "joint_qd": senses.joint_qd,
+            "action": senses.action,
+            "goal_quat": senses.goal_quat,
+            "fresh": senses.fresh,
+            "rotation": belief.rotation,
+            "position": belief.position,
+            "pose": pose,
+            "label": label,
+        }
+        if self._camera is not None:
+            values["points"] = senses.points.half()
+        for name, value in values.items():
+            if name not in self._store:
+                shape = (self._cfg.learn.window, *value.shape)
+                self._store[name] = value.new_empty(shape)
+            self._store[name][step] = value

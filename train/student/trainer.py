@@ -1,0 +1,135 @@
+"""The training of the student, the same in all stages: act, learn from what was done, save the policy."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from vd.command.config import to_dict
+from vd.policy.bundle import write_policy
+from vd.policy.contract import Contract
+from vd.train.checkpoint import POLICY_NAME
+from vd.train.loop import check_update
+from vd.train.student.config import StudentTrainCfg
+from vd.train.student.sequences import Sequences, SequenceSource, belief_errors, student_losses
+from vd.train.supervised import SupervisedLoop
+from vd.vision.acting import ActingStudent, StudentPolicy
+from vd.vision.student import Belief, Student
+
+LOWER_RATES = "lower --learn.learning-rate, or take --learn.precision fp32"
+"""Remedy for a network that diverges."""
+
+
+class StudentTrainer(SupervisedLoop):
+    """Trains a student on the sequences of a stage.
+
+    While it acts, batch norms use their running statistics, as they do at work.
+
+    Args:
+        acting: The student at work, on the hands of ``source``.
+        source: Where sequences come from.
+        cfg: Settings.
+        contract: What its policy's file says of it.
+        device: Torch device.
+    """
+
+    kind = "student"
+    network: Student
+
+    def __init__(
+        self,
+        acting: ActingStudent,
+        source: SequenceSource,
+        cfg: StudentTrainCfg,
+        *,
+        contract: Contract,
+        device: str,
+    ) -> None:
+        super().__init__(
+            acting.network,
+            cfg.run,
+            learning_rate=cfg.learn.learning_rate,
+            warmup_steps=cfg.learn.warmup_steps,
+            task=contract.task,
+            device=device,
+            env=source.env,
+        )
+        self.acting = acting
+        self.source = source
+        self.cfg = cfg
+        self.contract = contract
+        self.network.half = cfg.learn.precision == "bf16"
+
+    def _samples(self) -> int:
+        return self.source.samples
+
+    def _iterate(self) -> dict[str, Any] | None:
+        done = self._done()
+        rows = []
+        self.network.eval()
+        for sequences in self.source.minibatches(self.acting, self._stopping):
+            rows.append(self._step(sequences, done))
+            self.network.eval()
+        if not rows or self._stopping():
+            return None
+        self._share_statistics()
+        figures = {name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]}
+        count = self.iteration + 1
+        if count % self.cfg.clouds.validate_every == 0 or count == self.total_iterations:
+            figures |= self.source.measure(self.acting)
+        read = self._read(figures)
+        check_update(read, self.network, LOWER_RATES)
+        return read | self.source.figures()
+
+    def _step(self, sequences: Sequences, done: float) -> dict[str, torch.Tensor]:
+        """One optimiser step; its losses and errors."""
+        self.network.train()
+        output = self.network(sequences.sight, sequences.hidden, sequences.done)
+        losses = student_losses(output, sequences, self.cfg.learn)
+        norm = self._descend(torch.stack(tuple(losses.values())).sum(), done)
+        last = Belief(output.belief.rotation[-1].detach(), output.belief.position[-1].detach())
+        truth = Belief(sequences.truth.rotation[-1], sequences.truth.position[-1])
+        turn, shift = belief_errors(last, truth)
+        logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
+        logged["loss/grad_norm"] = norm
+        logged["learn/rotation_error"] = turn.mean()
+        logged["learn/position_error_mm"] = 1e3 * shift.mean()
+        return logged
+
+    def _share_statistics(self) -> None:
+        """Average the batch norms' running statistics over the processes."""
+        if not self.is_distributed:
+            return
+        for value in self.network.buffers():
+            if value.is_floating_point():
+                torch.distributed.all_reduce(value)
+                value /= self.world_size
+
+    def _shared_state(self) -> dict[str, Any]:
+        return super()._shared_state() | {"contract": to_dict(self.contract)}
+
+    def _process_state(self) -> dict[str, Any]:
+        state = super()._process_state() | {"source": self.source.state_dict()}
+        if self.env is not None:
+            believed = {"rotation": self.acting.belief.rotation}
+            believed["position"] = self.acting.belief.position
+            state |= {"belief": believed, "hidden": self.acting.hidden}
+        return state
+
+    def _restore_process(self, state: dict[str, Any]) -> None:
+        super()._restore_process(state)
+        self.source.load_state_dict(state["source"])
+        if self.env is not None:
+            self.acting.belief = Belief(**state["belief"])
+            self.acting.hidden = state["hidden"]
+
+    def _close(self) -> None:
+        self.source.close()
+
+    def _save_policy(self, path: Path, state: dict[str, Any]) -> None:
+        network = Student(self.network.cfg, self.network.num_actions)
+        network.load_state_dict(state["student_state_dict"])
+        network.eval().requires_grad_(False)
+        contract = replace(self.contract, iterations=self.iteration, env_steps=self.env_steps)
+        write_policy(StudentPolicy(network, contract), self.run.out / POLICY_NAME)
