@@ -17,8 +17,6 @@ from vd.envs.cfg import ReorientCfg
 from vd.policy.contract import Contract, Contracted, PolicySpec
 
 CHECKPOINT_FORMAT = "visual-dexterity checkpoint 1"
-_STAGE = ("difficulty", "tightness", "tightening")
-"""What says how far the curriculum has come, in the state of an environment."""
 _PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
 """Those of which a policy notes the versions."""
 _WEIGHTS = "_state_dict"
@@ -198,7 +196,7 @@ def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedP
             stage=stage_of(state),
             software=installed_versions(_PACKAGES),
         )
-        from_dict(ReorientCfg, contract.task, where="task")
+        ReorientCfg.of_task(contract.task)
         return TrainedPolicy(contract, state["actor_state_dict"], critic, device)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: {error}; take the version that wrote it") from error
@@ -206,8 +204,8 @@ def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedP
 
 def stage_of(state: dict[str, Any]) -> dict[str, Any]:
     """How far the curriculum of a checkpoint has come."""
-    environment = state["ranks"][0]["env"]
-    return {key: environment[key] for key in _STAGE if key in environment}
+    levels: dict[str, Any] = state["ranks"][0]["env"].get("levels", {})
+    return levels
 
 
 def perceptron(spec: PolicySpec) -> nn.Sequential:
