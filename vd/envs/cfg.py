@@ -171,6 +171,9 @@ class StartCfg:
     """Poses at rest of each environment, to choose from; found by dropping the object at the
     beginning.
     """
+    reached_share: float = 0.0
+    """Ours: share of the episodes that begin in a state which the policy reached itself in that
+    environment, with the object off the table and slow: grasped, or about to be."""
 
 
 @dataclass(frozen=True)
@@ -459,6 +462,7 @@ class ReorientCfg:
         self.randomisation.validate()
         self.curriculum.validate()
         self.table.validate()
+        require(self.start, "start.", "in [0, 1]", "reached_share")
         if self.start.at_rest and self.start.poses < 1:
             raise ValueError(f"start.at_rest needs start.poses >= 1 (now {self.start.poses})")
         if isinstance(self.objects, str):

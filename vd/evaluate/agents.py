@@ -234,7 +234,11 @@ def task_for(
     return replace(
         _on_hand(base, hand, hand_layer),
         success=replace(SuccessCfg(), rotation_rad=stop_tolerance_rad),
-        start=base.start if at_rest is None else replace(base.start, at_rest=at_rest),
+        start=replace(
+            base.start,
+            at_rest=base.start.at_rest if at_rest is None else at_rest,
+            reached_share=0.0,
+        ),
         goal=base.goal
         if max_goal_angle_rad is None
         else replace(base.goal, max_angle_rad=max_goal_angle_rad),
