@@ -151,7 +151,9 @@ def test_what_is_drawn_grows_with_the_level_of_physics():
 def test_tables_leave_and_lifted_objects_get_their_weight_with_the_level_of_air():
     table = TableCfg(lift_share=0.5, away_share=1.0, away_s=(0.01, 0.01))
     env = make(CurriculumCfg(air=LEVEL, object_weight=0.01), table=table, num_envs=4)
-    assert not env.parameters.must_lift.numpy().any() and env.parameters.table_steps.numpy().min() > 9
+    assert (
+        not env.parameters.must_lift.numpy().any() and env.parameters.table_steps.numpy().min() > 9
+    )
 
     def fallen() -> np.ndarray:
         """How far each object falls in a control step, from where nothing is in its way [m]."""

@@ -248,7 +248,9 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert "--init: no policy at" in capsys.readouterr().err
     assert main(["teacher", "--init", "dclaw3-tracking", "--out", str(tmp_path / "run")]) == 1
     assert "sees by camera; give its teacher, dclaw3" in capsys.readouterr().err
-    assert main(["teacher", "--init-levels", "1", "0", "1", "1", "--out", str(tmp_path / "run")]) == 1
+    assert (
+        main(["teacher", "--init-levels", "1", "0", "1", "1", "--out", str(tmp_path / "run")]) == 1
+    )
     assert "--init-levels says where a run with --init begins" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 

@@ -36,9 +36,7 @@ RATE, RAISE_AT = 0.0013, 0.1
 steps of 16384 environments, to 1. Tried with LOOSE."""
 LOOSENED = CurriculumCfg(
     stillness=LevelCfg(rate=RATE, raise_at=RAISE_AT),
-    loose=LooseCfg(
-        joint_speed_rad_s=2.0, object_speed_m_s=0.12, action_norm=2.8, rotation_rad=0.3
-    ),
+    loose=LooseCfg(joint_speed_rad_s=2.0, object_speed_m_s=0.12, action_norm=2.8, rotation_rad=0.3),
 )
 """What moves meanwhile; loose is what it was in the last training of the installed policies."""
 IDENTIFIED_LAYER = Path("gap/identified.usda")

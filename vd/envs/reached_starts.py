@@ -72,9 +72,7 @@ class ReachedStarts:
             [self._slot],
         )
         for name, rows in self._rows.items():
-            state.launch(
-                keep_rows_kernel, [self._slot, rows], [self._kept[name]], dim=rows.shape
-            )
+            state.launch(keep_rows_kernel, [self._slot, rows], [self._kept[name]], dim=rows.shape)
 
     def begin(self, ended: wp.array, new_goal: wp.array, step_count: wp.array) -> None:
         """Put states back into a share of the environments of ``ended`` [N]. Device work only.

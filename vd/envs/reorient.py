@@ -228,7 +228,9 @@ class ReorientEnv:
         self.ended.fill_(1)
         self._new_goal.zero_()
         self.randomiser.draw(self.ended)
-        self._reset_envs(self.ended, use_start=object_quat is not None, use_goal=goal_quat is not None)
+        self._reset_envs(
+            self.ended, use_start=object_quat is not None, use_goal=goal_quat is not None
+        )
         self.randomiser.write_model()
         self.observe()
 

@@ -24,6 +24,13 @@ if TYPE_CHECKING:
 BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
 
+
+def has_no_file(name: str | Path) -> bool:
+    """Whether an agent is built in, or a function of a user, ``module:function``."""
+    text = str(name)
+    return text in BUILT_IN or (":" in text and not Path(text).exists())
+
+
 POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 """Policies of the package, and POLICY_LIST. A wheel has two of them, a checkout all."""
 POLICY_LIST = "policies.json"
@@ -95,7 +102,7 @@ def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None 
     from vd.assets_usd.objects.sets import check_sets
 
     for name in agents:
-        if name not in BUILT_IN:
+        if not has_no_file(name):
             find_policy(name)
     check_sets(objects)
     if hand is not None:
@@ -121,13 +128,13 @@ def policy_name(name: str | Path) -> str:
 def open_policy(name: str | Path, device: str) -> "TrainedPolicy | TrackingPolicy | None":
     """Load what :func:`find_policy` finds.
 
-    None for a built-in agent, which has to know its task first.
+    None for an agent without a file, which has to know its task first.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is no policy.
     """
-    if name in BUILT_IN:
+    if has_no_file(name):
         return None
     path = find_policy(name)
     if has_suffix(path, ONNX_SUFFIX):

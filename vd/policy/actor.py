@@ -4,7 +4,7 @@ A trained actor, zero or random actions. They need torch only, no simulator and 
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -122,6 +122,28 @@ class BuiltIn:
         if self._still:
             return observation.new_zeros(shape)
         return torch.rand(shape, generator=self._generator, device=observation.device) * 2.0 - 1.0
+
+
+class FunctionPolicy:
+    """A function of a user, from observations [N, O] to actions [N, A], tensors of one device."""
+
+    def __init__(self, function: Callable[[torch.Tensor], torch.Tensor], num_actions: int) -> None:
+        self._function, self.num_actions = function, num_actions
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """Actions [N, A].
+
+        Raises:
+            ValueError: The function gave something of another shape.
+        """
+        with torch.no_grad():
+            action = torch.as_tensor(self._function(observation), device=observation.device)
+        wanted = (len(observation), self.num_actions)
+        if tuple(action.shape) != wanted:
+            raise ValueError(
+                f"the policy gave actions {tuple(action.shape)}, not {wanted}; mend it"
+            )
+        return action.float()
 
 
 def read_state(
