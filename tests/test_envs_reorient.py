@@ -10,6 +10,8 @@ from vd.assets_usd.objects.model import write_object
 from vd.assets_usd.objects.procedural import cube
 from vd.envs.cfg import (
     CurriculumCfg,
+    LevelCfg,
+    LooseCfg,
     ObservationCfg,
     RandomisationCfg,
     ReorientCfg,
@@ -17,7 +19,6 @@ from vd.envs.cfg import (
     StartCfg,
     SuccessCfg,
     TableCfg,
-    TighteningCfg,
 )
 from vd.envs.reorient import ReorientEnv
 from vd.envs.setup import ALWAYS, chosen, table_steps
@@ -358,9 +359,9 @@ def test_objects_weigh_what_their_files_say_where_nothing_is_drawn(tmp_path):
     assert env.randomiser.object_mass.numpy() == pytest.approx(0.25)
 
 
-def tightening(**changes) -> CurriculumCfg:
+def rising(**loose) -> CurriculumCfg:
     """A curriculum whose thresholds tighten."""
-    return CurriculumCfg(tightening=TighteningCfg(enabled=True, **changes))
+    return CurriculumCfg(stillness=LevelCfg(rate=0.1), loose=LooseCfg(**loose))
 
 
 @pytest.mark.parametrize(
@@ -372,9 +373,16 @@ def tightening(**changes) -> CurriculumCfg:
         ),
         ({"table": TableCfg(away_share=0.3, away_s=(3.0, 1.0))}, r"table\.away_s"),
         ({"sim": SimCfg(physics_hz=100.0)}, r"sim\.physics_hz"),
-        ({"curriculum": tightening(action_norm=0.0)}, r"curriculum\.tightening\.action_norm is 0"),
-        ({"curriculum": tightening(object_weight=0.1)}, r"give table\.lift_share"),
-        ({"curriculum": tightening(rotation_rad=0.2)}, "raise the latter"),
+        ({"curriculum": rising(action_norm=0.0)}, r"curriculum\.loose\.action_norm is 0"),
+        (
+            {"curriculum": CurriculumCfg(air=LevelCfg(rate=0.1), object_weight=0.1)},
+            r"give table\.lift_share",
+        ),
+        ({"curriculum": rising(rotation_rad=0.2)}, "raise the latter"),
+        (
+            {"curriculum": CurriculumCfg(goals=LevelCfg(raise_at=0.2, lower_at=0.3))},
+            r"curriculum\.goals\.lower_at",
+        ),
     ],
 )
 def test_settings_that_cannot_work_are_named(changes, message):

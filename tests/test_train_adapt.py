@@ -31,7 +31,7 @@ def test_it_goes_on_as_the_policy_was_trained_with_the_servos_of_the_layer_alone
     policy, run = read_policy(adapt.find_start("dclaw4")), teacher_cfg(cfg)
     before = ReorientCfg.of(policy)
     asked = {"hand_layer": str(cfg.hand_layer), "objects": ("cube",), "seed": 0}
-    assert run.init_stage == (1.0, adapt.LOOSE), "it begins loosened"
+    assert run.init_levels == (1.0, adapt.LOOSE, 1.0, 1.0), "it begins loosened"
     assert run.env == replace(before, randomisation=EXACT, curriculum=run.env.curriculum, **asked)
     assert run.run.max_steps == policy.contract.env_steps + cfg.steps
     write_config(run)

@@ -12,7 +12,8 @@ import torch
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
 from vd.command.config import to_dict
-from vd.envs.cfg import CurriculumCfg, ReorientCfg, TighteningCfg
+from vd.envs.cfg import ReorientCfg
+from vd.envs.curriculum import Levels
 from vd.policy.actor import MeanAction
 from vd.policy.agents import SHIPPED_POLICIES
 from vd.policy.bundle import read_contract, read_policy, write_policy
@@ -79,7 +80,7 @@ def test_a_run_begun_from_a_policy_acts_as_it_and_says_how_long_the_critic_learn
         )
     actor, learned = _state(runner.alg.actor), read_policy(path).weights
     assert _same(actor, learned) == list(actor), "its normaliser and its std belong to it"
-    assert runner.env.env.stage.difficulty == pytest.approx(0.03)
+    assert runner.env.env.levels.goals == pytest.approx(0.03)
     assert not runner.alg.optimizer.state_dict()["state"], "moments would be another network's"
     values = _state(runner.alg.critic)
     if critic:
@@ -121,26 +122,15 @@ def test_only_the_critic_learns_while_it_warms_up(tmp_path, monkeypatch, schedul
     ]
 
 
-@pytest.mark.parametrize(
-    ("tightened", "asked", "wanted"),
-    [(True, None, (1.0, 1.0)), (False, None, (1.0, 0.0)), (True, (0.5, 0.0), (0.5, 0.0))],
-)
-def test_a_policy_that_does_not_say_how_far_it_came_has_come_to_the_end(
-    tmp_path, tightened, asked, wanted
-):
-    """Some installed ones do not; whether stillness tightened stands in their task."""
+@pytest.mark.parametrize("asked", [None, (0.5, 0.0, 1.0, 1.0)])
+def test_a_policy_that_does_not_say_how_far_it_came_has_come_to_the_end(tmp_path, asked):
     path = _export(tmp_path / "first", learner=False)
-    curriculum = CurriculumCfg(tightening=TighteningCfg(enabled=tightened))
-    _changed(path, task={"hand": "dummy", "curriculum": to_dict(curriculum)})
     env = DummyEnv(num_envs=16)
-    env.cfg = replace(
-        env.cfg, curriculum=CurriculumCfg(enabled=True, tightening=TighteningCfg(enabled=True))
-    )
     runner = make_runner(tmp_path / "second", env=env, policy=NORMALISING)
     runner.begin_from(str(path), asked)
-    assert (env.stage.difficulty, env.stage.tightness) == wanted
-    with pytest.raises(ValueError, match=r"--init-stage is 1\.5 0"):
-        runner.begin_from(str(path), (1.5, 0.0))
+    assert env.levels == (Levels() if asked is None else Levels(*asked))
+    with pytest.raises(ValueError, match=r"--init-levels is 1\.5 0 1 1"):
+        runner.begin_from(str(path), (1.5, 0.0, 1.0, 1.0))
 
 
 class Seeing(DummyEnv):
@@ -258,8 +248,10 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert "--init: no policy at" in capsys.readouterr().err
     assert main(["teacher", "--init", "dclaw3-tracking", "--out", str(tmp_path / "run")]) == 1
     assert "sees by camera; give its teacher, dclaw3" in capsys.readouterr().err
-    assert main(["teacher", "--init-stage", "1", "0", "--out", str(tmp_path / "run")]) == 1
-    assert "--init-stage says where a run with --init begins" in capsys.readouterr().err
+    assert (
+        main(["teacher", "--init-levels", "1", "0", "1", "1", "--out", str(tmp_path / "run")]) == 1
+    )
+    assert "--init-levels says where a run with --init begins" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

@@ -55,7 +55,7 @@ def test_a_run_goes_on_bit_for_bit_and_another_sees_more_from_there(tmp_path):
         for name in ("whole", "part")
     ]
     assert rows[0][2:] == rows[1]
-    assert rows[1][-1]["task/difficulty"] > 0.0
+    assert rows[1][-1]["level/goals"] > 0.0
 
     blind = read_policy(checkpoint_path(tmp_path / "part", 4))
     seen = replace(smoke().env.observation, shape="full", dynamics="critic")

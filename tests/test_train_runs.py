@@ -10,7 +10,7 @@ import pytest
 import torch
 from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
-from vd.envs.curriculum import Stage
+from vd.envs.curriculum import Levels
 from vd.policy.bundle import read_policy
 from vd.train.checkpoint import find_checkpoint, list_checkpoints, load_checkpoint
 from vd.train.loop import Interrupted, TrainingDivergedError
@@ -52,7 +52,7 @@ def test_three_and_three_more_equal_six(tmp_path, schedule):
     assert [row["iteration"] for row in _rows(part)] == [1, 2, 3, 4, 5, 6]
     assert resumed.env_steps == whole.env_steps
     assert resumed.alg.learning_rate == whole.alg.learning_rate
-    assert resumed.env.env.stage.difficulty == whole.env.env.stage.difficulty
+    assert resumed.env.env.levels == whole.env.env.levels
 
 
 def test_keeps_the_last_and_the_best_since_two_episodes_are_over(tmp_path):
@@ -68,7 +68,7 @@ def test_keeps_the_last_and_the_best_since_two_episodes_are_over(tmp_path):
     ]
     best = load_checkpoint(find_checkpoint(tmp_path, "best"))
     scores = [
-        (row["task/difficulty"], row["success_per_goal"] or 0.0, row["mean_reward"])
+        (0.5 * (row["level/goals"] + 1.0), row["success_per_goal"] or 0.0, row["mean_reward"])
         for row in _rows(tmp_path)
     ]
     assert best["iter"] == 2 + scores[1:].index(max(scores[1:]))
@@ -203,7 +203,7 @@ def test_the_floor_of_the_std_falls_as_stillness_tightens(tmp_path):
     observation = torch.randn(50, env.num_observations)
     seen = []
     for tightness in (0.0, 0.5, 1.0):
-        env.stage = Stage(1.0, tightness)
+        env.levels = Levels(1.0, tightness)
         runner.learn(1)
         with torch.no_grad():  # an output that asks for as little noise as there can be
             runner.alg.actor.mlp[-2].bias[2:] = -50.0
@@ -212,7 +212,7 @@ def test_the_floor_of_the_std_falls_as_stillness_tightens(tmp_path):
         assert torch.allclose(std, torch.full_like(std, floor), rtol=1e-4)
 
     again = make_runner(tmp_path, env=DummyEnv(num_envs=16), policy=policy)
-    again.env.env.stage = Stage(1.0, 0.5)
+    again.env.env.levels = Levels(1.0, 0.5)
     again.learn(1)
     assert float(again.alg.actor.distribution.log_floor) == pytest.approx(np.log(0.1))
 
@@ -223,10 +223,10 @@ def test_the_best_is_the_tightest_before_the_most_successful(tmp_path):
     runner._window = GoalWindow(1)
     scores = []
     for tightness in (0.0, 0.5, 0.25):
-        env.stage = Stage(1.0, tightness)
+        env.levels = Levels(1.0, tightness)
         runner.learn(1)
         scores.append(runner._score)
-    assert [score[0] for score in scores] == [0.0, 0.5, 0.25]
+    assert [score[0] for score in scores] == [0.5, 0.75, 0.625]
     assert load_checkpoint(find_checkpoint(tmp_path, "best"))["iter"] == 2
 
 

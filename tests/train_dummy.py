@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from vd.envs.cfg import CurriculumCfg
-from vd.envs.curriculum import Stage
+from vd.envs.curriculum import LEVELS, Levels
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 from vd.train.runner import TeacherRunner
 from vd.train.vec_env import ReorientVecEnv
@@ -57,7 +57,7 @@ class DummyEnv:
         self.done = wp.zeros(n, dtype=wp.int32, device=device)
         self.step_count = wp.zeros(n, dtype=wp.int32, device=device)
         self.goal_counts = wp.zeros(3, dtype=float, device=device)
-        self.stage = Stage(difficulty=0.0)
+        self.levels = Levels(goals=0.0)
         self.steps = 0
         self._generator = np.random.default_rng(seed)
         self._target = self._draw(n)
@@ -96,17 +96,26 @@ class DummyEnv:
         """All is well."""
 
     def update_curriculum(self) -> dict[str, float]:
-        """Raise the difficulty a little."""
-        self.stage = replace(self.stage, difficulty=min(1.0, self.stage.difficulty + 0.01))
-        return asdict(self.stage)
+        """Let the goals recede a little."""
+        self.levels = replace(self.levels, goals=min(1.0, self.levels.goals + 0.01))
+        return {}
+
+    @property
+    def progress(self) -> float:
+        """Of goals and stillness."""
+        return 0.5 * (self.levels.goals + self.levels.stillness)
+
+    def levels_of(self, state: dict[str, Any]) -> Levels:
+        """Those of a state."""
+        return Levels(**{name: state["levels"].get(name, 1.0) for name in LEVELS})
 
     def failed_steps(self) -> int:
         """Nothing fails here."""
         return 0
 
-    def set_stage(self, stage: Stage) -> None:
-        """Nothing depends on it."""
-        self.stage = stage
+    def set_levels(self, levels: Levels) -> None:
+        """Nothing depends on them."""
+        self.levels = levels
 
     def reset(self) -> None:
         """New episodes everywhere."""
@@ -125,7 +134,7 @@ class DummyEnv:
             .to_bytes(16, "little")
             .hex(),
             "steps": self.steps,
-            "difficulty": self.stage.difficulty,
+            "levels": asdict(self.levels),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -138,7 +147,7 @@ class DummyEnv:
             "inc": int.from_bytes(bytes.fromhex(state["increment"]), "little"),
         }
         self._generator.bit_generator.state = inner
-        self.steps, self.stage = state["steps"], Stage(state["difficulty"])
+        self.steps, self.levels = state["steps"], self.levels_of(state)
         self._observe()
 
     def close(self) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vd.command.config import from_dict, leaves, to_dict
+from vd.envs.curriculum import LEVELS
 
 if TYPE_CHECKING:
     from torch import nn
@@ -116,7 +117,8 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     if not state["learner"]:
         raise ValueError(f"--init: {path} does not say how it was trained; add --preset")
     try:
-        env = from_dict(ReorientCfg, state["task"], where="task")
+        task = ReorientCfg.of_task(state["task"])
+        env = replace(task, curriculum=base.env.curriculum)
         learner = state["learner"]
         ppo = from_dict(PpoCfg, learner["ppo"], where="learner.ppo")
         ppo = replace(ppo, imitation_iterations=0)  # how it began is its own
@@ -183,21 +185,21 @@ def widen(
 
 
 def completed(
-    state: dict[str, Any], own: dict[str, Any], stage: tuple[float, float] | None = None
+    state: dict[str, Any], own: dict[str, Any], levels: tuple[float, ...] | None = None
 ) -> dict[str, Any]:
     """What a run begins from as a checkpoint: what it lacks is that of the run.
 
     The critic reads what the actor reads, so where it is missing it begins with the actor's
-    normalisation. A policy without a stage of the curriculum has come to the end of it.
+    normalisation. A policy that says nothing of a level has come to the end of it.
 
     Args:
         state: A checkpoint, or a policy, widened for the run.
         own: Networks, optimiser and window of the run: ``critic_state_dict``,
             ``optimizer_state_dict``, ``window``.
-        stage: Difficulty and tightness to begin at, rather than those of the file.
+        levels: Levels of the curriculum to begin at, rather than those of the file.
 
     Raises:
-        ValueError: The stage is not within 0 and 1.
+        ValueError: A level is not within 0 and 1.
     """
     if "critic_state_dict" not in state:
         critic = own["critic_state_dict"]
@@ -209,26 +211,20 @@ def completed(
         # One that reads more begins with a normalisation of its own.
         state = state | {"critic_state_dict": critic | (normaliser if len(normaliser) == 4 else {})}
     if "optimizer_state_dict" not in state:
-        tightening = state["task"].get("curriculum", {}).get("tightening", {}).get("enabled", False)
-        ended = {"difficulty": 1.0, "tightness": 1.0, "tightening": tightening}
-        reached = state["stage"] or ended
         state = state | {
             "optimizer_state_dict": own["optimizer_state_dict"],
             "elapsed_s": 0.0,
             "best": None,
             "window": own["window"],
-            "ranks": [{"env": reached}],
+            "ranks": [{"env": {"levels": state["stage"]}}],
             "infos": None,
         }
-    if stage is None:
+    if levels is None:
         return state
-    difficulty, tightness = stage
-    if not (0.0 <= difficulty <= 1.0 and 0.0 <= tightness <= 1.0):
-        raise ValueError(
-            f"--init-stage is {difficulty:g} {tightness:g}; difficulty and tightness lie within 0 "
-            f"and 1"
-        )
-    moved = {"difficulty": difficulty, "tightness": tightness, "tightening": True}
+    if not all(0.0 <= level <= 1.0 for level in levels):
+        given = " ".join(f"{level:g}" for level in levels)
+        raise ValueError(f"--init-levels is {given}; levels lie within 0 and 1")
+    moved = {"levels": dict(zip(LEVELS, levels, strict=True))}
     return state | {"ranks": [rank | {"env": rank["env"] | moved} for rank in state["ranks"]]}
 
 

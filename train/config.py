@@ -31,6 +31,8 @@ class PpoCfg:
     """adaptive: the actor's rate follows the KL divergence of its updates."""
     desired_kl: float = 0.01
     """KL divergence that the adaptive schedule aims at."""
+    late_kl: float | None = None
+    """The same where the curriculum has come to its end; geometric in between. None: it stays."""
     clip: float = PAPER.teacher.clip
     """Bound of the probability ratio's distance from 1."""
     gamma: float = PAPER.teacher.gamma
@@ -74,8 +76,8 @@ class PolicyCfg:
     std_range: tuple[float, float] = (1e-6, 1e6)
     """Bounds of the standard deviation; the default leaves it free, as in the paper's code."""
     quiet_std: float | None = None
-    """Lower bound of the standard deviation where stillness has tightened to that of success
-    (--env.curriculum.tightening); the bound falls towards it with the tightness. None: it stays."""
+    """Lower bound of the standard deviation where success asks for its full stillness
+    (--env.curriculum.stillness); the bound falls towards it with that level. None: it stays."""
     normalise_observations: bool = False
     """Subtract a running mean and divide by a running std; the paper does not."""
 
@@ -128,7 +130,8 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
     """
     run.validate()
     require(ppo, "--ppo.", "positive", "rollout_steps minibatch_size epochs clip grad_norm")
-    require(ppo, "--ppo.", "positive", "actor_learning_rate critic_learning_rate desired_kl")
+    rates = "actor_learning_rate critic_learning_rate"
+    require(ppo, "--ppo.", "positive", f"{rates} desired_kl late_kl")
     require(ppo, "--ppo.", "zero or positive", "imitation_iterations bound_coefficient")
     require(ppo, "--ppo.", "in [0, 1]", "gamma gae_lambda")
     if not min(policy.hidden, default=0) > 0:

@@ -48,7 +48,7 @@ class BoundedStdGaussian(_Drawn, HeteroscedasticGaussianDistribution):
         low, high = std_range
         super().__init__(output_dim, init_std=init_std, std_range=std_range, std_type="log")
         self._log_ceiling = math.log(high)
-        # No part of a checkpoint: it follows from the settings and the stage of the curriculum.
+        # No part of a checkpoint: it follows from the settings and the curriculum.
         self.register_buffer("log_floor", torch.tensor(math.log(low)), persistent=False)
 
     def set_floor(self, std: float) -> None:

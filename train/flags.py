@@ -36,7 +36,7 @@ Ctrl-C saves. --help-all lists the flags of physics, reward, success and of the 
 _RARE = {
     "env": "sim action reward success visuals table_friction",
     "env.observation": "terms critic_terms",
-    "env.curriculum.tightening": "joint_speed_rad_s object_speed_m_s object_spin_rad_s action_norm",
+    "env.curriculum": "loose",
     "env.randomisation": "stiffness_scale damping_scale link_mass_scale friction table_friction "
     "object_scale object_scale_count object_mass_kg action_noise_std action_offset_std "
     "observation_noise_mean observation_noise_std observation_offset_std force_probability "

@@ -12,14 +12,16 @@ from vd.envs.cfg import (
     TOWARDS_GOAL,
     CurriculumCfg,
     GoalCfg,
+    LevelCfg,
     ObservationCfg,
     RandomisationCfg,
     ReorientCfg,
     RewardCfg,
     StartCfg,
     SuccessCfg,
-    TighteningCfg,
+    TableCfg,
 )
+from vd.evaluate.conditions import CONDITIONS
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
@@ -45,9 +47,9 @@ class TeacherCfg:
     policy (dclaw3), a policy, a checkpoint or a run's folder. Of a policy without a critic or an
     optimiser the critic learns alone first. Without --preset its task and its networks are
     this run's defaults. It may have observed less: what is new starts without effect."""
-    init_stage: tuple[float, float] | None = None
-    """Difficulty and tightness of the curriculum at which a run with --init begins. None: those of
-    what it begins from; 1 and 1 for a policy that does not say, which is the task as configured."""
+    init_levels: tuple[float, float, float, float] | None = None
+    """Levels of the curriculum (goals, stillness, physics, air) at which a run with --init begins.
+    None: those of what it begins from; 1 for a policy that does not say, the task as configured."""
     smoke: bool = False
     """Check the installation: the preset, cpu-demo if none is named, tiny, on the CPU, for at most
     a minute. It learns nothing, and keeps nothing unless --out is given."""
@@ -84,11 +86,14 @@ SHORT_ROLLOUTS = PpoCfg(
 """Many optimiser steps per sample, and a rate that follows the divergence."""
 
 
-def gpu() -> TeacherCfg:
-    """One GPU or each of several: the paper's task, by the recipe that learns.
+SLOWLY = LevelCfg(rate=0.0008, raise_at=0.25, lower_at=0.1)
+"""The rate of the installed policies' last training (docs/lessons.md); its bounds are not tuned."""
 
-    What measurements chose, beside the paper's value where that differs (docs/lessons.md). Four
-    fingers did better with ``--ppo.desired-kl 0.03``.
+
+def gpu() -> TeacherCfg:
+    """One GPU or each of several: the paper's task, from nothing to goals in the air.
+
+    What measurements chose, beside the paper's value where that differs (docs/lessons.md).
     """
     return TeacherCfg(
         preset="gpu",
@@ -97,7 +102,9 @@ def gpu() -> TeacherCfg:
         ppo=replace(
             SHORT_ROLLOUTS,
             actor_learning_rate=2e-4,  # where the schedule starts; paper: 3e-4, fixed
-            desired_kl=0.06,  # longer steps pay once the floor holds the std
+            # Of four fingers; three began better with 0.06. Small steps paid once all is random.
+            desired_kl=0.03,
+            late_kl=0.01,
             gamma=PAPER.teacher.gamma,  # far enough to let go and grasp anew; 0.97 before
             bound_coefficient=0.01,  # a third of the means lay beyond the clip; paper: none
             cuda_graph=True,  # a seventh of the time of learning
@@ -116,11 +123,16 @@ def gpu() -> TeacherCfg:
             num_envs=16384,
             objects=TRAINING_SET,
             episode_s=5.0,  # stuck environments waste samples; paper: 10 s
-            # About one in 40 million was seen, always of a slim object, and ended the run.
-            failures_per_million=1.0,
-            # A third of the goals is left to learn; paper: neither shape nor views.
-            observation=ObservationCfg(shape="full", view="goal", canonical=True),
-            reward=TOWARDS_GOAL,
+            # About one in 40 million was seen, always of a slim object, more with all that is
+            # drawn, and ended the run.
+            failures_per_million=50.0,
+            sim=SimCfg(njmax=224),  # light objects at high friction touch at more places
+            # A third of the goals is left to learn, and cameras see no axes of a file; paper:
+            # neither shape nor views. The critic knows the present and what is drawn.
+            observation=ObservationCfg(
+                shape="full", view="goal", canonical=True, file_axes=False, dynamics="critic"
+            ),
+            reward=replace(TOWARDS_GOAL, lift=0.5),
             # The tightest: what fingers at a std of 0.08 can keep; without noise they then pass the
             # paper's test, which evaluation asks for. Goals end more exactly than there: what is
             # pressed from 0.4 rad on would never be turned the rest of the way.
@@ -131,16 +143,17 @@ def gpu() -> TeacherCfg:
                 object_spin_rad_s=0.8,
                 fall_m=0.12,
             ),
-            # As soon as some goals are reached, and never back, and then from
-            # what fingers at a std of 0.2 can keep to the above; paper: none.
+            # Goals recede as soon as some are reached. All else takes 1250 iterations at least,
+            # since what falls short of success by a dip comes back; paper: no curriculum.
             curriculum=CurriculumCfg(
-                enabled=True,
-                raise_at=0.3,
-                lower_at=0.0,
-                rate=0.005,
-                tightening=TighteningCfg(enabled=True, raise_at=0.4, lower_at=0.3, rate=0.003),
+                goals=LevelCfg(rate=0.005, raise_at=0.3),
+                stillness=SLOWLY,
+                physics=SLOWLY,
+                air=SLOWLY,
+                object_weight=0.1,
             ),
-            randomisation=RandomisationCfg(enabled=False),  # paper: Table S3
+            randomisation=replace(CONDITIONS["mixed"], redraw_s=10.0),  # paper: Table S3
+            table=TableCfg(away_share=0.5, away_s=(1.0, 3.5), lift_share=0.5),  # paper: it stays
         ),
     )
 
@@ -154,6 +167,7 @@ def in_palm(preset: str, hand: str, objects: tuple[str, ...] = ("cube",)) -> Tea
         objects: Object sets, made to fit the hand.
     """
     base = gpu()
+    nominal = replace(base.env.curriculum, object_weight=1.0)
     env = replace(
         base.env,
         hand=hand,
@@ -171,8 +185,17 @@ def in_palm(preset: str, hand: str, objects: tuple[str, ...] = ("cube",)) -> Tea
         # not known.
         reward=replace(TOWARDS_GOAL, fall=-150.0),
         success=replace(base.env.success, rotation_rad=0.2, joint_speed_rad_s=0.8, fall_m=None),
+        curriculum=nominal,
+        randomisation=RandomisationCfg(enabled=False),
+        table=TableCfg(),
     )
-    return replace(base, preset=preset, run=replace(base.run, out=Path("runs") / preset), env=env)
+    return replace(
+        base,
+        preset=preset,
+        run=replace(base.run, out=Path("runs") / preset),
+        ppo=replace(base.ppo, desired_kl=0.06, late_kl=None),  # with which they were trained
+        env=env,
+    )
 
 
 def cpu_demo() -> TeacherCfg:
@@ -211,7 +234,6 @@ def cpu_demo() -> TeacherCfg:
             ),
             start=StartCfg(at_rest=True),
             goal=GoalCfg(max_angle_rad=1.0, about_vertical=True),
-            curriculum=CurriculumCfg(enabled=False),
             randomisation=RandomisationCfg(enabled=False),
         ),
     )

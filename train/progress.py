@@ -9,8 +9,10 @@ INTERVAL_S = 10.0
 """Between two prints."""
 FIGURES = {
     "success_per_goal": "success {:.1%} of goals",
-    "task/difficulty": "difficulty {:.2f}",
-    "task/tightness": "tightness {:.2f}",
+    "level/goals": "goals {:.2f}",
+    "level/stillness": "stillness {:.2f}",
+    "level/physics": "physics {:.2f}",
+    "level/air": "air {:.2f}",
     "mean_reward": "reward {:.3f}",
     "task/rotation_error": "error {:.2f} rad",
     "action_std": "std {:.3f}",

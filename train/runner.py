@@ -95,13 +95,13 @@ class TeacherRunner(TrainingLoop):
         """
         self._take(load_checkpoint(Path(path), self.device), path)
 
-    def begin_from(self, path: str | Path, stage: tuple[float, float] | None = None) -> None:
+    def begin_from(self, path: str | Path, levels: tuple[float, ...] | None = None) -> None:
         """Begin with networks, optimiser, curriculum and counters of another run's checkpoint or policy.
 
         Environments, random states, learning rates and the choice of the best checkpoint are this
         run's own, and so are a critic and an optimiser that the file lacks; then the critic learns
-        alone first. Networks that read less than this run observes are widened. With ``stage``
-        difficulty and tightness are these.
+        alone first. Networks that read less than this run observes are widened. With ``levels``
+        those of the curriculum are these.
 
         Raises:
             ValueError: The file is damaged, of another hand or of another network.
@@ -118,7 +118,7 @@ class TeacherRunner(TrainingLoop):
         self.unlike = unlike(found["task"], self.task)
         found, self.new_inputs = widen(found, self.alg.actor, self.alg.critic)
         own = self.alg.save() | {"window": self._window.state_dict()}
-        self._take(without_worlds(completed(found, own, stage)), path)
+        self._take(without_worlds(completed(found, own, levels)), path)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.begun = True
         self.critic_warmup = self.ppo.imitation_iterations or warmup_iterations(found)
@@ -129,7 +129,7 @@ class TeacherRunner(TrainingLoop):
     def save(self) -> None:
         """Write checkpoint and policy; the policy is that of the best checkpoint.
 
-        The best is chosen by the curriculum's stage, then success per goal over the last two
+        The best is chosen by the curriculum's progress, then success per goal over the last two
         episodes, then mean reward, in that order: while nothing succeeds the reward decides. Until
             two
         episodes are over the latest takes its place: near goals are reached first, so that early
@@ -167,8 +167,11 @@ class TeacherRunner(TrainingLoop):
         start = time.perf_counter()
         quiet = self.policy_cfg.quiet_std
         if quiet is not None:  # the least std falls as stillness tightens
-            floor = blend(self.policy_cfg.std_range[0], quiet, self.env.env.stage.tightness)
+            floor = blend(self.policy_cfg.std_range[0], quiet, self.env.env.levels.stillness)
             self.alg.actor.distribution.set_floor(floor)
+        if self.ppo.late_kl is not None:
+            progress = self.env.env.progress
+            self.alg.desired_kl = blend(self.ppo.desired_kl, self.ppo.late_kl, progress)
         if not self._collect():
             return None
         action_std = float(self.alg.get_policy().output_std.mean())
@@ -188,10 +191,8 @@ class TeacherRunner(TrainingLoop):
             **self.env.end_iteration(),
             **{f"loss/{name}": value for name, value in losses.items()},
         }
-        stage = (
-            figures["task/difficulty"] + figures["task/tightness"] - 1.0
-        )  # 1: the configured task
-        self._score = (stage, figures["success_per_goal"] or 0.0, figures["mean_reward"])
+        progress = self.env.env.progress
+        self._score = (progress, figures["success_per_goal"] or 0.0, figures["mean_reward"])
         return figures
 
     def _collect(self) -> bool:

@@ -51,9 +51,9 @@ def build_teacher(cfg: TeacherCfg, *, say: Callable[[str], object] = print) -> "
     init = find_start(cfg.init) if checkpoint is None and cfg.init is not None else None
     if init is not None:
         read_start(init)  # a damaged one is refused before anything is built
-    if cfg.init is None and cfg.init_stage is not None:
+    if cfg.init is None and cfg.init_levels is not None:
         raise ValueError(
-            "--init-stage says where a run with --init begins; leave it out, or give --init"
+            "--init-levels says where a run with --init begins; leave it out, or give --init"
         )
     if cfg.init is None and cfg.ppo.imitation_iterations:
         raise ValueError(
@@ -95,7 +95,7 @@ def build_teacher(cfg: TeacherCfg, *, say: Callable[[str], object] = print) -> "
     if checkpoint is not None:
         runner.load(checkpoint)
     elif init is not None:
-        runner.begin_from(init, cfg.init_stage)
+        runner.begin_from(init, cfg.init_levels)
     if rank == 0:
         # After all that can refuse: settings that a run cannot have must not take the place of its
         # own.

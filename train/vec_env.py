@@ -3,6 +3,7 @@
 A vectorised environment of torch tensors on the simulator's device.
 """
 
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -11,7 +12,6 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from vd.command.config import to_dict
-from vd.envs.saved_state import saved_stage
 from vd.paper import PAPER
 
 OBSERVATION_GROUP = "policy"
@@ -132,22 +132,17 @@ class ReorientVecEnv(VecEnv):
         """Once an iteration: move the curriculum.
 
         Returns:
-            ``task/difficulty`` and ``task/tightness``: the stage of the curriculum, 1 and 1 is the
-                configured
-            task; ``task/failed_steps``: those of environments here that were put back since the
-            begin (``ReorientCfg.failures_per_million``).
+            ``level/*``: the levels of the curriculum; ``task/failed_steps``: steps of environments
+            here that were put back since the begin (``ReorientCfg.failures_per_million``).
         """
         if torch.distributed.is_initialized():
-            # Every process counts all goals, and so moves to the same difficulty.
+            # Every process counts all goals, and so comes to the same levels.
             torch.distributed.all_reduce(wp.to_torch(self.env.goal_counts))
-        numbers = self.env.update_curriculum()
-        return {
-            "task/difficulty": numbers["difficulty"],
-            "task/tightness": numbers["tightness"],
-            "task/failed_steps": float(self.env.failed_steps()),
-        }
+        self.env.update_curriculum()
+        levels = {f"level/{name}": value for name, value in asdict(self.env.levels).items()}
+        return levels | {"task/failed_steps": float(self.env.failed_steps())}
 
     def start_anew(self, state: dict[str, Any]) -> None:
-        """Begin new episodes in all environments, at the stage of the curriculum that their state has."""
-        self.env.set_stage(saved_stage(state, self.env.cfg.curriculum))
+        """Begin new episodes in all environments, at the levels of the curriculum that a state has."""
+        self.env.set_levels(self.env.levels_of(state))
         self.env.reset()

@@ -130,7 +130,7 @@ class ObjectModel:
         return replace(
             self,
             vertices=self.vertices * np.float32(factor),
-            hulls=tuple(hull.times(np.float32(factor)) for hull in self.hulls),
+            hulls=tuple(hull.times(float(np.float32(factor))) for hull in self.hulls),
             inertia=self.inertia * factor**2,
             surface_points=self.surface_points * np.float32(factor),
             centre_of_mass=tuple(factor * c for c in self.centre_of_mass),

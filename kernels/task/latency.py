@@ -94,8 +94,7 @@ def begin_latency_kernel(
     joints: int,  # joints of the hand, D
     slots: int,  # rows of each world, L
     tip_body: wp.array[int],  # [G] link of each fingertip
-    latency: wp.vec2,  # range of the object's latency [s]
-    encoder_latency: wp.vec2,  # range of that of joints and fingertips [s]
+    ranges: wp.array[wp.vec2],  # [2] range of the object's latency, of joints and fingertips' [s]
     # In:
     mask_in: wp.array[int],  # [N] 1 where an episode begins
     now: StateArrays,  # the present state
@@ -114,8 +113,8 @@ def begin_latency_kernel(
     if mask_in[world] == 0:
         return
     state, share = uniform(rng[world], wp.vec2(0.0, 1.0))
-    latency_out[world] = wp.lerp(latency[0], latency[1], share)
-    encoder_latency_out[world] = wp.lerp(encoder_latency[0], encoder_latency[1], share)
+    latency_out[world] = wp.lerp(ranges[0][0], ranges[0][1], share)
+    encoder_latency_out[world] = wp.lerp(ranges[1][0], ranges[1][1], share)
     rng[world] = next_stream(state, world)
     for slot in range(slots):
         write_state(world * slots + slot, world, joints, tip_body, now, ring_out)
@@ -135,7 +134,7 @@ def recall_state_kernel(
     slots: int,  # rows of each world, L
     tip_body: wp.array[int],  # [G] link of each fingertip; only their poses are written
     physics_dt: float,  # time between two rows [s]
-    jitter: float,  # most that the object is seen later still, drawn in each call [s]
+    jitter: wp.array[float],  # [1] most that the object is seen later still, drawn in each call [s]
     # In:
     latency_in: wp.array[
         float
@@ -153,8 +152,8 @@ def recall_state_kernel(
     """Object and hand as they were their latency ago, of the nearest physics step. Launch: [N]."""
     world = wp.tid()
     latency = latency_in[world]
-    if jitter > 0.0:
-        state, more = uniform(rng[world], wp.vec2(0.0, jitter))
+    if jitter[0] > 0.0:
+        state, more = uniform(rng[world], wp.vec2(0.0, jitter[0]))
         latency += more
         rng[world] = next_stream(state, world)
     seen = aged_row(world, latency, physics_dt, slots, head_in)

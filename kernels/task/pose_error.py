@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def draw_pose_error_kernel(
     # Model:
-    size: wp.vec2,  # length of the displacement [m] and angle of the rotation [rad]
+    size: wp.array[wp.vec2],  # [1] length of the displacement [m], angle of the rotation [rad]
     # In:
     mask_in: wp.array[int],  # [N] 1 where a world is drawn anew
     # In/Out:
@@ -31,7 +31,8 @@ def draw_pose_error_kernel(
     state = rng[world]
     direction = wp.sample_unit_sphere_surface(state)
     axis = wp.sample_unit_sphere_surface(state)
-    error_out[world] = wp.transform(size[0] * direction, wp.quat_from_axis_angle(axis, size[1]))
+    turn = wp.quat_from_axis_angle(axis, size[0][1])
+    error_out[world] = wp.transform(size[0][0] * direction, turn)
     rng[world] = next_stream(state, world)
 
 

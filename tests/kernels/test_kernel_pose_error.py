@@ -35,7 +35,8 @@ def test_the_object_alone_is_displaced_and_turned_about_its_origin(device, data,
 def test_errors_have_their_size_and_every_direction_and_others_stay(device):
     worlds, size = 2000, (0.005, 0.1)
     mask = np.arange(worlds) % 4 != 0
-    inputs = [wp.vec2(*size), mask, streams(worlds, 3, device)]
+    sizes = wp.array([size], dtype=wp.vec2, device=device)
+    inputs = [sizes, mask, streams(worlds, 3, device)]
     (drawn,) = launch(draw_pose_error_kernel, worlds, inputs, device, worlds)
     assert np.isnan(drawn[~mask]).all()
     turn = Rotation.from_quat(drawn[mask, 3:]).as_rotvec()

@@ -18,7 +18,7 @@ import warp as wp
 
 import vd.kernels
 from vd.envs.cfg import ReorientCfg
-from vd.envs.curriculum import Stage
+from vd.envs.curriculum import Levels
 from vd.envs.reorient import ReorientEnv
 from vd.policy.actor import TrainedPolicy
 
@@ -103,7 +103,7 @@ def measure(
         env.step(env.action)
     # Before the policy, whose network and matrix workspace are no part of the simulation.
     memory = (before - free_memory(device)) / 1e9 if on_gpu else 0.0
-    env.set_stage(Stage())  # a teacher has learned the task as it is configured
+    env.set_levels(Levels())  # a teacher has learned the task as it is configured
     observation = wp.to_torch(env.observation)
     action = wp.to_torch(env.action)
 

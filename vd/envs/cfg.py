@@ -1,6 +1,6 @@
 """Configuration of the reorientation task; every default is the paper's."""
 
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, field, replace
 from math import pi
 from typing import TYPE_CHECKING, Any, Literal
@@ -171,6 +171,9 @@ class StartCfg:
     """Poses at rest of each environment, to choose from; found by dropping the object at the
     beginning.
     """
+    reached_share: float = 0.0
+    """Ours: share of the episodes that begin in a state which the policy reached itself in that
+    environment, with the object off the table and slow: grasped, or about to be."""
 
 
 @dataclass(frozen=True)
@@ -199,83 +202,83 @@ class TableCfg:
 
 
 @dataclass(frozen=True)
-class TighteningCfg:
-    """Ours: ask for little at first, later for the stillness and nearness of ``success``.
+class LevelCfg:
+    """Ours: how a level of the curriculum moves between 0 and 1, in each training iteration."""
 
-    Off by default.
+    rate: float = 0.0
+    """Change of the level in an iteration; at 0 the level is 1 from the beginning."""
+    raise_at: float = 0.4
+    """Success rate of goals above which it rises."""
+    lower_at: float = 0.0
+    """Success rate of goals below which it falls."""
 
-    Noise in the actions moves the fingers more than the paper's success allows, and without noise
-    nothing is learned, so both have to fall together (``policy.quiet_std``). Where the difficulty
-    is 1, the tightness grows by ``rate`` per update while the success rate of goals is above
-    ``raise_at``, and shrinks while it is below ``lower_at``. At 0 the thresholds are these, at 1
-    those of ``success``, geometric in between.
-    """
-
-    enabled: bool = False
-    """Whether tightness starts at 0 rather than 1."""
-    joint_speed_rad_s: float = 3.0
-    """Largest norm of the joint velocities at tightness 0 [rad/s]; fingers at a std of 0.2 have
-    about 1.
-    """
-    object_speed_m_s: float = 0.16
-    """Largest speed of the object at tightness 0 [m/s]."""
-    object_spin_rad_s: float = 2.0
-    """Largest angular speed of the object at tightness 0 [rad/s]."""
-    action_norm: float = 3.5
-    """Largest norm of the smoothed action at tightness 0; that of twelve actions of 1 is 3.46."""
-    rotation_rad: float = PAPER.success.rotation_rad
-    """Largest rotation error at tightness 0 [rad]; a smaller success.rotation_rad makes it
-    finer.
-    """
-    object_weight: float = 1.0
-    """Share of its weight that the object has at tightness 0 in the environments of
-    table.lift_share: what is light is easily held, and not lost before it is."""
-    raise_at: float = 0.5
-    """Success rate of goals above which stillness tightens."""
-    lower_at: float = 0.3
-    """Success rate of goals below which it loosens."""
-    rate: float = 0.005
-    """Change of the tightness per update (one update each training iteration)."""
-
-    def validate(self) -> None:
+    def validate(self, name: str) -> None:
         """Raise ValueError naming the field and the remedy."""
-        thresholds = "joint_speed_rad_s object_speed_m_s object_spin_rad_s action_norm rotation_rad"
-        require(self, "curriculum.tightening.", "positive", f"{thresholds} object_weight")
+        require(self, f"curriculum.{name}.", "in [0, 1]", "rate")
         if not 0.0 <= self.lower_at <= self.raise_at <= 1.0:
             raise ValueError(
-                f"curriculum.tightening.lower_at is {self.lower_at:g} and raise_at "
-                f"{self.raise_at:g}; they have to rise within 0 and 1"
+                f"curriculum.{name}.lower_at is {self.lower_at:g} and raise_at {self.raise_at:g}; "
+                "they have to rise within 0 and 1"
             )
 
 
 @dataclass(frozen=True)
-class CurriculumCfg:
-    """Ours: make the task harder as the success rate allows. Off by default.
+class LooseCfg:
+    """Ours: the thresholds of success where the level of stillness is 0; geometric in between.
 
-    While the success rate of goals is above ``raise_at`` the difficulty grows by ``rate`` per
-    update, while it is below ``lower_at`` it shrinks; in between it stays. Difficulty 0 is loose
-    stillness, near goals and free energy (:mod:`vd.envs.parameters`), difficulty 1 the configured
-    task.
+    Noise in the actions moves the fingers more than the paper's success allows, and without noise
+    nothing is learned, so both have to fall together (``policy.quiet_std``).
     """
 
-    enabled: bool = False
-    """Whether difficulty starts at 0 rather than 1."""
-    raise_at: float = 0.6
-    """Success rate of goals above which the task gets harder."""
-    lower_at: float = 0.3
-    """Success rate of goals below which the task gets easier."""
-    rate: float = 0.02
-    """Change of the difficulty per update (one update each training iteration)."""
-    tightening: TighteningCfg = field(default_factory=TighteningCfg)
+    joint_speed_rad_s: float = 3.0
+    """Largest norm of the joint velocities [rad/s]; fingers at a std of 0.2 have about 1."""
+    object_speed_m_s: float = 0.16
+    """Largest speed of the object [m/s]."""
+    object_spin_rad_s: float = 2.0
+    """Largest angular speed of the object [rad/s]."""
+    action_norm: float = 3.5
+    """Largest norm of the smoothed action; that of twelve actions of 1 is 3.46."""
+    rotation_rad: float = PAPER.success.rotation_rad
+    """Largest rotation error [rad]; a smaller success.rotation_rad makes it finer."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        thresholds = "joint_speed_rad_s object_speed_m_s object_spin_rad_s action_norm rotation_rad"
+        require(self, "curriculum.loose.", "positive", thresholds)
+
+
+@dataclass(frozen=True)
+class CurriculumCfg:
+    """Ours: levels from 0 to 1 that rise one after the other, as measured success allows.
+
+    Off by default. The first level below 1 rises while the success rate of goals is above its
+    ``raise_at``; the last one above 0 falls while it is below its ``lower_at``.
+    """
+
+    goals: LevelCfg = field(default_factory=LevelCfg)
+    """From near goals, hardly any stillness and free energy to those of the task."""
+    stillness: LevelCfg = field(default_factory=LevelCfg)
+    """From the thresholds of ``loose`` to those of ``success``."""
+    physics: LevelCfg = field(default_factory=LevelCfg)
+    """From nothing to what ``randomisation`` draws. Sizes and masses are drawn once: all along."""
+    air: LevelCfg = field(default_factory=LevelCfg)
+    """From no environment to the shares of ``table``."""
+    loose: LooseCfg = field(default_factory=LooseCfg)
+    object_weight: float = 1.0
+    """Share of its weight that the object has at air 0 in the environments of table.lift_share:
+    what is light is easily held, and not lost before it is."""
 
     @property
     def lightens(self) -> bool:
         """Whether objects that have to be lifted are lighter at first."""
-        return self.tightening.object_weight != 1.0
+        return self.object_weight != 1.0 and self.air.rate > 0.0
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        self.tightening.validate()
+        for name in ("goals", "stillness", "physics", "air"):
+            getattr(self, name).validate(name)
+        self.loose.validate()
+        require(self, "curriculum.", "positive", "object_weight")
 
 
 @dataclass(frozen=True)
@@ -436,7 +439,17 @@ class ReorientCfg:
         Raises:
             ValueError: It is of another version.
         """
-        return replace(from_dict(cls, policy.task, where="task of the policy"), **changes)
+        return replace(cls.of_task(policy.task, where="task of the policy"), **changes)
+
+    @classmethod
+    def of_task(cls, task: Mapping[str, Any], where: str = "task") -> "ReorientCfg":
+        """The task that a policy or checkpoint notes, without the curriculum of its training.
+
+        Raises:
+            ValueError: It is of another version; ``where`` says what it is.
+        """
+        kept = {name: value for name, value in task.items() if name != "curriculum"}
+        return from_dict(cls, kept, where=where)
 
     @property
     def max_episode_steps(self) -> int:
@@ -449,6 +462,7 @@ class ReorientCfg:
         self.randomisation.validate()
         self.curriculum.validate()
         self.table.validate()
+        require(self.start, "start.", "in [0, 1]", "reached_share")
         if self.start.at_rest and self.start.poses < 1:
             raise ValueError(f"start.at_rest needs start.poses >= 1 (now {self.start.poses})")
         if isinstance(self.objects, str):
@@ -461,22 +475,21 @@ class ReorientCfg:
         require(self.success, "success.", "an angle", "rotation_rad")
         if self.fingertip not in ("rigid", "soft"):
             raise ValueError(f"fingertip = {self.fingertip!r}; choose rigid or soft")
-        self._check_tightening()
+        self._check_curriculum()
 
-    def _check_tightening(self) -> None:
-        """Refuse a tightening that would loosen or do nothing."""
-        tightening = self.curriculum.tightening
-        if not tightening.enabled:
-            return
-        if self.success.rotation_rad > tightening.rotation_rad:
+    def _check_curriculum(self) -> None:
+        """Refuse a curriculum that would loosen or do nothing."""
+        curriculum = self.curriculum
+        rises = curriculum.stillness.rate > 0.0
+        if rises and self.success.rotation_rad > curriculum.loose.rotation_rad:
             raise ValueError(
                 f"success.rotation_rad is {self.success.rotation_rad:g}, looser than where it "
-                f"begins, curriculum.tightening.rotation_rad {tightening.rotation_rad:g}; raise "
+                f"begins, curriculum.loose.rotation_rad {curriculum.loose.rotation_rad:g}; raise "
                 "the latter"
             )
-        if tightening.object_weight != 1.0 and self.table.lift_share == 0.0:
+        if curriculum.lightens and self.table.lift_share == 0.0:
             raise ValueError(
-                f"curriculum.tightening.object_weight is {tightening.object_weight:g}, but no "
+                f"curriculum.object_weight is {curriculum.object_weight:g}, but no "
                 "environment asks for objects off the table, and only there are they light; give "
                 "table.lift_share"
             )

@@ -1,61 +1,77 @@
-"""How hard the task is while a policy learns it.
+"""How hard the task is while a policy learns it: levels that rise one after the other."""
 
-Nearer goals first, then success thresholds that tighten.
-"""
+from dataclasses import asdict, dataclass, fields, replace
 
-from dataclasses import dataclass
-
-from vd.envs.cfg import CurriculumCfg
+from vd.envs.cfg import LevelCfg, ReorientCfg
 
 
 @dataclass(frozen=True)
-class Stage:
-    """How far a run has come; all ones is the task as configured."""
+class Levels:
+    """How far a run has come, each in [0, 1]; all ones is the task as configured.
 
-    difficulty: float = 1.0
-    """Of goals and stillness (:class:`vd.envs.cfg.CurriculumCfg`), in [0, 1]."""
-    tightness: float = 1.0
-    """Of stillness, once the difficulty is 1 (:class:`vd.envs.cfg.TighteningCfg`), in [0, 1]."""
+    In the order in which they rise, see :class:`vd.envs.cfg.CurriculumCfg`.
+    """
+
+    goals: float = 1.0
+    stillness: float = 1.0
+    physics: float = 1.0
+    air: float = 1.0
 
 
-def first_stage(cfg: CurriculumCfg) -> Stage:
+LEVELS = tuple(field.name for field in fields(Levels))
+"""Names of the levels in the order in which they rise."""
+
+
+def moving_levels(cfg: ReorientCfg) -> dict[str, LevelCfg]:
+    """The levels that a task moves, in their order; others are 1: they change nothing in it."""
+    table = cfg.table
+    changes = {
+        "goals": True,
+        "stillness": True,
+        "physics": cfg.randomisation.enabled,
+        "air": table.away_share > 0.0 or table.lift_share > 0.0,
+    }
+    moving = {}
+    for name in LEVELS:
+        level: LevelCfg = getattr(cfg.curriculum, name)
+        if changes[name] and level.rate > 0.0:
+            moving[name] = level
+    return moving
+
+
+def first_levels(moving: dict[str, LevelCfg]) -> Levels:
     """Where a run begins."""
-    return Stage(
-        difficulty=0.0 if cfg.enabled else 1.0, tightness=0.0 if cfg.tightening.enabled else 1.0
-    )
+    return Levels(**dict.fromkeys(moving, 0.0))
 
 
-def next_stage(stage: Stage, success_rate: float, cfg: CurriculumCfg) -> Stage:
-    """The stage after an update of the curriculum.
-
-    Only one of the two moves: the tightness where the difficulty is 1, else the difficulty. So
-    goals come nearer again only where stillness is as loose as it gets.
+def next_levels(levels: Levels, success_rate: float, moving: dict[str, LevelCfg]) -> Levels:
+    """The levels after an update: at most one of them moves.
 
     Args:
-        stage: Now.
+        levels: Now.
         success_rate: Goals reached among those ended since the last update, in [0, 1].
-        cfg: How fast to move, and at which rates.
+        moving: Those that move, see :func:`moving_levels`.
     """
-    tightening = cfg.tightening
-    if tightening.enabled and stage.difficulty == 1.0:
-        step = _step(success_rate, tightening.raise_at, tightening.lower_at, tightening.rate)
-        tightness = _within_one(stage.tightness + step)
-        if tightness != stage.tightness:
-            return Stage(stage.difficulty, tightness)
-    if cfg.enabled and (stage.tightness == 0.0 or not tightening.enabled):
-        step = _step(success_rate, cfg.raise_at, cfg.lower_at, cfg.rate)
-        return Stage(_within_one(stage.difficulty + step), stage.tightness)
-    return stage
+    values = asdict(levels)
+    for name, level in moving.items():
+        if values[name] < 1.0:
+            if success_rate > level.raise_at:
+                return replace(levels, **{name: min(1.0, values[name] + level.rate)})
+            break
+    for name, level in reversed(moving.items()):
+        if values[name] > 0.0:
+            if success_rate < level.lower_at:
+                return replace(levels, **{name: max(0.0, values[name] - level.rate)})
+            break
+    return levels
 
 
-def blend(loose: float, tight: float, tightness: float) -> float:
-    """From ``loose`` to ``tight``, geometrically: each step of the tightness is the same factor."""
-    return loose ** (1.0 - tightness) * tight**tightness
+def progress_of(levels: Levels, moving: dict[str, LevelCfg]) -> float:
+    """How far all levels that move have come together, in [0, 1]."""
+    values = asdict(levels)
+    return sum(values[name] for name in moving) / len(moving) if moving else 1.0
 
 
-def _step(success_rate: float, raise_at: float, lower_at: float, rate: float) -> float:
-    return rate if success_rate > raise_at else -rate if success_rate < lower_at else 0.0
-
-
-def _within_one(value: float) -> float:
-    return min(1.0, max(0.0, value))
+def blend(loose: float, tight: float, level: float) -> float:
+    """From ``loose`` to ``tight``, geometrically: each step of the level is the same factor."""
+    return loose ** (1.0 - level) * tight**level

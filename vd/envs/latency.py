@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from vd.envs.task_state import TaskState
@@ -62,6 +63,9 @@ class SeenState:
         self._ring = wp.zeros((n * slots, columns), dtype=float, device=device)
         self._head = wp.zeros(n, dtype=wp.int32, device=device)
         self._model = [d, slots, state.fingers.tip_body]
+        ranges = [random.observation_latency_s, random.encoder_latency_s]
+        self._ranges = state.parameters.blended(np.zeros((2, 2)), ranges, wp.vec2)
+        self._jitter = state.parameters.blended([0.0], [random.observation_jitter_s], float)
         sim.after_physics_step = self.record
 
     def record(
@@ -77,11 +81,9 @@ class SeenState:
             return
         state, sim = self._state, self._state.sim
         now = self._now(sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd)
-        random = state.cfg.randomisation
-        ranges = [wp.vec2(*random.observation_latency_s), wp.vec2(*random.encoder_latency_s)]
         state.launch(
             begin_latency_kernel,
-            [*self._model, *ranges, mask, now, state.rng],
+            [*self._model, self._ranges, mask, now, state.rng],
             [self.latency, self.encoder_latency, self._ring],
         )
 
@@ -89,7 +91,7 @@ class SeenState:
         """Refresh :attr:`arrays`."""
         if self.is_late:
             state = self._state
-            times = [state.cfg.sim.physics_dt, state.cfg.randomisation.observation_jitter_s]
+            times = [state.cfg.sim.physics_dt, self._jitter]
             inputs = [*times, self.latency, self.encoder_latency, self._head, self._ring]
             state.launch(
                 recall_state_kernel, [*self._model, *inputs], [state.rng, _packed(self.arrays)]

@@ -7,7 +7,8 @@ import warp as wp
 
 from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import ReorientCfg
-from vd.envs.curriculum import Stage, blend
+from vd.envs.curriculum import Levels, blend
+from vd.envs.setup import chosen, table_steps
 from vd.kernels.task.actions import ActionParams
 from vd.kernels.task.observations import ObservationParams
 from vd.kernels.task.randomisation import ForceParams, RandomisationParams
@@ -17,95 +18,99 @@ from vd.kernels.task.success import SuccessParams
 from vd.paper import PAPER
 
 STILLNESS_START = 12.0
-"""Factor on the four stillness thresholds at difficulty 0 (ours): what moving fingers can keep."""
+"""Factor on the four stillness thresholds at level 0 of goals (ours): what moving fingers can
+keep."""
 GOAL_START_RAD = 1.0
-"""Largest goal angle at difficulty 0 [rad] (ours)."""
+"""Largest goal angle at level 0 of goals [rad] (ours)."""
 LIFT_M = 0.02
 """Height from which more is worth nothing [m]; as far as a finger can give way without a fall."""
+
+_STRUCTS: dict[str, Any] = {
+    "action": ActionParams,
+    "observation": ObservationParams,
+    "exact_observation": ObservationParams,
+    "start": StartParams,
+    "force": ForceParams,
+    "randomisation": RandomisationParams,
+    "reward": RewardParams,
+    "success": SuccessParams,
+    "goal": GoalParams,
+}
 
 
 class TaskParameters:
     """All parameter structs of the task, each an array of length 1 on the device.
 
     Arrays because a CUDA graph bakes scalar arguments in; a curriculum writes into them instead.
+
+    Attributes:
+        action, observation, exact_observation, start, force, randomisation, reward, success, goal:
+            The structs; ``exact_observation`` is without noise.
+        weight: Share of its weight that an object which has to be lifted has, shape [1].
+        must_lift: 1 where success asks that the object does not touch the table, int32, shape [N].
+        table_steps: Control steps of an episode for which the table stays, int32, shape [N].
     """
+
+    action: wp.array
+    observation: wp.array
+    exact_observation: wp.array
+    start: wp.array
+    force: wp.array
+    randomisation: wp.array
+    reward: wp.array
+    success: wp.array
+    goal: wp.array
 
     def __init__(self, cfg: ReorientCfg, hand: HandModel, device: Any):
         """Put the configuration at full difficulty on ``device``."""
-        self.cfg, self._hand = cfg, hand
-        random = cfg.randomisation
-        on = 1.0 if random.enabled else 0.0
-
-        def array(struct_type: Any, **values: Any) -> wp.array:
-            struct = struct_type()
-            for name, value in values.items():
-                setattr(struct, name, value)
-            return wp.array([struct], dtype=struct_type, device=device)
-
-        self.action = array(
-            ActionParams,
-            alpha=cfg.action.ema_alpha,
-            step_rad=cfg.action.scale_rad_s * cfg.sim.control_dt,
-            noise_std=on * random.action_noise_std,
-        )
-        self.observation, self.exact_observation = (
-            array(
-                ObservationParams,
-                velocity_scale=PAPER.observation.velocity_scale,
-                noise_mean=noise * random.observation_noise_mean,
-                noise_std=noise * random.observation_noise_std,
-                file_axes=float(cfg.observation.file_axes),
-                canonical=float(cfg.observation.canonical),
-            )
-            for noise in (on, 0.0)
-        )
-        self.start = array(
-            StartParams,
-            position=wp.vec3(*hand.workspace.drop_m),
+        self.cfg, self._hand, self._device = cfg, hand, device
+        self._staging: dict[str, np.ndarray] = {}
+        for name, struct in _STRUCTS.items():
+            array = wp.array([struct()], dtype=struct, device=device)
+            setattr(self, name, array)
+            self._staging[name] = array.numpy()
+        self._blended: list[tuple[wp.array, np.ndarray, np.ndarray]] = []
+        self.weight = wp.ones(1, dtype=float, device=device)
+        self.must_lift = wp.zeros(cfg.num_envs, dtype=wp.int32, device=device)
+        self.table_steps = wp.zeros(cfg.num_envs, dtype=wp.int32, device=device)
+        self._write(
+            "start",
+            position=np.array(hand.workspace.drop_m, dtype=np.float32),
             noise=PAPER.scene.object_start_noise_m,
         )
-        self.force = array(
-            ForceParams,
-            probability=on * random.force_probability,
-            # Of the impulse that is asked for, whatever the physics step.
-            force_per_mass=random.force_n_per_kg
-            * random.force_s
-            / (random.force_steps(cfg.sim) * cfg.sim.physics_dt),
-            decay=random.force_decay,
-        )
-        materials = PAPER.materials
+        self.set_levels(Levels())
 
-        def span(value: tuple[float, float], nominal: float) -> wp.vec2:
-            return wp.vec2(*value) if random.enabled else wp.vec2(nominal, nominal)
+    def blended(self, nominal: Any, drawn: Any, dtype: Any) -> wp.array:
+        """Numbers that the level of physics takes from ``nominal`` to ``drawn``, of any like shapes.
 
-        self.randomisation = array(
-            RandomisationParams,
-            friction=span(random.friction, materials.friction),
-            link_mass_scale=span(random.link_mass_scale, 1.0),
-            action_offset_std=on * random.action_offset_std,
-            observation_offset_std=on * random.observation_offset_std,
-        )
-        self.reward = array(RewardParams)
-        self.success = array(SuccessParams)
-        self.goal = array(GoalParams)
-        self.weight = wp.ones(1, dtype=float, device=device)
-        """Share of its weight that an object which has to be lifted has, shape [1]."""
-        self._staging = {
-            name: getattr(self, name).numpy() for name in ("reward", "success", "goal")
-        }
-        self.set_stage(Stage())
+        Returns:
+            Their array on the device. It is written anew with every level.
+        """
+        begin, end = np.broadcast_arrays(np.asarray(nominal, float), np.asarray(drawn, float))
+        array = wp.array(end, dtype=dtype, device=self._device)
+        self._blended.append((array, begin, end))
+        return array
 
-    def set_stage(self, stage: Stage) -> None:
-        """Write reward, success and goal parameters for a stage of the curriculum."""
-        cfg, difficulty = self.cfg, stage.difficulty
-        loose = cfg.curriculum.tightening
-        # Thresholds shrink geometrically: each step of difficulty tightens by the same factor.
-        slack = STILLNESS_START ** (1.0 - difficulty)
+    def set_levels(self, levels: Levels) -> None:
+        """Write all that depends on the levels of the curriculum."""
+        self._set_task(levels)
+        self._set_physics(levels.physics)
+        cfg = self.cfg
+        self.table_steps.assign(table_steps(cfg, levels.air))
+        self.must_lift.assign(chosen(cfg, levels.air * cfg.table.lift_share))
+        self.weight.fill_(blend(cfg.curriculum.object_weight, 1.0, levels.air))
+
+    def _set_task(self, levels: Levels) -> None:
+        """Reward, success and goals."""
+        cfg, level = self.cfg, levels.goals
+        loose = cfg.curriculum.loose
+        # Thresholds shrink geometrically: each step of the level tightens by the same factor.
+        slack = STILLNESS_START ** (1.0 - level)
         start = min(GOAL_START_RAD, cfg.goal.max_angle_rad)
         reward, success = cfg.reward, cfg.success
 
         def threshold(tightest: float, loosest: float) -> float:
-            return slack * blend(loosest, tightest, stage.tightness) if tightest > 0.0 else 0.0
+            return slack * blend(loosest, tightest, levels.stillness) if tightest > 0.0 else 0.0
 
         self._write(
             "reward",
@@ -116,7 +121,7 @@ class TaskParameters:
             fingertip_form=FINGERTIP_MEAN
             if reward.fingertip_mean_distance
             else FINGERTIP_SQUARED_SUM,
-            energy=reward.energy * difficulty,
+            energy=reward.energy * level,
             energy_clip=reward.energy_clip_w,
             fall=reward.fall,
             table_contact=reward.table_contact,
@@ -130,7 +135,7 @@ class TaskParameters:
         )
         self._write(
             "success",
-            rotation=blend(loose.rotation_rad, success.rotation_rad, stage.tightness),
+            rotation=blend(loose.rotation_rad, success.rotation_rad, levels.stillness),
             joint_speed=threshold(success.joint_speed_rad_s, loose.joint_speed_rad_s),
             object_speed=threshold(success.object_speed_m_s, loose.object_speed_m_s),
             object_spin=threshold(success.object_spin_rad_s, loose.object_spin_rad_s),
@@ -141,14 +146,54 @@ class TaskParameters:
         )
         self._write(
             "goal",
-            max_angle=start + (cfg.goal.max_angle_rad - start) * difficulty,
+            max_angle=start + (cfg.goal.max_angle_rad - start) * level,
             about_vertical=int(cfg.goal.about_vertical),
         )
 
-        self.weight.fill_(blend(loose.object_weight, 1.0, stage.tightness))
+    def _set_physics(self, level: float) -> None:
+        """Noise, disturbances and all ranges of what is drawn."""
+        cfg, random, materials = self.cfg, self.cfg.randomisation, PAPER.materials
+        share = level if random.enabled else 0.0
+        self._write(
+            "action",
+            alpha=cfg.action.ema_alpha,
+            step_rad=cfg.action.scale_rad_s * cfg.sim.control_dt,
+            noise_std=share * random.action_noise_std,
+        )
+        for name, noise in (("observation", share), ("exact_observation", 0.0)):
+            self._write(
+                name,
+                velocity_scale=PAPER.observation.velocity_scale,
+                noise_mean=noise * random.observation_noise_mean,
+                noise_std=noise * random.observation_noise_std,
+                file_axes=float(cfg.observation.file_axes),
+                canonical=float(cfg.observation.canonical),
+            )
+        # Of the impulse that is asked for, whatever the physics step.
+        longest_s = random.force_steps(cfg.sim) * cfg.sim.physics_dt
+        self._write(
+            "force",
+            probability=random.force_probability if random.enabled else 0.0,
+            force_per_mass=share * random.force_n_per_kg * random.force_s / longest_s,
+            decay=random.force_decay,
+        )
+        self._write(
+            "randomisation",
+            friction=_between((materials.friction,) * 2, random.friction, share),
+            link_mass_scale=random.link_mass_scale if random.enabled else (1.0, 1.0),
+            action_offset_std=share * random.action_offset_std,
+            observation_offset_std=share * random.observation_offset_std,
+        )
+        for array, nominal, drawn in self._blended:
+            array.assign(_between(nominal, drawn, level).astype(np.float32))
 
     def _write(self, name: str, **values: Any) -> None:
         staging = self._staging[name]
         for field, value in values.items():
             staging[field][0] = value
         getattr(self, name).assign(staging)
+
+
+def _between(nominal: Any, drawn: Any, level: float) -> np.ndarray:
+    """From ``nominal`` at level 0 to exactly ``drawn`` at 1."""
+    return (1.0 - level) * np.asarray(nominal, float) + level * np.asarray(drawn, float)

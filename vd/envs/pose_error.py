@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from vd.envs.task_state import TaskState
@@ -20,9 +21,10 @@ class PoseError:
 
     def __init__(self, state: TaskState):
         self._state, random = state, state.cfg.randomisation
-        self._size = wp.vec2(*random.object_pose_error) if random.enabled else wp.vec2()
-        self.is_wrong = max(self._size) > 0.0
+        self.is_wrong = random.enabled and max(random.object_pose_error) > 0.0
         if self.is_wrong:
+            sizes = [random.object_pose_error]
+            self._size = state.parameters.blended(np.zeros((1, 2)), sizes, wp.vec2)
             self._error = state.zeros(state.num_envs, dtype=wp.transform)
             self._believed = wp.zeros_like(state.sim.joint_q)
 

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from vd.assets_usd.objects.model import ObjectModel
-from vd.envs.servo import gain_scales
+from vd.envs.servo import gain_scales, plain_servos
 from vd.envs.task_state import TaskState
 from vd.kernels.servo.actuators import INERTIA, PAYLOAD_INERTIA
 from vd.kernels.task.environments import (
@@ -74,17 +74,21 @@ class Randomiser:
         self._nominal_kp = wp.array(state.hand.kp, dtype=float, device=device)
         self._nominal_kd = wp.array(state.hand.kd, dtype=float, device=device)
         kp_scale, kd_scale = gain_scales(state.hand, cfg.randomisation)
-        self._kp_scale, self._kd_scale, self._servo_ranges = (
-            wp.array(scale, dtype=wp.vec2, device=device)
-            for scale in (kp_scale, kd_scale, state.servo_ranges)
-        )
+        blended = state.parameters.blended
+        self._kp_scale = blended(1.0, kp_scale, wp.vec2)
+        self._kd_scale = blended(1.0, kd_scale, wp.vec2)
+        plain = plain_servos(state.hand, state.servo_ranges)
+        self._servo_ranges = blended(plain, state.servo_ranges, wp.vec2)
         inertia = state.servo_ranges[:, [INERTIA, PAYLOAD_INERTIA]]
         self._inertia_varies = bool(np.any(inertia[..., 0] != inertia[..., 1]))
         random = cfg.randomisation
-        nominal = (cfg.table_friction,) * 2, (PAPER.materials.object_mass_kg,) * 2
-        usual = (random.table_friction, random.object_mass_kg) if self.enabled else nominal
-        self._table_friction = self._ranges("table_friction", usual[0])
-        self._object_mass = self._ranges("mass", usual[1])
+        table = (cfg.table_friction,) * 2
+        mass = (PAPER.materials.object_mass_kg,) * 2
+        nominal = self._ranges("table_friction", table)
+        drawn = self._ranges("table_friction", random.table_friction if self.enabled else table)
+        self._table_friction = blended(nominal, drawn, wp.vec2)
+        masses = self._ranges("mass", random.object_mass_kg if self.enabled else mass)
+        self._object_mass = wp.array(masses, dtype=wp.vec2, device=device)
         measured = self._of_objects(["table_friction" in item.contact for item in state.objects])
         # The average of table and object, as the paper's engine has it; what was measured is of the
         # pair.
@@ -100,8 +104,8 @@ class Randomiser:
         """A value of each object as one of each environment, shape [N, ...]."""
         return np.array(values)[self._state.scene.world_object]
 
-    def _ranges(self, name: str, usual: tuple[float, float]) -> wp.array:
-        """Range of a parameter in each environment [N].
+    def _ranges(self, name: str, usual: tuple[float, float]) -> np.ndarray:
+        """Range of a parameter in each environment [N, 2].
 
         An identified one varies within its interval.
         """
@@ -112,8 +116,7 @@ class Randomiser:
             (value,), (low,), (high,) = item.contact[name]
             return (low, high) if usual[0] < usual[1] else (value, value)
 
-        ranges = self._of_objects([of(item) for item in self._state.objects])
-        return wp.array(ranges, dtype=wp.vec2, device=self._state.device)
+        return self._of_objects([of(item) for item in self._state.objects])
 
     def _draw_masses(self) -> None:
         """Draw link and object masses, with which inertias scale, and where the objects' centres are."""
@@ -223,7 +226,7 @@ class Randomiser:
             write_object_force_kernel,
             [
                 self.object_mass,
-                state.must_lift,
+                state.parameters.must_lift,
                 self._gravity,
                 state.parameters.weight,
                 state.scene.object_body,

@@ -13,12 +13,19 @@ import warp as wp
 
 from vd.command.device import warp_device
 from vd.envs.cfg import ReorientCfg
-from vd.envs.curriculum import Stage, first_stage, next_stage
+from vd.envs.curriculum import (
+    Levels,
+    first_levels,
+    moving_levels,
+    next_levels,
+    progress_of,
+)
 from vd.envs.followers import ActuatedActions
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
-from vd.envs.saved_state import load_arrays, save_state, saved_stage
-from vd.envs.setup import rest_poses, table_steps
+from vd.envs.reached_starts import ReachedStarts
+from vd.envs.saved_state import load_arrays, save_state, saved_levels
+from vd.envs.setup import rest_poses
 from vd.envs.starts import FreeStarts
 from vd.envs.task_state import build_task
 from vd.kernels.rng import init_rng_kernel
@@ -98,11 +105,7 @@ class ReorientEnv:
         )
         self.fingers, self.parameters = state.fingers, state.parameters
         self.measured_q, self.measured_qd = state.measured_q, state.measured_qd
-        self.smoothed, self.goal_quat, self.must_lift = (
-            state.smoothed,
-            state.goal_quat,
-            state.must_lift,
-        )
+        self.smoothed, self.goal_quat = state.smoothed, state.goal_quat
 
         self.num_envs = cfg.num_envs
         self.num_fingers = self.hand.num_fingers
@@ -137,14 +140,11 @@ class ReorientEnv:
         """Whether :meth:`step` takes actions in the symmetry frames, if any, or in the world's
         order.
         """
-        leaves = cfg.table.away_share > 0.0
-        self._table_steps = (
-            wp.array(table_steps(cfg), dtype=wp.int32, device=self.device) if leaves else None
-        )
-
-        self.stage = first_stage(cfg.curriculum)
+        self._table_leaves = cfg.table.away_share > 0.0
+        self._moving = moving_levels(cfg)
+        self.levels = first_levels(self._moving)
         """How hard the task is at present; all ones is the configured task."""
-        self.parameters.set_stage(self.stage)
+        self.parameters.set_levels(self.levels)
         self._graphs = Graphs(self.device, captured=self.sim.solver.captured)
         self.steps = 0
         """Control steps of all environments since the begin of the run, with those of a
@@ -191,6 +191,9 @@ class ReorientEnv:
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         self._reset_q = wp.array(self.hand.start, dtype=float, device=self.device)
         self._free_starts = FreeStarts(self.state, self.hand.start)
+        self._reached: ReachedStarts | None = None
+        if self.cfg.start.reached_share > 0.0:
+            self._reached = ReachedStarts(self.state, self.motion())
         self._actuated = ActuatedActions(self.state)
         self.refused = zeros(n, dtype=wp.int32)
         """Actions that were not finite since that was told, shape [N]."""
@@ -225,7 +228,9 @@ class ReorientEnv:
         self.ended.fill_(1)
         self._new_goal.zero_()
         self.randomiser.draw(self.ended)
-        self._reset_envs(use_start=object_quat is not None, use_goal=goal_quat is not None)
+        self._reset_envs(
+            self.ended, use_start=object_quat is not None, use_goal=goal_quat is not None
+        )
         self.randomiser.write_model()
         self.observe()
 
@@ -243,7 +248,7 @@ class ReorientEnv:
         self.ended.zero_()
         self._new_goal.assign(mask)
         self._given_goal.assign(goals)
-        self._reset_envs(use_goal=True)
+        self._reset_envs(self.ended, use_goal=True)
         self.observe()
 
     def step(self, action: Any) -> None:
@@ -354,8 +359,8 @@ class ReorientEnv:
         sim = self.sim
         self._apply_action()
         self.randomiser.disturb()
-        if self._table_steps is not None:
-            sim.place_tables(self.step_count, self._table_steps)
+        if self._table_leaves:
+            sim.place_tables(self.step_count, self.parameters.table_steps)
         sim.step()
         if self.cfg.failures_per_million > 0.0:
             sim.put_back(self.step_count, self.max_episode_steps - 1)
@@ -371,7 +376,12 @@ class ReorientEnv:
     def _launch_renewal(self) -> None:
         """Give new goals, reset what has ended, and observe."""
         self.randomiser.redraw(self.ended)
-        self._reset_envs()
+        if self._reached is None:
+            self._reset_envs(self.ended)
+        else:
+            self._reached.keep(self.ended, self.step_count)
+            self._reached.begin(self.ended, self._new_goal, self.step_count)
+            self._reset_envs(self._reached.reset)
         self.observer.observe()
 
     def _judge(self) -> None:
@@ -386,7 +396,7 @@ class ReorientEnv:
                 self.goal_quat,
                 self.smoothed,
                 sim.table_force,
-                self.must_lift,
+                self.parameters.must_lift,
             ],
             [self.rotation_error, self.still, self.success, self.fell],
         )
@@ -430,8 +440,10 @@ class ReorientEnv:
             [self.timed_out, self.done, self.ended, self._new_goal],
         )
 
-    def _reset_envs(self, *, use_start: bool = False, use_goal: bool = False) -> None:
-        """Reset the environments of ``ended``, give a goal to those of ``_new_goal`` too."""
+    def _reset_envs(
+        self, reset: wp.array, *, use_start: bool = False, use_goal: bool = False
+    ) -> None:
+        """Reset the environments of ``reset`` [N], give a goal to those of ``_new_goal`` too."""
         sim, p = self.sim, self.parameters
         self._launch(
             reset_kernel,
@@ -440,7 +452,7 @@ class ReorientEnv:
                 p.start,
                 p.goal,
                 self._rest_poses,
-                self.ended,
+                reset,
                 self._new_goal,
                 self._given_start,
                 int(use_start),
@@ -459,14 +471,14 @@ class ReorientEnv:
                 self._env_mask,
             ],
         )
-        self._free_starts.move(self.ended)
+        self._free_starts.move(reset)
         if self.symmetry_frames is not None:
-            self.symmetry_frames.choose(self.ended, self._new_goal)
+            self.symmetry_frames.choose(reset, self._new_goal)
         # The solver warm-starts from the last accelerations, which mean nothing after a reset.
         sim.solver.reset(sim.state, world_mask=self._env_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
         if sim.servo is not None:
-            sim.servo.reset(self.ended)
+            sim.servo.reset(reset)
         self.observer.begin(self.ended)
 
     def observe(self) -> None:
@@ -482,14 +494,9 @@ class ReorientEnv:
 
     def has_table(self) -> np.ndarray:
         """Whether each table was there in the last step, by the task, bool, shape [N] (host copy)."""
-        last = self._table_steps
         if self.hand.palm_up:
             return np.zeros(self.num_envs, bool)
-        return (
-            np.ones(self.num_envs, bool)
-            if last is None
-            else self.step_count.numpy() <= last.numpy()
-        )
+        return np.asarray(self.step_count.numpy() <= self.parameters.table_steps.numpy())
 
     def object_pose(self) -> np.ndarray:
         """Present object poses, position [m] and quaternion xyzw, shape [N, 7] (host copy)."""
@@ -527,37 +534,44 @@ class ReorientEnv:
     # Curriculum and checkpoints
 
     def update_curriculum(self) -> dict[str, float]:
-        """Move the stage by the success rate since the last call; returns numbers to log."""
+        """Move the levels by the success rate since the last call; returns numbers to log."""
         ended, reached, dropped = (float(v) for v in self.goal_counts.numpy())
         self.goal_counts.zero_()
         rate = reached / max(ended, 1.0)
-        stage = next_stage(self.stage, rate, self.cfg.curriculum) if ended > 0 else self.stage
-        if stage != self.stage:
-            self.set_stage(stage)
+        levels = next_levels(self.levels, rate, self._moving) if ended > 0 else self.levels
+        if levels != self.levels:
+            self.set_levels(levels)
         return {
             "success_per_goal": rate,
             "drop_per_goal": dropped / max(ended, 1.0),
             "goals_ended": ended,
-            "difficulty": stage.difficulty,
-            "tightness": stage.tightness,
         }
 
-    def set_stage(self, stage: Stage) -> None:
-        """Go to a stage of the curriculum."""
-        self.stage = stage
-        self.parameters.set_stage(stage)
+    def set_levels(self, levels: Levels) -> None:
+        """Go to these levels of the curriculum."""
+        self.levels = levels
+        self.parameters.set_levels(levels)
+
+    @property
+    def progress(self) -> float:
+        """How far all levels that move have come together, in [0, 1]; 1: the configured task."""
+        return progress_of(self.levels, self._moving)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue exactly, see :func:`vd.envs.saved_state.save_state`."""
-        return save_state(self.state, self.changing_arrays(), self.stage, self.steps)
+        return save_state(self.state, self.changing_arrays(), self.levels, self.steps)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`, see :func:`vd.envs.saved_state.load_arrays`."""
         load_arrays(self.state, self.changing_arrays(), state)
         self.steps = int(state["steps"])
-        self.set_stage(saved_stage(state, self.cfg.curriculum))
+        self.set_levels(self.levels_of(state))
         self.randomiser.write_model()
         self.sim.forward_kinematics()
+
+    def levels_of(self, state: dict[str, Any]) -> Levels:
+        """The levels at which this environment goes on from a :meth:`state_dict`."""
+        return saved_levels(state, self._moving)
 
     def changing_arrays(self) -> dict[str, wp.array]:
         """What changes from step to step: simulation, episodes, randomisation, random streams."""
@@ -573,6 +587,7 @@ class ReorientEnv:
             "rng": self.state.rng,
             **self.observer.stateful(),
             **self.randomiser.stateful(),
+            **({} if self._reached is None else self._reached.stateful()),
         }
 
     def close(self) -> None:

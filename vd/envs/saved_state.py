@@ -1,46 +1,43 @@
 """Saving an environment in the middle of its episodes, and going on from there."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from vd.envs.cfg import CurriculumCfg
-from vd.envs.curriculum import Stage, first_stage
+from vd.envs.cfg import LevelCfg
+from vd.envs.curriculum import Levels
 from vd.envs.task_state import TaskState
 
 
 def save_state(
-    task: TaskState, arrays: Mapping[str, wp.array], stage: Stage, steps: int
+    task: TaskState, arrays: Mapping[str, wp.array], levels: Levels, steps: int
 ) -> dict[str, Any]:
     """Everything needed to continue exactly.
 
     Args:
         task: The task.
         arrays: What changes from step to step, by name.
-        stage: Stage of the curriculum.
+        levels: How far the curriculum has come.
         steps: Control steps since the begin of the run.
     """
     return {
         "arrays": {name: array.numpy().copy() for name, array in arrays.items()},
-        "difficulty": stage.difficulty,
-        "tightening": task.cfg.curriculum.tightening.enabled,
-        "tightness": stage.tightness,
+        "levels": asdict(levels),
         "steps": steps,
         "objects": _objects(task),
     }
 
 
-def saved_stage(state: dict[str, Any], cfg: CurriculumCfg) -> Stage:
-    """Stage at which a run goes on from what :func:`save_state` gave.
+def saved_levels(state: dict[str, Any], moving: Mapping[str, LevelCfg]) -> Levels:
+    """Levels at which a run goes on from what :func:`save_state` gave.
 
-    The tightness is that of the saved run only if it had one and this run has one too.
+    Those that it does not move are 1, as are those that the saved run did not have.
     """
-    first = first_stage(cfg)
-    known = cfg.tightening.enabled and state["tightening"]
-    tightness = float(state["tightness"]) if known else first.tightness
-    return Stage(float(state["difficulty"]), tightness)
+    saved = state.get("levels", {})
+    return Levels(**{name: float(saved.get(name, 1.0)) for name in moving})
 
 
 def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, Any]) -> None:

@@ -46,6 +46,20 @@ def servo_ranges(hand: HandModel, cfg: RandomisationCfg) -> np.ndarray:
     return ranges
 
 
+def plain_servos(hand: HandModel, ranges: np.ndarray) -> np.ndarray:
+    """What each parameter of each joint is where nothing is drawn yet, [D, P, 2].
+
+    A parameter for which the hand's own value is no possible one, such as a torque limit that is
+    off at zero, has no way from there: it is as drawn, ``ranges`` [D, P, 2], all along.
+    """
+    plain = ranges.copy()
+    for parameter in PARAMETERS.values():
+        own = hand.servo[:, parameter.column]
+        possible = (np.abs(own) >= parameter.lower) & (np.abs(own) <= parameter.upper)
+        plain[possible, parameter.column] = own[possible, None]
+    return plain
+
+
 def needs_servo(ranges: np.ndarray) -> bool:
     """Whether any joint in any environment has more than a plain drive.
 

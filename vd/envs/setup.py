@@ -23,15 +23,17 @@ def object_scales(random: RandomisationCfg) -> list[float]:
     return [float(scale) for scale in np.linspace(*random.object_scale, random.object_scale_count)]
 
 
-def table_steps(cfg: ReorientCfg) -> np.ndarray:
+def table_steps(cfg: ReorientCfg, air: float) -> np.ndarray:
     """Control steps for which each environment's table stays, int32, shape [N].
+
+    ``air`` is the level of the curriculum: what part of ``away_share`` loses its table.
 
     Which environments lose it, and when, is drawn once from the seed: an episode says nothing of it
     to the policy.
     """
     table, n = cfg.table, cfg.num_envs
     draw = np.random.default_rng(cfg.seed)
-    away = draw.permutation(n) < round(table.away_share * n)
+    away = draw.permutation(n) < round(air * table.away_share * n)
     steps = np.maximum(1, np.round(draw.uniform(*table.away_s, size=n) * cfg.sim.control_hz))
     return np.where(away, steps, ALWAYS).astype(np.int32)
 

@@ -17,7 +17,7 @@ from vd.envs.cfg import ReorientCfg
 from vd.envs.fingers import Fingers
 from vd.envs.parameters import TaskParameters
 from vd.envs.servo import needs_servo, servo_ranges
-from vd.envs.setup import chosen, object_scales
+from vd.envs.setup import object_scales
 from vd.kernels.rng import init_rng_kernel
 from vd.sim.scene import Scene, build_scene
 from vd.sim.simulator import Simulator
@@ -52,8 +52,6 @@ class TaskState:
     """Moving average of the applied actions, shape [N, D]."""
     goal_quat: wp.array
     """Wanted orientation of the object, shape [N]."""
-    must_lift: wp.array
-    """1 where success asks that the object does not touch the table, shape [N]."""
     rng: wp.array
     """Random stream of each environment, shape [N]."""
     surface_points: wp.array
@@ -146,7 +144,6 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
         upper=wp.array(hand.upper, dtype=float, device=device),
         smoothed=wp.zeros((n, hand.num_joints), dtype=float, device=device),
         goal_quat=goal,
-        must_lift=wp.array(chosen(cfg, cfg.table.lift_share), dtype=wp.int32, device=device),
         rng=rng,
         surface_points=wp.array(
             np.stack([item.surface_points for item in objects]), dtype=wp.vec3, device=device

@@ -7,15 +7,12 @@ A function takes the :class:`vd.envs.reorient.ReorientEnv` and gives a torch ten
 to it.
 """
 
-import importlib
-import sys
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
 import warp as wp
 
+from vd.command.functions import named_function
 from vd.envs.cfg import ReorientCfg
 from vd.kernels.task.rewards import REWARD_TERMS
 from vd.sim.simulator import CHECKED
@@ -39,7 +36,8 @@ class OwnTerms:
         if wrong := [name for name, size in self._sizes.items() if size < 1]:
             raise ValueError(f"observation.terms: {wrong[0]} has to give 1 value or more")
         self._functions = {
-            name: _function(name) for name in self._coefficients.keys() | self._sizes.keys()
+            name: named_function(name, "the own term")
+            for name in self._coefficients.keys() | self._sizes.keys()
         }
         self._not_finite: dict[str, torch.Tensor] = {}
         self._steps = 0
@@ -102,20 +100,3 @@ class OwnTerms:
         bad = ~torch.isfinite(value).all()
         self._not_finite[name] = self._not_finite.get(name, bad) | bad
         return value.reshape(env.num_envs, size).float()
-
-
-def _function(name: str) -> Callable[[Any], torch.Tensor]:
-    """The function ``module:function``; modules of the working folder are found as well."""
-    module, _, function = name.partition(":")
-    here = str(Path.cwd())
-    sys.path.append(here)
-    try:
-        found: Any = getattr(importlib.import_module(module), function)
-    except Exception as error:
-        raise ValueError(
-            f"the own term {name!r} is not found ({error}); name it module:function, and run where "
-            "that module can be imported"
-        ) from error
-    finally:
-        sys.path.remove(here)
-    return found

@@ -45,7 +45,8 @@ EXCLUSIVE = (
 """Settings that say different things of the same."""
 POLICY_HELP = (
     "A policy.safetensors, a checkpoint, a run's folder, the name of an installed policy "
-    f" ({', '.join(SHIPPED_POLICIES)}), or zero or random, which have no file."
+    f" ({', '.join(SHIPPED_POLICIES)}), module:function, a function of yours from observations to "
+    "actions, or zero or random."
 )
 """What names a policy on a command line."""
 
@@ -127,7 +128,7 @@ class EvalCfg(HandFlags, EpisodeFlags):
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = ()
     suite: str | None = None
-    """Run the command lines of a suite, paper, robust or a YAML file (docs/concepts/evaluation.md),
+    """Run the command lines of a suite, paper, robust, benchmark or a YAML file (docs/concepts),
     on the D'Claw policies if none is named. --objects training=FOLDER held-out=FOLDER names
     objects; without, our procedural sets stand for them.
     """

@@ -10,10 +10,11 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vd.command.functions import named_function
 from vd.command.warp_quiet import quiet_warp
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
 from vd.evaluate.conditions import in_condition
-from vd.policy.agents import check_fits, open_policy, sees_clouds, task_for
+from vd.policy.agents import BUILT_IN, check_fits, open_policy, sees_clouds, task_for
 from vd.sim.cfg import in_mujoco
 
 if TYPE_CHECKING:
@@ -172,9 +173,12 @@ def actor_of(
     A camera policy with ``goals`` and ``sensor_errors``.
     """
     from vd.evaluate.result import Agent
-    from vd.policy.actor import BuiltIn
+    from vd.policy.actor import BuiltIn, FunctionPolicy
     from vd.policy.stopping import StoppingRule
 
+    if policy is None and name not in BUILT_IN:
+        function = FunctionPolicy(named_function(name, "the policy"), env.num_actions)
+        return function, Agent(name, "function", "state", StoppingRule)
     if policy is None:
         actor = BuiltIn(name, env.num_actions, seed=seed, device=env.device)
         return actor, Agent(name, name, "nothing", StoppingRule)

@@ -169,7 +169,7 @@ class Row:
     policy: str
     """As it was named."""
     kind: str
-    """teacher, tracking, vision, zero, random."""
+    """teacher, tracking, vision, function, zero, random."""
     sees: str
     """state, rendered clouds or nothing."""
     group: str

@@ -1,6 +1,6 @@
 """Suites: command lines of ``vd-eval`` in a file, which :mod:`vd.evaluate.suite_run` runs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -88,6 +88,10 @@ class Suite:
     title: str
     lines: tuple[SuiteEntry, ...]
     claims: tuple[Claim, ...] = ()
+    members: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """By group of objects the names of those that it takes of its sets; others take all."""
+    by_aspect: bool = False
+    """Whether its figures are by aspect ratio of the objects too."""
 
 
 def share_text(value: float, *interval: float) -> str:

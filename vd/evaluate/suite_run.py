@@ -10,11 +10,15 @@ import re
 import shlex
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
+from pathlib import Path
 from typing import Any, cast
+
+import numpy as np
 
 from vd.command.config import to_dict
 from vd.command.files import make_folder, write_json
@@ -38,12 +42,14 @@ from vd.evaluate.suite import (
     read_suite,
     share_text,
 )
-from vd.policy.agents import BUILT_IN, find_policy, open_policy, sees_clouds
+from vd.policy.agents import find_policy, has_no_file, open_policy, sees_clouds
 
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
 LOG_FILE = "log.txt"
 """Progress of an evaluation that ran beside others."""
+ASPECTS = (1.0, 2.0, 4.0, math.inf)
+"""Bounds of the classes of aspect ratio (ours)."""
 NOT_RUN = "not run; the same command goes on from here"
 # Settings that say where and how an evaluation runs, not what it measures.
 _NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs", "shard")
@@ -106,7 +112,8 @@ def run_suite(cfg: EvalCfg) -> Result:
     begun = time.monotonic()
     assert cfg.suite is not None
     suite = read_suite(cfg.suite)
-    groups = object_groups(cfg.objects, groups_of(suite.lines), quick=cfg.quick)
+    wanted = groups_of(suite.lines)
+    groups = object_groups(cfg.objects, wanted, quick=cfg.quick, members=suite.members)
     lines = suite.lines
     if cfg.quick:
         lines = tuple(entry for entry in lines if entry.quick)
@@ -285,14 +292,19 @@ def shown(entry: SuiteEntry) -> str:
 
 
 def object_groups(
-    objects: Sequence[str], wanted: Sequence[str], *, quick: bool
+    objects: Sequence[str],
+    wanted: Sequence[str],
+    *,
+    quick: bool,
+    members: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, ObjectGroup]:
     """The objects of each wanted group.
 
-    Those given as ``GROUP=SET``, our procedural ones for the others.
+    Those given as ``GROUP=SET``, our procedural ones for the others. Of a group with ``members``
+    only the objects of these names.
 
     Raises:
-        ValueError: No such group is wanted.
+        ValueError: No such group is wanted, or a set lacks one of the members.
     """
     from vd.assets_usd.objects.sets import set_files
 
@@ -309,7 +321,10 @@ def object_groups(
             print(f"left out: {group}; give --objects {group}=SET", file=sys.stderr)
             continue
         files = set_files(sets)
-        text = f"{len(files)} of {shown_name(', '.join(sets))}"
+        if names := (members or {}).get(group):
+            files = _members(group, files, names)
+            sets = tuple(map(str, files))
+        text = f"{len(files)} of {shown_name(', '.join(given.get(group, sets)))}"
         if quick and len(files) > QUICK_OBJECTS:
             step = len(files) / QUICK_OBJECTS
             sets = tuple(str(files[int(i * step)]) for i in range(QUICK_OBJECTS))
@@ -320,12 +335,23 @@ def object_groups(
     return groups
 
 
+def _members(group: str, files: Sequence[Path], names: Sequence[str]) -> list[Path]:
+    """The files of the objects of these names, in their order."""
+    by_name = {file.stem: file for file in files}
+    missing = [name for name in names if name not in by_name]
+    if missing:
+        raise ValueError(
+            f"--objects {group}: there is no {', '.join(missing)}; import all meshes of the suite"
+        )
+    return [by_name[name] for name in names]
+
+
 def fingerprint(name: str) -> str:
     """What tells the content of a policy from others.
 
-    A SHA-256, or the name of a built-in agent.
+    A SHA-256, or the name of an agent without a file.
     """
-    if name in BUILT_IN:
+    if has_no_file(name):
         return name
     return hashlib.sha256(find_policy(name).read_bytes()).hexdigest()
 
@@ -334,8 +360,11 @@ def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, ObjectG
     """The page and its figures, of what there is."""
     short = labels(result.policies)
     of_paper = bool(suite.claims)
-    figures = paper_figures(result, suite, short)
-    if not of_paper:
+    if of_paper:
+        figures = paper_figures(result, suite, short)
+    elif suite.by_aspect:
+        figures = aspect_table(result, groups, short)
+    else:
         figures = robust_table(result, suite.lines, short)
     summary = result.summary() | {"quick": cfg.quick, "figures": figures}
     write_json(cfg.out / f"{cfg.suite_name}.json", summary)
@@ -395,6 +424,42 @@ def robust_table(
                 }
             )
     return table
+
+
+def aspect_table(
+    result: Result, groups: dict[str, ObjectGroup], short: dict[str, str]
+) -> list[dict[str, str]]:
+    """A line for each entry and policy: success of all objects, and of each class of aspect ratio."""
+    from vd.assets_usd.objects.sets import load_set
+
+    aspects: dict[tuple[str, str], float] = {}
+    for name, group in groups.items():
+        for item in load_set(group.sets):
+            aspects[name, item.name] = aspect_ratio(item.surface_points)
+    table = []
+    for row in result.rows:
+        if not row.headline:
+            continue
+        line = {"condition": row.condition, "policy": short[row.policy]}
+        line["success"] = _share(row.overall.outcomes["success"])
+        for low, high in pairwise(ASPECTS):
+            rates = [
+                item.outcomes["success"].value
+                for item in row.per_object
+                if low <= aspects[row.group, item.name] < high
+            ]
+            mean = share_text(float(np.mean(rates))) if rates else NOTHING
+            line[f"aspect {low:g} to {high:g}"] = f"{mean} of {len(rates)}" if rates else mean
+        table.append(line)
+    return table
+
+
+def aspect_ratio(points: np.ndarray) -> float:
+    """Longest by shortest extent of points [P, 3] along their principal axes."""
+    centred = points - points.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    extents = np.ptp(centred @ axes.T, axis=0)
+    return float(extents.max() / extents.min())
 
 
 def paper_figures(result: Result, suite: Suite, short: dict[str, str]) -> list[dict[str, str]]:

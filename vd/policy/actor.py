@@ -4,7 +4,7 @@ A trained actor, zero or random actions. They need torch only, no simulator and 
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -18,8 +18,6 @@ from vd.policy import SUFFIX
 from vd.policy.contract import Contract, Contracted, PolicySpec
 
 CHECKPOINT_FORMAT = "visual-dexterity checkpoint 1"
-_STAGE = ("difficulty", "tightness", "tightening")
-"""What says how far the curriculum has come, in the state of an environment."""
 PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
 """Those of which a policy notes the versions."""
 _WEIGHTS = "_state_dict"
@@ -131,6 +129,28 @@ class BuiltIn:
         return torch.rand(shape, generator=self._generator, device=observation.device) * 2.0 - 1.0
 
 
+class FunctionPolicy:
+    """A function of a user, from observations [N, O] to actions [N, A], tensors of one device."""
+
+    def __init__(self, function: Callable[[torch.Tensor], torch.Tensor], num_actions: int) -> None:
+        self._function, self.num_actions = function, num_actions
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """Actions [N, A].
+
+        Raises:
+            ValueError: The function gave something of another shape.
+        """
+        with torch.no_grad():
+            action = torch.as_tensor(self._function(observation), device=observation.device)
+        wanted = (len(observation), self.num_actions)
+        if tuple(action.shape) != wanted:
+            raise ValueError(
+                f"the policy gave actions {tuple(action.shape)}, not {wanted}; mend it"
+            )
+        return action.float()
+
+
 def read_state(
     path: str | Path, device: str = "cpu", *, remedy: str, wanted: str = CHECKPOINT_FORMAT
 ) -> dict[str, Any]:
@@ -203,7 +223,7 @@ def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedP
             stage=stage_of(state),
             software=installed_versions(PACKAGES),
         )
-        from_dict(ReorientCfg, contract.task, where="task")
+        ReorientCfg.of_task(contract.task)
         return TrainedPolicy(contract, state["actor_state_dict"], critic, device)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: {error}; take the version that wrote it") from error
@@ -211,8 +231,8 @@ def teacher_in(state: dict[str, Any], path: str | Path, device: str) -> TrainedP
 
 def stage_of(state: dict[str, Any]) -> dict[str, Any]:
     """How far the curriculum of a checkpoint has come."""
-    environment = state["ranks"][0]["env"]
-    return {key: environment[key] for key in _STAGE if key in environment}
+    levels: dict[str, Any] = state["ranks"][0]["env"].get("levels", {})
+    return levels
 
 
 def perceptron(spec: PolicySpec) -> nn.Sequential:

@@ -23,6 +23,14 @@ if TYPE_CHECKING:
 
 BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
+
+
+def has_no_file(name: str | Path) -> bool:
+    """Whether an agent is built in, or a function of a user, ``module:function``."""
+    text = str(name)
+    return text in BUILT_IN or (":" in text and not Path(text).exists())
+
+
 POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 """Policies of the package. A wheel has two of them, a checkout all."""
 SHIPPED_POLICIES = {path.stem: path for path in sorted(POLICY_FOLDER.glob(f"*{SUFFIX}"))}
@@ -130,7 +138,7 @@ def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None 
     from vd.assets_usd.objects.sets import check_sets
 
     for name in agents:
-        if name not in BUILT_IN:
+        if not has_no_file(name):
             find_policy(name)
     check_sets(objects)
     if hand is not None:
@@ -154,13 +162,13 @@ def policy_name(name: str | Path) -> str:
 def open_policy(name: str | Path, device: str) -> "AnyPolicy | None":
     """Load what :func:`find_policy` finds.
 
-    None for a built-in agent, which has to know its task first.
+    None for an agent without a file, which has to know its task first.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is no policy.
     """
-    if name in BUILT_IN:
+    if has_no_file(name):
         return None
     path = find_policy(name)
     if has_suffix(path, ONNX_SUFFIX):
@@ -265,8 +273,10 @@ def task_for(
     observation = replace(observation, dynamics="none", critic_terms={})
     task = replace(task, observation=observation, reward=replace(task.reward, terms={}))
     task = _on_hand(task, hand, hand_layer)
+    start = replace(task.start, reached_share=0.0)
     if at_rest is not None:
-        task = replace(task, start=replace(task.start, at_rest=at_rest))
+        start = replace(start, at_rest=at_rest)
+    task = replace(task, start=start)
     if max_goal_angle_rad is not None:
         task = replace(task, goal=replace(task.goal, max_angle_rad=max_goal_angle_rad))
     return replace(

@@ -180,7 +180,7 @@ def contract_of(text: str, where: str | Path) -> Contract:
                 f"format is {values['format']!r}, this version reads {POLICY_FORMAT!r}"
             )
         contract = from_dict(Contract, values, where="contract")
-        from_dict(ReorientCfg, contract.task, where="contract.task")
+        ReorientCfg.of_task(contract.task, where="contract.task")
     except (ValueError, TypeError, KeyError) as error:
         raise ContractError(f"{where}: {error}; take the version that wrote it") from error
     return contract
@@ -354,7 +354,7 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
         ContractError: The first field that differs, what the hand has, what the policy wants, what
             to do.
     """
-    task = from_dict(ReorientCfg, contract.task, where="contract.task")
+    task = ReorientCfg.of_task(contract.task, where="contract.task")
     have = dict(leaves(derive_interface(task, hand, contract.camera)))
     want = dict(leaves(contract.interface))
     for name in dict.fromkeys((*want, *have)):
