@@ -1,0 +1,159 @@
+"""A cube with an AprilTag on each face: where its tags are, and its pose from those in an image.
+
+The object's frame has its origin in the middle of the cube and its axes along the edges. Pixels are
+those of :class:`vd.assets_usd.hand_data.Intrinsics`.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_data import Intrinsics
+from vd.deploy.camera.camera import Camera, StaleCamera
+from vd.deploy.camera.markers import find_markers, opencv
+from vd.deploy.pose.source import StampedPose
+
+DICTIONARY = "DICT_APRILTAG_36h11"
+"""Not the one of the markers on fingertips, so that none is mistaken for another."""
+CELLS = 8
+"""Cells on a side of a tag, its black border included."""
+MARGIN_CELLS = 1
+"""White border that detection needs around the black one; the rest of a face is the tag."""
+TAG_SHARE = CELLS / (CELLS + 2 * MARGIN_CELLS)
+"""Side of a tag's black square over that of the cube."""
+FACES = (
+    ((1, 0, 0), (0, 0, 1)),
+    ((0, 1, 0), (0, 0, 1)),
+    ((-1, 0, 0), (0, 0, 1)),
+    ((0, -1, 0), (0, 0, 1)),
+    ((0, 0, 1), (-1, 0, 0)),
+    ((0, 0, -1), (1, 0, 0)),
+)
+"""Outward normal of the face of each tag, and the direction of the tag's upper edge."""
+SIZE_M = 0.07
+"""Side of a cube that hands hold [m]: that of the built-in object ``cube``."""
+MOST_PX = 2.0
+"""Root mean square of the corners' distances from a cube's, above which there is no cube [px]."""
+ALIKE_PX = 1.0
+"""Difference of that between two poses below which the image does not say which one it is [px]."""
+RECENT_S = 0.5
+"""Age of a last pose that tells which of two like poses it is [s]."""
+WAIT_S = 0.04
+"""Longest wait for an image [s], one of 30 a second."""
+
+
+def face_corners(side_m: float, cube_m: float) -> np.ndarray:
+    """Corners of a square in the middle of each face, in the cube's frame [m] [6, 4, 3].
+
+    From the top left on clockwise, as seen from outside.
+
+    Args:
+        side_m: Side of the squares.
+        cube_m: Side of the cube.
+    """
+    faces = []
+    for normal, up in np.asarray(FACES, dtype=float):
+        right = np.cross(up, normal)
+        middle = 0.5 * cube_m * normal
+        corners = [up - right, up + right, right - up, -up - right]
+        faces.append(middle + 0.5 * side_m * np.array(corners))
+    return np.array(faces)
+
+
+def find_cube(
+    corners: Mapping[int, np.ndarray],
+    lens: Intrinsics,
+    size_m: float,
+    before: np.ndarray | None = None,
+) -> tuple[np.ndarray | None, float]:
+    """Pose of the cube in the camera's optical frame.
+
+    One least squares over the corners of all tags. A single tag far away looks alike from two
+    sides: then the pose is that nearer to where the cube was.
+
+    Args:
+        corners: Corners of each tag in the image [px] [4, 2], by its number.
+        lens: The lens.
+        size_m: Side of the cube [m].
+        before: Where it was lately [7].
+
+    Returns:
+        The pose [7], None where there is none, and how well the corners fit [px].
+    """
+    tags = sorted(number for number in corners if 0 <= number < len(FACES))
+    if not tags:
+        return None, np.inf
+    cv = opencv()
+    points = face_corners(TAG_SHARE * size_m, size_m)[tags].reshape(-1, 3)
+    pixels = np.concatenate([corners[number] for number in tags])
+    method = cv.SOLVEPNP_SQPNP if len(tags) > 1 else cv.SOLVEPNP_IPPE
+    _, turns, places, errors = cv.solvePnPGeneric(points, pixels, lens.matrix, None, flags=method)
+    fitting = []
+    for turn, place in zip(turns, places, strict=True):
+        turn, place = cv.solvePnPRefineLM(points, pixels, lens.matrix, None, turn, place)
+        there, _ = cv.projectPoints(points, turn, place, lens.matrix, None)
+        off_px = float(np.sqrt(np.mean(np.sum((there[:, 0] - pixels) ** 2, axis=1))))
+        quaternion = Rotation.from_rotvec(turn.ravel()).as_quat()
+        fitting.append((off_px, np.concatenate([place.ravel(), quaternion])))
+    best_px, pose = min(fitting, key=lambda fit: fit[0])
+    if best_px > MOST_PX:
+        return None, best_px
+    if before is not None:
+        alike = [fit for off_px, fit in fitting if off_px < best_px + ALIKE_PX]
+        pose = min(alike, key=lambda fit: _angle(fit, before))
+    return pose, best_px
+
+
+def _angle(pose: np.ndarray, other: np.ndarray) -> float:
+    """Angle between two poses [7] [rad]."""
+    turn = Rotation.from_quat(pose[3:]) * Rotation.from_quat(other[3:]).inv()
+    return float(turn.magnitude())
+
+
+class TagPoses:
+    """Poses of a cube of tags in a camera's images, in its optical frame.
+
+    Args:
+        camera: Images of brightness, uint8 [H, W].
+        size_m: Side of the cube [m].
+    """
+
+    def __init__(self, camera: Camera, size_m: float = SIZE_M):
+        self.name = "tags"
+        self.trouble = ""
+        self._camera = camera
+        self._size_m = size_m
+        self._newest: StampedPose | None = None
+
+    def read(self) -> StampedPose | None:
+        """The pose in the newest image that showed one; None before the first.
+
+        Raises:
+            CameraError: The camera does not serve.
+        """
+        try:
+            frame = self._camera.read(WAIT_S)
+        except StaleCamera as error:
+            self.trouble = str(error)
+            return self._newest
+        tags = find_markers(frame.image, DICTIONARY)
+        last, before = self._newest, None
+        if last is not None and frame.time_s < last.time_s + RECENT_S:
+            before = last.pose
+        pose, off_px = find_cube(tags, self._camera.intrinsics, self._size_m, before)
+        if pose is not None:
+            self.trouble = ""
+            self._newest = StampedPose(frame.time_s, pose)
+        elif np.isinf(off_px):
+            self.trouble = "no tag of the cube is seen: turn it to the camera, and give it light"
+        else:
+            self.trouble = (
+                f"the tags fit no cube of {self._size_m:g} m ({off_px:.1f} pixels off): name its "
+                f"side, tags:{self._size_m:g}, and glue its faces as vd-deploy tags prints them"
+            )
+        return self._newest
+
+    def close(self) -> None:
+        """Close the camera."""
+        self._camera.close()
