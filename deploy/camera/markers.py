@@ -40,19 +40,24 @@ def opencv() -> ModuleType:
     return cv2
 
 
-def find_markers(image: np.ndarray, dictionary: str = DICTIONARY) -> dict[int, np.ndarray]:
+def find_markers(
+    image: np.ndarray, dictionary: str = DICTIONARY, *, by_edges: bool = False
+) -> dict[int, np.ndarray]:
     """Corners of each marker [px], [4, 2], by its number: from the print's top left on, clockwise.
 
     Args:
         image: Brightness, uint8 [H, W].
         dictionary: OpenCV's name of the markers.
+        by_edges: Lay lines through the edges, whose crossings are the corners: several times as
+            exact as corners alone, and twenty times as slow.
 
     Raises:
         CameraError: OpenCV is not installed.
     """
     cv = opencv()
     parameters = cv.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv.aruco.CORNER_REFINE_SUBPIX
+    refined_by = cv.aruco.CORNER_REFINE_APRILTAG if by_edges else cv.aruco.CORNER_REFINE_SUBPIX
+    parameters.cornerRefinementMethod = refined_by
     parameters.cornerRefinementWinSize = 3
     parameters.minMarkerPerimeterRate = 0.02
     detector = cv.aruco.ArucoDetector(_dictionary(cv, dictionary), parameters)

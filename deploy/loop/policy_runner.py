@@ -43,7 +43,9 @@ class Sensed:
     """Depth image [m], 0 for none [H, W]."""
     truth: np.ndarray | None = None
     """True position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] of the object [13], which
-    a twin tells, and of the policies a teacher is told."""
+    a twin tells."""
+    object_state: np.ndarray | None = None
+    """The same as a teacher is told it: by --pose, or the truth; None: not known yet."""
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,9 @@ class PolicyRunner:
 
 
 class TeacherRunner(PolicyRunner):
-    """A teacher before a twin, which tells the object's true state.
+    """A teacher, which is told the object's state: by a twin, or by who tells poses.
 
-    An environment makes its observation.
+    An environment makes its observation. Until a state is known the hand holds still.
 
     Args:
         policy: The teacher.
@@ -142,17 +144,18 @@ class TeacherRunner(PolicyRunner):
     def decide(self, sensed: Sensed) -> Decision:
         """What it does in this state."""
         env, sim = self._env, self._env.sim
-        truth = self._before if sensed.truth is None else sensed.truth
+        known = sensed.object_state is not None
+        state = sensed.object_state if sensed.object_state is not None else self._before
         for array, joints, rest in (
-            (sim.joint_q, sensed.joint_q, truth[:7]),
-            (sim.joint_qd, sensed.joint_qd, truth[7:]),
-            (env.measured_q, sensed.joint_q, truth[:7]),
-            (env.measured_qd, sensed.joint_qd, truth[7:]),
+            (sim.joint_q, sensed.joint_q, state[:7]),
+            (sim.joint_qd, sensed.joint_qd, state[7:]),
+            (env.measured_q, sensed.joint_q, state[:7]),
+            (env.measured_qd, sensed.joint_qd, state[7:]),
             (env.smoothed, sensed.smoothed, ()),
         ):
             array.assign(np.array([[*joints, *rest]], dtype=np.float32)[:, : array.shape[1]])
         sim.forward_kinematics()
-        if self._begins:
+        if self._begins and known:
             env.give_goals(np.zeros(1, int), sensed.goal_quat[None])
             self._begins = False
         env.observe()
@@ -160,7 +163,9 @@ class TeacherRunner(PolicyRunner):
         action = as_warp(self._policy.act(seen))
         if env.symmetry_frames is not None:
             action = env.symmetry_frames.world_action(action)
-        error = symmetric_error(truth[None, 3:7], sensed.goal_quat[None], env.objects[0].symmetry)
+        if not known:
+            return Decision(np.zeros_like(sensed.smoothed), float("nan"))
+        error = symmetric_error(state[None, 3:7], sensed.goal_quat[None], env.objects[0].symmetry)
         return Decision(action.numpy()[0].copy(), float(error[0]))
 
 
@@ -236,10 +241,10 @@ def load_runner(
         item: The object.
         tolerance_rad: How near to the goal it is to stop [rad].
         seed: Of the choice of camera points.
-        object: What a twin holds, whose true state a teacher is told; None: a real hand.
+        object: What a twin holds, or what poses are of, for a teacher; None: nobody tells it.
 
     Raises:
-        ValueError: It is for another hand, or a teacher for a real one.
+        ValueError: It is for another hand, or a teacher that nobody tells the object's state.
     """
     if name == ZERO:
         return PolicyRunner(ReorientCfg(hand=hand_name), StoppingRule())
@@ -253,8 +258,8 @@ def load_runner(
     if object is not None:
         return TeacherRunner(policy, hand_name, object, tolerance_rad)
     raise ValueError(
-        f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train "
-        "tracker makes a tracking policy of it"
+        f"{name} is a teacher: it needs the object's pose, which no robot senses; tell it by --pose, "
+        "or have vd-train tracker make a tracking policy of it"
     )
 
 

@@ -2,12 +2,11 @@
 
 Pursue goals one after the other, in one process at 12 Hz, and log every step.
 
-The policy sees joints and a depth camera: a tracking or vision policy. A twin tells a teacher the
-truth.
+The policy sees joints and a depth camera: a tracking or vision policy. A teacher is told where the
+object is: by --pose, or by a twin, which tells the truth.
 """
 
 import contextlib
-import importlib.util
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -70,7 +69,7 @@ class RunCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """File or name of a policy that sees by camera, with --twin a teacher too, and by
+    """File or name of a policy that sees by camera, with --twin or --pose a teacher too, and by
     default the hand's installed vision or tracking policy. "zero" is the zero-action baseline."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj,
@@ -100,6 +99,13 @@ class RunCfg(HandOptions):
     """Where it was found to be (camera.usda of vd-deploy calibrate); where it was in training by
     default.
     """
+    pose: str | None = None
+    """Who tells where the object is, for a policy that observes it (a teacher): ros2:/TOPIC
+    (geometry_msgs/PoseStamped), udp:PORT, tags, tags:SIDE_M (a cube of vd-deploy tags before the
+    camera), or of a twin sim, sim:delay_s=0.1,noise_m=0.002,noise_rad=0.02."""
+    pose_frame: tuple[float, float, float, float, float, float, float] | None = None
+    """Pose of the frame that poses are in, in the hand's base: position [m] and quaternion xyzw; by
+    default that of the camera, of --camera-layer or the hand."""
     safety: SafetyCfg = field(default_factory=SafetyCfg)
     """Limits."""
     log: Path | None = None
@@ -126,7 +132,11 @@ class RunCfg(HandOptions):
     @property
     def policy_name(self) -> str:
         """The policy, or the installed one of the hand; one that sees, on a twin a teacher too."""
-        kinds = ("vision", "tracking", "teacher") if self.twin else ("vision", "tracking")
+        kinds: tuple[str, ...] = ("vision", "tracking")
+        if self.twin:
+            kinds = ("vision", "tracking", "teacher")
+        if self.pose is not None:
+            kinds = ("teacher",)
         return self.policy or default_policy(self.hand, *kinds)
 
     def validate(self) -> None:
@@ -136,19 +146,24 @@ class RunCfg(HandOptions):
         check_names([], [self.object], self.hand)
         check_names([self.policy_name], [])
         from vd.deploy.loop.goals import SCAN_SUFFIXES
+        from vd.deploy.pose.open import check_pose_options
+        from vd.deploy.ros import need_rclpy
 
         require(self, "--", "positive", "random_goals episode_s")
         require(self, "--", "zero or positive", "hold_s")
         if self.ros2 and (self.twin or self.port):
             raise ValueError("--ros2 is in place of --port and --twin; name one")
-        if self.ros2 and importlib.util.find_spec("rclpy") is None:
-            raise ValueError("--ros2 needs rclpy: source the setup.bash of a ROS 2 for this Python")
+        if self.ros2:
+            need_rclpy("--ros2")
+        if self.pose is not None:
+            check_pose_options(self.pose, twin=self.twin)
+        elif self.pose_frame is not None:
+            raise ValueError("--pose-frame places the poses of --pose; name their source, too")
         if self.realistic and not self.twin:
             raise ValueError("--realistic is for --twin")
-        if self.twin and Path(self.object).suffix.lower() in SCAN_SUFFIXES:
-            raise ValueError(
-                f"--object {self.object}: a twin cannot hold a scan; vd-assets import it first"
-            )
+        if Path(self.object).suffix.lower() in SCAN_SUFFIXES and (self.twin or self.pose):
+            who = "a twin cannot hold" if self.twin else "a teacher does not know"
+            raise ValueError(f"--object {self.object}: {who} a scan; vd-assets import it first")
         if self.log is not None and (package := LOG_FILES.get(self.log.suffix)):
             if self.log.exists():
                 raise FileExistsError(f"--log {self.log} is there; choose another name")
@@ -181,10 +196,12 @@ def run(cfg: RunCfg) -> int:
     goals = _goals(cfg, item)
     _say_chosen(cfg, len(goals))
     tolerance = cfg.tolerance_rad
-    told = cfg.object if cfg.twin else None
+    told = cfg.object if cfg.twin or cfg.pose else None
     runner = load_runner(
         name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told
     )
+    if cfg.pose and runner.camera is not None:
+        raise ValueError(f"--pose is for a teacher; {name} sees by camera: leave it out")
     if "torch" in sys.modules:  # of several threads, some would wait for one that has no core
         sys.modules["torch"].set_num_threads(1)
     if not runner.calibrated:
@@ -258,6 +275,9 @@ def _pursue(
     from vd.deploy.loop.action import ActionFilter
     from vd.deploy.loop.log import LogWriter
     from vd.deploy.loop.loop import NO_SYMMETRY, ControlLoop, summary
+    from vd.deploy.pose.check_pose import pose_findings
+    from vd.deploy.pose.follower import PoseFollower
+    from vd.deploy.pose.open import open_poses, pose_options, source_frame
     from vd.deploy.ros import UNKNOWN, RosGoals
 
     hand, twin, hz = connection.hand, connection.twin, runner.task.sim.control_hz
@@ -275,6 +295,23 @@ def _pursue(
             seen = camera_findings(
                 camera, runner.camera, hand.goal_in_base, fps=cfg.camera.fps if twin is None else hz
             )
+        poses = None
+        if cfg.pose is not None:
+            in_base = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+            if pose_options(cfg.pose).kind != "sim":
+                in_base = source_frame(hand, cfg.pose_frame, cfg.camera_layer)
+            if twin is not None:
+                twin.place_object()
+            opened = open_poses(
+                cfg.pose,
+                connection,
+                cfg.camera,
+                in_base,
+                ros_arguments=cfg.ros2_args,
+                seed=cfg.seed,
+            )
+            poses = stack.enter_context(opened)
+            seen = pose_findings(*poses, hand, cfg.safety.pose_stale_s)
         warm_up(runner, pose, [*goals, NO_SYMMETRY[0]][0], camera)
         stack.enter_context(undisturbed(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals{', and those it is given' * cfg.ros2}."
@@ -298,6 +335,9 @@ def _pursue(
                 safe.arm()
                 safe.move(pose, HOME_RAD_S)
                 place(safe, pose, twin, yes=cfg.yes)
+                follower = None
+                if poses is not None:
+                    follower = PoseFollower(*poses, safe.bus.clock.now())
                 loop = ControlLoop(
                     safe,
                     runner,
@@ -308,6 +348,7 @@ def _pursue(
                     hold_s=cfg.hold_s,
                     camera=camera,
                     twin=twin,
+                    follower=follower,
                     symmetry=item.symmetry,
                     more=(lambda: False) if served is None else served.more,
                 )

@@ -4,6 +4,7 @@ The object's frame has its origin in the middle of the cube and its axes along t
 those of :class:`vd.assets_usd.hand_data.Intrinsics`.
 """
 
+import threading
 from collections.abc import Mapping
 
 import numpy as np
@@ -39,8 +40,10 @@ ALIKE_PX = 1.0
 """Difference of that between two poses below which the image does not say which one it is [px]."""
 RECENT_S = 0.5
 """Age of a last pose that tells which of two like poses it is [s]."""
-WAIT_S = 0.04
-"""Longest wait for an image [s], one of 30 a second."""
+AROUND = 0.2
+"""Width of what is looked at around the tags that were found, as a share of their extent."""
+WAIT_S = 0.2
+"""Longest wait for an image [s]."""
 
 
 def face_corners(side_m: float, cube_m: float) -> np.ndarray:
@@ -59,6 +62,23 @@ def face_corners(side_m: float, cube_m: float) -> np.ndarray:
         corners = [up - right, up + right, right - up, -up - right]
         faces.append(middle + 0.5 * side_m * np.array(corners))
     return np.array(faces)
+
+
+def find_tags(image: np.ndarray) -> dict[int, np.ndarray]:
+    """Corners of each tag [px] [4, 2], by its number.
+
+    Args:
+        image: Brightness, uint8 [H, W].
+    """
+    roughly = find_markers(image, DICTIONARY)
+    if not roughly:
+        return {}
+    corners = np.concatenate(list(roughly.values()))
+    border = AROUND * np.ptp(corners, axis=0).max()
+    left, top = np.maximum(corners.min(axis=0) - border, 0).astype(int)
+    right, bottom = (corners.max(axis=0) + border).astype(int)
+    exactly = find_markers(image[top:bottom, left:right], DICTIONARY, by_edges=True)
+    return {number: found + np.array([left, top]) for number, found in exactly.items()}
 
 
 def find_cube(
@@ -88,7 +108,7 @@ def find_cube(
     points = face_corners(TAG_SHARE * size_m, size_m)[tags].reshape(-1, 3)
     pixels = np.concatenate([corners[number] for number in tags])
     method = cv.SOLVEPNP_SQPNP if len(tags) > 1 else cv.SOLVEPNP_IPPE
-    _, turns, places, errors = cv.solvePnPGeneric(points, pixels, lens.matrix, None, flags=method)
+    _, turns, places, _ = cv.solvePnPGeneric(points, pixels, lens.matrix, None, flags=method)
     fitting = []
     for turn, place in zip(turns, places, strict=True):
         turn, place = cv.solvePnPRefineLM(points, pixels, lens.matrix, None, turn, place)
@@ -114,6 +134,8 @@ def _angle(pose: np.ndarray, other: np.ndarray) -> float:
 class TagPoses:
     """Poses of a cube of tags in a camera's images, in its optical frame.
 
+    A thread looks at images, which takes much of a control step, from :meth:`start` on.
+
     Args:
         camera: Images of brightness, uint8 [H, W].
         size_m: Side of the cube [m].
@@ -125,9 +147,34 @@ class TagPoses:
         self._camera = camera
         self._size_m = size_m
         self._newest: StampedPose | None = None
+        self._error: Exception | None = None
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="tags", daemon=True)
+
+    def start(self) -> "TagPoses":
+        """Look at images from now on."""
+        self._thread.start()
+        return self
 
     def read(self) -> StampedPose | None:
         """The pose in the newest image that showed one; None before the first.
+
+        Raises:
+            CameraError: The camera does not serve.
+        """
+        if self._error is not None:
+            raise self._error
+        return self._newest
+
+    def close(self) -> None:
+        """Look no more, and close the camera."""
+        self._end.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._camera.close()
+
+    def look(self) -> None:
+        """Take an image, and find the cube in it.
 
         Raises:
             CameraError: The camera does not serve.
@@ -136,8 +183,8 @@ class TagPoses:
             frame = self._camera.read(WAIT_S)
         except StaleCamera as error:
             self.trouble = str(error)
-            return self._newest
-        tags = find_markers(frame.image, DICTIONARY)
+            return
+        tags = find_tags(frame.image)
         last, before = self._newest, None
         if last is not None and frame.time_s < last.time_s + RECENT_S:
             before = last.pose
@@ -152,8 +199,11 @@ class TagPoses:
                 f"the tags fit no cube of {self._size_m:g} m ({off_px:.1f} pixels off): name its "
                 f"side, tags:{self._size_m:g}, and glue its faces as vd-deploy tags prints them"
             )
-        return self._newest
 
-    def close(self) -> None:
-        """Close the camera."""
-        self._camera.close()
+    def _work(self) -> None:
+        """What the thread does."""
+        try:
+            while not self._end.is_set():
+                self.look()
+        except Exception as error:
+            self._error = error

@@ -178,9 +178,10 @@ class TwinCommand:
 
         Args:
             pipe: Takes the path of the port, which is printed without one. Answers ``object`` with
-                its position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] [13], ``depth``
-                with an image [m] [H, W] and its time [s], and ``place``, by which the object is
-                where an episode starts.
+                its position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] [13], ``scene``
+                with its pose [7] and the joints [rad] [D] of one moment, ``depth`` with an image
+                [m] [H, W] and its time [s], and ``place``, by which the object is where an episode
+                starts.
 
         Raises:
             ValueError: Options that cannot be.
@@ -233,6 +234,8 @@ class TwinCommand:
             match request:
                 case "object":
                     return np.concatenate([hand.joint_q[-7:], hand.joint_qd[-6:]])
+                case "scene":
+                    return hand.joint_q[-7:], hand.joint_q[:-7]
                 case "depth" if camera is not None:
                     camera.capture()
                     return camera.depth.numpy()[0].copy(), time.monotonic()
