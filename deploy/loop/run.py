@@ -38,10 +38,13 @@ from vd.paper import PAPER
 from vd.policy.defaults import default_policy
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
     from vd.assets_usd.hand_data import CameraModel, HandModel
     from vd.assets_usd.objects.model import ObjectModel
     from vd.deploy.loop.log import Sink
     from vd.deploy.loop.policy_runner import PolicyRunner
+    from vd.deploy.pose.source import PoseSource
     from vd.deploy.twin.child import TwinChild
 
 LOG_FILES = {MCAP: "mcap_ros2", ".rrd": "rerun"}
@@ -187,7 +190,6 @@ def run(cfg: RunCfg) -> int:
     from vd.assets_usd.hands import load_hand
     from vd.deploy.hardware.connect import motors_of
     from vd.deploy.loop.goals import one_object
-    from vd.deploy.loop.policy_runner import load_runner
     from vd.deploy.ros import connect_ros
 
     quiet_warp()
@@ -195,21 +197,7 @@ def run(cfg: RunCfg) -> int:
     item, name = one_object(cfg.object), cfg.policy_name
     goals = _goals(cfg, item)
     _say_chosen(cfg, len(goals))
-    tolerance = cfg.tolerance_rad
-    told = cfg.object if cfg.twin or cfg.pose else None
-    runner = load_runner(
-        name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told
-    )
-    if cfg.pose and runner.camera is not None:
-        raise ValueError(f"--pose is for a teacher; {name} sees by camera: leave it out")
-    if "torch" in sys.modules:  # of several threads, some would wait for one that has no core
-        sys.modules["torch"].set_num_threads(1)
-    if not runner.calibrated:
-        print(
-            f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts "
-            "that distance; vd-train tracker finds a better one",
-            file=sys.stderr,
-        )
+    runner = _runner(cfg, name, hand, item)
     fault: Exception | None = None
     status = 0
     camera = runner.camera or hand.mounted_camera
@@ -238,6 +226,28 @@ def run(cfg: RunCfg) -> int:
         if fault is not None:
             raise fault
     return status
+
+
+def _runner(cfg: RunCfg, name: str, hand: "HandModel", item: "ObjectModel") -> "PolicyRunner":
+    """The policy, with what is told of it."""
+    from vd.deploy.loop.policy_runner import load_runner
+
+    tolerance = cfg.tolerance_rad
+    told = cfg.object if cfg.twin or cfg.pose else None
+    runner = load_runner(
+        name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told
+    )
+    if cfg.pose and runner.camera is not None:
+        raise ValueError(f"--pose is for a teacher; {name} sees by camera: leave it out")
+    if "torch" in sys.modules:  # of several threads, some would wait for one that has no core
+        sys.modules["torch"].set_num_threads(1)
+    if not runner.calibrated:
+        print(
+            f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts "
+            "that distance; vd-train tracker finds a better one",
+            file=sys.stderr,
+        )
+    return runner
 
 
 def _say_chosen(cfg: RunCfg, goals: int) -> None:
@@ -277,7 +287,6 @@ def _pursue(
     from vd.deploy.loop.loop import NO_SYMMETRY, ControlLoop, summary
     from vd.deploy.pose.check_pose import pose_findings
     from vd.deploy.pose.follower import PoseFollower
-    from vd.deploy.pose.open import open_poses, pose_options, source_frame
     from vd.deploy.ros import UNKNOWN, RosGoals
 
     hand, twin, hz = connection.hand, connection.twin, runner.task.sim.control_hz
@@ -297,20 +306,7 @@ def _pursue(
             )
         poses = None
         if cfg.pose is not None:
-            in_base = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-            if pose_options(cfg.pose).kind != "sim":
-                in_base = source_frame(hand, cfg.pose_frame, cfg.camera_layer)
-            if twin is not None:
-                twin.place_object()
-            opened = open_poses(
-                cfg.pose,
-                connection,
-                cfg.camera,
-                in_base,
-                ros_arguments=cfg.ros2_args,
-                seed=cfg.seed,
-            )
-            poses = stack.enter_context(opened)
+            poses = stack.enter_context(_poses(cfg, cfg.pose, connection))
             seen = pose_findings(*poses, hand, cfg.safety.pose_stale_s)
         warm_up(runner, pose, [*goals, NO_SYMMETRY[0]][0], camera)
         stack.enter_context(undisturbed(cfg.realtime))
@@ -363,6 +359,21 @@ def _pursue(
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
             report(folder, steps, pacer.missed, times)
     return int(reason == "lost")
+
+
+def _poses(
+    cfg: RunCfg, source: str, connection: Connection
+) -> "AbstractContextManager[tuple[PoseSource, np.ndarray]]":
+    """What --pose names, with the pose of its frame in the world; a twin shows its object."""
+    from vd.deploy.pose.open import NO_MOTION, open_poses, pose_options, source_frame
+
+    in_base = NO_MOTION
+    if pose_options(source).kind != "sim":
+        in_base = source_frame(connection.hand, cfg.pose_frame, cfg.camera_layer)
+    if connection.twin is not None:
+        connection.twin.place_object()
+    words = {"ros_arguments": cfg.ros2_args, "seed": cfg.seed}
+    return open_poses(source, connection, cfg.camera, in_base, **words)
 
 
 def _sink(

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import compose
-from vd.deploy.pose.source import PoseSource, StampedPose
+from vd.deploy.pose.source import PoseSource
 
 FASTEST_M_S, FASTEST_RAD_S = 1.0, 15.0
 """Speeds above which a pose is not believed. In 2848 control steps of ``leap-cube`` in simulation a
@@ -53,7 +53,7 @@ class PoseFollower:
         """
         newest = self._source.read()
         last = self._object
-        if newest is None or (last.state is not None and newest.time_s <= last.time_s):
+        if newest is None or newest.time_s <= last.time_s:
             fault = self._source.trouble or (last.fault if last.state is None else "")
             return FollowedObject(last.state, last.time_s, fault)
         pose = compose(self._frame, newest.pose)

@@ -18,6 +18,8 @@ from vd.deploy.pose.twin_poses import TagsOfTwin, TruthCfg, TwinPoses
 from vd.deploy.pose.udp_poses import UdpPoses
 
 FORMS = "ros2:/TOPIC, udp:PORT, udp:ADDRESS:PORT, tags, tags:SIDE_M or, of a twin, sim"
+NO_MOTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+"""The pose of a frame in itself."""
 TWIN_LENS = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
 """Of a twin's images of tags: 56 degrees wide, as common cameras are."""
 
@@ -144,7 +146,7 @@ def open_poses(
         if options.kind == "sim":
             assert twin is not None
             source = TwinPoses(twin.object_state, options.truth, seed=seed)
-            frame = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+            frame = NO_MOTION
         elif options.kind == "udp":
             source = UdpPoses(options.host, options.port)
         elif options.kind == "ros2":

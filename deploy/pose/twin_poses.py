@@ -18,8 +18,10 @@ from vd.deploy.pose.rendered import render_cube
 from vd.deploy.pose.source import StampedPose
 from vd.deploy.twin.child import TwinChild
 
+IMAGES_HZ = 15.0
+"""Images a second: drawing and reading them takes the time of other programs, too."""
 IMAGE_NOISE = 3.0
-"""Standard deviation of each pixel's brightness, of 255."""
+"""Standard deviation of each pixel's brightness, of 255; the same in all images."""
 
 
 @dataclass(frozen=True)
@@ -108,10 +110,15 @@ class TagsOfTwin:
         self._hand = hand
         self._camera = camera
         self._size_m = size_m
-        self._rng = np.random.default_rng(seed)
+        self._noise = np.random.default_rng(seed).normal(
+            0.0, IMAGE_NOISE, (intrinsics.height, intrinsics.width)
+        )
+        self._due_s = 0.0
 
     def read(self, timeout_s: float) -> Frame:
-        """An image of the present: brightness, uint8 [H, W]."""
+        """The next image: brightness, uint8 [H, W]."""
+        time.sleep(max(0.0, self._due_s - time.monotonic()))
+        self._due_s = time.monotonic() + 1.0 / IMAGES_HZ
         state, joint_q = self._twin.ask("scene", timeout_s)
         time_s = time.monotonic()
         in_base = compose(invert(self._hand.mount), state[:7])
@@ -120,11 +127,10 @@ class TagsOfTwin:
         turns = Rotation.from_quat(links[:, 3:]).as_matrix()
         points = np.einsum("pij,pkj->pki", turns, self._hand.link_points) + links[:, None, :3]
         points = Rotation.from_quat(to_camera[3:]).apply(points.reshape(-1, 3)) + to_camera[:3]
-        image = render_cube(
-            compose(to_camera, in_base), self.intrinsics, self._size_m, before=points
-        )
-        noise = self._rng.normal(0.0, IMAGE_NOISE, image.shape)
-        return Frame(np.clip(image + noise, 0, 255).astype(np.uint8), time_s)
+        pose = compose(to_camera, in_base)
+        image = render_cube(pose, self.intrinsics, self._size_m, before=points)
+        noisy = np.clip(image + self._noise, 0, 255).astype(np.uint8)
+        return Frame(noisy, time_s)
 
     def close(self) -> None:
         """The twin goes on."""
