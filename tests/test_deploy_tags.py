@@ -1,8 +1,5 @@
 """A cube of tags: the print, where its tags are found, and its pose from images."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -64,22 +61,19 @@ def test_a_hand_before_it_hides_tags_and_those_left_give_the_pose():
 
 
 def test_of_two_like_poses_of_a_single_tag_that_near_the_last_one_is_taken():
-    """Corners exactly in the middle of the two, as of a tag that is far away and seen from the front."""
-    turn = Rotation.from_euler("xyz", [0, 90, 0], degrees=True)
-    front = np.array([0.0, 0.0, 1.5, *turn.as_quat()])
-    corners = Rotation.from_quat(front[3:]).apply(face_corners(TAG_SHARE * SIZE_M, SIZE_M)[0])
-    there = corners + front[:3]
-    pixels = there[:, :2] / there[:, 2:] * 600.0 + np.array([320.0, 240.0])
-    tilted = []
-    for angle in (20.0, -20.0):
-        lean = Rotation.from_euler("x", angle, degrees=True) * turn
-        before = np.array([*front[:3], *lean.as_quat()])
-        seen = before[:3] + lean.apply(face_corners(TAG_SHARE * SIZE_M, SIZE_M)[0])
-        tag = seen[:, :2] / seen[:, 2:] * 600.0 + np.array([320.0, 240.0])
-        found, _ = find_cube({0: tag}, LENS, SIZE_M, before)
-        tilted.append(errors(found, before)[1])
-    assert max(tilted) < 2.0
-    assert errors(find_cube({0: pixels}, LENS, SIZE_M, front)[0], front)[0] < 10.0
+    """From the front and far away, a tag that leans up looks like one that leans down."""
+    rng = np.random.default_rng(3)
+    for angle in (15.0, -15.0):
+        lean = Rotation.from_euler("yx", [90.0, angle], degrees=True)
+        pose = np.array([0.0, 0.0, 1.5, *lean.as_quat()])
+        faces = pose[:3] + lean.apply(face_corners(TAG_SHARE * SIZE_M, SIZE_M).reshape(-1, 3))
+        nearest = faces.reshape(6, 4, 3)[:, :, 2].mean(axis=1).argmin()
+        tag = faces.reshape(6, 4, 3)[nearest]
+        pixels = tag[:, :2] / tag[:, 2:] * 600.0 + np.array([320.0, 240.0])
+        for _ in range(8):
+            noisy = {int(nearest): pixels + rng.normal(0.0, 0.2, (4, 2))}
+            found, _ = find_cube(noisy, LENS, SIZE_M, before=pose)
+            assert errors(found, pose)[1] < 12.0
 
 
 def test_tags_that_are_not_on_a_cube_of_this_size_are_no_pose():
@@ -127,15 +121,3 @@ def test_the_command_writes_a_page_and_refuses_sizes_that_fit_none(tmp_path, cap
     assert "--pose tags:0.06" in capsys.readouterr().out
     assert cli.main(["tags", "--size", "7", str(tmp_path / "b.pdf")]) == 1
     assert "give the side of the cube in metres" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_teacher_turns_a_cube_on_the_twin_from_images_of_its_tags(tmp_path):
-    """The whole of it, in processes of its own: rendered images, tags, follower, teacher, motors."""
-    place = "0.0 0.0 -0.1 0.0 0.0 0.0 1.0"
-    command = f"dclaw3 --hand dclaw3 --twin --pose tags --goal 0,0,1@60 --pose-frame {place}"
-    line = [*command.split(), "--episode-s", "4", "--no-realtime", "--log", str(tmp_path / "log")]
-    done = subprocess.run(
-        [sys.executable, "-m", "vd.deploy.cli", *line], capture_output=True, text=True, check=False
-    )
-    assert done.returncode in (0, 1), done.stderr

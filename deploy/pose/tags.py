@@ -107,11 +107,15 @@ def find_cube(
     cv = opencv()
     points = face_corners(TAG_SHARE * size_m, size_m)[tags].reshape(-1, 3)
     pixels = np.concatenate([corners[number] for number in tags])
-    method = cv.SOLVEPNP_SQPNP if len(tags) > 1 else cv.SOLVEPNP_IPPE
-    _, turns, places, _ = cv.solvePnPGeneric(points, pixels, lens.matrix, None, flags=method)
+    if len(tags) == 1:
+        guesses = _from_one(tags[0], pixels, lens, size_m)
+    else:
+        method = cv.SOLVEPNP_SQPNP
+        _, turns, places, _ = cv.solvePnPGeneric(points, pixels, lens.matrix, None, flags=method)
+        guesses = list(zip(turns, places, strict=True))
     fitting = []
-    for turn, place in zip(turns, places, strict=True):
-        turn, place = cv.solvePnPRefineLM(points, pixels, lens.matrix, None, turn, place)
+    for guess in guesses:
+        turn, place = cv.solvePnPRefineLM(points, pixels, lens.matrix, None, *guess)
         there, _ = cv.projectPoints(points, turn, place, lens.matrix, None)
         off_px = float(np.sqrt(np.mean(np.sum((there[:, 0] - pixels) ** 2, axis=1))))
         quaternion = Rotation.from_rotvec(turn.ravel()).as_quat()
@@ -123,6 +127,32 @@ def find_cube(
         alike = [fit for off_px, fit in fitting if off_px < best_px + ALIKE_PX]
         pose = min(alike, key=lambda fit: _angle(fit, before))
     return pose, best_px
+
+
+def _from_one(
+    number: int, pixels: np.ndarray, lens: Intrinsics, size_m: float
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Both poses of the cube that show one tag alike: rotation vectors [3, 1] and places [3, 1].
+
+    Args:
+        number: The tag.
+        pixels: Its corners [px] [4, 2].
+        lens: The lens.
+        size_m: Side of the cube [m].
+    """
+    cv = opencv()
+    normal, up = np.asarray(FACES[number], dtype=float)
+    face = np.stack([np.cross(up, normal), up, normal], axis=1)
+    flat = face_corners(TAG_SHARE * size_m, size_m)[number] @ face
+    flat[:, 2] = 0.0  # as the method has it
+    method = cv.SOLVEPNP_IPPE
+    _, turns, places, _ = cv.solvePnPGeneric(flat, pixels, lens.matrix, None, flags=method)
+    poses = []
+    for turn, place in zip(turns, places, strict=True):
+        of_cube = Rotation.from_rotvec(turn.ravel()) * Rotation.from_matrix(face.T)
+        middle = place.ravel() - of_cube.apply(0.5 * size_m * normal)
+        poses.append((of_cube.as_rotvec()[:, None], middle[:, None]))
+    return poses
 
 
 def _angle(pose: np.ndarray, other: np.ndarray) -> float:
