@@ -157,8 +157,8 @@ class Tracker:
     ("spoil", "said"),
     [
         ("", ""),
-        ("stale", r"no pose is believed for 0\.5\d s: no tag is seen"),
-        ("jump", r"no pose is believed for 0\.5\d s: told jumps by 0 mm and 90 degrees"),
+        ("stale", r"no pose is believed for 1\.0\d s: no tag is seen"),
+        ("jump", r"no pose is believed for 1\.0\d s: told jumps by 0 mm and 90 degrees"),
         ("future", r"the newest pose is 1\.\d\d s from the future: wait .*stamp a pose when"),
         ("lost", "lost"),
     ],
@@ -183,7 +183,7 @@ def test_stale_jumping_and_future_poses_stop_the_hand_and_name_the_reason(tmp_pa
                     place = np.array([0.5, 0.0, 0.0, *GOAL])
                     follower = PoseFollower(Tracker(bus.clock, ""), place, begin_s)
                 loop = ControlLoop(
-                    safe, runner, actions, pacer, log, episode_s=3.0, hold_s=0.0, follower=follower
+                    safe, runner, actions, pacer, log, episode_s=4.0, hold_s=0.0, follower=follower
                 )
                 return loop.run([GOAL])
 
