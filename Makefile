@@ -24,14 +24,15 @@ OBJECTS ?=
 FIGURES_ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test lint type format reference docs bench figures clean
+.PHONY: help env demo test coverage lint type format reference docs bench figures clean
 
 help:
 	@echo 'make demo     turn unseen objects, close a gap, drive a simulated hand, train a little: demo/index.html'
 	@echo '              MESHES=DIR turns your own meshes; DEMO_ARGS=--quick ends after the first part'
 	@echo 'make test     all tests; TEST_ARGS="-k rewards" chooses some'
+	@echo 'make coverage  the same, and which lines no test runs'
 	@echo 'make lint     ruff, without changing files      make format   the same, changing files'
-	@echo 'make type     mypy on the built package         make bench    simulation throughput'
+	@echo 'make type     mypy on the package               make bench    simulation throughput'
 	@echo 'make docs     the documentation as a site, build/site/index.html'
 	@echo 'make figures  every published figure anew, hours on a GPU; FIGURES=teacher some, OBJECTS="held-out=DIR ..."'
 	@echo 'make reference  the tables of docs/reference, from the code'
@@ -62,6 +63,10 @@ test: $(STAMP)
 	@echo 'all tests take about ten minutes on two cores; each file is named as it begins'
 	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
 
+# Code in Warp kernels and in processes of their own is not counted.
+coverage: $(STAMP)
+	$(MAKE) --no-print-directory test TEST_ARGS='--cov=vd --cov-report=term:skip-covered $(TEST_ARGS)'
+
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -70,12 +75,11 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# The folders become one package only when installed, so the checker reads the built wheel.
+# The folders become one package only when installed; links show the checker that package.
 type: $(STAMP)
-	rm -rf build/lib build/bdist.* build/types
-	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir build/types .
-	cd build/types && "$(abspath $(BIN))/python" -m zipfile -e *.whl . && \
-	  "$(abspath $(BIN))/mypy" --config-file ../../pyproject.toml -p vd
+	rm -rf build/types/vd && mkdir -p build/types/vd
+	cd build/types/vd && ln -s $(wildcard $(CURDIR)/vd/*) $(addprefix $(CURDIR)/,kernels assets_usd train deploy) .
+	cd build/types && "$(abspath $(BIN))/mypy" --config-file ../../pyproject.toml -p vd
 
 # Strict: a broken link or anchor, or a page that is nowhere listed, fails.
 reference: $(STAMP)

@@ -14,7 +14,7 @@ from pxr import Gf, Sdf
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CameraModel, HandError, HandModel
-from vd.assets_usd.hand_layer import open_layer, save_layer
+from vd.assets_usd.hand_layer import author, open_layer, save_layer
 from vd.assets_usd.hand_model import OPTICAL_FROM_USD, read_hand
 
 CAMERA_LAYER_FORMAT = "vd-camera-layer/1"
@@ -45,11 +45,8 @@ def write_camera_layer(
     layer.customLayerData = {"format": CAMERA_LAYER_FORMAT, **notes}
     camera = Sdf.CreatePrimInLayer(layer, f"/{hand.name}/base/camera")
     x, y, z, w = (Rotation.from_quat(pose[3:]) * OPTICAL_FROM_USD.inv()).as_quat()
-    for name, kind, value in (
-        ("xformOp:translate", Sdf.ValueTypeNames.Double3, Gf.Vec3d(*pose[:3])),
-        ("xformOp:orient", Sdf.ValueTypeNames.Quatd, Gf.Quatd(w, x, y, z)),
-    ):
-        Sdf.AttributeSpec(camera, name, kind).default = value
+    author(camera, "xformOp:translate", Sdf.ValueTypeNames.Double3, Gf.Vec3d(*pose[:3]))
+    author(camera, "xformOp:orient", Sdf.ValueTypeNames.Quatd, Gf.Quatd(w, x, y, z))
     save_layer(layer, path)
 
 

@@ -40,7 +40,8 @@ class Hand:
         paths = [hand_usd(name) for name in self.names or HANDS]
         for path in paths:
             if self.out is not None:
-                target, text = self.out / path.name, path.read_text()
+                target = self.out / path.name
+                text = path.read_text()
                 if target.exists() and target.read_text(errors="replace") != text:
                     raise ValueError(
                         f"{target} is there and another hand; write to another folder (--out)"
@@ -214,36 +215,45 @@ def _bar(label: str) -> Callable[[str, int, int], None]:
 
 def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
     """What became of an import, in a few lines."""
-    count = Counter(r.status for r in results)
+    count = Counter(result.status for result in results)
     lines = [
         f"{count['imported']} imported, {count['cached']} unchanged, {count['refused']} refused in "
         f"{seconds:.0f} s; {out}"
     ]
-    good = {r.job.name: r.model for r in results if r.model is not None}
-    if good:
-        size = sum(Path(r.job.target).stat().st_size for r in results if r.model is not None)
-        worst = sorted(good.values(), key=lambda model: -model.volume_error)
-        named = ", ".join(f"{model.name} {model.volume_error:.1%}" for model in worst[:WORST_SHOWN])
-        hulls = sum(len(model.hulls) for model in worst) / len(worst)
-        lines.append(f"{hulls:.1f} convex parts on average, {size / 1e6:.1f} MB")
-        median = statistics.median(model.volume_error for model in worst)
-        lines.append(f"volume error of the parts: median {median:.1%}, worst {named}")
-        scaled = sum("scaled by" in note for model in worst for note in model.notes)
-        lines.append(
-            f"longest side {_span([model.longest_side for model in worst])} m ({scaled} of "
-            f"{len(worst)} scaled), mass {_span([model.mass_kg for model in worst])} kg"
+    warnings = []
+    refusals = []
+    models = []
+    size = 0
+    scaled = 0
+    for result in results:
+        model = result.model
+        if model is None:
+            refusals.append(f"refused {result.job.source}: {result.reason}")
+            continue
+        models.append(model)
+        size += Path(result.job.target).stat().st_size
+        scaled += any("scaled by" in note for note in model.notes)
+        warnings += [f"warning {model.name}: {text}" for text in model.warnings]
+    if models:
+        models.sort(key=lambda model: -model.volume_error)
+        hulls = statistics.mean(len(model.hulls) for model in models)
+        median = statistics.median(model.volume_error for model in models)
+        worst = ", ".join(
+            f"{model.name} {model.volume_error:.1%}" for model in models[:WORST_SHOWN]
         )
-    lines += [
-        f"warning {name}: {words}" for name, model in good.items() for words in model.warnings
-    ]
-    lines += [f"refused {r.job.source}: {r.reason}" for r in results if r.status == "refused"]
-    return "\n".join(lines)
+        lengths = _span([model.longest_side for model in models])
+        masses = _span([model.mass_kg for model in models])
+        lines += [
+            f"{hulls:.1f} convex parts on average, {size / 1e6:.1f} MB",
+            f"volume error of the parts: median {median:.1%}, worst {worst}",
+            f"longest side {lengths} m ({scaled} of {len(models)} scaled), mass {masses} kg",
+        ]
+    return "\n".join([*lines, *warnings, *refusals])
 
 
 def _span(values: list[float]) -> str:
     """Least and largest of some values; one where they are equal."""
-    low, high = f"{min(values):.3g}", f"{max(values):.3g}"
-    return low if low == high else f"{low}-{high}"
+    return "-".join(dict.fromkeys([f"{min(values):.3g}", f"{max(values):.3g}"]))
 
 
 @interrupt.command("vd-assets")

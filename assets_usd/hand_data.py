@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 
@@ -269,9 +270,11 @@ class HandModel:
     @property
     def joint_finger(self) -> np.ndarray:
         """Finger of each joint, int [D]."""
-        return np.repeat(
-            np.arange(self.num_fingers), [finger.stop - finger.start for finger in self.fingers]
-        )
+        return np.repeat(np.arange(self.num_fingers), self._finger_lengths)
+
+    @property
+    def _finger_lengths(self) -> list[int]:
+        return [finger.stop - finger.start for finger in self.fingers]
 
     @property
     def joints_per_finger(self) -> int:
@@ -280,7 +283,7 @@ class HandModel:
         Raises:
             HandError: Its fingers differ.
         """
-        counts = [finger.stop - finger.start for finger in self.fingers]
+        counts = self._finger_lengths
         if len(set(counts)) > 1:
             raise HandError(
                 f"{self.path}: the fingers of {self.name} have {counts} joints; what was asked for "
@@ -310,8 +313,7 @@ class HandModel:
     @property
     def goal_in_base(self) -> np.ndarray:
         """Where objects are handled, in the base frame [m] [3]."""
-        place = np.array([*self.workspace.goal_m, 0.0, 0.0, 0.0, 1.0])
-        return compose(invert(self.mount), place)[:3]
+        return placed(invert(self.mount), np.array(self.workspace.goal_m))
 
     @property
     def down(self) -> np.ndarray:
@@ -341,17 +343,16 @@ class HandModel:
                 f"{self.name}: q has shape {q.shape}; its last axis must be {self.num_joints} "
                 f"joints"
             )
-        batch = q.shape[:-1]
-        flat = q.reshape(-1, self.num_joints)
-        poses = np.empty((len(flat), len(self.link_names), 7))
-        poses[:, 0] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-        for joint in range(self.num_joints):  # parents come before their children
-            turn = Rotation.from_rotvec(flat[:, joint, None] * self.joint_axis[joint]).as_quat()
-            motion = np.concatenate([np.zeros((len(flat), 3)), turn], axis=1)
-            pose = compose(poses[:, self.joint_parent[joint]], self.joint_parent_frame[joint])
-            pose = compose(compose(pose, motion), invert(self.joint_child_frame[joint]))
-            poses[:, self.joint_child[joint]] = pose
-        return poses.reshape(*batch, len(self.link_names), 7)
+        poses = np.empty((*q.shape[:-1], len(self.link_names), 7))
+        poses[..., 0, :] = pose_at(np.zeros(3))
+        motion = np.zeros((*q.shape, 7))
+        turns = Rotation.from_rotvec((q[..., None] * self.joint_axis).reshape(-1, 3))
+        motion[..., 3:] = turns.as_quat().reshape(*q.shape, 4)
+        for joint, frame in enumerate(self.joint_child_frame):  # parents before their children
+            parent = poses[..., self.joint_parent[joint], :]
+            pose = compose(compose(parent, self.joint_parent_frame[joint]), motion[..., joint, :])
+            poses[..., self.joint_child[joint], :] = compose(pose, invert(frame))
+        return poses
 
     def tip_poses(self, q: np.ndarray) -> np.ndarray:
         """Poses of the fingertip sites in the base frame, [.., F, 7], for ``q`` [.., D] [rad]."""
@@ -363,12 +364,20 @@ def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     first, second = np.broadcast_arrays(
         np.asarray(first, dtype=float), np.asarray(second, dtype=float)
     )
-    a, b = first.reshape(-1, 7), second.reshape(-1, 7)
-    turn = Rotation.from_quat(a[:, 3:])
-    moved = turn.apply(b[:, :3]) + a[:, :3]
-    return np.concatenate([moved, (turn * Rotation.from_quat(b[:, 3:])).as_quat()], axis=1).reshape(
-        first.shape
-    )
+    a = first.reshape(-1, 7)
+    b = second.reshape(-1, 7)
+    turn = Rotation.from_quat(a[:, 3:]) * Rotation.from_quat(b[:, 3:])
+    return np.concatenate([placed(a, b[:, :3]), turn.as_quat()], axis=1).reshape(first.shape)
+
+
+def placed(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points [3] or [N, 3] of the frame of a pose [7], or each of its own [N, 7], in the outer frame."""
+    return np.asarray(Rotation.from_quat(pose[..., 3:]).apply(points) + pose[..., :3])
+
+
+def pose_at(point: npt.ArrayLike) -> np.ndarray:
+    """The pose [7] of a frame at a point [3] that is not turned."""
+    return np.concatenate([point, [0.0, 0.0, 0.0, 1.0]])
 
 
 def invert(pose: np.ndarray) -> np.ndarray:
@@ -382,5 +391,7 @@ def canonical_quat(quat: np.ndarray) -> np.ndarray:
 
     Xyzw [4].
     """
-    first = next((value for value in (quat[3], *quat[:3]) if value != 0.0), 1.0)
-    return -quat if first < 0.0 else quat
+    for value in (quat[3], *quat[:3]):
+        if value != 0.0:
+            return -quat if value < 0.0 else quat
+    return quat

@@ -19,7 +19,7 @@ on ``/servo/<joint>`` or ``/pendulum/<joint>``.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd
@@ -132,6 +132,17 @@ def write_layer(
         for effect, values in effects.get(name, {}).items():
             _write_numbers(where, joint, effect, values)
     save_layer(layer, path)
+
+
+def author(
+    prim: Sdf.PrimSpec, name: str, kind: Sdf.ValueTypeName, value: Any, documentation: str = ""
+) -> None:
+    """Author an attribute on a prim's spec; those in the namespace ``vd`` are of no schema."""
+    custom = name.startswith(f"{NAMESPACE}:")
+    spec = Sdf.AttributeSpec(prim, name, kind, Sdf.VariabilityVarying, declaresCustom=custom)
+    spec.default = value
+    if documentation:
+        spec.documentation = documentation
 
 
 def save_layer(layer: Sdf.Layer, path: Path) -> None:
@@ -268,26 +279,20 @@ def read_servo(
     for parameter in BASELINE:
         if parameter.name in baseline:
             rows[:, parameter.column] = baseline[parameter.name]
-    for index, joint in enumerate(joints):
+    for row, interval, joint in zip(rows, intervals, joints, strict=True):
         where = f"{source}: {joint.GetPath()}"
-        valued: dict[str, set[str]] = {}
+        valued: dict[str, set[str]] = {BASELINE_GROUP: {p.name for p in BASELINE}}
+        ranges: dict[str, _Number] = {}
         for name, number, is_interval, value in _authored(where, joint):
+            parameter = number.parameter
             if is_interval:
-                intervals[index, number.parameter.column] = _interval(
-                    where, name, number.parameter, value
-                )
+                interval[parameter.column] = _interval(where, name, parameter, value)
+                ranges[name] = number
             else:
-                rows[index, number.parameter.column] = _checked(
-                    where, name, number.parameter, value
-                )
-                valued.setdefault(number.group, set()).add(number.parameter.name)
-        for name, number, is_interval, _ in _authored(where, joint):
-            given = valued.get(number.group, set())
-            if (
-                is_interval
-                and number.group != BASELINE_GROUP
-                and number.parameter.name not in given
-            ):
+                row[parameter.column] = _checked(where, name, parameter, value)
+                valued.setdefault(number.group, set()).add(parameter.name)
+        for name, number in ranges.items():
+            if number.parameter.name not in valued.get(number.group, ()):
                 raise HandError(
                     f"{where}: '{name}' is an interval without a value; author the value too"
                 )
@@ -372,26 +377,20 @@ def _write_numbers(
             raise HandError(
                 f"{where}: {group} has no parameter {name!r}; one of {', '.join(known)}"
             )
-        number, unit = known[name], known[name].parameter.unit
-        alone = isinstance(estimate, (int, float))
-        value, *bounds = [float(estimate)] if alone else map(float, estimate)  # type: ignore[arg-type]
-        checked = _checked(where, number.attribute, number.parameter, value)
-        own = number.attribute.startswith(f"{NAMESPACE}:")
-        kind = Sdf.ValueTypeNames.Double if own else Sdf.ValueTypeNames.Float
-        spec = Sdf.AttributeSpec(
-            joint, number.attribute, kind, Sdf.VariabilityVarying, declaresCustom=own
+        number = known[name]
+        unit = number.parameter.unit
+        value, *bounds = np.atleast_1d(estimate).tolist()
+        ours = number.attribute.startswith(f"{NAMESPACE}:")
+        author(
+            joint,
+            number.attribute,
+            Sdf.ValueTypeNames.Double if ours else Sdf.ValueTypeNames.Float,
+            _checked(where, number.attribute, number.parameter, value) * number.factor,
+            f"{EFFECTS[group].meaning} [{unit}]"
+            if group in EFFECTS
+            else f"{name} = {value:g} {unit}",
         )
-        spec.default = checked * number.factor
-        meaning = f"{name} = {value:g} {unit}"
-        spec.documentation = f"{EFFECTS[group].meaning} [{unit}]" if group in EFFECTS else meaning
         if bounds:
-            low, high = _interval(where, number.interval, number.parameter, bounds)
-            spec = Sdf.AttributeSpec(
-                joint,
-                number.interval,
-                Sdf.ValueTypeNames.Float2,
-                Sdf.VariabilityVarying,
-                declaresCustom=True,
-            )
-            spec.default = Gf.Vec2f(low, high)
-            spec.documentation = f"95 % interval of {name} [{unit}]"
+            ends = Gf.Vec2f(*_interval(where, number.interval, number.parameter, bounds))
+            meaning = f"95 % interval of {name} [{unit}]"
+            author(joint, number.interval, Sdf.ValueTypeNames.Float2, ends, meaning)

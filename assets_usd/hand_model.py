@@ -9,35 +9,52 @@ pose is a row ``(x, y, z, qx, qy, qz, qw)``.
 
 import math
 import re
-from itertools import pairwise
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import newton_usd_schemas  # noqa: F401 - before the first stage, or mimic joints are no schema of it
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+from trimesh.util import append_faces
 
 from vd.assets_usd.hand_data import (
     CameraModel,
     CollisionShape,
     HandError,
     HandModel,
+    MotorModel,
+    Workspace,
     compose,
+    pose_at,
 )
-from vd.assets_usd.hand_description import Described, xyzw
 from vd.assets_usd.hand_layer import add_layer, read_servo
+from vd.assets_usd.objects.geometry import Surface
 from vd.kernels.servo.actuators import MAX_JOINTS
 
-__all__ = ["CameraModel", "CollisionShape", "HandError", "HandModel", "open_stage", "read_hand"]
+__all__ = [
+    "CameraModel",
+    "CollisionShape",
+    "HandError",
+    "HandModel",
+    "open_stage",
+    "read_hand",
+    "read_surfaces",
+]
 
 OPTICAL_FROM_USD = Rotation.from_euler("x", 180, degrees=True)
 """A USD camera looks along -z with +y up; the optical frame along +z with +y down."""
 
-LINK_NAME = re.compile(r"f(\d+)_l(\d+)")
 ORTHONORMAL_TOLERANCE = 1e-5
 """Allowed scale or shear in the transform of a link, above the rounding of single precision."""
+
+ROUNDING_RAD = 1e-5
+"""How far a start may be beyond a limit: limits are degrees in single precision."""
+
+OPTIONAL_GAINS: dict[str, type] = {"p_gain": int, "d_gain": int, "current": float}
+"""What a file need not say of a motor."""
 
 
 def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) -> Usd.Stage:
@@ -67,7 +84,7 @@ def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) 
         raise HandError(f"{path}: the stage has no default prim; set it to the hand's root prim")
     variants = root.GetVariantSet("fingertip")
     kinds = variants.GetVariantNames()
-    if fingertip not in kinds and not (not kinds and fingertip == "rigid"):
+    if fingertip not in (kinds or ["rigid"]):
         raise HandError(
             f"{path}: {root.GetPath()} has no variant {fingertip!r} in its set 'fingertip': "
             f"choose one of {', '.join(kinds) or 'none (add the variant)'}"
@@ -95,13 +112,104 @@ def read_hand(path: Path, *, fingertip: str = "rigid", layer: Path | None = None
     return _Reader(Path(path), fingertip, None if layer is None else Path(layer)).read()
 
 
-class _Reader(Described):
+def read_surfaces(hand: HandModel) -> dict[int, Surface]:
+    """What is drawn of each link, by its index; in its frame [m], float32 and int32.
+
+    Raises:
+        HandError: A mesh is not of triangles, or nothing is drawn at all.
+    """
+    reader = _Reader(hand.path, hand.fingertip, hand.layer)
+    surfaces: dict[int, Surface] = {}
+    for link, name in enumerate(hand.link_names):
+        meshes = reader.drawn_meshes(reader.prim(name))
+        if meshes:
+            vertices, faces = append_faces(*zip(*meshes, strict=True))
+            surfaces[link] = Surface(vertices.astype(np.float32), faces.astype(np.int32))
+    if not surfaces:
+        raise HandError(f"{hand.path}: no link has a mesh to draw; give the links meshes")
+    return surfaces
+
+
+class _LinkRow(NamedTuple):
+    """What a hand has of one link; columns are fields of :class:`HandModel`."""
+
+    link_mass: float
+    link_com: np.ndarray
+    link_inertia: np.ndarray
+
+
+class _JointRow(NamedTuple):
+    """What a hand has of one joint, likewise."""
+
+    joint_parent: int
+    joint_child: int
+    joint_axis: np.ndarray
+    joint_parent_frame: np.ndarray
+    joint_child_frame: np.ndarray
+    lower: float
+    upper: float
+    kp: float
+    kd: float
+    effort: float
+    velocity_limit: float
+    armature: float
+    start: float
+    mimic: int
+    mimic_factor: float
+    mimic_offset: float
+
+
+def _columns(rows: Sequence[NamedTuple]) -> dict[str, Any]:
+    """Each field of rows as an array."""
+    return dict(zip(rows[0]._fields, map(np.array, zip(*rows, strict=True)), strict=True))
+
+
+class _Reader:
     """One reading of one file; every method raises :class:`HandError`."""
 
     def __init__(self, path: Path, fingertip: str, layer: Path | None):
-        super().__init__(path, open_stage(path, fingertip, layer), layer)
+        self.path = path
         self.fingertip = fingertip
+        self.layer = layer
+        self.stage = open_stage(path, fingertip, layer)
+        self.root = self.stage.GetDefaultPrim()
         self.cache = UsdGeom.XformCache()
+
+    def fail(self, where: Any, what: str, remedy: str) -> HandError:
+        """The error to raise for a prim or a path."""
+        prim = where.GetPath() if isinstance(where, Usd.Prim) else where
+        file = f"{self.path} with the layer {self.layer}" if self.layer else str(self.path)
+        return HandError(f"{file}: {prim}: {what}; {remedy}")
+
+    def prim(self, relative: str) -> Usd.Prim:
+        """The prim at a path below the root."""
+        path = self.root.GetPath().AppendPath(relative)
+        prim = self.stage.GetPrimAtPath(path)
+        if not prim:
+            raise self.fail(path, "the prim is missing", "add it, or export the hand again")
+        return prim
+
+    def value(self, prim: Usd.Prim, attribute: str) -> Any:
+        """The value of an attribute, which must have been authored."""
+        authored = prim.GetAttribute(attribute)
+        if not authored or not authored.HasAuthoredValue():
+            raise self.fail(prim, f"'{attribute}' is not authored", "give it a value")
+        return authored.Get()
+
+    def number(self, prim: Usd.Prim, attribute: str, *, positive: bool = False) -> float:
+        """The value of a scalar attribute: finite, and above zero where that is asked for."""
+        number = float(self.value(prim, attribute))
+        if not math.isfinite(number) or (positive and number <= 0.0):
+            wanted = "positive" if positive else "finite"
+            raise self.fail(prim, f"'{attribute}' is {number}", f"it must be {wanted}")
+        return number
+
+    def vector(self, prim: Usd.Prim, attribute: str, size: int = 3) -> np.ndarray:
+        """The value of an attribute of so many numbers, finite [size]."""
+        vector = np.array(self.value(prim, attribute), dtype=float)
+        if vector.shape != (size,) or not np.isfinite(vector).all():
+            raise self.fail(prim, f"'{attribute}' is {vector}", f"{size} finite numbers")
+        return vector
 
     def read(self) -> HandModel:
         """The whole hand."""
@@ -110,129 +218,103 @@ class _Reader(Described):
             raise self.fail(
                 self.root, "PhysicsArticulationRootAPI is missing", "apply it to the root prim"
             )
-        counts = self._fingers()
-        self._refuse_unknown(counts)
-        order = [(f, i) for f, count in enumerate(counts) for i in range(1, count + 1)]
-        links = ("base", *(f"f{f}_l{i}" for f, i in order))
-        joints = [self.prim(f"f{f}_j{i}") for f, i in order]
+        fingers = self._fingers()
+        links = ["base"]
+        joints = []
+        tips = []
+        for finger, joint_range in enumerate(fingers):
+            count = joint_range.stop - joint_range.start
+            links += [f"f{finger}_l{i + 1}" for i in range(count)]
+            joints += [self.prim(f"f{finger}_j{i + 1}") for i in range(count)]
+            tips.append(self.prim(f"{links[-1]}/f{finger}_tip"))
         bodies = [self.prim(name) for name in links]
         index = {body.GetPath(): i for i, body in enumerate(bodies)}
-        masses = [self._mass(body) for body in bodies]
-        frames = [self._joint_frames(joint, index) for joint in joints]
-        mimic = [self.mimic(joint, joints) for joint in joints]
-        drives = np.array(
-            [
-                self._drive(joint, driven=row[0] < 0)
-                for joint, row in zip(joints, mimic, strict=True)
-            ]
-        )
-        self.check_mimic(joints, [row[0] for row in mimic])
-        baseline = dict(
-            zip(("kp", "kd", "velocity_limit", "inertia"), drives.T[[2, 3, 5, 6]], strict=True)
-        )
-        servo, servo_interval = read_servo(joints, baseline, self.layer or self.path)
-        tip_prims = [self.prim(f"f{f}_l{count}/f{f}_tip") for f, count in enumerate(counts)]
-        tips = {prim.GetParent().GetPath() for prim in tip_prims}
-        points = self._point_prims(links)
-        ends = np.cumsum([0, *counts])
+        columns = _columns([self._link(body) for body in bodies])
+        columns |= _columns([self._joint(joint, joints, index) for joint in joints])
+        self._check_mimic(joints, columns["mimic"])
+        drive = {name: columns[name] for name in ("kp", "kd", "velocity_limit")}
+        drive["inertia"] = columns["armature"]
+        servo, servo_interval = read_servo(joints, drive, self.layer or self.path)
+        tip_link = [index[tip.GetParent().GetPath()] for tip in tips]
+        shapes: list[CollisionShape] = []
+        for link, body in enumerate(bodies):
+            shapes += self._shapes(body, link, needed=link in tip_link)
         camera = self.stage.GetPrimAtPath(self.root.GetPath().AppendPath("base/camera"))
+        point_link, link_points = self._points(links)
         return HandModel(
             name=self.root.GetName(),
             fingertip=self.fingertip,
             path=self.path,
             layer=self.layer,
-            fingers=tuple(slice(int(a), int(b)) for a, b in pairwise(ends)),
-            mount=self.mount(),
-            palm=self.direction("vd:palm"),
-            workspace=self.workspace(),
-            link_names=links,
+            fingers=tuple(fingers),
+            mount=np.concatenate(
+                [
+                    self.vector(self.root, "vd:mount:position"),
+                    xyzw(self.value(self.root, "vd:mount:orientation")),
+                ]
+            ),
+            palm=self._palm(),
+            workspace=self._workspace(),
+            link_names=tuple(links),
             joint_names=tuple(joint.GetName() for joint in joints),
-            joint_parent=np.array([frame[0] for frame in frames]),
-            joint_child=np.array([frame[1] for frame in frames]),
-            joint_axis=np.array([self._axis(joint) for joint in joints]),
-            joint_parent_frame=np.array([frame[2] for frame in frames]),
-            joint_child_frame=np.array([frame[3] for frame in frames]),
-            lower=drives[:, 0],
-            upper=drives[:, 1],
-            kp=drives[:, 2],
-            kd=drives[:, 3],
-            effort=drives[:, 4],
-            velocity_limit=drives[:, 5],
-            armature=drives[:, 6],
-            start=self.start(joints, drives),
-            mimic=np.array([row[0] for row in mimic]),
-            mimic_factor=np.array([row[1] for row in mimic]),
-            mimic_offset=np.array([row[2] for row in mimic]),
-            motors=self.motors(joints),
+            **columns,
+            motors=self._motors(joints),
             servo=servo,
             servo_interval=servo_interval,
-            link_mass=np.array([mass for mass, _, _ in masses]),
-            link_com=np.array([com for _, com, _ in masses]),
-            link_inertia=np.array([inertia for _, _, inertia in masses]),
-            tip_link=np.array([index[prim.GetParent().GetPath()] for prim in tip_prims]),
-            tip_frame=np.array([self._relative(prim, prim.GetParent()) for prim in tip_prims]),
+            tip_link=np.array(tip_link),
+            tip_frame=np.array([self._relative(tip, tip.GetParent()) for tip in tips]),
             mounted_camera=self._camera(camera, bodies[0]) if camera else None,
-            point_link=np.array([link for _, link in points]),
-            link_points=self._points([prim for prim, _ in points]),
-            shapes=tuple(
-                shape for i, body in enumerate(bodies) for shape in self._shapes(body, i, tips)
-            ),
+            point_link=point_link,
+            link_points=link_points,
+            shapes=tuple(shapes),
         )
 
     def _check_units(self) -> None:
         if UsdGeom.GetStageUpAxis(self.stage) != UsdGeom.Tokens.z:
             raise self.fail("/", "'upAxis' is not Z", "author the hand with z up")
-        for name, unit in (
-            ("metersPerUnit", UsdGeom.GetStageMetersPerUnit(self.stage)),
-            ("kilogramsPerUnit", UsdPhysics.GetStageKilogramsPerUnit(self.stage)),
-        ):
+        units = {
+            "metersPerUnit": UsdGeom.GetStageMetersPerUnit(self.stage),
+            "kilogramsPerUnit": UsdPhysics.GetStageKilogramsPerUnit(self.stage),
+        }
+        for name, unit in units.items():
             if unit != 1.0:
-                raise self.fail(
-                    "/", f"'{name}' is {unit}", "author the hand in metres and kilograms"
-                )
+                remedy = "author the hand in metres and kilograms"
+                raise self.fail("/", f"'{name}' is {unit}", remedy)
 
-    def _fingers(self) -> list[int]:
+    def _fingers(self) -> list[slice]:
         """Joints of each finger, by the names of its links, which have no gaps."""
-        found: dict[int, list[int]] = {}
-        for child in self.root.GetChildren():
-            if match := LINK_NAME.fullmatch(child.GetName()):
-                found.setdefault(int(match[1]), []).append(int(match[2]))
-        counts = [len(found.get(finger, ())) for finger in range(len(found))]
-        if (
-            not counts
-            or 0 in counts
-            or any(sorted(n) != [*range(1, len(n) + 1)] for n in found.values())
-        ):
-            names = (
-                ", ".join(f"f{f}_l{i}" for f in sorted(found) for i in sorted(found[f]))
-                or "no links"
-            )
+        names = {child.GetName() for child in self.root.GetChildren()}
+        known = {"base"}
+        fingers: list[slice] = []
+        end = 0
+        while f"f{len(fingers)}_l1" in names:
+            finger = len(fingers)
+            count = 0
+            while f"f{finger}_l{count + 1}" in names:
+                count += 1
+                known |= {f"f{finger}_l{count}", f"f{finger}_j{count}"}
+            if count > MAX_JOINTS:
+                what = f"finger {finger} has {count} joints"
+                raise self.fail(self.root, what, f"weld joints until it has {MAX_JOINTS} at most")
+            fingers.append(slice(end, end + count))
+            end += count
+        links = {name for name in names if re.fullmatch(r"f\d+_l\d+", name)}
+        if not fingers or links - known:
             raise self.fail(
                 self.root,
-                f"fingers {sorted(found)} found, of {names}",
+                f"has the links {', '.join(sorted(links)) or 'of no finger'}",
                 "name links f0_l1, f0_l2 and so on from the palm, f1_l1 ..., without gaps",
             )
-        if max(counts) > MAX_JOINTS:
-            finger = counts.index(max(counts))
-            raise self.fail(
-                self.root,
-                f"finger {finger} has {max(counts)} joints",
-                f"weld joints until it has {MAX_JOINTS} at most",
-            )
-        return counts
+        self._refuse_unknown(known)
+        return fingers
 
-    def _refuse_unknown(self, counts: list[int]) -> None:
+    def _refuse_unknown(self, known: set[str]) -> None:
         """Refuse links and joints that the model would leave out."""
-        numbers = [f"{i + 1}" for i in range(MAX_JOINTS)]
-        known = {"base"} | {
-            f"f{f}_{k}{i}" for f, n in enumerate(counts) for i in numbers[:n] for k in "lj"
-        }
         for prim in Usd.PrimRange(self.root):
-            if not (prim.HasAPI(UsdPhysics.RigidBodyAPI) or prim.IsA(UsdPhysics.Joint)):
+            is_joint = prim.IsA(UsdPhysics.Joint)
+            if not is_joint and not prim.HasAPI(UsdPhysics.RigidBodyAPI):
                 continue
-            if prim.IsA(UsdPhysics.FixedJoint) and not all(
-                prim.GetRelationship(f"physics:body{side}").GetTargets() for side in (0, 1)
-            ):
+            if prim.IsA(UsdPhysics.FixedJoint) and not (_bodies(prim, 0) and _bodies(prim, 1)):
                 continue  # it fixes the hand to the world
             if prim.GetParent() != self.root or prim.GetName() not in known:
                 raise self.fail(
@@ -242,123 +324,196 @@ class _Reader(Described):
                     "it",
                 )
 
-    def _point_prims(self, links: tuple[str, ...]) -> list[tuple[Usd.Prim, int]]:
-        """Prim and link of the sets of surface samples, as far as links have them."""
-        places = [("base/points", 0)]
-        for index, link in enumerate(links[1:], 1):
-            if link.endswith("_l1"):
-                places.append((f"base/{link.replace('_l1', '_motor')}_points", 0))
-            places.append((f"{link}/points", index))
-        root = self.root.GetPath()
-        found = [(self.stage.GetPrimAtPath(root.AppendPath(place)), link) for place, link in places]
-        return [(prim, link) for prim, link in found if prim]
-
     def _relative(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
         """Pose [7] of a prim in the frame of an ancestor; a scale is dropped, shear is refused."""
-        matrix, _ = self.cache.ComputeRelativeTransform(prim, ancestor)
-        rows = np.array(matrix)[:3, :3]
-        scale = np.linalg.norm(rows, axis=1)
-        turn = (rows / scale[:, None]).T  # USD transforms row vectors
-        if (
-            np.abs(turn @ turn.T - np.eye(3)).max() > ORTHONORMAL_TOLERANCE
-            or np.linalg.det(turn) < 0.0
-        ):
+        matrix = self._matrix(prim, ancestor)
+        # USD transforms row vectors.
+        turn = (matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=1, keepdims=True)).T
+        shear = np.abs(turn @ turn.T - np.eye(3)).max()
+        if shear > ORTHONORMAL_TOLERANCE or np.linalg.det(turn) < 0.0:
             raise self.fail(
                 prim, "its transform shears or mirrors", "use translation, rotation and scale only"
             )
-        return np.concatenate(
-            [np.array(matrix.ExtractTranslation()), Rotation.from_matrix(turn).as_quat()]
+        return np.concatenate([matrix[3, :3], Rotation.from_matrix(turn).as_quat()])
+
+    def _matrix(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
+        """Transform of row vectors from a prim to an ancestor [4, 4]."""
+        return np.array(self.cache.ComputeRelativeTransform(prim, ancestor)[0])
+
+    def drawn_meshes(self, body: Usd.Prim) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Vertices [V, 3] and triangles [T, 3] of what is drawn of a link, in its frame."""
+        meshes = []
+        for prim in Usd.PrimRange(body):
+            if not prim.IsA(UsdGeom.Mesh) or UsdGeom.Imageable(prim).ComputePurpose() == "guide":
+                continue
+            mesh = UsdGeom.Mesh(prim)
+            if set(mesh.GetFaceVertexCountsAttr().Get() or ()) != {3}:
+                what = "'faceVertexCounts' are not all 3"
+                raise self.fail(prim, what, "triangulate the mesh")
+            matrix = self._matrix(prim, body)
+            vertices = np.array(mesh.GetPointsAttr().Get()) @ matrix[:3, :3] + matrix[3, :3]
+            faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+            meshes.append((vertices, faces))
+        return meshes
+
+    def _palm(self) -> np.ndarray:
+        """Where the palm looks, a unit vector [3]."""
+        palm = self.vector(self.root, "vd:palm")
+        if not np.linalg.norm(palm) > 0.0:
+            raise self.fail(self.root, f"'vd:palm' is {palm}", "give it a direction")
+        return np.asarray(palm / np.linalg.norm(palm))
+
+    def _workspace(self) -> Workspace:
+        low, high = self.vector(self.root, "vd:workspace:size", 2)
+        if not 0.0 < low <= high:
+            raise self.fail(
+                self.root, f"'vd:workspace:size' is ({low}, {high})", "smallest first, above 0"
+            )
+        return Workspace(
+            drop_m=tuple(self.vector(self.root, "vd:workspace:drop").tolist()),
+            goal_m=tuple(self.vector(self.root, "vd:workspace:goal").tolist()),
+            fall_m=self.number(self.root, "vd:workspace:fall", positive=True),
+            size_m=(float(low), float(high)),
         )
 
-    def _mass(self, body: Usd.Prim) -> tuple[float, np.ndarray, np.ndarray]:
+    def _link(self, body: Usd.Prim) -> _LinkRow:
         if not body.HasAPI(UsdPhysics.RigidBodyAPI):
             raise self.fail(body, "PhysicsRigidBodyAPI is missing", "apply it to every link")
-        mass = self.number(body, "physics:mass", positive=True)
-        com = np.array(self.value(body, "physics:centerOfMass"), dtype=float)
-        moments = np.array(self.value(body, "physics:diagonalInertia"), dtype=float)
-        if not np.all(moments > 0.0) or 2.0 * moments.max() > moments.sum() * (
-            1.0 + ORTHONORMAL_TOLERANCE
-        ):
+        moments = self.vector(body, "physics:diagonalInertia")
+        most = moments.sum() * (1.0 + ORTHONORMAL_TOLERANCE) / 2.0
+        if moments.min() <= 0.0 or moments.max() > most:
             raise self.fail(
                 body,
                 f"'physics:diagonalInertia' is {moments}",
                 "three positive moments, none above the sum of two",
             )
         axes = Rotation.from_quat(xyzw(self.value(body, "physics:principalAxes"))).as_matrix()
-        return mass, com, axes @ np.diag(moments) @ axes.T
-
-    def _axis(self, joint: Usd.Prim) -> np.ndarray:
-        return np.eye(3)["XYZ".index(self.value(joint, "physics:axis"))]
-
-    def _joint_frames(
-        self, joint: Usd.Prim, index: dict[Any, int]
-    ) -> tuple[int, int, np.ndarray, np.ndarray]:
-        """Parent link, child link, and the joint frame in each."""
-        if not joint.IsA(UsdPhysics.RevoluteJoint):
-            raise self.fail(
-                joint,
-                f"is a {joint.GetTypeName() or 'typeless prim'}",
-                "make it a PhysicsRevoluteJoint",
-            )
-        links, frames = [], []
-        for side in (0, 1):
-            targets = joint.GetRelationship(f"physics:body{side}").GetTargets()
-            if len(targets) != 1 or targets[0] not in index:
-                names = [str(target) for target in targets]
-                raise self.fail(
-                    joint, f"'physics:body{side}' is {names}", "point it at one link of the hand"
-                )
-            links.append(index[targets[0]])
-            position = np.array(self.value(joint, f"physics:localPos{side}"), dtype=float)
-            frames.append(
-                np.concatenate([position, xyzw(self.value(joint, f"physics:localRot{side}"))])
-            )
-        finger, number = re.findall(r"\d+", joint.GetName())
-        child = self.root.GetPath().AppendChild(f"f{finger}_l{number}")
-        parent = self.root.GetPath().AppendChild(
-            "base" if number == "1" else f"f{finger}_l{int(number) - 1}"
+        return _LinkRow(
+            self.number(body, "physics:mass", positive=True),
+            self.vector(body, "physics:centerOfMass"),
+            axes @ np.diag(moments) @ axes.T,
         )
-        if links != [index[parent], index[child]]:
-            raise self.fail(
-                joint, "joins other links than its name says", f"join {parent} and {child}"
-            )
-        return links[0], links[1], frames[0], frames[1]
 
-    def _drive(self, joint: Usd.Prim, *, driven: bool) -> tuple[float, ...]:
-        """Limits, kp, kd, effort, velocity limit and armature, in radians.
-
-        Gains only if ``driven``.
-        """
+    def _joint(
+        self, joint: Usd.Prim, joints: list[Usd.Prim], index: dict[Sdf.Path, int]
+    ) -> _JointRow:
+        """A joint; its gains have to be positive only if it follows no other."""
+        if not joint.IsA(UsdPhysics.RevoluteJoint):
+            kind = joint.GetTypeName() or "typeless prim"
+            raise self.fail(joint, f"is a {kind}", "make it a PhysicsRevoluteJoint")
+        parent, child = self._joined_links(joint, index)
         lower = self.number(joint, "physics:lowerLimit")
         upper = self.number(joint, "physics:upperLimit")
         if lower >= upper:
-            raise self.fail(
-                joint,
-                f"'physics:lowerLimit' {lower} is not below 'physics:upperLimit' {upper}",
-                "swap",
-            )
-        stiffness = self.number(joint, "drive:angular:physics:stiffness", positive=driven)
-        damping = self.number(joint, "drive:angular:physics:damping", positive=driven)
-        return (
-            math.radians(lower),
-            math.radians(upper),
-            math.degrees(stiffness),  # authored per degree
-            math.degrees(damping),
-            self.number(joint, "drive:angular:physics:maxForce", positive=True),
-            math.radians(self.number(joint, "newton:velocityLimit", positive=True)),
-            self.number(joint, "newton:armature"),
+            what = f"'physics:lowerLimit' {lower} is not below 'physics:upperLimit' {upper}"
+            raise self.fail(joint, what, "swap")
+        start = self.number(joint, "vd:start")
+        low = math.radians(lower)
+        high = math.radians(upper)
+        if not low - ROUNDING_RAD <= start <= high + ROUNDING_RAD:
+            within = f"choose one within its limits, {low:.3f} and {high:.3f} rad"
+            raise self.fail(joint, f"'vd:start' is {start:g} rad", within)
+        leader, factor, offset = self._mimic(joint, joints)
+        drive = "drive:angular:physics"
+        driven = leader < 0
+        return _JointRow(
+            joint_parent=parent,
+            joint_child=child,
+            joint_axis=np.eye(3)["XYZ".index(self.value(joint, "physics:axis"))],
+            joint_parent_frame=self._joint_frame(joint, 0),
+            joint_child_frame=self._joint_frame(joint, 1),
+            lower=low,
+            upper=high,
+            # Gains are authored per degree.
+            kp=math.degrees(self.number(joint, f"{drive}:stiffness", positive=driven)),
+            kd=math.degrees(self.number(joint, f"{drive}:damping", positive=driven)),
+            effort=self.number(joint, f"{drive}:maxForce", positive=True),
+            velocity_limit=math.radians(self.number(joint, "newton:velocityLimit", positive=True)),
+            armature=self.number(joint, "newton:armature"),
+            start=start,
+            mimic=leader,
+            mimic_factor=factor,
+            mimic_offset=offset,
         )
+
+    def _joint_frame(self, joint: Usd.Prim, side: int) -> np.ndarray:
+        """The frame of a joint in its parent (side 0) or child [7]."""
+        position = self.vector(joint, f"physics:localPos{side}")
+        return np.concatenate([position, xyzw(self.value(joint, f"physics:localRot{side}"))])
+
+    def _joined_links(self, joint: Usd.Prim, index: dict[Sdf.Path, int]) -> tuple[int, int]:
+        """Parent and child of a joint, which its name says."""
+        for side in (0, 1):
+            targets = _bodies(joint, side)
+            if len(targets) != 1 or targets[0] not in index:
+                what = f"'physics:body{side}' is {[str(target) for target in targets]}"
+                raise self.fail(joint, what, "point it at one link of the hand")
+        finger, number = re.findall(r"\d+", joint.GetName())
+        before = "base" if number == "1" else f"f{finger}_l{int(number) - 1}"
+        parent = self.root.GetPath().AppendChild(before)
+        child = self.root.GetPath().AppendChild(f"f{finger}_l{number}")
+        if [*_bodies(joint, 0), *_bodies(joint, 1)] != [parent, child]:
+            what = "joins other links than its name says"
+            raise self.fail(joint, what, f"join {parent} and {child}")
+        return index[parent], index[child]
+
+    def _mimic(self, joint: Usd.Prim, joints: list[Usd.Prim]) -> tuple[int, float, float]:
+        """The joint that a joint follows, or -1, with factor and offset [rad]."""
+        targets = joint.GetRelationship("newton:mimicJoint").GetTargets()
+        if not targets:
+            return -1, 1.0, 0.0
+        paths = [other.GetPath() for other in joints]
+        if len(targets) != 1 or targets[0] not in paths:
+            what = f"'newton:mimicJoint' is {[str(target) for target in targets]}"
+            raise self.fail(joint, what, "point it at one joint of the hand")
+        factor = self.number(joint, "newton:mimicCoef1")
+        offset = math.radians(self.number(joint, "newton:mimicCoef0"))
+        return paths.index(targets[0]), factor, offset
+
+    def _check_mimic(self, joints: list[Usd.Prim], leaders: np.ndarray) -> None:
+        """Refuse a joint that follows one which follows another."""
+        for joint, leader in zip(joints, leaders, strict=True):
+            if leader >= 0 and leaders[leader] >= 0:
+                name = joints[leader].GetName()
+                raise self.fail(joint, f"follows {name}, which follows another", "follow that one")
+
+    def _motors(self, joints: list[Usd.Prim]) -> tuple[MotorModel | None, ...]:
+        """The motor of each joint that says which it has; no two have one ID."""
+        motors: list[MotorModel | None] = []
+        ids: set[int] = set()
+        for joint in joints:
+            if not joint.GetAuthoredPropertiesInNamespace("vd:motor"):
+                motors.append(None)
+                continue
+            gains = {}
+            for name, kind in OPTIONAL_GAINS.items():
+                if joint.GetAttribute(f"vd:motor:{name}").HasAuthoredValue():
+                    gains[name] = kind(self.number(joint, f"vd:motor:{name}"))
+            motor = MotorModel(
+                model=str(self.value(joint, "vd:motor:model")),
+                id=int(self.value(joint, "vd:motor:id")),
+                sign=self.number(joint, "vd:motor:sign"),
+                offset_rad=self.number(joint, "vd:motor:offset"),
+                gear=self.number(joint, "vd:motor:gear", positive=True),
+                **gains,
+            )
+            if abs(motor.sign) != 1.0:
+                raise self.fail(joint, f"'vd:motor:sign' is {motor.sign:g}", "it is 1, or -1")
+            if motor.id in ids:
+                what = f"'vd:motor:id' {motor.id} is another joint's too"
+                raise self.fail(joint, what, "change one")
+            ids.add(motor.id)
+            motors.append(motor)
+        return tuple(motors)
 
     def _camera(self, prim: Usd.Prim, base: Usd.Prim) -> CameraModel:
         if not prim.IsA(UsdGeom.Camera):
-            raise self.fail(
-                prim, f"is a {prim.GetTypeName() or 'typeless prim'}", "make it a Camera"
-            )
-        width, height = (int(n) for n in self.value(prim, "vd:resolution"))
+            kind = prim.GetTypeName() or "typeless prim"
+            raise self.fail(prim, f"is a {kind}", "make it a Camera")
+        width, height = (int(pixels) for pixels in self.value(prim, "vd:resolution"))
         if min(width, height) < 1:
-            raise self.fail(
-                prim, f"'vd:resolution' is {width} x {height}", "give the image size in pixels"
-            )
+            what = f"'vd:resolution' is {width} x {height}"
+            raise self.fail(prim, what, "give the image size in pixels")
         focal = self.number(prim, "focalLength", positive=True)
         across = self.number(prim, "horizontalAperture", positive=True)
         down = self.number(prim, "verticalAperture", positive=True)
@@ -379,21 +534,34 @@ class _Reader(Described):
             quaternion=(Rotation.from_quat(pose[3:]) * OPTICAL_FROM_USD).as_quat(),
         )
 
-    def _points(self, prims: list[Usd.Prim]) -> np.ndarray:
-        sets = [np.array(self.value(prim, "points"), dtype=np.float32) for prim in prims]
-        for prim, samples in zip(prims, sets, strict=True):
-            if samples.shape != sets[0].shape or not np.isfinite(samples).all() or not samples.size:
+    def _points(self, links: list[str]) -> tuple[np.ndarray, np.ndarray]:
+        """Link [P] and surface samples [P, S, 3] of each set, as far as links have them."""
+        places = [("base/points", 0)]
+        for link, name in enumerate(links[1:], 1):
+            if name.endswith("_l1"):
+                places.append((f"base/{name.replace('_l1', '_motor')}_points", 0))
+            places.append((f"{name}/points", link))
+        numbers: list[int] = []
+        sets: list[np.ndarray] = []
+        for place, link in places:
+            prim = self.stage.GetPrimAtPath(self.root.GetPath().AppendPath(place))
+            if not prim:
+                continue
+            samples = np.array(self.value(prim, "points"), dtype=np.float32)
+            sets.append(samples)
+            numbers.append(link)
+            if samples.shape != sets[0].shape or not samples.size or not np.isfinite(samples).all():
                 raise self.fail(
                     prim,
                     f"'points' has shape {samples.shape}",
                     f"{len(sets[0])} finite points, as many on each link",
                 )
-        return np.stack(sets) if sets else np.zeros((0, 0, 3), dtype=np.float32)
+        return np.array(numbers), np.stack(sets) if sets else np.zeros((0, 0, 3), np.float32)
 
-    def _shapes(self, body: Usd.Prim, link: int, tips: set[Sdf.Path]) -> list[CollisionShape]:
+    def _shapes(self, body: Usd.Prim, link: int, *, needed: bool) -> list[CollisionShape]:
         """Colliders of a link; only those with fingertips need one."""
         prims = [prim for prim in Usd.PrimRange(body) if prim.HasAPI(UsdPhysics.CollisionAPI)]
-        if not prims and body.GetPath() in tips:
+        if needed and not prims:
             raise self.fail(
                 body, "has no collider", "apply PhysicsCollisionAPI to a primitive below it"
             )
@@ -401,44 +569,36 @@ class _Reader(Described):
 
     def _shape(self, prim: Usd.Prim, body: Usd.Prim, link: int) -> CollisionShape:
         frame = self._relative(prim, body)
-        matrix, _ = self.cache.ComputeRelativeTransform(prim, body)
-        scale = np.linalg.norm(np.array(matrix)[:3, :3], axis=1)
-        kind, vertices = str(prim.GetTypeName()), np.zeros((0, 3))
+        scale = np.linalg.norm(self._matrix(prim, body)[:3, :3], axis=1)
+        usd_kind = str(prim.GetTypeName())
+        kind = usd_kind.lower()
+        vertices = np.zeros((0, 3))
         size: tuple[float, ...]
-        if kind == "Cube":
+        if usd_kind == "Cube":
+            kind = "box"
             half = self.number(prim, "size", positive=True) / 2.0
-            size = tuple(float(half * s) for s in scale)
-        elif kind == "Mesh":
-            if prim.GetAttribute("physics:approximation").Get() != UsdPhysics.Tokens.convexHull:
-                raise self.fail(
-                    prim,
-                    "'physics:approximation' is not convexHull",
-                    "split the mesh into convex parts and give each PhysicsMeshCollisionAPI with "
-                    "it",
-                )
-            corners = np.array(self.value(prim, "points"), dtype=float) * scale
-            vertices = corners[ConvexHull(corners).vertices]
-            low, high = vertices.min(axis=0), vertices.max(axis=0)
-            frame = compose(frame, np.array([*(low + high) / 2.0, 0.0, 0.0, 0.0, 1.0]))
-            vertices, size = vertices - (low + high) / 2.0, tuple(((high - low) / 2.0).tolist())
-        elif kind in ("Sphere", "Capsule", "Cylinder"):
+            size = tuple((half * scale).tolist())
+        elif usd_kind == "Mesh":
+            kind = "hull"
+            corners = self._hull_corners(prim) * scale
+            low = corners.min(axis=0)
+            high = corners.max(axis=0)
+            frame = compose(frame, pose_at((low + high) / 2.0))
+            vertices = corners - (low + high) / 2.0
+            size = tuple(((high - low) / 2.0).tolist())
+        elif usd_kind in ("Sphere", "Capsule", "Cylinder"):
             if np.abs(scale - 1.0).max() > ORTHONORMAL_TOLERANCE:
-                raise self.fail(
-                    prim, f"is scaled by {scale}", "put the size into its radius and height"
-                )
+                what = f"is scaled by {scale}"
+                raise self.fail(prim, what, "put the size into its radius and height")
             size = (self.number(prim, "radius", positive=True),)
-            if kind != "Sphere":
+            if usd_kind != "Sphere":
                 size += (self.number(prim, "height", positive=True) / 2.0,)
                 upright = np.roll(np.eye(3), "XYZ".index(self.value(prim, "axis")) - 2, axis=1)
-                frame[3:] = (
-                    Rotation.from_quat(frame[3:]) * Rotation.from_matrix(upright)
-                ).as_quat()
+                turn = Rotation.from_quat(frame[3:]) * Rotation.from_matrix(upright)
+                frame[3:] = turn.as_quat()
         else:
-            raise self.fail(
-                prim,
-                f"is a {kind}",
-                "collide with a Cube, Sphere, Capsule, Cylinder or convex Mesh",
-            )
+            remedy = "collide with a Cube, Sphere, Capsule, Cylinder or convex Mesh"
+            raise self.fail(prim, f"is a {usd_kind}", remedy)
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
         if not material:
             raise self.fail(prim, "no physics material is bound", "bind one with friction")
@@ -446,10 +606,32 @@ class _Reader(Described):
         return CollisionShape(
             path=str(prim.GetPath()),
             link=link,
-            kind={"Cube": "box", "Mesh": "hull"}.get(kind, kind.lower()),
+            kind=kind,
             size=size,
             frame=frame,
             vertices=vertices,
             friction=self.number(surface, "physics:dynamicFriction"),
             fingertip=surface.GetName() == "fingertip_surface",
         )
+
+    def _hull_corners(self, prim: Usd.Prim) -> np.ndarray:
+        """Corners of the convex hull of a mesh that collides [V, 3]."""
+        if prim.GetAttribute("physics:approximation").Get() != UsdPhysics.Tokens.convexHull:
+            raise self.fail(
+                prim,
+                "'physics:approximation' is not convexHull",
+                "split the mesh into convex parts and give each PhysicsMeshCollisionAPI with it",
+            )
+        points = np.array(self.value(prim, "points"), dtype=float)
+        return points[ConvexHull(points).vertices]
+
+
+def _bodies(joint: Usd.Prim, side: int) -> list[Sdf.Path]:
+    """What a joint joins on its first (0) or second side."""
+    return list(joint.GetRelationship(f"physics:body{side}").GetTargets())
+
+
+def xyzw(quaternion: Gf.Quatf) -> np.ndarray:
+    """A USD quaternion as a unit quaternion xyzw [4], in double precision."""
+    components = np.array([*quaternion.GetImaginary(), quaternion.GetReal()], dtype=float)
+    return np.asarray(components / np.linalg.norm(components))

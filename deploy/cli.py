@@ -1,11 +1,11 @@
 """``vd-deploy``: a policy on a real hand, or on its twin, and what has to come before and after."""
 
 import importlib
+import inspect
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from vd.command import interrupt
 from vd.command.line import behind_command, parse
@@ -23,8 +23,8 @@ COMMANDS = {
     "tags": ("pose.tag_sheet", "print a cube of tags, by which --pose tags sees it"),
     "score": ("loop.score", "the object's error at each stop, by motion capture"),
 }
-"""Module of each command and what it does. A module has its options, such as RunCfg, and a function
-of the command's name, which takes them and returns a status."""
+"""Module of each command and what it does. A module has a function of the command's name, which takes
+options as it is annotated, and returns a status."""
 USAGE = """usage: vd-deploy [POLICY] [flags]   the same as vd-deploy run
        vd-deploy COMMAND [flags]
 
@@ -47,7 +47,7 @@ def _no_policy(text: str) -> str:
     """Why it is no file, no folder and no installed policy; "" if it is one."""
     if Path(text).exists():
         return ""
-    from vd.evaluate.agents import check_names
+    from vd.policy.agents import check_names
 
     try:
         check_names([text], [])
@@ -72,19 +72,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"vd-deploy: {wrong}", file=sys.stderr)
         return FAILED
     module = importlib.import_module(f"vd.deploy.{COMMANDS[name][0]}")
-    options_of = getattr(module, f"{name.capitalize()}Cfg")
+    command = getattr(module, name)
+    options_of = inspect.get_annotations(command)["cfg"]
     options = parse(options_of, arguments, prog=f"vd-deploy {name}", description=module.__doc__)
-    if hasattr(options, "port") and not (options.port or options.twin or _by_ros(options)):
+    by_ros = getattr(options, "ros2", False)
+    if hasattr(options, "port") and not (options.port or options.twin or by_ros):
         from vd.deploy.hardware.port import find_port
 
         options = replace(options, port=find_port())
         print(f"vd-deploy: --port {options.port}, the only serial adapter", file=sys.stderr)
-    return int(getattr(module, name)(options))
-
-
-def _by_ros(options: Any) -> bool:
-    """Whether the motors are behind ROS 2, and have no port here."""
-    return bool(getattr(options, "ros2", False))
+    return int(command(options))
 
 
 if __name__ == "__main__":

@@ -118,7 +118,9 @@ class Pacer:
     """
 
     def __init__(self, hz: float, clock: Clock = MONOTONIC, *, latest: float = 1.0):
-        self.period_s, self.clock, self._latest = 1.0 / hz, clock, latest
+        self.period_s = 1.0 / hz
+        self.clock = clock
+        self._latest = latest
         self.due_s = -math.inf
         """When the present step was due [s]; before the first one long ago."""
         self.missed = 0

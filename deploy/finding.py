@@ -14,7 +14,7 @@ class Finding:
     what: str
     """What was looked at."""
     ok: bool
-    found: str
+    words: str
     """How it is; where it is wrong with the remedy."""
 
 
@@ -31,9 +31,10 @@ def finding(what: str, wrong: Sequence[str], right: str) -> Finding:
 
 def show(findings: Iterable[Finding], *, quiet: bool = False) -> list[Finding]:
     """All findings, printed as they come unless ``quiet``."""
-    kept = []
-    for one in findings:
-        kept.append(one)
+    shown = []
+    for finding in findings:
+        shown.append(finding)
         if not quiet:
-            print(f"{'ok   ' if one.ok else 'WRONG'}  {one.what:<20} {one.found}", flush=True)
-    return kept
+            mark = "ok   " if finding.ok else "WRONG"
+            print(f"{mark}  {finding.what:<20} {finding.words}", flush=True)
+    return shown

@@ -20,18 +20,18 @@ import json
 import shlex
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel, MotorModel
 from vd.assets_usd.hands import load_hand
 from vd.deploy.camera.ros_camera import FIRST_S, monotonic
-from vd.deploy.clock import MONOTONIC, from_future
+from vd.deploy.clock import MONOTONIC, Clock, from_future
 from vd.deploy.finding import Finding, finding
 from vd.deploy.hardware.answers import HandState, SilentError
 from vd.deploy.hardware.connect import Connection, HandOptions
-from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.joints import JointMotors
 from vd.deploy.loop.goals import GoalError, make_goals
 from vd.deploy.safety.limits import out_of_range
 from vd.paper import PAPER
@@ -48,7 +48,7 @@ FEWEST = 2.0
 """States for each control step, at least."""
 
 
-class _Joints(Joints):
+class _Joints(JointMotors):
     """Joints whose motors nobody here knows: of each angles and limits are the joint's own."""
 
     def __init__(self, hand: HandModel):
@@ -61,7 +61,7 @@ class _Joints(Joints):
 
 
 class RosHand:
-    """What :class:`vd.deploy.safety.safety.SafeHand` asks of a bus, over topics.
+    """A hand behind topics, as :class:`vd.deploy.hardware.motors.Motors`.
 
     Stops hold, torque stays on.
 
@@ -70,19 +70,21 @@ class RosHand:
         node: Of rclpy.
     """
 
-    clock = MONOTONIC
+    clock: Clock = MONOTONIC
 
     def __init__(self, hand: HandModel, node: Any):
         from rclpy.qos import qos_profile_sensor_data
         from sensor_msgs.msg import JointState
         from std_msgs.msg import Float64MultiArray
 
-        self.hand, self.ids, self._message = (
-            hand,
-            tuple(range(len(hand.joint_names))),
-            Float64MultiArray,
-        )
-        self._node, self._state, self._wrong, self.count = node, cast(HandState | None, None), "", 0
+        self.hand = hand
+        self.ids = tuple(range(len(hand.joint_names)))
+        self.count = 0
+        """JointStates so far."""
+        self._message = Float64MultiArray
+        self._node = node
+        self._state: HandState | None = None
+        self._wrong = ""
         self._arrived = threading.Condition()
         self._commands = node.create_publisher(Float64MultiArray, COMMANDS, 1)
         node.create_subscription(JointState, STATES, self._take, qos_profile_sensor_data)
@@ -137,12 +139,15 @@ class RosHand:
             )
             yield Finding("joint states", False, why)
             return
-        begin, first, ages = self.clock.now(), self.count, []
+        begin = self.clock.now()
+        first = self.count
+        ages = []
         while self.clock.now() < begin + LOOK_S:
             assert self._state is not None
             ages.append(self.clock.now() - self._state.time_s)
             self.clock.sleep(STATE_S)
-        rate, age = (self.count - first) / LOOK_S, float(np.median(ages))
+        rate = (self.count - first) / LOOK_S
+        age = float(np.median(ages))
         wrong = []
         if rate < FEWEST * PAPER.scene.control_hz:
             wrong.append(f"{rate:.0f} a second, fewer than {FEWEST * PAPER.scene.control_hz:.0f}")
@@ -185,7 +190,7 @@ class RosHand:
         if self._state is not None:
             self.write_goals(self._state.position)
 
-    def stiffen(self, share: float) -> None:
+    def stiffen(self, share: float, ids: Sequence[int] | None = None) -> None:
         """The driver's."""
 
     def torque(self, on: bool, ids: Sequence[int] | None = None) -> dict[int, str]:
@@ -222,7 +227,9 @@ class RosGoals:
         from std_msgs.msg import String
         from std_srvs.srv import Trigger
 
-        self._goals, self._result, self._string = goals, SetParametersResult, String
+        self._goals = goals
+        self._result = SetParametersResult
+        self._string = String
         self._finished = threading.Event()
         self._events = node.create_publisher(String, "~/events", 10)
         node.declare_parameter("goal", [0.0, 0.0, 0.0, 1.0])
@@ -235,11 +242,10 @@ class RosGoals:
 
     def _set(self, parameters: Sequence[Any]) -> Any:
         try:
-            new = [
-                make_goals([",".join(map(str, one.value))])[0]
-                for one in parameters
-                if one.name == "goal"
-            ]
+            new = []
+            for parameter in parameters:
+                if parameter.name == "goal":
+                    new += make_goals([",".join(map(str, parameter.value))])
         except (GoalError, TypeError) as error:
             return self._result(successful=False, reason=str(error))
         self._goals.extend(new)
@@ -247,7 +253,8 @@ class RosGoals:
 
     def _finish(self, _: Any, answer: Any) -> Any:
         self._finished.set()
-        answer.success, answer.message = True, "ends after the last goal"
+        answer.success = True
+        answer.message = "ends after the last goal"
         return answer
 
     def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:
@@ -274,7 +281,7 @@ def connect_ros(options: HandOptions, arguments: str = "") -> Iterator[Connectio
     """
     hand = load_hand(options.hand, layer=options.hand_layer)
     with running_node(arguments) as node:
-        yield Connection(_Joints(hand), cast(Any, RosHand(hand, node)), ros=node)
+        yield Connection(_Joints(hand), RosHand(hand, node), ros=node)
 
 
 def need_rclpy(flag: str) -> None:

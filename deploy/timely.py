@@ -14,20 +14,17 @@ takes.
 
 
 @contextlib.contextmanager
-def undisturbed(before_all: bool, *, level: int = 0) -> Iterator[bool]:
+def undisturbed(before_all: bool) -> Iterator[bool]:
     """Run without the garbage collector, without long turns of other threads, and before other programs.
 
     The collector pauses for a second where there is much; a run makes little. A thread that waits
     for the
     interpreter, as after every packet, waits for whoever has it: 5 ms by default. Before all
     ordinary programs run all threads, those that begin later too, where the system permits it
-    (root, ``ulimit -r 1``): the watchdog must not wait for other programs. Loop and twin need it on
-    a busy machine; both mostly sleep.
+    (root, ``ulimit -r 1``): the watchdog must not wait for other programs. The loop mostly sleeps.
 
     Args:
         before_all: Whether to try that.
-        level: Above the lowest real-time priority. A twin's is higher than the loop's, as motors'
-            processors do not wait for ours.
 
     Yields:
         Whether it does.
@@ -38,23 +35,22 @@ def undisturbed(before_all: bool, *, level: int = 0) -> Iterator[bool]:
     gc.freeze()
     gc.disable()
     before: dict[int, tuple[int, os.sched_param]] = {}
-    with contextlib.suppress(
-        AttributeError, FileNotFoundError, PermissionError
-    ):  # not Linux, not permitted
-        priority = os.sched_param(os.sched_get_priority_min(os.SCHED_RR) + level)
-        for thread in (
-            int(entry.name) for entry in Path("/proc/self/task").iterdir() if before_all
-        ):
-            with contextlib.suppress(ProcessLookupError):  # it has just ended
-                had = os.sched_getscheduler(thread), os.sched_getparam(thread)
-                os.sched_setscheduler(thread, os.SCHED_RR, priority)
-                before[thread] = had
+    if before_all:
+        # Not Linux, or not permitted.
+        with contextlib.suppress(AttributeError, FileNotFoundError, PermissionError):
+            priority = os.sched_param(os.sched_get_priority_min(os.SCHED_RR))
+            for entry in Path("/proc/self/task").iterdir():
+                thread = int(entry.name)
+                with contextlib.suppress(ProcessLookupError):  # it has just ended
+                    usual = os.sched_getscheduler(thread), os.sched_getparam(thread)
+                    os.sched_setscheduler(thread, os.SCHED_RR, priority)
+                    before[thread] = usual
     try:
         yield bool(before)
     finally:
-        for thread, had in before.items():
+        for thread, usual in before.items():
             with contextlib.suppress(ProcessLookupError):
-                os.sched_setscheduler(thread, *had)
+                os.sched_setscheduler(thread, *usual)
         sys.setswitchinterval(turn_s)
         gc.enable()
         gc.unfreeze()

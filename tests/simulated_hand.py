@@ -8,15 +8,15 @@ from collections.abc import Iterator, Sequence
 
 import dynamixel_sdk
 import numpy as np
+from motor_line import MotorLine
+from motor_model import make_motors
+from motor_plant import Plant
 from simulated_clock import SimulatedClock
 
 from vd.assets_usd.hand_model import HandModel
 from vd.deploy.hardware.bus import BAUD_RATE, MotorBus
 from vd.deploy.hardware.control_table import to_angle
-from vd.deploy.hardware.joints import Joints
-from vd.deploy.twin.line import MotorLine
-from vd.deploy.twin.motor import make_motors
-from vd.deploy.twin.plant import Plant
+from vd.deploy.hardware.joints import JointMotors
 
 BYTE_S = 10.0 / BAUD_RATE
 """Eight bits, a start bit and a stop bit."""
@@ -81,7 +81,7 @@ class SimulatedPort(dynamixel_sdk.PortHandler):
 
 @contextlib.contextmanager
 def simulated_bus(
-    hand: HandModel, joints: Joints, plant: Plant | None = None
+    hand: HandModel, joints: JointMotors, plant: Plant | None = None
 ) -> Iterator[tuple[MotorLine, MotorBus]]:
     """A line of a hand's motors, and a configured bus to it."""
     clock = SimulatedClock()

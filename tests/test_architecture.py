@@ -62,7 +62,6 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     ),
     "vd.geometry": (*USD, *DESCRIPTIONS, "vd.geometry"),
     "vd.policy": (*CAMERA, *DESCRIPTIONS, "vd.tracking"),
-    "vd.policy.store": ("vd",),  # a command, which finds policies as evaluation does
     "vd.tracking": (*CAMERA, *DESCRIPTIONS, "vd.tracking"),
     "vd.vision": CAMERA,
     "vd.envs": (*USD, "vd.sim", "vd.envs"),

@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from vd.bench import depth
-from vd.bench.cli import DepthCommand, PhysicsCommand, SimCommand
+from vd.bench.cli import SimCommand
 from vd.bench.sim import own_share
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
@@ -32,24 +31,3 @@ def test_our_kernels_take_a_share_of_a_step(device):
         pytest.skip("Warp times single kernels on a GPU only")
     cfg = ReorientCfg(hand="dclaw3", objects=("cube",), num_envs=8)
     assert 0.0 < own_share(ReorientEnv(cfg, device)) < 1.0
-
-
-def test_physics_report_names_what_moves(tmp_path):
-    out = tmp_path / "physics.json"
-    PhysicsCommand(objects=("cube",), device="cpu", json=out).run()
-    (report,) = json.loads(out.read_text())["rows"]
-    assert report["objects"] == 1 and report["at_rest_share"] == 1.0 and report["moving"] == []
-    assert report["pinch"]["creep"] < 0.2e-3
-
-
-def test_depth_images_and_clouds_are_counted(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(depth, "LEAST_TIME_S", 0.01)
-    out = tmp_path / "depth.json"
-    DepthCommand(envs=(1, 2), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
-    report = json.loads(out.read_text())
-    assert [row["envs"] for row in report["rows"]] == [1, 2]
-    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == report["rows"]
-    for row in report["rows"]:
-        assert min(row["images"], row["clouds"]) > 0.0
-        # The hand covers some of the picture, and nobody sees it otherwise.
-        assert row["points"] > 500

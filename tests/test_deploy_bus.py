@@ -1,4 +1,4 @@
-"""dynamixel-sdk, unchanged, against the twin over its pseudo-terminal."""
+"""dynamixel-sdk, unchanged, against simulated motors behind a pseudo-terminal."""
 
 import time
 
@@ -7,6 +7,10 @@ import pytest
 
 sdk = pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
+from motor_line import Faults  # noqa: E402
+from motor_model import Motor  # noqa: E402
+from motor_packets import Failure  # noqa: E402
+from motor_terminal import MotorTerminal  # noqa: E402
 from simulated_hand import simulated_bus  # noqa: E402
 
 from vd.assets_usd.hands import load_hand  # noqa: E402
@@ -22,27 +26,24 @@ from vd.deploy.hardware.answers import (  # noqa: E402
 from vd.deploy.hardware.bus import MotorBus  # noqa: E402
 from vd.deploy.hardware.control_table import MODELS, to_angle  # noqa: E402
 from vd.deploy.hardware.joints import read_joints  # noqa: E402
-from vd.deploy.hardware.packets import Failure  # noqa: E402
 from vd.deploy.hardware.registers import MotorSettings  # noqa: E402
-from vd.deploy.twin.line import Faults  # noqa: E402
-from vd.deploy.twin.motor import Motor  # noqa: E402
-from vd.deploy.twin.twin import Twin  # noqa: E402
 
 IDS = (10, 11, 12)
 MODEL = "XH430-V210"
+MODELS_OF_ALL = [MODELS[MODEL]] * len(IDS)
 LIMITS = MotorSettings(current_limit_a=0.5, velocity_limit_rad_s=1.0, lower_rad=-1.0, upper_rad=1.2)
 
 
 @pytest.fixture
 def twin():
-    with Twin([Motor(MODELS[MODEL], id) for id in IDS]) as served:
+    with MotorTerminal([Motor(MODELS[MODEL], id) for id in IDS]) as served:
         yield served
 
 
 @pytest.fixture
 def bus(twin):
     # The SDK waits 34 ms for an answer; on a busy machine the twin may not run for longer.
-    with MotorBus(twin.path, IDS, MODEL, retries=20) as opened:
+    with MotorBus(twin.path, IDS, MODELS_OF_ALL, retries=20) as opened:
         yield opened
 
 
@@ -67,13 +68,13 @@ def test_the_sdk_finds_the_motors(bus, twin):
 
 def test_a_port_is_for_one_program_at_a_time_and_says_why_it_cannot_be_opened(bus, twin):
     with pytest.raises(BusError, match=f"in use; .*`fuser -v {twin.path}`"):
-        MotorBus(twin.path, IDS, MODEL)
+        MotorBus(twin.path, IDS, MODELS_OF_ALL)
     with pytest.raises(BusError, match=r"no such device; is the adapter plugged in\? There are: "):
-        MotorBus("/dev/ttyUSB99", IDS, MODEL)
+        MotorBus("/dev/ttyUSB99", IDS, MODELS_OF_ALL)
     bus.close()
     with pytest.raises(BusError, match="is lost"):
         bus.read_state()
-    with MotorBus(twin.path, IDS, MODEL, retries=20) as again:
+    with MotorBus(twin.path, IDS, MODELS_OF_ALL, retries=20) as again:
         again.read_state()
 
 
@@ -130,7 +131,7 @@ def test_a_blocked_motor_shuts_down_and_says_why_until_rebooted(bus, twin):
     assert state.alert.tolist() == [False, True, False]
     assert bus.hardware_errors() == {11: "overload"}
     assert bus.read(11, "torque_enable") == 0 and state.current[1] == 0.0
-    assert "access" in bus.torque(True, [11])[11]
+    assert "not available" in bus.torque(True, [11])[11]
     twin.motors[1].reboot()
     bus.configure(dict.fromkeys(IDS, full))
     assert bus.hardware_errors() == {}
@@ -142,7 +143,7 @@ def test_a_program_that_did_not_run_is_not_called_a_lost_cable(starved_s):
     with simulated_bus(hand, read_joints(hand)) as (line, bus):
         bus._port.starved_s = starved_s
         line.faults.cut_off.add(11)
-        ask = (lambda: bus.read(11, "led"), bus.read_state, bus.read_torque)
+        ask = (lambda: bus.read(11, "drive_mode"), bus.read_state, bus.read_torque)
         for one in ask:
             with pytest.raises(LateError if starved_s else SilentError) as caught:
                 one()
@@ -218,8 +219,8 @@ def test_a_position_that_no_motor_can_count_is_refused_before_any_other_is_known
     start = motor.items["present_position"].address - STATE_ADDRESS
     far[start : start + 4] = counts.to_bytes(4, "little", signed=True)
     with pytest.raises(BusError, match=f"motor 11: its position came as {counts} counts"):
-        check.accept(0.0, [Answer(11, 0, bytes(far))])
-    assert check.accept(0.0, [Answer(11, 0, sound)]).position[0] == 0.0
+        check.accept(0.0, [Answer(11, 0, False, bytes(far))])
+    assert check.accept(0.0, [Answer(11, 0, False, sound)]).position[0] == 0.0
 
 
 def test_goals_arrive_with_the_question_for_the_state_unless_others_are_sent_before(bus, twin):

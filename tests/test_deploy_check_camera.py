@@ -44,7 +44,7 @@ class Camera:
 
 def look(camera: Camera, place=PLACE) -> dict[str, tuple[bool, str]]:
     found = camera_findings(camera, place, HAND.goal_in_base, fps=30.0, clock=camera.clock)
-    return {one.what.removeprefix("camera "): (one.ok, one.found) for one in found}
+    return {one.what.removeprefix("camera "): (one.ok, one.words) for one in found}
 
 
 def wrong(found: dict[str, tuple[bool, str]]) -> list[str]:

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from motor_plant import Drive, NewtonPlant
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.hardware.control_table import MODELS
-from vd.deploy.hardware.joints import CalibrationError, Joints, read_joints
-from vd.deploy.twin.newton_hand import NewtonHand
-from vd.deploy.twin.plant import Drive
+from vd.deploy.hardware.joints import CalibrationError, JointMotors, read_joints
 from vd.kernels.servo.actuators import COULOMB_TORQUE
 from vd.sim.cfg import SimCfg
 
@@ -23,15 +22,15 @@ def hand():
 
 
 @pytest.fixture
-def turned(hand) -> Joints:
+def turned(hand) -> JointMotors:
     """Motors mounted every which way."""
     rng = np.random.default_rng(0)
     signs, angles = rng.choice([-1.0, 1.0], 9), rng.uniform(-0.5, 0.5, 9)
     turned = zip(hand.motors, signs, angles, strict=True)
-    return Joints(hand, tuple(replace(motor, sign=s, offset_rad=o) for motor, s, o in turned))
+    return JointMotors(hand, tuple(replace(motor, sign=s, offset_rad=o) for motor, s, o in turned))
 
 
-def save(joints: Joints, path, hand: str) -> dict:
+def save(joints: JointMotors, path, hand: str) -> dict:
     """Write a calibration file."""
     rows = zip(joints.names, joints.ids, joints.sign, joints.offset, strict=True)
     motors = [{"joint": n, "id": i, "sign": int(s), "offset_rad": float(o)} for n, i, s, o in rows]
@@ -40,13 +39,13 @@ def save(joints: Joints, path, hand: str) -> dict:
     return record
 
 
-def drives(joints: Joints, goal: np.ndarray | None) -> list[Drive]:
+def drives(joints: JointMotors, goal: np.ndarray | None) -> list[Drive]:
     angles = [None] * len(joints.ids) if goal is None else list(joints.to_motor(goal))
     return [Drive(angle, 200.0, 6.0, 2.6) for angle in angles]
 
 
 def test_the_hand_goes_where_its_motors_drive_and_falls_without_them(hand, turned):
-    plant = NewtonHand(hand, turned)
+    plant = NewtonPlant(turned)
     reset = hand.start
     np.testing.assert_allclose(turned.to_joint(plant.read()[0]), reset, atol=1e-6)
     goal = reset + np.tile([0.1, 0.2, 0.3], 3)
@@ -66,14 +65,14 @@ def test_the_hand_goes_where_its_motors_drive_and_falls_without_them(hand, turne
 
 
 def test_limits_are_the_hands_in_the_motors_frame(hand, turned):
-    turned = Joints(hand, tuple(replace(motor, model=MODEL) for motor in turned.motors))
+    turned = JointMotors(hand, tuple(replace(motor, model=MODEL) for motor in turned.motors))
     settings = turned.settings()
     for axis, id in enumerate(turned.ids):
         ends = turned.to_motor(np.stack([hand.lower, hand.upper]))[:, axis]
         assert settings[id].lower_rad == min(ends) and settings[id].upper_rad == max(ends)
         torque = settings[id].current_limit_a * MODELS[MODEL].torque_nm_per_a
         assert torque == pytest.approx(hand.effort[axis], rel=1e-6)
-    far = Joints(
+    far = JointMotors(
         hand, tuple(replace(motor, offset_rad=motor.offset_rad + 3.0) for motor in turned.motors)
     )
     with pytest.raises(CalibrationError, match=r"f0_j1, motor 10: its range"):
@@ -135,7 +134,7 @@ def test_goals_and_readings_do_not_wait_for_steps(hand, effect):
         servo = hand.servo.copy()
         servo[:, effect] = 0.1
         hand = replace(hand, servo=servo)
-    coarse, fine = (NewtonHand(hand, joints, SimCfg(physics_hz=hz)) for hz in (480.0, 3840.0))
+    coarse, fine = (NewtonPlant(joints, SimCfg(physics_hz=hz)) for hz in (480.0, 3840.0))
     rng = np.random.default_rng(0)
     reset = hand.start
     errors, speeds = [], []
@@ -158,7 +157,7 @@ def test_the_recorded_steps_are_the_solvers(hand):
     Contacts come and go, and the solver's iterations differ.
     """
     joints = read_joints(hand)
-    recorded, stepped = NewtonHand(hand, joints), NewtonHand(hand, joints)
+    recorded, stepped = NewtonPlant(joints), NewtonPlant(joints)
     goal = np.tile([0.3, hand.lower[1], hand.lower[2]], 3)
     contacts = []
     for _ in range(40):

@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 import threading
 from dataclasses import replace
 
@@ -13,7 +11,6 @@ import pytest
 from simulated_clock import SimulatedClock
 
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop import run_page
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.safety.safety import StopReport
@@ -48,7 +45,7 @@ def folder(tmp_path):
         "tolerance_rad": 1.0,
     }
     log = LogWriter(tmp_path / "log", hand, run, servo={"p_gain": 200}, truth=True, clock=clock)
-    log.also_to(lambda said: McapLog(tmp_path / "log.mcap", said, np.array(hand.workspace.goal_m)))
+    log.also_to(McapLog(tmp_path / "log.mcap", log.run, np.array(hand.workspace.goal_m)))
     for step in range(STEPS):
         wave = 0.3 * np.sin(0.5 * step + np.arange(9))
         joints = {channel: wave + 0.01 * i for i, channel in enumerate(JOINT_CHANNELS)}
@@ -111,32 +108,6 @@ def test_the_mcap_beside_it_has_all_of_it_and_ros_2_messages_for_others(folder, 
     for size in (2000, 5):
         file.write_bytes(file.read_bytes()[:size])
         assert play([str(file)]) == 1 and "is damaged" in capsys.readouterr().err
-
-
-def test_rerun_reads_what_is_written_for_it(folder, tmp_path):
-    pytest.importorskip("rerun")
-    from vd.deploy.loop.rerun_log import RerunLog
-
-    hand, log, path = load_hand("dclaw3"), read_log(folder), tmp_path / "log.rrd"
-    sink = RerunLog(path, log.run, hand, load_set("cube")[0], hand.camera)
-    for step in range(STEPS):
-        sink.step(
-            {name: values[step] for name, values in log.columns.items()},
-            np.ones((2, 3), np.float32),
-        )
-    sink.event(log.events[0])
-    sink.close(log.run)
-    told = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "print", str(path)], capture_output=True, text=True
-    )
-    for name in (
-        "/world/found",
-        "/world/camera/depth",
-        "/joints/position",
-        "/loop/sent_s",
-        "/events",
-    ):
-        assert name in told.stdout
 
 
 def test_a_log_is_shown(folder, tmp_path, capsys):

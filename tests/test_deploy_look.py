@@ -18,7 +18,7 @@ from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop.policy_runner import load_runner, seen_points
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import open_policy, task_for
+from vd.policy.agents import open_policy, task_for
 from vd.sensors.depth_camera import DepthCamera
 from vd.train.cli import main
 

@@ -16,7 +16,7 @@ from vd.deploy.hardware.joints import read_joints
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop, summary
-from vd.deploy.loop.policy_runner import Decision, PolicyRunner, TrackingRunner
+from vd.deploy.loop.policy_runner import PolicyDecision, PolicyRunner, TrackingRunner
 from vd.deploy.loop.run_page import FILM_FILE, PAGE_FILE, goal_results, summary_line
 from vd.deploy.safety.safety import SafeHand, StoppedError
 from vd.envs.cfg import ReorientCfg
@@ -65,7 +65,7 @@ class LateCamera:
     clock: SimulatedClock
 
     def read(self, _timeout_s: float) -> Frame:
-        """As :class:`Camera`."""
+        """As :class:`ImageSource`."""
         self.clock.sleep(0.005)
         return Frame(np.zeros((2, 2), np.float32), self.clock.now() - 0.04)
 
@@ -88,13 +88,13 @@ class Countdown(PolicyRunner):
         """From the start again."""
         self.distance, self.begun, self.decided = self.start, self.begun + 1, 0
 
-    def decide(self, sensed) -> Decision:
+    def decide(self, sensed) -> PolicyDecision:
         """A tenth nearer."""
         if not self.begun:
             self.clock.sleep(self.look_s)
         self.decided += 1
         self.distance -= 0.1
-        return Decision(np.full(9, 0.1), self.distance)
+        return PolicyDecision(np.full(9, 0.1), self.distance)
 
 
 @pytest.fixture
@@ -196,7 +196,7 @@ def test_an_action_that_is_not_finite_stops_the_hand(looped, value):
         where.append((line.motors, line.plant.position.copy()))
         action = np.zeros(9)
         action[4] = value if len(where) > 5 else 0.0
-        return Decision(action, 9.0)
+        return PolicyDecision(action, 9.0)
 
     with pytest.raises(ValueError, match="the policy's action is not finite"):
         looped(decide)
@@ -212,7 +212,7 @@ def test_a_policy_that_hangs_is_stopped_and_it_is_said(looped):
         if len(states) == 3:
             clock.sleep(5.0)
         states.append(sum(motor.get("torque_enable") for motor in line.motors))
-        return Decision(np.zeros(9), 9.0)
+        return PolicyDecision(np.zeros(9), 9.0)
 
     with pytest.raises(StoppedError, match="the loop stands: no step ended for 0"):
         looped(decide)
@@ -222,7 +222,7 @@ def test_a_policy_that_hangs_is_stopped_and_it_is_said(looped):
 def test_a_first_look_that_does_not_end_is_stopped(looped):
     def decide(clock, line):
         clock.sleep(60.0)
-        return Decision(np.zeros(9), 9.0)
+        return PolicyDecision(np.zeros(9), 9.0)
 
     with pytest.raises(StoppedError, match="the policy has not decided for 10 s"):
         looped(decide)
@@ -288,7 +288,7 @@ class SpoiltCamera:
     images: int = 0
 
     def read(self, _timeout_s: float) -> Frame:
-        """As :class:`Camera`: each image is new by its time."""
+        """As :class:`ImageSource`: each image is new by its time."""
         self.clock.sleep(0.005)
         self.images += 1
         wall = self.rng.normal(0.6, 0.002, self.last.shape).astype(np.float32)
@@ -358,7 +358,7 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
     truth = None if turned is None else Truth(quat=tuple(quat))
     if truth is None:
         log = LogWriter(
-            log.folder / "real", load_hand("dclaw3"), log._run, servo={}, clock=hand.clock
+            log.folder / "real", load_hand("dclaw3"), log.run, servo={}, clock=hand.clock
         )
     ControlLoop(hand, runner, actions, pacer, log, episode_s=limit_s, hold_s=0.2, twin=truth).run(
         [GOAL]

@@ -10,6 +10,8 @@ import pytest
 
 pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
+from motor_model import Motor
+from motor_plant import NewtonPlant
 from simulated_hand import simulated_bus
 
 from vd.assets_usd.hand_data import HandModel, MotorModel
@@ -23,10 +25,8 @@ from vd.deploy.hardware.joints import CalibrationError, read_joints
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop
-from vd.deploy.loop.policy_runner import Decision, PolicyRunner
+from vd.deploy.loop.policy_runner import PolicyDecision, PolicyRunner
 from vd.deploy.safety.safety import SafeHand, StoppedError
-from vd.deploy.twin.motor import Motor
-from vd.deploy.twin.newton_hand import NewtonHand
 from vd.envs.cfg import ReorientCfg
 from vd.policy.stopping import StoppingRule
 
@@ -55,7 +55,7 @@ class Bending(PolicyRunner):
         """One action of one joint."""
         action = np.zeros(len(sensed.joint_q))
         action[2] = 1.0
-        return Decision(action, float("nan"))
+        return PolicyDecision(action, float("nan"))
 
 
 def fly(hand: HandModel, folder) -> tuple[np.ndarray, list[Motor]]:
@@ -64,7 +64,7 @@ def fly(hand: HandModel, folder) -> tuple[np.ndarray, list[Motor]]:
     How the joints moved [rad] [D], and the motors.
     """
     joints = read_joints(hand)
-    plant = NewtonHand(hand, joints)
+    plant = NewtonPlant(joints)
     with simulated_bus(hand, joints, plant) as (line, bus):
         with SafeHand(bus, joints) as safe:
             safe.arm()
@@ -125,7 +125,7 @@ def test_states_are_in_the_units_of_each_model_and_a_wrong_model_is_named(monkey
         bus.clock.sleep(0.02)
         connection = Connection(joints, bus)
         bus._states.forget()
-        assert [one.found for one in check.preflight(connection) if not one.ok] == []
+        assert [one.words for one in check.preflight(connection) if not one.ok] == []
         position, velocity, torque = line.plant.read()
         torque[:3] = 0.93 / 2, 1.5 / 2, 3.0 / 2  # half of what they stall at
         monkeypatch.setattr(line.plant, "read", lambda: (position, velocity, torque))
@@ -142,7 +142,7 @@ def test_states_are_in_the_units_of_each_model_and_a_wrong_model_is_named(monkey
         ):
             safe.read()
         line.motors[0] = Motor(MODELS["XL330-M288"], 3)
-        (wrong,) = (one.found for one in check.preflight(connection) if not one.ok)
+        (wrong,) = (one.words for one in check.preflight(connection) if not one.ok)
         assert "motor 3 is XL330-M288, not XC330-M288" in wrong
 
 

@@ -4,8 +4,7 @@ import random
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from vd.deploy.hardware.packets import (
+from motor_packets import (
     HEADER,
     LONGEST,
     Instruction,

@@ -24,13 +24,13 @@ from vd.deploy.hardware.joints import read_joints
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop
-from vd.deploy.loop.policy_runner import Decision, PolicyRunner, Sensed, load_runner
+from vd.deploy.loop.policy_runner import PolicyDecision, PolicyRunner, Sensed, load_runner
 from vd.deploy.pose import check_pose
 from vd.deploy.pose.check_pose import pose_findings
 from vd.deploy.pose.follower import PoseFollower
 from vd.deploy.pose.open import pose_options, source_frame
 from vd.deploy.pose.ros_poses import RosPoses
-from vd.deploy.pose.source import PoseError, StampedPose
+from vd.deploy.pose.source import PoseSourceError, StampedPose
 from vd.deploy.pose.twin_poses import TruthCfg, TwinPoses
 from vd.deploy.pose.udp_poses import UdpPoses
 from vd.deploy.safety.safety import SafeHand, StoppedError
@@ -45,7 +45,7 @@ NO_MOTION = np.array([0.0, 0.0, 0.0, *GOAL])
 
 
 @dataclass
-class Told:
+class ToldPoses:
     """A source that tells what it is given."""
 
     name = "told"
@@ -66,7 +66,7 @@ class Told:
 
 
 def test_velocities_are_differences_of_poses_in_the_world_frame():
-    source = Told()
+    source = ToldPoses()
     turn = Rotation.from_euler("x", 90.0, degrees=True)
     frame = np.array([0.1, 0.2, 0.3, *turn.as_quat()])
     follower = PoseFollower(source, frame, begin_s=5.0)
@@ -96,7 +96,7 @@ def test_velocities_are_differences_of_poses_in_the_world_frame():
     ],
 )
 def test_a_jump_is_not_believed_however_long_it_lasts_and_one_back_is(place, turn, said):
-    source = Told()
+    source = ToldPoses()
     follower = PoseFollower(source, NO_MOTION, begin_s=0.0)
     source.tell(1.0)
     before = follower.look().state
@@ -117,19 +117,19 @@ class Still(PolicyRunner):
         super().__init__(ReorientCfg(), StoppingRule(0.1))
         self.told = []
 
-    def decide(self, sensed) -> Decision:
+    def decide(self, sensed) -> PolicyDecision:
         """No action."""
         self.told.append(sensed.object_state)
-        return Decision(np.zeros_like(sensed.smoothed), 9.0)
+        return PolicyDecision(np.zeros_like(sensed.smoothed), 9.0)
 
 
 @dataclass
-class Tracker:
+class RestingTracker:
     """A tracker of a cube at rest in the hand, 20 Hz and 60 ms late, spoilt after a second."""
 
     clock: SimulatedClock
     spoil: str
-    source: Told = field(default_factory=Told)
+    source: ToldPoses = field(default_factory=ToldPoses)
     name = "told"
     trouble = ""
 
@@ -177,11 +177,11 @@ def test_stale_jumping_and_future_poses_stop_the_hand_and_name_the_reason(tmp_pa
             with SafeHand(bus, joints) as safe:
                 safe.arm()
                 begin_s = bus.clock.now()
-                follower = PoseFollower(Tracker(bus.clock, spoil), NO_MOTION, begin_s)
+                follower = PoseFollower(RestingTracker(bus.clock, spoil), NO_MOTION, begin_s)
                 pacer, actions = Pacer(HZ, bus.clock), ActionFilter(HAND, ReorientCfg())
                 if spoil == "lost":  # beyond the workspace
                     place = np.array([0.5, 0.0, 0.0, *GOAL])
-                    follower = PoseFollower(Tracker(bus.clock, ""), place, begin_s)
+                    follower = PoseFollower(RestingTracker(bus.clock, ""), place, begin_s)
                 loop = ControlLoop(
                     safe, runner, actions, pacer, log, episode_s=4.0, hold_s=0.0, follower=follower
                 )
@@ -216,7 +216,7 @@ def test_datagrams_are_poses_on_this_computers_clock_and_what_is_none_is_named()
 
     try:
         assert source.read() is None
-        with pytest.raises(PoseError, match=f"cannot listen at 127.0.0.1, port {port}"):
+        with pytest.raises(PoseSourceError, match=f"cannot listen at 127.0.0.1, port {port}"):
             UdpPoses("127.0.0.1", port)
         pose = {"position": [0.1, 0.2, 0.3], "quaternion": [0.0, 0.0, 0.6, 0.8]}
         now = time.time()
@@ -235,7 +235,7 @@ def test_datagrams_are_poses_on_this_computers_clock_and_what_is_none_is_named()
             ),
         ):
             send(wrong)
-            with pytest.raises(PoseError, match=f"udp:{port}: {said}"):
+            with pytest.raises(PoseSourceError, match=f"udp:{port}: {said}"):
                 source.read()
     finally:
         source.close()
@@ -262,10 +262,10 @@ def test_poses_of_a_topic_have_the_time_of_their_stamp(monkeypatch):
     np.testing.assert_allclose(read.pose, [0.1, 0.2, 0.3, 0.0, 0.0, 1.0, 0.0])
     assert 0.07 < time.monotonic() - read.time_s < 1.0
     take(message(0, turn))
-    with pytest.raises(PoseError, match="ros2:/cube/pose: poses have no stamp"):
+    with pytest.raises(PoseSourceError, match="ros2:/cube/pose: poses have no stamp"):
         source.read()
     take(message(ns // 10**9, Message(x=0.0, y=0.0, z=0.0, w=0.0)))
-    with pytest.raises(PoseError, match=r"quaternion is .* length 1"):
+    with pytest.raises(PoseSourceError, match=r"quaternion is .* length 1"):
         source.read()
     source.close()
     node.destroy_subscription.assert_called_once()
@@ -291,23 +291,25 @@ def test_a_twins_truth_comes_late_and_with_noise():
 
 def test_the_preflight_tells_rate_age_and_place_and_what_is_wrong(monkeypatch):
     clock = SimulatedClock()
-    tracker = Tracker(clock, "")
+    tracker = RestingTracker(clock, "")
     fine = list(pose_findings(tracker, NO_MOTION, HAND, 0.5, clock=clock))
     assert [one.ok for one in fine] == [True, True]
-    assert "20 a second from told" in fine[0].found and "0 cm from where dclaw3" in fine[1].found
-    silent = list(pose_findings(Told("no tag is seen"), NO_MOTION, HAND, 0.5, clock=clock))
+    assert "20 a second from told" in fine[0].words and "0 cm from where dclaw3" in fine[1].words
+    silent = list(pose_findings(ToldPoses("no tag is seen"), NO_MOTION, HAND, 0.5, clock=clock))
     assert [one.ok for one in silent] == [False]
-    assert silent[0].found == "none from told within 5 s: no tag is seen"
+    assert silent[0].words == "none from told within 5 s: no tag is seen"
     for spoil, oldest_s, said in (
         ("future", 0.5, "from the future: wait .*stamp them when"),
         ("", 0.01, r"0\.0\d s old: stamp them by this computer's clock"),
     ):
-        spoilt = list(pose_findings(Tracker(clock, spoil), NO_MOTION, HAND, oldest_s, clock=clock))
+        spoilt = list(
+            pose_findings(RestingTracker(clock, spoil), NO_MOTION, HAND, oldest_s, clock=clock)
+        )
         assert not spoilt[0].ok
-        assert re.search(said, spoilt[0].found)
+        assert re.search(said, spoilt[0].words)
     monkeypatch.setattr(check_pose, "FEWEST_HZ", 30.0)
-    slow = next(pose_findings(Tracker(clock, ""), NO_MOTION, HAND, 0.5, clock=clock))
-    assert not slow.ok and "poses a second from told, not 30" in slow.found
+    slow = next(pose_findings(RestingTracker(clock, ""), NO_MOTION, HAND, 0.5, clock=clock))
+    assert not slow.ok and "poses a second from told, not 30" in slow.words
 
 
 def test_a_teacher_that_knows_no_pose_holds_still():

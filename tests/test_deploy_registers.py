@@ -37,7 +37,7 @@ class Rig:
 
     def wrong(self) -> list[str]:
         """What the preflight finds wrong."""
-        return [one.found for one in self.findings().values() if not one.ok]
+        return [one.words for one in self.findings().values() if not one.ok]
 
 
 @pytest.fixture
@@ -57,16 +57,20 @@ def rig(monkeypatch):
 def test_every_register_of_the_table_is_compared(rig):
     rig.bus.configure(rig.connection.joints.settings())
     tables = {id: rig.bus.read_table(id) for id in rig.bus.ids}
-    assert [one.what for one in check.register_findings(rig.connection, tables)] == ["registers"]
+    assert [one.what for one in check.register_findings(rig.connection.joints, tables)] == [
+        "registers"
+    ]
     for register in REGISTERS:
         right = tables[12][register.name]
         other = 0 if register.bits else right - 1 if register.least else right + 1
         spoilt = {**tables, 12: {**tables[12], register.name: other}}
-        (only,) = check.register_findings(rig.connection, spoilt)
-        assert only.what == register.name and f"motor 12: {other};" in only.found
+        (only,) = check.register_findings(rig.connection.joints, spoilt)
+        assert only.what == register.name and f"motor 12: {other};" in only.words
         assert only.ok != bool(register.remedy)
     more = {**tables, 12: {**tables[12], "shutdown": FACTORY["shutdown"] | 1}}
-    assert [one.what for one in check.register_findings(rig.connection, more)] == ["registers"]
+    assert [one.what for one in check.register_findings(rig.connection.joints, more)] == [
+        "registers"
+    ]
 
 
 def test_a_motor_whose_firmware_has_no_watchdog_is_refused_and_a_newer_one_is_not(rig):
@@ -107,4 +111,4 @@ def test_an_adapter_that_keeps_answers_is_refused(tmp_path, monkeypatch, latency
     found = list(check.adapter_findings(str(tmp_path / "usb-FTDI_U2D2")))
     assert [one.ok for one in found] == ([] if right is None else [right])
     if right is False:
-        assert f"echo 1 | sudo tee {tmp_path}/ttyUSB7/latency_timer" in found[0].found
+        assert f"echo 1 | sudo tee {tmp_path}/ttyUSB7/latency_timer" in found[0].words

@@ -157,7 +157,7 @@ def test_what_is_missing_old_or_of_other_names_is_said_and_nothing_moves(capsys)
     hand = RosHand(HAND, make_node("a"))
     few = Message(header=stamped(), name=["f0_j1"], position=[0.0], velocity=[0.0])
     publish("/joint_states", few)
-    assert "lacks f0_j2; names are those of the hand's USD" in next(hand.findings()).found
+    assert "lacks f0_j2; names are those of the hand's USD" in next(hand.findings()).words
     with pytest.raises(SilentError, match="JointState lacks f0_j2"):
         hand.read_state()
     whole = {"name": HAND.joint_names, "position": HAND.upper + 1.0, "velocity": HAND.upper}
@@ -165,8 +165,8 @@ def test_what_is_missing_old_or_of_other_names_is_said_and_nothing_moves(capsys)
     with pytest.raises(SilentError, match="no new JointState on /joint_states"):
         hand.read_state()
     states, commands, pose = hand.findings()
-    assert "fewer than 24" in states.found and "set clocks" in states.found and not states.ok
-    assert "nobody listens on /commands" in commands.found and "f0_j1" in pose.found
+    assert "fewer than 24" in states.words and "set clocks" in states.words and not states.ok
+    assert "nobody listens on /commands" in commands.words and "f0_j1" in pose.words
 
 
 def test_states_and_images_from_the_future_are_refused_with_their_topic():
@@ -180,7 +180,7 @@ def test_states_and_images_from_the_future_are_refused_with_their_topic():
     with pytest.raises(SilentError, match=said):
         hand.read_state()
     (states,) = hand.findings()
-    assert not states.ok and "from the future" in states.found
+    assert not states.ok and "from the future" in states.words
     age_s, over = [0.0], threading.Event()
 
     def driver():

@@ -18,7 +18,7 @@ from simulated_hand import energised, push, simulated_bus
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.hardware.answers import BusError
-from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.joints import JointMotors
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import WATCH_S, SafeHand, StoppedError
 from vd.deploy.timely import undisturbed
@@ -42,12 +42,12 @@ def hand():
 
 
 @pytest.fixture
-def joints(hand) -> Joints:
+def joints(hand) -> JointMotors:
     """Some motors turn the other way and are mounted elsewhere."""
     rng = np.random.default_rng(1)
     signs, angles = rng.choice([-1.0, 1.0], 9), rng.uniform(-0.3, 0.3, 9)
     turned = zip(hand.motors, signs, angles, strict=True)
-    return Joints(hand, tuple(replace(motor, sign=s, offset_rad=o) for motor, s, o in turned))
+    return JointMotors(hand, tuple(replace(motor, sign=s, offset_rad=o) for motor, s, o in turned))
 
 
 @pytest.fixture
@@ -113,7 +113,7 @@ def fastest(bus, line) -> list[float]:
 @pytest.mark.parametrize("current", [0.0, 0.3])
 def test_a_joint_that_was_moved_since_the_preflight_is_not_snapped_back(hand, axis, moved, current):
     """By hand, while the question waits: beyond its range, or by a whole turn as LEAP's motors count."""
-    joints = Joints(hand, tuple(replace(motor, current=current) for motor in hand.motors))
+    joints = JointMotors(hand, tuple(replace(motor, current=current) for motor in hand.motors))
     with simulated_bus(hand, joints) as (line, bus):
         line.plant.position[:] = START
         line.plant.position[axis] += moved
@@ -129,7 +129,7 @@ def test_a_joint_that_was_moved_since_the_preflight_is_not_snapped_back(hand, ax
 
 @pytest.mark.parametrize("current", [0.0, 0.3])
 def test_a_joint_that_hangs_a_little_out_of_its_range_is_brought_back_slowly(hand, current):
-    joints = Joints(hand, tuple(replace(motor, current=current) for motor in hand.motors))
+    joints = JointMotors(hand, tuple(replace(motor, current=current) for motor in hand.motors))
     with simulated_bus(hand, joints) as (line, bus):
         line.plant.position[:] = START
         line.plant.position[0] = hand.upper[0] + 0.09
@@ -144,7 +144,7 @@ def test_a_joint_that_hangs_a_little_out_of_its_range_is_brought_back_slowly(han
 
 def test_a_joint_that_is_pushed_far_out_of_its_range_is_not_sent_back_at_once(hand):
     """Motors that limit their current have no limits of position, and take goals out of the range."""
-    joints = Joints(hand, tuple(replace(motor, current=0.3) for motor in hand.motors))
+    joints = JointMotors(hand, tuple(replace(motor, current=0.3) for motor in hand.motors))
     with simulated_bus(hand, joints) as (line, bus):
         line.plant.position[:] = START
         bus.clock.sleep(0.01)

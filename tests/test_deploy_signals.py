@@ -12,6 +12,9 @@ import pytest
 
 pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
+from motor_line import Faults
+from motor_model import make_motors
+from motor_terminal import MotorTerminal
 from simulated_hand import energised
 
 from vd.assets_usd.hands import load_hand
@@ -21,9 +24,6 @@ from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.joints import read_joints
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import SafeHand
-from vd.deploy.twin.line import Faults
-from vd.deploy.twin.motor import make_motors
-from vd.deploy.twin.twin import Twin
 
 PATIENT = SafetyCfg(lost_s=2.0, misses=12, hold_s=0.3)
 """For a machine with other work: late steps are not what is tried here."""
@@ -105,7 +105,7 @@ def driver(start, tmp_path):
     """Makes a driver that does something."""
     joints = read_joints(load_hand("dclaw3"))
     drivers = []
-    with Twin(make_motors(joints), faults=Faults(seed=1)) as twin:
+    with MotorTerminal(make_motors(joints), faults=Faults(seed=1)) as twin:
         twin.plant.position[:] = joints.to_motor(joints.hand.start + 0.1)
         twin.go_on()
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import warp as wp
 from newton.sensors import SensorCamera
+from posed_scenes import pose, posed_scene
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.sets import load_set
-from vd.bench.depth import bench_scene, pose
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
@@ -34,7 +34,7 @@ def scenes():
     def get(device):
         if device not in built:
             objects = load_set("procedural-150-seed0")[::60]
-            built[device] = bench_scene(objects, WORLDS, "dclaw4", device, 3, visuals=True)
+            built[device] = posed_scene(objects, WORLDS, "dclaw4", device, 3, visuals=True)
         return built[device]
 
     return get

@@ -174,7 +174,9 @@ def test_successes_in_a_row_end_with_a_fall_or_a_goal_that_takes_too_long(tmp_pa
     assert a.mean == pytest.approx(15 / 4) and a.median == 4.5 and row.successes.sum() == 7
     write_page(Result((row,)), tmp_path / "eval.html")
     for text in (read_page(tmp_path / "eval.html")[0], terminal_text(Result((row,)))):
-        assert "of all goals" in text and "3.8" in text and "4.5" in text and "1.5 s a goal" in text
+        assert (
+            "of all goals" in text and "3.8" in text and "4.5" in text and "episode s 1.5" in text
+        )
 
 
 def test_up_to_symmetry_a_first_goal_is_judged_like_a_single_one():

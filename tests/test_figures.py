@@ -27,7 +27,9 @@ def test_tables_are_those_of_the_stored_figures():
         assert path.read_text() == page, "run: python docs/figures.py tables"
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/results.md", "docs/limitations.md"])
+@pytest.mark.parametrize(
+    "name", ["README.md", "docs/results.md", "docs/limitations.md", "docs/lessons.md"]
+)
 def test_no_figure_stands_outside_of_them(name):
     rest = BLOCK.sub("", (ROOT / name).read_text()).replace("95 % intervals", "")
     assert re.findall(r"[^\n]*\d ?%[^\n]*", rest) == []
@@ -46,7 +48,7 @@ def test_every_stored_figure_of_a_suite_has_its_command_line():
 
 
 def _any_objects(line):
-    return dict.fromkeys(figures.GROUP.findall(line), (("cube",), "cube"))
+    return dict.fromkeys(figures.GROUP.findall(line), suite_run.ObjectGroup(("cube",), "cube"))
 
 
 @pytest.fixture

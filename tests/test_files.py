@@ -20,8 +20,8 @@ from vd.command.files import (
     make_folder,
     write_text,
 )
-from vd.evaluate.agents import open_policy
 from vd.play.video import write_frames
+from vd.policy.agents import open_policy
 from vd.policy.bundle import write_policy
 from vd.train.checkpoint import save_checkpoint
 

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from vd.command.interrupt import EXTRAS, command
-from vd.evaluate.agents import DEFAULT_POLICY, POLICY_LIST, SHIPPED_POLICIES
+from vd.policy.agents import DEFAULT_POLICY, SHIPPED_POLICIES
 from vd.train.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -94,7 +94,6 @@ def test_wheel_holds_modules_policies_and_what_else_is_read(wheel):
     assert {name for name in sizes if name.endswith(".safetensors")} == {
         f"vd/policies/{name}.safetensors" for name in shipped
     }
-    assert f"vd/policies/{POLICY_LIST}" in sizes
     for (
         name,
         path,

@@ -13,8 +13,8 @@ from safetensors.torch import load_file, save
 
 from vd.assets_usd.hands import load_hand
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import SHIPPED_POLICIES, open_policy
 from vd.evaluate.cli import main as evaluate
+from vd.policy.agents import SHIPPED_POLICIES, open_policy
 from vd.policy.bundle import read_contract, read_policy, write_policy
 from vd.policy.contract import (
     CONTRACT_KEY,

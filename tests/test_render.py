@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.model import ObjectModel
-from vd.play.render import Camera, Renderer
+from vd.play.render import PictureCamera, Renderer
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0]
 FACES = [[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6], [0, 4, 5], [0, 5, 1]]
@@ -78,7 +78,7 @@ def test_object_is_drawn_where_the_camera_projects_it(cube_renderer, position):
 def test_goal_has_the_outline_of_the_object_in_the_same_orientation():
     plate = box("plate", [0.10, 0.05, 0.01])
     quat = Rotation.from_euler("xyz", [0.5, 0.9, 0.3]).as_quat()
-    camera = Camera()
+    camera = PictureCamera()
     renderer = Renderer(None, [plate], width=160, height=160, goal_size=160, camera=camera)
     (same,) = renderer.render(pose(camera.target, quat), np.array([quat]))
     (other,) = renderer.render(pose(camera.target, quat), np.array([IDENTITY]))

@@ -14,7 +14,7 @@ from test_alignment import TINY
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import SHIPPED_POLICIES, find_policy
+from vd.policy.agents import SHIPPED_POLICIES, find_policy
 from vd.policy.bundle import read_policy, write_policy
 from vd.policy.contract import TrackingSpec
 from vd.tracking.policy import TrackingPolicy

@@ -17,7 +17,6 @@ from vd.deploy.loop.policy_runner import TrackingRunner
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
-from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy, sees_clouds, task_for
 from vd.evaluate.goals import ONE_GOAL
 from vd.evaluate.result import Result
 from vd.evaluate.trace import Trace
@@ -25,6 +24,7 @@ from vd.evaluate.tracking import TrackingActor, sensed
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 from vd.policy.actor import TrainedPolicy, perceptron
+from vd.policy.agents import SHIPPED_POLICIES, find_policy, open_policy, sees_clouds, task_for
 from vd.policy.bundle import read_policy, write_policy
 from vd.policy.contract import Contract, PolicySpec, TrackingSpec
 from vd.sensors.cfg import DepthSensorCfg

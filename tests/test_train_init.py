@@ -13,8 +13,8 @@ from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
 from vd.command.config import to_dict
 from vd.envs.cfg import CurriculumCfg, ReorientCfg, TighteningCfg
-from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.policy.actor import MeanAction
+from vd.policy.agents import SHIPPED_POLICIES
 from vd.policy.bundle import read_contract, read_policy, write_policy
 from vd.train import begin
 from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from vd.evaluate.agents import SHIPPED_POLICIES, open_policy
+from vd.policy.agents import SHIPPED_POLICIES, open_policy
 from vd.policy.bundle import read_policy
 from vd.policy.onnx import read_onnx
 from vd.train.cli import main

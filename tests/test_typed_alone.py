@@ -21,7 +21,7 @@ from vd.command.files import locked
 from vd.deploy.loop.goals import SHOWN, shown_goals
 from vd.evaluate.statistics import symmetric_error
 from vd.logs.recording import write_recording
-from vd.policy.defaults import default_policy
+from vd.policy.agents import default_policy
 from vd.train import adapt, tracker
 from vd.train.flags import parse_teacher
 from vd.train.student.cli import parse_student

@@ -11,10 +11,16 @@ import tyro
 from vd.command.config import require
 from vd.command.device import resolve_device
 from vd.command.line import parse, say_same_as
-from vd.evaluate.agents import DEFAULT_HAND, DEFAULT_POLICY, NO_LAYER, check_names, policy_at
 from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.conditions import EXACT
-from vd.policy.defaults import default_policy
+from vd.policy.agents import (
+    DEFAULT_HAND,
+    DEFAULT_POLICY,
+    NO_LAYER,
+    check_names,
+    default_policy,
+    policy_at,
+)
 from vd.train.begin import find_start, read_start, settings_of
 from vd.train.flags import saved_config
 from vd.train.presets import PRESETS, TeacherCfg
@@ -223,7 +229,7 @@ def teacher_cfg(cfg: AdaptCfg) -> TeacherCfg:
 
 def _check_teacher(name: str) -> None:
     """Refuse what sees by camera: its teacher learns, and sees again afterwards."""
-    from vd.evaluate.agents import open_policy
+    from vd.policy.agents import open_policy
     from vd.tracking.policy import TrackingPolicy
 
     policy = open_policy(name, "cpu")
@@ -240,7 +246,7 @@ def _check_teacher(name: str) -> None:
 def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object]) -> None:
     """Compare the policy before and after, in the nominal and in the identified model, and write the page."""
     from vd.evaluate.compare import compare
-    from vd.evaluate.page import asked, percent, shown_name, write_page
+    from vd.evaluate.page import percent, settings_text, shown_name, write_page
     from vd.evaluate.result import SUCCESS, Result
 
     say("comparing the policy before and after, in the nominal and in the identified model ...")
@@ -268,6 +274,7 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
         f"{run.env.hand}, in {rate[IDENTIFIED, before]} in the identified one ({layer}), and "
         f"adapted to that in {rate[IDENTIFIED, after]}."
     )
-    title, how = f"{before}, adapted to an identified hand", asked([rows[0].protocol])
+    title = f"{before}, adapted to an identified hand"
+    how = settings_text([rows[0].protocol])
     write_page(result, page, title=title, lead=told, notes=(f"{how}.",))
     say(f"{told}\n{page}")

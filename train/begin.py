@@ -57,7 +57,7 @@ def find_start(name: str) -> Path:
     Raises:
         FileNotFoundError: There is none.
     """
-    from vd.evaluate.agents import find_policy
+    from vd.policy.agents import find_policy
     from vd.train.checkpoint import BEST_NAME, CHECKPOINT_FOLDER
 
     try:

@@ -26,7 +26,7 @@ from vd.command.config import require
 from vd.command.files import check_folder
 from vd.command.line import parse
 from vd.paper import PAPER
-from vd.policy.defaults import default_policy
+from vd.policy.agents import default_policy
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -63,7 +63,7 @@ def export_command(arguments: list[str]) -> int:
     if cfg.resumable:
         _export_checkpoint(Path(cfg.policy), cfg.output)
         return 0
-    from vd.evaluate.agents import find_policy, open_policy
+    from vd.policy.agents import find_policy, open_policy
     from vd.policy.bundle import write_policy
     from vd.policy.contract import without_folders
 

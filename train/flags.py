@@ -13,7 +13,7 @@ from vd.command.config import from_dict, to_dict
 from vd.command.device import resolve_device
 from vd.command.files import write_json
 from vd.command.line import PRINT, ConfigFile, parse, take_config
-from vd.evaluate.agents import check_names
+from vd.policy.agents import check_names
 from vd.train.begin import settings_of
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
 

@@ -16,11 +16,11 @@ import tyro
 from vd.command.device import resolve_device
 from vd.command.files import check_file
 from vd.command.line import parse, say_same_as
-from vd.evaluate.agents import DEFAULT_POLICY, check_names
 from vd.evaluate.cfg import EpisodeFlags, EvalCfg
 from vd.evaluate.goals import Goals
 from vd.paper import PAPER
 from vd.policy import SUFFIX, check_suffix
+from vd.policy.agents import DEFAULT_POLICY, check_names
 
 if TYPE_CHECKING:
     from vd.evaluate.trace import Trace
@@ -98,7 +98,7 @@ def _track(cfg: TrackerCfg) -> int:
     check_file(cfg.out)
     print("running the episodes ...", flush=True)
     from vd.command.warp_quiet import quiet_warp
-    from vd.evaluate.agents import open_teacher, policy_name
+    from vd.policy.agents import open_teacher, policy_name
     from vd.policy.bundle import write_policy
     from vd.policy.contract import TrackingSpec
     from vd.policy.stopping import calibrate

@@ -39,8 +39,8 @@ def load_policy(name: str | Path, env: "ReorientEnv | None" = None, device: str 
         ValueError: The file is no policy.
     """
     from vd.command.device import resolve_device
-    from vd.evaluate.agents import open_policy
     from vd.evaluate.compare import actor_of
+    from vd.policy.agents import open_policy
 
     policy = open_policy(name, resolve_device(device) if env is None else env.device)
     if env is not None:
@@ -65,9 +65,9 @@ def evaluate_policies(*policies: str | Path, **settings: Any) -> "Result":
         ValueError: A setting or a set of objects cannot be used.
     """
     from vd.command.config import from_dict
-    from vd.evaluate.agents import check_names, policy_at
     from vd.evaluate.cfg import EvalCfg, parse_groups
     from vd.evaluate.compare import compare
+    from vd.policy.agents import check_names, policy_at
 
     names = [name if isinstance(name, str) else policy_at(name) for name in policies]
     cfg = from_dict(EvalCfg, {"policies": names, **settings})

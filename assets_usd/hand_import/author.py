@@ -4,6 +4,7 @@ from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -11,7 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial.transform import Rotation
 from trimesh.util import append_faces
 
-from vd.assets_usd.hand_data import MotorModel, canonical_quat, compose, invert
+from vd.assets_usd.hand_data import MotorModel, canonical_quat, compose, invert, placed, pose_at
 from vd.assets_usd.hand_import.description import Description
 from vd.assets_usd.hand_import.guess import Stance
 from vd.assets_usd.hand_import.source import Joint, Link, Shape
@@ -39,7 +40,9 @@ class Author:
     """Writes one hand into a stage of two layers."""
 
     def __init__(self, tree: Tree, stance: Stance, said: Description, name: str):
-        self.tree, self.stance, self.said = tree, stance, said
+        self.tree = tree
+        self.stance = stance
+        self.said = said
         self.names = ["base"]
         self.joints = []
         for finger, joints in enumerate(tree.finger_joints()):
@@ -80,12 +83,10 @@ class Author:
             apart: Pairs of links whose contacts are off.
         """
         name = self.root[1:]
-        for one, pairs in groupby(sorted(apart), key=itemgetter(0)):
-            link = self.stage.GetPrimAtPath(f"{self.root}/{self.names[one]}")
+        for first, pairs in groupby(sorted(apart), key=itemgetter(0)):
+            link = self.stage.GetPrimAtPath(f"{self.root}/{self.names[first]}")
             others = UsdPhysics.FilteredPairsAPI.Apply(link).CreateFilteredPairsRel()
-            others.ClearTargets(removeSpec=False)
-            for _, other in pairs:
-                others.AddTarget(f"{self.root}/{self.names[other]}")
+            others.SetTargets([f"{self.root}/{self.names[second]}" for _, second in pairs])
         path = folder / f"{name}.usda"
         self.meshes.Export(str(folder / f"{name}_meshes.usdc"))
         numbers = Sdf.Layer.CreateAnonymous(".usda")
@@ -95,18 +96,16 @@ class Author:
         return path
 
     def _describe(self, root: Usd.Prim) -> None:
-        stance, place = self.stance, self.stance.workspace
+        stance = self.stance
+        place = stance.workspace
         kinds = Sdf.ValueTypeNames
-        for name, kind, value in (
-            ("vd:mount:position", kinds.Double3, Gf.Vec3d(*stance.mount[:3])),
-            ("vd:mount:orientation", kinds.Quatd, _quat(stance.mount[3:])),
-            ("vd:palm", kinds.Double3, Gf.Vec3d(*stance.palm)),
-            ("vd:workspace:drop", kinds.Double3, Gf.Vec3d(*place.drop_m)),
-            ("vd:workspace:goal", kinds.Double3, Gf.Vec3d(*place.goal_m)),
-            ("vd:workspace:fall", kinds.Double, place.fall_m),
-            ("vd:workspace:size", kinds.Double2, Gf.Vec2d(*place.size_m)),
-        ):
-            root.CreateAttribute(name, kind, custom=True).Set(value)
+        _custom(root, "vd:mount:position", kinds.Double3, Gf.Vec3d(*stance.mount[:3]))
+        _custom(root, "vd:mount:orientation", kinds.Quatd, _quat(stance.mount[3:]))
+        _custom(root, "vd:palm", kinds.Double3, Gf.Vec3d(*stance.palm))
+        _custom(root, "vd:workspace:drop", kinds.Double3, Gf.Vec3d(*place.drop_m))
+        _custom(root, "vd:workspace:goal", kinds.Double3, Gf.Vec3d(*place.goal_m))
+        _custom(root, "vd:workspace:fall", kinds.Double, place.fall_m)
+        _custom(root, "vd:workspace:size", kinds.Double2, Gf.Vec2d(*place.size_m))
 
     def _materials(self) -> None:
         for name, (stiffness, damping) in SURFACES.items():
@@ -126,7 +125,7 @@ class Author:
         xform = UsdGeom.Xform.Define(self.stage, path)
         _place(xform, pose)
         prim = xform.GetPrim()
-        prim.CreateAttribute("vd:source", Sdf.ValueTypeNames.String, custom=True).Set(link.name)
+        _custom(prim, "vd:source", Sdf.ValueTypeNames.String, link.name)
         UsdPhysics.RigidBodyAPI.Apply(prim)
         moments, quaternion = principal_axes(link.inertia)
         mass = UsdPhysics.MassAPI.Apply(prim)
@@ -176,7 +175,7 @@ class Author:
             hull = simplify_hull(convex_hull(shape_mesh(shape)[0]), HULL_VERTICES)
             middle = (hull.vertices.min(axis=0) + hull.vertices.max(axis=0)) / 2.0
             mesh = self._mesh(path, hull.vertices - middle, hull.faces)
-            pose = np.array([*middle, 0.0, 0.0, 0.0, 1.0])
+            pose = pose_at(middle)
             UsdPhysics.MeshCollisionAPI.Apply(mesh.GetPrim()).CreateApproximationAttr("convexHull")
         prim = self.stage.GetPrimAtPath(path)
         if shape.kind != "box":
@@ -220,14 +219,15 @@ class Author:
         # UsdPhysics knows axes x, y and z alone: both frames turn until x is the axis.
         turn = Rotation.align_vectors([joint.axis], [[1.0, 0.0, 0.0]])[0].as_quat()
         turned = np.array([0.0, 0.0, 0.0, *turn])
-        frames = compose(joint.parent_frame, turned), compose(joint.child_frame, turned)
+        parent_frame = compose(joint.parent_frame, turned)
+        child_frame = compose(joint.child_frame, turned)
         revolute.CreateAxisAttr("X")
         revolute.CreateBody0Rel().SetTargets([f"{self.root}/{self.names[joint.parent]}"])
         revolute.CreateBody1Rel().SetTargets([f"{self.root}/{self.names[joint.child]}"])
-        revolute.CreateLocalPos0Attr(Gf.Vec3f(*frames[0][:3]))
-        revolute.CreateLocalRot0Attr(Gf.Quatf(_quat(frames[0][3:])))
-        revolute.CreateLocalPos1Attr(Gf.Vec3f(*frames[1][:3]))
-        revolute.CreateLocalRot1Attr(Gf.Quatf(_quat(frames[1][3:])))
+        revolute.CreateLocalPos0Attr(Gf.Vec3f(*parent_frame[:3]))
+        revolute.CreateLocalRot0Attr(Gf.Quatf(_quat(parent_frame[3:])))
+        revolute.CreateLocalPos1Attr(Gf.Vec3f(*child_frame[:3]))
+        revolute.CreateLocalRot1Attr(Gf.Quatf(_quat(child_frame[3:])))
         revolute.CreateLowerLimitAttr(float(np.degrees(joint.lower)))
         revolute.CreateUpperLimitAttr(float(np.degrees(joint.upper)))
         drive = UsdPhysics.DriveAPI.Apply(prim, "angular")
@@ -249,34 +249,30 @@ class Author:
             _float(prim, "newton:mimicCoef0", float(np.degrees(offset)))
             _float(prim, "newton:mimicCoef1", factor)
         kinds = Sdf.ValueTypeNames
-        prim.CreateAttribute("vd:source", kinds.String, custom=True).Set(joint.name)
-        prim.CreateAttribute("vd:start", kinds.Double, custom=True).Set(
-            float(self.stance.start[number])
-        )
+        _custom(prim, "vd:source", kinds.String, joint.name)
+        _custom(prim, "vd:start", kinds.Double, float(self.stance.start[number]))
         if motor := self.said.motors.get(joint.name):
-            self._motor(prim, motor)
+            _author_motor(prim, motor)
 
-    @staticmethod
-    def _motor(prim: Usd.Prim, motor: MotorModel) -> None:
-        kinds = Sdf.ValueTypeNames
-        for name, kind, value in (
-            ("model", kinds.String, motor.model),
-            ("id", kinds.Int, motor.id),
-            ("sign", kinds.Double, motor.sign),
-            ("offset", kinds.Double, motor.offset_rad),
-            ("gear", kinds.Double, motor.gear),
-            ("p_gain", kinds.Int, motor.p_gain),
-            ("d_gain", kinds.Int, motor.d_gain),
-            ("current", kinds.Double, motor.current),
-        ):
-            prim.CreateAttribute(f"vd:motor:{name}", kind, custom=True).Set(value)
+
+def _author_motor(joint: Usd.Prim, motor: MotorModel) -> None:
+    kinds = Sdf.ValueTypeNames
+    _custom(joint, "vd:motor:model", kinds.String, motor.model)
+    _custom(joint, "vd:motor:id", kinds.Int, motor.id)
+    _custom(joint, "vd:motor:sign", kinds.Double, motor.sign)
+    _custom(joint, "vd:motor:offset", kinds.Double, motor.offset_rad)
+    _custom(joint, "vd:motor:gear", kinds.Double, motor.gear)
+    _custom(joint, "vd:motor:p_gain", kinds.Int, motor.p_gain)
+    _custom(joint, "vd:motor:d_gain", kinds.Int, motor.d_gain)
+    _custom(joint, "vd:motor:current", kinds.Double, motor.current)
 
 
 def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and faces [T, 3] of any shape, in its link."""
     match shape.kind:
         case "mesh":
-            vertices, faces = shape.vertices, shape.faces
+            vertices = shape.vertices
+            faces = shape.faces
         case "box":
             made = trimesh.creation.box(2.0 * np.array(shape.size))
         case "sphere":
@@ -288,10 +284,11 @@ def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         case _:
             made = trimesh.creation.cylinder(shape.size[0], 2.0 * shape.size[1], sections=24)
     if shape.kind != "mesh":
-        vertices, faces = np.array(made.vertices), np.array(made.faces)
+        vertices = np.array(made.vertices)
+        faces = np.array(made.faces)
         if shape.kind == "capsule":
             vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    return shape.frame[:3] + Rotation.from_quat(shape.frame[3:]).apply(vertices), faces
+    return placed(shape.frame, vertices), faces
 
 
 def convex_parts(shape: Shape) -> list[Shape]:
@@ -305,13 +302,18 @@ def convex_parts(shape: Shape) -> list[Shape]:
 def _distance(shape: Shape, point: np.ndarray) -> float:
     """From a point to the box around a shape [m]."""
     pose, half = shape_box(shape)
-    local = compose(invert(pose), np.array([*point, 0.0, 0.0, 0.0, 1.0]))[:3]
+    local = placed(invert(pose), point)
     return float(np.linalg.norm(np.maximum(np.abs(local) - half, 0.0)))
 
 
 def _apply(prim: Usd.Prim, schema: str) -> None:
     """Apply a schema by its name: Newton's are no Python classes."""
     prim.AddAppliedSchema(schema)
+
+
+def _custom(prim: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: Any) -> None:
+    """Author an attribute of ours."""
+    prim.CreateAttribute(name, kind, custom=True).Set(value)
 
 
 def _float(prim: Usd.Prim, name: str, value: float) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import Workspace, compose
+from vd.assets_usd.hand_data import Workspace, compose, placed, pose_at
 from vd.assets_usd.hand_import.description import Description, Place
 from vd.assets_usd.hand_import.source import Joint, Link
 from vd.assets_usd.hand_import.tree import Tree, shape_box
@@ -84,8 +84,8 @@ def _complete_drives(tree: Tree, start: np.ndarray) -> None:
             leader.damping += joint.mimic[1] ** 2 * joint.damping
             joint.effort = joint.effort if joint.effort > 0.0 else leader.effort
             joint.kp = joint.kd = joint.damping = 0.0
-    _fill(tree, "velocity", [SPEED_RAD_S for _ in tree.joints])
-    _fill(tree, "armature", [ARMATURE_KG_M2 for _ in tree.joints])
+    _fill(tree, "velocity", [SPEED_RAD_S] * len(tree.joints))
+    _fill(tree, "armature", [ARMATURE_KG_M2] * len(tree.joints))
     _fill(tree, "kp", [joint.effort / FULL_TORQUE_RAD for joint in tree.joints])
     damping = []
     for joint, critical in zip(tree.joints, critical_damping(tree, start), strict=True):
@@ -96,14 +96,14 @@ def _complete_drives(tree: Tree, start: np.ndarray) -> None:
 
 def _fill(tree: Tree, field: str, values: list[float]) -> None:
     """Give the drives that lack a number the one that is guessed, which a note says."""
-    found = []
+    guessed = []
     for joint, value in zip(tree.joints, values, strict=True):
         if math.isnan(getattr(joint, field)):
             setattr(joint, field, value)
-            found.append(value)
-    if found:
-        span = " to ".join(dict.fromkeys(f"{end:.3g}" for end in (min(found), max(found))))
-        tree.notes.append(f"guess: {field} = {span} of {len(found)} joints (drive, drives)")
+            guessed.append(value)
+    if guessed:
+        span = " to ".join(dict.fromkeys(f"{end:.3g}" for end in (min(guessed), max(guessed))))
+        tree.notes.append(f"guess: {field} = {span} of {len(guessed)} joints (drive, drives)")
 
 
 def critical_damping(tree: Tree, q: np.ndarray) -> np.ndarray:
@@ -149,12 +149,12 @@ def _mass_matrix(tree: Tree, q: np.ndarray) -> np.ndarray:
 
 
 def _tips(tree: Tree) -> list[np.ndarray]:
-    """Fingertips; of fingers without a mark the corner of a box that is farthest from the last joint."""
+    """Fingertips; of fingers without a mark the middle of an end of a box, farthest from the last joint."""
     tips = []
     for joints, marked in zip(tree.finger_joints(), tree.tips, strict=True):
-        link, joint = tree.links[joints[-1] + 1], tree.joints[joints[-1]]
         if marked is None:
-            marked = np.array([*_farthest(link, joint), 0.0, 0.0, 0.0, 1.0])
+            link = tree.links[joints[-1] + 1]
+            marked = pose_at(_farthest(link, tree.joints[joints[-1]]))
             where = _text(marked[:3])
             tree.notes.append(
                 f"guess: the tip of {link.name} is at {where}, what is farthest (tips)"
@@ -165,45 +165,43 @@ def _tips(tree: Tree) -> list[np.ndarray]:
 
 def _farthest(link: Link, joint: Joint) -> np.ndarray:
     """The middle of the end of a link that is farthest from its joint [3]."""
-    boxes = [shape_box(shape) for shape in link.shapes if shape.collides] or [
-        shape_box(shape) for shape in link.shapes
-    ]
-    if not boxes:
-        return np.asarray(2.0 * link.com - joint.child_frame[:3])
+    root = joint.child_frame[:3]
+    shapes = [shape for shape in link.shapes if shape.collides] or link.shapes
+    if not shapes:
+        return np.asarray(2.0 * link.com - root)
     ends = []
-    for pose, half in boxes:
-        sides = np.concatenate([np.diag(half), -np.diag(half)])
-        ends.append(pose[:3] + Rotation.from_quat(pose[3:]).apply(sides))
+    for shape in shapes:
+        pose, half = shape_box(shape)
+        ends.append(placed(pose, np.concatenate([np.diag(half), -np.diag(half)])))
     points = np.concatenate(ends)
-    return np.asarray(points[np.argmax(np.linalg.norm(points - joint.child_frame[:3], axis=1))])
-
-
-def followed(tree: Tree, q: np.ndarray) -> np.ndarray:
-    """Angles with those joints where they are led that follow others [D]."""
-    q, names = q.copy(), [joint.name for joint in tree.joints]
-    for i, joint in enumerate(tree.joints):
-        if joint.mimic is not None:
-            leader, factor, offset = joint.mimic
-            q[i] = factor * q[names.index(leader)] + offset
-    return q
+    return np.asarray(points[np.argmax(np.linalg.norm(points - root, axis=1))])
 
 
 def _start(tree: Tree, said: Description) -> np.ndarray:
     """The pose that is described; elsewhere open: zero, or the limit nearest to it."""
-    angles = [said.start.get(j.name, float(np.clip(0.0, j.lower, j.upper))) for j in tree.joints]
+    angles = np.clip(np.zeros(len(tree.joints)), *_limits(tree))
+    for i, joint in enumerate(tree.joints):
+        angles[i] = said.start.get(joint.name, angles[i])
     if not said.start:
         tree.notes.append(
             "guess: starts with all joints at zero, or their limit nearest to it (start)"
         )
-    q = followed(tree, np.array(angles))
-    return np.clip(q, [j.lower for j in tree.joints], [j.upper for j in tree.joints])
+
+    return np.clip(tree.followed(angles), *_limits(tree))
+
+
+def _limits(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper limits [D] [rad] each."""
+    lower = np.array([joint.lower for joint in tree.joints])
+    upper = np.array([joint.upper for joint in tree.joints])
+    return lower, upper
 
 
 def _tip_points(tree: Tree, tips: list[np.ndarray], q: np.ndarray) -> np.ndarray:
     """Fingertips in the base [F, 3]."""
     poses = tree.forward_kinematics(q)
     last = [joints[-1] + 1 for joints in tree.finger_joints()]
-    return np.stack([compose(poses[link], tip)[:3] for link, tip in zip(last, tips, strict=True)])
+    return compose(poses[last], np.stack(tips))[:, :3]
 
 
 def _roots(tree: Tree) -> np.ndarray:
@@ -218,12 +216,13 @@ def _palm(tree: Tree, tips: list[np.ndarray], said: Description) -> np.ndarray:
     """
     if said.palm is not None:
         return np.array(said.palm) / np.linalg.norm(said.palm)
-    lower, upper = np.array([[j.lower, j.upper] for j in tree.joints]).T
-    open_q = followed(tree, np.clip(np.zeros(len(lower)), lower, upper))
+    lower, upper = _limits(tree)
+    open_q = tree.followed(np.clip(np.zeros(len(lower)), lower, upper))
     wider = np.where(np.abs(upper) > np.abs(lower), upper, lower)
     one_sided = np.abs(lower + upper) > 0.2 * (upper - lower)
-    bent_q = followed(tree, np.where(one_sided, open_q + BENT * (wider - open_q), open_q))
-    opened, bent = _tip_points(tree, tips, open_q), _tip_points(tree, tips, bent_q)
+    bent_q = tree.followed(np.where(one_sided, open_q + BENT * (wider - open_q), open_q))
+    opened = _tip_points(tree, tips, open_q)
+    bent = _tip_points(tree, tips, bent_q)
     along = opened - _roots(tree)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     ways = bent - opened
@@ -264,12 +263,11 @@ def _mount(tree: Tree, ends: Ends, start: np.ndarray, palm: np.ndarray) -> np.nd
     forward -= (forward @ palm) * palm
     forward /= np.linalg.norm(forward)
     turn = Rotation.from_matrix(np.stack([forward, np.cross(palm, forward), palm]))
-    lowest, poses = math.inf, tree.forward_kinematics(start)
-    for link, pose in zip(tree.links, poses, strict=True):
-        for box, half in (shape_box(shape) for shape in link.shapes if shape.collides):
-            placed = compose(pose, box)
-            reach = np.abs(turn.as_matrix()[2] @ Rotation.from_quat(placed[3:]).as_matrix()) @ half
-            lowest = min(lowest, float(turn.apply(placed[:3])[2] - reach))
+    down = turn.inv().apply([0.0, 0.0, -1.0])
+    lowest = math.inf
+    for link, pose in zip(tree.links, tree.forward_kinematics(start), strict=True):
+        for box, half in _collider_boxes(link):
+            lowest = min(lowest, -_reach(down, compose(pose, box), half))
     middle = turn.apply(_middle(ends))
     return np.array([-middle[0], -middle[1], GROUND_M - lowest, *turn.as_quat()])
 
@@ -279,6 +277,17 @@ def _middle(ends: Ends) -> np.ndarray:
     return np.asarray((ends[0].mean(axis=0) + ends[1].mean(axis=0)) / 2.0)
 
 
+def _collider_boxes(link: Link) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Pose [7] in the link and half extents [3] of the boxes around what collides."""
+    return [shape_box(shape) for shape in link.shapes if shape.collides]
+
+
+def _reach(direction: np.ndarray, pose: np.ndarray, half: np.ndarray) -> float:
+    """How far a box reaches along a direction [3] from the origin of its pose's frame."""
+    axes = Rotation.from_quat(pose[3:]).as_matrix()
+    return float(direction @ pose[:3] + np.abs(direction @ axes) @ half)
+
+
 def _workspace(
     tree: Tree, ends: Ends, palm: np.ndarray, mount: np.ndarray, said: Place
 ) -> Workspace:
@@ -286,15 +295,13 @@ def _workspace(
     reach = float(np.linalg.norm(ends[1] - ends[0], axis=1).mean())
     size = said.size or (SIZES[0] * reach, SIZES[1] * reach)
     middle = _middle(ends)
-    boxes = [shape_box(shape) for shape in tree.links[0].shapes if shape.collides]
-    tops = [
-        float(palm @ pose[:3] + np.abs(palm @ Rotation.from_quat(pose[3:]).as_matrix()) @ half)
-        for pose, half in boxes
-    ]
+    tops = [_reach(palm, pose, half) for pose, half in _collider_boxes(tree.links[0])]
+
     above = max(max(tops, default=0.0) + 0.5 * float(np.mean(size)) - palm @ middle, 0.0)
-    goal = compose(mount, np.array([*(middle + above * palm), 0.0, 0.0, 0.0, 1.0]))[:3]
+    goal = placed(mount, middle + above * palm)
     x, y, z = said.goal or (float(v) for v in goal)
-    drop, fall = said.drop or (x, y, z + DROP_M), said.fall or FALL * reach
+    drop = said.drop or (x, y, z + DROP_M)
+    fall = said.fall or FALL * reach
     for name, value in {"drop": drop, "goal": (x, y, z), "size": size, "fall": (fall,)}.items():
         if getattr(said, name) is None:
             tree.notes.append(f"guess: {name} {_text(np.array(value))} m (workspace)")

@@ -31,7 +31,8 @@ BEYOND_RAD = 0.02
 """By which a joint may be led beyond its limits before it is said."""
 LEAST_DAMPING_RATIO = 0.2
 """A drive that is damped less swings for long."""
-MOST_EFFORT_NM, MOST_MASS_KG = 5.0, 5.0
+MOST_EFFORT_NM = 5.0
+MOST_MASS_KG = 5.0
 """A joint that is stronger and a hand that is heavier are not believed without a warning."""
 
 
@@ -61,7 +62,8 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
     Raises:
         HandError: The file cannot be imported; says why and what to do.
     """
-    said, source = read_description(describe), read_source(path)
+    said = read_description(describe)
+    source = read_source(path)
     tree = grow(source, said)
     stance = take_stance(tree, said)
     _check_units(source, tree, stance)
@@ -81,9 +83,9 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
         deep = overlaps(read_hand(author.write(Path(scratch), near)), near)
         target = author.write(Path(scratch), near | deep.keys())
         warnings += [
-            f"{tree.links[one].name} and {tree.links[other].name} are {1e3 * depth:.1f} mm in each "
+            f"{tree.links[first].name} and {tree.links[second].name} are {1e3 * depth:.1f} mm in each "
             "other at the start; their contact is off, unless another start keeps them apart"
-            for (one, other), depth in sorted(deep.items())
+            for (first, second), depth in sorted(deep.items())
         ]
         warnings += _replaced(folder / target.name, source)
         make_folder(folder)
@@ -147,40 +149,40 @@ def _swinging(tree: Tree, stance: Stance) -> list[str]:
 
 def _suspicious(tree: Tree) -> list[str]:
     """What is possible but seldom meant."""
-    said = []
-    strong = [joint for joint in tree.joints if joint.effort > MOST_EFFORT_NM]
+    warnings = []
+    strong = [joint.effort for joint in tree.joints if joint.effort > MOST_EFFORT_NM]
     if strong:
-        most = max(joint.effort for joint in strong)
-        said.append(
-            f"{len(strong)} joints are as strong as {most:g} N m; is that the motor's torque? "
+        warnings.append(
+            f"{len(strong)} joints are as strong as {max(strong):g} N m; is that the motor's torque? "
             f"(drive)"
         )
     mass = sum(link.mass for link in tree.links)
     if mass > MOST_MASS_KG:
-        said.append(f"the hand weighs {mass:.2f} kg; is that in kilograms?")
+        warnings.append(f"the hand weighs {mass:.2f} kg; is that in kilograms?")
     for link in tree.links[1:]:
         radius = math.sqrt(np.linalg.eigvalsh(link.inertia)[-1] / link.mass)
         if radius > REACH_M[1]:
-            said.append(
+            warnings.append(
                 f"{link.name} turns like a body of {radius:.2g} m; is its inertia in kg m2?"
             )
     by_name = {joint.name: joint for joint in tree.joints}
     for joint in tree.joints:
         if joint.mimic is not None:
             leader, factor, offset = joint.mimic
-            ends = sorted(
-                factor * end + offset for end in (by_name[leader].lower, by_name[leader].upper)
-            )
-            if ends[0] < joint.lower - BEYOND_RAD or ends[1] > joint.upper + BEYOND_RAD:
-                said.append(
-                    f"{joint.name} follows {leader} to {ends[0]:.2f} and {ends[1]:.2f} rad, beyond "
-                    f"its limits {joint.lower:.2f} and {joint.upper:.2f}, which hold both back "
-                    "(limits)"
+            ends = [
+                factor * by_name[leader].lower + offset,
+                factor * by_name[leader].upper + offset,
+            ]
+            low, high = sorted(ends)
+            if low < joint.lower - BEYOND_RAD or high > joint.upper + BEYOND_RAD:
+                warnings.append(
+                    f"{joint.name} follows {leader} to {low:.2f} and {high:.2f} rad, beyond "
+                    f"its limits {joint.lower:.2f} and {joint.upper:.2f}, which hold both back (limits)"
                 )
-    return said + [
+    away = [joint for joint in tree.joints if not joint.lower <= 0.0 <= joint.upper]
+    return warnings + [
         f"zero is outside the limits of {joint.name}, {joint.lower:.2f} to {joint.upper:.2f} rad"
-        for joint in tree.joints
-        if not joint.lower <= 0.0 <= joint.upper
+        for joint in away
     ]
 
 
@@ -195,19 +197,21 @@ def _untouched(source: Source, tree: Tree) -> set[tuple[int, int]]:
     number: dict[str, int] = {}
     for i, link in enumerate(tree.links):
         number.setdefault(link.name, i)  # of copies the first has the shapes
-    number |= {
-        name: i for i, link in enumerate(tree.links) for name in link.sites if name not in number
-    }
-    pairs = {
-        (min(link, joint.child), max(link, joint.child))
-        for joint in tree.joints
-        for link in range(len(tree.links))
-        if link != joint.child and tree.links[link].name == tree.links[joint.parent].name
-    }
+    for i, link in enumerate(tree.links):
+        for name in link.sites:
+            number.setdefault(name, i)
+    pairs = set()
+    for joint in tree.joints:
+        for i, link in enumerate(tree.links):
+            if i != joint.child and link.name == tree.links[joint.parent].name:
+                pairs.add((min(i, joint.child), max(i, joint.child)))
     for joints in tree.finger_joints():
         pairs |= set(combinations([joint + 1 for joint in joints], 2))
-    named = [sorted((number.get(a, 0), number.get(b, 0))) for a, b in source.apart]
-    return pairs | {(a, b) for a, b in named if a != b}
+    for names in source.apart:
+        first, second = sorted(number.get(name, 0) for name in names)
+        if first != second:
+            pairs.add((first, second))
+    return pairs
 
 
 def overlaps(hand: HandModel, near: set[tuple[int, int]]) -> dict[tuple[int, int], float]:
@@ -230,12 +234,12 @@ def overlaps(hand: HandModel, near: set[tuple[int, int]]) -> dict[tuple[int, int
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    found: dict[tuple[int, int], float] = {}
+    depths: dict[tuple[int, int], float] = {}
     for i, j in combinations(range(len(hand.shapes)), 2):
         a, b = sorted((hand.shapes[i].link, hand.shapes[j].link))
         if a == b or (a, b) in near:
             continue
         depth = -mujoco.mj_geomDistance(model, data, i, j, DEEP_M, None)
         if depth > DEEP_M:
-            found[a, b] = max(depth, found.get((a, b), 0.0))
-    return found
+            depths[a, b] = max(depth, depths.get((a, b), 0.0))
+    return depths

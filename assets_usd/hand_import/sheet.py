@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandModel, compose
+from vd.assets_usd.hand_data import HandModel, compose, placed
 from vd.assets_usd.hand_import.author import shape_mesh
 from vd.assets_usd.hand_import.source import Shape
 from vd.assets_usd.objects.geometry import convex_hull
@@ -19,7 +18,8 @@ from vd.assets_usd.objects.sheet import look_at, part_colour, save_figure
 
 VIEWS = {"from the front": (12.0, -60.0), "from above": (89.0, -90.0), "from the side": (0.0, 0.0)}
 """Name, elevation and azimuth [degrees] of the pictures, world frame."""
-AXIS_M, ARROW = 0.012, "#222222"
+AXIS_M = 0.012
+ARROW = "#222222"
 """Half a length of an axis, drawn through its joint."""
 TIP = "#c02020"
 
@@ -28,9 +28,7 @@ def _collider(shape: Any) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of a collider in its link."""
     if shape.kind == "hull":
         hull = convex_hull(shape.vertices)
-        return shape.frame[:3] + Rotation.from_quat(shape.frame[3:]).apply(
-            hull.vertices
-        ), hull.faces
+        return placed(shape.frame, hull.vertices), hull.faces
     return shape_mesh(Shape(shape.kind, shape.size, shape.frame, collides=True))
 
 
@@ -39,25 +37,25 @@ def _draw(axes: Any, hand: HandModel, links: np.ndarray, joints: np.ndarray) -> 
     corners = []
     for shape in hand.shapes:
         vertices, faces = _collider(shape)
-        pose = links[shape.link]
-        corners.append((pose[:3] + Rotation.from_quat(pose[3:]).apply(vertices))[faces])
+        corners.append(placed(links[shape.link], vertices)[faces].reshape(-1, 3))
         hue = part_colour(shape.link, 0.5 if shape.link else 0.0, 0.85)
         axes.add_collection3d(
             Poly3DCollection(
-                corners[-1], facecolors=[hue], edgecolors=[hue], linewidths=0.2, alpha=0.45
+                corners[-1].reshape(-1, 3, 3),
+                facecolors=[hue],
+                edgecolors=[hue],
+                linewidths=0.2,
+                alpha=0.45,
             )
         )
     for joint, frame in enumerate(joints):
-        along = Rotation.from_quat(frame[3:]).apply(hand.joint_axis[joint]) * AXIS_M
-        ends = np.stack([frame[:3] - along, frame[:3] + along])
+        ends = placed(frame, np.outer([-AXIS_M, AXIS_M], hand.joint_axis[joint]))
         axes.plot(*ends.T, color=ARROW, linewidth=1.2)
         axes.text(*ends[1], hand.joint_names[joint].split("_j")[-1], fontsize=5, color=ARROW)
     tips = compose(links[hand.tip_link], hand.tip_frame)[:, :3]
     axes.scatter(*tips.T, color=TIP, s=12, depthshade=False)
     axes.scatter(*np.array(hand.workspace.drop_m)[:, None], color="#20a040", s=25, marker="x")
-    points = np.concatenate(
-        [*(corner.reshape(-1, 3) for corner in corners), [hand.workspace.drop_m]]
-    )
+    points = np.concatenate([*corners, [hand.workspace.drop_m]])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     look_at(axes, middle, np.abs(points - middle).max(), 1.35)
 
@@ -68,11 +66,10 @@ def joint_table(hand: HandModel, sources: list[str]) -> str:
     Name, the source's, limits, start, drive, motor or the joint that it follows.
     """
     width = max(map(len, ["source", *sources]))
-    lines = [
-        f"joint  {'source':{width}}   limits [rad]    start  N m    kp     kd    moves by",
-    ]
+    lines = [f"joint  {'source':{width}}   limits [rad]    start  N m    kp     kd    moves by"]
     for i, name in enumerate(hand.joint_names):
-        motor, leader = hand.motors[i], hand.mimic[i]
+        motor = hand.motors[i]
+        leader = hand.mimic[i]
         if leader >= 0:
             moves = f"{hand.mimic_factor[i]:g} x {hand.joint_names[leader]}"
         else:

@@ -13,15 +13,17 @@ from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandError, compose
+from vd.assets_usd.hand_data import HandError, compose, pose_at
+from vd.assets_usd.objects.geometry import mesh_volume
 from vd.command.warp_quiet import quiet_warp
 
-IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+IDENTITY = pose_at(np.zeros(3))
 UNLIMITED = 1e4
 """Angles and efforts from which a parser means that there is no limit."""
+SIZE_NUMBERS = {"box": 3, "ellipsoid": 3, "sphere": 1, "mesh": 0}
+"""Numbers in the size of a shape; of other kinds there are two."""
 HARMLESS = ("texture", "opacity")
 """Words of what a parser says of looks alone; all else that it says has left something out."""
 
@@ -38,7 +40,7 @@ class Shape:
     """As in :class:`vd.assets_usd.hand_data.CollisionShape`; empty for a mesh."""
     frame: np.ndarray
     """In its link [7]."""
-    collides: bool
+    collides: bool = True
     vertices: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     faces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int32))
     split: bool = False
@@ -105,8 +107,8 @@ class Source:
 
     path: Path
     name: str
-    links: list[Link]
-    joints: list[Joint]
+    links: list[Link] = field(default_factory=list)
+    joints: list[Joint] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     """What is said about the file."""
     problems: list[str] = field(default_factory=list)
@@ -118,7 +120,8 @@ class Source:
 
 def lead(joints: dict[str, Joint], name: str) -> tuple[str, float, float]:
     """The joint that moves another in the end, or that itself; factor and offset [rad]."""
-    factor, offset = 1.0, 0.0
+    factor = 1.0
+    offset = 0.0
     for _ in joints:  # a joint that follows a follower follows what that does
         if name not in joints or (above := joints[name].mimic) is None:
             break
@@ -147,7 +150,7 @@ def read_source(path: Path) -> Source:
             f"{path}: neither a URDF nor an MJCF; expand a xacro first, export others to URDF"
         )
     quiet_warp()
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             source = read(path)
@@ -160,20 +163,25 @@ def read_source(path: Path) -> Source:
             xacro = "<xacro:" in text or "${" in str(error)
             remedy = f"; expand it first: xacro {path.name} > hand.urdf" if xacro else ""
             raise HandError(f"{path}: cannot be parsed: {error}{remedy}") from error
-    for heard, kind in dict.fromkeys(
-        (" ".join(str(one.message).split()), one.category) for one in said
-    ):
-        if any(word in heard for word in HARMLESS) or issubclass(kind, DeprecationWarning):
-            source.notes.append(f"the parser says: {heard}")
-        elif "package" in heard:
-            heard = heard.partition(" For robust")[0]
-            source.problems.append(
-                f"{heard} Name a folder above {path.name} so, or write relative paths"
-            )
-        else:
-            file = "; put the file there" if "exist" in heard or "found" in heard else ""
-            source.problems.append(f"the parser says: {heard}{file}")
+    for warning in caught:
+        _note_warning(source, " ".join(str(warning.message).split()), warning.category)
+    source.notes = list(dict.fromkeys(source.notes))
+    source.problems = list(dict.fromkeys(source.problems))
     return source
+
+
+def _note_warning(source: Source, text: str, kind: type[Warning]) -> None:
+    """Take what a parser warns of as a problem, unless it matters to looks alone."""
+    if issubclass(kind, DeprecationWarning) or any(word in text for word in HARMLESS):
+        source.notes.append(f"the parser says: {text}")
+    elif "package" in text:
+        short = text.partition(" For robust")[0]
+        name = source.path.name
+        source.problems.append(f"{short} Name a folder above {name} so, or write relative paths")
+    else:
+        missing = "exist" in text or "found" in text
+        remedy = "; put the file there" if missing else ""
+        source.problems.append(f"the parser says: {text}{remedy}")
 
 
 def _read_urdf(path: Path) -> Source:
@@ -182,69 +190,76 @@ def _read_urdf(path: Path) -> Source:
     builder = newton.ModelBuilder()
     builder.default_shape_cfg.density = 0.0  # masses are those of the file
     builder.add_urdf(str(path))
-    kinds = {newton.GeoType.MESH: "mesh", newton.GeoType.CONVEX_MESH: "mesh"}
-    label = builder.articulation_label[0] if builder.articulation_label else ""
-    short = [body.removeprefix(f"{label}/") for body in builder.body_label]
-    links = [
-        Link(
-            name,
-            float(builder.body_mass[i]),
-            np.array(builder.body_com[i], dtype=float),
-            np.array(builder.body_inertia[i], dtype=float).reshape(3, 3),
-        )
-        for i, name in enumerate(short)
-    ]
+    label = "".join(builder.articulation_label[:1])
+    source = Source(path, label or path.stem)
+    for i, name in enumerate(builder.body_label):
+        com = np.array(builder.body_com[i], dtype=float)
+        inertia = np.array(builder.body_inertia[i], dtype=float).reshape(3, 3)
+        mass = float(builder.body_mass[i])
+        source.links.append(Link(name.removeprefix(f"{label}/"), mass, com, inertia))
     for i, body in enumerate(builder.shape_body):
-        kind = newton.GeoType(builder.shape_type[i])
-        scale = tuple(float(s) for s in builder.shape_scale[i])
-        shape = Shape(
-            kinds.get(kind, kind.name.lower()),
-            scale[: {"box": 3, "sphere": 1}.get(kind.name.lower(), 2)],
-            np.array(builder.shape_transform[i], dtype=float),
-            bool(builder.shape_flags[i] & newton.ShapeFlags.COLLIDE_SHAPES),
-            colour=tuple(float(c) for c in builder.shape_color[i]),
-        )
-        if shape.kind == "mesh":
-            mesh = builder.shape_source[i]
-            shape.vertices = np.array(mesh.vertices, dtype=float) * scale
-            shape.faces = np.array(mesh.indices, dtype=np.int32).reshape(-1, 3)
-            if trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume < 0.0:
-                shape.faces = shape.faces[:, ::-1]  # a scale that mirrors, as of left hands
-            shape.size = ()
-        links[body].shapes.append(shape)
-    names = [joint.removeprefix(f"{label}/") for joint in builder.joint_label]
-    joints: list[Joint] = []
-    source = Source(path, label or path.stem, links, joints)
+        source.links[body].shapes.append(_urdf_shape(builder, i))
     _check_urdf_names(source)
-    friction = {}
+    names = [name.removeprefix(f"{label}/") for name in builder.joint_label]
+    friction: dict[str, float] = {}
     for i, name in enumerate(names):
         if builder.joint_parent[i] < 0:
             continue  # what fixes it to the world
-        kind, dof = newton.JointType(builder.joint_type[i]), builder.joint_qd_start[i]
-        joint = Joint(name, kind.name.lower(), builder.joint_parent[i], builder.joint_child[i])
-        joint.parent_frame = np.array(builder.joint_X_p[i], dtype=float)
-        joint.child_frame = np.array(builder.joint_X_c[i], dtype=float)
-        joints.append(joint)
-        if kind != newton.JointType.REVOLUTE:
-            continue
-        axis = np.array(builder.joint_axis[dof], dtype=float)
-        if not np.linalg.norm(axis) > 0.0:
-            source.problems.append(f"{name} has no axis but 0 0 0; give it one")
-            continue
-        joint.axis = axis / np.linalg.norm(axis)
-        joint.lower, joint.upper = (
-            _bounded(values[dof])
-            for values in (builder.joint_limit_lower, builder.joint_limit_upper)
-        )
-        joint.effort = _bounded(builder.joint_effort_limit[dof]) or math.nan
-        joint.velocity = _bounded(builder.joint_velocity_limit[dof]) or math.nan
-        joint.damping = float(builder.joint_damping[dof])
-        friction[name] = builder.joint_friction[dof]
-        if (leader := builder.joint_mimic_joint[i]) >= 0:
+        joint = _urdf_joint(builder, i, name, source)
+        source.joints.append(joint)
+        if joint.kind == "revolute":
+            friction[name] = builder.joint_friction[builder.joint_qd_start[i]]
+        leader = builder.joint_mimic_joint[i]
+        if leader >= 0:
             offset, factor = builder.joint_mimic_coeffs[i]
             joint.mimic = names[leader], float(factor), float(offset)
     _leave_out(source, "dry friction", friction)
     return source
+
+
+def _urdf_shape(builder: Any, number: int) -> Shape:
+    import newton
+
+    kind = newton.GeoType(builder.shape_type[number]).name.lower().removeprefix("convex_")
+    scale = tuple(float(factor) for factor in builder.shape_scale[number])
+    flags = builder.shape_flags[number]
+    shape = Shape(
+        kind,
+        scale[: SIZE_NUMBERS.get(kind, 2)],
+        np.array(builder.shape_transform[number], dtype=float),
+        bool(flags & newton.ShapeFlags.COLLIDE_SHAPES),
+        colour=tuple(float(part) for part in builder.shape_color[number]),
+    )
+    if kind == "mesh":
+        mesh = builder.shape_source[number]
+        shape.vertices = np.array(mesh.vertices, dtype=float) * scale
+        shape.faces = np.array(mesh.indices, dtype=np.int32).reshape(-1, 3)
+        if mesh_volume(shape.vertices, shape.faces) < 0.0:
+            shape.faces = shape.faces[:, ::-1]  # a scale that mirrors, as of left hands
+    return shape
+
+
+def _urdf_joint(builder: Any, number: int, name: str, source: Source) -> Joint:
+    import newton
+
+    kind = newton.JointType(builder.joint_type[number]).name.lower()
+    joint = Joint(name, kind, builder.joint_parent[number], builder.joint_child[number])
+    joint.parent_frame = np.array(builder.joint_X_p[number], dtype=float)
+    joint.child_frame = np.array(builder.joint_X_c[number], dtype=float)
+    if kind != "revolute":
+        return joint
+    dof = builder.joint_qd_start[number]
+    axis = np.array(builder.joint_axis[dof], dtype=float)
+    if not axis.any():
+        source.problems.append(f"{name} has no axis but 0 0 0; give it one")
+        return joint
+    joint.axis = axis / np.linalg.norm(axis)
+    joint.lower = _bounded(builder.joint_limit_lower[dof])
+    joint.upper = _bounded(builder.joint_limit_upper[dof])
+    joint.effort = _bounded(builder.joint_effort_limit[dof]) or math.nan
+    joint.velocity = _bounded(builder.joint_velocity_limit[dof]) or math.nan
+    joint.damping = float(builder.joint_damping[dof])
+    return joint
 
 
 def _check_urdf_names(source: Source) -> None:
@@ -252,22 +267,21 @@ def _check_urdf_names(source: Source) -> None:
     root = ElementTree.parse(source.path).getroot()
     for kind in ("link", "joint"):
         counts = Counter(str(element.get("name")) for element in root.findall(kind))
-        twice = [name for name, count in counts.items() if count > 1]
-        source.problems += [
-            f"{name} is the name of more than one {kind}; rename them" for name in twice
-        ]
-        if kind == "link":
-            alone = counts.keys() - {link.name for link in source.links}
-            source.notes += [
-                f"{name} is joined to nothing and is left out" for name in sorted(alone)
-            ]
+        for name, count in counts.items():
+            if count > 1:
+                source.problems.append(f"{name} is the name of more than one {kind}; rename them")
+    joined = {link.name for link in source.links}
+    for element in root.findall("link"):
+        name = str(element.get("name"))
+        if name not in joined:
+            source.notes.append(f"{name} is joined to nothing and is left out")
 
 
 def _leave_out(source: Source, what: str, values: dict[str, float]) -> None:
     """Say what of joints or links a hand has no place for."""
-    names = [name for name, value in values.items() if value]
+    names = ", ".join(name for name, value in values.items() if value)
     if names:
-        source.notes.append(f"{what} is left out: of {', '.join(names)}")
+        source.notes.append(f"{what} is left out: of {names}")
 
 
 def _bounded(value: float) -> float:
@@ -277,111 +291,109 @@ def _bounded(value: float) -> float:
 
 def _read_mjcf(path: Path) -> Source:
     model: Any = mujoco.MjModel.from_xml_path(str(path))
-    source = Source(path, model.names.split(b"\0")[0].decode() or path.stem, [], [])
+    source = Source(path, model.names.split(b"\0")[0].decode() or path.stem)
+    lifted: dict[str, float] = {}
     for i in range(1, model.nbody):
-        turn = Rotation.from_quat(model.body_iquat[i][[1, 2, 3, 0]]).as_matrix()
-        source.links.append(
-            Link(
-                model.body(i).name or f"body {i}",
-                float(model.body_mass[i]),
-                model.body_ipos[i].copy(),
-                turn @ np.diag(model.body_inertia[i]) @ turn.T,
-            )
-        )
-        _mjcf_joints(model, i, source)
-    for geom in np.flatnonzero(model.geom_bodyid > 0):
-        source.links[model.geom_bodyid[geom] - 1].shapes.append(_mjcf_shape(model, int(geom)))
-    for site in np.flatnonzero(model.site_bodyid > 0):
-        pose = _pose(model.site_pos[site], model.site_quat[site])
-        source.links[model.site_bodyid[site] - 1].sites[model.site(site).name] = pose
+        body = model.body(i)
+        turn = Rotation.from_quat(body.iquat, scalar_first=True).as_matrix()
+        name = body.name or f"body {i}"
+        inertia = turn @ np.diag(body.inertia) @ turn.T
+        source.links.append(Link(name, float(body.mass[0]), body.ipos.copy(), inertia))
+        lifted[name] = float(model.body_gravcomp[i])
+        _mjcf_joints(model, body, source)
+    for i in range(model.ngeom):
+        body = model.geom_bodyid[i]
+        if body > 0:
+            source.links[body - 1].shapes.append(_mjcf_shape(model, i))
+    for i in range(model.nsite):
+        site = model.site(i)
+        if site.bodyid > 0:
+            source.links[site.bodyid[0] - 1].sites[site.name] = _pose(site)
     for signature in model.exclude_signature:
-        bodies = signature >> 16, signature & 0xFFFF
-        if min(bodies) > 0:
-            first, second = (source.links[body - 1].name for body in bodies)
-            source.apart.append((first, second))
+        first = signature >> 16
+        second = signature & 0xFFFF
+        if min(first, second) > 0:
+            source.apart.append((source.links[first - 1].name, source.links[second - 1].name))
     _mjcf_equalities(model, source)
     _mjcf_actuators(model, source)
-    joints = {_joint_name(model, i): i for i in range(model.njnt)}
-    for what, values, number in (
-        ("dry friction", model.dof_frictionloss, model.jnt_dofadr),
-        ("the spring", model.jnt_stiffness, np.arange(model.njnt)),
-    ):
-        _leave_out(source, what, {name: float(values[number[i]]) for name, i in joints.items()})
-    lifted = {model.body(i).name: float(model.body_gravcomp[i]) for i in range(1, model.nbody)}
+    friction: dict[str, float] = {}
+    springs: dict[str, float] = {}
+    for i in range(model.njnt):
+        joint = model.joint(i)
+        name = _joint_name(model, i)
+        friction[name] = float(joint.frictionloss[0])
+        springs[name] = float(joint.stiffness[0])
+    _leave_out(source, "dry friction", friction)
+    _leave_out(source, "the spring", springs)
     _leave_out(source, "compensation of gravity", lifted)
     return source
 
 
-def _pose(position: np.ndarray, wxyz: np.ndarray) -> np.ndarray:
-    return np.concatenate([position, wxyz[[1, 2, 3, 0]]])
+def _pose(item: Any) -> np.ndarray:
+    """Of a body, geom or site in its parent [7]."""
+    return np.concatenate([item.pos, item.quat[[1, 2, 3, 0]]])
 
 
-def _joint_name(model: Any, joint: int) -> str:
+def _joint_name(model: Any, number: int) -> str:
     """Its name, or one that says whose it is."""
-    body = model.body(model.jnt_bodyid[joint])
-    return str(model.joint(joint).name or f"the joint of {body.name or f'body {body.id}'}")
+    joint = model.joint(number)
+    body = model.body(joint.bodyid[0])
+    return str(joint.name or f"the joint of {body.name or f'body {body.id}'}")
 
 
-def _mjcf_joints(model: Any, body: int, source: Source) -> None:
+def _mjcf_joints(model: Any, body: Any, source: Source) -> None:
     """The joint of a body: none is a fixed one, more than one are none that a hand has."""
-    first, count = model.body_jntadr[body], model.body_jntnum[body]
-    parent, place = (
-        model.body_parentid[body] - 1,
-        _pose(model.body_pos[body], model.body_quat[body]),
-    )
-    link = source.links[body - 1].name
-    names = [_joint_name(model, i) for i in range(first, first + count)]
+    child = body.id - 1
+    parent = int(body.parentid[0]) - 1
+    link = source.links[child].name
+    first = int(body.jntadr[0])
+    numbers = range(first, first + int(body.jntnum[0]))
+    names = ", ".join(_joint_name(model, i) for i in numbers)
     if parent < 0:
-        if count:
-            source.notes.append(
-                f"{link} is free to move in the file, by {', '.join(names)}; here it is fixed"
-            )
+        if names:
+            source.notes.append(f"{link} is free to move in the file, by {names}; here it is fixed")
         return
-    if count == 0:
-        source.joints.append(
-            Joint(f"weld of {link}", "fixed", parent, body - 1, parent_frame=place)
-        )
+    if not names:
+        weld = Joint(f"weld of {link}", "fixed", parent, child, parent_frame=_pose(body))
+        source.joints.append(weld)
         return
-    if count > 1:
-        source.problems.append(
-            f"{link} has {count} joints, {', '.join(names)}; put a body between them"
-        )
-    kind = mujoco.mjtJoint(model.jnt_type[first])
-    joint = Joint(names[0], kind.name[6:].lower(), parent, body - 1)
-    joint.child_frame = np.concatenate([model.jnt_pos[first], [0.0, 0.0, 0.0, 1.0]])
-    joint.parent_frame = compose(place, joint.child_frame)
+    if len(numbers) > 1:
+        count = len(numbers)
+        source.problems.append(f"{link} has {count} joints, {names}; put a body between them")
+    said = model.joint(first)
+    kind = mujoco.mjtJoint(said.type[0]).name.removeprefix("mjJNT_").lower()
+    joint = Joint(_joint_name(model, first), kind, parent, child)
+    joint.child_frame = pose_at(said.pos)
+    joint.parent_frame = compose(_pose(body), joint.child_frame)
     source.joints.append(joint)
-    if kind != mujoco.mjtJoint.mjJNT_HINGE:
+    if kind != "hinge":
         return
-    joint.kind, joint.axis = "revolute", model.jnt_axis[first].copy()
-    zero, dof = model.qpos0[model.jnt_qposadr[first]], model.jnt_dofadr[first]
+    joint.kind = "revolute"
+    joint.axis = said.axis.copy()
+    zero = float(said.qpos0[0])
     if zero:
         source.notes.append(f"{joint.name} counts from {zero:g} rad in the file (ref); here from 0")
-    if model.jnt_limited[first]:
-        joint.lower, joint.upper = (float(end - zero) for end in model.jnt_range[first])
-    joint.armature = float(model.dof_armature[dof]) or math.nan
-    joint.damping = float(model.dof_damping[dof])
+    if said.limited:
+        joint.lower, joint.upper = (said.range - zero).tolist()
+    joint.armature = float(said.armature[0]) or math.nan
+    joint.damping = float(said.damping[0])
     if model.jnt_actfrclimited[first]:
         joint.effort = float(np.abs(model.jnt_actfrcrange[first]).max())
 
 
-def _mjcf_shape(model: Any, geom: int) -> Shape:
-    kind = mujoco.mjtGeom(model.geom_type[geom]).name[7:].lower()
-    shape = Shape(
-        kind,
-        tuple(
-            model.geom_size[geom][: {"box": 3, "ellipsoid": 3, "sphere": 1}.get(kind, 2)].tolist()
-        ),
-        _pose(model.geom_pos[geom], model.geom_quat[geom]),
-        bool(model.geom_contype[geom] or model.geom_conaffinity[geom]),
-        colour=tuple(model.geom_rgba[geom][:3].tolist()),
-    )
+def _mjcf_shape(model: Any, number: int) -> Shape:
+    geom = model.geom(number)
+    kind = mujoco.mjtGeom(geom.type[0]).name.removeprefix("mjGEOM_").lower()
+    size = tuple(geom.size[: SIZE_NUMBERS.get(kind, 2)].tolist())
+    shape = Shape(kind, size, _pose(geom), bool(geom.contype[0] or geom.conaffinity[0]))
+    shape.colour = tuple(geom.rgba[:3].tolist())
     if kind == "mesh":
-        mesh = model.geom_dataid[geom]
-        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        shape.vertices = model.mesh_vert[first : first + count].astype(float)
-        first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-        shape.faces, shape.size = model.mesh_face[first : first + count].copy(), ()
+        mesh = geom.dataid[0]
+        first = model.mesh_vertadr[mesh]
+        vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+        shape.vertices = vertices.astype(float)
+        first = model.mesh_faceadr[mesh]
+        shape.faces = model.mesh_face[first : first + model.mesh_facenum[mesh]].copy()
     return shape
 
 
@@ -389,69 +401,67 @@ def _mjcf_equalities(model: Any, source: Source) -> None:
     """Couplings of two joints by a line are joints that follow; all others are problems."""
     joints = {joint.name: joint for joint in source.joints}
     for i in range(model.neq):
-        if not model.eq_active0[i]:
+        equality = model.equality(i)
+        if not equality.active0:
             continue
-        kind, data = mujoco.mjtEq(model.eq_type[i]), model.eq_data[i]
-        name = model.eq(i).name or f"equality {i}"
-        if kind != mujoco.mjtEq.mjEQ_JOINT or model.eq_obj2id[i] < 0 or np.any(data[2:5]):
-            text = kind.name[5:].lower()
+        kind = mujoco.mjtEq(equality.type[0])
+        offset, factor, *curved = equality.data[:5].tolist()
+        if kind != mujoco.mjtEq.mjEQ_JOINT or equality.obj2id < 0 or any(curved):
+            name = equality.name or f"equality {i}"
+            text = kind.name.removeprefix("mjEQ_").lower()
             source.problems.append(
                 f"{name} ({text}) couples more than a line; remove it and use hold or mimic"
             )
             continue
-        one, other = (
-            _joint_name(model, number[i]) for number in (model.eq_obj1id, model.eq_obj2id)
-        )
-        if one in joints:
-            joints[one].mimic = other, float(data[1]), float(data[0])
+        follower = _joint_name(model, equality.obj1id[0])
+        if follower in joints:
+            leader = _joint_name(model, equality.obj2id[0])
+            joints[follower].mimic = leader, factor, offset
 
 
 def _mjcf_actuators(model: Any, source: Source) -> None:
     """What turns joints, by themselves or by a tendon of several: gains and limits of force."""
-    by_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
-    idle = sorted(set(range(model.ntendon)) - set(model.actuator_trnid[by_tendon, 0]))
-    if idle:
-        names = ", ".join(model.tendon(i).name for i in idle)
-        source.notes.append(f"tendons without a motor are left out: {names}")
+    pulled = set()
     for i in range(model.nu):
-        gear = float(model.actuator_gear[i, 0]) or 1.0
-        ratios = {joint: gear * ratio for joint, ratio in _moved(model, i, source).items()}
-        actuator = Actuator(_actuator_name(model, i), ratios)
-        if model.actuator_forcelimited[i]:
-            actuator.effort = float(np.abs(model.actuator_forcerange[i]).max())
-        elif (
-            model.actuator_ctrllimited[i]
-            and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
-        ):
-            actuator.effort = float(
-                np.abs(model.actuator_gainprm[i, 0] * model.actuator_ctrlrange[i]).max()
+        said = model.actuator(i)
+        name = said.name or f"actuator {i}"
+        if said.gaintype == mujoco.mjtGain.mjGAIN_MUSCLE:
+            source.problems.append(f"{name} is a muscle, which only pulls; make it a motor")
+        ratios = _moved(model, said)
+        if not ratios:
+            source.problems.append(
+                f"{name} pulls at no joint but over sites; give its joints motors of their own"
             )
-        if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE:
-            actuator.kp, actuator.kd = (-float(b) for b in model.actuator_biasprm[i, 1:3])
+        if said.trntype == mujoco.mjtTrn.mjTRN_TENDON:
+            name = model.tendon(said.trnid[0]).name
+            pulled.add(name)
+        gear = float(said.gear[0]) or 1.0
+        actuator = Actuator(name, {joint: gear * ratio for joint, ratio in ratios.items()})
+        if said.forcelimited:
+            actuator.effort = float(np.abs(said.forcerange).max())
+        elif said.ctrllimited and said.biastype == mujoco.mjtBias.mjBIAS_NONE:
+            actuator.effort = float(np.abs(said.gainprm[0] * said.ctrlrange).max())
+        if said.biastype == mujoco.mjtBias.mjBIAS_AFFINE:
+            actuator.kp = -float(said.biasprm[1])
+            actuator.kd = -float(said.biasprm[2])
         source.actuators.append(actuator)
+    tendons = [model.tendon(i).name for i in range(model.ntendon)]
+    idle = ", ".join(name for name in tendons if name not in pulled)
+    if idle:
+        source.notes.append(f"tendons without a motor are left out: {idle}")
 
 
-def _actuator_name(model: Any, actuator: int) -> str:
-    """The name of the tendon that it pulls, or its own."""
-    if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_TENDON:
-        return str(model.tendon(model.actuator_trnid[actuator, 0]).name)
-    return str(model.actuator(actuator).name or f"actuator {actuator}")
-
-
-def _moved(model: Any, actuator: int, source: Source) -> dict[str, float]:
-    """Joints that an actuator moves, and the coefficient of each."""
-    kind, target = model.actuator_trntype[actuator], model.actuator_trnid[actuator, 0]
-    name = model.actuator(actuator).name or f"actuator {actuator}"
-    if model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_MUSCLE:
-        source.problems.append(f"{name} is a muscle, which only pulls; make it a motor")
-    if kind == mujoco.mjtTrn.mjTRN_JOINT:
+def _moved(model: Any, actuator: Any) -> dict[str, float]:
+    """Joints that an actuator moves, and the coefficient of each; none where it pulls over sites."""
+    target = actuator.trnid[0]
+    if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT:
         return {_joint_name(model, target): 1.0}
-    wraps = range(0)
-    if kind == mujoco.mjtTrn.mjTRN_TENDON:
-        wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
-    if not wraps or any(model.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
-        source.problems.append(
-            f"{name} pulls at no joint but over sites; give its joints motors of their own"
-        )
+    if actuator.trntype != mujoco.mjtTrn.mjTRN_TENDON:
         return {}
-    return {_joint_name(model, model.wrap_objid[w]): float(model.wrap_prm[w]) for w in wraps}
+    first = model.tendon_adr[target]
+    ratios = {}
+    for wrap in range(first, first + model.tendon_num[target]):
+        if model.wrap_type[wrap] != mujoco.mjtWrap.mjWRAP_JOINT:
+            return {}
+        ratios[_joint_name(model, model.wrap_objid[wrap])] = float(model.wrap_prm[wrap])
+    return ratios

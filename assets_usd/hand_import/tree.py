@@ -1,18 +1,17 @@
 """A source welded to what a hand is: a base and fingers, each a chain of revolute joints."""
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandError, compose, invert
+from vd.assets_usd.hand_data import HandError, compose, invert, placed, pose_at
 from vd.assets_usd.hand_import.description import Description, Drive
 from vd.assets_usd.hand_import.source import IDENTITY, Joint, Link, Shape, Source, lead
-from vd.assets_usd.objects.geometry import hull_volume
+from vd.assets_usd.objects.geometry import hull_volume, mesh_volume
 from vd.kernels.servo.actuators import MAX_JOINTS
 
 KINDS = ("box", "sphere", "capsule", "cylinder", "mesh", "ellipsoid")
@@ -23,7 +22,8 @@ MOST_RAD = 2.0 * math.pi + 0.01
 """Limits beyond a turn are in degrees, or none."""
 SLACK_RAD = 1e-3
 """By which a described angle may be rounded beyond a limit."""
-LEAST_M, MOST_M = 0.0005, 1.0
+LEAST_M = 0.0005
+MOST_M = 1.0
 """Lengths of shapes between which they are those of a hand in metres."""
 HOLLOW = 1.5
 """Volume of a hull over that of its mesh from which it closes a hollow that may matter."""
@@ -42,11 +42,11 @@ class Tree:
     """File that it was read from, for people."""
     links: list[Link]
     """Welded; of each the frame is that of the source's link that moves."""
-    joints: list[Joint]
+    joints: list[Joint] = field(default_factory=list)
     """Parents and children count in ``links``; joint i moves link i + 1."""
-    counts: list[int]
+    counts: list[int] = field(default_factory=list)
     """Joints of each finger."""
-    tips: list[np.ndarray | None]
+    tips: list[np.ndarray | None] = field(default_factory=list)
     """Fingertip in the last link of each finger [7], where the source marks one."""
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -58,10 +58,20 @@ class Tree:
             poses.append(compose(poses[joint.parent], joint_pose(joint, angle)))
         return np.stack(poses)
 
-    def finger_joints(self) -> list[list[int]]:
+    def finger_joints(self) -> list[range]:
         """Joints of each finger."""
-        ends = np.cumsum([0, *self.counts])
-        return [list(range(a, b)) for a, b in pairwise(ends)]
+        ends = np.cumsum([0, *self.counts]).tolist()
+        return [range(first, end) for first, end in pairwise(ends)]
+
+    def followed(self, q: np.ndarray) -> np.ndarray:
+        """Angles with those joints where they are led that follow others [D]."""
+        q = q.copy()
+        names = [joint.name for joint in self.joints]
+        for i, joint in enumerate(self.joints):
+            if joint.mimic is not None:
+                leader, factor, offset = joint.mimic
+                q[i] = factor * q[names.index(leader)] + offset
+        return q
 
 
 def joint_pose(joint: Joint, angle: float) -> np.ndarray:
@@ -83,8 +93,10 @@ class _Grower:
     """One source; problems are collected and raised together."""
 
     def __init__(self, source: Source, said: Description):
-        self.source, self.said = source, said
-        self.notes, self.problems = list(source.notes), list(source.problems)
+        self.source = source
+        self.said = said
+        self.notes = list(source.notes)
+        self.problems = list(source.problems)
         self.warnings: list[str] = []
         self.by_name = {joint.name: joint for joint in source.joints}
         self.out: dict[int, list[int]] = {}
@@ -108,35 +120,14 @@ class _Grower:
         self._take_said()
         base, starts = self._palm()
         self.fail()
-        links, joints = [self._welded(base)], []
-        counts, tips = [], []
-        chains = [chain for start in starts for chain in self._chains(start)]
+        chains: list[list[Joint]] = []
+        for start in starts:
+            chains += self._chains(start)
         copies = Counter(joint.name for chain in chains for joint in chain)
+        tree = Tree(self.source.path.name, [self._welded(base)], notes=self.notes)
+        tree.warnings = self.warnings
         for chain in chains:
-            counts.append(len(chain))
-            if len(chain) > MAX_JOINTS:
-                self.problems.append(
-                    f"the finger of {chain[0].name} has {len(chain)} joints; hold some of them"
-                )
-            parent = 0
-            for joint in chain:
-                first = self._first(joint.parent)
-                offset = self._group(first)[joint.parent]
-                joints.append(
-                    replace(
-                        joint,
-                        parent=parent,
-                        child=len(links),
-                        parent_frame=compose(offset, joint.parent_frame),
-                    )
-                )
-                parent = len(links)
-                link = self._welded(joint.child)
-                number = copies[joint.name]
-                if any(link.name == other.name for other in links):
-                    link.shapes = []  # they are of the finger before
-                links.append(replace(link, mass=link.mass / number, inertia=link.inertia / number))
-            tips.append(self._tip(chain[-1].child))
+            self._add_finger(tree, chain, copies)
         self.fail()
         if self.raised:
             self.notes.append(
@@ -148,26 +139,44 @@ class _Grower:
                 f"guess: meshes of {', '.join(self.hollow)} collide as their hulls, up to "
                 f"{max(self.hollow.values()):.1f} times their volume (parts)"
             )
-        name = self.source.path.name
-        tree = Tree(name, links, joints, counts, tips, self.notes, self.warnings)
         self._check_followers(tree)
         self._check_numbers(tree)
         self.fail()
         return tree
 
+    def _add_finger(self, tree: Tree, chain: list[Joint], copies: Counter[str]) -> None:
+        """Put the joints of a finger into a tree, and the links that they move."""
+        tree.counts.append(len(chain))
+        if len(chain) > MAX_JOINTS:
+            self.problems.append(
+                f"the finger of {chain[0].name} has {len(chain)} joints; hold some of them"
+            )
+        parent = 0
+        for joint in chain:
+            offset = self._group(self._first(joint.parent))[joint.parent]
+            place = compose(offset, joint.parent_frame)
+            child = len(tree.links)
+            tree.joints.append(replace(joint, parent=parent, child=child, parent_frame=place))
+            parent = child
+            link = self._welded(joint.child)
+            link.mass /= copies[joint.name]
+            link.inertia = link.inertia / copies[joint.name]
+            if any(link.name == other.name for other in tree.links):
+                link.shapes = []  # they are of the finger before
+            tree.links.append(link)
+        tree.tips.append(self._tip(chain[-1].child))
+
     def _check_names(self) -> None:
         joints = [joint.name for joint in self.source.joints if joint.kind != "fixed"]
         links = [link.name for link in self.source.links]
-        for kind, known, entries in (
-            ("joint", joints, "hold mimic limits drives start motors"),
-            ("link", links, "mass tips parts"),
-        ):
-            self.problems += [
-                f"{entry}: there is no {kind} {name}; there are {', '.join(known)}"
-                for entry in entries.split()
-                for name in getattr(self.said, entry)
-                if name not in known
-            ]
+        entries = dict.fromkeys(("hold", "mimic", "limits", "drives", "start", "motors"), "joint")
+        entries |= dict.fromkeys(("mass", "tips", "parts"), "link")
+        for entry, kind in entries.items():
+            known = joints if kind == "joint" else links
+            for name in getattr(self.said, entry):
+                if name not in known:
+                    there = ", ".join(known)
+                    self.problems.append(f"{entry}: there is no {kind} {name}; there are {there}")
 
     def _take_mimic(self) -> None:
         """What follows what, by the description or the file."""
@@ -188,16 +197,17 @@ class _Grower:
         limits = {name: joint.effort for name, joint in self.by_name.items()}
         efforts: dict[str, float] = {}
         for actuator in self.source.actuators:
-            ratios: dict[str, float] = {}
-            torques: dict[str, float] = {}
+            ratios: dict[str, float] = defaultdict(float)
+            torques: dict[str, float] = defaultdict(float)
             free: dict[str, str] = {}
             for name, ratio in actuator.ratios.items():
                 leader, factor, _ = lead(self.by_name, name)
-                if leader in self.by_name and name not in self.held and leader not in self.held:
-                    torque = np.copysign(np.fmin(actuator.effort * abs(ratio), limits[name]), ratio)
-                    ratios[leader] = ratios.get(leader, 0.0) + factor * ratio
-                    torques[leader] = torques.get(leader, 0.0) + factor * torque
-                    free.setdefault(leader, name)
+                if leader not in self.by_name or name in self.held or leader in self.held:
+                    continue
+                torque = np.copysign(np.fmin(actuator.effort * abs(ratio), limits[name]), ratio)
+                ratios[leader] += factor * ratio
+                torques[leader] += factor * torque
+                free.setdefault(leader, name)
             if len(ratios) > 1:
                 first, *rest = free.values()
                 lines = ", ".join(f"{name}: {{joint: {first}}}" for name in rest)
@@ -206,13 +216,13 @@ class _Grower:
                     f"no drive of a joint does; say mimic: {{{lines}}}, or hold: {{{rest[0]}: 0}}"
                 )
             for name, ratio in ratios.items():
-                joint = self.by_name[name]
+                efforts[name] = float(np.fmin(abs(torques[name]), efforts.get(name, math.nan)))
                 if actuator.kp > 0.0:
+                    joint = self.by_name[name]
                     joint.kp = float(np.nansum([joint.kp, actuator.kp * ratio**2]))
                     joint.kd = float(np.nansum([joint.kd, actuator.kd * ratio**2]))
                     if joint.kd + joint.damping == 0.0:
                         joint.kd = math.nan  # nothing says it
-                efforts[name] = float(np.fmin(abs(torques[name]), efforts.get(name, math.nan)))
         for name, effort in efforts.items():
             self.by_name[name].effort = effort
 
@@ -231,7 +241,8 @@ class _Grower:
         for link in self.source.links:
             if link.name in said.mass:
                 scale = said.mass[link.name] / link.mass if link.mass > 0.0 else 0.0
-                link.mass, link.inertia = said.mass[link.name], link.inertia * scale
+                link.mass = said.mass[link.name]
+                link.inertia = link.inertia * scale
         for name, angle in said.hold.items():
             self.notes.append(f"{name} is held at {angle:g} rad, as described")
             self._check_angle("hold", self.by_name[name], angle)
@@ -249,7 +260,8 @@ class _Grower:
 
     def _group(self, first: int) -> dict[int, np.ndarray]:
         """Links that move with one, and their poses in it [7]."""
-        poses, queue = {first: IDENTITY}, [first]
+        poses = {first: IDENTITY}
+        queue = [first]
         for link in queue:
             for number in self.out.get(link, ()):
                 joint = self.source.joints[number]
@@ -269,7 +281,8 @@ class _Grower:
     def _leaving(self, first: int) -> list[Joint]:
         """Joints that leave a group, in the order of the file."""
         group = self._group(first)
-        return [j for j in self.source.joints if j.parent in group and not self._is_welded(j)]
+        joints = self.source.joints
+        return [joint for joint in joints if joint.parent in group and not self._is_welded(joint)]
 
     def _palm(self) -> tuple[int, list[Joint]]:
         """The root and the first joints of the fingers; joints of a wrist become held."""
@@ -303,10 +316,11 @@ class _Grower:
 
     def _moving(self, link: int) -> int:
         """Joints that move below a link."""
-        below = [self.source.joints[n] for n in self.out.get(link, ())]
-        return sum(not self._is_welded(joint) for joint in below) + sum(
-            self._moving(j.child) for j in below
-        )
+        count = 0
+        for number in self.out.get(link, ()):
+            joint = self.source.joints[number]
+            count += self._moving(joint.child) + (not self._is_welded(joint))
+        return count
 
     def _branches(self, link: int) -> bool:
         """Whether more than one joint leaves a link or what it carries."""
@@ -342,58 +356,44 @@ class _Grower:
 
     def _welded(self, first: int) -> Link:
         """A link with all that is fixed to it."""
-        group = self._group(first)
-        parts = [(self.source.links[i], pose) for i, pose in group.items()]
         whole = Link(self.source.links[first].name)
-        for link, pose in parts:
+        parts: list[MassPart] = []
+        for number, pose in self._group(first).items():
+            link = self.source.links[number]
             split = link.name in self.said.parts
             for shape in link.shapes:
                 self._check_shape(link, shape, split=split)
-            whole.shapes += [
-                replace(s, frame=compose(pose, s.frame), split=split) for s in link.shapes
-            ]
-            whole.sites |= {name: compose(pose, site) for name, site in link.sites.items()}
-            whole.sites |= {link.name: pose} if link is not parts[0][0] else {}
-        for link, _ in parts:
+                whole.shapes.append(replace(shape, frame=compose(pose, shape.frame), split=split))
+            for name, site in link.sites.items():
+                whole.sites[name] = compose(pose, site)
+            if number != first:
+                whole.sites[link.name] = pose
             if not 0.0 <= link.mass < math.inf:
                 self.problems.append(
                     f"{link.name} weighs {link.mass:g} kg in the file; say mass: "
                     f"{{{link.name}: 0.02}}"
                 )
-        if not sum(link.mass for link, _ in parts) > 0.0:
+            parts.append(_mass_part(link.mass, pose, link.com, link.inertia))
+        if not sum(mass for mass, _, _ in parts) > 0.0:
             return self._weighed(whole)
-        turns = [Rotation.from_quat(pose[3:]) for _, pose in parts]
-        combine(
-            whole,
-            [
-                (
-                    link.mass,
-                    pose[:3] + turn.apply(link.com),
-                    turn.as_matrix() @ link.inertia @ turn.as_matrix().T,
-                )
-                for (link, pose), turn in zip(parts, turns, strict=True)
-            ],
-        )
+        combine(whole, parts)
         return self._possible(whole)
 
     def _weighed(self, link: Link) -> Link:
         """A link whose mass nobody says, as the boxes around its colliders are."""
-        boxes = [shape_box(shape) for shape in link.shapes if shape.collides]
-        if not boxes:
+        parts: list[MassPart] = []
+        for shape in link.shapes:
+            if shape.collides:
+                pose, half = shape_box(shape)
+                mass = float(8.0 * np.prod(half) * DENSITY_KG_M3)
+                inertia = np.diag(mass / 3.0 * (half @ half - half**2))
+                parts.append(_mass_part(mass, pose, np.zeros(3), inertia))
+        if not parts:
             self.problems.append(
                 f"{link.name} has neither mass nor collider; give it one: mass: "
                 f"{{{link.name}: 0.02}}"
             )
             return link
-        parts = []
-        for pose, half in boxes:
-            mass, turn = (
-                float(8.0 * np.prod(half) * DENSITY_KG_M3),
-                Rotation.from_quat(pose[3:]).as_matrix(),
-            )
-            parts.append(
-                (mass, pose[:3], turn @ np.diag(mass / 3.0 * (half @ half - half**2)) @ turn.T)
-            )
         combine(link, parts)
         self.notes.append(
             f"guess: {link.name} has no mass in the file; {link.mass:.3f} kg by its colliders "
@@ -416,20 +416,19 @@ class _Grower:
 
     def _tip(self, last: int) -> np.ndarray | None:
         """The fingertip that is described, or that the source marks, in the last link [7]."""
-        group = self._group(last)
-        for number, pose in group.items():
+        sites: dict[str, np.ndarray] = {}
+        frames: dict[str, np.ndarray] = {}
+        for number, pose in self._group(last).items():
             link = self.source.links[number]
             if link.name in self.said.tips:
-                return compose(pose, np.array([*self.said.tips[link.name], 0.0, 0.0, 0.0, 1.0]))
-        marked = {
-            name: compose(pose, site)
-            for n, pose in group.items()
-            for name, site in self.source.links[n].sites.items()
-        }
-        frames = {self.source.links[n].name: pose for n, pose in group.items() if n != last}
-        for name, pose in (marked | frames).items():
+                return compose(pose, pose_at(self.said.tips[link.name]))
+            for name, site in link.sites.items():
+                sites[name] = compose(pose, site)
+            if number != last:
+                frames[link.name] = pose
+        for name, pose in (sites | frames).items():
             if "tip" in name.lower():
-                return np.array([*pose[:3], 0.0, 0.0, 0.0, 1.0])
+                return pose_at(pose[:3])
         return None
 
     def _check_followers(self, tree: Tree) -> None:
@@ -470,20 +469,18 @@ class _Grower:
                 )
             elif joint.name in self.said.start:
                 self._check_angle("start", joint, self.said.start[joint.name])
-        weak = [
-            joint.name for joint in tree.joints if not joint.effort > 0.0 and joint.mimic is None
-        ]
+        weak = [j.name for j in tree.joints if not j.effort > 0.0 and j.mimic is None]
         if weak:
             self.problems.append(
                 f"{', '.join(weak)}: no torque limit in the file; say drive: {{effort: 1.0}} (N m) "
-                f"or "
-                f"drives: {{{weak[0]}: {{effort: 1.0}}}}; or mimic or hold, where there is no motor"
+                f"or drives: {{{weak[0]}: {{effort: 1.0}}}}; or mimic or hold, where there is no "
+                "motor"
             )
-        for end in np.cumsum(tree.counts):
-            if not any(shape.collides for shape in tree.links[end].shapes):
+        for joints in tree.finger_joints():
+            link = tree.links[joints[-1] + 1]
+            if not any(shape.collides for shape in link.shapes):
                 self.problems.append(
-                    f"nothing collides of {tree.links[end].name}, which has a fingertip; add a "
-                    f"collision"
+                    f"nothing collides of {link.name}, which has a fingertip; add a collision"
                 )
 
     def _check_shape(self, link: Link, shape: Shape, *, split: bool) -> None:
@@ -501,7 +498,7 @@ class _Grower:
             )
         elif shape.collides and shape.kind == "mesh":
             hull = hull_volume(shape.vertices)
-            volume = abs(float(trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume))
+            volume = abs(mesh_volume(shape.vertices, shape.faces))
             if not hull > 0.0:
                 self.problems.append(
                     f"{what} is flat and collides; give it a thickness, or make it a box"
@@ -512,32 +509,36 @@ class _Grower:
             self.problems.append(f"{what} is flat and collides; give it a thickness")
 
 
-def combine(link: Link, parts: list[tuple[float, np.ndarray, np.ndarray]]) -> None:
-    """Give a link the mass of parts.
+MassPart = tuple[float, np.ndarray, np.ndarray]
+"""Mass, centre [3], and inertia about it [3, 3], in the axes of a link."""
 
-    Mass, centre [3], inertia about it in the link's axes [3, 3] each.
-    """
+
+def _mass_part(mass: float, pose: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> MassPart:
+    """A body in a link, of which centre and inertia are in a frame with a pose [7]."""
+    turn = Rotation.from_quat(pose[3:]).as_matrix()
+    return mass, placed(pose, com), turn @ inertia @ turn.T
+
+
+def combine(link: Link, parts: list[MassPart]) -> None:
+    """Give a link the mass of parts."""
     link.mass = sum(mass for mass, _, _ in parts)
-    link.com = np.asarray(sum(mass * at for mass, at, _ in parts)) / link.mass
-    for mass, at, inertia in parts:
-        arm = at - link.com
+    link.com = np.asarray(sum(mass * centre for mass, centre, _ in parts)) / link.mass
+    for mass, centre, inertia in parts:
+        arm = centre - link.com
         link.inertia = link.inertia + inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
 
 
 def shape_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Pose [7] in the link, and half extents [3], of the box around a shape."""
-    match shape.kind:
-        case "sphere":
-            return shape.frame, np.full(3, shape.size[0])
-        case "capsule":
-            return shape.frame, np.array(
-                [shape.size[0], shape.size[0], shape.size[0] + shape.size[1]]
-            )
-        case "cylinder":
-            return shape.frame, np.array([shape.size[0], shape.size[0], shape.size[1]])
-        case "mesh":
-            low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
-            middle = np.array([*(low + high) / 2.0, 0.0, 0.0, 0.0, 1.0])
-            return compose(shape.frame, middle), (high - low) / 2.0
-        case _:
-            return shape.frame, np.array(shape.size[:3])
+    if shape.kind == "mesh":
+        low = shape.vertices.min(axis=0)
+        high = shape.vertices.max(axis=0)
+        return compose(shape.frame, pose_at((low + high) / 2.0)), (high - low) / 2.0
+    if shape.kind == "sphere":
+        return shape.frame, np.full(3, shape.size[0])
+    if shape.kind in ("capsule", "cylinder"):
+        radius, half_length = shape.size
+        if shape.kind == "capsule":
+            half_length += radius
+        return shape.frame, np.array([radius, radius, half_length])
+    return shape.frame, np.array(shape.size[:3])

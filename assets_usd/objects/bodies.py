@@ -77,7 +77,8 @@ def body_of(mesh: RepairedMesh) -> Body:
 
 
 def _outer_body(mesh: RepairedMesh) -> Body:
-    vertices, faces = mesh.vertices, mesh.faces
+    vertices = mesh.vertices
+    faces = mesh.faces
     within: Inside = partial(inside, vertices, faces)
     if mesh.watertight:
         solid = solid_of_mesh(vertices, faces)
@@ -119,7 +120,8 @@ def _solid_by_points(vertices: np.ndarray, within: Inside) -> Solid:
     """Mass properties of what is inside, on a grid turned against the object."""
     turn = GRID_TURN.as_matrix()
     turned = vertices @ turn.T
-    low, side = turned.min(axis=0), np.ptp(turned, axis=0)
+    low = turned.min(axis=0)
+    side = np.ptp(turned, axis=0)
     pitch = float(side.max()) / VOXELS
     shape = np.maximum(np.ceil(side / pitch).astype(int), 1)
     points = low + (np.indices(shape).reshape(3, -1).T + 0.5) * pitch

@@ -48,8 +48,10 @@ class ContactParameter(NamedTuple):
         Identified, or nominal.
         """
         name = next(key for key, parameter in CONTACT.items() if parameter is self)
-        told = {"mass": (item.mass_kg,), "centre_of_mass": item.centre_of_mass}
-        return np.array(told.get(name, item.contact.get(name, (self.nominal,))[0]), dtype=float)
+        usd_values = {"mass": (item.mass_kg,), "centre_of_mass": item.centre_of_mass}
+        return np.array(
+            usd_values.get(name, item.contact.get(name, (self.nominal,))[0]), dtype=float
+        )
 
 
 _MATERIALS = PAPER.materials
@@ -100,23 +102,16 @@ interval.
 """
 
 
-def author_contact(prim: Any, found: Identified) -> None:
+def author_contact(prim: Any, identified: Identified) -> None:
     """Author what was identified on the spec of an object's root prim, USD's own attributes apart."""
     from pxr import Sdf
 
-    for name, (value, low, high) in found.items():
-        author(prim, f"{NAMESPACE}:{name}", Sdf.ValueTypeNames.DoubleArray, list(value))
-        author(prim, f"{NAMESPACE}:{name}:ci95", Sdf.ValueTypeNames.DoubleArray, [*low, *high])
+    from vd.assets_usd.hand_layer import author
 
-
-def author(prim: Any, name: str, kind: Any, value: Any) -> None:
-    """Author an attribute of a type of ``Sdf.ValueTypeNames`` on a prim's spec."""
-    from pxr import Sdf
-
-    custom = name.startswith(NAMESPACE)
-    Sdf.AttributeSpec(
-        prim, name, kind, Sdf.VariabilityVarying, declaresCustom=custom
-    ).default = value
+    kind = Sdf.ValueTypeNames.DoubleArray
+    for name, (value, low, high) in identified.items():
+        author(prim, f"{NAMESPACE}:{name}", kind, list(value))
+        author(prim, f"{NAMESPACE}:{name}:ci95", kind, [*low, *high])
 
 
 def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ...]]:
@@ -130,7 +125,7 @@ def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ..
         ValueError: An attribute is no parameter, or not as many ordered, finite numbers as it
             should be.
     """
-    found = {}
+    identified = {}
     for attribute in prim.GetAuthoredPropertiesInNamespace(NAMESPACE):
         full = attribute.GetName()
         name = full.removeprefix(f"{NAMESPACE}:").removesuffix(":ci95")
@@ -151,8 +146,8 @@ def read_contact(prim: Any, where: str) -> dict[str, tuple[tuple[float, ...], ..
                 f"{where}: {full!r}: give {size} numbers, and for its ci95 {size} low and {size} "
                 f"high"
             )
-        found[name] = tuple(tuple(float(v) for v in part) for part in (value, low, high))
-    return found
+        identified[name] = tuple(tuple(float(v) for v in part) for part in (value, low, high))
+    return identified
 
 
 def damping_ratio(restitution: float) -> float:
@@ -168,5 +163,6 @@ def damping_ratio(restitution: float) -> float:
             - restitution
         )
 
-    low, high = 1e-6, 1.0 - 1e-6
+    low = 1e-6
+    high = 1.0 - 1e-6
     return float(brentq(kept, low, high)) if kept(low) > 0.0 > kept(high) else high

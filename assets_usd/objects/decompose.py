@@ -42,7 +42,8 @@ with few parts, and simplifying each part to 32 vertices alone takes 5 %."""
 USUAL_HULLS = 8
 """Parts tried first: enough for most shapes, and each part is a collision shape in every world."""
 
-FINE_THRESHOLD, FINE_HULLS = 0.4, 96
+FINE_THRESHOLD = 0.4
+FINE_HULLS = 96
 """Factor on the threshold, and most parts, of the fine decomposition from which parts are merged
 where the first is not good."""
 
@@ -183,7 +184,8 @@ def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:
         pair(i, range(i))
     while len(corners) > most:
         i, j = min(together, key=lambda key: together[key] - volume[key[0]] - volume[key[1]])
-        new, others = max(corners) + 1, [k for k in corners if k not in (i, j)]
+        new = max(corners) + 1
+        others = [k for k in corners if k not in (i, j)]
         volume[new] = together[i, j]
         both = np.concatenate([corners.pop(i), corners.pop(j)])
         corners[new] = both[ConvexHull(both).vertices]
@@ -219,14 +221,14 @@ def best_decomposition(
     fine = decompose(vertices, faces, limits, 2 * HULL_VERTICES)
     if fine.fallback:
         return replace(first, fallback=("no finer parts", *fine.fallback))
-    found = [first]
+    candidates = [first]
     parts = [hull.vertices for hull in fine.hulls]
     for most in sorted((n for n in MERGED_HULLS if n <= settings.max_hulls), reverse=True):
         parts = merge_parts(parts, most)
         hulls = tidy_hulls(parts, HULL_VERTICES)
-        found.append(Decomposition(hulls, f"{fine.method}, merged", error=error_of(hulls)))
-    enough = max(GOOD_ERROR, NEARLY * min(each.error for each in found))
+        candidates.append(Decomposition(hulls, f"{fine.method}, merged", error=error_of(hulls)))
+    enough = max(GOOD_ERROR, NEARLY * min(candidate.error for candidate in candidates))
     return min(
-        (each for each in found if each.error <= enough),
-        key=lambda each: (len(each.hulls), each.error),
+        (candidate for candidate in candidates if candidate.error <= enough),
+        key=lambda candidate: (len(candidate.hulls), candidate.error),
     )

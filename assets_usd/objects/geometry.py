@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
+from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
@@ -32,7 +33,9 @@ GRID_TURN = Rotation.from_euler("xyz", [0.37, 0.61, 0.23])
 have.
 """
 
-FINEST_GRID, COARSEST_GRID, GRID_BISECTIONS = 65536.0, 8.0, 8
+FINEST_GRID = 65536.0
+COARSEST_GRID = 8.0
+GRID_BISECTIONS = 8
 """Grids tried when a mesh is coarsened: cells along its longest side, and bisection steps.
 The finest has room for debris that makes the object itself small."""
 
@@ -49,6 +52,10 @@ class Surface(NamedTuple):
     vertices: np.ndarray
     faces: np.ndarray
 
+    def times(self, factor: float) -> "Surface":
+        """The surface, larger by a factor."""
+        return self._replace(vertices=self.vertices * factor)
+
 
 Hull = Surface
 """A convex polyhedron."""
@@ -63,6 +70,17 @@ class Solid(NamedTuple):
     volume: float
     centroid: np.ndarray
     inertia: np.ndarray
+
+
+def _corners(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """First, second and third corners of triangles, [3, T, 3] float64."""
+    return np.asarray(vertices, dtype=np.float64)[faces.T]
+
+
+def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Normals of triangles [T, 3], as long as twice their areas."""
+    a, b, c = _corners(vertices, faces)
+    return np.cross(b - a, c - a)
 
 
 def convex_hull(points: np.ndarray) -> Hull:
@@ -81,8 +99,7 @@ def convex_hull(points: np.ndarray) -> Hull:
         hull = ConvexHull(points)
     except QhullError as error:
         raise ValueError("the points lie in one plane") from error
-    corner = points[hull.simplices]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = _normals(points, hull.simplices)
     inward = np.einsum("ij,ij->i", normal, hull.equations[:, :3]) < 0.0
     simplices = hull.simplices.copy()
     simplices[inward] = simplices[inward][:, ::-1]
@@ -103,12 +120,12 @@ def hull_planes(hull: Hull) -> tuple[np.ndarray, np.ndarray]:
 
     Inside is ``n.x <= d``.
     """
-    corner = hull.vertices[hull.faces].astype(np.float64)
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = _normals(*hull)
     length = np.linalg.norm(normal, axis=1)
     keep = length > 1e-12 * length.max()
     normal = normal[keep] / length[keep, None]
-    return normal, np.einsum("ij,ij->i", normal, corner[keep, 0])
+    first = _corners(*hull)[0, keep]
+    return normal, np.einsum("ij,ij->i", normal, first)
 
 
 def hull_depth(hull: Hull, points: np.ndarray) -> np.ndarray:
@@ -129,8 +146,27 @@ def union_depth(hulls: Sequence[Hull], points: np.ndarray) -> np.ndarray:
 
 def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Signed volume enclosed by a closed mesh, m^3 (divergence theorem)."""
-    a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, i]] for i in range(3))
+    a, b, c = _corners(vertices, faces)
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+
+
+class _QueriedMesh:
+    """A mesh on the processor, of unit length, that Warp's kernels ask."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, winding: bool = False):
+        import warp as wp
+
+        self.low = vertices.min(axis=0)
+        self.size = float(np.ptp(vertices, axis=0).max())
+        indices = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
+        self.mesh = wp.Mesh(self.placed(vertices), indices, support_winding_number=winding)
+
+    def placed(self, points: np.ndarray) -> Any:
+        """Points [.., 3] in its frame, as an array of vectors."""
+        import warp as wp
+
+        scaled = (points - self.low) / self.size
+        return wp.array(scaled.astype(np.float32), dtype=wp.vec3, device="cpu")
 
 
 def inside(
@@ -141,22 +177,11 @@ def inside(
 
     from vd.kernels.sensor.winding import inside_kernel
 
-    low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
-
-    def on_device(places: np.ndarray) -> Any:
-        return wp.array(((places - low) / size).astype(np.float32), dtype=wp.vec3, device="cpu")
-
-    corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-    mesh = wp.Mesh(on_device(vertices), corners, support_winding_number=True)
-    found = wp.zeros(len(points), dtype=wp.bool, device="cpu")
-    wp.launch(
-        inside_kernel,
-        dim=len(points),
-        inputs=[mesh.id, level, on_device(points)],
-        outputs=[found],
-        device="cpu",
-    )
-    return np.asarray(found.numpy(), dtype=bool)
+    queried = _QueriedMesh(vertices, faces, winding=True)
+    result = wp.zeros(len(points), dtype=wp.bool, device="cpu")
+    inputs = [queried.mesh.id, level, queried.placed(points)]
+    wp.launch(inside_kernel, result.shape, inputs, [result], device="cpu")
+    return np.asarray(result.numpy(), dtype=bool)
 
 
 def distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -165,18 +190,12 @@ def distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np
 
     from vd.kernels.sensor.shape_grids import off_mesh_kernel
 
-    low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
-
-    def on_device(places: np.ndarray) -> Any:
-        return wp.array(((places - low) / size).astype(np.float32), dtype=wp.vec3, device="cpu")
-
-    corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-    mesh = wp.Mesh(on_device(vertices), corners)
-    found = wp.zeros((1, len(points)), dtype=float, device="cpu")
-    number = wp.array([mesh.id], dtype=wp.uint64, device="cpu")
-    samples = on_device(points[None])
-    wp.launch(off_mesh_kernel, found.shape, [samples, number], [found], device="cpu")
-    return size * np.asarray(found.numpy()[0])
+    queried = _QueriedMesh(vertices, faces)
+    result = wp.zeros((1, len(points)), dtype=float, device="cpu")
+    number = wp.array([queried.mesh.id], dtype=wp.uint64, device="cpu")
+    inputs = [queried.placed(points[None]), number]
+    wp.launch(off_mesh_kernel, result.shape, inputs, [result], device="cpu")
+    return queried.size * np.asarray(result.numpy()[0])
 
 
 def sides_along_axes(points: np.ndarray) -> np.ndarray:
@@ -192,34 +211,38 @@ def simplify_hull(hull: Hull, max_vertices: int) -> Hull:
     scaled about its centroid to the original volume, so that round parts shrink nowhere on average.
     """
     points = hull.vertices
-    size = float(np.ptp(points, axis=0).max())
-    centre = points.mean(axis=0)
-    first = int(np.argmax(np.linalg.norm(points - centre, axis=1)))
-    second = int(np.argmax(np.linalg.norm(points - points[first], axis=1)))
-    axis = (points[second] - points[first]) / np.linalg.norm(points[second] - points[first])
-    away = points - points[first]
-    third = int(np.argmax(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1)))
-    normal = np.cross(points[second] - points[first], points[third] - points[first])
-    fourth = int(np.argmax(np.abs(away @ normal)))
-    chosen = [first, second, third, fourth]
+    tolerance = SIMPLIFY_TOLERANCE * float(np.ptp(points, axis=0).max())
+    chosen = _tetrahedron(points)
     kept = convex_hull(points[chosen])
     while len(chosen) < min(max_vertices, len(points)):
         depth = hull_depth(kept, points)
         farthest = int(np.argmax(depth))
-        if depth[farthest] < SIMPLIFY_TOLERANCE * size:
+        if depth[farthest] < tolerance:
             break
         chosen.append(farthest)
         kept = convex_hull(points[chosen])
-    full, part = mesh_volume(*hull), mesh_volume(*kept)
+    growth = np.cbrt(mesh_volume(*hull) / mesh_volume(*kept))
     centroid = solid_of_mesh(*kept).centroid
-    return Hull(centroid + (kept.vertices - centroid) * np.cbrt(full / part), kept.faces)
+    return Hull(centroid + (kept.vertices - centroid) * growth, kept.faces)
+
+
+def _tetrahedron(points: np.ndarray) -> list[int]:
+    """Four of points [n, 3]: each is the farthest from their mean, the point, line or plane before."""
+    first = int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))
+    away = points - points[first]
+    second = int(np.argmax(np.linalg.norm(away, axis=1)))
+    axis = away[second] / np.linalg.norm(away[second])
+    third = int(np.argmax(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1)))
+    normal = np.cross(away[second], away[third])
+    fourth = int(np.argmax(np.abs(away @ normal)))
+    return [first, second, third, fourth]
 
 
 def solid_of_mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     """Exact mass properties of the solid bounded by a closed, outward mesh (density 1)."""
     vertices = np.asarray(vertices, dtype=np.float64)
     reference = vertices.mean(axis=0)
-    a, b, c = ((vertices - reference)[faces[:, i]] for i in range(3))
+    a, b, c = _corners(vertices - reference, faces)
     six_volume = np.einsum("ij,ij->i", a, np.cross(b, c))
     volume = six_volume.sum() / 6.0
     centroid = np.einsum("i,ij->j", six_volume, a + b + c) / 24.0 / volume
@@ -268,7 +291,8 @@ def voxelise_surface(
     :func:`voxelise_hulls`.
     """
     vertices = np.asarray(vertices, dtype=np.float64)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low = vertices.min(axis=0)
+    high = vertices.max(axis=0)
     pitch = float((high - low).max()) / voxels
     margin = 2
     shape = np.ceil((high - low) / pitch).astype(int) + 1 + 2 * margin
@@ -326,8 +350,7 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def triangle_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area of each triangle [T], m^2."""
-    a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, i]] for i in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2.0
+    return np.linalg.norm(_normals(vertices, faces), axis=1) / 2.0
 
 
 def random_surface_points(
@@ -337,11 +360,12 @@ def random_surface_points(
     area = np.cumsum(triangle_areas(vertices, faces))
     if not len(area) or area[-1] <= 0.0:
         raise ValueError("the surface has no area")
-    index = np.minimum(np.searchsorted(area, rng.uniform(0.0, area[-1], count)), len(area) - 1)
+    index = np.searchsorted(area, rng.uniform(0.0, area[-1], count))
     u, v = rng.uniform(size=(2, count, 1))
     flip = u + v > 1.0
-    u, v = np.where(flip, 1.0 - u, u), np.where(flip, 1.0 - v, v)
-    a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[index, i]] for i in range(3))
+    u = np.where(flip, 1.0 - u, u)
+    v = np.where(flip, 1.0 - v, v)
+    a, b, c = _corners(vertices, faces[np.minimum(index, len(area) - 1)])
     return a + u * (b - a) + v * (c - a)
 
 
@@ -367,12 +391,11 @@ def surface_points(
     """
     rng = np.random.default_rng(seed)
     tolerance = 1e-6 * float(np.ptp(vertices, axis=0).max())
-    candidates = random_surface_points(vertices, faces, CANDIDATES_PER_POINT * count, rng)
-    if outside:
-        candidates = candidates[union_depth(outside, candidates) > -tolerance]
+    candidates = np.zeros((0, 3))
     while len(candidates) < count:
-        more = random_surface_points(vertices, faces, CANDIDATES_PER_POINT * count, rng)
-        candidates = np.concatenate([candidates, more[union_depth(outside, more) > -tolerance]])
+        points = random_surface_points(vertices, faces, CANDIDATES_PER_POINT * count, rng)
+        outer = points[union_depth(outside, points) > -tolerance]
+        candidates = np.concatenate([candidates, outer])
     return candidates[spread(candidates, count)]
 
 
@@ -433,30 +456,28 @@ def cluster_vertices(
     """
     if len(faces) <= max_faces:
         return vertices, faces
-    low, side = vertices.min(axis=0), np.ptp(vertices, axis=0)
-    fine, coarse = FINEST_GRID, COARSEST_GRID
-    if len(vertices) > len(
-        faces
-    ):  # triangles with corners of their own: those at one place are one
-        same, faces = _clustered(vertices, faces, fine, tidied)
-        one = np.zeros(same.max() + 1, dtype=int)
-        one[same] = np.arange(len(same))
-        vertices = vertices[one]
-    cluster, merged = _clustered(vertices, faces, coarse, tidied)
+    if len(vertices) > len(faces):  # corners of their own: those at one place become one
+        cell, faces = _clustered(vertices, faces, FINEST_GRID, tidied)
+        kept = np.zeros(cell.max() + 1, dtype=int)
+        kept[cell] = np.arange(len(cell))
+        vertices = vertices[kept]
+    fine = FINEST_GRID
+    coarse = COARSEST_GRID
+    cell, merged = _clustered(vertices, faces, coarse, tidied)
     for _ in range(GRID_BISECTIONS):
         cells = float(np.sqrt(fine * coarse))
-        trial = _clustered(vertices, faces, cells, tidied)
-        if len(trial[1]) > max_faces:
+        finer = _clustered(vertices, faces, cells, tidied)
+        if len(finer[1]) > max_faces:
             fine = cells
         else:
             coarse = cells
-            cluster, merged = trial
+            cell, merged = finer
+    side = np.ptp(vertices, axis=0)
     used, index = np.unique(merged, return_inverse=True)
-    moved = _quadric_vertices(vertices, faces, cluster, float(side.max()) / coarse)[used]
-    spread = np.ptp(moved, axis=0)
-    moved = low + (moved - moved.min(axis=0)) * np.where(
-        spread > 0.0, side / np.maximum(spread, 1e-30), 1.0
-    )
+    moved = _quadric_vertices(vertices, faces, cell, float(side.max()) / coarse)[used]
+    extent = np.ptp(moved, axis=0)
+    scale = np.where(extent > 0.0, side / np.maximum(extent, 1e-30), 1.0)
+    moved = vertices.min(axis=0) + (moved - moved.min(axis=0)) * scale
     return moved, index.reshape(-1, 3).astype(np.int32)
 
 
@@ -467,13 +488,14 @@ def _clustered(
     tidied: Callable[[np.ndarray], np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cell of each vertex [V] on a grid of ``cells`` along the longest side, and the triangles left."""
-    low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
+    low = vertices.min(axis=0)
+    size = float(np.ptp(vertices, axis=0).max())
     x, y, z = np.floor((vertices - low) / size * cells).astype(np.int64).T
     most = int(cells) + 1
-    cluster = np.unique((x * most + y) * most + z, return_inverse=True)[1].reshape(-1)
-    merged = cluster[faces]
+    cell = np.unique((x * most + y) * most + z, return_inverse=True)[1].reshape(-1)
+    merged = cell[faces]
     a, b, c = merged.T
-    return cluster, tidied(merged[(a != b) & (b != c) & (c != a)])
+    return cell, tidied(merged[(a != b) & (b != c) & (c != a)])
 
 
 def _quadric_vertices(
@@ -484,21 +506,27 @@ def _quadric_vertices(
     Near its mean, on the planes of its triangles, at most a cell away.
     """
     count = int(cluster.max()) + 1
-    total = np.stack([np.bincount(cluster, vertices[:, i], count) for i in range(3)], axis=1)
-    mean = total / np.bincount(cluster, minlength=count)[:, None]
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    mean = _sums(cluster, vertices, count) / np.bincount(cluster, minlength=count)[:, None]
+    normal = _normals(vertices, faces)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal /= np.maximum(length, 1e-30)
-    matrix = np.zeros((count, 3, 3))
+    weighted = length * normal
+    planes = (weighted[:, :, None] * normal[:, None, :]).reshape(-1, 9)
+    first = vertices[faces[:, 0]]
+    sums = np.zeros((count, 9))
     right = np.zeros((count, 3))
     for corners in cluster[faces].T:
-        offset = np.einsum("ij,ij->i", normal, corner[:, 0] - mean[corners])
-        for i in range(3):
-            weight = length[:, 0] * normal[:, i]
-            right[:, i] += np.bincount(corners, weight * offset, count)
-            for j in range(3):
-                matrix[:, i, j] += np.bincount(corners, weight * normal[:, j], count)
+        offset = np.einsum("ij,ij->i", normal, first - mean[corners])
+        right += _sums(corners, weighted * offset[:, None], count)
+        sums += _sums(corners, planes, count)
+    matrix = sums.reshape(-1, 3, 3)
     # The mean pulls weakly where the planes leave a direction free.
     matrix += (1e-2 * np.trace(matrix, axis1=1, axis2=2) + 1e-30)[:, None, None] * np.eye(3)
     return mean + np.clip(np.linalg.solve(matrix, right[:, :, None])[:, :, 0], -cell, cell)
+
+
+def _sums(groups: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+    """Sums of rows [N, K] over each of ``count`` groups, of which each row has one [N]."""
+    numbers = np.arange(len(groups))
+    members = csr_matrix((np.ones(len(groups)), (groups, numbers)), (count, len(groups)))
+    return np.asarray(members @ rows)

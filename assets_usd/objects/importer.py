@@ -66,7 +66,8 @@ COMPARED = 20_000
 MAX_DECOMPOSED_FACES = 12_000
 """Faces of what is split into convex parts: CoACD's time grows with them, and parts are coarser."""
 
-MAX_ERROR, MAX_OFFSET = 1.0, 0.03
+MAX_ERROR = 1.0
+MAX_OFFSET = 0.03
 """Parts are refused if they differ from the mesh by more than its volume, and are farther from its
 surface,
 on average, than this share of the longest side: 4 mm of 13 cm, where fingertips have a radius of 10
@@ -78,7 +79,8 @@ volume.
 LAST_REMEDY = "export it again with fewer faces, or import it alone (--jobs 1)"
 """What helps where nothing is known of why an import failed."""
 
-HANG_S, OVERHEAD_S = 20.0, 600.0
+HANG_S = 20.0
+OVERHEAD_S = 600.0
 """Wall-clock time after which a mesh is taken to hang: for each second of processor time that CoACD
 may take, of which a busy machine gives it a twentieth of a core at least, and beside its runs."""
 

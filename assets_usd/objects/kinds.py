@@ -30,9 +30,14 @@ SIDES = (-1, 1)
 
 def car(u: Draw) -> Iterator[Hull]:
     """Body, cabin, spoiler, four wheels."""
-    length, width, height = u(2.4, 3.2), u(1.2, 1.6), u(0.45, 0.7)
-    wheel, cabin = u(0.28, 0.42), u(0.4, 0.75)
-    back, front, top = -0.45 * length, u(0.0, 0.2) * length, height + cabin
+    length = u(2.4, 3.2)
+    width = u(1.2, 1.6)
+    height = u(0.45, 0.7)
+    wheel = u(0.28, 0.42)
+    cabin = u(0.4, 0.75)
+    back = -0.45 * length
+    front = u(0.0, 0.2) * length
+    top = height + cabin
     yield box((0, 0, height / 2), (length, width, height), top=(0.95, 0.9))
     sill = height * 0.8
     yield prism(
@@ -48,14 +53,20 @@ def car(u: Draw) -> Iterator[Hull]:
 
 def truck(u: Draw) -> Iterator[Hull]:
     """Chassis, cab, load, exhaust, two axles with wheels."""
-    length, width, cab, load = u(3.0, 4.0), u(1.2, 1.5), u(1.0, 1.4), u(0.7, 1.5)
+    length = u(3.0, 4.0)
+    width = u(1.2, 1.5)
+    cab = u(1.0, 1.4)
+    load = u(0.7, 1.5)
     yield box((0, 0, 0.4), (length, 0.8 * width, 0.3))
-    front, back, roof = length / 2, length / 2 - 0.9, 0.4 + cab
+    front = length / 2
+    back = length / 2 - 0.9
+    roof = 0.4 + cab
     outline = [(back, 0.4), (front, 0.4), (front, 0.9), (front - 0.3, roof), (back, roof)]
     yield prism(outline, -width / 2, width / 2)
     size = (length - 1.2, width * u(0.9, 1.15), load)
     yield box((-0.45, 0, 0.5 + load / 2), size, top=(1, u(0.8, 1.0)))
-    x, y = front - 1.0, width / 2 - 0.1
+    x = front - 1.0
+    y = width / 2 - 0.1
     yield cylinder((x, y, 0.5), (x, y, cab + 0.9), 0.12, sides=8)
     for x in (-0.36 * length, 0.34 * length):
         yield cylinder((x, -width / 2, 0.3), (x, width / 2, 0.3), u(0.36, 0.5))
@@ -63,7 +74,9 @@ def truck(u: Draw) -> Iterator[Hull]:
 
 def locomotive(u: Draw) -> Iterator[Hull]:
     """Boiler, cab, chassis, chimney, dome, cow catcher, axles."""
-    length, radius, cab = u(2.6, 3.4), u(0.45, 0.65), u(0.7, 1.0)
+    length = u(2.6, 3.4)
+    radius = u(0.45, 0.65)
+    cab = u(0.7, 1.0)
     front = length / 2
     yield cylinder((-0.2 * length, 0, 1.0), (front, 0, 1.0), radius)
     yield box((-front + cab / 2, 0, 1.15), (cab, 1.5, u(1.5, 2.0)))
@@ -79,8 +92,12 @@ def locomotive(u: Draw) -> Iterator[Hull]:
 
 def aeroplane(u: Draw) -> Iterator[Hull]:
     """Fuselage, two swept wings, tailplane, fin, cockpit."""
-    length, radius, span = u(3.0, 3.8), u(0.3, 0.45), u(1.3, 1.9)
-    sweep, chord, thick = u(0.2, 0.9), u(0.7, 1.1), u(0.16, 0.24)
+    length = u(3.0, 3.8)
+    radius = u(0.3, 0.45)
+    span = u(1.3, 1.9)
+    sweep = u(0.2, 0.9)
+    chord = u(0.7, 1.1)
+    thick = u(0.16, 0.24)
     yield rod((length / 2, 0, 0), (-length / 2, 0, 0.15), radius, 0.45 * radius)
     for side in SIDES:
         tip = [(-chord * 0.35 - sweep, side * span), (chord * 0.1 - sweep, side * span)]
@@ -94,11 +111,13 @@ def aeroplane(u: Draw) -> Iterator[Hull]:
 
 def boat(u: Draw) -> Iterator[Hull]:
     """Bow and stern of the hull, cabin, funnel, mast, bench."""
-    length, width = u(2.4, 3.2), u(0.9, 1.3)
+    length = u(2.4, 3.2)
+    width = u(0.9, 1.3)
     deck = np.array([(-1, -1), (-1, 1), (0.2, 1), (1.1, 0.05), (1.1, -0.05), (0.2, -1)])
     deck = deck * (length / 2, width / 2)
     keel = deck * (0.8, 0.5)
-    cabin, x = u(0.5, 0.8), u(-0.3, 0.0) * length
+    cabin = u(0.5, 0.8)
+    x = u(-0.3, 0.0) * length
     yield convex_hull(
         np.concatenate([np.insert(deck, 2, 0.6, axis=1), np.insert(keel, 2, 0.0, axis=1)])
     )
@@ -110,8 +129,12 @@ def boat(u: Draw) -> Iterator[Hull]:
 
 def quadruped(u: Draw) -> Iterator[Hull]:
     """Trunk, neck and head, four legs, tail."""
-    length, girth, leg = u(1.4, 2.2), u(0.42, 0.7), u(0.8, 1.3)
-    rise, reach, thick = u(0.3, 1.1), u(0.3, 0.8), u(0.15, 0.24)
+    length = u(1.4, 2.2)
+    girth = u(0.42, 0.7)
+    leg = u(0.8, 1.3)
+    rise = u(0.3, 1.1)
+    reach = u(0.3, 0.8)
+    thick = u(0.15, 0.24)
     head = vec(length / 2 + reach, 0.0, leg + girth * 0.5 + rise)
     yield rod((-length / 2, 0, leg + 0.25), (length / 2, 0, leg + 0.3), girth * u(0.8, 1.0), girth)
     yield rod((length / 2 - 0.1, 0, leg + 0.4), head, 0.6 * girth, 0.4 * girth)
@@ -124,8 +147,11 @@ def quadruped(u: Draw) -> Iterator[Hull]:
 
 def bird(u: Draw) -> Iterator[Hull]:
     """Body, neck, head, beak, tail, two wings, foot."""
-    body, head = vec(u(0.9, 1.2), u(0.55, 0.75), u(0.55, 0.7)), vec(u(0.7, 1.1), 0.0, u(0.7, 1.2))
-    size, wing, lift = u(0.32, 0.45), u(0.6, 1.1), u(-0.2, 0.6)
+    body = vec(u(0.9, 1.2), u(0.55, 0.75), u(0.55, 0.7))
+    head = vec(u(0.7, 1.1), 0.0, u(0.7, 1.2))
+    size = u(0.32, 0.45)
+    wing = u(0.6, 1.1)
+    lift = u(-0.2, 0.6)
     yield ellipsoid((0, 0, 0), body, euler=(0, u(-0.4, 0.1), 0))
     yield rod((0.5 * body[0], 0, 0.2), head, 0.36, 0.28)
     yield ellipsoid(head, (size, 0.9 * size, size))
@@ -142,7 +168,9 @@ def bird(u: Draw) -> Iterator[Hull]:
 
 def fish(u: Draw) -> Iterator[Hull]:
     """Body, head, two tail lobes, back fin, two side fins."""
-    length, height, width = u(1.2, 1.6), u(0.55, 0.9), u(0.35, 0.5)
+    length = u(1.2, 1.6)
+    height = u(0.55, 0.9)
+    width = u(0.35, 0.5)
     end = -length
     yield ellipsoid((0, 0, 0), (length, width, height))
     yield ellipsoid((0.6 * length, 0, -0.05), (0.55 * length, 0.9 * width, 0.62 * height))
@@ -165,7 +193,8 @@ def fish(u: Draw) -> Iterator[Hull]:
 
 def dinosaur(u: Draw) -> Iterator[Hull]:
     """Two-legged: body, neck, head, tail, thighs with feet, arms."""
-    hip, chest = vec(-0.3, 0, 1.2), vec(0.6, 0, 1.2 + u(0.2, 0.7))
+    hip = vec(-0.3, 0, 1.2)
+    chest = vec(0.6, 0, 1.2 + u(0.2, 0.7))
     head = chest + vec(u(0.3, 0.6), 0, u(0.4, 0.8))
     tail = hip + vec(-u(1.2, 1.9), 0, u(-0.6, 0.2))
     yield rod(hip, chest, u(0.5, 0.62), 0.42)
@@ -181,7 +210,8 @@ def dinosaur(u: Draw) -> Iterator[Hull]:
 
 def _sole(u: Draw, length: float, width: float) -> np.ndarray:
     """Convex outline of a left or right foot, heel at x = 0."""
-    side, waist = u.choice([-1.0, 1.0]), u(0.38, 0.45)
+    side = u.choice([-1.0, 1.0])
+    waist = u(0.38, 0.45)
     outer = [(0.0, -0.25), (0.1, -0.4), (0.65, -0.55), (0.9, -0.4), (1.0, -0.1 + 0.2 * waist)]
     inner = [(0.98, 0.25), (0.75, 0.48), (0.1, 0.38), (0.0, 0.22)]
     return np.array([(length * x, side * width * y) for x, y in outer + inner])
@@ -189,7 +219,9 @@ def _sole(u: Draw, length: float, width: float) -> np.ndarray:
 
 def sneaker(u: Draw) -> Iterator[Hull]:
     """Sole, toe box, instep, collar, tongue."""
-    length, width, height = u(2.4, 3.0), u(0.9, 1.15), u(0.9, 1.3)
+    length = u(2.4, 3.0)
+    width = u(0.9, 1.15)
+    height = u(0.9, 1.3)
     yield prism(_sole(u, length, width), 0.0, u(0.25, 0.4), axis="z")
     yield ellipsoid((0.72 * length, 0, 0.38), (0.27 * length, 0.46 * width, u(0.35, 0.5)))
     toe = [(0.75 * length, 0.2), (0.7 * length, 0.6), (0.45 * length, height)]
@@ -201,7 +233,10 @@ def sneaker(u: Draw) -> Iterator[Hull]:
 
 def boot(u: Draw) -> Iterator[Hull]:
     """Sole, heel, foot, toe cap, shaft, cuff."""
-    length, width, shaft, lean = u(2.0, 2.6), u(0.8, 1.05), u(1.6, 2.4), u(-0.2, 0.25)
+    length = u(2.0, 2.6)
+    width = u(0.8, 1.05)
+    shaft = u(1.6, 2.4)
+    lean = u(-0.2, 0.25)
     ankle = 0.2 * length
     yield prism(_sole(u, length, width), 0.2, 0.4, axis="z")
     yield box((0.15 * length, 0, 0.13), (0.3 * length, 0.7 * width, 0.3), top=(1.0, 1.1))
@@ -215,7 +250,9 @@ def boot(u: Draw) -> Iterator[Hull]:
 
 def heel_shoe(u: Draw) -> Iterator[Hull]:
     """Sloped arch, sole, stiletto heel, toe box, counter."""
-    length, width, lift = u(2.2, 2.7), u(0.7, 0.9), u(0.8, 1.3)
+    length = u(2.2, 2.7)
+    width = u(0.7, 0.9)
+    lift = u(0.8, 1.3)
     ball = 0.65 * length
     arch = [
         (0.0, lift),
@@ -234,7 +271,10 @@ def heel_shoe(u: Draw) -> Iterator[Hull]:
 
 def hammer(u: Draw) -> Iterator[Hull]:
     """Handle, grip, head, face, two claws."""
-    length, head, spread, drop = u(2.6, 3.4), u(0.22, 0.3), u(0.12, 0.3), u(0.2, 0.7)
+    length = u(2.6, 3.4)
+    head = u(0.22, 0.3)
+    spread = u(0.12, 0.3)
+    drop = u(0.2, 0.7)
     yield rod((0, 0, 0), (0, 0, length), 0.2, 0.16)
     yield rod((0, 0, 0), (0, 0, 0.4 * length), u(0.22, 0.3))
     yield box((0.0, 0, length), (0.8, 2 * head, 2 * head))
@@ -245,7 +285,9 @@ def hammer(u: Draw) -> Iterator[Hull]:
 
 def wrench(u: Draw) -> Iterator[Hull]:
     """Open-ended, bent: handle, head, two jaws of unequal length, end plate."""
-    length, depth, bend = u(2.4, 3.2), u(0.3, 0.5), u(-0.7, 1.1)
+    length = u(2.4, 3.2)
+    depth = u(0.3, 0.5)
+    bend = u(-0.7, 1.1)
     tip = vec(length, bend)
     yield beam((0, 0), (0.55 * length, 0), u(0.4, 0.6), depth)
     yield beam((0.5 * length, 0), tip, u(0.35, 0.55), depth)
@@ -257,8 +299,10 @@ def wrench(u: Draw) -> Iterator[Hull]:
 
 def drill(u: Draw) -> Iterator[Hull]:
     """Motor, chuck, bit, grip, battery, trigger."""
-    length, tilt = u(1.6, 2.2), u(0.1, 0.5)
-    front, foot = length / 2, vec(-0.45 - tilt, 0.0, -u(1.3, 1.8))
+    length = u(1.6, 2.2)
+    tilt = u(0.1, 0.5)
+    front = length / 2
+    foot = vec(-0.45 - tilt, 0.0, -u(1.3, 1.8))
     yield cylinder((-front, 0, 0), (front, 0, 0), 0.46, 0.38)
     yield cylinder((front - 0.1, 0, 0), (front + 0.5, 0, 0), 0.3, 0.2, sides=10)
     yield rod((front, 0, 0), (front + u(0.8, 1.2), 0, 0), 0.09)
@@ -269,7 +313,8 @@ def drill(u: Draw) -> Iterator[Hull]:
 
 def axe(u: Draw) -> Iterator[Hull]:
     """Handle with a bent end, head, blade, spike."""
-    length, blade = u(2.6, 3.2), u(0.8, 1.3)
+    length = u(2.6, 3.2)
+    blade = u(0.8, 1.3)
     yield rod((0, 0, 0.4), (0, 0, length), 0.17)
     yield rod((0, 0, 0.5), (u(0.2, 0.5), 0, 0), 0.19, 0.22)
     yield box((0, 0, length - 0.2), (0.7, 0.45, 0.55))
@@ -284,7 +329,8 @@ def axe(u: Draw) -> Iterator[Hull]:
 
 def pliers(u: Draw) -> Iterator[Hull]:
     """Two handles of unequal bend, pivot, two jaws of unequal length."""
-    opening, depth = u(0.35, 0.6), u(0.28, 0.4)
+    opening = u(0.35, 0.6)
+    depth = u(0.28, 0.4)
     yield rod((0, 0.03, 0), (-1.2, 0.03, -opening), 0.22, 0.19)
     yield rod((-1.2, 0, -opening), (-u(2.0, 2.4), 0, -opening * 0.7), 0.22)
     yield rod((0, -0.03, 0), (-1.1, -0.03, opening), 0.22, 0.19)
@@ -317,7 +363,10 @@ STROKES = {
 def letter(u: Draw) -> Iterator[Hull]:
     """A character of straight strokes, slanted and stretched."""
     lines = STROKES[str(u.choice(sorted(STROKES)))].split("|")
-    stretch, slant, width, depth = u(0.85, 1.25), u(-0.2, 0.3), u(0.28, 0.42), u(0.35, 0.8)
+    stretch = u(0.85, 1.25)
+    slant = u(-0.2, 0.3)
+    width = u(0.28, 0.42)
+    depth = u(0.35, 0.8)
     for line in lines:
         corners = [[float(number) for number in corner.split(",")] for corner in line.split()]
         for start, end in pairwise((stretch * x + slant * z, z) for x, z in corners):
@@ -326,7 +375,10 @@ def letter(u: Draw) -> Iterator[Hull]:
 
 def monogram(u: Draw) -> Iterator[Hull]:
     """An L or a hook of thick strokes with a rod and a ball on its faces: no mirror plane left."""
-    width, depth, arm, side = u(0.4, 0.55), u(0.4, 0.7), u(0.8, 1.5), u.choice([-1.0, 1.0])
+    width = u(0.4, 0.55)
+    depth = u(0.4, 0.7)
+    arm = u(0.8, 1.5)
+    side = u.choice([-1.0, 1.0])
     yield beam((0, 0), (0, u(1.6, 2.2)), width, depth)
     yield beam((0, 0), (arm, u(-0.2, 0.3)), width, depth)
     yield rod((0, 0, 1.2), (u(-0.3, 0.3), side * u(0.8, 1.2), 1.3), 0.3, 0.24)
@@ -340,12 +392,17 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 def _grown(u: Draw, host: Hull) -> Hull:
     """A random primitive rooted inside a part and sticking out of it."""
     normals, offsets = hull_planes(host)
-    centre, plane = host.vertices.mean(axis=0), int(u.integers(len(normals)))
+    centre = host.vertices.mean(axis=0)
+    plane = int(u.integers(len(normals)))
     normal = normals[plane]
     surface = centre + (offsets[plane] - normal @ centre) * normal
     out = _unit(normal + u.normal(0.0, 0.25, 3))
-    length, turn, kind, thick = u(0.6, 1.5), u(-np.pi, np.pi, 3), int(u.integers(4)), u(0.25, 0.5)
-    root, middle = surface - 0.3 * length * out, surface + out * length * 0.35
+    length = u(0.6, 1.5)
+    turn = u(-np.pi, np.pi, 3)
+    kind = int(u.integers(4))
+    thick = u(0.25, 0.5)
+    root = surface - 0.3 * length * out
+    middle = surface + out * length * 0.35
     if kind == 0:
         return rod(root, surface + length * out, thick, thick * u(0.5, 1.0))
     if kind == 1:
@@ -365,7 +422,8 @@ def cluster(u: Draw) -> list[Hull]:
 
 def branch(u: Draw) -> Iterator[Hull]:
     """A bent trunk of rods with side arms that end in blobs."""
-    points, direction = [np.zeros(3)], vec(0.0, 0.0, 1.0)
+    points = [np.zeros(3)]
+    direction = vec(0.0, 0.0, 1.0)
     for _ in range(3):
         direction = _unit(direction + u.normal(0.0, 0.45, 3))
         points.append(points[-1] + direction * u(0.6, 1.0))
@@ -380,9 +438,12 @@ def branch(u: Draw) -> Iterator[Hull]:
 
 def handled_tool(u: Draw) -> Iterator[Hull]:
     """A handle with a collar and a head of any form at an angle: spoon, brush, key, ladle, mallet."""
-    length, thick, flat = u(2.4, 4.5), u(0.16, 0.32), u(0.4, 1.0)
+    length = u(2.4, 4.5)
+    thick = u(0.16, 0.32)
+    flat = u(0.4, 1.0)
     head = vec(length, 0.0, 0.0)
-    lean, size = u(-0.9, 0.9), u(0.35, 0.9, 3) * (1.0, 1.0, flat)
+    lean = u(-0.9, 0.9)
+    size = u(0.35, 0.9, 3) * (1.0, 1.0, flat)
     aside = u(-0.3, 0.3)
     yield rod((0, 0, 0), head, thick, thick * u(0.6, 1.0))
     yield cylinder((0.3 * length, 0, 0), (u(0.45, 0.6) * length, 0, 0), thick * u(1.0, 1.4))
@@ -400,8 +461,11 @@ def handled_tool(u: Draw) -> Iterator[Hull]:
 
 def bent_bar(u: Draw) -> Iterator[Hull]:
     """A bar of two or three straight pieces, with a knob near one end: lever, crank, bracket."""
-    thick, depth, bend = u(0.3, 0.55), u(0.3, 0.6), u(-1.1, 1.1)
-    length, rest = u(1.8, 3.2), u(0.5, 1.6)
+    thick = u(0.3, 0.55)
+    depth = u(0.3, 0.6)
+    bend = u(-1.1, 1.1)
+    length = u(1.8, 3.2)
+    rest = u(0.5, 1.6)
     end = vec(length + rest * np.cos(bend), rest * np.sin(bend))
     yield beam((0, 0), (length, 0), thick, depth)
     yield beam((length, 0), end, thick * u(0.7, 1.0), depth)
@@ -427,7 +491,10 @@ def plate(u: Draw) -> Iterator[Hull]:
 
 def open_ring(u: Draw) -> Iterator[Hull]:
     """Six pieces around a flattened ring, one of them heavy, and a stub: ring, clamp, frame, watch."""
-    wide, high, thick, depth = u(0.9, 1.3), u(0.5, 1.1), u(0.22, 0.36), u(0.3, 0.7)
+    wide = u(0.9, 1.3)
+    high = u(0.5, 1.1)
+    thick = u(0.22, 0.36)
+    depth = u(0.3, 0.7)
     count = 6 if u() < 0.7 else 5
     corners = 2.0 * np.pi * np.arange(7) / 6 + u(0.0, 1.0)
     points = np.stack([wide * np.cos(corners), high * np.sin(corners)], axis=1)
@@ -443,7 +510,9 @@ def open_ring(u: Draw) -> Iterator[Hull]:
 
 def hook(u: Draw) -> Iterator[Hull]:
     """A straight shank and an arc of four pieces, with a foot: hook, cane, tap, handle."""
-    shank, radius, thick = u(1.2, 2.6), u(0.5, 0.9), u(0.18, 0.3)
+    shank = u(1.2, 2.6)
+    radius = u(0.5, 0.9)
+    thick = u(0.18, 0.3)
     angles = np.linspace(np.pi, np.pi - u(2.0, 4.0), 5)
     arc = np.stack([radius * (1.0 + np.cos(angles)), shank + radius * np.sin(angles)], axis=1)
     arc = np.insert(arc, 1, u(-0.3, 0.3) * np.linspace(0.0, 1.0, 5) ** 2, axis=1)
@@ -455,7 +524,10 @@ def hook(u: Draw) -> Iterator[Hull]:
 
 def shell(u: Draw) -> Iterator[Hull]:
     """A trough of four wall pieces with one end closed and a tab: scoop, half a shell, soap dish."""
-    radius, length, wall, span = u(0.7, 1.1), u(1.4, 2.6), u(0.14, 0.22), u(2.2, 3.6)
+    radius = u(0.7, 1.1)
+    length = u(1.4, 2.6)
+    wall = u(0.14, 0.22)
+    span = u(2.2, 3.6)
     angles = -0.5 * np.pi + np.linspace(-0.5, 0.5, 5) * span
     for start, end in pairwise(angles):
         outline = [
@@ -470,7 +542,9 @@ def shell(u: Draw) -> Iterator[Hull]:
 
 def mug(u: Draw) -> Iterator[Hull]:
     """A bottom, five walls, a handle of two rods: open, so truly concave."""
-    radius, height, wall = u(0.8, 1.0), u(1.5, 2.2), u(0.14, 0.2)
+    radius = u(0.8, 1.0)
+    height = u(1.5, 2.2)
+    wall = u(0.14, 0.2)
     angles = 2.0 * np.pi * np.arange(6) / 5
     bottom = [(0.95 * radius * np.cos(t), 0.95 * radius * np.sin(t)) for t in angles[:5]]
     yield prism(bottom, 0.0, 1.4 * wall, axis="z")
@@ -479,7 +553,9 @@ def mug(u: Draw) -> Iterator[Hull]:
             (r * np.cos(t), r * np.sin(t)) for r in (radius, radius - wall) for t in (start, end)
         ]
         yield prism(outline, 0.0, height, axis="z")
-    reach, low, high = u(0.5, 0.8), 0.2 * height, u(0.7, 0.9) * height
+    reach = u(0.5, 0.8)
+    low = 0.2 * height
+    high = u(0.7, 0.9) * height
     corner = (-radius - reach, 0.0, u(0.4, 0.6) * height)
     # The middle of the wall opposite the first corner; the rod's cap must not come through it.
     inner = -radius * np.cos(np.pi / 5) - 0.04
@@ -489,15 +565,21 @@ def mug(u: Draw) -> Iterator[Hull]:
 
 def chair(u: Draw) -> Iterator[Hull]:
     """Seat, back, four legs, two arm rests."""
-    width, depth, leg, back = u(1.1, 1.4), u(1.0, 1.3), u(0.8, 1.2), u(1.0, 1.5)
-    thick, splay, lean = u(0.14, 0.2), u(0.0, 0.15), u(0.0, 0.25)
+    width = u(1.1, 1.4)
+    depth = u(1.0, 1.3)
+    leg = u(0.8, 1.2)
+    back = u(1.0, 1.5)
+    thick = u(0.14, 0.2)
+    splay = u(0.0, 0.15)
+    lean = u(0.0, 0.25)
     yield box((0, 0, leg), (depth, width, 0.24))
     behind = (-depth / 2 - lean / 2, 0, leg + back / 2)
     yield box(behind, (0.22, 0.9 * width, back + 0.2), euler=(0, -lean, 0))
     for x, y in product(SIDES, SIDES):
         top = vec(x * (depth / 2 - thick), y * (width / 2 - thick), leg)
         yield rod(top, top * (1 + splay, 1 + splay, 0), thick, 0.8 * thick)
-    arm, rear = u(0.35, 0.5), -depth / 2 - 0.1
+    arm = u(0.35, 0.5)
+    rear = -depth / 2 - 0.1
     rest = [(rear, leg), (depth * 0.3, leg), (depth * 0.4, leg + arm), (rear, leg + arm)]
     for y in SIDES:
         yield prism(rest, y * width / 2 - 0.1, y * width / 2 + 0.1)
@@ -505,12 +587,14 @@ def chair(u: Draw) -> Iterator[Hull]:
 
 def robot(u: Draw) -> Iterator[Hull]:
     """Torso, head, backpack, arms and legs in a pose, antenna."""
-    width, height = u(0.8, 1.1), u(0.9, 1.3)
+    width = u(0.8, 1.1)
+    height = u(0.9, 1.3)
     yield box((0, 0, height / 2), (0.6, width, height), top=(1.0, 1.15))
     yield box((0.05, 0, height + 0.22), (0.5, 0.55, 0.5), euler=(0, 0, u(-0.5, 0.5)))
     yield box((-0.45, 0, 0.6 * height), (0.4, 0.6 * width, 0.6 * height))
     for side in SIDES:
-        shoulder, swing = vec(0.0, side * width * 0.55, height - 0.15), u(-0.9, 2.2)
+        shoulder = vec(0.0, side * width * 0.55, height - 0.15)
+        swing = u(-0.9, 2.2)
         yield rod(
             shoulder,
             shoulder + vec(np.sin(swing), 0.3 * side, -np.cos(swing)) * u(0.8, 1.0),
@@ -525,8 +609,13 @@ def robot(u: Draw) -> Iterator[Hull]:
 
 def camera(u: Draw) -> Iterator[Hull]:
     """Body, lens, hood, grip, finder, dial."""
-    width, height, depth, lens = u(1.7, 2.2), u(1.0, 1.3), u(0.5, 0.7), u(0.36, 0.46)
-    reach, offset, dial = depth / 2 + u(0.4, 0.9), u(-0.3, 0.1), width / 2 - 0.3
+    width = u(1.7, 2.2)
+    height = u(1.0, 1.3)
+    depth = u(0.5, 0.7)
+    lens = u(0.36, 0.46)
+    reach = depth / 2 + u(0.4, 0.9)
+    offset = u(-0.3, 0.1)
+    dial = width / 2 - 0.3
     yield box((0, 0, 0), (depth, width, height))
     yield cylinder((0, offset, 0), (reach, offset, 0), lens)
     yield cylinder((reach - 0.1, offset, 0), (reach + 0.3, offset, 0), lens, 1.2 * lens)

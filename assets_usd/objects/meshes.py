@@ -96,7 +96,8 @@ def scales_that_fit(sides: Sequence[float], width: float, fit: Fit = DCLAW) -> t
         fit: Sizes that fit the hand.
     """
     low, high = fit.longest
-    longest, shortest = float(max(sides)), float(min(sides))
+    longest = float(max(sides))
+    shortest = float(min(sides))
     return max(low / longest, fit.thinnest / shortest), min(high / longest, fit.mean_width / width)
 
 
@@ -107,13 +108,15 @@ def scale_of(
 
     Notes and warnings.
     """
-    sides, width = np.ptp(vertices, axis=0), mean_width(vertices)
+    sides = np.ptp(vertices, axis=0)
+    width = mean_width(vertices)
     fit = fit_of(settings.hand)
     unit = UNITS_M.get(settings.units, declared)
     if not settings.keep_size or unit is None:
         factor, note = choose_scale(sides, width, unit, fit)
         return factor, [note] if note else [], []
-    size, (least, most) = f"{sides.max() * unit:.3f} m", scales_that_fit(sides, width, fit)
+    size = f"{sides.max() * unit:.3f} m"
+    (least, most) = scales_that_fit(sides, width, fit)
     misfit = (
         f"does not fit the hand at its real size of {size}, mean width {width * unit:.3f} m: "
         f"longest side {fit.longest[0]:g} to {fit.longest[1]:g} m, mean width at most "

@@ -25,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.objects.contact_layer import (
     LAYER_FORMAT,
     Identified,
-    author,
     author_contact,
     read_contact,
 )
@@ -131,9 +130,7 @@ class ObjectModel:
         return replace(
             self,
             vertices=self.vertices * np.float32(factor),
-            hulls=tuple(
-                hull._replace(vertices=hull.vertices * np.float32(factor)) for hull in self.hulls
-            ),
+            hulls=tuple(hull.times(np.float32(factor)) for hull in self.hulls),
             inertia=self.inertia * factor**2,
             surface_points=self.surface_points * np.float32(factor),
             centre_of_mass=tuple(factor * c for c in self.centre_of_mass),
@@ -386,13 +383,15 @@ def read_object(path: Path) -> ObjectModel:
     )
 
 
-def write_contact_layer(path: Path, item_file: Path, found: Identified, recording: str) -> None:
+def write_contact_layer(
+    path: Path, item_file: Path, identified: Identified, recording: str
+) -> None:
     """Write what was identified as a layer over an object's file, atomically.
 
     Args:
         path: File to write, ``.usda``.
         item_file: The object's file, which becomes a sublayer.
-        found: What was identified.
+        identified: What was identified.
         recording: From which recording, for people.
 
     Raises:
@@ -400,7 +399,7 @@ def write_contact_layer(path: Path, item_file: Path, found: Identified, recordin
     """
     from pxr import Gf, Sdf
 
-    from vd.assets_usd.hand_layer import save_layer
+    from vd.assets_usd.hand_layer import author, save_layer
 
     item = read_object(item_file)
     layer = Sdf.Layer.CreateAnonymous(".usda")
@@ -413,14 +412,14 @@ def write_contact_layer(path: Path, item_file: Path, found: Identified, recordin
     layer.customLayerData = {"format": LAYER_FORMAT, "recording": recording}
     prim = Sdf.PrimSpec(layer, item.name, Sdf.SpecifierOver)
 
-    author_contact(prim, found)
-    if "mass" in found:
-        mass = found["mass"][0][0]
+    author_contact(prim, identified)
+    if "mass" in identified:
+        mass = identified["mass"][0][0]
         moments = Gf.Vec3f(*map(float, item.inertia * mass / item.mass_kg))
         author(prim, "physics:mass", Sdf.ValueTypeNames.Float, mass)
         author(prim, "physics:diagonalInertia", Sdf.ValueTypeNames.Float3, moments)
-    if "centre_of_mass" in found:
-        centre = Gf.Vec3f(*found["centre_of_mass"][0])
+    if "centre_of_mass" in identified:
+        centre = Gf.Vec3f(*identified["centre_of_mass"][0])
         author(prim, "physics:centerOfMass", Sdf.ValueTypeNames.Point3f, centre)
     save_layer(layer, path)
 

@@ -103,36 +103,34 @@ def find_meshes(paths: Iterable[Path]) -> list[Path]:
         MeshError: A path does not exist, or nothing was found.
     """
     paths = list(paths)
-    found: list[Path] = []
+    files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            found += _meshes_below(path)
+            files += _meshes_below(path)
         elif path.exists() or path.is_symlink():
-            found.append(path)
+            files.append(path)
         else:
             raise MeshError(f"{path}: no such file or folder")
-    if not found:
+    if not files:
         raise MeshError(
             f"no mesh in {', '.join(map(str, paths))}; supported: {', '.join(MESH_SUFFIXES)}; to "
             "be told what is wrong with a file, name it"
         )
-    return list(dict.fromkeys(map(absolute, found)))
+    return list(dict.fromkeys(map(absolute, files)))
 
 
 def _meshes_below(folder: Path) -> list[Path]:
-    files = sorted(
-        path
-        for path in folder.rglob("*")
-        if path.is_file()
-        and path.suffix.lower() in MESH_SUFFIXES
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    )
-    usd = [path for path in files if path.suffix.lower().startswith(".usd")]
-    left_out = {path for path in usd if stored_facts(path)}
-    for path in usd:
-        if path not in left_out:
-            left_out |= _parts_of_usd(path)
-    return [path for path in files if path not in left_out and path.resolve() not in left_out]
+    files = []
+    left_out: set[Path] = set()
+    for path in sorted(folder.rglob("*")):
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        suffix = path.suffix.lower()
+        if hidden or suffix not in MESH_SUFFIXES or not path.is_file():
+            continue
+        files.append(path)
+        if suffix.startswith(".usd"):
+            left_out |= {path.resolve()} if stored_facts(path) else _parts_of_usd(path)
+    return [path for path in files if path.resolve() not in left_out]
 
 
 def _parts_of_usd(path: Path) -> set[Path]:
@@ -213,7 +211,8 @@ def check_target(job: Job) -> None:
             f"{target} is there and no object of vd-assets, or a damaged one; remove it, or import "
             "into another folder (--out)"
         )
-    source, file = str(facts.get("source", "")), str(facts.get("file", ""))
+    source = str(facts.get("source", ""))
+    file = str(facts.get("file", ""))
     # Objects of versions that recorded no file are told by the name in their source.
     if file and os.path.realpath(file) == os.path.realpath(job.source):
         return

@@ -33,11 +33,12 @@ def vec(*components: float) -> np.ndarray:
 
 def _unit_sphere() -> np.ndarray:
     """The 12 vertices of an icosahedron and the 20 of its dual, on the unit sphere, [32, 3]."""
-    points = [np.roll([0.0, i, j * GOLDEN], k) for i, j, k in product((-1, 1), (-1, 1), range(3))]
-    points += [np.array(corner, dtype=float) for corner in product((-1, 1), repeat=3)]
-    points += [
-        np.roll([0.0, i * GOLDEN, j / GOLDEN], k) for i, j, k in product((-1, 1), (-1, 1), range(3))
-    ]
+    points = []
+    for i, j, k in product((-1, 1), (-1, 1), range(3)):
+        points.append(np.roll([0.0, i, j * GOLDEN], k))
+    points += map(np.array, product((-1.0, 1.0), repeat=3))
+    for i, j, k in product((-1, 1), (-1, 1), range(3)):
+        points.append(np.roll([0.0, i * GOLDEN, j / GOLDEN], k))
     sphere = np.array(points)
     return sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
 
@@ -46,8 +47,7 @@ _SPHERE = _unit_sphere()
 
 
 def _placed(points: np.ndarray, centre: Vector, euler: Vector) -> Hull:
-    rotation = Rotation.from_euler("xyz", np.asarray(euler, dtype=float))
-    return convex_hull(rotation.apply(points) + np.asarray(centre, dtype=float))
+    return convex_hull(Rotation.from_euler("xyz", euler).apply(points) + centre)
 
 
 def _frame(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -69,35 +69,44 @@ def box(
 ) -> Hull:
     """Box of full side lengths ``size``; its upper face (z) is scaled by ``top``."""
     corners = np.array(list(product((-0.5, 0.5), repeat=3)))
-    corners[corners[:, 2] > 0.0, :2] *= np.asarray(top, dtype=float)
-    return _placed(corners * np.asarray(size, dtype=float), centre, euler)
+    corners[corners[:, 2] > 0.0, :2] *= top
+    return _placed(corners * size, centre, euler)
 
 
 def ellipsoid(centre: Vector, radii: Vector, *, euler: Vector = (0, 0, 0)) -> Hull:
     """Ellipsoid with 32 vertices on its surface."""
-    return _placed(_SPHERE * np.asarray(radii, dtype=float), centre, euler)
+    return _placed(_SPHERE * radii, centre, euler)
 
 
 def rod(start: Vector, end: Vector, radius: float, end_radius: float | None = None) -> Hull:
     """Capsule between two points, tapered if ``end_radius`` is given; 30 vertices."""
-    a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    a = np.asarray(start, dtype=float)
+    b = np.asarray(end, dtype=float)
     axis, u, v = _frame(a, b)
-    points = []
-    for centre, out, r in (
-        (a, -axis, radius),
-        (b, axis, radius if end_radius is None else end_radius),
-    ):
-        ring = _ring(u, v, 8)
-        cap = (_ring(u, v, 6, 0.3) + out) / 2.0**0.5
-        points += [centre + r * ring, centre + r * cap, (centre + r * out)[None]]
-    return convex_hull(np.concatenate(points))
+    return convex_hull(
+        np.concatenate(
+            [
+                _rounded_end(a, -axis, u, v, radius),
+                _rounded_end(b, axis, u, v, radius if end_radius is None else end_radius),
+            ]
+        )
+    )
+
+
+def _rounded_end(
+    centre: np.ndarray, out: np.ndarray, u: np.ndarray, v: np.ndarray, radius: float
+) -> np.ndarray:
+    """A ring, a smaller one and the pole of a half ball that looks out, [15, 3]."""
+    cap = (_ring(u, v, 6, 0.3) + out) / 2.0**0.5
+    return centre + radius * np.concatenate([_ring(u, v, 8), cap, out[None]])
 
 
 def cylinder(
     start: Vector, end: Vector, radius: float, end_radius: float | None = None, sides: int = SIDES
 ) -> Hull:
     """Cylinder or truncated cone between two points."""
-    a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    a = np.asarray(start, dtype=float)
+    b = np.asarray(end, dtype=float)
     _, u, v = _frame(a, b)
     ring = _ring(u, v, sides)
     return convex_hull(
@@ -119,8 +128,10 @@ def prism(outline: npt.ArrayLike, low: float, high: float, *, axis: str = "y") -
 
 def beam(start: npt.ArrayLike, end: npt.ArrayLike, width: float, depth: float) -> Hull:
     """Flat stroke between two points of the x-z plane, ``width`` wide in it and ``depth`` thick along y."""
-    a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    a = np.asarray(start, dtype=float)
+    b = np.asarray(end, dtype=float)
     along = (b - a) / np.linalg.norm(b - a)
     across = np.array([-along[1], along[0]]) * width / 2.0
-    a, b = a - along * width / 2.0, b + along * width / 2.0
+    a = a - along * width / 2.0
+    b = b + along * width / 2.0
     return prism([a + across, a - across, b - across, b + across], -depth / 2.0, depth / 2.0)

@@ -50,7 +50,8 @@ MIN_ASYMMETRY = 0.012
 12 cm.
 """
 
-STRETCH, SHEAR = 0.35, 0.25
+STRETCH = 0.35
+SHEAR = 0.25
 """Spread of the random stretch of each axis (log scale) and of the shear of x by z: one kind then
 gives short and long, fat and lean objects."""
 
@@ -103,7 +104,8 @@ def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
 
     Vertices [V, 3], faces [T, 3].
     """
-    vertices, faces = [], []
+    vertices = []
+    faces = []
     for i, hull in enumerate(hulls):
         inside = np.zeros(len(hull.faces), dtype=bool)
         for j, other in enumerate(hulls):
@@ -134,7 +136,7 @@ def model_of_parts(
     """
     everything = np.concatenate([h.vertices for h in hulls])
     scale = 1.0 if longest_side is None else longest_side / float(np.ptp(everything, axis=0).max())
-    parts = [Hull(h.vertices * scale, h.faces) for h in hulls]
+    parts = [hull.times(scale) for hull in hulls]
     vertices, faces = union_surface(parts)
     points = surface_points(vertices, faces, SURFACE_POINTS, outside=parts)
     return build_model(
@@ -172,7 +174,8 @@ def draw_object(
     u = Draw(np.random.PCG64(seed))
     for _ in range(ATTEMPTS):
         # One random stretch and shear keeps parts convex and y a mirror axis.
-        hulls, matrix = list(make(u)), np.diag(np.exp(u(-STRETCH, STRETCH, 3)))
+        hulls = list(make(u))
+        matrix = np.diag(np.exp(u(-STRETCH, STRETCH, 3)))
         matrix[0, 2] = u(-SHEAR, SHEAR)
         hulls = [Hull(hull.vertices @ matrix.T, hull.faces) for hull in hulls]
         longest = float(u(*LONGEST_SIDE_M))

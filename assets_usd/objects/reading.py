@@ -136,7 +136,8 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     vertices: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
-    furthest, where = -1, 0
+    furthest = -1
+    where = 0
     text = re.sub(rb"\\\r?\n", b" ", Path(path).read_bytes())
     for number, line in enumerate(text.splitlines(), 1):
         word, *rest = line.partition(b"#")[0].split() or [b""]
@@ -148,7 +149,8 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
                 corners = [_corner(name, len(vertices)) for name in rest]
                 faces += [(corners[0], *pair) for pair in pairwise(corners[1:])]
                 if max(corners) > furthest:
-                    furthest, where = max(corners), number
+                    furthest = max(corners)
+                    where = number
         except (ValueError, IndexError) as error:
             shown = line.decode(errors="replace").strip()[:60]
             raise MeshError(f"damaged: line {number} is {shown!r}; export it again") from error

@@ -24,7 +24,8 @@ from vd.assets_usd.objects.settings import MeshError
 CONVEX = 0.99
 """A closed piece that fills this share of its convex hull is taken as convex."""
 
-STRAY_AREA, STRAY_VOLUME = 0.01, 1e-3
+STRAY_AREA = 0.01
+STRAY_VOLUME = 1e-3
 """A piece with less of the surface, which encloses nothing or less of the volume, is a stray: scans
 have single triangles inside and beside them."""
 
@@ -93,7 +94,7 @@ class RepairedMesh:
         return replace(
             self,
             vertices=self.vertices * factor,
-            pieces=tuple(Hull(p.vertices * factor, p.faces) for p in self.pieces),
+            pieces=tuple(hull.times(factor) for hull in self.pieces),
             cavity_vertices=self.cavity_vertices * factor,
         )
 
@@ -217,7 +218,8 @@ def _without_strays(mesh: Any, notes: list[str], warnings: list[str]) -> Any:
     A long one that touches, as by their boxes, is a thin part: an antenna, a ring of wire.
     """
     of_face, pieces = _pieces(mesh)
-    area, volume = np.array([piece.area for piece in pieces]), np.abs(_volumes(pieces))
+    area = np.array([piece.area for piece in pieces])
+    volume = np.abs(_volumes(pieces))
     stray = (area < STRAY_AREA * area.sum()) & (volume <= STRAY_VOLUME * volume.sum())
     if stray.all():
         return mesh
@@ -280,7 +282,8 @@ def _containers(pieces: list[Any], volume: np.ndarray) -> tuple[np.ndarray, np.n
 
     Itself if in none.
     """
-    largest, smallest = np.arange(len(pieces)), np.arange(len(pieces))
+    largest = np.arange(len(pieces))
+    smallest = np.arange(len(pieces))
     low, high = np.stack([piece.bounds for piece in pieces], axis=1)
     for outer in np.argsort(np.abs(volume))[::-1]:
         if not volume[outer]:

@@ -70,7 +70,8 @@ def surface_of_scan(points: np.ndarray, device: str = "cpu") -> Surface:
     areas = share.T @ np.linalg.solve(weights, np.full(len(points), 0.5))
     level = float(np.median(share @ areas))
 
-    low, high = points.min(axis=0), points.max(axis=0)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     pitch = float((high - low).max()) / CELLS
     corner = low - MARGIN_CELLS * pitch
     x, y, z = (np.ceil((high - low) / pitch).astype(int) + 1 + 2 * MARGIN_CELLS).tolist()

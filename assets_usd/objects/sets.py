@@ -114,7 +114,8 @@ def _place(entry: str | Path) -> Path:
         ObjectError: There are none, and the message lists the sets and the commands that make
             more; or the name means two places.
     """
-    path, root = Path(entry).expanduser(), objects_dir()
+    path = Path(entry).expanduser()
+    root = objects_dir()
     if isinstance(entry, str) and is_built_in(entry) and not path.is_file():
         return built_in_folder(entry)
     named = root / path.name if path.name == str(entry) else root
@@ -187,11 +188,11 @@ def load_set(names_or_paths: str | Path | Iterable[str | Path]) -> list[ObjectMo
         [names_or_paths] if isinstance(names_or_paths, str | Path) else names_or_paths
     )
     models = [read_object(path) for path in files]
-    seen: dict[str, Path] = {}
+    files_by_name: dict[str, Path] = {}
     for model, path in zip(models, files, strict=True):
-        if model.name in seen:
+        if model.name in files_by_name:
             raise ObjectError(
-                f"{path}: object {model.name} is also in {seen[model.name]}; leave one out"
+                f"{path}: object {model.name} is also in {files_by_name[model.name]}; leave one out"
             )
-        seen[model.name] = path
+        files_by_name[model.name] = path
     return models

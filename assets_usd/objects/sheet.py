@@ -23,13 +23,16 @@ VIEW = {"elev": 24.0, "azim": -52.0}
 ZOOM = 1.6
 """Of matplotlib's boxes, so that a ball around the object fills its axes."""
 
-TILE_IN, MARGIN_IN = 1.7, 0.1
+TILE_IN = 1.7
+MARGIN_IN = 0.1
 """Side of a picture, and what is left free about texts [inch]; 100 pixels each."""
 
-CAPTION_POINTS, TITLE_POINTS = 7, 11
+CAPTION_POINTS = 7
+TITLE_POINTS = 11
 """Sizes of the font."""
 
-LETTER, LINE = 0.6, 1.25
+LETTER = 0.6
+LINE = 1.25
 """Width of a usual letter and height of a line, as shares of the font's size."""
 
 
@@ -101,34 +104,42 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
     Returns:
         The path.
     """
-    errors = [model.volume_error for model in models]
     columns = max(1, round(np.sqrt(len(models) / 2)))
     rows = -(-len(models) // columns)
     width = columns * 2 * TILE_IN
+    errors = [model.volume_error for model in models]
+    summary = f"volume error {np.median(errors):.1%}, worst {max(errors):.1%}"
     head = _lines(f"{title}, objects: {len(models)}", TITLE_POINTS, width)
-    errors_said = f"volume error {np.median(errors):.1%}, worst {max(errors):.1%}"
-    head += _lines(errors_said, TITLE_POINTS, width)
+    head += _lines(summary, TITLE_POINTS, width)
     captions = [_caption(model) for model in models]
-    heights = []
-    for row in range(rows):
-        beside = captions[row * columns : (row + 1) * columns]
-        lines = max(caption.count("\n") + 1 for caption in beside)
-        heights.append(TILE_IN + _height_in(lines, CAPTION_POINTS))
-    size = (width, sum(heights) + _height_in(len(head), TITLE_POINTS) + MARGIN_IN)
-    figure = Figure(size, dpi=100)
+    most_lines = max(caption.count("\n") + 1 for caption in captions)
+    caption_in = _height_in(most_lines, CAPTION_POINTS)
+    head_in = _height_in(len(head), TITLE_POINTS) + MARGIN_IN
+    height = rows * (TILE_IN + caption_in) + head_in
+    figure = Figure((width, height), dpi=100)
+    cells = figure.add_gridspec(
+        2 * rows,
+        2 * columns,
+        height_ratios=[TILE_IN, caption_in] * rows,
+        left=0.0,
+        right=1.0,
+        bottom=0.0,
+        top=1.0 - head_in / height,
+        wspace=0.0,
+        hspace=0.0,
+    )
     for i, model in enumerate(models):
-        left = (i % columns) * 2 * TILE_IN
-        top = sum(heights[i // columns :])
-        hulls = [(hull.vertices, hull.faces) for hull in model.hulls]
-        hues = [part_colour(k, 0.52, 0.97) for k in range(len(hulls))]
-        for k, (drawn, colours) in enumerate(
-            [([(model.vertices, model.faces)], [MESH_COLOUR]), (hulls, hues)]
-        ):
-            place = np.divide((left + k * TILE_IN, top - TILE_IN, TILE_IN, TILE_IN), (*size, *size))
-            _draw(figure.add_axes(tuple(place), projection="3d"), drawn, colours)
-        at = ((left + MARGIN_IN) / size[0], (top - TILE_IN) / size[1])
+        row, column = divmod(i, columns)
+        drawing = figure.add_subplot(cells[2 * row, 2 * column], projection="3d")
+        left, bottom = drawing.get_position(original=True).p0
+        _draw(drawing, [(model.vertices, model.faces)], [MESH_COLOUR])
+        hues = [part_colour(number, 0.52, 0.97) for number in range(len(model.hulls))]
+        _draw(
+            figure.add_subplot(cells[2 * row, 2 * column + 1], projection="3d"), model.hulls, hues
+        )
         colour = WARNING_COLOUR if model.warnings else "black"
-        figure.text(*at, captions[i], fontsize=CAPTION_POINTS, va="top", color=colour)
-    at = (MARGIN_IN / size[0], 1.0 - MARGIN_IN / size[1])
-    figure.text(*at, "\n".join(head), fontsize=TITLE_POINTS, va="top")
+        left += MARGIN_IN / width
+        figure.text(left, bottom, captions[i], fontsize=CAPTION_POINTS, va="top", color=colour)
+    corner = (MARGIN_IN / width, 1.0 - MARGIN_IN / height)
+    figure.text(*corner, "\n".join(head), fontsize=TITLE_POINTS, va="top")
     return save_figure(figure, path)

@@ -125,7 +125,8 @@ def _triangles(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     )
     if not sound:
         raise MeshError(f"{mesh.GetPath()} is no valid mesh: {why}; export it again")
-    corners, counts = np.array(corners, dtype=np.int64), np.array(counts, dtype=np.int64)
+    corners = np.array(corners, dtype=np.int64)
+    counts = np.array(counts, dtype=np.int64)
     triangles = np.maximum(counts - 2, 0)
     first_corner = np.repeat(np.cumsum(counts) - counts, triangles)
     step = 1 + np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles)

@@ -81,10 +81,10 @@ def calibrate(cfg: CalibrateCfg) -> int:
     check_file(cfg.out)  # a person's work is not to be lost
     views = take(cfg, fingers)
     thought = np.concatenate([hand.camera.position, hand.camera.quaternion])
-    found = solve(views, thought, {finger: seat(hand, finger, thought) for finger in fingers})
-    error_m = found.point_error(hand.goal_in_base)
-    write_camera_layer(cfg.out, hand, found, error_m)
-    print("\n".join(report(hand, found, views, error_m)))
+    estimate = solve(views, thought, {finger: seat(hand, finger, thought) for finger in fingers})
+    error_m = estimate.point_error(hand.goal_in_base)
+    write_camera_layer(cfg.out, hand, estimate, error_m)
+    print("\n".join(report(hand, estimate, views, error_m)))
     print(f"written to {cfg.out}; vd-deploy --camera-layer {cfg.out}")
     if error_m <= LARGEST_ERROR_M:
         return 0
@@ -124,7 +124,9 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
         camera = RealSense(find_device(cfg.camera.serial), cfg.camera, infrared=True)
         stack.callback(camera.close)
         connection = stack.enter_context(connect(cfg))
-        hand, bus, joints = connection.hand, connection.bus, connection.joints
+        hand = connection.hand
+        bus = connection.bus
+        joints = connection.joints
         confirm("The torque goes off, and the hand lets go.", yes=cfg.yes)
         with held():  # else some motors would keep their torque
             failed = bus.torque(False)
@@ -135,7 +137,9 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
             "still."
         )
         poses: dict[int, list[np.ndarray]] = {number: [] for number in fingers}
-        tip, finger, corners = [], [], []
+        tip = []
+        finger = []
+        corners = []
         while min(map(len, poses.values())) < cfg.count:
             before = joints.to_joint(bus.read_state().position)
             image = camera.read(IMAGE_S).image
@@ -144,17 +148,20 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
                 continue
             joint_q = 0.5 * (before + after)
             for number, square in find_markers(image).items():
-                own = joint_q[3 * number : 3 * number + 3]
+                finger_q = joint_q[3 * number : 3 * number + 3]
                 if number in poses and all(
-                    np.abs(own - other).max() > SAME_RAD for other in poses[number]
+                    np.abs(finger_q - other).max() > SAME_RAD for other in poses[number]
                 ):
-                    poses[number].append(own)
+                    poses[number].append(finger_q)
                     tip.append(hand.tip_poses(joint_q)[number])
                     finger.append(number)
                     corners.append(square)
-            said = ", ".join(str(len(kept)) for kept in poses.values())
+            counts = ", ".join(str(len(kept)) for kept in poses.values())
             print(
-                f"\r{said} of {cfg.count} views of each finger", end="", file=sys.stderr, flush=True
+                f"\r{counts} of {cfg.count} views of each finger",
+                end="",
+                file=sys.stderr,
+                flush=True,
             )
         print(file=sys.stderr)
         return Views(

@@ -28,7 +28,7 @@ class Frame:
     """When it was exposed [s], on the clock of :func:`time.monotonic`."""
 
 
-class Camera(Protocol):
+class ImageSource(Protocol):
     """Where images come from. Optical frame: x right, y down, z forward."""
 
     @property

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vd.assets_usd.hand_data import CameraModel
-from vd.deploy.camera.camera import Camera, CameraError
+from vd.deploy.camera.camera import CameraError, ImageSource
 from vd.deploy.clock import MONOTONIC, Clock, from_future
 from vd.deploy.finding import Finding, finding
 
@@ -65,7 +65,8 @@ class ObjectPlace:
         first = np.maximum(np.round(np.array([column, row]) - half), 0).astype(int)
         last = np.maximum(np.round(np.array([column, row]) + half), 0).astype(int)
         self._columns, self._rows = map(slice, first, last)
-        self._near, self._far = camera.near, camera.far
+        self._near = camera.near
+        self._far = camera.far
 
     def seen(self, image: np.ndarray) -> float:
         """Share of the pixels about it that show a surface: depth in range, like its neighbours'.
@@ -87,7 +88,7 @@ class ObjectPlace:
         return float(surface.mean())
 
 
-class Sight:
+class SightWatch:
     """Whether a camera goes on seeing the object's place, and the object, while the hand moves.
 
     Arguments are those of :class:`ObjectPlace`.
@@ -108,7 +109,8 @@ class Sight:
             joint_q: Where the joints are meanwhile [rad] [D].
         """
         if not np.array_equal(image, self._image):
-            self._image, self._joint_q = image, joint_q
+            self._image = image
+            self._joint_q = joint_q
         elif np.abs(joint_q - self._joint_q).max() > MOVED_RAD:
             return f"the same image comes again and again, though the hand moves: {REPLUG}"
         share = self._place.seen(image)
@@ -136,7 +138,12 @@ def _unseen(share: float, wanted: float) -> str:
 
 
 def camera_findings(
-    camera: Camera, place: CameraModel, around: np.ndarray, *, fps: float, clock: Clock = MONOTONIC
+    camera: ImageSource,
+    place: CameraModel,
+    around: np.ndarray,
+    *,
+    fps: float,
+    clock: Clock = MONOTONIC,
 ) -> Iterator[Finding]:
     """Look at a camera.
 
@@ -162,11 +169,11 @@ def camera_findings(
     height, width = frames[-1].image.shape
     yield Finding("camera streams", True, f"{len(frames)} images of {width} x {height}")
     yield _rate(np.array([frame.time_s for frame in frames]), float(np.median(ages)), fps)
-    seen = camera.intrinsics.seen_from(place)
-    place_seen = ObjectPlace(seen, around)
-    yield _lens(seen, place_seen.spot)
+    lens = camera.intrinsics.seen_from(place)
+    place_seen = ObjectPlace(lens, around)
+    yield _lens(lens, place_seen.spot)
     images = [frame.image for frame in frames]
-    valid = np.mean([(image >= seen.near) & (image <= seen.far) for image in images])
+    valid = np.mean([(image >= lens.near) & (image <= lens.far) for image in images])
     share = float(np.mean([place_seen.seen(image) for image in images]))
     if share < DEPTH_SHARE:
         yield Finding("camera depth", False, _unseen(share, DEPTH_SHARE))

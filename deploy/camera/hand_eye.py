@@ -128,14 +128,17 @@ def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -
     rows = _enough(views.finger, np.arange(len(views)))
     if len(rows) < LEAST_VIEWS:
         raise HandEyeError(f"{len(rows)} views of a marker; take at least {LEAST_VIEWS}, better 30")
-    views, turned = views.chosen(rows), {}
+    views = views.chosen(rows)
+    turned = {}
     for finger in np.unique(views.finger):
         options = [_turned(markers[int(finger)], quarter) for quarter in range(4)]
         mine = views.chosen(np.flatnonzero(views.finger == finger))
-        turned[int(finger)] = min(options, key=lambda one: np.median(_off(mine, camera, one)))
-    found = refine(views, camera, turned, robust=True)
+        turned[int(finger)] = min(options, key=lambda marker: np.median(_off(mine, camera, marker)))
+    estimate = refine(views, camera, turned, robust=True)
     for _ in range(2):
-        off = _off(views, found.camera, np.stack([found.markers[int(f)] for f in views.finger]))
+        off = _off(
+            views, estimate.camera, np.stack([estimate.markers[int(f)] for f in views.finger])
+        )
         rows = _enough(views.finger, np.flatnonzero(off < INLIER_PX))
         if len(rows) < max(LEAST_VIEWS, len(views) / 2):
             raise HandEyeError(
@@ -143,9 +146,9 @@ def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -
                 "side, that it sits firmly, that fingers and motors are numbered as in the "
                 "calibration, light, and that the camera is roughly where the hand's file has it"
             )
-        again = refine(views.chosen(rows), found.camera, found.markers)
-        found = replace(again, markers=found.markers | again.markers, inliers=rows)
-    return found
+        again = refine(views.chosen(rows), estimate.camera, estimate.markers)
+        estimate = replace(again, markers=estimate.markers | again.markers, inliers=rows)
+    return estimate
 
 
 def _enough(finger: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -182,7 +185,8 @@ def refine(
 
     loss = {"loss": "soft_l1", "f_scale": ROBUST_PX} if robust else {}
     result = least_squares(residual, np.zeros(6 * len(start)), x_scale="jac", **loss)
-    now, count = poses(result.x), len(views)
+    now = poses(result.x)
+    count = len(views)
     covariance, freedom = _scatter(result.jac, result.fun, count)
     # Steps of the camera's place are in the base, turns about its own axes: as HandEye has them.
     return HandEye(
@@ -214,8 +218,8 @@ def _scatter(jacobian: np.ndarray, residual: np.ndarray, views: int) -> tuple[np
     middle = np.zeros_like(normal)
     for view in range(views):
         part = slice(rows * view, rows * (view + 1))
-        own = jacobian[part]
-        score = own.T @ np.linalg.solve(np.eye(rows) - own @ inverse @ own.T, residual[part])
+        block = jacobian[part]
+        score = block.T @ np.linalg.solve(np.eye(rows) - block @ inverse @ block.T, residual[part])
         middle += np.outer(score, score)
     freedom = max(1, round(views - jacobian.shape[1] / rows))
     return inverse @ middle @ inverse * (views - 1) / views, freedom

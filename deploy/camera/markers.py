@@ -63,7 +63,7 @@ def find_markers(
     detector = cv.aruco.ArucoDetector(_dictionary(cv, dictionary), parameters)
     corners, numbers, _ = detector.detectMarkers(np.ascontiguousarray(image))
     rows = [] if numbers is None else zip(numbers.ravel(), corners, strict=True)
-    return {int(number): found.reshape(4, 2).astype(float) + 0.5 for number, found in rows}
+    return {int(number): square.reshape(4, 2).astype(float) + 0.5 for number, square in rows}
 
 
 def save_marker(path: Path, number: int, side_m: float) -> None:

@@ -124,7 +124,8 @@ class RealSense:
             if self._sensor.supports(option):  # a D405 has no projector
                 self._sensor.set_option(option, value)
         side = 1 if infrared else cfg.decimation
-        self._infrared, self._decimate = infrared, rs.decimation_filter(side) if side > 1 else None
+        self._infrared = infrared
+        self._decimate = rs.decimation_filter(side) if side > 1 else None
         lens = _intrinsics(profile.as_video_stream_profile())
         self.intrinsics = Intrinsics(
             lens.width // side,
@@ -155,7 +156,8 @@ class RealSense:
                     f"no image from the camera within {timeout_s:.2f} s; check its cable (USB 3) "
                     f"and power"
                 )
-            frame, self._newest = self._newest, None
+            frame = self._newest
+            self._newest = None
         if frame.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock:
             raise CameraError(
                 "the camera stamps its images by a clock of its own, so nobody knows their age: "
@@ -185,17 +187,17 @@ def _choose(device: Any, stream: Any, pixels: Any, cfg: RealSenseCfg) -> tuple[A
     Raises:
         CameraError: There is none; names those that there are.
     """
-    found = []
+    offered = []
     for sensor in device.query_sensors():
         for profile in sensor.get_stream_profiles():
             wanted = profile.stream_type() == stream and profile.format() == pixels
             if not wanted or profile.stream_index() > 1:
                 continue
             video = profile.as_video_stream_profile()
-            found.append((video.width(), video.height(), video.fps()))
-            if found[-1] == (cfg.width, cfg.height, cfg.fps):
+            offered.append((video.width(), video.height(), video.fps()))
+            if offered[-1] == (cfg.width, cfg.height, cfg.fps):
                 return sensor, profile
-    sizes = ", ".join(f"{w} x {h} at {fps} Hz" for w, h, fps in sorted(set(found), reverse=True))
+    sizes = ", ".join(f"{w} x {h} at {fps} Hz" for w, h, fps in sorted(set(offered), reverse=True))
     raise CameraError(
         f"the camera has no {stream.name} images of {cfg.width} x {cfg.height} at {cfg.fps} Hz; "
         f"it has {sizes or 'none at all'}. On USB 2 it has fewer: use a USB 3 cable and port"

@@ -23,7 +23,7 @@ def monotonic(stamp: Any) -> float:
 
 
 class RosCamera:
-    """Depth images of a topic, as :class:`vd.deploy.camera.camera.Camera`.
+    """Depth images of a topic, as :class:`vd.deploy.camera.camera.ImageSource`.
 
     Raises:
         CameraError: There is no camera_info, or its images are distorted.
@@ -33,7 +33,9 @@ class RosCamera:
         from rclpy.qos import qos_profile_sensor_data
         from sensor_msgs.msg import CameraInfo, Image
 
-        self._node, self._lens, self._newest = node, cast(Any, None), cast(Any, None)
+        self._node = node
+        self._lens = cast(Any, None)
+        self._newest = cast(Any, None)
         self._arrived = threading.Condition()
         self._held = [
             node.create_subscription(kind, topic, take, qos_profile_sensor_data)
@@ -73,7 +75,8 @@ class RosCamera:
             if not self._arrived.wait_for(lambda: self._newest is not None, timeout_s):
                 where = self._node.resolve_topic_name(IMAGES)
                 raise StaleCamera(f"no image on {where} within {timeout_s:.2f} s")
-            image, self._newest = self._newest, None
+            image = self._newest
+            self._newest = None
         if image.encoding not in DEPTHS:
             raise CameraError(
                 f"images are {image.encoding}; depth is {' or '.join(DEPTHS)}: remap {IMAGES}"
@@ -92,5 +95,5 @@ class RosCamera:
 
     def close(self) -> None:
         """Listen no more."""
-        for one in self._held:
-            self._node.destroy_subscription(one)
+        for subscription in self._held:
+            self._node.destroy_subscription(subscription)

@@ -16,13 +16,15 @@ from vd.deploy.hardware.control_table import (
     FULL_PWM,
     RAD_S_PER_COUNT,
     TICK_MODULUS,
-    Item,
     Model,
     table,
     to_angle,
 )
-from vd.deploy.hardware.packets import ALERT, Failure
 
+ALERT = 0x80
+"""Bit of a status packet's error byte: the motor's hardware error status is not zero."""
+STATUS = 0x55
+"""Instruction of a status packet."""
 STATE_ADDRESS, STATE_BYTES = 120, 27
 """From the realtime tick to the temperature: one read for the whole state."""
 OTHER_BYTES = STATE_BYTES + 1
@@ -59,7 +61,7 @@ class GarbledError(BusError):
 
 @dataclass(frozen=True)
 class HandState:
-    """State at one reading of all motors, or by :meth:`Joints.state` of their joints.
+    """State at one reading of all motors, or by :meth:`JointMotors.state` of their joints.
 
     Arrays have shape [D].
     """
@@ -90,16 +92,10 @@ class Answer:
 
     id: int
     error: int
-    """Error number, with the alert bit."""
+    """Error number; 0 where the motor did what it was told."""
+    alert: bool
+    """Whether it reports a hardware error."""
     data: bytes
-
-    @property
-    def refused(self) -> str:
-        """Why the motor did not do it, in words; empty if it did."""
-        number = self.error & ~ALERT
-        if not number:
-            return ""
-        return f"refused: {Failure(number).name.lower() if number in set(Failure) else f'error {number}'}"
 
 
 def read_answer(frame: bytes) -> Answer | None:
@@ -109,16 +105,18 @@ def read_answer(frame: bytes) -> Answer | None:
     it leaves to us.
     """
     length = int.from_bytes(frame[5:7], "little")
-    if len(frame) < 7 + length or length < 4 or frame[7] != 0x55:
+    if len(frame) < 7 + length or length < 4 or frame[7] != STATUS:
         return None
-    return Answer(frame[4], frame[8], frame[9 : 5 + length])
+    error = frame[8]
+    return Answer(frame[4], error & ~ALERT, bool(error & ALERT), frame[9 : 5 + length])
 
 
 class StateCheck:
     """Makes states of the answers of some motors, and refuses those that cannot follow the last one."""
 
     def __init__(self, ids: Sequence[int], models: Sequence[Model]):
-        self._ids, self._items = tuple(ids), table(models[0])
+        self._ids = tuple(ids)
+        self._items = table(models[0])
         self._current_unit_a = np.array([model.current_unit_a for model in models])
         self.fastest = np.full(len(self._ids), np.inf)
         """Limits of the motors' speeds, as far as they are known [rad/s] [D]."""
@@ -138,12 +136,10 @@ class StateCheck:
         Raises:
             BusError: A state that cannot be.
         """
-        columns = [answer.data for answer in answers]
 
         def column(name: str) -> np.ndarray:
-            item: Item = self._items[name]
-            start = item.address - STATE_ADDRESS
-            return np.array([item.from_bytes(data[start : start + item.size]) for data in columns])
+            item = self._items[name]
+            return np.array([item.within(answer.data, STATE_ADDRESS) for answer in answers])
 
         counts = column("present_position")
         for answer, count in zip(answers, counts, strict=True):
@@ -153,13 +149,13 @@ class StateCheck:
                 )
         state = HandState(
             time_s=time_s,
-            position=np.array([to_angle(int(count)) for count in counts]),
+            position=to_angle(counts),
             velocity=column("present_velocity") * RAD_S_PER_COUNT,
             current=column("present_current") * self._current_unit_a,
             pwm=column("present_pwm") / FULL_PWM,
             voltage=0.1 * column("present_input_voltage"),
             temperature=column("present_temperature").astype(float),
-            alert=np.array([bool(answer.error & ALERT) for answer in answers]),
+            alert=np.array([answer.alert for answer in answers]),
             tick=column("realtime_tick"),
         )
         if self._last is not None:
@@ -170,10 +166,13 @@ class StateCheck:
     def _compare(self, last: HandState, state: HandState) -> None:
         """Refuse a state that cannot follow the last one."""
         elapsed = state.time_s - last.time_s
-        gone = (state.tick - last.tick) % TICK_MODULUS / 1000.0
         span = TICK_MODULUS / 1000.0
-        difference = (gone - elapsed + 0.5 * span) % span - 0.5 * span
-        for id, late in zip(self._ids, difference, strict=True):
+        gone = (state.tick - last.tick) / 1000.0
+        lateness = (gone - elapsed + 0.5 * span) % span - 0.5 * span
+        moved = np.abs(state.position - last.position)
+        possible = SPEED_MARGIN * self.fastest * elapsed + JUMP_RAD
+        for axis, id in enumerate(self._ids):
+            late = lateness[axis]
             if abs(late) > CLOCK_TOLERANCE_S:
                 # A motor that restarted is not heard again before configure(): its gains and limits
                 # are gone.
@@ -182,9 +181,7 @@ class StateCheck:
                     "state: that state was an old one; if this goes on, the motor restarted and "
                     "has to be configured"
                 )
-        for axis, id in enumerate(self._ids):
-            moved = abs(state.position[axis] - last.position[axis])
-            if moved > SPEED_MARGIN * self.fastest[axis] * elapsed + JUMP_RAD:
+            if moved[axis] > possible[axis]:
                 raise BusError(
-                    f"motor {id}: moved {moved:.2f} rad in {elapsed:.3f} s, which it cannot"
+                    f"motor {id}: moved {moved[axis]:.2f} rad in {elapsed:.3f} s, which it cannot"
                 )

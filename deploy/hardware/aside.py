@@ -26,21 +26,29 @@ def aside(hand: HandModel, moving: int) -> np.ndarray:
     Each of the others has one joint aside, the first outward if that will do; it is where it
     touches nothing, or least often.
     """
-    touching, joints = _Touching(hand), np.arange(hand.num_joints)
+    touching = _Touching(hand)
+    joints = np.arange(hand.num_joints)
     middle, half = 0.5 * (hand.lower + hand.upper), 0.5 * (hand.upper - hand.lower)
-    own = hand.joint_finger == moving
-    shares = np.linspace(-ASIDE, ASIDE, STEPS)
-    swept = [middle + share * half * (joints == j) for j in joints[own] for share in shares]
-    pose, placed = middle, {moving}
+    moves = hand.joint_finger == moving
+    swept = []
+    for joint in joints[moves]:
+        swing = half * (joints == joint)
+        swept += [middle + share * swing for share in np.linspace(-ASIDE, ASIDE, STEPS)]
+    pose = middle
+    placed = {moving}
     for finger in sorted(set(range(hand.num_fingers)) - placed):
         placed.add(finger)
-        columns = joints[hand.fingers[finger]]
-        swings = [share * half * (joints == j) for j in columns for share in (ASIDE, -ASIDE)]
-        candidates = [pose + swing for swing in (swings[0], np.zeros_like(pose), *swings[1:])]
-        often = [
-            sum(touching(np.where(own, q, other), placed) for q in swept) for other in candidates
-        ]
-        pose = candidates[int(np.argmin(often))]
+        candidates = []
+        for joint in joints[hand.fingers[finger]]:
+            swing = ASIDE * half * (joints == joint)
+            candidates += [pose + swing, pose - swing]
+        candidates.insert(1, pose)
+        fewest = np.inf
+        for candidate in candidates:
+            touches = sum(touching(np.where(moves, q, candidate), placed) for q in swept)
+            if touches < fewest:
+                fewest = touches
+                pose = candidate
     return pose
 
 
@@ -72,6 +80,7 @@ class _Touching:
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_collision(self._model, self._data)
-        pairs, gaps = self._finger[self._data.contact.geom], self._data.contact.dist
+        pairs = self._finger[self._data.contact.geom]
+        gaps = self._data.contact.dist
         near = gaps < np.where((pairs < 0).any(axis=1), 0.0, CLEARANCE_M)
         return bool((near & np.isin(pairs, [-1, *fingers]).all(axis=1)).any())

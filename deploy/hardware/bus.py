@@ -7,10 +7,9 @@ Which states are accepted, :mod:`vd.deploy.hardware.answers` says. Everything go
 """
 
 import contextlib
-import os
 import termios
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -37,15 +36,18 @@ from vd.deploy.hardware.control_table import (
     Model,
     describe_hardware_error,
     model_name,
-    motor_model,
     table,
     to_counts,
 )
-from vd.deploy.hardware.packets import BROADCAST, STATUS_BYTES, Instruction, Packet, encode, numbers
-from vd.deploy.hardware.port import BAUD_RATE, WAIT_S, open_port, pseudo, sdk
+from vd.deploy.hardware.port import BAUD_RATE, WAIT_S, open_port, sdk
 from vd.deploy.hardware.registers import MotorSettings, different
 
 T = TypeVar("T")
+HEADER = b"\xff\xff\xfd\x00"
+STUFFED = b"\xff\xff\xfd"
+"""What within a packet is followed by one more FD, so that no header appears."""
+STATUS_BYTES = 11
+"""Bytes of a status packet without data."""
 STARVED_S = 0.02
 """A read of the port that returns so much too late may have missed an answer: motors answer within
 5 ms, and the SDK, once it runs again, finds that its 34 ms are over."""
@@ -57,10 +59,8 @@ TWICE = (
     "one with ROBOTIS' DYNAMIXEL Wizard 2.0), or a cable is bad"
 )
 """What garbled answers mean."""
-RETRIES, TWIN_RETRIES = 1, 3
-"""The twin is a process among others, which may not run for longer than the SDK waits for an
-answer.
-"""
+RETRIES = 1
+"""How often to ask again where no sound answer came."""
 LATE_S = 0.02
 """Pause after a question that was asked in vain or again; what arrives meanwhile is dropped."""
 
@@ -74,9 +74,9 @@ class MotorBus:
     Args:
         port: Device, such as /dev/ttyUSB0, or an open port of the SDK's kind.
         ids: Motors in the order of the arrays.
-        models: Model of each, or the name of that of all.
+        models: Model of each.
         baud_rate: To open the device with.
-        retries: How often to ask again where no sound answer came; what suits the port by default.
+        retries: How often to ask again where no sound answer came.
         clock: Time.
 
     Raises:
@@ -87,34 +87,32 @@ class MotorBus:
         self,
         port: Any,
         ids: Sequence[int],
-        models: str | Sequence[Model],
+        models: Sequence[Model],
         *,
         baud_rate: int = BAUD_RATE,
-        retries: int | None = None,
+        retries: int = RETRIES,
         clock: Clock = MONOTONIC,
     ):
         """Open the port."""
-        self.ids, self.clock = tuple(ids), clock
-        self.models = (
-            (motor_model(models),) * len(self.ids) if isinstance(models, str) else tuple(models)
-        )
-        """Model of each motor."""
-        self._model = dict(zip(self.ids, self.models, strict=True))
+        self.ids = tuple(ids)
+        self.clock = clock
+        self._model = dict(zip(self.ids, models, strict=True))
         self._items = {id: table(model) for id, model in self._model.items()}
         self._sdk = sdk()
         self._lock = threading.RLock()
         self._packets = self._sdk.PacketHandler(2.0)
-        self._states = StateCheck(self.ids, self.models)
-        self._goals, self._length = b"", STATE_BYTES
+        self._states = StateCheck(self.ids, models)
+        self._goals = b""
+        self._length = STATE_BYTES
         self._settings: dict[int, MotorSettings] = {}
         self.rejected = 0
         """States that were not accepted."""
         self._port = open_port(port, baud_rate) if isinstance(port, str) else port
-        if retries is None:
-            retries = TWIN_RETRIES if pseudo(self.port) else RETRIES
         self.retries = retries
-        self._late_s = self._listened_s = 0.0
-        self._hear, self._port.readPort = self._port.readPort, self._listen
+        self._late_s = 0.0
+        self._listened_s = 0.0
+        self._hear = self._port.readPort
+        self._port.readPort = self._listen
 
     def __enter__(self) -> "MotorBus":
         return self
@@ -145,7 +143,8 @@ class MotorBus:
     def _line(self) -> Iterator[None]:
         """The bus for one exchange. What the serial port raises becomes a BusError."""
         with self._lock:
-            self._late_s, self._listened_s = 0.0, self.clock.now()
+            self._late_s = 0.0
+            self._listened_s = self.clock.now()
             try:
                 yield
             except (OSError, termios.error, TypeError) as error:  # a closed port raises TypeError
@@ -153,24 +152,31 @@ class MotorBus:
                     f"{self.port} is lost: {error}; is its adapter still there?"
                 ) from error
             finally:
-                self._port.is_using = (
-                    False  # else no packet could follow an exchange that was interrupted
-                )
+                # Else no packet could follow an exchange that was interrupted.
+                self._port.is_using = False
+
+    def _packet(self, id: int, instruction: int, parameters: bytes = b"") -> bytes:
+        """A packet of protocol 2.0 on the wire."""
+        body = bytes([instruction]) + parameters
+        body = body.replace(STUFFED, STUFFED + STUFFED[-1:])
+        packet = HEADER + bytes([id]) + _words(len(body) + 2) + body
+        return packet + _words(self._packets.updateCRC(0, packet, len(packet)))
 
     def _ask(
-        self, id: int, what: str, instruction: Instruction, parameters: bytes = b"", size: int = 0
+        self, id: int, what: str, instruction: int, parameters: bytes = b"", size: int = 0
     ) -> bytes:
         """One exchange with one motor, again if no sound answer came.
 
         The ``size`` bytes of its answer.
         """
-        first = self.clock.now()
+        packet = self._packet(id, instruction, parameters)
+        first_s = self.clock.now()
         for attempt in range(self.retries + 1):
-            last = self.clock.now()
+            last_s = self.clock.now()
             try:
                 with self._line():
-                    self._send(encode(Packet(id, instruction, parameters)), STATUS_BYTES + size)
-                    answer = self._answer(id, size, f"{what}: " if what else "")
+                    self._send(packet, STATUS_BYTES + size)
+                    answer = self._answer(id, size, what)
             except (SilentError, LateError, GarbledError) as error:
                 # An answer that comes now is none to the next question.
                 self.clock.sleep(LATE_S)
@@ -181,36 +187,43 @@ class MotorBus:
                 raise
             else:
                 if attempt:  # it may have been to the first try, and that to the last is as late
-                    self.clock.sleep(LATE_S + last - first)
+                    self.clock.sleep(LATE_S + last_s - first_s)
                 break
-        if answer.refused:
-            raise BusError(f"motor {id}: {what}: {answer.refused}")
+        if answer.error:
+            raise BusError(f"motor {id}: {what}{self._refused(answer)}")
         return answer.data
 
-    def ping_all(self) -> dict[int, tuple[int, int]]:
-        """Model number and firmware version of every motor that answers a ping to all, by ID."""
+    def _refused(self, answer: Answer) -> str:
+        """Why a motor did not do it, in the SDK's words."""
+        words = self._packets.getRxPacketError(answer.error)
+        return f"refused: {words.removeprefix('[RxPacketError] ').rstrip('!.').lower()}"
+
+    def ping_all(self) -> list[int]:
+        """IDs of all motors that answer a ping to all."""
         with self._line():
-            found, _ = self._packets.broadcastPing(self._port)
-        return {int(id): (int(number), int(firmware)) for id, (number, firmware) in found.items()}
+            motors, _ = self._packets.broadcastPing(self._port)
+        return [int(id) for id in motors]
 
     def missing(self) -> dict[int, str]:
         """What is wrong with the motors that do not answer, or are of another model, by ID."""
         wrong = {}
         for id in self.ids:
             try:
-                number = int.from_bytes(self._ask(id, "", Instruction.PING, size=3)[:2], "little")
+                answer = self._ask(id, "", self._sdk.INST_PING, size=3)
             except (SilentError, LateError, GarbledError) as error:
                 wrong[id] = str(error)
-            else:
-                if number != self._model[id].number:
-                    wrong[id] = f"motor {id} is {model_name(number)}, not {self._model[id].name}"
+                continue
+            number = int.from_bytes(answer[:2], "little")
+            if number != self._model[id].number:
+                wrong[id] = f"motor {id} is {model_name(number)}, not {self._model[id].name}"
         return wrong
 
     def read(self, id: int, name: str) -> int:
         """Value of one item of the control table."""
         item = self._items[id][name]
-        where = numbers(item.address, item.size)
-        return item.from_bytes(self._ask(id, f"read {name}", Instruction.READ, where, item.size))
+        where = _words(item.address, item.size)
+        data = self._ask(id, f"read {name}: ", self._sdk.INST_READ, where, item.size)
+        return item.from_bytes(data)
 
     def read_table(self, id: int) -> dict[str, int]:
         """The whole control table of a motor, with one packet: values by item.
@@ -218,17 +231,14 @@ class MotorBus:
         Raises:
             BusError: No sound answer; GarbledError where answers came that were none.
         """
-        data = self._ask(id, "read the control table", Instruction.READ, numbers(0, SIZE), SIZE)
-        return {
-            name: item.from_bytes(data[item.address : item.address + item.size])
-            for name, item in self._items[id].items()
-        }
+        data = self._ask(id, "read its table: ", self._sdk.INST_READ, _words(0, SIZE), SIZE)
+        return {name: item.within(data) for name, item in self._items[id].items()}
 
     def write(self, id: int, name: str, value: int) -> None:
         """Write one item of the control table."""
         item = self._items[id][name]
-        data = numbers(item.address) + item.to_bytes(value)
-        self._ask(id, f"write {value} to {name}", Instruction.WRITE, data)
+        data = _words(item.address) + item.to_bytes(value)
+        self._ask(id, f"write {value} to {name}: ", self._sdk.INST_WRITE, data)
 
     def configure(self, settings: Mapping[int, MotorSettings]) -> None:
         """Torque off, write what differs of the registers that are ours to set, and read all of it back.
@@ -242,8 +252,8 @@ class MotorBus:
             for _ in range(2):  # another operating mode changes the gains
                 for name, (_, wanted) in self._to_set(id, settings[id]).items():
                     self.write(id, name, wanted)
-            for name, (found, wanted) in self._to_set(id, settings[id]).items():
-                wrong.append(f"motor {id}: {name} is {found}, not {wanted}")
+            for name, (value, wanted) in self._to_set(id, settings[id]).items():
+                wrong.append(f"motor {id}: {name} is {value}, not {wanted}")
         if wrong:
             raise BusError("; ".join(wrong))
         with self._lock:
@@ -254,9 +264,9 @@ class MotorBus:
     def _to_set(self, id: int, settings: MotorSettings) -> dict[str, tuple[int, int]]:
         """Registers that are ours to set and differ: value, and the wanted one."""
         rows = different(self.read_table(id), self._model[id], settings)
-        return {one.name: values for one, values in rows.items() if not one.remedy}
+        return {row.name: values for row, values in rows.items() if not row.remedy}
 
-    def torque(self, on: bool, ids: Iterable[int] | None = None) -> dict[int, str]:
+    def torque(self, on: bool, ids: Sequence[int] | None = None) -> dict[int, str]:
         """Switch torque on or off. Goes on to the other motors if one does not answer.
 
         Returns:
@@ -270,16 +280,19 @@ class MotorBus:
                 failed[id] = str(error)
         return failed
 
-    def stiffen(self, share: float) -> None:
-        """Have every motor hold with a share of the position gain that was configured.
+    def stiffen(self, share: float, ids: Sequence[int] | None = None) -> None:
+        """Have motors hold with a share of the position gain that was configured.
 
-        One packet for all, which none answers; the whole gain is written to each, which does.
+        A smaller gain of all motors goes out in one packet, which none answers; else it is written
+        to each, which does.
         """
-        gains = [round(share * self._settings[id].p_gain) for id in self.ids]
-        if share < 1.0:
-            self._write_all("position_p_gain", gains)
+        gains = {}
+        for id in self.ids if ids is None else ids:
+            gains[id] = round(share * self._settings[id].p_gain)
+        if ids is None and share < 1.0:
+            self._write_all("position_p_gain", list(gains.values()))
             return
-        for id, gain in zip(self.ids, gains, strict=True):
+        for id, gain in gains.items():
             self.write(id, "position_p_gain", gain)
 
     def release(self) -> None:
@@ -308,8 +321,12 @@ class MotorBus:
 
     def hardware_errors(self) -> dict[int, str]:
         """Hardware errors of the motors that have one, in words, by ID."""
-        found = {id: self.read(id, "hardware_error_status") for id in self.ids}
-        return {id: describe_hardware_error(bits) for id, bits in found.items() if bits}
+        errors = {}
+        for id in self.ids:
+            bits = self.read(id, "hardware_error_status")
+            if bits:
+                errors[id] = describe_hardware_error(bits)
+        return errors
 
     def write_goals(self, goals: np.ndarray, *, with_state: bool = False) -> None:
         """Send all goals in one packet.
@@ -338,11 +355,10 @@ class MotorBus:
     def _write_all(self, name: str, values: Sequence[int], *, later: bool = False) -> None:
         """Write one item of every motor in one packet, now or with the question for their state."""
         item = self._items[self.ids[0]][name]
-        rows = [
-            bytes([id]) + item.to_bytes(value) for id, value in zip(self.ids, values, strict=True)
-        ]
-        parameters = numbers(item.address, item.size) + b"".join(rows)
-        packet = encode(Packet(BROADCAST, Instruction.SYNC_WRITE, parameters))
+        parameters = _words(item.address, item.size)
+        for id, value in zip(self.ids, values, strict=True):
+            parameters += bytes([id]) + item.to_bytes(value)
+        packet = self._packet(self._sdk.BROADCAST_ID, self._sdk.INST_SYNC_WRITE, parameters)
         with self._line():
             self._goals = packet if later else b""
             if not later:
@@ -371,7 +387,8 @@ class MotorBus:
         try:
             with self._line():
                 asked = self.clock.now()
-                goals, self._goals = self._goals, b""
+                goals = self._goals
+                self._goals = b""
                 heard, answers = self._ask_all(STATE_ADDRESS, self._length, before=goals)
                 took = self.clock.now() - asked
                 if took > CLOCK_TOLERANCE_S:
@@ -418,15 +435,14 @@ class MotorBus:
             length: How many.
             before: Packets to send in one piece with it.
         """
-        question = encode(
-            Packet(BROADCAST, Instruction.SYNC_READ, numbers(address, length) + bytes(self.ids))
-        )
+        parameters = _words(address, length) + bytes(self.ids)
+        question = self._packet(self._sdk.BROADCAST_ID, self._sdk.INST_SYNC_READ, parameters)
         # One time for all: the SDK counts no time for the answers' bytes.
         heard = self._send(before + question, (STATUS_BYTES + length) * len(self.ids))
         answers = [self._answer(id, length) for id in self.ids]
         for answer in answers:
-            if answer.refused:
-                raise BusError(f"motor {answer.id}: {answer.refused}")
+            if answer.error:
+                raise BusError(f"motor {answer.id}: {self._refused(answer)}")
         return heard, answers
 
     def _send(self, packets: bytes, answer_bytes: int = 0) -> float:
@@ -451,11 +467,9 @@ class MotorBus:
             if result != self._sdk.COMM_SUCCESS:
                 break
             answer = read_answer(bytes(frame))
-            if (
-                answer is not None
-                and answer.id == id
-                and (answer.refused or len(answer.data) == size)
-            ):
+            if answer is None or answer.id != id:
+                continue
+            if answer.error or len(answer.data) == size:
                 return answer
         if result == self._sdk.COMM_RX_TIMEOUT or self._late_s > STARVED_S:
             raise self._silence(f"{what}motor {id} does not answer")
@@ -468,11 +482,11 @@ class MotorBus:
             return LateError(
                 f"{what}: this program was {self._late_s:.3f} s late to listen: {BUSY}"
             )
-        if pseudo(self.port):  # a twin has no cable, but this computer's processors
-            load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
-            return SilentError(
-                f"{what}: others may keep the twin from answering ({load}), or its options"
-            )
         return SilentError(
             f"{what}: check its cable, power, baud rate and ID, which may be that of another motor"
         )
+
+
+def _words(*values: int) -> bytes:
+    """Numbers of two bytes, as addresses and lengths are."""
+    return b"".join(value.to_bytes(2, "little") for value in values)

@@ -1,7 +1,4 @@
-"""From options to a hand.
-
-Its model, its motors' calibration, and the bus, to real motors or to a twin.
-"""
+"""From options to a hand: its model, its motors' calibration, and the motors or their twin."""
 
 import contextlib
 import sys
@@ -16,9 +13,11 @@ from vd.deploy.hardware.port import BAUD_RATE
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
-    from vd.deploy.hardware.bus import MotorBus
-    from vd.deploy.hardware.joints import Joints
-    from vd.deploy.twin.child import TwinChild
+    from vd.deploy.hardware.joints import JointMotors
+    from vd.deploy.hardware.motors import Motors
+    from vd.deploy.twin.twin import Twin
+
+STARTING = "starting the twin (the first start compiles its kernels for minutes) ..."
 
 
 @dataclass(frozen=True)
@@ -32,11 +31,7 @@ class HandOptions:
     port: str | None = None
     """Serial port of the motors, such as /dev/ttyUSB0."""
     twin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Simulate the motors and the hand in place of --port."""
-    twin_args: str = ""
-    """More options of the twin: --twin-args="--lose 0.01"; see python -m vd.deploy.twin.twin
-    --help.
-    """
+    """Simulate the hand in place of --port."""
     calibration: Path | None = None
     """Calibration file of the joints' motors; by default IDs, directions and zeros are the
     USD's.
@@ -49,13 +44,13 @@ class HandOptions:
 
 @dataclass(frozen=True)
 class Connection:
-    """A hand and the bus to its motors."""
+    """A hand and its motors."""
 
-    joints: "Joints"
+    joints: "JointMotors"
     """Which motor turns which joint of the hand."""
-    bus: "MotorBus"
+    bus: "Motors"
     """Its motors, in the joints' order."""
-    twin: "TwinChild | None" = None
+    twin: "Twin | None" = None
     """The twin, if it is one."""
     ros: Any = None
     """The node, where the hand is behind ROS 2."""
@@ -66,11 +61,11 @@ class Connection:
         return self.joints.hand
 
 
-def motors_of(options: HandOptions) -> "Joints":
+def motors_of(options: HandOptions) -> "JointMotors":
     """The motors of the options' hand.
 
     Raises:
-        ValueError: Port and twin, motor, hand, layer or calibration cannot be used.
+        ValueError: Motor, hand, layer or calibration cannot be used.
     """
     from vd.assets_usd.hands import load_hand
     from vd.deploy.hardware.joints import read_joints
@@ -81,47 +76,27 @@ def motors_of(options: HandOptions) -> "Joints":
 
 @contextlib.contextmanager
 def connect(options: HandOptions, **twin_options: Any) -> Iterator[Connection]:
-    """Open the bus to the hand of the options.
-
-    A twin behind it is started, and ended with the block.
+    """The hand of the options.
 
     Args:
         options: The options.
-        twin_options: Defaults of the twin, if there is one: fields of TwinCommand.
+        twin_options: Arguments of a twin, if it is one.
 
     Raises:
         ValueError: Options that cannot be.
-        TwinError: The twin did not start.
         BusError: The port cannot be opened.
     """
-    from vd.command.line import parse
-    from vd.deploy.hardware.bus import MotorBus
-    from vd.deploy.twin.child import TwinChild
-    from vd.deploy.twin.twin import TwinCommand
-
     joints = motors_of(options)
     if options.twin == (options.port is not None):
         raise ValueError("give --port, such as /dev/ttyUSB0, or --twin for a simulated hand")
-    with contextlib.ExitStack() as stack:
-        twin, port = None, options.port
-        if port is None:
-            default = TwinCommand(
-                hand=options.hand,
-                hand_layer=options.hand_layer,
-                calibration=options.calibration,
-                model=options.motor,
-                **twin_options,
-            )
-            command = parse(
-                TwinCommand, options.twin_args.split(), default=default, prog="--twin-args"
-            )
-            print(
-                "starting the twin (the first start compiles its kernels for minutes) ...",
-                file=sys.stderr,
-                flush=True,
-            )
-            twin = TwinChild(command)
-            stack.callback(twin.close)
-            port = twin.path
-        bus = MotorBus(port, joints.ids, joints.models, baud_rate=options.baud_rate)
-        yield Connection(joints, stack.enter_context(bus), twin)
+    if options.port is None:
+        from vd.deploy.twin.twin import Twin
+
+        print(STARTING, file=sys.stderr, flush=True)
+        twin = Twin(joints, **twin_options)
+        yield Connection(joints, twin, twin)
+        return
+    from vd.deploy.hardware.bus import MotorBus
+
+    with MotorBus(options.port, joints.ids, joints.models, baud_rate=options.baud_rate) as bus:
+        yield Connection(joints, bus)

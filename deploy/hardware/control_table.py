@@ -7,8 +7,11 @@ of the range, velocities in rad/s, currents in A.
 import math
 from dataclasses import dataclass
 from enum import IntFlag
+from typing import TypeVar
 
 import numpy as np
+
+Counts = TypeVar("Counts", float, np.ndarray)
 
 COUNTS_PER_TURN = 4096
 CENTRE = 2048
@@ -17,8 +20,10 @@ FARTHEST_COUNTS = 256 * COUNTS_PER_TURN
 """Range of the extended position mode, 256 turns either way: no sound position lies beyond."""
 RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
 RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
+MAX_ID = 252
+"""Largest ID of a motor."""
 SIZE = 148
-"""Bytes that are simulated: all but the indirect addresses behind."""
+"""Bytes of the table: all but the indirect addresses behind."""
 EEPROM_END = 64
 """Items below are kept without power, and cannot be written while torque is on."""
 POSITION_MODE = 3
@@ -26,7 +31,7 @@ CURRENT_POSITION_MODE = 5
 """Position control under a largest current, over 256 turns either way: position limits do not
 act.
 """
-FULL_PWM = 885.0
+FULL_PWM = 885
 """Counts of the whole supply voltage."""
 WATCHDOG_UNIT_S = 0.02
 """Unit of the bus watchdog."""
@@ -45,16 +50,10 @@ class Item:
     address: int
     size: int
     """Bytes, little-endian."""
-    writable: bool = True
     initial: int = 0
-    low: int | None = None
-    """Least value that can be written; None asks nothing."""
-    high: int | None = None
-
-    @property
-    def signed(self) -> bool:
-        """Whether negative numbers are two's complement."""
-        return self.low is None or self.low < 0
+    """The factory's value."""
+    signed: bool = False
+    """Whether negative numbers are two's complement."""
 
     def to_bytes(self, value: int) -> bytes:
         """Little-endian bytes of a value."""
@@ -63,6 +62,11 @@ class Item:
     def from_bytes(self, data: bytes) -> int:
         """The value of ``size`` bytes."""
         return int.from_bytes(data, "little", signed=self.signed)
+
+    def within(self, data: bytes, first: int = 0) -> int:
+        """Its value in bytes of the control table from the address ``first`` on."""
+        start = self.address - first
+        return self.from_bytes(data[start : start + self.size])
 
 
 @dataclass(frozen=True)
@@ -90,48 +94,29 @@ class Model:
     """Whether it measures and limits its current. Others tell a load, in 0.1 % of the largest, by
     which the current is guessed, and have no current-based mode."""
 
-    def current_of(self, torque_nm: np.ndarray) -> np.ndarray:
-        """Currents for torques [A], no larger than the motor's largest."""
-        return np.minimum(
-            torque_nm / self.torque_nm_per_a, self.current_limit * self.current_unit_a
-        )
+    def current_of(self, torque_nm: float) -> float:
+        """Current for a torque [A], no larger than the motor's largest."""
+        return min(torque_nm / self.torque_nm_per_a, self.current_limit * self.current_unit_a)
 
 
-MODELS = {
-    model.name: model
-    for model in (
-        Model("XL330-M077", 1190, 1e-3, 1750, 1620, (35, 70), 5.0, 0.215 / 1.47, 70, 2047),
-        Model("XL330-M288", 1200, 1e-3, 1750, 445, (35, 70), 5.0, 0.52 / 1.47, 70, 2047),
-        Model("XC330-T181", 1210, 1e-3, 910, 510, (55, 140), 12.0, 0.80 / 0.88, 70, 2047),
-        Model("XC330-T288", 1220, 1e-3, 910, 320, (55, 140), 12.0, 1.00 / 0.88, 70, 2047),
-        Model("XC330-M181", 1230, 1e-3, 2352, 545, (35, 70), 5.0, 0.60 / 1.80, 70, 2047),
-        Model("XC330-M288", 1240, 1e-3, 2352, 350, (35, 70), 5.0, 0.93 / 1.80, 70, 2047),
-        Model(
-            "XL430-W250",
-            1060,
-            1.4e-3,
-            1000,
-            265,
-            (60, 140),
-            12.0,
-            1.5 / 1.4,
-            72,
-            senses_current=False,
-        ),
-        Model(
-            "XC430-W150", 1070, 1.4e-3, 1000, 460, (60, 160), 12.0, 1.6 / 1.4, senses_current=False
-        ),
-        Model(
-            "XC430-W240", 1080, 1.4e-3, 1000, 306, (60, 160), 12.0, 1.9 / 1.4, senses_current=False
-        ),
-        Model("XM430-W210", 1030, 2.69e-3, 1193, 330, (95, 160), 12.0, 3.0 / 2.3),
-        Model("XM430-W350", 1020, 2.69e-3, 1193, 200, (95, 160), 12.0, 4.1 / 2.3),
-        Model("XM540-W150", 1130, 2.69e-3, 2047, 230, (95, 160), 12.0, 7.3 / 4.4),
-        Model("XM540-W270", 1120, 2.69e-3, 2047, 128, (95, 160), 12.0, 10.6 / 4.4),
-        Model("XH430-W350", 1000, 2.69e-3, 648, 280, (95, 160), 12.0, 3.4 / 1.3),
-        Model("XH430-V210", 1050, 1.34e-3, 689, 380, (110, 300), 24.0, 2.6 / 0.7),
-    )
-}
+_MODELS = (
+    Model("XL330-M077", 1190, 1e-3, 1750, 1620, (35, 70), 5.0, 0.215 / 1.47, 70, 2047),
+    Model("XL330-M288", 1200, 1e-3, 1750, 445, (35, 70), 5.0, 0.52 / 1.47, 70, 2047),
+    Model("XC330-T181", 1210, 1e-3, 910, 510, (55, 140), 12.0, 0.80 / 0.88, 70, 2047),
+    Model("XC330-T288", 1220, 1e-3, 910, 320, (55, 140), 12.0, 1.00 / 0.88, 70, 2047),
+    Model("XC330-M181", 1230, 1e-3, 2352, 545, (35, 70), 5.0, 0.60 / 1.80, 70, 2047),
+    Model("XC330-M288", 1240, 1e-3, 2352, 350, (35, 70), 5.0, 0.93 / 1.80, 70, 2047),
+    Model("XL430-W250", 1060, 1.4e-3, 1000, 265, (60, 140), 12.0, 1.5 / 1.4, 72, 1023, False),
+    Model("XC430-W150", 1070, 1.4e-3, 1000, 460, (60, 160), 12.0, 1.6 / 1.4, 80, 1023, False),
+    Model("XC430-W240", 1080, 1.4e-3, 1000, 306, (60, 160), 12.0, 1.9 / 1.4, 80, 1023, False),
+    Model("XM430-W210", 1030, 2.69e-3, 1193, 330, (95, 160), 12.0, 3.0 / 2.3),
+    Model("XM430-W350", 1020, 2.69e-3, 1193, 200, (95, 160), 12.0, 4.1 / 2.3),
+    Model("XM540-W150", 1130, 2.69e-3, 2047, 230, (95, 160), 12.0, 7.3 / 4.4),
+    Model("XM540-W270", 1120, 2.69e-3, 2047, 128, (95, 160), 12.0, 10.6 / 4.4),
+    Model("XH430-W350", 1000, 2.69e-3, 648, 280, (95, 160), 12.0, 3.4 / 1.3),
+    Model("XH430-V210", 1050, 1.34e-3, 689, 380, (110, 300), 24.0, 2.6 / 0.7),
+)
+MODELS = {model.name: model for model in _MODELS}
 """The motors, by name."""
 
 
@@ -170,66 +155,51 @@ def describe_hardware_error(bits: int) -> str:
 
 
 def table(model: Model) -> dict[str, Item]:
-    """The control table of a motor, by item."""
+    """The entries of a motor's control table that a hand needs, by name."""
     low_v, high_v = model.volts
-    gain = {"low": 0, "high": 16383}
     items = {
-        "model_number": Item(0, 2, False, model.number, 0),
-        "model_information": Item(2, 4, False, 0, 0),
-        "firmware_version": Item(6, 1, False, WATCHDOG_FIRMWARE, 0),
-        "id": Item(7, 1, True, 1, 0, 252),
-        "baud_rate": Item(8, 1, True, 1, 0, 7),
-        "return_delay_time": Item(9, 1, True, 250, 0, 254),
-        "drive_mode": Item(10, 1, True, 0, 0, 5),
-        "operating_mode": Item(11, 1, True, POSITION_MODE, 0, 16),
-        "secondary_id": Item(12, 1, True, 255, 0, 255),
-        "protocol_type": Item(13, 1, True, 2, 1, 2),
-        "homing_offset": Item(20, 4, True, 0, -1_044_479, 1_044_479),
-        "moving_threshold": Item(24, 4, True, 10, 0, 1023),
-        "temperature_limit": Item(31, 1, True, model.temperature_limit, 0, 100),
-        "max_voltage_limit": Item(32, 2, True, high_v, low_v, high_v),
-        "min_voltage_limit": Item(34, 2, True, low_v, low_v, high_v),
-        "pwm_limit": Item(36, 2, True, int(FULL_PWM), 0, int(FULL_PWM)),
-        "current_limit": Item(38, 2, True, model.current_limit, 0, model.current_limit),
-        "velocity_limit": Item(44, 4, True, model.velocity_limit, 0, model.velocity_most),
-        "max_position_limit": Item(48, 4, True, 4095, 0, 4095),
-        "min_position_limit": Item(52, 4, True, 0, 0, 4095),
-        "startup_configuration": Item(60, 1, True, 0, 0, 3),
-        "shutdown": Item(63, 1, True, 0b110100, 0, 255),
-        "torque_enable": Item(64, 1, True, 0, 0, 1),
-        "led": Item(65, 1, True, 0, 0, 1),
-        "status_return_level": Item(68, 1, True, 2, 0, 2),
-        "registered_instruction": Item(69, 1, False, 0, 0),
-        "hardware_error_status": Item(70, 1, False, 0, 0),
-        "velocity_i_gain": Item(76, 2, True, 1920, **gain),
-        "velocity_p_gain": Item(78, 2, True, 100, **gain),
-        "position_d_gain": Item(80, 2, True, 0, **gain),
-        "position_i_gain": Item(82, 2, True, 0, **gain),
-        "position_p_gain": Item(84, 2, True, 800, **gain),
-        "feedforward_2nd_gain": Item(88, 2, True, 0, **gain),
-        "feedforward_1st_gain": Item(90, 2, True, 0, **gain),
-        "bus_watchdog": Item(98, 1, True, 0, WATCHDOG_TRIPPED, 127),
-        "goal_pwm": Item(100, 2, True, int(FULL_PWM)),
-        "goal_current": Item(102, 2, True, model.current_limit),
-        "goal_velocity": Item(104, 4, True, model.velocity_limit),
-        "profile_acceleration": Item(108, 4, True, 0, 0, 32767),
-        "profile_velocity": Item(112, 4, True, 0, 0, 32767),
-        "goal_position": Item(116, 4),
-        "realtime_tick": Item(120, 2, False, 0, 0),
-        "moving": Item(122, 1, False, 0, 0),
-        "moving_status": Item(123, 1, False, 0, 0),
-        "present_pwm": Item(124, 2, False),
-        "present_current": Item(126, 2, False),
-        "present_velocity": Item(128, 4, False),
-        "present_position": Item(132, 4, False),
-        "velocity_trajectory": Item(136, 4, False),
-        "position_trajectory": Item(140, 4, False),
-        "present_input_voltage": Item(144, 2, False, round(10 * model.supply_v), 0),
-        "present_temperature": Item(146, 1, False, 30, 0),
-        "backup_ready": Item(147, 1, False, 0, 0),
+        "firmware_version": Item(6, 1, WATCHDOG_FIRMWARE),
+        "return_delay_time": Item(9, 1, 250),
+        "drive_mode": Item(10, 1),
+        "operating_mode": Item(11, 1, POSITION_MODE),
+        "secondary_id": Item(12, 1, 255),
+        "homing_offset": Item(20, 4, signed=True),
+        "temperature_limit": Item(31, 1, model.temperature_limit),
+        "max_voltage_limit": Item(32, 2, high_v),
+        "min_voltage_limit": Item(34, 2, low_v),
+        "pwm_limit": Item(36, 2, FULL_PWM),
+        "current_limit": Item(38, 2, model.current_limit),
+        "velocity_limit": Item(44, 4, model.velocity_limit),
+        "max_position_limit": Item(48, 4, 4095),
+        "min_position_limit": Item(52, 4),
+        "startup_configuration": Item(60, 1),
+        "shutdown": Item(63, 1, 0b110100),
+        "torque_enable": Item(64, 1),
+        "status_return_level": Item(68, 1, 2),
+        "hardware_error_status": Item(70, 1),
+        "position_d_gain": Item(80, 2),
+        "position_i_gain": Item(82, 2),
+        "position_p_gain": Item(84, 2, 800),
+        "feedforward_2nd_gain": Item(88, 2),
+        "feedforward_1st_gain": Item(90, 2),
+        "bus_watchdog": Item(98, 1, signed=True),
+        "goal_pwm": Item(100, 2, FULL_PWM, signed=True),
+        "goal_current": Item(102, 2, model.current_limit, signed=True),
+        "profile_acceleration": Item(108, 4),
+        "profile_velocity": Item(112, 4),
+        "goal_position": Item(116, 4, signed=True),
+        "realtime_tick": Item(120, 2),
+        "present_pwm": Item(124, 2, signed=True),
+        "present_current": Item(126, 2, signed=True),
+        "present_velocity": Item(128, 4, signed=True),
+        "present_position": Item(132, 4, signed=True),
+        "present_input_voltage": Item(144, 2),
+        "present_temperature": Item(146, 1),
     }
-    lacking = () if model.senses_current else ("current_limit", "goal_current")
-    return {name: item for name, item in items.items() if name not in lacking}
+    if not model.senses_current:
+        del items["current_limit"]
+        del items["goal_current"]
+    return items
 
 
 def to_counts(angle_rad: float) -> int:
@@ -237,6 +207,6 @@ def to_counts(angle_rad: float) -> int:
     return CENTRE + round(angle_rad / RAD_PER_COUNT)
 
 
-def to_angle(counts: int) -> float:
-    """The angle of a count [rad]."""
+def to_angle(counts: Counts) -> Counts:
+    """The angle of a count, or of several [rad]."""
     return (counts - CENTRE) * RAD_PER_COUNT

@@ -14,8 +14,7 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel, MotorModel
 from vd.command.config import from_dict
 from vd.deploy.hardware.answers import HandState
-from vd.deploy.hardware.control_table import RAD_S_PER_COUNT, Model, motor_model, to_angle
-from vd.deploy.hardware.packets import MAX_ID
+from vd.deploy.hardware.control_table import MAX_ID, RAD_S_PER_COUNT, Model, motor_model, to_angle
 from vd.deploy.hardware.registers import MotorSettings
 
 FORMAT = "vd-motors/1"
@@ -44,7 +43,7 @@ class CalibrationError(ValueError):
     """Motors that cannot be used; names file or hand, joint and remedy."""
 
 
-class Joints:
+class JointMotors:
     """The motors of a hand's joints, in the joints' order.
 
     Raises:
@@ -52,7 +51,9 @@ class Joints:
     """
 
     def __init__(self, hand: HandModel, motors: tuple[MotorModel, ...]):
-        self.hand, self.names, self.motors = hand, hand.joint_names, motors
+        self.hand = hand
+        self.names = hand.joint_names
+        self.motors = motors
         self.ids = tuple(motor.id for motor in motors)
         """Motor of each joint [D]."""
         self.sign = np.array([motor.sign for motor in motors])
@@ -63,16 +64,19 @@ class Joints:
         """Angle of the motor where the joint is at zero [rad], shape [D]."""
         self.capped = np.array([motor.current > 0.0 for motor in motors])
         """Whether its mode keeps the motor below its largest current [D]."""
-        try:
-            self.models: tuple[Model, ...] = tuple(motor_model(motor.model) for motor in motors)
-        except ValueError as error:
-            raise CalibrationError(f"{hand.name}: {error}") from error
-        for name, model, capped in zip(self.names, self.models, self.capped, strict=True):
-            if capped and not model.senses_current:
+        self.models: list[Model] = []
+        """Model of each motor [D]."""
+        for name, motor in zip(self.names, motors, strict=True):
+            try:
+                model = motor_model(motor.model)
+            except ValueError as error:
+                raise CalibrationError(f"{hand.name}: {error}") from error
+            if motor.current > 0.0 and not model.senses_current:
                 raise CalibrationError(
                     f"{hand.name}: {name} has a largest current, which {model.name} does not "
                     "measure; take vd:motor:current away"
                 )
+            self.models.append(model)
 
     def to_motor(self, joint: np.ndarray) -> np.ndarray:
         """Angles of the motors [rad] from those of the joints, shape [..., D]."""
@@ -97,9 +101,11 @@ class Joints:
 
         What it is said to have, or needs for its joint's torque.
         """
-        torque = self.hand.effort / self.gear
-        needed = [float(model.current_of(t)) for model, t in zip(self.models, torque, strict=True)]
-        return np.where(self.capped, [motor.current for motor in self.motors], needed)
+        currents = np.zeros(len(self.motors))
+        for axis, (motor, model) in enumerate(zip(self.motors, self.models, strict=True)):
+            needed = model.current_of(self.hand.effort[axis] / motor.gear)
+            currents[axis] = motor.current if motor.current > 0.0 else needed
+        return currents
 
     @property
     def p_gain(self) -> int:
@@ -124,7 +130,9 @@ class Joints:
         ends = np.sort(
             np.stack([self.to_motor(self.hand.lower), self.to_motor(self.hand.upper)]), axis=0
         )
-        first, last, currents = to_angle(0), to_angle(4095), self.currents()
+        first = to_angle(0)
+        last = to_angle(4095)
+        currents = self.currents()
         result = {}
         for axis, (motor, model) in enumerate(zip(self.motors, self.models, strict=True)):
             low, high = float(ends[0, axis]), float(ends[1, axis])
@@ -149,7 +157,7 @@ class Joints:
 
 def read_joints(
     hand: HandModel, calibration: Path | None = None, model: str | None = None
-) -> Joints:
+) -> JointMotors:
     """The motors of a hand.
 
     Args:
@@ -167,22 +175,22 @@ def read_joints(
     if calibration is not None:
         entries = _read_calibration(Path(calibration), hand)
     motors = []
-    for name, leader, said in zip(hand.joint_names, hand.mimic, hand.motors, strict=True):
+    for name, leader, described in zip(hand.joint_names, hand.mimic, hand.motors, strict=True):
         entry = entries.get(name)
         if leader >= 0:
             raise CalibrationError(
                 f"{hand.name}: {name} follows another joint; each needs a motor here"
             )
-        if said is None and (entry is None or model is None):
+        if described is None and (entry is None or model is None):
             raise CalibrationError(
                 f"{hand.path} does not say which motor turns {name}: describe motors when it is "
                 "imported (vd:motor), or give --motor and --calibration"
             )
-        motor = said or MotorModel(str(model), 0)
+        motor = described or MotorModel(str(model), 0)
         if entry is not None:
             motor = replace(motor, id=entry.id, sign=entry.sign, offset_rad=entry.offset_rad)
         motors.append(motor if model is None else replace(motor, model=model))
-    return Joints(hand, tuple(motors))
+    return JointMotors(hand, tuple(motors))
 
 
 def _read_calibration(path: Path, hand: HandModel) -> dict[str, _Motor]:
@@ -212,7 +220,8 @@ def _by_joint(file: _File, hand: HandModel) -> dict[str, _Motor]:
             f"its field hand names {file.hand!r}: zeros and directions of another hand's motors "
             f"are not this one's; calibrate {hand.name}"
         )
-    named, ids = ([getattr(motor, name) for motor in file.motors] for name in ("joint", "id"))
+    named = [motor.joint for motor in file.motors]
+    ids = [motor.id for motor in file.motors]
     for name in hand.joint_names:
         if named.count(name) != 1:
             raise ValueError(f"motors has {named.count(name) or 'no'} entries of {name}; give one")

@@ -64,7 +64,9 @@ def open_port(path: str, baud_rate: int = BAUD_RATE) -> Any:
             fcntl.ioctl(handler.ser.fileno(), termios.TIOCEXCL)
     except OSError as error:
         raise BusError(f"cannot open {path}: {_why(path, error)}") from error
-    handler.baudrate, handler.tx_time_per_byte, handler.is_open = baud_rate, 1e4 / baud_rate, True
+    handler.baudrate = baud_rate
+    handler.tx_time_per_byte = 1e4 / baud_rate
+    handler.is_open = True
     return handler
 
 

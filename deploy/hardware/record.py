@@ -21,7 +21,6 @@ from vd.command.files import check_folder
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.aside import aside
-from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import ready
 from vd.deploy.hardware.connect import Connection, HandOptions, connect, motors_of
 from vd.deploy.hardware.control_table import RAD_PER_COUNT, TICK_MODULUS
@@ -32,7 +31,7 @@ from vd.logs.hand_log import read_columns
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
-    from vd.deploy.hardware.joints import Joints
+    from vd.deploy.hardware.joints import JointMotors
     from vd.logs.recording import Recording, Trajectory
 
 RATE_HZ = 100.0
@@ -83,7 +82,7 @@ class RecordCfg(HandOptions):
     safety: SafetyCfg = field(default_factory=lambda: WIDE)
     """Limits."""
     realtime: bool = True
-    """Run before all ordinary programs, the twin too, where that is permitted (root, ulimit -r)."""
+    """Run before all ordinary programs, where that is permitted (root, ulimit -r)."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves."""
 
@@ -103,7 +102,9 @@ class Sample(NamedTuple):
     enabled: np.ndarray
 
 
-def motions_of(motors: "Joints", fingers: Sequence[int], sets: Sequence[str]) -> list["Trajectory"]:
+def motions_of(
+    motors: "JointMotors", fingers: Sequence[int], sets: Sequence[str]
+) -> list["Trajectory"]:
     """The motions of excitation sets, finger by finger.
 
     Raises:
@@ -113,11 +114,10 @@ def motions_of(motors: "Joints", fingers: Sequence[int], sets: Sequence[str]) ->
 
     hand = motors.hand
     reach = JointRange(hand.joint_names, hand.lower, hand.upper, p_gain=float(motors.p_gain))
-    every = excitation_set(reach, sets)
     joints = joints_of(hand, fingers)
-    chosen = [motion for motion in every if motion.joints[0] in joints]
-    ordered = sorted(chosen, key=lambda motion: _finger(motion.joints[0]))
-    return [_of_hand(motion, motors) for motion in numbered(ordered)]
+    chosen = [motion for motion in excitation_set(reach, sets) if motion.joints[0] in joints]
+    chosen.sort(key=lambda motion: _finger(motion.joints[0]))
+    return [_of_hand(motion, motors) for motion in numbered(chosen)]
 
 
 def _finger(joint: str) -> str:
@@ -125,9 +125,10 @@ def _finger(joint: str) -> str:
     return joint.partition("_")[0]
 
 
-def _of_hand(motion: "Trajectory", motors: "Joints") -> "Trajectory":
+def _of_hand(motion: "Trajectory", motors: "JointMotors") -> "Trajectory":
     """A motion with the fingers aside that it does not move, and the usual gain if it names none."""
-    hand, command = motors.hand, motion.command.copy()
+    hand = motors.hand
+    command = motion.command.copy()
     moving = hand.joint_finger[hand.joint_names.index(motion.joints[0])]
     others = hand.joint_finger != moving
     command[:, others] = aside(hand, int(moving))[others]
@@ -135,7 +136,7 @@ def _of_hand(motion: "Trajectory", motors: "Joints") -> "Trajectory":
     return replace(motion, command=command, conditions=conditions)
 
 
-def read_plan(path: Path, motors: "Joints") -> list["Trajectory"]:
+def read_plan(path: Path, motors: "JointMotors") -> list["Trajectory"]:
     """The motions of a plan that ``vd-gap plan`` wrote; joints that it does not name are straight.
 
     ``path`` is next_experiment.json, or the folder with it.
@@ -146,11 +147,8 @@ def read_plan(path: Path, motors: "Joints") -> list["Trajectory"]:
     file = path / "next_experiment.json" if path.is_dir() else path
     try:
         plan: dict[str, Any] = json.loads(file.read_text())
-        return [
-            _planned(file.parent, entry, plan["joints"], motors) for entry in plan["trajectories"]
-        ]
-    except RecordError:
-        raise
+        entries = plan["trajectories"]
+        return [_planned(file.parent, entry, plan["joints"], motors) for entry in entries]
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise RecordError(
             f"{file} is no plan for {motors.hand.name}: {error}; vd-gap plan writes one"
@@ -158,12 +156,13 @@ def read_plan(path: Path, motors: "Joints") -> list["Trajectory"]:
 
 
 def _planned(
-    folder: Path, entry: Mapping[str, Any], joints: Sequence[str], motors: "Joints"
+    folder: Path, entry: Mapping[str, Any], joints: Sequence[str], motors: "JointMotors"
 ) -> "Trajectory":
     """The motion of a plan's entry, whose file is in ``folder``."""
     from vd.logs.recording import Trajectory
 
-    hand, columns = motors.hand, read_columns(folder / entry["file"])
+    hand = motors.hand
+    columns = read_columns(folder / entry["file"])
     command = np.tile(0.5 * (hand.lower + hand.upper), (len(columns["t"]), 1))
     enabled = np.ones(command.shape, dtype=bool)
     for name in joints:
@@ -172,11 +171,9 @@ def _planned(
         column = hand.joint_names.index(name)
         command[:, column] = columns[f"command.{name}"]
         enabled[:, column] = columns.get(f"enabled.{name}", np.ones(len(command))) > 0.0
-    file, kind, joints = (
-        "plan_" + Path(entry["file"]).name,
-        entry["excitation"],
-        tuple(entry["joints"]),
-    )
+    file = "plan_" + Path(entry["file"]).name
+    kind = entry["excitation"]
+    joints = tuple(entry["joints"])
     motion = Trajectory(
         file, kind, joints, entry["conditions"], columns["t"], command, command, enabled
     )
@@ -189,13 +186,14 @@ def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
     Raises:
         ValueError: The hand lacks a finger.
     """
-    wrong = [finger for finger in fingers if not 0 <= finger < hand.num_fingers]
-    if wrong:
-        raise ValueError(
-            f"--fingers {wrong[0]}: {hand.name} has fingers 0 to {hand.num_fingers - 1}"
-        )
-    chosen = sorted(set(fingers)) or range(hand.num_fingers)
-    return tuple(name for f in chosen for name in hand.joint_names[hand.fingers[f]])
+    names: list[str] = []
+    for finger in sorted(set(fingers)) or range(hand.num_fingers):
+        if not 0 <= finger < hand.num_fingers:
+            raise ValueError(
+                f"--fingers {finger}: {hand.name} has fingers 0 to {hand.num_fingers - 1}"
+            )
+        names.extend(hand.joint_names[hand.fingers[finger]])
+    return tuple(names)
 
 
 def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
@@ -214,12 +212,12 @@ def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
         When each was measured [T] [s]: as long after it was asked for as most of them were.
     """
     gone = np.diff(ticks, axis=0) % TICK_MODULUS
-    own = np.concatenate([[0.0], 1e-3 * gone.mean(axis=1).cumsum()])
+    motor_s = np.concatenate([[0.0], 1e-3 * gone.mean(axis=1).cumsum()])
     # The rates of two clocks differ; a share of the packets that comes late must not count. All
     # pairs of some samples: those of all take longer than a hand may wait for its loop.
-    some = np.unique(np.linspace(0, len(own) - 1, CLOCK_SAMPLES).astype(int))
-    rate, begin, *_ = theilslopes((asked_s - own)[some], own[some])
-    return np.asarray(own * (1.0 + rate) + begin)
+    rows = np.unique(np.linspace(0, len(motor_s) - 1, CLOCK_SAMPLES).astype(int))
+    rate, begin, *_ = theilslopes((asked_s - motor_s)[rows], motor_s[rows])
+    return np.asarray(motor_s * (1.0 + rate) + begin)
 
 
 def play(
@@ -235,8 +233,8 @@ def play(
     safe.move(motion.command[0], SPEED_RAD_S)
     # Of motors whose gains differ, each has the same share of its own.
     share = float(motion.conditions["p_gain"]) / safe.joints.p_gain
-    own = {bus.ids[column]: safe.joints.motors[column].p_gain for column in columns}
-    _set_gains(bus, {id: round(share * gain) for id, gain in own.items()})
+    ids = [bus.ids[column] for column in columns]
+    bus.stiffen(share, ids)
     samples = list[Sample]()
     pacer = Pacer(rate_hz, bus.clock)
     pacer.wait()
@@ -256,39 +254,35 @@ def play(
         pacer.wait()
     if not on.all():
         safe.switch(np.ones_like(on))
-    _set_gains(bus, own)
+    bus.stiffen(1.0, ids)
     return _trajectory(motion, columns, samples)
-
-
-def _set_gains(bus: MotorBus, gains: Mapping[int, int]) -> None:
-    for id, gain in gains.items():
-        if bus.read(id, "position_p_gain") != gain:
-            bus.write(id, "position_p_gain", gain)
 
 
 def _trajectory(
     motion: "Trajectory", columns: Sequence[int], samples: Sequence[Sample]
 ) -> "Trajectory":
     """What was measured, of some joints, at the times of the motors' clocks."""
+    states = [sample.state for sample in samples]
 
     def of(name: str) -> np.ndarray:
-        return np.array([getattr(one.state, name) for one in samples])[:, columns]
+        return np.array([getattr(state, name) for state in states])[:, columns]
 
-    asked_s = np.array([one.state.time_s for one in samples])
-    sent_s = np.array([one.sent_s for one in samples])
-    measured_s = measured_at(asked_s, np.array([one.state.tick for one in samples]))
+    asked_s = np.array([state.time_s for state in states])
+    sent_s = np.array([sample.sent_s for sample in samples])
+    measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
     # A goal arrives with the question for its state, unless that was asked again.
     sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
-    measured: dict[str, Any] = {name: of(name) for name in STATE_CHANNELS}
+    channels: dict[str, Any] = {name: of(name) for name in STATE_CHANNELS}
+    if not channels["pwm"].any():  # a motor that does not tell its duty cycle says zero
+        del channels["pwm"]
     return replace(
         motion,
         time=measured_s - measured_s[0],
         command_time=sent_s - measured_s[0],
-        command=np.array([one.goal for one in samples])[:, columns],
+        command=np.array([sample.goal for sample in samples])[:, columns],
         position=of("position"),
-        enabled=np.array([one.enabled for one in samples])[:, columns],
-        # A motor that does not tell its duty cycle says zero.
-        **{name: values for name, values in measured.items() if name != "pwm" or values.any()},
+        enabled=np.array([sample.enabled for sample in samples])[:, columns],
+        **channels,
     )
 
 
@@ -304,12 +298,8 @@ def record(cfg: RecordCfg) -> int:
         motions = motions_of(motors, cfg.fingers, cfg.excitations)
     else:
         motions = read_plan(cfg.plan, motors)
-    with (
-        connect(
-            cfg, physics_hz=TWIN_JOINT_HZ / motors.hand.num_joints, realtime=cfg.realtime
-        ) as connection,
-        undisturbed(cfg.realtime),
-    ):
+    physics_hz = TWIN_JOINT_HZ / motors.hand.num_joints
+    with connect(cfg, physics_hz=physics_hz) as connection, undisturbed(cfg.realtime):
         recording = _begun(cfg, connection, joints)
         done = {trajectory.file for trajectory in recording.trajectories}
         left = [motion for motion in motions if motion.file not in done]
@@ -329,8 +319,8 @@ def record(cfg: RecordCfg) -> int:
             left.sort(key=payload_of)
             for payload, group in itertools.groupby(left, key=payload_of):
                 _session(cfg, connection, joints, list(group), payload, keep)
-        for one in written:
-            one.result()
+        for writing in written:
+            writing.result()
     print(f"{cfg.out}: {len(recording.trajectories)} motions; vd-gap run {cfg.out} --out gap")
     return 0
 
@@ -361,14 +351,14 @@ def _session(
             trajectory = play(safe, motion, columns, cfg.rate_hz)
             rate = (len(trajectory.time) - 1) / trajectory.time[-1]
             what = f"{number}/{len(motions)} {Path(motion.file).stem}"
-            said = f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz"
+            line = f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz"
             if rate < RATE_SHARE * cfg.rate_hz:
                 look = "" if cfg.twin else "look at the adapter's latency timer and the baud rate, "
-                said += (
+                line += (
                     f", not {cfg.rate_hz:g}: a sample takes {1e3 / rate:.1f} ms; {look}"
                     f"end other programs, or ask for --rate-hz {rate:.0f}"
                 )
-            print(said, file=sys.stderr, flush=True)
+            print(line, file=sys.stderr, flush=True)
             keep(trajectory)
 
 
@@ -379,10 +369,10 @@ def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "
 
     model = called(connection.hand)
     if (cfg.out / "recording.json").exists():
-        found = read_recording(cfg.out)
-        if found.joints != joints or found.model != model:
+        begun = read_recording(cfg.out)
+        if begun.joints != joints or begun.model != model:
             raise RecordError(
-                f"{cfg.out} is of {found.model}, {', '.join(found.joints)}; choose another --out"
+                f"{cfg.out} is of {begun.model}, {', '.join(begun.joints)}; choose another --out"
             )
-        return found
+        return begun
     return Recording(cfg.out, model, joints, connection.joints.servo(), RAD_PER_COUNT, ())

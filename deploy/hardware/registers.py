@@ -42,11 +42,11 @@ class Register:
     least: bool = False
     """Whether a larger value will do, too."""
 
-    def right(self, found: int, wanted: int) -> bool:
+    def right(self, value: int, wanted: int) -> bool:
         """Whether a value will do."""
         if self.least:
-            return found >= wanted
-        return found & wanted == wanted if self.bits else found == wanted
+            return value >= wanted
+        return value & wanted == wanted if self.bits else value == wanted
 
 
 REGISTERS = (
@@ -94,7 +94,7 @@ REGISTERS = (
 """The table."""
 ROUNDING = 1e-6
 """Of a count: 0.35 A are 350 counts of 1 mA, not 349."""
-OWN = ("current_limit", "goal_current")
+OPTIONAL = ("current_limit", "goal_current")
 """Registers that not every motor and mode has: they are compared where the settings name them."""
 
 
@@ -133,23 +133,26 @@ class MotorSettings:
 
 
 def different(
-    found: Mapping[str, int], model: Model, settings: MotorSettings
+    values_found: Mapping[str, int], model: Model, settings: MotorSettings
 ) -> dict[Register, tuple[int, int]]:
     """Registers that are not as they should be: the value of each, and the wanted one.
 
     Args:
-        found: Control table of a motor.
+        values_found: Control table of a motor.
         model: Its model.
         settings: What its joint wants; the factory's values otherwise.
     """
-    items, own = table(model), settings.values(model)
-    compared = [one for one in REGISTERS if one.name in own or one.name not in OWN]
-    wanted = {one: own.get(one.name, items[one.name].initial) for one in compared}
-    return {
-        one: (found[one.name], value)
-        for one, value in wanted.items()
-        if not one.right(found[one.name], value)
-    }
+    items = table(model)
+    values = settings.values(model)
+    differences = {}
+    for register in REGISTERS:
+        name = register.name
+        if name in OPTIONAL and name not in values:
+            continue
+        wanted = values.get(name, items[name].initial)
+        if not register.right(values_found[name], wanted):
+            differences[register] = (values_found[name], wanted)
+    return differences
 
 
 def kept(register: Register) -> bool:

@@ -15,7 +15,8 @@ class ActionFilter:
 
     def __init__(self, hand: HandModel, task: ReorientCfg):
         params = ActionParams()
-        params.alpha, params.noise_std = task.action.ema_alpha, 0.0
+        params.alpha = task.action.ema_alpha
+        params.noise_std = 0.0
         params.step_rad = task.action.scale_rad_s * task.sim.control_dt
         count = hand.num_joints
 
@@ -37,10 +38,6 @@ class ActionFilter:
     def reset(self) -> None:
         """Forget the actions so far, as at the start of an episode."""
         self._smoothed.zero_()
-
-    def put(self, smoothed: np.ndarray) -> None:
-        """Go on from another average [D]."""
-        self._smoothed.assign(np.asarray(smoothed, dtype=np.float32)[None])
 
     def goal(self, action: np.ndarray, joint_q: np.ndarray) -> np.ndarray:
         """Joint goals [rad] [D] for an action [D] taken at joint positions [rad] [D]."""

@@ -97,7 +97,8 @@ def scan_object(path: Path) -> ObjectModel:
     except MeshError as error:
         raise GoalError(f"{path}: {error}; scan it again, or export it as PLY") from error
     factor = _unit(path, float(np.ptp(surface.vertices, axis=0).max()))
-    vertices, faces = surface.vertices * factor, surface.faces
+    vertices = surface.vertices * factor
+    faces = surface.faces
     try:
         return build_model(
             "scan",
@@ -141,13 +142,14 @@ def make_goals(
             rows = [line.split("#")[0].strip() for line in Path(text).read_text().splitlines()]
         except (OSError, UnicodeDecodeError) as error:
             raise GoalError(f"--goal {text} cannot be read ({error})") from error
-        found = [_goal(row, f"{text}, line {i + 1}: {row}") for i, row in enumerate(rows) if row]
-        if not found:
+        listed = [_goal(row, f"{text}, line {i + 1}: {row}") for i, row in enumerate(rows) if row]
+        if not listed:
             raise GoalError(
                 f"--goal {text} holds no orientation; write one on each line, such as 0,0,1@90"
             )
-        goals += found
-    rng, last = np.random.default_rng(seed), np.array([0.0, 0.0, 0.0, 1.0])
+        goals += listed
+    rng = np.random.default_rng(seed)
+    last = np.array([0.0, 0.0, 0.0, 1.0])
     for _ in range(0 if goals else drawn):
         last = draw_goals(last[None], rng, max_angle)[0]
         goals.append(last)
@@ -182,7 +184,8 @@ def _goal(text: str, where: str) -> np.ndarray:
         numbers = np.array([float(part) for part in turn.split(",")])
         angle = np.radians(float(degrees)) if "@" in text else 0.0
     except ValueError:
-        numbers, angle = np.zeros(0), 0.0
+        numbers = np.zeros(0)
+        angle = 0.0
     wanted = 4 if "@" not in text else 3
     length = float(np.linalg.norm(numbers))
     if len(numbers) != wanted or not (np.isfinite(length + angle) and length > 0.0):

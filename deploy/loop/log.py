@@ -85,15 +85,18 @@ class LogWriter:
         if (folder / RUN_FILE).exists():
             raise FileExistsError(f"{folder} holds a log; choose another folder")
         make_folder(folder)
-        self.folder, self._joints = folder, hand.joint_names
-        self._clock, self.started_s = clock, clock.now()
-        self._run = {
+        self.folder = folder
+        self._joints = hand.joint_names
+        self._clock = clock
+        self.started_s = clock.now()
+        self.run: dict[str, Any] = {
             "format": LOG_FORMAT,
             "hand": called(hand),
             "joints": list(hand.joint_names),
             "unix_s": time.time(),
             **run,
         }
+        """What run.json says."""
         recording = {
             "format": RECORDING_FORMAT,
             "model": called(hand),
@@ -122,11 +125,11 @@ class LogWriter:
         self._pending: deque[Future[Any]] = deque()
         self._append(self._steps, ",".join(self._columns))
         write_json(folder / RECORDING_FILE, recording)
-        write_json(folder / RUN_FILE, self._run)
+        write_json(folder / RUN_FILE, self.run)
 
-    def also_to(self, make: Callable[[Mapping[str, Any]], Sink]) -> None:
-        """Write to a sink too, made of what run.json says."""
-        self._sinks.append(make(self._run))
+    def also_to(self, sink: Sink) -> None:
+        """Write to a sink too."""
+        self._sinks.append(sink)
 
     def since(self, time_s: float) -> float:
         """Seconds from the start of the log to a time of the monotonic clock."""
@@ -164,16 +167,16 @@ class LogWriter:
         self._append(self._steps, ",".join(f"{value:.{DIGITS}f}" for value in row))
         if self._sinks:
             image = depth.copy() if depth is not None and self._count % DEPTH_STEPS == 0 else None
-            told = dict(zip(self._columns, map(float, row), strict=True))
-            self._tell(lambda sink: sink.step(told, image))
+            values_by_name = dict(zip(self._columns, map(float, row), strict=True))
+            self._tell(lambda sink: sink.step(values_by_name, image))
         self._count += 1
 
     def goal(self, number: int, goal: np.ndarray) -> None:
         """A goal [4] is begun; one that was not known when the log began is noted first."""
-        goals = self._run["goals"]
+        goals = self.run["goals"]
         if number == len(goals):
             goals.append([float(value) for value in goal])
-            run = {**self._run, "goals": list(goals)}
+            run = {**self.run, "goals": list(goals)}
             self._later(lambda: write_json(self.folder / RUN_FILE, run))
         self.event("goal", goal=number)
 
@@ -195,7 +198,7 @@ class LogWriter:
             OSError: Something could not be written.
         """
         self.event("end", reason=reason)
-        run = {**self._run, "end": {"reason": reason, **summary}}
+        run = {**self.run, "end": {"reason": reason, **summary}}
         self._tell(lambda sink: sink.close(run))
         self._writer.shutdown()
         os.close(self._steps)

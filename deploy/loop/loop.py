@@ -7,21 +7,24 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vd.deploy.camera.camera import Camera
-from vd.deploy.camera.check_camera import Sight
+from vd.deploy.camera.camera import ImageSource
+from vd.deploy.camera.check_camera import SightWatch
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import NOWHERE, LogWriter
-from vd.deploy.loop.policy_runner import Decision, PolicyRunner, Sensed
+from vd.deploy.loop.policy_runner import PolicyDecision, PolicyRunner, Sensed
 from vd.deploy.pose.follower import PoseFollower
 from vd.deploy.safety.safety import SafeHand
-from vd.deploy.twin.child import TwinChild
 from vd.evaluate.statistics import symmetric_error
 from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.deploy.twin.twin import Twin
 
 CAMERA_SHARE = 0.5
 """Share of a control period for which an image is waited for."""
@@ -74,25 +77,26 @@ class ControlLoop:
         *,
         episode_s: float = PAPER.scene.episode_s,
         hold_s: float = 1.0,
-        camera: Camera | None = None,
-        twin: TwinChild | None = None,
+        camera: ImageSource | None = None,
+        twin: "Twin | None" = None,
         follower: PoseFollower | None = None,
         symmetry: np.ndarray = NO_SYMMETRY,
         more: Callable[[], bool] = lambda: False,
     ):
-        self._safe, self._runner, self._actions, self._pacer, self._log = (
-            safe,
-            runner,
-            actions,
-            pacer,
-            log,
-        )
-        self._episode_s, self._hold_s = episode_s, hold_s
-        self._camera, self._twin, self._symmetry = camera, twin, symmetry
+        self._safe = safe
+        self._runner = runner
+        self._actions = actions
+        self._pacer = pacer
+        self._log = log
+        self._episode_s = episode_s
+        self._hold_s = hold_s
+        self._camera = camera
+        self._twin = twin
         self._follower = follower
-        self._sight: Sight | None = None
+        self._symmetry = symmetry
+        self._sight: SightWatch | None = None
         if runner.camera is not None:
-            self._sight = Sight(runner.camera, safe.hand.goal_in_base)
+            self._sight = SightWatch(runner.camera, safe.hand.goal_in_base)
         self._more = more
         self._target = safe.hand.start
         self.times: list[StepTimes] = []
@@ -105,7 +109,8 @@ class ControlLoop:
             StoppedError: The hand was stopped.
             StaleCamera: There is no new image.
         """
-        outcomes, waited = [], True
+        outcomes = []
+        waited = True
         while not len(goals) and self._more():
             self.step(0, NO_SYMMETRY[0], acting=False)
         for number, goal in enumerate(goals):
@@ -129,8 +134,9 @@ class ControlLoop:
         self._runner.begin()
         sensed, *_ = self._sense(goal)
         clock = self._pacer.clock
-        found, end = clock.beside(lambda: self._runner.decide(sensed)), clock.now() + LOOK_S
-        while not found():
+        decided = clock.beside(lambda: self._runner.decide(sensed))
+        end = clock.now() + LOOK_S
+        while not decided():
             if clock.now() > end:
                 raise self._safe.stop(f"the policy has not decided for {LOOK_S:g} s")
             self.step(number, goal, acting=False)
@@ -167,9 +173,12 @@ class ControlLoop:
             What ends the pursuit, if anything does, and the distance to the goal [rad], NaN for
             none.
         """
-        late_s, busy_s, due_s = self._pacer.wait(), time.process_time(), self._pacer.due_s
+        late_s = self._pacer.wait()
+        busy_s = time.process_time()
+        due_s = self._pacer.due_s
         sensed, state, image_s = self._sense(goal)
-        decision, ended = Decision(np.zeros_like(sensed.smoothed), np.nan), ""
+        decision = PolicyDecision(np.zeros_like(sensed.smoothed), np.nan)
+        ended = ""
         if acting:
             decision = self._runner.decide(sensed)
             ended = self._ended(decision, sensed, first=first)
@@ -194,10 +203,12 @@ class ControlLoop:
             StoppedError: The hand was stopped.
             StaleCamera: There is no new image.
         """
-        depth, image_s = None, np.nan
+        depth = None
+        image_s = np.nan
         if self._camera is not None:
             frame = self._camera.read(CAMERA_SHARE * self._pacer.period_s)
-            depth, image_s = frame.image, frame.time_s
+            depth = frame.image
+            image_s = frame.time_s
         truth = None if self._twin is None else self._twin.object_state()
         state = self._safe.read()
         if depth is not None:
@@ -206,17 +217,20 @@ class ControlLoop:
         object_state = truth
         if self._follower is not None:
             followed = self._follower.look()
-            object_state, image_s = followed.state, followed.time_s
+            object_state = followed.state
+            image_s = followed.time_s
             self._safe.pose_at(followed.time_s, followed.fault)
         joints = state.position, state.velocity, self._actions.smoothed
         return Sensed(*joints, goal, depth, truth, object_state), state, image_s
 
-    def _ended(self, decision: Decision, sensed: Sensed, *, first: bool) -> str:
+    def _ended(self, decision: PolicyDecision, sensed: Sensed, *, first: bool) -> str:
         """``stopped``, ``lost``, or nothing."""
-        sight, voxels = self._sight, decision.voxels
+        sight = self._sight
+        voxels = decision.voxels
         if sight is not None and voxels is not None and sight.loses(voxels):
             return "lost"
-        rule, distance = self._runner.rule, np.array(decision.distance)
+        rule = self._runner.rule
+        distance = np.array(decision.distance)
         if rule.stops(distance, np.array(np.linalg.norm(sensed.smoothed))) and not first:
             return "stopped"
         workspace = self._safe.hand.workspace
@@ -232,7 +246,7 @@ class ControlLoop:
         number: int,
         sensed: Sensed,
         state: HandState,
-        decision: Decision,
+        decision: PolicyDecision,
         sent: np.ndarray,
         acting: bool,
         times: StepTimes,
@@ -256,9 +270,9 @@ class ControlLoop:
         pose = decision.found
         if self._follower is not None and sensed.object_state is not None:
             pose = sensed.object_state[:7]
-        found = NOWHERE if pose is None else pose.tolist()
+        found_pose = NOWHERE if pose is None else pose.tolist()
         sent_s = self._pacer.due_s + times.sent_s
-        self._log.step(state.time_s, sent_s, joints, values, truth, found, sensed.depth)
+        self._log.step(state.time_s, sent_s, joints, values, truth, found_pose, sensed.depth)
         self.times.append(times)
         if len(self.times) % STATUS_STEPS == 0:
             doing = f"distance {decision.distance:.2f} rad" if acting else "holding"
@@ -281,16 +295,17 @@ def summary(times: Sequence[StepTimes]) -> dict[str, dict[str, float]]:
     ``command_delay.delay_s`` has the motors' own delay besides). What no step has is left out.
     """
     values = {
-        name: np.array([getattr(one, name) for one in times]) for name in StepTimes.__annotations__
+        name: np.array([getattr(step, name) for step in times])
+        for name in StepTimes.__annotations__
     }
     values["observation_latency_s"] = values["sensed_s"] - values["image_s"]
     values["command_delay_s"] = values["sent_s"] - values["sensed_s"]
-    found = {}
+    table = {}
     for name, seconds in values.items():
         ms = 1e3 * seconds[np.isfinite(seconds)]
         if len(ms):
             figures = {"median": np.median(ms), "p99": np.percentile(ms, 99), "max": ms.max()}
-            found[name.replace("_s", "_ms")] = {
+            table[name.replace("_s", "_ms")] = {
                 key: round(float(value), 3) for key, value in figures.items()
             }
-    return found
+    return table

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 
 PLAIN = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+POSE = [f"position {axis}" for axis in "xyz"] + [f"rotation {axis}" for axis in "xyzw"]
+"""Columns of a rigid body in OptiTrack's layout."""
 UNIT_TOLERANCE = 1e-2
 """Deviation of a quaternion's length from 1, above which it is none."""
 UNITS_M = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
@@ -73,55 +75,78 @@ def read_mocap(path: Path, body: str | None = None) -> Mocap:
     return mocap
 
 
+def _number(cell: str) -> float:
+    """A cell as a number, NaN where it is empty."""
+    return float(cell or "nan")
+
+
 def _numbers(rows: Sequence[Sequence[str]], columns: Sequence[int]) -> np.ndarray:
-    """Cells of some columns as numbers, empty ones NaN [T, C]."""
-    values = [[float(row[c] or "nan") if c < len(row) else np.nan for c in columns] for row in rows]
-    return np.array(values).reshape(-1, len(columns))
+    """Cells of some columns as numbers, NaN where a row is too short [T, C]."""
+    values = np.full((len(rows), len(columns)), np.nan)
+    for index, row in enumerate(rows):
+        for place, column in enumerate(columns):
+            if column < len(row):
+                values[index, place] = _number(row[column])
+    return values
 
 
 def _plain(rows: list[list[str]]) -> np.ndarray:
     """Times and poses [T, 8] of the plain layout."""
     header = [cell.lower() for cell in rows[0]]
-    if missing := [name for name in PLAIN if name not in header]:
-        raise ValueError(
-            f"there is no column {missing[0]!r}; the first line must name {', '.join(PLAIN)} "
-            "(and tracked), or the file be OptiTrack's export"
-        )
+    for name in PLAIN:
+        if name not in header:
+            raise ValueError(
+                f"there is no column {name!r}; the first line must name {', '.join(PLAIN)} "
+                "(and tracked), or the file be OptiTrack's export"
+            )
     values = _numbers(rows[1:], [header.index(name) for name in PLAIN])
     if "tracked" in header:
-        values[_numbers(rows[1:], [header.index("tracked")])[:, 0] < 0.5, 1:] = np.nan
+        tracked = _numbers(rows[1:], [header.index("tracked")])[:, 0]
+        values[tracked < 0.5, 1:] = np.nan
     return values
 
 
 def _optitrack(rows: list[list[str]], body: str | None) -> np.ndarray:
     """Times and poses [T, 8] of OptiTrack's layout."""
-    head = {
-        key.lower(): value.lower() for key, value in zip(rows[0][::2], rows[0][1::2], strict=False)
-    }
-    turns, unit = head.get("rotation type", "quaternion"), head.get("length units", "meters")
-    if turns != "quaternion":
-        raise ValueError(f"rotations are {turns}; export them as quaternions")
+    head = [cell.lower() for cell in rows[0]]
+    settings = dict(zip(head[::2], head[1::2], strict=False))
+    rotation = settings.get("rotation type", "quaternion")
+    unit = settings.get("length units", "meters")
+    if rotation != "quaternion":
+        raise ValueError(f"rotations are {rotation}; export them as quaternions")
     if unit not in UNITS_M:
         raise ValueError(f"lengths are in {unit!r}; export them in {' or '.join(UNITS_M)}")
-    names = next((row for row in rows if "Name" in row[:2]), None)
-    start = next((i for i, row in enumerate(rows) if row[0] == "Frame"), 0)
-    if names is None or start == 0:
+    names: list[str] = []
+    start = 0
+    for index, row in enumerate(rows):
+        if "Name" in row[:2] and not names:
+            names = row
+        if row[0] == "Frame":
+            start = index
+            break
+    if not names or start == 0:
         raise ValueError("no rows Name and Frame in the head; export it from Motive again")
-    found: dict[str, dict[tuple[str, str], int]] = {}
-    for column, (name, kind, axis) in enumerate(
-        zip(names, rows[start - 1], rows[start], strict=False)
-    ):
-        found.setdefault(name, {}).setdefault((kind.lower(), axis.lower()), column)
-    wanted = [("position", axis) for axis in "xyz"] + [("rotation", axis) for axis in "xyzw"]
-    bodies = {
-        name: columns for name, columns in found.items() if all(key in columns for key in wanted)
-    }
+    bodies = _bodies(names, rows[start - 1], rows[start])
     if body is None and len(bodies) == 1:
         body = next(iter(bodies))
     if body not in bodies:
         raise ValueError(
             f"it has the rigid bodies {', '.join(bodies) or '(none)'}; name one of them with --body"
         )
-    values = _numbers(rows[start + 1 :], [1, *(bodies[body][key] for key in wanted)])
+    values = _numbers(rows[start + 1 :], [1, *bodies[body]])
     values[:, 1:4] *= UNITS_M[unit]
     return values
+
+
+def _bodies(
+    names: Sequence[str], kinds: Sequence[str], axes: Sequence[str]
+) -> dict[str, list[int]]:
+    """Columns of the position and quaternion of every rigid body that has them all, by its name."""
+    columns: dict[str, dict[str, int]] = {}
+    for column, (name, kind, axis) in enumerate(zip(names, kinds, axes, strict=False)):
+        columns.setdefault(name, {}).setdefault(f"{kind} {axis}".lower(), column)
+    bodies = {}
+    for name, places in columns.items():
+        if set(POSE) <= places.keys():
+            bodies[name] = [places[key] for key in POSE]
+    return bodies

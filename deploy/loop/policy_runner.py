@@ -11,11 +11,11 @@ import warp as wp
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import check_fits, open_policy, task_for
 from vd.evaluate.statistics import symmetric_error
 from vd.geometry.arrays import Array, as_warp, library_of, of_warp
 from vd.paper import PAPER
 from vd.policy import ONNX_SUFFIX, has_suffix
+from vd.policy.agents import check_fits, open_policy, task_for
 from vd.policy.onnx import read_onnx
 from vd.policy.senses import Senses
 from vd.policy.stopping import StoppingRule
@@ -49,7 +49,7 @@ class Sensed:
 
 
 @dataclass(frozen=True)
-class Decision:
+class PolicyDecision:
     """What a policy says of a moment.
 
     Raises:
@@ -89,7 +89,8 @@ class PolicyRunner:
     calibrated = True
 
     def __init__(self, task: ReorientCfg, rule: StoppingRule):
-        self.task, self.rule = task, rule
+        self.task = task
+        self.rule = rule
 
     def look_by(self, camera: CameraModel) -> None:
         """See by a camera with this lens at this place, in place of the one of the training."""
@@ -101,12 +102,12 @@ class PolicyRunner:
     def new_goal(self) -> None:
         """A new goal: memory starts empty, as in training."""
 
-    def decide(self, sensed: Sensed) -> Decision:
+    def decide(self, sensed: Sensed) -> PolicyDecision:
         """What to do now."""
-        return Decision(np.zeros_like(sensed.smoothed), float("nan"))
+        return PolicyDecision(np.zeros_like(sensed.smoothed), float("nan"))
 
 
-class TeacherRunner(PolicyRunner):
+class TeacherPolicyRunner(PolicyRunner):
     """A teacher, which is told the object's state: by a twin, or by who tells poses.
 
     An environment makes its observation. Until a state is known the hand holds still.
@@ -133,7 +134,9 @@ class TeacherRunner(PolicyRunner):
             objects=(object,),
         )
         super().__init__(task, StoppingRule(tolerance_rad))
-        self._env, self._policy, self._begins = ReorientEnv(task, "cpu"), policy, True
+        self._env = ReorientEnv(task, "cpu")
+        self._policy = policy
+        self._begins = True
         drop = self._env.hand.workspace.drop_m
         self._before = np.array([*drop, 0.0, 0.0, 0.0, 1.0, *np.zeros(6)])
 
@@ -141,11 +144,11 @@ class TeacherRunner(PolicyRunner):
         """The symmetry frame is chosen anew."""
         self._begins = True
 
-    def decide(self, sensed: Sensed) -> Decision:
+    def decide(self, sensed: Sensed) -> PolicyDecision:
         """What it does in this state."""
-        env, sim = self._env, self._env.sim
-        known = sensed.object_state is not None
-        state = sensed.object_state if sensed.object_state is not None else self._before
+        env = self._env
+        sim = self._env.sim
+        state = self._before if sensed.object_state is None else sensed.object_state
         for array, joints, rest in (
             (sim.joint_q, sensed.joint_q, state[:7]),
             (sim.joint_qd, sensed.joint_qd, state[7:]),
@@ -155,18 +158,18 @@ class TeacherRunner(PolicyRunner):
         ):
             array.assign(np.array([[*joints, *rest]], dtype=np.float32)[:, : array.shape[1]])
         sim.forward_kinematics()
-        if self._begins and known:
+        if self._begins:
             env.give_goals(np.zeros(1, int), sensed.goal_quat[None])
-            self._begins = False
+            self._begins = sensed.object_state is None
         env.observe()
-        seen = of_warp(env.observation, library_of(self._policy.network.offset))
-        action = as_warp(self._policy.act(seen))
+        observation = of_warp(env.observation, library_of(self._policy.network.offset))
+        action = as_warp(self._policy.act(observation))
         if env.symmetry_frames is not None:
             action = env.symmetry_frames.world_action(action)
-        if not known:
-            return Decision(np.zeros_like(sensed.smoothed), float("nan"))
+        if sensed.object_state is None:
+            return PolicyDecision(np.zeros_like(sensed.smoothed), float("nan"))
         error = symmetric_error(state[None, 3:7], sensed.goal_quat[None], env.objects[0].symmetry)
-        return Decision(action.numpy()[0].copy(), float(error[0]))
+        return PolicyDecision(action.numpy()[0].copy(), float(error[0]))
 
 
 class TrackingRunner(PolicyRunner):
@@ -194,32 +197,40 @@ class TrackingRunner(PolicyRunner):
     ):
         super().__init__(ReorientCfg.of(policy), policy.spec.rule_for(tolerance_rad))
         self.kind = policy.kind
-        self.calibrated, depth = policy.spec.calibrated_for(tolerance_rad), policy.spec.depth
+        self.calibrated = policy.spec.calibrated_for(tolerance_rad)
+        depth = policy.spec.depth
         self._cloud = partial(
             CameraCloud, mount=hand.mount, points=depth.points, crop_m=depth.crop_m, seed=seed
         )
         self._tracker_of = partial(Tracker, policy, hand, [item])
-        self._fresh, self._library = True, library_of(policy.teacher.network.offset)
+        self._fresh = True
+        self._library = library_of(policy.teacher.network.offset)
         self.look_by(hand.camera.at(policy.spec.camera))
 
     def look_by(self, camera: CameraModel) -> None:
         """See by another camera."""
-        self.camera, self.eye, self._tracker = camera, self._cloud(camera), self._tracker_of(camera)
+        self.camera = camera
+        self.eye = self._cloud(camera)
+        self._tracker = self._tracker_of(camera)
 
     def begin(self) -> None:
         """The object is looked for anew, which takes several times as long as a step."""
         self._fresh = True
 
-    def decide(self, sensed: Sensed) -> Decision:
+    def decide(self, sensed: Sensed) -> PolicyDecision:
         """Mean action, and the expected distance."""
         points = seen_points(self.eye, sensed.depth)
         senses = senses_of(sensed, of_warp(points, self._library), fresh=self._fresh)
         decided = self._tracker.step(senses)
-        self._fresh, found = False, self._tracker.observer.found
-        assert found is not None
-        pose = np.concatenate([np.asarray(found.position[0]), np.asarray(found.orientation[0])])
-        action, angle = np.array(decided.action[0]), float(decided.angle[0])
-        return Decision(action, angle, pose, int(found.voxels[0]))
+        self._fresh = False
+        estimate = self._tracker.observer.found
+        assert estimate is not None
+        pose = np.concatenate(
+            [np.asarray(estimate.position[0]), np.asarray(estimate.orientation[0])]
+        )
+        action = np.array(decided.action[0])
+        angle = float(decided.angle[0])
+        return PolicyDecision(action, angle, pose, int(estimate.voxels[0]))
 
 
 def load_runner(
@@ -256,7 +267,7 @@ def load_runner(
     if isinstance(policy, TrackingPolicy):
         return TrackingRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     if object is not None:
-        return TeacherRunner(policy, hand_name, object, tolerance_rad)
+        return TeacherPolicyRunner(policy, hand_name, object, tolerance_rad)
     raise ValueError(
         f"{name} is a teacher: it needs the object's pose, which no robot senses; tell it by --pose, "
         "or have vd-train tracker make a tracking policy of it"

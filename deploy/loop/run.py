@@ -8,7 +8,7 @@ object is: by --pose, or by a twin, which tells the truth.
 
 import contextlib
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -23,7 +23,7 @@ from vd.command.files import check_folder
 from vd.command.line import say_same_as
 from vd.command.warp_quiet import quiet_warp
 from vd.deploy.asking import answer, answered, ask, attended
-from vd.deploy.camera.camera import Camera
+from vd.deploy.camera.camera import ImageSource
 from vd.deploy.camera.realsense import RealSenseCfg
 from vd.deploy.finding import Finding
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
@@ -31,24 +31,20 @@ from vd.deploy.loop.run_page import goal_results, summary_line, write_page
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import MOVE_S, SafeHand
 from vd.deploy.timely import undisturbed
-from vd.evaluate.agents import check_names
 from vd.logs.hand_log import is_log, read_log
 from vd.logs.log_format import MCAP, LogError
 from vd.paper import PAPER
-from vd.policy.defaults import default_policy
+from vd.policy.agents import check_names, default_policy
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from vd.assets_usd.hand_data import CameraModel, HandModel
+    from vd.assets_usd.hand_model import HandModel
     from vd.assets_usd.objects.model import ObjectModel
-    from vd.deploy.loop.log import Sink
     from vd.deploy.loop.policy_runner import PolicyRunner
     from vd.deploy.pose.source import PoseSource
-    from vd.deploy.twin.child import TwinChild
+    from vd.deploy.twin.twin import Twin
 
-LOG_FILES = {MCAP: "mcap_ros2", ".rrd": "rerun"}
-"""Endings of files that a log can be written to besides, and the package that each needs."""
 LOGS = Path("runs/deploy")
 """Folder of the logs that are not named."""
 HOME_RAD_S = 0.5
@@ -68,7 +64,7 @@ DRAWING = "drawing the film (the first one compiles its kernels) ..."
 
 
 @dataclass(frozen=True)
-class RunCfg(HandOptions):
+class DriveCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
@@ -112,8 +108,8 @@ class RunCfg(HandOptions):
     safety: SafetyCfg = field(default_factory=SafetyCfg)
     """Limits."""
     log: Path | None = None
-    """Folder of the log; runs/deploy/ and the time by default. NAME.mcap (ROS 2 messages) or
-    NAME.rrd (Rerun) is written beside the folder NAME."""
+    """Folder of the log; runs/deploy/ and the time by default. NAME.mcap (ROS 2 messages) is
+    written beside the folder NAME."""
     ros2: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Drive a hand behind ROS 2 in place of --port. Goals come from a service too
     (vd.deploy.ros).
@@ -123,7 +119,7 @@ class RunCfg(HandOptions):
     seed: int = 0
     """Of drawn goals and of the choice of points."""
     realtime: bool = True
-    """Run before all ordinary programs, the twin too, where that is permitted (root, ulimit -r)."""
+    """Run before all ordinary programs, where that is permitted (root, ulimit -r)."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves; a twin is not asked for."""
 
@@ -167,13 +163,13 @@ class RunCfg(HandOptions):
         if Path(self.object).suffix.lower() in SCAN_SUFFIXES and (self.twin or self.pose):
             who = "a twin cannot hold" if self.twin else "a teacher does not know"
             raise ValueError(f"--object {self.object}: {who} a scan; vd-assets import it first")
-        if self.log is not None and (package := LOG_FILES.get(self.log.suffix)):
+        if self.log is not None and self.log.suffix == MCAP:
             if self.log.exists():
                 raise FileExistsError(f"--log {self.log} is there; choose another name")
-            interrupt.need(package)
+            interrupt.need("mcap_ros2")
 
 
-def run(cfg: RunCfg) -> int:
+def run(cfg: DriveCfg) -> int:
     """Run the policy; 0 if all goals were pursued, 1 if the object was lost.
 
     Raises:
@@ -183,7 +179,7 @@ def run(cfg: RunCfg) -> int:
     cfg.validate()
     folder = LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
     if cfg.log is not None:
-        folder = cfg.log.with_suffix("") if cfg.log.suffix in LOG_FILES else cfg.log
+        folder = cfg.log.with_suffix("") if cfg.log.suffix == MCAP else cfg.log
     check_folder(folder)
     if is_log(folder):
         raise FileExistsError(f"{folder} holds a log; choose another folder")
@@ -194,19 +190,15 @@ def run(cfg: RunCfg) -> int:
 
     quiet_warp()
     hand = load_hand(cfg.hand, layer=cfg.hand_layer) if cfg.ros2 else motors_of(cfg).hand
-    item, name = one_object(cfg.object), cfg.policy_name
+    item = one_object(cfg.object)
+    name = cfg.policy_name
     goals = _goals(cfg, item)
     _say_chosen(cfg, len(goals))
     runner = _runner(cfg, name, hand, item)
     fault: Exception | None = None
     status = 0
-    camera = runner.camera or hand.mounted_camera
-    camera_pose = (
-        None if camera is None else (*map(float, camera.position), *map(float, camera.quaternion))
-    )
-    twin: dict[str, Any] = {"object": cfg.object, "camera": camera_pose}
-    twin |= {"realistic": cfg.realistic, "realtime": cfg.realtime}
-    with connect_ros(cfg, cfg.ros2_args) if cfg.ros2 else connect(cfg, **twin) as connection:
+    opened = connect_ros(cfg, cfg.ros2_args) if cfg.ros2 else connect(cfg, item=item)
+    with opened as connection:
         try:
             status = _pursue(cfg, name, runner, connection, item, goals, folder)
         except Exception as error:  # the page says why, too
@@ -228,14 +220,14 @@ def run(cfg: RunCfg) -> int:
     return status
 
 
-def _runner(cfg: RunCfg, name: str, hand: "HandModel", item: "ObjectModel") -> "PolicyRunner":
-    """The policy, with what is told of it."""
+def _runner(cfg: DriveCfg, name: str, hand: "HandModel", item: "ObjectModel") -> "PolicyRunner":
+    """The policy, with what is known of it."""
     from vd.deploy.loop.policy_runner import load_runner
 
     tolerance = cfg.tolerance_rad
-    told = cfg.object if cfg.twin or cfg.pose else None
+    known_object = cfg.object if cfg.twin or cfg.pose else None
     runner = load_runner(
-        name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=told
+        name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=known_object
     )
     if cfg.pose and runner.camera is not None:
         raise ValueError(f"--pose is for a teacher; {name} sees by camera: leave it out")
@@ -250,7 +242,7 @@ def _runner(cfg: RunCfg, name: str, hand: "HandModel", item: "ObjectModel") -> "
     return runner
 
 
-def _say_chosen(cfg: RunCfg, goals: int) -> None:
+def _say_chosen(cfg: DriveCfg, goals: int) -> None:
     """Say what a run takes that names no policy."""
     if cfg.policy is None:
         where = ["--ros2"] if cfg.ros2 else ["--port", cfg.port] if cfg.port else ["--twin"]
@@ -258,7 +250,7 @@ def _say_chosen(cfg: RunCfg, goals: int) -> None:
         say_same_as("vd-deploy", *words, why=f"{goals} goals")
 
 
-def _goals(cfg: RunCfg, item: "ObjectModel") -> list[np.ndarray]:
+def _goals(cfg: DriveCfg, item: "ObjectModel") -> list[np.ndarray]:
     """What was asked for, or where nothing was, what shows something; with ROS 2 none."""
     from vd.deploy.loop.goals import make_goals, shown_goals
 
@@ -269,7 +261,7 @@ def _goals(cfg: RunCfg, item: "ObjectModel") -> list[np.ndarray]:
 
 
 def _pursue(
-    cfg: RunCfg,
+    cfg: DriveCfg,
     name: str,
     runner: "PolicyRunner",
     connection: Connection,
@@ -289,40 +281,47 @@ def _pursue(
     from vd.deploy.pose.follower import PoseFollower
     from vd.deploy.ros import UNKNOWN, RosGoals
 
-    hand, twin, hz = connection.hand, connection.twin, runner.task.sim.control_hz
+    hand = connection.hand
+    twin = connection.twin
+    hz = runner.task.sim.control_hz
     pose = hand.start
     with contextlib.ExitStack() as stack:
-        camera: Camera | None = None
-        seen: Iterable[Finding] = ()
+        camera: ImageSource | None = None
+        looks: Iterable[Finding] = ()
         if runner.camera is not None:
-            camera = open_camera(cfg.camera, connection, runner.camera)
+            camera = open_camera(cfg.camera, connection, runner.camera, realistic=cfg.realistic)
             stack.callback(camera.close)
             where = (
                 runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
             )
             runner.look_by(camera.intrinsics.seen_from(where))
-            seen = camera_findings(
+            looks = camera_findings(
                 camera, runner.camera, hand.goal_in_base, fps=cfg.camera.fps if twin is None else hz
             )
         poses = None
         if cfg.pose is not None:
             poses = stack.enter_context(_poses(cfg, cfg.pose, connection))
-            seen = pose_findings(*poses, hand, cfg.safety.pose_stale_s)
+            looks = pose_findings(*poses, hand, cfg.safety.pose_stale_s)
         warm_up(runner, pose, [*goals, NO_SYMMETRY[0]][0], camera)
         stack.enter_context(undisturbed(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals{', and those it is given' * cfg.ros2}."
-        ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=seen)
-        said, servo = _description(cfg, name, runner, item, goals), connection.joints.servo()
+        ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=looks)
+        description = _description(cfg, name, runner, item, goals)
+        servo = connection.joints.servo()
         without = () if connection.ros is None else UNKNOWN
-        log = LogWriter(folder, hand, said, servo=servo, truth=twin is not None, without=without)
-        file = cfg.log
-        if file is not None and file.suffix in LOG_FILES:
-            log.also_to(lambda run: _sink(file, run, hand, item, runner.camera))
+        log = LogWriter(
+            folder, hand, description, servo=servo, truth=twin is not None, without=without
+        )
+        if cfg.log is not None and cfg.log.suffix == MCAP:
+            from vd.logs.mcap_log import McapLog
+
+            log.also_to(McapLog(cfg.log, log.run, np.asarray(hand.workspace.goal_m)))
         served = None if connection.ros is None else RosGoals(connection.ros, goals)
         if served is not None:
-            log.also_to(lambda _: served)
+            log.also_to(served)
         pacer = Pacer(hz, latest=LATEST)
-        reason, outcomes = "aborted", list[str]()
+        reason = "aborted"
+        outcomes = list[str]()
         loop: ControlLoop | None = None
         try:
             # With ROS 2 torque is the driver's.
@@ -362,7 +361,7 @@ def _pursue(
 
 
 def _poses(
-    cfg: RunCfg, source: str, connection: Connection
+    cfg: DriveCfg, source: str, connection: Connection
 ) -> "AbstractContextManager[tuple[PoseSource, np.ndarray]]":
     """What --pose names, with the pose of its frame in the world; a twin shows its object."""
     from vd.deploy.pose.open import NO_MOTION, open_poses, pose_options, source_frame
@@ -376,25 +375,8 @@ def _poses(
     return open_poses(source, connection, cfg.camera, in_base, **words)
 
 
-def _sink(
-    file: Path,
-    run: Mapping[str, Any],
-    hand: "HandModel",
-    item: "ObjectModel",
-    camera: "CameraModel | None",
-) -> "Sink":
-    """What writes the file of a log."""
-    if file.suffix == MCAP:
-        from vd.logs.mcap_log import McapLog
-
-        return McapLog(file, run, np.asarray(hand.workspace.goal_m))
-    from vd.deploy.loop.rerun_log import RerunLog
-
-    return RerunLog(file, run, hand, item, camera)
-
-
 def warm_up(
-    runner: "PolicyRunner", pose: np.ndarray, goal: np.ndarray, camera: Camera | None
+    runner: "PolicyRunner", pose: np.ndarray, goal: np.ndarray, camera: ImageSource | None
 ) -> None:
     """Let the policy decide a few times on what is seen now; the run begins without that.
 
@@ -409,7 +391,11 @@ def warm_up(
 
 
 def _description(
-    cfg: RunCfg, name: str, runner: "PolicyRunner", item: "ObjectModel", goals: Sequence[np.ndarray]
+    cfg: DriveCfg,
+    name: str,
+    runner: "PolicyRunner",
+    item: "ObjectModel",
+    goals: Sequence[np.ndarray],
 ) -> dict[str, Any]:
     """What a run's log says of it beside its steps."""
     return {
@@ -425,7 +411,7 @@ def _description(
     }
 
 
-def place(safe: SafeHand, pose: np.ndarray, twin: "TwinChild | None", *, yes: bool) -> None:
+def place(safe: SafeHand, pose: np.ndarray, twin: "Twin | None", *, yes: bool) -> None:
     """Hold the pose until the object is between the fingers: a person's or the twin's doing.
 
     Raises:

@@ -41,15 +41,14 @@ class GoalResult:
         """In one line."""
         words = {True: "reached", False: "not reached", None: "error not known"}[self.success]
         far = "" if self.error_rad is None else f", {self.error_rad:.2f} rad from it"
-        said = "" if self.predicted_rad is None else f", predicted {self.predicted_rad:.2f}"
-        return (
-            f"goal {self.goal + 1}: {words}: {self.outcome} after {self.seconds:.1f} s{far}{said}"
-        )
+        predicted = "" if self.predicted_rad is None else f", predicted {self.predicted_rad:.2f}"
+        return f"goal {self.goal + 1}: {words}: {self.outcome} after {self.seconds:.1f} s{far}{predicted}"
 
 
 def goal_results(log: HandLog) -> list[GoalResult]:
     """How each goal ended that was pursued."""
-    columns, stops = log.columns, {stop.goal: stop for stop in log.stops}
+    columns = log.columns
+    stops = {stop.goal: stop for stop in log.stops}
     results = []
     for goal in np.unique(columns["goal"][columns["acting"] > 0.0]).astype(int):
         rows = np.flatnonzero((columns["goal"] == goal) & (columns["acting"] > 0.0))
@@ -73,22 +72,22 @@ def goal_results(log: HandLog) -> list[GoalResult]:
 
 def summary_line(results: Sequence[GoalResult], goals: int) -> str:
     """How many goals were reached of those that were to be pursued."""
-    if any(one.success is None for one in results):
-        stopped = sum(one.outcome == "stopped" for one in results)
+    if any(result.success is None for result in results):
+        stopped = sum(result.outcome == "stopped" for result in results)
         return f"{stopped} of {goals} goals stopped; vd-deploy score tells the errors, by motion capture"
     return f"{sum(bool(one.success) for one in results)} of {goals} goals reached"
 
 
 def ending(log: HandLog) -> list[str]:
     """Why a run ended, and which motors may still have their torque on, in sentences."""
-    said = str(log.run.get("end", {}).get("reason", ""))
+    end_reason = str(log.run.get("end", {}).get("reason", ""))
     if log.stopped is None:
         unknown = "Nobody noted that the torque went off: every motor may be on. Cut their power."
-        return [f"Ended: {said or 'without a word, as a program that is killed'}.", unknown]
+        return [f"Ended: {end_reason or 'without a word, as a program that is killed'}.", unknown]
     reason, may_be_on = log.stopped
     sentences = [f"Stopped: {reason}."]
     if reason == FINISHED:
-        sentences = [f"Ended: {said or reason}."]
+        sentences = [f"Ended: {end_reason or reason}."]
     if not may_be_on:
         return [*sentences, "The torque of every motor is off."]
     if LEFT_ON in may_be_on.values():
@@ -127,14 +126,14 @@ def write_page(log: HandLog, results: Sequence[GoalResult], *, filmed: bool = Tr
         remedy=f"vd-play {log.path}" if able else interrupt.remedy("imageio_ffmpeg"),
         rows=[
             (
-                one.goal + 1,
-                one.outcome,
-                f"{one.seconds:.1f}",
-                "" if one.predicted_rad is None else f"{one.predicted_rad:.2f}",
-                "" if one.error_rad is None else f"{one.error_rad:.2f}",
-                {True: "yes", False: "no", None: ""}[one.success],
+                result.goal + 1,
+                result.outcome,
+                f"{result.seconds:.1f}",
+                "" if result.predicted_rad is None else f"{result.predicted_rad:.2f}",
+                "" if result.error_rad is None else f"{result.error_rad:.2f}",
+                {True: "yes", False: "no", None: ""}[result.success],
             )
-            for one in results
+            for result in results
         ],
         tolerance_rad=f"{log.tolerance_rad:g}" if "error" in log.columns else None,
     )

@@ -136,7 +136,8 @@ def in_world(
     frame = Rotation.from_quat(world)
     if up == "y":
         frame = frame * Rotation.from_euler("x", 90, degrees=True)
-    pose, rows = mocap.pose.copy(), mocap.tracked
+    pose = mocap.pose.copy()
+    rows = mocap.tracked
     turn = frame * Rotation.from_quat(pose[rows, 3:]) * Rotation.from_quat(marker)
     pose[rows] = np.concatenate([frame.apply(pose[rows, :3]), turn.as_quat()], axis=1)
     return replace(mocap, pose=pose)
@@ -177,7 +178,7 @@ def score_run(
         trials.append(Trial(stop.goal, stop.time_s, stop.outcome, tracked, error, stop.distance))
     kept = [trial.error_rad for trial in trials if not trial.discarded]
     errors = np.array([np.inf if error is None else error for error in kept])
-    found = errors[np.isfinite(errors)]
+    stop_errors = errors[np.isfinite(errors)]
     within = errors <= np.array(TOLERANCES_RAD)[:, None]
     rates = rate_intervals(within[:, None, :], "episode") if kept else []
     return Score(
@@ -185,7 +186,7 @@ def score_run(
         mocap.path,
         offset_s,
         tuple(trials),
-        median_interval(found[None], "episode") if len(found) else None,
+        median_interval(stop_errors[None], "episode") if len(stop_errors) else None,
         tuple(zip(TOLERANCES_RAD, rates, strict=False)),
     )
 
@@ -205,7 +206,8 @@ def lines(result: Score) -> list[str]:
         f"stop"
     )
     if result.median is not None:
-        m, stops = result.median, sum(trial.error_rad is not None for trial in result.trials)
+        m = result.median
+        stops = sum(trial.error_rad is not None for trial in result.trials)
         rows.append(
             f"median error at {stops} stops: {m.value:.2f} rad ({np.degrees(m.value):.0f} deg), "
             f"95 % {m.low:.2f} to {m.high:.2f}"

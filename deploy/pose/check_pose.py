@@ -8,7 +8,7 @@ from vd.assets_usd.hand_data import HandModel, compose
 from vd.deploy.camera.camera import CameraError
 from vd.deploy.clock import MONOTONIC, Clock, from_future
 from vd.deploy.finding import Finding, finding
-from vd.deploy.pose.source import PoseError, PoseSource, StampedPose
+from vd.deploy.pose.source import PoseSource, PoseSourceError, StampedPose
 
 FIRST_S = 5.0
 """Longest wait for a first pose."""
@@ -49,7 +49,7 @@ def pose_findings(
                 poses.append(newest)
                 ages_s.append(clock.now() - newest.time_s)
             clock.sleep(POLL_S)
-    except (PoseError, CameraError) as error:
+    except (PoseSourceError, CameraError) as error:
         yield Finding("pose", False, str(error))
         return
     if not poses:

@@ -49,7 +49,7 @@ class PoseFollower:
         """The object as it is known now.
 
         Raises:
-            PoseError: What came is no pose.
+            PoseSourceError: What came is no pose.
         """
         newest = self._source.read()
         last = self._object

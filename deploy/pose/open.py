@@ -135,7 +135,7 @@ def open_poses(
         seed: Of the noise of what a twin tells.
 
     Raises:
-        PoseError: There is none.
+        PoseSourceError: There is none.
         CameraError: The camera does not serve.
     """
     options = pose_options(text)

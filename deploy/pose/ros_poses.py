@@ -3,7 +3,7 @@
 from typing import Any
 
 from vd.deploy.camera.ros_camera import monotonic
-from vd.deploy.pose.source import PoseError, StampedPose, make_pose
+from vd.deploy.pose.source import PoseSourceError, StampedPose, make_pose
 
 
 class RosPoses:
@@ -36,14 +36,16 @@ class RosPoses:
         """The newest pose; None before the first one.
 
         Raises:
-            PoseError: What came is no pose, or has no stamp.
+            PoseSourceError: What came is no pose, or has no stamp.
         """
         message = self._message
         if message is None:
             return None
         stamp = message.header.stamp
         if stamp.sec == 0:
-            raise PoseError(f"{self.name}: poses have no stamp; stamp them when they are seen")
+            raise PoseSourceError(
+                f"{self.name}: poses have no stamp; stamp them when they are seen"
+            )
         place, turn = message.pose.position, message.pose.orientation
         position = (place.x, place.y, place.z)
         quaternion = (turn.x, turn.y, turn.z, turn.w)

@@ -10,7 +10,7 @@ UNIT_TOLERANCE = 0.01
 """Deviation of a quaternion's length from 1, above which it is none."""
 
 
-class PoseError(RuntimeError):
+class PoseSourceError(RuntimeError):
     """A source of poses, or a pose, that cannot be used; names the remedy."""
 
 
@@ -36,7 +36,7 @@ class PoseSource(Protocol):
         """The newest pose; None before the first one. Does not wait for another.
 
         Raises:
-            PoseError: What came is no pose.
+            PoseSourceError: What came is no pose.
         """
 
     def close(self) -> None:
@@ -52,12 +52,12 @@ def make_pose(position: Sequence[float], quaternion: Sequence[float], where: str
         where: Who sent it.
 
     Raises:
-        PoseError: It is none.
+        PoseSourceError: It is none.
     """
     place = np.asarray(position, dtype=float)
     if place.shape != (3,) or not np.isfinite(place).all():
-        raise PoseError(f"{where}: position is {position}; send 3 finite numbers, metres")
+        raise PoseSourceError(f"{where}: position is {position}; send 3 finite numbers, metres")
     turn = np.asarray(quaternion, dtype=float)
     if turn.shape != (4,) or not abs(np.linalg.norm(turn) - 1.0) < UNIT_TOLERANCE:
-        raise PoseError(f"{where}: quaternion is {quaternion}; send x, y, z, w of length 1")
+        raise PoseSourceError(f"{where}: quaternion is {quaternion}; send x, y, z, w of length 1")
     return np.concatenate([place, turn / np.linalg.norm(turn)])

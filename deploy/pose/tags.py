@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import Intrinsics
-from vd.deploy.camera.camera import Camera, StaleCamera
+from vd.deploy.camera.camera import ImageSource, StaleCamera
 from vd.deploy.camera.markers import find_markers, opencv
 from vd.deploy.pose.source import StampedPose
 
@@ -171,7 +171,7 @@ class TagPoses:
         size_m: Side of the cube [m].
     """
 
-    def __init__(self, camera: Camera, size_m: float = SIZE_M):
+    def __init__(self, camera: ImageSource, size_m: float = SIZE_M):
         self.name = "tags"
         self.trouble = ""
         self._camera = camera

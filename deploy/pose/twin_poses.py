@@ -16,7 +16,7 @@ from vd.command.config import require
 from vd.deploy.camera.camera import Frame
 from vd.deploy.pose.rendered import render_cube
 from vd.deploy.pose.source import StampedPose
-from vd.deploy.twin.child import TwinChild
+from vd.deploy.twin.twin import Twin
 
 IMAGES_HZ = 15.0
 """Images a second: drawing and reading them takes the time of other programs, too."""
@@ -44,7 +44,7 @@ class TwinPoses:
     """The truth of a twin, in the world frame, taken whenever it is read.
 
     Args:
-        truth: State of the object [13], as :meth:`TwinChild.object_state` tells it.
+        truth: State of the object [13], as :meth:`Twin.object_state` tells it.
         cfg: Its errors.
         now: Time [s].
         seed: Of the noise.
@@ -97,7 +97,7 @@ class TagsOfTwin:
 
     def __init__(
         self,
-        twin: TwinChild,
+        twin: Twin,
         hand: HandModel,
         camera: np.ndarray,
         intrinsics: Intrinsics,
@@ -119,9 +119,8 @@ class TagsOfTwin:
         """The next image: brightness, uint8 [H, W]."""
         time.sleep(max(0.0, self._due_s - time.monotonic()))
         self._due_s = time.monotonic() + 1.0 / IMAGES_HZ
-        state, joint_q = self._twin.ask("scene", timeout_s)
-        time_s = time.monotonic()
-        in_base = compose(invert(self._hand.mount), state[:7])
+        time_s, joint_q, object_pose = self._twin.poses()
+        in_base = compose(invert(self._hand.mount), object_pose)
         to_camera = invert(self._camera)
         links = self._hand.forward_kinematics(joint_q)[self._hand.point_link]
         turns = Rotation.from_quat(links[:, 3:]).as_matrix()

@@ -12,7 +12,7 @@ import json
 import socket
 
 from vd.deploy.clock import of_unix
-from vd.deploy.pose.source import PoseError, StampedPose, make_pose
+from vd.deploy.pose.source import PoseSourceError, StampedPose, make_pose
 
 LONGEST = 4096
 """Bytes of a datagram at most."""
@@ -27,7 +27,7 @@ class UdpPoses:
         port: Number of the port.
 
     Raises:
-        PoseError: Nobody may listen there.
+        PoseSourceError: Nobody may listen there.
     """
 
     def __init__(self, host: str, port: int):
@@ -39,7 +39,7 @@ class UdpPoses:
             self._socket.bind((host, port))
         except OSError as error:
             self._socket.close()
-            raise PoseError(
+            raise PoseSourceError(
                 f"{self.name}: cannot listen at {host}, port {port} ({error.strerror}); choose "
                 "another port, or end who has it"
             ) from error
@@ -49,7 +49,7 @@ class UdpPoses:
         """The newest pose; None before the first one.
 
         Raises:
-            PoseError: What came is no pose.
+            PoseSourceError: What came is no pose.
         """
         while True:
             try:
@@ -71,7 +71,7 @@ class UdpPoses:
             stamp = float(values["stamp"])
             pose = make_pose(values["position"], values["quaternion"], self.name)
         except (ValueError, KeyError, TypeError) as error:
-            raise PoseError(
+            raise PoseSourceError(
                 f"{self.name}: no pose: {data[:80]!r}; send a JSON object with "
                 f"{', '.join(sorted(FIELDS))}"
             ) from error

@@ -14,7 +14,7 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.command.config import require
 from vd.deploy.hardware.answers import HandState
-from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.joints import JointMotors
 from vd.deploy.hardware.registers import RESTART
 from vd.paper import PAPER
 
@@ -119,16 +119,18 @@ class Limits:
         ValueError: The margin leaves a joint no range.
     """
 
-    def __init__(self, joints: Joints, names: Sequence[str], cfg: SafetyCfg):
-        hand, self._names, self._cfg = joints.hand, tuple(names), cfg
+    def __init__(self, joints: JointMotors, names: Sequence[str], cfg: SafetyCfg):
+        hand = joints.hand
+        self._names = tuple(names)
+        self._cfg = cfg
         self.lower, self.upper = hand.lower + cfg.margin_rad, hand.upper - cfg.margin_rad
         if (self.lower >= self.upper).any():
             raise ValueError(
                 f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider"
             )
         self._current = np.where(joints.capped, np.inf, cfg.current_share * joints.currents())
-        most = [model.temperature_limit - SHUTDOWN_C for model in joints.models]
-        self._temperature = np.minimum(cfg.temperature_c, most)
+        shutdown_c = np.array([model.temperature_limit for model in joints.models])
+        self._temperature = np.minimum(cfg.temperature_c, shutdown_c - SHUTDOWN_C)
         self._velocity = cfg.velocity_share * hand.velocity_limit
         self._supply = np.array([model.supply_v for model in joints.models])
         self._blocked = Lasting(cfg.blocked_s)

@@ -36,8 +36,8 @@ import numpy as np
 from vd.deploy.clock import from_future
 from vd.deploy.finding import listed
 from vd.deploy.hardware.answers import BusError, HandState, LateError, SilentError
-from vd.deploy.hardware.bus import MotorBus
-from vd.deploy.hardware.joints import Joints
+from vd.deploy.hardware.joints import JointMotors
+from vd.deploy.hardware.motors import Motors
 from vd.deploy.safety.limits import PERIOD_S, Limits, SafetyCfg, out_of_range
 from vd.deploy.safety.signals import REASONS, Signals
 from vd.logs.log_format import FINISHED
@@ -130,21 +130,23 @@ class SafeHand:
 
     def __init__(
         self,
-        bus: MotorBus,
-        joints: Joints,
+        bus: Motors,
+        joints: JointMotors,
         cfg: SafetyCfg = DEFAULTS,
         say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
         ended: Callable[[StopReport], None] = lambda report: None,
     ):
         """Nothing is sent before :meth:`arm`."""
-        self.bus, self.joints, self.hand, self.cfg = bus, joints, joints.hand, cfg
-        self._say, self._ended = say, ended
+        self.bus = bus
+        self.joints = joints
+        self.hand = joints.hand
+        self.cfg = cfg
+        self._say = say
+        self._ended = ended
         self._names = [
             f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)
         ]
         self.limits = Limits(joints, self._names, self.cfg)
-        self.repeated = 0
-        """Readings without a sound answer, for which the last state stood in."""
         self.report: StopReport | None = None
         """How the stop went, once there was one."""
         self._state: HandState | None = None
@@ -236,7 +238,6 @@ class SafeHand:
             last = self._state
             if last is None or self.bus.clock.now() - last.time_s > self.cfg.lost_s:
                 raise self.stop(unheard(error), lost=True) from error
-            self.repeated += 1
             self._check()
             return last
         self._state = state
@@ -402,7 +403,8 @@ class SafeHand:
     def _due(self) -> str:
         """Why the hand has to stop now, whatever its motors say; empty if it has not."""
         now = self.bus.clock.now()
-        silent, age = now - self._beat_s, now - self._image_s
+        silent = now - self._beat_s
+        age = now - self._image_s
         if came := self._signals.came():
             return REASONS[signal.Signals(came[0])]
         if silent > self.cfg.misses * PERIOD_S:
@@ -499,7 +501,7 @@ class SafeHand:
                 self.bus.release()  # one packet for all; each is asked afterwards
             except BusError as error:
                 return dict.fromkeys(left, str(error))
-            left = self.bus.torque(False, left)
+            left = self.bus.torque(False, list(left))
             if not left:
                 with contextlib.suppress(BusError):
                     self.bus.watch(

@@ -53,7 +53,8 @@ class Signals:
             signal.signal(number, handler)
         signal.set_wakeup_fd(self._wakeup)
         self.came()
-        pipe, self._pipe = self._pipe, None
+        pipe = self._pipe
+        self._pipe = None
         for end in pipe:
             os.close(end)
 

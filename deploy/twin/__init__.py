@@ -1,1 +1,1 @@
-"""A hand without the hand: simulated motors and camera that speak the real protocols."""
+"""A hand without the hand: the simulator in place of motors and camera."""

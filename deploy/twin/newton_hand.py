@@ -1,4 +1,4 @@
-"""The hand in Newton as the plant behind the twin's motors, on the CPU, over a table with an object or none.
+"""The hand in Newton, on the CPU, over a table with an object or none.
 
 One world, stepped at the simulator's physics rate. Steps do not end when somebody asks: a goal that
 arrives within a step counts for the rest of it, and the joints are told where they have got to
@@ -15,8 +15,6 @@ import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.deploy.hardware.joints import Joints
-from vd.deploy.twin.plant import Drive
 from vd.kernels.task.actions import limit_joint_velocity_kernel
 from vd.sim.cfg import SimCfg
 from vd.sim.engine import make_solver
@@ -37,26 +35,21 @@ them from.
 
 
 class NewtonHand:
-    """A simulated hand; its axes are the motors', in the joints' order.
+    """A simulated hand. Arrays are of its joints, shape [D].
 
-    A motor at the position gain of the hand's USD has the hand's stiffness and damping; its
-    stiffness grows with the gain. In current-based mode its current limits the torque. With its
-    torque off a joint has neither. Effects of the hand's layer act as in training.
+    A joint that is driven has the stiffness and damping of the hand's USD, or a share of its
+    stiffness. One that is let go has neither. Effects of the hand's layer act as in training.
+
+    Attributes:
+        scene: What is where in the world; None without an object to handle.
     """
 
-    def __init__(
-        self,
-        hand: HandModel,
-        joints: Joints,
-        cfg: SimCfg | None = None,
-        item: ObjectModel | None = None,
-    ):
+    def __init__(self, hand: HandModel, cfg: SimCfg | None = None, item: ObjectModel | None = None):
         """Build the world, with the hand in the task's reset pose and the object above the table."""
-        self.hand, self.joints = hand, joints
+        self.hand = hand
         cfg = cfg or SimCfg()
         self.cfg = cfg = replace(cfg, nconmax=ROOM * cfg.nconmax, njmax=ROOM * cfg.njmax)
         self.scene: Scene | None = None
-        """What is where in the world; None without an object to handle."""
         if item is None:
             world = build_hand(hand, cfg, visuals=False)
             if not hand.palm_up:
@@ -68,18 +61,18 @@ class NewtonHand:
             self.scene = build_scene(hand=hand, objects=[item], num_envs=1, cfg=cfg, device="cpu")
             self._model = self.scene.model
         self._solver = make_solver(self._model, cfg)
-        self._state, self._next = self._model.state(), self._model.state()
+        self._state = self._model.state()
+        self._next = self._model.state()
         self._control = self._model.control()
         self._axes = hand.num_joints
         self._target = hand.start
         self._held = np.full(self._axes, np.nan, dtype=np.float32)
-        self._limits = wp.zeros(self._axes, dtype=float, device="cpu")
-        self._pair_s, self._rest = 2.0 * cfg.physics_dt, 0.0
-        self._pulled = np.zeros(self._axes)
-        self._stiffness, self._damping = np.zeros(self._axes), np.zeros(self._axes)
-        self._p_gain = np.array([motor.p_gain for motor in joints.motors])
+        self._limits = wp.array(hand.velocity_limit, dtype=float, device="cpu")
+        self._pair_s = 2.0 * cfg.physics_dt
+        self._rest_s = 0.0  # simulated time that is less than a pair of steps
+        self._pulled = np.zeros(self._axes)  # targets over that time
+        self._power = np.full(self._axes, np.nan)
         self._effort = hand.effort
-        self._gains: tuple[tuple[float, float, float], ...] = ()
         self._write(self._state.joint_q, self._target)
         if item is not None:
             self.place_object((0.0, 0.0, 0.0, 1.0))
@@ -99,6 +92,7 @@ class NewtonHand:
         if self._servo is not None:
             self._servo.reset(wp.ones(1, dtype=wp.int32, device="cpu"))
         self._hold(self._target)
+        self.drive(self._target, np.zeros(self._axes), hand.effort)
 
     @property
     def joint_q(self) -> np.ndarray:
@@ -136,10 +130,10 @@ class NewtonHand:
         """Two physics steps as one recorded launch, which takes a tenth of the time.
 
         The launches of a step one by one would take most of its time, and hold the interpreter,
-        which the thread that answers packets needs. Two, because states swap; they end where they
-        began.
+        which the loop's threads need. Two, because states swap; they end where they began.
         """
-        q, qd = wp.clone(self._state.joint_q), wp.clone(self._state.joint_qd)
+        q = wp.clone(self._state.joint_q)
+        qd = wp.clone(self._state.joint_qd)
         self._two_steps()  # loads kernels and allocates
         with wp.ScopedCapture(device="cpu") as capture:
             self._two_steps()
@@ -148,47 +142,67 @@ class NewtonHand:
         return capture.graph
 
     def _two_steps(self) -> None:
-        here, there = self._state, self._next
-        for _ in range(2):
-            before, q, qd = (
-                a.reshape((1, -1)) for a in (here.joint_q, there.joint_q, there.joint_qd)
-            )
-            if self._servo is not None:
-                self._servo.receive()
-                self._servo.drive(before, here.joint_qd.reshape((1, -1)))
-            self._solver.step(here, there, self._control, None, self.cfg.physics_dt)
-            wp.launch(
-                limit_joint_velocity_kernel,
-                dim=(1, len(self._limits)),
-                inputs=[self._limits, self.cfg.physics_dt, before],
-                outputs=[q, qd],
-                device="cpu",
-            )
-            if self._servo is not None:
-                self._servo.finish(before, q, qd)
-            here, there = there, here
+        self._step(self._state, self._next)
+        self._step(self._next, self._state)
         if self._servo is not None:
             self._servo.measure()
 
-    def advance(self, seconds: float, drives: Sequence[Drive]) -> None:
+    def _step(self, here: newton.State, there: newton.State) -> None:
+        """One physics step from one state to the other."""
+        before = here.joint_q.reshape((1, -1))
+        q = there.joint_q.reshape((1, -1))
+        qd = there.joint_qd.reshape((1, -1))
+        if self._servo is not None:
+            self._servo.receive()
+            self._servo.drive(before, here.joint_qd.reshape((1, -1)))
+        self._solver.step(here, there, self._control, None, self.cfg.physics_dt)
+        wp.launch(
+            limit_joint_velocity_kernel,
+            dim=(1, self._axes),
+            inputs=[self._limits, self.cfg.physics_dt, before],
+            outputs=[q, qd],
+            device="cpu",
+        )
+        if self._servo is not None:
+            self._servo.finish(before, q, qd)
+
+    def drive(self, target: np.ndarray, power: np.ndarray, effort: np.ndarray) -> None:
+        """Say where the joints are to go from now on.
+
+        Args:
+            target: Angles [rad].
+            power: Stiffness over the hand's own; 0 lets a joint go.
+            effort: Largest torques [N m].
+        """
+        self._target = np.where(power > 0.0, target, self._target)
+        if not np.array_equal(effort, self._effort):
+            self._effort = effort
+            self._write(self._model.joint_effort_limit, effort)
+        elif np.array_equal(power, self._power):
+            return
+        self._power = power
+        if self._servo is not None:
+            self._servo.power.assign(power[None].astype(np.float32))
+        else:
+            self._write(self._model.joint_target_ke, self.hand.kp * power)
+            self._write(self._model.joint_target_kd, self.hand.kd * (power > 0.0))
+        self._solver.notify_model_changed(newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES)
+
+    def advance(self, seconds: float) -> None:
         """Go on by ``seconds``; what is less than a pair of physics steps is kept for the next time."""
-        self._set_gains(drives)
-        goals = np.array([np.nan if drive.goal_rad is None else drive.goal_rad for drive in drives])
-        self._target = np.where(np.isnan(goals), self._target, self.joints.to_joint(goals))
-        fastest = np.array([drive.velocity_limit for drive in drives]) / self.joints.gear
-        self._limits.assign(np.minimum(fastest, self.hand.velocity_limit))
         seconds = min(seconds, LONGEST_S)
-        while self._rest + seconds >= self._pair_s:
-            share = self._pair_s - self._rest
+        while self._rest_s + seconds >= self._pair_s:
+            share = self._pair_s - self._rest_s
             self._hold((self._pulled + share * self._target) / self._pair_s)
             wp.capture_launch(self._graph)
             seconds -= share
-            self._rest, self._pulled = 0.0, np.zeros(self._axes)
-        self._rest += seconds
+            self._rest_s = 0.0
+            self._pulled = np.zeros(self._axes)
+        self._rest_s += seconds
         self._pulled = self._pulled + seconds * self._target
 
     def _hold(self, target: np.ndarray) -> None:
-        """Give the joints the goals of the next steps [rad] [D]."""
+        """Give the joints the goals of the next steps [rad]."""
         target = target.astype(np.float32)
         if np.array_equal(target, self._held):
             return
@@ -200,41 +214,20 @@ class NewtonHand:
             self._servo.send(self._sent)
 
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions [rad], velocities [rad/s] and torques [N m] of the motors, each of shape [D].
+        """Positions [rad], velocities [rad/s] and torques [N m].
 
         Without an object positions are those of now, else of the last step, as is what the object
         and the camera tell.
         """
-        q, qd = self.joint_q[: self._axes].astype(float), self.joint_qd[: self._axes].astype(float)
+        q = self.joint_q[: self._axes].astype(float)
+        qd = self.joint_qd[: self._axes].astype(float)
         reference = self._held if self._servo is None else self._servo.reference.numpy()[0]
-        torque = self._stiffness * (reference - q) - self._damping * qd
+        damping = self.hand.kd * (self._power > 0.0)
+        torque = self.hand.kp * self._power * (reference - q) - damping * qd
         torque = np.clip(torque, -self._effort, self._effort)
         if self._servo is not None:  # late, or with an offset
             q = self._servo.measured_q.numpy()[0].astype(float)
             qd = self._servo.measured_qd.numpy()[0].astype(float)
         if self.scene is None:
-            q = q + self._rest * qd
-        sign, gear = self.joints.sign, self.joints.gear
-        return self.joints.to_motor(q), sign * gear * qd, sign * torque / gear
-
-    def _set_gains(self, drives: Sequence[Drive]) -> None:
-        """Tell the solver of gains that changed, and of torque switched on or off."""
-        gains = tuple(
-            (one.p_gain, float(one.goal_rad is not None), one.torque_limit) for one in drives
-        )
-        if gains == self._gains:
-            return
-        self._gains = gains
-        p_gain, on, torque = np.array(gains).T
-        scale = on * p_gain / self._p_gain
-        if self.joints.capped.any():
-            most = np.minimum(self.hand.effort, torque * self.joints.gear)
-            self._effort = np.where(self.joints.capped, most, self.hand.effort)
-            self._write(self._model.joint_effort_limit, self._effort)
-        self._stiffness, self._damping = self.hand.kp * scale, self.hand.kd * on
-        if self._servo is not None:
-            self._servo.power.assign(scale[None].astype(np.float32))
-        else:
-            self._write(self._model.joint_target_ke, self._stiffness)
-            self._write(self._model.joint_target_kd, self._damping)
-        self._solver.notify_model_changed(newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES)
+            q = q + self._rest_s * qd
+        return q, qd, torque

@@ -1,257 +1,200 @@
-"""A simulated motor bus behind a pseudo-terminal.
+"""A twin: the hand in Newton, in real time, in place of motors, camera and object."""
 
-Programs talk to it as to a serial port with motors on it.
-
-``python -m vd.deploy.twin.twin`` owns such a port and prints its path. The motors of
-:mod:`vd.deploy.twin.line` answer byte by byte; behind them stands any
-:class:`vd.deploy.twin.plant.Plant`. Motors hear what arrives when it arrives, however long the
-plant takes: they have processors of their own.
-"""
-
-import contextlib
-import os
-import pty
-import select
-import sys
-import termios
 import threading
-import time
-import tty
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
-from multiprocessing.connection import Connection
-from pathlib import Path
-from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Sequence
 
 import numpy as np
-import tyro
 
-from vd.command import interrupt
-from vd.command.line import parse
+from vd.assets_usd.hand_data import CameraModel
+from vd.assets_usd.objects.model import ObjectModel
 from vd.command.warp_quiet import quiet_warp
-from vd.deploy.timely import undisturbed
-from vd.deploy.twin.line import Faults, MotorLine
-from vd.deploy.twin.motor import Motor, make_motors
-from vd.deploy.twin.plant import Plant
+from vd.deploy.camera.camera import Frame
+from vd.deploy.clock import MONOTONIC, Clock
+from vd.deploy.hardware.answers import HandState
+from vd.deploy.hardware.control_table import RAD_PER_COUNT, RAD_S_PER_COUNT, TICK_MODULUS
+from vd.deploy.hardware.joints import JointMotors
+from vd.deploy.twin.newton_hand import NewtonHand
 from vd.paper import PAPER
+from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.depth_camera import DepthCamera
+from vd.sim.cfg import SimCfg
 
-if TYPE_CHECKING:
-    from vd.deploy.twin.newton_hand import NewtonHand
-
-IDLE_S = 0.005
-"""Longest wait for bytes: the plant goes on in steps of this size at most."""
-LONGEST = 4096
-"""Bytes that are taken at once."""
+WARM_C = 30.0
+"""Temperature that its motors tell [deg C]."""
 
 
-class Twin(MotorLine):
-    """Motors on a line, stepped in real time, behind a pseudo-terminal.
+class Twin:
+    """A simulated hand as :class:`vd.deploy.hardware.motors.Motors`, over a table.
+
+    It catches up with the clock whenever it is asked or told something. Angles are told in a
+    motor's counts. Supply, temperature and packets are not simulated: nothing fails.
 
     Args:
-        motors: As of :class:`MotorLine`, as are ``plant`` and ``faults``.
-        pipe: To the program that started it, if one did: requests come by it, and it ends with its
-            other end.
-        answer: To each request.
+        joints: Which motor turns which joint.
+        item: The object between the fingers, if there is one.
+        physics_hz: Rate of the simulation.
+        clock: Time.
     """
 
     def __init__(
         self,
-        motors: Sequence[Motor],
-        plant: Plant | None = None,
-        faults: Faults | None = None,
-        pipe: Connection | None = None,
-        answer: Callable[[str], Any] | None = None,
+        joints: JointMotors,
+        item: ObjectModel | None = None,
+        *,
+        physics_hz: float = PAPER.scene.physics_hz,
+        clock: Clock = MONOTONIC,
     ):
-        """Open the pseudo-terminal; serves once started."""
-        super().__init__(motors, plant, faults, put=self._write)
-        self._pipe, self._answer = pipe, answer or (lambda request: None)
-        self._end = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._heard: SimpleQueue[tuple[float, bytes | str]] = SimpleQueue()
-        self._near, self._far = pty.openpty()
-        tty.setraw(self._far)
-        os.set_blocking(self._near, False)
-        self.path = os.ttyname(self._far)
-        """Device for a program to open."""
+        quiet_warp()
+        self.ids = joints.ids
+        self.clock = clock
+        self.hand = NewtonHand(joints.hand, SimCfg(physics_hz=physics_hz), item)
+        """The hand, where it was when it was last asked."""
+        self._joints = joints
+        self._goals = joints.hand.start
+        self._on = np.zeros(len(self.ids), dtype=bool)
+        self._share = np.ones(len(self.ids))
+        self._amperes = joints.gear * np.array([model.torque_nm_per_a for model in joints.models])
+        self._current_unit_a = np.array([model.current_unit_a for model in joints.models])
+        self._supply_v = np.array([model.supply_v for model in joints.models])
+        limited = joints.currents() * self._amperes
+        self._effort = np.where(joints.capped, limited, joints.hand.effort)
+        self._lock = threading.RLock()
+        self._now_s = clock.now()
 
-    def __enter__(self) -> "Twin":
-        self._thread = threading.Thread(target=self.serve, name="twin", daemon=True)
-        self._thread.start()
-        return self
+    def _catch_up(self) -> float:
+        """Simulate up to the present [s], which is returned."""
+        now_s = self.clock.now()
+        self.hand.advance(max(0.0, now_s - self._now_s))
+        self._now_s = now_s
+        return now_s
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def _drive(self) -> None:
+        """Have goals, torque and gains act from now on."""
+        self.hand.drive(self._goals, self._on * self._share, self._effort)
+
+    def read_state(self, *, retries: int | None = None) -> HandState:
+        """The state of the present."""
+        with self._lock:
+            now_s = self._catch_up()
+            q, qd, torque = self.hand.read()
+        joints = self._joints
+        count = len(self.ids)
+        return HandState(
+            time_s=now_s,
+            position=_counted(joints.to_motor(q), RAD_PER_COUNT),
+            velocity=_counted(joints.sign * joints.gear * qd, RAD_S_PER_COUNT),
+            current=_counted(joints.sign * torque / self._amperes, self._current_unit_a),
+            pwm=np.zeros(count),
+            voltage=self._supply_v,
+            temperature=np.full(count, WARM_C),
+            alert=np.zeros(count, dtype=bool),
+            tick=np.full(count, 1e3 * now_s % TICK_MODULUS),
+        )
+
+    def write_goals(self, goals: np.ndarray, *, with_state: bool = False) -> None:
+        """Drive to these angles of the motors [rad] from now on."""
+        with self._lock:
+            self._catch_up()
+            self._goals = self._joints.to_joint(_counted(goals, RAD_PER_COUNT))
+            self._drive()
+
+    def freeze(self) -> None:
+        """Hold where the joints are."""
+        self.write_goals(self.read_state().position)
+
+    def stiffen(self, share: float, ids: Sequence[int] | None = None) -> None:
+        """Hold with a share of the hand's stiffness."""
+        with self._lock:
+            self._catch_up()
+            self._share[self._chosen(ids)] = share
+            self._drive()
+
+    def torque(self, on: bool, ids: Sequence[int] | None = None) -> dict[int, str]:
+        """Drive joints or let them go; one that is switched on stays where it is."""
+        with self._lock:
+            self._catch_up()
+            begun = self._chosen(ids) & ~self._on if on else np.zeros(len(self.ids), dtype=bool)
+            self._goals = np.where(begun, self.hand.read()[0], self._goals)
+            self._on[self._chosen(ids)] = on
+            self._drive()
+        return {}
+
+    def _chosen(self, ids: Sequence[int] | None) -> np.ndarray:
+        """Which motors have one of these IDs, all without any, shape [D] bool."""
+        return np.isin(self.ids, list(self.ids if ids is None else ids))
+
+    def read_torque(self) -> np.ndarray:
+        """Which joints are driven."""
+        return self._on.copy()
+
+    def read_tripped(self) -> np.ndarray:
+        """None: the twin ends with the program that it would watch."""
+        return np.zeros(len(self.ids), dtype=bool)
+
+    def hardware_errors(self) -> dict[int, str]:
+        """None."""
+        return {}
+
+    def watch(self, seconds: float) -> None:
+        """Nothing: see :meth:`read_tripped`."""
+
+    def release(self) -> None:
+        """Let all joints go."""
+        self.torque(False)
+
+    def object_state(self) -> np.ndarray:
+        """The object's true position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] [13]."""
+        with self._lock:
+            self._catch_up()
+            return np.concatenate([self.hand.joint_q[-7:], self.hand.joint_qd[-6:]])
+
+    def poses(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """The present [s], the joints [rad] [D] and the object's pose [7] of that moment."""
+        with self._lock:
+            now_s = self._catch_up()
+            whole = self.hand.joint_q
+        return now_s, whole[:-7], whole[-7:]
+
+    def place_object(self) -> None:
+        """Put the object where an episode starts; it falls from there."""
+        with self._lock:
+            self._catch_up()
+            self.hand.place_object((0.0, 0.0, 0.0, 1.0))
+
+    def render(self, camera: DepthCamera) -> Frame:
+        """A depth image of the present."""
+        with self._lock:
+            now_s = self._catch_up()
+            camera.capture()
+        return Frame(camera.depth.numpy()[0].copy(), now_s)
+
+
+class TwinCamera:
+    """A depth camera before a twin with an object: an image whenever one is wanted.
+
+    Args:
+        twin: The twin.
+        place: Lens and pose of the camera.
+        realistic: Whether its images have the errors of a real camera.
+    """
+
+    def __init__(self, twin: Twin, place: CameraModel, *, realistic: bool = False):
+        assert twin.hand.scene is not None, "there is nothing to see without an object"
+        sensor = DepthSensorCfg.realistic() if realistic else DepthSensorCfg()
+        self.intrinsics = place
+        self._twin = twin
+        self._camera = DepthCamera.of_scene(
+            twin.hand.scene, twin.hand.body_q, DepthCameraCfg(points=0, sensor=sensor), place
+        )
+
+    def read(self, timeout_s: float) -> Frame:
+        """An image of the present."""
+        return self._twin.render(self._camera)
 
     def close(self) -> None:
-        """Stop serving and close the pseudo-terminal."""
-        self.end()
-        if self._thread is not None:
-            self._thread.join()
-        for end in (self._near, self._far):
-            os.close(end)
-
-    def end(self) -> None:
-        """Have :meth:`serve` return."""
-        self._end.set()
-
-    def serve(self) -> None:
-        """Answer until it has to end."""
-        listener = threading.Thread(target=self._listen, name="listener", daemon=True)
-        listener.start()
-        try:
-            while not self._end.is_set():
-                self._serve_once()
-        finally:
-            self.end()
-            listener.join()
-
-    def _serve_once(self) -> None:
-        wait_s = max(0.0, min(IDLE_S, self.due_s - self._clock.now()))
-        try:
-            at, heard = self._heard.get(timeout=wait_s)
-        except Empty:
-            self.go_on()
-            return
-        if isinstance(heard, bytes):
-            self.go_on(heard, at=at)
-        elif self._pipe is not None:
-            self.go_on()
-            with contextlib.suppress(OSError):  # who asked is gone, which the listener hears
-                self._pipe.send(self._answer(heard))
-
-    def _listen(self) -> None:
-        """Pass on what arrives, with the time at which it did.
-
-        Meanwhile the plant may be in a step.
-        """
-        sources: list[Any] = [self._near] if self._pipe is None else [self._near, self._pipe]
-        while not self._end.is_set():
-            for source in select.select(sources, [], [], IDLE_S)[0]:
-                at = self._clock.now()
-                try:
-                    heard = os.read(source, LONGEST) if source is self._near else source.recv()
-                except (EOFError, OSError):
-                    if source is self._pipe:
-                        self.end()
-                else:
-                    self._heard.put((at, heard))
-
-    def _write(self, data: bytes) -> None:
-        try:
-            os.write(self._near, data)
-        except BlockingIOError:  # nobody reads: as on a wire, what is not read is lost
-            termios.tcflush(self._far, termios.TCIFLUSH)
+        """Nothing to stop."""
 
 
-@dataclass(frozen=True)
-class TwinCommand:
-    """Serve a bus of simulated motors on a pseudo-terminal until interrupted."""
-
-    hand: str = "dclaw3"
-    """Hand that its motors move, simulated in Newton: dclaw3, dclaw4, an imported hand or a hand's
-    USD.
-    """
-    hand_layer: Path | None = None
-    """Identified servo model over it (identified.usda), whose effects act."""
-    physics_hz: float = PAPER.scene.physics_hz
-    """Rate of its simulation."""
-    calibration: Path | None = None
-    """Calibration file of that hand's motors."""
-    object: str | None = None
-    """Object on the table or in the hand: name of a built-in set, or a file."""
-    camera: tuple[float, float, float, float, float, float, float] | None = None
-    """Pose of the depth camera in the hand's base frame, position [m] and quaternion xyzw; the
-    hand's own.
-    """
-    realistic: bool = False
-    """Give the depth images the errors of a real camera."""
-    model: str | None = None
-    """Model of all motors, in place of what the hand's USD says."""
-    faults: Annotated[Faults, tyro.conf.arg(name="")] = field(default_factory=Faults)
-    realtime: bool = False
-    """Run before all ordinary programs, where that is permitted."""
-
-    def serve(self, pipe: Connection | None = None) -> None:
-        """Serve until interrupted, or until a pipe's other end is gone.
-
-        Args:
-            pipe: Takes the path of the port, which is printed without one. Answers ``object`` with
-                its position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] [13], ``scene``
-                with its pose [7] and the joints [rad] [D] of one moment, ``depth`` with an image
-                [m] [H, W] and its time [s], and ``place``, by which the object is where an episode
-                starts.
-
-        Raises:
-            ValueError: Options that cannot be.
-        """
-        plant = self._plant()
-        motors = make_motors(plant.joints)
-        tell: Callable[[str], None] = partial(print, flush=True) if pipe is None else pipe.send
-        answer = None if pipe is None else self._beside(plant)
-        with (
-            contextlib.closing(Twin(motors, plant, self.faults, pipe, answer)) as twin,
-            undisturbed(self.realtime, level=1),
-        ):
-            tell(twin.path)  # once it can answer at once: the collector takes a while
-            twin.serve()
-
-    def _plant(self) -> "NewtonHand":
-        """The simulated hand and its motors."""
-        from vd.assets_usd.hands import load_hand
-        from vd.deploy.hardware.joints import read_joints
-        from vd.deploy.loop.goals import one_object
-        from vd.deploy.twin.newton_hand import NewtonHand
-        from vd.sim.cfg import SimCfg
-
-        quiet_warp()
-        hand = load_hand(self.hand, layer=self.hand_layer)
-        joints = read_joints(hand, self.calibration, self.model)
-        item = None if self.object is None else one_object(self.object)
-        return NewtonHand(hand, joints, SimCfg(physics_hz=self.physics_hz), item=item)
-
-    def _beside(self, hand: "NewtonHand") -> Callable[[str], Any] | None:
-        """What answers requests, of a hand with an object.
-
-        Eyes and a helping hand, which no real one has.
-        """
-        if hand.scene is None:
-            return None
-        from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
-        from vd.sensors.depth_camera import DepthCamera
-
-        camera: DepthCamera | None = None
-        if hand.hand.mounted_camera is not None:
-            sensor = DepthSensorCfg.realistic() if self.realistic else DepthSensorCfg()
-            cfg, place = DepthCameraCfg(points=0, sensor=sensor), hand.hand.camera.at(self.camera)
-            camera = DepthCamera.of_scene(
-                hand.scene, hand.body_q, cfg, place, seed=self.faults.seed
-            )
-            camera.capture()  # loads kernels
-
-        def answer(request: str) -> Any:
-            match request:
-                case "object":
-                    return np.concatenate([hand.joint_q[-7:], hand.joint_qd[-6:]])
-                case "scene":
-                    return hand.joint_q[-7:], hand.joint_q[:-7]
-                case "depth" if camera is not None:
-                    camera.capture()
-                    return camera.depth.numpy()[0].copy(), time.monotonic()
-                case "place":
-                    hand.place_object((0.0, 0.0, 0.0, 1.0))
-            return None
-
-        return answer
-
-
-@interrupt.command("vd.deploy.twin.twin")
-def main() -> int:
-    """Entry point of ``python -m vd.deploy.twin.twin``; returns the exit status."""
-    parse(TwinCommand, prog="python -m vd.deploy.twin.twin", description=__doc__).serve()
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def _counted(values: np.ndarray, unit: float | np.ndarray) -> np.ndarray:
+    """Values in whole units."""
+    return np.asarray(np.round(values / unit) * unit)

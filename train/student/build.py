@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
     """The environments of the student: those of the teacher's training."""
-    from vd.evaluate.agents import task_for
+    from vd.policy.agents import task_for
 
     trained, chosen = ReorientCfg.of(policy), cfg.task
     task = task_for(
@@ -74,7 +74,7 @@ def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print)
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
     from vd.command.workers import one_thread_without_gpu
-    from vd.evaluate.agents import open_teacher
+    from vd.policy.agents import open_teacher
     from vd.train.student.network import open_network
     from vd.vision.alignment import AlignmentNetwork
 

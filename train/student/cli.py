@@ -6,7 +6,7 @@ from pathlib import Path
 
 from vd.command import interrupt
 from vd.command.line import PRINT, ConfigFile, parse, say_same_as
-from vd.evaluate.agents import DEFAULT_POLICY, check_names, find_policy, installed_policies
+from vd.policy.agents import DEFAULT_POLICY, check_names, find_policy, installed_policies
 from vd.train.flags import machine_preset, normalise, saved_config, starting, value_of
 from vd.train.student.build import build_student
 from vd.train.student.config import ALIGNMENT_NAME, PRESETS, SIMULATED, StudentTrainCfg, smoke

@@ -22,7 +22,7 @@ def open_network(
         FileNotFoundError: There is no such file.
         ValueError: It holds no such network.
     """
-    from vd.evaluate.agents import installed_policies, open_policy
+    from vd.policy.agents import installed_policies, open_policy
     from vd.tracking.policy import TrackingPolicy
 
     if name not in installed_policies() and not has_suffix(name, SUFFIX):
@@ -45,7 +45,7 @@ def default_network(hand: str, preset: str) -> str:
     Raises:
         ValueError: There is neither.
     """
-    from vd.policy.defaults import default_policy
+    from vd.policy.agents import default_policy
 
     own = Path(PRESETS[preset](0).run.out) / ALIGNMENT_NAME
     if own.is_file() and load_alignment(own)[1].hand == hand:

@@ -1,54 +1,30 @@
-"""vd-bench: measure speed, physics, depth camera and gap workflow.
+"""vd-bench: measure the speed of the simulation, and what the gap workflow finds."""
 
-Rates are ratios within one run.
-"""
-
-import dataclasses
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from vd.command import interrupt
 from vd.command.device import resolve_device
-from vd.command.files import check_file, check_folder
+from vd.command.files import check_file, check_folder, write_json
 from vd.command.line import parse
 from vd.command.warp_quiet import quiet_warp
 
 
-def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> None:
-    """Print rows as they come, a line of JSON each, and write a file after each.
-
-    The next may fail.
-    """
-    import warp as wp
-
-    from vd.command.files import write_json
-    from vd.command.versions import code_fingerprint
-
-    done: list[dict[str, Any]] = []
-    made = {
-        "device": str(wp.get_device(device).name),
-        "date": f"{date.today()}",
-        "code": code_fingerprint(),
-        "rows": done,
-    }
-    for row in rows:
-        done.append(row)
-        print(json.dumps(row), flush=True)
-        if path:
-            write_json(path, made)
-
-
 @dataclass(frozen=True)
-class Measurement:
-    """What the measurements of simulation, contacts and camera have in common."""
+class SimCommand:
+    """Control steps per second, memory and start-up of the simulation under a policy's actions."""
 
+    envs: tuple[int, ...] = (4096, 8192, 16384)
+    """Numbers of environments to measure."""
+    policy: str = "dclaw4"
+    """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets, mixed over the environments."""
     device: str = "auto"
@@ -56,85 +32,36 @@ class Measurement:
     json: Path | None = None
     """Write the rows to this file as JSON."""
 
-
-@dataclass(frozen=True)
-class SimCommand(Measurement):
-    """Control steps per second, memory and start-up of the simulation under a policy's actions."""
-
-    envs: tuple[int, ...] = (4096, 8192, 16384)
-    """Numbers of environments to measure."""
-    policy: str = "dclaw4"
-    """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
-
     def run(self) -> int:
-        """Measure and print."""
-        from vd.evaluate.agents import open_teacher
+        """Measure, print a line of JSON for each number of environments, and write after each."""
+        if self.json is not None:
+            check_file(self.json)
+        from vd.policy.agents import open_teacher
 
         device = resolve_device(self.device)
         teacher = open_teacher(self.policy, device)
         if teacher is None:
             raise ValueError(f"--policy {self.policy} has no network; give a teacher")
         quiet_warp()
+        import warp as wp
+
         from vd.bench.sim import measure
+        from vd.command.versions import code_fingerprint
         from vd.envs.cfg import ReorientCfg
 
-        task = ReorientCfg.of(teacher, objects=self.objects)
-        tasks = (dataclasses.replace(task, num_envs=envs) for envs in self.envs)
-        rows = (measure(cfg, device, teacher=teacher) for cfg in tasks)
-        report(rows, device, self.json)
-        return 0
-
-
-@dataclass(frozen=True)
-class PhysicsCommand(Measurement):
-    """Contact quality: objects at rest, a pinched cube."""
-
-    seed: int = 0
-    """Of the orientations in which objects are dropped on the table."""
-
-    def run(self) -> int:
-        """Measure and print."""
-        quiet_warp()
-        from vd.assets_usd.objects.sets import load_set
-        from vd.bench.physics import pinch, rest
-        from vd.sim.cfg import SimCfg
-
-        cfg, device = SimCfg(), resolve_device(self.device)
-        results = rest(load_set(list(self.objects)), cfg, device=device, seed=self.seed)
-        moving = [r for r in results if not r.rests]
-        row = {
-            "objects": len(results),
-            "at_rest_share": 1.0 - len(moving) / len(results),
-            "deepest_contact_m": max(r.penetration for r in results),
-            "moving": [dataclasses.asdict(r) for r in moving],
-            "pinch": dataclasses.asdict(pinch(load_set("cube")[0], cfg, device=device)),
+        rows: list[dict[str, float]] = []
+        measured = {
+            "device": wp.get_device(device).name,
+            "date": f"{date.today()}",
+            "code": code_fingerprint(),
+            "rows": rows,
         }
-        report([row], device, self.json)
-        return 0
-
-
-@dataclass(frozen=True)
-class DepthCommand(Measurement):
-    """Depth images and clouds per second."""
-
-    envs: tuple[int, ...] = (256, 1024, 4096)
-    """Numbers of environments to measure; 1 for the figure at deployment on a CPU."""
-    hand: str = "dclaw4"
-    """Hand."""
-    seed: int = 0
-    """Of the poses."""
-
-    def run(self) -> int:
-        """Measure and print."""
-        quiet_warp()
-        from vd.assets_usd.objects.sets import load_set
-        from vd.bench.depth import measure
-
-        device, objects = resolve_device(self.device), load_set(list(self.objects))
-        rows = (
-            measure(objects, envs, device, hand=self.hand, seed=self.seed) for envs in self.envs
-        )
-        report(rows, device, self.json)
+        for envs in self.envs:
+            task = ReorientCfg.of(teacher, objects=self.objects, num_envs=envs)
+            rows.append(measure(task, device, teacher=teacher))
+            print(json.dumps(rows[-1]), flush=True)
+            if self.json is not None:
+                write_json(self.json, measured)
         return 0
 
 
@@ -196,8 +123,12 @@ class GapCommand:
             first_seed=self.first_seed,
             which=self.battery,
         )
-        device, cases = resolve_device(self.device), shard(cases, self.shard)
-        results = run_battery(cases, self.out, jobs=max(self.jobs, 1), device=device)
+        results = run_battery(
+            shard(cases, self.shard),
+            self.out,
+            jobs=max(self.jobs, 1),
+            device=resolve_device(self.device),
+        )
         if self.shard is not None:
             return 0
         write_text(self.out / "summary.md", markdown(results))
@@ -231,8 +162,6 @@ class ContactCommand:
 
 Command = (
     Annotated[SimCommand, tyro.conf.subcommand("sim")]
-    | Annotated[PhysicsCommand, tyro.conf.subcommand("physics")]
-    | Annotated[DepthCommand, tyro.conf.subcommand("depth")]
     | Annotated[GapCommand, tyro.conf.subcommand("gap")]
     | Annotated[ContactCommand, tyro.conf.subcommand("contact")]
 )
@@ -244,8 +173,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = parse(Command, arguments, prog="vd-bench", description=__doc__)
     if isinstance(command, GapCommand | ContactCommand):
         check_folder(command.out)
-    elif isinstance(command, Measurement) and command.json is not None:
-        check_file(command.json)
     return command.run()
 
 

@@ -54,14 +54,14 @@ def own_share(env: ReorientEnv) -> float:
         "step", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True
     ) as timer:
         env.launch_step()
-    own = tuple(f"{name}_" for name in own_kernel_names())
-    # Warp reports "forward kernel NAME_HASH".
-    times = [
-        (result.name.split()[-1].startswith(own), result.elapsed) for result in timer.timing_results
-    ]
-    return float(
-        sum(elapsed for ours, elapsed in times if ours) / sum(elapsed for _, elapsed in times)
-    )
+    prefixes = tuple(f"{name}_" for name in own_kernel_names())
+    ours = 0.0
+    total = 0.0
+    for result in timer.timing_results:
+        total += result.elapsed
+        if result.name.split()[-1].startswith(prefixes):  # "forward kernel NAME_HASH"
+            ours += result.elapsed
+    return ours / total
 
 
 def own_kernel_names() -> set[str]:
@@ -104,7 +104,8 @@ def measure(
     # Before the policy, whose network and matrix workspace are no part of the simulation.
     memory = (before - free_memory(device)) / 1e9 if on_gpu else 0.0
     env.set_stage(Stage())  # a teacher has learned the task as it is configured
-    observation, action = wp.to_torch(env.observation), wp.to_torch(env.action)
+    observation = wp.to_torch(env.observation)
+    action = wp.to_torch(env.action)
 
     def policy() -> None:
         """The teacher's mean actions, where the next step reads them."""
@@ -120,17 +121,16 @@ def measure(
     step_s = seconds_per_call(lambda: env.step(env.action), calls, device, before=policy)
     env.check()
     data = env.sim.solver.mjw_data
-    contacts, rows = float(data.nacon.numpy()[0]), int(np.max(data.nefc.numpy()))
-    n = cfg.num_envs
+    envs = cfg.num_envs
     return {
-        "envs": n,
-        "whole_step": n / step_s,
-        "with_policy": n / (policy_s + step_s),
+        "envs": envs,
+        "whole_step": envs / step_s,
+        "with_policy": envs / (policy_s + step_s),
         "own_kernels": own_share(env) if on_gpu else 0.0,
         "memory_gb": memory,
         "start_s": start_s,
-        "contacts_mean": contacts / n,
-        "rows_max": rows,
+        "contacts_mean": float(data.nacon.numpy()[0]) / envs,
+        "rows_max": int(np.max(data.nefc.numpy())),
     }
 
 

@@ -63,31 +63,32 @@ def from_dict(
     if left_out and over is None:
         raise ValueError(f"{where or cls.__name__} has no {', '.join(sorted(left_out))}; name it")
     prefix = f"{where}." if where else ""
-    found = {
-        name: _convert(hints[name], item, prefix + name, getattr(over, name, None))
-        for name, item in values.items()
-    }
-    return cls(**found) if over is None else dataclasses.replace(over, **found)  # type: ignore[type-var]
+    converted = {}
+    for name, item in values.items():
+        converted[name] = _convert(hints[name], item, prefix + name, getattr(over, name, None))
+    if over is None:
+        return cls(**converted)
+    return dataclasses.replace(over, **converted)  # type: ignore[type-var]
 
 
 def needed(cls: type) -> set[str]:
     """Names of the fields of a dataclass that have no default."""
-    missing = dataclasses.MISSING
-    return {
-        one.name for one in dataclasses.fields(cls) if one.default is one.default_factory is missing
-    }
+    names = set()
+    for field in dataclasses.fields(cls):
+        if field.default is field.default_factory is dataclasses.MISSING:
+            names.add(field.name)
+    return names
 
 
 def _meant(name: str, names: set[str], hints: Mapping[str, Any]) -> str:
     """Asks for the field that ``name`` is likely meant to be, one of a group or one that is spelled alike."""
-    groups = {one: hints[one] for one in sorted(names) if dataclasses.is_dataclass(hints[one])}
-    inside = [
-        f"{one}.{name}"
-        for one, kind in groups.items()
-        if name in {f.name for f in dataclasses.fields(kind)}
-    ]
-    found = inside + difflib.get_close_matches(name, sorted(names), 1)
-    return f"is it {found[0]}? " if found else ""
+    for group in sorted(names):
+        kind = hints[group]
+        if dataclasses.is_dataclass(kind) and name in {f.name for f in dataclasses.fields(kind)}:
+            return f"is it {group}.{name}? "
+    for likely in difflib.get_close_matches(name, sorted(names), 1):
+        return f"is it {likely}? "
+    return ""
 
 
 def _convert(hint: Any, value: Any, where: str, over: Any = None) -> Any:
@@ -99,7 +100,8 @@ def _convert(hint: Any, value: Any, where: str, over: Any = None) -> Any:
     """
     if hint is Any:
         return value
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    args = typing.get_args(hint)
     if origin is typing.Annotated:
         return _convert(args[0], value, where, over)
     if origin in (typing.Union, types.UnionType):
@@ -145,7 +147,7 @@ def _convert_plain(kind: type, value: Any, where: str) -> Any:
         try:
             return kind(value)
         except ValueError as error:
-            options = ", ".join(repr(one.value) for one in kind)
+            options = ", ".join(repr(option.value) for option in kind)
             raise ValueError(f"{where}: {value!r} is not one of {options}") from error
     if kind is Path and isinstance(value, str):
         return Path(value)

@@ -138,8 +138,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
             yield temporary
         except Exception as error:
             # Writers in other languages lose the reason, so the disk is asked.
-            told = isinstance(error, OSError) and error.errno in _FULL
-            reason = error if told else _refusal(temporary)
+            reason: BaseException | None = error
+            if not isinstance(error, OSError) or error.errno not in _FULL:
+                reason = _refusal(temporary)
             if isinstance(reason, OSError):
                 raise output_error(path, reason) from error
             raise

@@ -41,7 +41,7 @@ EXTRAS = {
     "hardware": ("dynamixel_sdk", "serial", "pyrealsense2", "cv2"),
     "recordings": ("pyarrow", "rosbags"),
     "gym": ("gymnasium",),
-    "log": ("mcap_ros2", "rerun"),
+    "log": ("mcap_ros2",),
     "export": ("onnx", "onnxscript", "onnxruntime"),
 }
 """Packages that not every user needs, by the extra that brings them."""
@@ -179,7 +179,8 @@ def _terminated() -> Iterator[None]:
         raise Terminated
 
     note(0)
-    before, sys.unraisablehook = sys.unraisablehook, _come_again
+    before = sys.unraisablehook
+    sys.unraisablehook = _come_again
     try:
         with handled(terminate, signal.SIGTERM, signal.SIGHUP):
             yield

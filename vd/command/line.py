@@ -20,7 +20,8 @@ from vd.command.config import from_dict, needed, to_dict
 
 T = TypeVar("T")
 
-CONFIG, PRINT = "--config", "--print-config"
+CONFIG = "--config"
+PRINT = "--print-config"
 HELP = """Settings may be in a file too: --config FILE reads YAML or JSON as --print-config prints it. Flags
 override it, and what it leaves out keeps its default."""
 _FLOAT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$")
@@ -47,14 +48,14 @@ class ConfigFile:
 
     def words(self, flags: Mapping[str, str]) -> list[str]:
         """What the file says of a few flags, by dotted path, as if it had been typed."""
-        found = []
+        words = []
         for path, flag in flags.items():
             value: Any = self.values
             for name in path.split("."):
                 value = value.get(name) if isinstance(value, Mapping) else None
             if value is not None and value is not False:
-                found += [flag] if value is True else [flag, str(value)]
-        return found
+                words += [flag] if value is True else [flag, str(value)]
+        return words
 
 
 def parse(
@@ -81,7 +82,10 @@ def parse(
     arguments, file = take_config(sys.argv[1:] if words is None else words)
     commands = _subcommands(kind)
     if commands and arguments and arguments[0] in commands:
-        kind, prog, description = commands[arguments[0]], f"{prog} {arguments.pop(0)}", None
+        command = arguments.pop(0)
+        kind = commands[command]
+        prog = f"{prog} {command}"
+        description = None
     if file is not None and isinstance(kind, type):
         default = file.over(default or kind(**dict.fromkeys(needed(kind), tyro.MISSING)))
         arguments = [word for word in arguments if word not in _set_already(default, arguments)]
@@ -108,11 +112,10 @@ def behind_command(words: Sequence[str]) -> list[str]:
 
     These behind the rest.
     """
-    left, moved = list(words), list[str]()
-    while left and left[0].partition("=")[0] in (CONFIG, PRINT):
-        count = 2 if left[0] == CONFIG else 1
-        moved, left = moved + left[:count], left[count:]
-    return left + moved
+    count = 0
+    while count < len(words) and words[count].partition("=")[0] in (CONFIG, PRINT):
+        count += 2 if words[count] == CONFIG else 1
+    return [*words[count:], *words[:count]]
 
 
 def take_config(words: Sequence[str]) -> tuple[list[str], ConfigFile | None]:
@@ -171,22 +174,23 @@ def _subcommands(kind: Any) -> dict[str, Any]:
     """Settings of subcommands by name; none of a single command."""
     if dataclasses.is_dataclass(kind):
         return {}
-    return {
-        marker.name: typing.get_args(option)[0]
-        for option in typing.get_args(kind)
-        for marker in typing.get_args(option)[1:]
-        if getattr(marker, "name", None)
-    }
+    commands = {}
+    for option in typing.get_args(kind):
+        settings, *markers = typing.get_args(option)
+        for marker in markers:
+            if getattr(marker, "name", None):
+                commands[marker.name] = settings
+    return commands
 
 
 def _set_already(default: Any, words: Sequence[str]) -> set[str]:
     """Switches that are on already: tyro knows some of these by their opposite alone."""
-    names = [
-        f.name.replace("_", "-")
-        for f in dataclasses.fields(default)
-        if getattr(default, f.name) is True
-    ]
-    return {f"--{name}" for name in names if f"--no-{name}" not in words}
+    flags = set()
+    for field in dataclasses.fields(default):
+        name = field.name.replace("_", "-")
+        if getattr(default, field.name) is True and f"--no-{name}" not in words:
+            flags.add(f"--{name}")
+    return flags
 
 
 def say_same_as(*words: object, why: str = "") -> None:

@@ -41,23 +41,23 @@ def write_html(path: Path, template: str, **data: Any) -> None:
 @cache
 def environment() -> Environment:
     """The templates, with the filters ``cell`` (a table's cell) and ``embed`` (a picture or video)."""
-    found = Environment(
+    templates = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters |= {"cell": _cell, "embed": _embed}
-    return found
+    templates.filters |= {"cell": _cell, "embed": _embed}
+    return templates
 
 
 def _cell(value: object) -> Markup:
     """A table's cell; an interval goes below its number, so that columns are narrow."""
-    found = _WITH_INTERVAL.fullmatch(str(value))
-    if found is None:
+    parts = _WITH_INTERVAL.fullmatch(str(value))
+    if parts is None:
         return escape(value)
-    number, interval = found.groups()
+    number, interval = parts.groups()
     return Markup("{} <small>{}</small>").format(
         number.replace(" ", "\N{NO-BREAK SPACE}"), interval
     )
@@ -67,7 +67,8 @@ def _embed(image: "Figure | bytes | Path") -> str:
     """A matplotlib figure, PNG bytes, or a PNG, GIF or MP4 file as an address that holds it."""
     kind = "image/png"
     if isinstance(image, Path):
-        kind, data = _KINDS.get(image.suffix.lower(), kind), image.read_bytes()
+        kind = _KINDS.get(image.suffix.lower(), kind)
+        data = image.read_bytes()
     elif isinstance(image, bytes):
         data = image
     else:

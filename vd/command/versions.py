@@ -8,21 +8,21 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-MEASURING = ("kernels", "sim", "envs", "sensors", "tracking", "vision", "evaluate")
+MEASURING = ("kernels", "sim", "envs", "sensors", "tracking", "vision", "policy", "evaluate")
 """Packages that decide what an evaluation gives."""
-SHOWING = ("cli.py", "page.py", "claims.py", "suite.py", "suite_run.py")
+SHOWING = ("cli.py", "page.py", "claims.py", "suite.py", "suite_run.py", "store.py")
 """Files in them that only ask and show."""
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
     """Version of each package by its distribution's name; ``not installed`` where there is none."""
-    found = {}
+    versions = {}
     for name in packages:
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            versions[name] = "not installed"
+    return versions
 
 
 @cache

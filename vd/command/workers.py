@@ -86,7 +86,8 @@ def run_tasks(
         with patch.dict(os.environ, inherited if gpu else inherited | {"CUDA_VISIBLE_DEVICES": ""}):
             while waiting or running:
                 while idle and waiting:
-                    worker, task = idle.pop(), waiting.popleft()
+                    worker = idle.pop()
+                    task = waiting.popleft()
                     running[worker.submit(work, task)] = task, worker, time.monotonic()
                 wait(running, LONGEST_WAIT_S, FIRST_COMPLETED)
                 for future, (task, worker, begun) in list(running.items()):

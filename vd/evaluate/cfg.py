@@ -12,11 +12,10 @@ from vd.assets_usd.hands import HANDS
 from vd.command.config import require
 from vd.command.workers import shard
 from vd.envs.cfg import RandomisationCfg
-from vd.evaluate.agents import DEFAULT_HAND, SHIPPED_POLICIES
 from vd.evaluate.conditions import CONDITIONS, Condition
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, ONE_GOAL, Goals, GoalSchedule
 from vd.paper import PAPER
-from vd.policy.defaults import default_policy
+from vd.policy.agents import DEFAULT_HAND, SHIPPED_POLICIES, default_policy
 from vd.sim.cfg import Engine
 
 # Seconds between progress lines where they go to a file.
@@ -273,7 +272,8 @@ def parse_groups(objects: Sequence[str]) -> dict[str, tuple[str, ...]]:
     for item in objects:
         name, equals, sets = item.partition("=")
         if not equals:
-            name, sets = "objects", item
+            name = "objects"
+            sets = item
         if not name or not sets:
             raise ValueError(
                 f"--objects: '{item}' has to be NAME=SET, such as training=procedural-150-seed0"

@@ -11,11 +11,10 @@ from vd.evaluate.suite import Claim
 from vd.paper import PAPER
 
 
-def ours(claim: Claim, rows: Sequence[Row]) -> Any:
-    """Ours, from the rows of one policy in an evaluation; None where it has no such figure."""
+def claimed(claim: Claim, rows: Sequence[Row]) -> Any:
+    """Our figure, from the rows of one policy in an evaluation; None where it has no such figure."""
     for row in rows:
-        own = row.headline if claim.stopped_by is None else row.stopped_by == claim.stopped_by
-        if own and not row.ours:
+        if row.stopped_by == claim.stopped_by or (claim.stopped_by is None and row.headline):
             return measured(row, claim.measure)
     return None
 
@@ -35,15 +34,16 @@ def measured(row: Row, measure: str) -> Any:
 
 def lost_at_once(row: Row) -> Interval:
     """Share of episodes that lost the object in the half second after the table went."""
-    gone = round(PAPER.scene.air_table_s * row.protocol.control_hz)
-    soon = gone + round(0.5 * row.protocol.control_hz)
-    return _share(row, [e.fell and gone < e.steps <= soon for e in row.episodes])
+    table_step = round(PAPER.scene.air_table_s * row.protocol.control_hz)
+    soon = table_step + round(0.5 * row.protocol.control_hz)
+    return _share(row, [e.fell and table_step < e.steps <= soon for e in row.episodes])
 
 
 def success_without_table(row: Row) -> Interval:
     """Share of episodes that were stopped within the tolerance when the table had gone."""
-    gone = round(PAPER.scene.air_table_s * row.protocol.control_hz)
-    return _share(row, row.successes.ravel() & [e.steps > gone for e in row.episodes])
+    table_step = round(PAPER.scene.air_table_s * row.protocol.control_hz)
+    without_table = np.array([e.steps > table_step for e in row.episodes])
+    return _share(row, row.successes.ravel() & without_table)
 
 
 def _share(row: Row, chosen: list[bool] | np.ndarray) -> Interval:

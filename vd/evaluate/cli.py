@@ -8,9 +8,9 @@ from itertools import chain
 from vd.command import interrupt
 from vd.command.files import check_file, check_folder
 from vd.command.line import parse, say_same_as
-from vd.evaluate.agents import check_names
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.suite import read_suite
+from vd.policy.agents import check_names
 
 
 @interrupt.command("vd-eval")
@@ -38,9 +38,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _evaluate(cfg: EvalCfg) -> int:
     from vd.evaluate.compare import compare
     from vd.evaluate.page import terminal_text, write_page
-    from vd.evaluate.suite_run import OUT_OF_TIME, run_suite
+    from vd.evaluate.suite_run import run_suite
 
-    written, page = (cfg.out / f"{cfg.suite_name}{suffix}" for suffix in (".json", ".html"))
+    written = cfg.out / f"{cfg.suite_name}.json"
+    page = cfg.out / f"{cfg.suite_name}.html"
     if cfg.suite is None:
         result = compare(cfg)
         write_page(result, page)
@@ -57,7 +58,7 @@ def _evaluate(cfg: EvalCfg) -> int:
         print(json.dumps(result.summary(), indent=1) if cfg.suite is None else written.read_text())
     for condition, policy, why in result.missing:
         print(f"vd-eval: {condition} of {policy}: {why}", file=sys.stderr)
-    return int(any(why != OUT_OF_TIME for _, _, why in result.missing))
+    return int(bool(result.missing))
 
 
 if __name__ == "__main__":

@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import date
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vd.command.warp_quiet import quiet_warp
-from vd.evaluate.agents import check_fits, open_policy, sees_clouds, task_for
 from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
 from vd.evaluate.conditions import in_condition
+from vd.policy.agents import check_fits, open_policy, sees_clouds, task_for
 from vd.sim.cfg import in_mujoco
 
 if TYPE_CHECKING:
@@ -21,9 +22,12 @@ if TYPE_CHECKING:
     from vd.evaluate.result import Agent, Protocol, Result
     from vd.evaluate.trace import Trace
 
-ENVS_CPU, ENVS_GPU, ENVS_CAMERA_GPU, ENVS_PLAN = 64, 8192, 1024, 128
-"""Environments simulated at once by default: enough to keep the device busy, few enough to fit
-anywhere; images and clouds take memory, and who plans simulates hundreds for each."""
+# Environments simulated at once by default: enough to keep the device busy, few enough to fit
+# anywhere. Images and clouds take memory, and who plans simulates hundreds for each.
+ENVS_CPU = 64
+ENVS_GPU = 8192
+ENVS_CAMERA_GPU = 1024
+ENVS_PLAN = 128
 _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "mujoco", "torch")
 
 
@@ -52,25 +56,25 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
     from vd.tracking.symmetry import with_symmetries
 
     groups = parse_groups(cfg.object_sets)
-    everything = tuple(dict.fromkeys(s for sets in groups.values() for s in sets))
+    everything = tuple(dict.fromkeys(chain(*groups.values())))
     files = set_files(everything)
     camera = any(map(sees_clouds, policies.values()))
     envs = cfg.num_envs or envs_for(len(files), cfg.episodes, device, camera=camera, plan=cfg.plan)
     rows = []
     env: Any = None
-    task, start = None, None
+    start = None
     for name, policy in policies.items():
-        wanted = task_of(cfg, policy, everything, envs)
-        if task != wanted:
+        task = task_of(cfg, policy, everything, envs)
+        if env is None or env.cfg != task:
             print(
                 "building the environments (the first start compiles kernels: minutes)",
                 file=sys.stderr,
             )
             if env is not None:
                 env.close()
-            env = ReorientEnv(wanted, device)
+            env = ReorientEnv(task, device)
             env.objects = with_symmetries(env.objects, device)
-            task, start = wanted, env.state_dict()
+            start = env.state_dict()
         env.load_state_dict(start)
         actor, agent = actor_of(
             name, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
@@ -81,7 +85,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
         for group, sets in groups.items():
             chosen = [files.index(file) for file in set_files(sets)]
             objects = [env.objects[number] for number in chosen]
-            protocol = _protocol(cfg, wanted, sets, agent.sees)
+            protocol = _protocol(cfg, task, sets, agent.sees)
             rows += judge(
                 trace.of(chosen), protocol, objects, agent, group=group, condition=condition
             )
@@ -90,8 +94,8 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
         "device": wp.get_device(device).name,
         "date": f"{date.today()}",
         "code": code_fingerprint(),
-    } | installed_versions(_PACKAGES)
-    result = Result(tuple(rows), software)
+    }
+    result = Result(tuple(rows), software | installed_versions(_PACKAGES))
     result.write(cfg.out / "eval.json")
     return result
 
@@ -177,12 +181,10 @@ def actor_of(
     if not sees_clouds(policy):
         return policy, Agent(name, "teacher", "state", StoppingRule)
     from vd.command.workers import one_thread_without_gpu
-
-    one_thread_without_gpu(env.device)
-    settings: dict[str, Any] = {"goals": goals, "sensor_errors": sensor_errors, "seed": seed}
     from vd.evaluate.tracking import TrackingActor
 
-    eyes = TrackingActor(env, policy, **settings)
+    one_thread_without_gpu(env.device)
+    eyes = TrackingActor(env, policy, goals=goals, sensor_errors=sensor_errors, seed=seed)
     return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for)
 
 
@@ -203,16 +205,24 @@ def planning(actor: Any, agent: "Agent", env: Any, seed: int) -> tuple[Any, "Age
 
 def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "Trace":
     """All episodes of one policy, with a progress bar."""
-    from vd.evaluate.rollout import draw_turns
+    import numpy as np
+
+    from vd.evaluate.rollout import draw_starts_and_goals, draw_turns
     from vd.evaluate.trace import record
 
     schedule = cfg.schedule
-    ways = agent.ways_to_stop(cfg.stop_tolerance, schedule).values()
+    draw: dict[str, Any] = {"seed": cfg.seed, "max_goal_angle": cfg.max_goal_angle}
+    names = [item.name for item in env.objects]
+    starts = None
+    goals = None
+    if not env.cfg.start.at_rest:  # such starts are the environment's to draw
+        drawn = [draw_starts_and_goals(name, cfg.episodes, **draw) for name in names]
+        starts = np.stack([start for start, _ in drawn])
+        goals = np.stack([goal for _, goal in drawn])
     turns = None
     if schedule.most > 1:
-        names = [item.name for item in env.objects]
-        draw: dict[str, Any] = {"seed": cfg.seed, "max_goal_angle": cfg.max_goal_angle}
         turns = draw_turns(names, cfg.episodes, schedule.most, **draw)
+    ways = agent.ways_to_stop(cfg.stop_tolerance, schedule).values()
     with _progress(cfg, env, agent) as on_step:
         trace = record(
             env,
@@ -222,33 +232,12 @@ def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "Trace":
             ways=[way for way in ways if way[1] != "success"],
             tolerance=cfg.stop_tolerance,
             turns=turns,
+            starts=starts,
+            goals=goals,
             on_step=on_step,
-            **_drawn(cfg, env),
         )
     env.check()
     return trace
-
-
-def _drawn(cfg: EvalCfg, env: Any) -> dict[str, Any]:
-    """Starts and goals [K, M, 4] of all objects by these names.
-
-    None: the environment draws them.
-    """
-    import numpy as np
-
-    from vd.evaluate.rollout import draw_starts_and_goals
-
-    if env.cfg.start.at_rest:
-        return {}
-    drawn = [
-        draw_starts_and_goals(
-            item.name, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle
-        )
-        for item in env.objects
-    ]
-    return {
-        name: np.stack([pair[i] for pair in drawn]) for i, name in enumerate(("starts", "goals"))
-    }
 
 
 @contextmanager
@@ -272,6 +261,9 @@ def envs_for(
 
     The same number for every object, at most one for each episode.
     """
-    limit = ENVS_CPU if device == "cpu" else ENVS_CAMERA_GPU if camera else ENVS_GPU
-    limit = min(limit, ENVS_PLAN) if plan else limit
+    limit = ENVS_CAMERA_GPU if camera else ENVS_GPU
+    if device == "cpu":
+        limit = ENVS_CPU
+    if plan:
+        limit = min(limit, ENVS_PLAN)
     return num_objects * max(1, min(episodes, limit // num_objects))

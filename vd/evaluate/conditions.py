@@ -38,14 +38,14 @@ _only = partial(replace, EXACT)
 STEP_LATE_S = 1.0 / PAPER.scene.control_hz
 """One control step, 83 ms: a camera and the loop behind it are this late at worst."""
 _LATE = _at(STEP_LATE_S)
-FRICTION_NM, PLAY_RAD = 0.15, 0.03
-"""Largest dry friction [N m] and backlash [rad] of a joint (ours; identified servos have up to
-half).
-"""
-COMMAND_DELAY_S, OBSERVATION_LATENCY_S = 0.04, 0.12
-"""Largest delay of commands, latency of the object [s] (ours): motor bus; depth camera and its
-loop.
-"""
+FRICTION_NM = 0.15
+"""Largest dry friction of a joint [N m] (ours; identified servos have up to half)."""
+PLAY_RAD = 0.03
+"""Largest backlash of a joint [rad] (ours; identified servos have up to half)."""
+COMMAND_DELAY_S = 0.04
+"""Largest delay of commands [s] (ours): the motor bus."""
+OBSERVATION_LATENCY_S = 0.12
+"""Largest latency of the object [s] (ours): depth camera and its loop."""
 
 MASS_KG = (0.03, 0.18)
 """The paper's base range of the object's mass [kg]."""
@@ -134,8 +134,10 @@ def in_condition(task: ReorientCfg, name: Condition) -> ReorientCfg:
     if name == "soft-tips":
         return replace(task, fingertip="soft")
     if name == "stiff-contacts":  # two physics steps are the least time constant
-        hz, constant_s = 2.0 * task.sim.physics_hz, 0.5 * task.sim.contact_time_constant_s
-        return replace(
-            task, sim=replace(task.sim, physics_hz=hz, contact_time_constant_s=constant_s)
+        sim = replace(
+            task.sim,
+            physics_hz=2.0 * task.sim.physics_hz,
+            contact_time_constant_s=0.5 * task.sim.contact_time_constant_s,
         )
+        return replace(task, sim=sim)
     return task

@@ -1,14 +1,15 @@
 """An evaluation, or a suite of them, as one HTML page, and as lines for a terminal."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vd.command.page import write_html
 from vd.evaluate.goals import AIR_GOALS, CONSECUTIVE, HOLD_S
-from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row
+from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row, Summary
 from vd.evaluate.statistics import Interval
 
 if TYPE_CHECKING:
@@ -16,12 +17,11 @@ if TYPE_CHECKING:
 
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 """Header and rows."""
-
 NOTHING = "–"  # noqa: RUF001
 WORDS = 3
 """Columns of the tables of rows that hold text."""
-_RUN_FILES = ("policy.safetensors",)
-"""Files that are called the same in every run, so that their folder tells more."""
+POLICY_FILE = "policy.safetensors"
+"""File that is called the same in every run, so that its folder tells more."""
 _NAMES = ("policy", "objects", "stopped by")
 _HEADER = (*_NAMES, "success", f"and held {HOLD_S:g} s", "within 0.1 rad", "lost")
 _BESIDE_HEADER = (*_NAMES, "up to symmetry", "median error [rad]", "time [s]")
@@ -47,18 +47,38 @@ _BOUND_HEADER = (
 GREY = "#8a8f98"
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Of policies in their order: those of Okabe and Ito, which colour-blind readers can tell apart."""
-PANELS, PANEL_INCH = 3, (4.2, 3.6)
-"""Panels of the figure side by side, and the size of one."""
+PANELS = 3
+"""Panels of the figure side by side."""
+PANEL_INCH = (4.2, 3.6)
+"""Width and height of a panel."""
 
 
 def shown_name(text: str) -> str:
     """Names, separated by commas, as a page prints them: of an absolute path its last two parts."""
-    parts = (Path(name) for name in text.split(", "))
-    return ", ".join("/".join(p.parts[-2:]) if p.is_absolute() else str(p) for p in parts)
+    names = []
+    for name in text.split(", "):
+        path = Path(name)
+        names.append("/".join(path.parts[-2:]) if path.is_absolute() else str(path))
+    return ", ".join(names)
 
 
-def percent(interval: Interval) -> str:
-    """``12.3 % (10.1 to 14.9)``."""
+def labels(names: Sequence[str]) -> dict[str, str]:
+    """Short names of policies: the last part of each path where that is another than of all others."""
+    paths = {}
+    for name in names:
+        path = Path(name)
+        paths[name] = path.parent if path.name == POLICY_FILE else path
+    last_parts = [path.name for path in paths.values()]
+    short = {}
+    for name, path in paths.items():
+        short[name] = path.name if last_parts.count(path.name) == 1 else str(path)
+    return short
+
+
+def percent(interval: Interval | None) -> str:
+    """``12.3 % (10.1 to 14.9)``, or for None that it was not tried."""
+    if interval is None:
+        return "not tried"
     return f"{100 * interval.value:.1f} % ({100 * interval.low:.1f} to {100 * interval.high:.1f})"
 
 
@@ -69,29 +89,16 @@ def number(interval: Interval | None) -> str:
     return f"{interval.value:.2f} ({interval.low:.2f} to {interval.high:.2f})"
 
 
-def points(difference: Interval, unit: str = "") -> str:
-    """``+1.2 (-0.4 to +2.8)``, of shares in per cent, with ``unit`` behind the first number."""
-    value, low, high = (
-        100 * share for share in (difference.value, difference.low, difference.high)
-    )
-    return f"{value:+.1f}{unit} ({low:+.1f} to {high:+.1f})"
+def points(difference: Interval) -> str:
+    """A difference of shares in per cent: ``+1.2 points (-0.4 to +2.8)``."""
+    low = 100 * difference.low
+    high = 100 * difference.high
+    return f"{100 * difference.value:+.1f} points ({low:+.1f} to {high:+.1f})"
 
 
-def labels(names: Sequence[str]) -> dict[str, str]:
-    """Short names of policies: the ends of their paths that tell them apart."""
-
-    def telling(name: str) -> tuple[str, ...]:
-        parts = Path(name).parts
-        return parts[:-1] if len(parts) > 1 and parts[-1] in _RUN_FILES else parts
-
-    short = {}
-    for name in names:
-        parts = telling(name)
-        others = [telling(other) for other in names if other != name]
-        lengths = range(1, len(parts))
-        enough = (n for n in lengths if all(parts[-n:] != other[-n:] for other in others))
-        short[name] = "/".join(parts[-next(enough, len(parts)) :])
-    return short
+def share(value: float | None) -> str:
+    """``12.3 %``, or that there is none."""
+    return "none" if value is None else f"{100 * value:.1f} %"
 
 
 def write_page(
@@ -111,29 +118,30 @@ def write_page(
     ``conditions`` have a name, the place in the paper or what is changed, and flags.
     """
     short = labels(result.policies)
-    success, beside = _tables(result, short)
     headlines = [row for row in result.rows if row.headline]
+    missing = []
+    for condition, policy, why in result.missing:
+        missing.append((condition, shown_name(policy), why))
+    objects = [(_heading(row, short), *_object_table(row)) for row in headlines]
     write_html(
         path,
         "evaluation.html",
-        title=title or f"Evaluation of {', '.join(shown_name(name) for name in short.values())}",
-        lead=lead or (asked([row.protocol for row in result.rows]) if result.rows else ""),
+        title=title or f"Evaluation of {', '.join(map(shown_name, short.values()))}",
+        lead=lead or settings_text([row.protocol for row in result.rows]),
         notes=notes,
-        success=success,
-        beside=beside,
+        success=_success_table(result.rows, short),
+        beside=_beside_table(result.rows, short),
         hold_s=f"{HOLD_S:g}",
         air=_air_table(headlines, short),
         air_hold_s=f"{AIR_GOALS.hold_s:g}",
         consecutive=_consecutive_table(result.rows, short),
         differences=_differences(result, short),
         figures=figures,
-        missing=[(condition, shown_name(policy), why) for condition, policy, why in result.missing],
+        missing=missing,
         errors=ecdf_figure(result, short) if result.rows else None,
         bounds=_bound_table(headlines, short),
         warnings=result.warnings,
-        objects=[]
-        if conditions
-        else [(_heading(row, short), *_object_table(row)) for row in headlines],
+        objects=[] if conditions else objects,
         conditions=conditions,
         of_paper=of_paper,
         protocol=[] if conditions else _protocol(result, short),
@@ -143,49 +151,57 @@ def write_page(
 
 
 def terminal_text(result: Result) -> str:
-    """Tables, warnings and what was asked, for a terminal.
+    """Tables, warnings and settings, for a terminal.
 
     Of one policy without a suite by object too.
     """
     if not result.rows:
         return ""
-    short, suite = labels(result.policies), any(row.condition for row in result.rows)
+    short = labels(result.policies)
     parts = []
-    for header, rows in _tables(result, short):
-        # Only the first figure has its interval here: a line has to fit.
-        cut = [
-            [*row[: WORDS + 1], *(cell.split(" (")[0] for cell in row[WORDS + 1 :])] for row in rows
-        ]
-        parts.append(aligned([header, *cut], words=WORDS))
-    header, rows = _air_table(result.rows, short)
-    parts += [aligned([header, *rows], words=2)] if rows else []
-    header, rows = _consecutive_table(result.rows, short)
-    parts += [aligned([header, *rows], words=2)] if rows else []
+    for header, rows in (_success_table(result.rows, short), _beside_table(result.rows, short)):
+        lines = [header]
+        for row in rows:
+            # Only the first figure has its interval here: a line has to fit.
+            figures = [cell.split(" (")[0] for cell in row[WORDS + 1 :]]
+            lines.append([*row[: WORDS + 1], *figures])
+        parts.append(aligned(lines, words=WORDS))
+    for header, rows in (_air_table(result.rows, short), _consecutive_table(result.rows, short)):
+        if rows:
+            parts.append(aligned([header, *rows], words=2))
+    suite = any(row.condition for row in result.rows)
     if len(result.policies) == 1 and not suite:
-        for row in result.rows:
-            if row.headline:
-                header, rows = _object_table(row)
-                parts.append(f"{_heading(row, short)}\n{aligned([header, *rows], words=1)}")
-    parts += ["\n".join("  ".join(cells) for cells in _differences(result, short))]
-    parts += [f"warning {name}: {words}" for name, words in result.warnings.items()]
-    parts += [] if suite else [asked([row.protocol for row in result.rows])]
-    return "\n\n".join(part for part in parts if part)
+        parts += _object_parts(result, short)
+    parts += map("  ".join, _differences(result, short))
+    parts += [f"warning {name}: {warning}" for name, warning in result.warnings.items()]
+    if not suite:
+        parts.append(settings_text([row.protocol for row in result.rows]))
+    return "\n\n".join(parts)
+
+
+def _object_parts(result: Result, short: dict[str, str]) -> list[str]:
+    parts = []
+    for row in result.rows:
+        if row.headline:
+            header, rows = _object_table(row)
+            parts.append(f"{_heading(row, short)}\n{aligned([header, *rows], words=1)}")
+    return parts
 
 
 def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
     """Rows of cells as lines of text: the first ``words`` columns flush left, the others right."""
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if column < words else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = []
+        for column, (cell, width) in enumerate(zip(row, widths, strict=True)):
+            cells.append(cell.ljust(width) if column < words else cell.rjust(width))
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
 
 
 def ecdf_figure(result: Result, short: dict[str, str]) -> "Figure":
-    """Distributions of the errors at the stop or end, by each policy's own rule.
+    """Distributions of the errors at the stop or end of each policy's headline row.
 
     A panel for each condition and group; ``short`` are names of the policies.
     """
@@ -194,122 +210,151 @@ def ecdf_figure(result: Result, short: dict[str, str]) -> "Figure":
     headlines = result.headlines()
     columns = min(PANELS, len(headlines))
     rows = -(-len(headlines) // columns)
-    figure = Figure(figsize=(columns * PANEL_INCH[0], rows * PANEL_INCH[1]), layout="constrained")
+    width, height = PANEL_INCH
+    figure = Figure(figsize=(columns * width, rows * height), layout="constrained")
     angle = np.linspace(0.0, np.pi, 200)
+    by_chance = (angle - np.sin(angle)) / np.pi  # of orientations uniform on SO(3)
     colour = dict(zip(result.policies, COLOURS * len(result.policies), strict=False))
-    for panel, ((condition, group), found) in enumerate(headlines.items()):
+    for panel, ((condition, group), row_of) in enumerate(headlines.items()):
         axes = figure.add_subplot(rows, columns, panel + 1)
         axes.spines[["top", "right"]].set_visible(False)
-        for policy, row in found.items():
+        for policy, row in row_of.items():
             # Lost objects count, but have no error: the curve ends below one.
             errors = np.sort([e.exact_error_rad for e in row.episodes if not e.fell])
-            share = np.arange(len(errors) + 1) / len(row.episodes)
-            steps = np.concatenate([[0.0], errors, [np.pi]]), np.append(share, share[-1])
-            axes.step(*steps, where="post", color=colour[policy], label=short[policy])
-        by_chance = (angle - np.sin(angle)) / np.pi  # of orientations uniform on SO(3)
+            shares = np.arange(len(errors) + 1) / len(row.episodes)
+            axes.step(
+                np.concatenate([[0.0], errors, [np.pi]]),
+                np.append(shares, shares[-1]),
+                where="post",
+                color=colour[policy],
+                label=short[policy],
+            )
+            axes.axvline(row.protocol.stop_tolerance_rad, color=GREY, linewidth=0.6)
         axes.plot(angle, by_chance, color=GREY, linestyle=":", label="at random")
-        axes.axvline(row.protocol.stop_tolerance_rad, color=GREY, linewidth=0.6)
         axes.set(xlim=(0.0, np.pi), ylim=(0.0, 1.0), title=condition or group)
         axes.set(xlabel="error at the stop or end [rad]", ylabel="share of episodes")
         axes.legend(frameon=False, loc="lower right", fontsize=7)
     return figure
 
 
-def _tables(result: Result, short: dict[str, str]) -> tuple[Table, Table]:
-    """Of all rows: the figures by which policies are judged, and those beside them."""
-    success, beside = [], []
-    for row in result.rows:
-        name = row.kind if row.kind == row.policy else f"{short[row.policy]} ({row.kind})"
-        names, outcomes = (name, _where(row), _stopped_by(row)), row.overall.outcomes
-        held = "not tried" if row.held is None else percent(row.held)
-        success.append(
+def _success_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
+    """The figures by which policies are judged."""
+    lines = []
+    for row in rows:
+        outcomes = row.overall.outcomes
+        lines.append(
             (
-                *names,
+                *_names(row, short),
                 percent(outcomes["success"]),
-                held,
-                "not tried" if row.precise is None else percent(row.precise),
+                percent(row.held),
+                percent(row.precise),
                 percent(outcomes["object falls"]),
             )
         )
-        median, time_s = number(row.overall.median_error_rad), number(row.overall.time_s)
-        beside.append((*names, percent(row.overall.symmetric), median, time_s))
-    return (_HEADER, success), (_BESIDE_HEADER, beside)
+    return _HEADER, lines
+
+
+def _beside_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
+    """The figures beside those."""
+    lines = []
+    for row in rows:
+        overall = row.overall
+        lines.append(
+            (
+                *_names(row, short),
+                percent(overall.symmetric),
+                number(overall.median_error_rad),
+                number(overall.time_s),
+            )
+        )
+    return _BESIDE_HEADER, lines
+
+
+def _names(row: Row, short: dict[str, str]) -> tuple[str, str, str]:
+    """What a row is of: policy, objects, stop."""
+    policy = short[row.policy]
+    if row.kind != row.policy:
+        policy = f"{policy} ({row.kind})"
+    return policy, _where(row), row.stopped_by
 
 
 def _object_table(row: Row) -> Table:
     """All objects of a row, and each."""
-    return _OBJECT_HEADER, [
-        (
-            one.name,
-            *map(percent, one.outcomes.values()),
-            percent(one.symmetric),
-            number(one.median_error_rad),
-        )
-        for one in (row.overall, *row.per_object)
-    ]
+    return _OBJECT_HEADER, [_object_cells(summary) for summary in (row.overall, *row.per_object)]
 
 
-def share(value: float | None) -> str:
-    """``12.3 %``, or that there is none."""
-    return "none" if value is None else f"{100 * value:.1f} %"
+def _object_cells(summary: Summary) -> list[str]:
+    cells = [summary.name]
+    cells += map(percent, summary.outcomes.values())
+    cells.append(percent(summary.symmetric))
+    cells.append(number(summary.median_error_rad))
+    return cells
 
 
 def _air_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     """What became of goals in a row in the air."""
-    return _AIR_HEADER, [
-        (
-            short[row.policy],
-            _where(row),
-            percent(air.held),
-            share(air.first),
-            percent(air.in_a_row),
-            share(air.lost),
-            share(air.let_go),
-        )
-        for row in rows
-        if (air := row.in_air) is not None
-    ]
+    lines = []
+    for row in rows:
+        air = row.in_air
+        if air is not None:
+            lines.append(
+                (
+                    short[row.policy],
+                    _where(row),
+                    percent(air.held),
+                    share(air.first),
+                    percent(air.in_a_row),
+                    share(air.lost),
+                    share(air.let_go),
+                )
+            )
+    return _AIR_HEADER, lines
 
 
 def _consecutive_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     """Successes in a row: of all objects, and of each where there are more."""
-    return _CONSECUTIVE_HEADER, [
-        (
-            short[row.policy],
-            _where(row) if one.name == "all" else one.name,
-            f"{one.mean:.1f}",
-            f"{one.median:g}",
-            *map(share, (one.goals, one.lost, one.full)),
-        )
-        for row in rows
-        for one in row.consecutive[: None if len(row.object_names) > 1 else 1]
-    ]
+    lines = []
+    for row in rows:
+        for count in row.consecutive:
+            if count.name != "all" and len(row.object_names) == 1:
+                continue
+            lines.append(
+                (
+                    short[row.policy],
+                    _where(row) if count.name == "all" else count.name,
+                    f"{count.mean:.1f}",
+                    f"{count.median:g}",
+                    share(count.goals),
+                    share(count.lost),
+                    share(count.full),
+                )
+            )
+    return _CONSECUTIVE_HEADER, lines
 
 
 def _bound_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     """What predictions are worth at each bound."""
-    return _BOUND_HEADER, [
-        (
-            short[row.policy],
-            _where(row),
-            bound,
-            share(seen),
-            share(row.prediction.right[bound]),
-            f"{row.prediction.mean_error_rad:.2f}",
-        )
-        for row in rows
-        if row.prediction is not None
-        for bound, seen in row.prediction.seen.items()
-    ]
-
-
-def _stopped_by(row: Row) -> str:
-    """What stops a row's episodes, marked where that is ours."""
-    return f"{row.stopped_by}; ours: {row.ours}" if row.ours else row.stopped_by
+    lines = []
+    for row in rows:
+        prediction = row.prediction
+        if prediction is None:
+            continue
+        for bound, seen in prediction.seen.items():
+            lines.append(
+                (
+                    short[row.policy],
+                    _where(row),
+                    bound,
+                    share(seen),
+                    share(prediction.right[bound]),
+                    f"{prediction.mean_error_rad:.2f}",
+                )
+            )
+    return _BOUND_HEADER, lines
 
 
 def _heading(row: Row, short: dict[str, str]) -> str:
-    return f"{short[row.policy]}, {_where(row)}, stopped by {_stopped_by(row)}"
+    return f"{short[row.policy]}, {_where(row)}, stopped by {row.stopped_by}"
 
 
 def _where(row: Row) -> str:
@@ -317,60 +362,46 @@ def _where(row: Row) -> str:
     return f"{row.group}, {row.condition}" if row.condition not in ("", row.group) else row.group
 
 
-def _differences(result: Result, short: dict[str, str]) -> list[tuple[str, ...]]:
-    return [
-        (f"{short[other.policy]} over {short[first.policy]}", _where(first), points(d, " points"))
-        for first, other, d in result.differences()
-    ]
+def _differences(result: Result, short: dict[str, str]) -> list[tuple[str, str, str]]:
+    lines = []
+    for first, other, difference in result.differences():
+        pair = f"{short[other.policy]} over {short[first.policy]}"
+        lines.append((pair, _where(first), points(difference)))
+    return lines
 
 
-def asked(protocols: Sequence[Protocol]) -> str:
-    """What was asked: hands, place, episodes, starts, goals, stop and randomisation.
+def settings_text(protocols: Sequence[Protocol]) -> str:
+    """The settings of evaluations that are not the usual ones; empty: there is no evaluation.
 
-    Hands alone differ.
+    Policies differ in few of them, such as the hand: then all values are told.
     """
-    protocol = protocols[0]
-    layers = {
-        shown_name(p.hand): "" if p.hand_layer is None else f" with {p.hand_layer}"
-        for p in protocols
-    }
-    hands = ", ".join(f"{hand}{layer}" for hand, layer in layers.items())
-    angle = protocol.max_goal_angle_rad
-    if protocol.goals_about_vertical:
-        goals = f"turned about the vertical by at most {angle:g} rad"
-    elif angle >= np.pi - 1e-6:
-        goals = "uniform on SO(3)"
-    else:
-        goals = f"uniform within {angle:g} rad of the start"
-    rest = "at rest on the table, as the environment draws them"
-    table = "" if protocol.table_friction is None else f" of friction {protocol.table_friction:g}"
-    times = f"{protocol.episodes} episode{'s' * (protocol.episodes > 1)}"
-    limit = f"{protocol.episode_s:g} s" + (" a goal" if protocol.consecutive else "")
-    place = "palm up" if protocol.palm_up else "on the table"
-    parts = (
-        f"{hands} {'in the air' if protocol.in_air or protocol.air_goals else place}{table}",
-        *(["goal after goal"] if protocol.air_goals or protocol.consecutive else []),
-        f"{times} of {limit} for each object, seed {protocol.seed}",
-        f"starts {rest if protocol.at_rest else 'dropped into the hand, uniform on SO(3)'}",
-        f"goals {goals}",
-        f"stop within {protocol.stop_tolerance_rad:g} rad",
-        f"randomisation {protocol.randomisation}",
-        *([] if protocol.engine == "newton" else ["physics by MuJoCo's own engine"]),
-    )
+    parts = []
+    for setting in fields(Protocol):
+        values: list[Any] = []
+        for protocol in protocols:
+            value = getattr(protocol, setting.name)
+            if isinstance(value, float):
+                value = f"{value:.4g}"
+            if value not in (*values, setting.default):
+                values.append(value)
+        name = setting.name.replace("_", " ")
+        if values == [True]:
+            parts.append(name)
+        elif values and setting.name != "objects":
+            parts.append(f"{name} {shown_name(', '.join(map(str, values)))}")
     return "; ".join(parts)
 
 
 def _protocol(result: Result, short: dict[str, str]) -> list[tuple[str, str]]:
-    """What each policy sees and stops by, and the objects of each group."""
-    known = {"mesh": "the exact mesh", "points": "500 exact points", "scan": "500 points of a scan"}
-    groups = {row.group: row.protocol.objects for row in result.rows}
-    rows = [(f"objects: {name}", shown_name(sets)) for name, sets in groups.items()]
+    """The objects of each group, and what each policy sees and stops by."""
+    lines = []
+    for group in dict.fromkeys(row.group for row in result.rows):
+        sets = next(row.protocol.objects for row in result.rows if row.group == group)
+        lines.append((f"objects: {group}", shown_name(sets)))
     for row in result.rows:
-        told = f"sees {row.sees}"
-        if row.sees.endswith("clouds"):
-            errs = ", which err as a real camera does" if row.protocol.sensor_errors else ""
-            told += f"{errs}; knows shapes and goals by {known[row.protocol.goals]}"
+        rule = f"sees {row.sees}"
         if row.stopped_by != SUCCESS:
-            told += f"; stops below {row.rule.distance_rad:.3g} rad, action norm {row.rule.action_norm:.3g}"
-            rows.append((f"{short[row.policy]}, {row.group}, by {_stopped_by(row)}", told))
-    return rows
+            bounds = f"{row.rule.distance_rad:.3g} rad, action norm {row.rule.action_norm:.3g}"
+            rule = f"{rule}; stops below {bounds}"
+        lines.append((f"{short[row.policy]}, {row.group}, by {row.stopped_by}", rule))
+    return lines

@@ -30,7 +30,7 @@ from vd.paper import PAPER
 from vd.policy.stopping import StoppingRule
 from vd.sim.cfg import Engine
 
-RESULT_FORMAT = "visual-dexterity evaluation 8"
+RESULT_FORMAT = "visual-dexterity evaluation 9"
 BOUNDS_RAD = (PAPER.success.precise_rad, PAPER.success.rotation_rad)
 """Bounds on the distance at which predictions are judged, as in the paper."""
 OUTCOMES = ("success", "orientation error", "time-out", "object falls")
@@ -41,10 +41,6 @@ StoppedBy = Literal["prediction", "true distance", "success criteria of training
 SUCCESS: StoppedBy = "success criteria of training"
 ANY_ACTION = 100.0
 """Bound that no norm of an action exceeds: others who count consecutive successes ask for none."""
-OWN_NORM = "its own bound of the action"
-"""Mark of rows that are ours: stopped by the bound of the action's norm that a policy's file
-has.
-"""
 
 
 @dataclass(frozen=True)
@@ -183,8 +179,6 @@ class Row:
     stopped_by: StoppedBy
     rule: StoppingRule
     """Bounds of the distance and of the action's norm."""
-    ours: str = ""
-    """What of it is ours, not the paper's; empty for the conditions of the paper."""
     protocol: Protocol
     object_names: tuple[str, ...]
     overall: Summary
@@ -216,12 +210,9 @@ class Row:
 
     @property
     def headline(self) -> bool:
-        """Whether it is the policy's own rule.
-
-        By its prediction if it has one, else by the true distance.
-        """
-        by = "prediction" if self.sees.endswith("clouds") else "true distance"
-        return self.stopped_by == by and not self.ours
+        """Whether it is judged first: by the prediction of who makes one, else by the true distance."""
+        by_prediction = self.sees.endswith("clouds")
+        return self.stopped_by == ("prediction" if by_prediction else "true distance")
 
 
 @dataclass(frozen=True)
@@ -242,45 +233,46 @@ class Result:
     @property
     def warnings(self) -> dict[str, str]:
         """What may be wrong with objects, by name."""
-        return {name: words for row in self.rows for name, words in row.warnings.items()}
+        warnings: dict[str, str] = {}
+        for row in self.rows:
+            warnings |= row.warnings
+        return warnings
 
     def headlines(self) -> dict[tuple[str, str], dict[str, Row]]:
         """The headline row of each policy, by condition and group."""
-        found: dict[tuple[str, str], dict[str, Row]] = {}
+        headlines: dict[tuple[str, str], dict[str, Row]] = {}
         for row in self.rows:
             if row.headline:
-                found.setdefault((row.condition, row.group), {})[row.policy] = row
-        return found
+                headlines.setdefault((row.condition, row.group), {})[row.policy] = row
+        return headlines
 
     def differences(self) -> list[tuple[Row, Row, Interval]]:
         """Every other policy beside the first, and how much larger its share of success is, paired."""
-        found = []
-        for rows in self.headlines().values():
-            first, *others = rows.values()
+        differences = []
+        for row_of in self.headlines().values():
+            first, *others = row_of.values()
             for other in others:
                 if other.protocol.episodes == first.protocol.episodes:
                     unit = first.overall.unit
-                    found.append(
-                        (first, other, paired_difference(other.successes, first.successes, unit))
-                    )
-        return found
+                    interval = paired_difference(other.successes, first.successes, unit)
+                    differences.append((first, other, interval))
+        return differences
 
     def summary(self) -> dict[str, Any]:
         """What is written, as JSON, without episodes."""
-        found = to_dict(self)
-        for row in found["rows"]:
+        summary = to_dict(self)
+        for row in summary["rows"]:
             del row["episodes"]
-        found["differences"] = [
-            {
+        summary["differences"] = []
+        for first, other, interval in self.differences():
+            compared = {
                 "policy": other.policy,
                 "from": first.policy,
                 "condition": first.condition,
                 "group": first.group,
             }
-            | to_dict(interval)
-            for first, other, interval in self.differences()
-        ]
-        return found
+            summary["differences"].append(compared | to_dict(interval))
+        return summary
 
     def write(self, path: Path) -> None:
         """Write as JSON, atomically."""
@@ -294,14 +286,12 @@ class Result:
             ValueError: Not such a file, or of another version.
         """
         values: Any = json.loads(Path(path).read_text())
-        found = values.get("format") if isinstance(values, dict) else None
-        if found != RESULT_FORMAT:
-            raise ValueError(
-                f"{path}: format is {found!r}, expected {RESULT_FORMAT!r}; run vd-eval again"
-            )
         try:
+            written = values["format"]
+            if written != RESULT_FORMAT:
+                raise ValueError(f"format is {written!r}, expected {RESULT_FORMAT!r}")
             return from_dict(Result, values)
-        except ValueError as error:
+        except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: {error}; run vd-eval again") from error
 
 
@@ -319,28 +309,25 @@ class Agent:
 
     def ways_to_stop(
         self, tolerance_rad: float, schedule: GoalSchedule = ONE_GOAL
-    ) -> dict[tuple[StoppedBy, str], Way]:
-        """The ways to stop it within a tolerance [rad], the headline first, by name and what is ours of it.
+    ) -> dict[StoppedBy, Way]:
+        """The ways to stop it within a tolerance [rad], the headline first.
 
-        They are the bounds of the distance that it predicts, if it does, and of the true one, both
-        with the released code's bound of the action's norm; and, as ours, its own bound of the norm
-        where that is another. What predicts nothing is stopped by the success criteria of training,
-        too. Goals in a row depend on what stops it: there the first way is the only one.
+        They are bounds of the distance that it predicts, if it does, and of the true one, both with
+        the released code's bound of the action's norm. What predicts nothing is stopped by the
+        success criteria of training, too. Goals in a row depend on what stops it: there the first
+        way is the only one.
         """
-        own = self.rules(tolerance_rad)
         norm = ANY_ACTION if schedule.distance_alone else PAPER.success.action_norm
         true = StoppingRule(tolerance_rad, norm)
         predicts = self.sees.endswith("clouds")
-        ways: dict[tuple[StoppedBy, str], Way] = {}
+        ways: dict[StoppedBy, Way] = {}
         if predicts:
-            ways["prediction", ""] = (replace(own, action_norm=norm), "predicted")
-        ways["true distance", ""] = (true, "exact")
+            ways["prediction"] = (replace(self.rules(tolerance_rad), action_norm=norm), "predicted")
+        ways["true distance"] = (true, "exact")
+        if not predicts:
+            ways[SUCCESS] = (true, "success")
         if schedule.most > 1:
             return dict([next(iter(ways.items()))])
-        if not predicts:
-            ways[SUCCESS, ""] = (true, "success")
-        elif own.action_norm != norm:
-            ways["prediction", OWN_NORM] = (own, "predicted")
         return ways
 
 
@@ -356,16 +343,16 @@ def judge(
     """Rows of one policy, one for each way to stop, from its episodes with the objects of one group."""
     tolerance = protocol.stop_tolerance_rad
     schedule = trace.schedule
+    in_a_row = schedule.most > 1
+    in_air = in_a_row and schedule.first_s > 0.0
     unit = choose_unit(len(objects))
     names = tuple(item.name for item in objects)
     rows = []
-    for (stopped_by, ours), way in agent.ways_to_stop(tolerance, schedule).items():
+    for stopped_by, way in agent.ways_to_stop(tolerance, schedule).items():
         rule, by = way
-        alike = _stopped_within(
-            trace, rule, "error" if by == "exact" else by, trace.error, tolerance
-        )
         episodes = trace.episodes(rule, by)
-        in_a_row = schedule.most > 1
+        by_symmetry = "error" if by == "exact" else by
+        alike = _stopped_within(trace, rule, by_symmetry, trace.error, tolerance)
         rows.append(
             Row(
                 policy=agent.policy,
@@ -375,18 +362,17 @@ def judge(
                 condition=condition,
                 stopped_by=stopped_by,
                 rule=rule,
-                ours=ours,
                 protocol=protocol,
                 object_names=names,
                 overall=summarise("all", episodes, alike, protocol, unit),
                 per_object=_per_object(names, episodes, alike, protocol),
                 held=None if in_a_row else _held(trace, way, tolerance, unit),
-                precise=None if in_a_row else _precise(trace, agent, (stopped_by, ours), by, unit),
+                precise=None if in_a_row else _precise(trace, agent, stopped_by, unit),
                 prediction=_prediction(trace) if by == "predicted" and not in_a_row else None,
                 warnings=_warnings(trace, agent, objects, condition),
                 episodes=episodes,
-                in_air=_in_air(trace, way, unit) if in_a_row and schedule.first_s else None,
-                consecutive=() if schedule.first_s or not in_a_row else _consecutive(trace, names),
+                in_air=_in_air(trace, way, unit) if in_air else None,
+                consecutive=_consecutive(trace, names) if in_a_row and not in_air else (),
             )
         )
     return rows
@@ -398,8 +384,8 @@ def _per_object(
     count = protocol.episodes
     summaries = []
     for k, name in enumerate(names):
-        own = episodes[k * count : (k + 1) * count]
-        summaries.append(summarise(name, own, alike[k : k + 1], protocol, "episode"))
+        of_object = episodes[k * count : (k + 1) * count]
+        summaries.append(summarise(name, of_object, alike[k : k + 1], protocol, "episode"))
     return tuple(summaries)
 
 
@@ -411,14 +397,11 @@ def _held(trace: Trace, way: Way, tolerance: float, unit: Unit) -> Interval | No
     return rate_intervals((stopped & (trace.held[way] <= tolerance))[None], unit)[0]
 
 
-def _precise(
-    trace: Trace, agent: Agent, name: tuple[StoppedBy, str], by: StopsBy, unit: Unit
-) -> Interval:
+def _precise(trace: Trace, agent: Agent, stopped_by: StoppedBy, unit: Unit) -> Interval:
     """Share of episodes stopped within 0.1 rad by the rule for that."""
-    precise = PAPER.success.precise_rad
-    # A rule that has the paper's bound of the norm for 0.1 rad has no other of its own for it.
-    rule, _ = agent.ways_to_stop(precise).get(name, (agent.rules(precise), by))
-    return rate_intervals(_stopped_within(trace, rule, by, trace.exact, precise)[None], unit)[0]
+    tolerance = PAPER.success.precise_rad
+    rule, by = agent.ways_to_stop(tolerance)[stopped_by]
+    return rate_intervals(_stopped_within(trace, rule, by, trace.exact, tolerance)[None], unit)[0]
 
 
 def _warnings(trace: Trace, agent: Agent, objects: list[Any], condition: str) -> dict[str, str]:
@@ -447,22 +430,23 @@ def _in_air(trace: Trace, way: Way, unit: Unit) -> InAir:
 
 def _consecutive(trace: Trace, names: Sequence[str]) -> tuple[Consecutive, ...]:
     """Of all objects, and of each."""
-    parts = {"all": slice(None)} | {name: slice(k, k + 1) for k, name in enumerate(names)}
-    rows = []
-    for name, part in parts.items():
-        reached = trace.reached[part]
-        full = reached == trace.schedule.most
-        rows.append(
-            Consecutive(
-                name,
-                mean=float(reached.mean()),
-                median=float(np.median(reached)),
-                goals=float(reached.sum() / (reached.sum() + (~full).sum())),
-                lost=float((trace.fell[part] & ~full).mean()),
-                full=float(full.mean()),
-            )
-        )
-    return tuple(rows)
+    counts = [_consecutive_of("all", trace)]
+    for k, name in enumerate(names):
+        counts.append(_consecutive_of(name, trace.of([k])))
+    return tuple(counts)
+
+
+def _consecutive_of(name: str, trace: Trace) -> Consecutive:
+    reached = trace.reached
+    full = reached == trace.schedule.most
+    return Consecutive(
+        name,
+        mean=float(reached.mean()),
+        median=float(np.median(reached)),
+        goals=float(reached.sum() / (reached.sum() + (~full).sum())),
+        lost=float((trace.fell & ~full).mean()),
+        full=float(full.mean()),
+    )
 
 
 def summarise(
@@ -501,10 +485,9 @@ def _column(episodes: tuple[Episode, ...], protocol: Protocol, name: str) -> np.
 
 def _outcomes(episodes: tuple[Episode, ...], protocol: Protocol) -> np.ndarray:
     """Which episodes are in each class of OUTCOMES, bool [4, K, M]."""
-    stopped, fell, error = (
-        _column(episodes, protocol, name) for name in ("stopped", "fell", "exact_error_rad")
-    )
-    right = error <= protocol.stop_tolerance_rad
+    stopped = _column(episodes, protocol, "stopped")
+    fell = _column(episodes, protocol, "fell")
+    right = _column(episodes, protocol, "exact_error_rad") <= protocol.stop_tolerance_rad
     return np.stack([stopped & right, stopped & ~right, ~stopped & ~fell, ~stopped & fell])
 
 
@@ -518,11 +501,13 @@ def _stopped_within(
 
 def _prediction(trace: Trace) -> Prediction:
     assert trace.predicted is not None
-    there = np.isfinite(trace.predicted)
-    true, predicted = trace.error[there], trace.predicted[there]
-    return Prediction(
-        states=len(true),
-        mean_error_rad=float(np.abs(predicted - true).mean()),
-        seen={str(bound): share_among(predicted <= bound, true <= bound) for bound in BOUNDS_RAD},
-        right={str(bound): share_among(true <= bound, predicted <= bound) for bound in BOUNDS_RAD},
-    )
+    known = np.isfinite(trace.predicted)
+    true = trace.error[known]
+    predicted = trace.predicted[known]
+    seen = {}
+    right = {}
+    for bound in BOUNDS_RAD:
+        seen[str(bound)] = share_among(predicted <= bound, true <= bound)
+        right[str(bound)] = share_among(true <= bound, predicted <= bound)
+    error = float(np.abs(predicted - true).mean())
+    return Prediction(states=len(true), mean_error_rad=error, seen=seen, right=right)

@@ -34,8 +34,10 @@ def draw_goals(start: np.ndarray, rng: np.random.Generator, max_goal_angle: floa
     # The angle of a uniform rotation has density (1 - cos)/pi: invert its cumulative distribution.
     grid = np.linspace(0.0, max_goal_angle, ANGLE_GRID)
     cumulative = grid - np.sin(grid)
-    angle = np.interp(rng.random(len(start)) * cumulative[-1], cumulative, grid)
-    return (Rotation.from_rotvec(axis * angle[:, None]) * Rotation.from_quat(start)).as_quat()
+    share = rng.random(len(start)) * cumulative[-1]
+    angle = np.interp(share, cumulative, grid)
+    turn = Rotation.from_rotvec(axis * angle[:, None])
+    return (turn * Rotation.from_quat(start)).as_quat()
 
 
 def draw_turns(
@@ -45,25 +47,28 @@ def draw_turns(
     turns = []
     for name in names:
         rng = np.random.default_rng([seed, zlib.crc32(name.encode()), most])
-        at = np.tile([0.0, 0.0, 0.0, 1.0], (episodes * most, 1))
-        turns.append(draw_goals(at, rng, max_goal_angle).reshape(episodes, most, 4))
+        identity = np.tile([0.0, 0.0, 0.0, 1.0], (episodes * most, 1))
+        turn = draw_goals(identity, rng, max_goal_angle)
+        turns.append(turn.reshape(episodes, most, 4))
     return np.stack(turns)
 
 
 def episode_rounds(world_object: np.ndarray, objects: int, episodes: int) -> list[np.ndarray]:
     """For every round the episode number of each environment, -1 for none: a list of [N] arrays."""
-    missing = sorted(set(range(objects)) - set(world_object.tolist()))
-    if missing:
+    envs_of = np.bincount(world_object, minlength=objects)
+    if not envs_of.all():
         raise ValueError(
-            f"no environment simulates object {missing[0]}; raise the number of environments to "
-            f"{objects}"
+            f"no environment simulates object {envs_of.argmin()}; raise the number of environments "
+            f"to {objects}"
         )
-    # The position of each environment among those of its object.
-    order = np.array([np.count_nonzero(world_object[:w] == k) for w, k in enumerate(world_object)])
-    share = np.bincount(world_object, minlength=objects)
-    count = int(np.ceil(episodes / share.min()))
-    numbers = [turn * share[world_object] + order for turn in range(count)]
-    return [np.where(number < episodes, number, -1) for number in numbers]
+    place = np.zeros_like(world_object)  # of each environment among those of its object
+    for k in range(objects):
+        place[world_object == k] = np.arange(envs_of[k])
+    rounds = []
+    for turn in range(int(np.ceil(episodes / envs_of.min()))):
+        number = turn * envs_of[world_object] + place
+        rounds.append(np.where(number < episodes, number, -1))
+    return rounds
 
 
 def unit_quats(quat: np.ndarray) -> np.ndarray:

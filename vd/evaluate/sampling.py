@@ -123,24 +123,25 @@ class SamplingController:
 
     def _noise(self) -> torch.Tensor:
         """Noise of standard deviation 1, smooth in time, shape [N, S, H, A]; that of the first is 0."""
-        cfg, device = self.cfg, self._plan.device
-        knots = -(-cfg.horizon // cfg.knot_steps) + 1
-        drawn = torch.randn(
-            self._env.num_envs * cfg.samples,
+        cfg = self.cfg
+        envs = self._env.num_envs
+        knots = torch.randn(
+            envs * cfg.samples,
             self._env.num_actions,
-            knots,
+            -(-cfg.horizon // cfg.knot_steps) + 1,
             generator=self._generator,
-            device=device,
+            device=self._plan.device,
         )
-        smooth = torch.nn.functional.interpolate(drawn, size=cfg.horizon, mode="linear")
-        noise = smooth.transpose(1, 2).unflatten(0, (self._env.num_envs, cfg.samples))
+        smooth = torch.nn.functional.interpolate(knots, size=cfg.horizon, mode="linear")
+        noise = smooth.transpose(1, 2).unflatten(0, (envs, cfg.samples))
         noise[:, 0] = 0.0
         return noise
 
     def _simulate(self, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Simulate all futures; their actions [N, S, H, A] and returns [N, S]."""
-        cfg, model = self.cfg, self._model
-        shape = self._env.num_envs, cfg.samples
+        cfg = self.cfg
+        model = self._model
+        shape = (self._env.num_envs, cfg.samples)
         taken = torch.empty_like(noise)
         returns = torch.zeros(shape, device=noise.device)
         alive = torch.ones(shape, device=noise.device)

@@ -30,14 +30,12 @@ def scan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
     Noisy, one side replaced by others.
     """
-    along = np.argsort(points @ rng.normal(size=3))
-    seen = along[: round(len(points) * (1.0 - MISSING))]
-    again = rng.choice(seen, len(points) - len(seen))
+    order = np.argsort(points @ rng.normal(size=3))
+    visible = order[: round(len(points) * (1.0 - MISSING))]
+    repeated = rng.choice(visible, len(points) - len(visible))
     noise = rng.normal(scale=NOISE_M, size=points.shape).astype(points.dtype)
     scanned = np.empty_like(points)
-    scanned[along] = (
-        points[np.concatenate([seen, again])] + noise
-    )  # as without order as the points were
+    scanned[order] = points[np.concatenate([visible, repeated])] + noise  # in the points' own order
     return scanned
 
 
@@ -65,12 +63,14 @@ def known_objects(
     """
     if goals == "mesh":
         return objects
-    known, rng = [], np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
+    known = []
     for item in objects:
-        points = item.surface_points if goals == "points" else scan(item.surface_points, rng)
-        known.append(
-            known_by_points(item, points, device)
-            if surfaces
-            else replace(item, surface_points=points)
-        )
+        points = item.surface_points
+        if goals == "scan":
+            points = scan(points, rng)
+        if surfaces:
+            known.append(known_by_points(item, points, device))
+        else:
+            known.append(replace(item, surface_points=points))
     return known

@@ -53,9 +53,12 @@ def rotation_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Hamilton product ``a b`` of quaternions xyzw, shapes [..., 4], broadcast."""
-    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    vector = aw * bv + bw * av + np.cross(av, bv)
-    scalar = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
+    a_vector = a[..., :3]
+    a_scalar = a[..., 3:]
+    b_vector = b[..., :3]
+    b_scalar = b[..., 3:]
+    vector = a_scalar * b_vector + b_scalar * a_vector + np.cross(a_vector, b_vector)
+    scalar = a_scalar * b_scalar - np.sum(a_vector * b_vector, axis=-1, keepdims=True)
     return np.concatenate([vector, scalar], axis=-1)
 
 
@@ -107,18 +110,16 @@ def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
         unit: What the statement is about.
     """
     outcomes = np.asarray(outcomes, dtype=float)
+    lows, highs = _logit_t(outcomes, unit)
     intervals = []
-    for group, low, high in zip(outcomes, *_logit_t(outcomes, unit), strict=True):
+    for group, low, high in zip(outcomes, lows, highs, strict=True):
         rate = float(group.mean())
-        if np.isfinite(low):
-            intervals.append(
-                Interval(rate, min(float(low), rate), max(float(high), rate), "logit-t")
-            )
-        else:
-            exact = stats.binomtest(round(group.sum()), group.size).proportion_ci(
-                CONFIDENCE, "exact"
-            )
-            intervals.append(Interval(rate, float(exact.low), float(exact.high), "clopper-pearson"))
+        method = "logit-t"
+        if not np.isfinite(low):
+            method = "clopper-pearson"
+            test = stats.binomtest(round(group.sum()), group.size)
+            low, high = test.proportion_ci(CONFIDENCE, "exact")
+        intervals.append(Interval(rate, min(float(low), rate), max(float(high), rate), method))
     return intervals
 
 

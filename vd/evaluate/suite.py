@@ -9,22 +9,22 @@ from vd.paper import PAPER
 
 FOLDER = Path(__file__).with_name("suites")
 """Where the suites are that have a name."""
-OWN_SETS: dict[str, str | None] = {
-    "training": "procedural-150-seed0",
-    "validation": None,
-    "held-out": "procedural-heldout",
-    "symmetric": "symmetric",
+OWN_SETS = {
+    "training": ("procedural-150-seed0",),
+    "held-out": ("procedural-heldout",),
+    "symmetric": ("symmetric",),
 }
-"""By group of objects the set where none is given: ours, made on demand; the paper's are meshes.
+"""By group of objects the sets where none are given: ours, made on demand; the paper's are meshes.
 Choices are made on training and validation, held-out judges. For validation nothing stands in: it
 is left out.
 """
 
-QUICK_OBJECTS, QUICK_EPISODES, QUICK_CAMERA_EPISODES = 6, 4, 1
-"""Objects of a group and episodes of each in the reduced suite; a control step of a camera policy
-takes a second and more on a CPU."""
-QUICK_S = 540.0
-"""Time after which the reduced suite begins no evaluation any more [s]."""
+QUICK_OBJECTS = 6
+"""Objects of a group in the reduced suite."""
+QUICK_EPISODES = 4
+"""Episodes of each in the reduced suite."""
+QUICK_CAMERA_EPISODES = 1
+"""The same of a camera policy, of which a control step takes a second and more on a CPU."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,13 @@ class Claim:
         """
         if self.paper is None:
             return ""
-        value: tuple[float, ...] = getattr(PAPER.results, self.paper)
+        values: tuple[float, ...] = getattr(PAPER.results, self.paper)
         if self.unit == "share":
-            return share_text(*value)
-        return f"{value[0]:.2f} to {value[1]:.2f}" if self.unit == "rad" else f"below {value[0]:g}"
+            return share_text(*values)
+        if self.unit == "rad":
+            low, high = values
+            return f"{low:.2f} to {high:.2f}"
+        return f"below {values[0]:g}"
 
 
 @dataclass(frozen=True)
@@ -90,8 +93,11 @@ class Suite:
 def share_text(value: float, *interval: float) -> str:
     """``85 % (82 to 88)``, with a decimal where whole per cents would hide how small it is."""
     digits = 0 if interval and value >= 0.1 else 1
-    texts = [f"{100.0 * part:.{digits}f}" for part in (value, *interval)]
-    return f"{texts[0]} %" + (f" ({texts[1]} to {texts[2]})" if interval else "")
+    text = f"{100.0 * value:.{digits}f} %"
+    if interval:
+        low, high = interval
+        text = f"{text} ({100.0 * low:.{digits}f} to {100.0 * high:.{digits}f})"
+    return text
 
 
 def read_suite(name: str) -> Suite:
@@ -114,11 +120,12 @@ def read_suite(name: str) -> Suite:
         suite = from_dict(Suite, values if isinstance(values, dict) else {})
     except (ValueError, yaml.YAMLError) as error:
         raise ValueError(f"--suite {path}: {error}") from error
-    names = [entry.name for entry in suite.lines]
+    names = set()
     for entry in suite.lines:
-        if names.count(entry.name) > 1:
+        if entry.name in names:
             raise ValueError(f"--suite {path}: {entry.name} is there twice; rename one")
-        if not entry.lines or any(not line.startswith("vd-eval ") for line in entry.lines):
+        names.add(entry.name)
+        if not entry.lines or not all(line.startswith("vd-eval ") for line in entry.lines):
             raise ValueError(
                 f"--suite {path}: {entry.name} has to have a line 'vd-eval POLICY ...' for teacher, "
                 "camera or both"

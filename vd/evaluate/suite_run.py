@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from typing import Any, cast
 
 from vd.command.config import to_dict
@@ -21,9 +21,8 @@ from vd.command.files import make_folder, write_json
 from vd.command.line import parse
 from vd.command.versions import code_fingerprint
 from vd.command.workers import run_tasks, shard
-from vd.evaluate.agents import BUILT_IN, find_policy, open_policy, sees_clouds
 from vd.evaluate.cfg import EvalCfg, parse_groups
-from vd.evaluate.claims import ours
+from vd.evaluate.claims import claimed
 from vd.evaluate.compare import compare
 from vd.evaluate.conditions import CHANGED
 from vd.evaluate.page import NOTHING, labels, number, points, shown_name, write_page
@@ -34,20 +33,17 @@ from vd.evaluate.suite import (
     QUICK_CAMERA_EPISODES,
     QUICK_EPISODES,
     QUICK_OBJECTS,
-    QUICK_S,
-    Claim,
     Suite,
     SuiteEntry,
     read_suite,
     share_text,
 )
+from vd.policy.agents import BUILT_IN, find_policy, open_policy, sees_clouds
 
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
 LOG_FILE = "log.txt"
 """Progress of an evaluation that ran beside others."""
-OUT_OF_TIME = "out of time; the same command goes on from here"
-"""Why evaluations of the reduced suite were not run."""
 NOT_RUN = "not run; the same command goes on from here"
 # Settings that say where and how an evaluation runs, not what it measures.
 _NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs", "shard")
@@ -55,14 +51,19 @@ _PASSED_ON = ("seed", "device", "num_envs", "hand", "hand_layer", "engine", "ran
 """Flags beside ``--suite`` that every line gets."""
 _GROUP = re.compile(r"([\w-]+)=SET\b")
 
-Objects = tuple[tuple[str, ...], str]
-"""The objects of a group: what vd-eval is given, sets or chosen files of them, and the same for a
-reader.
-"""
+
+@dataclass(frozen=True)
+class ObjectGroup:
+    """The objects of a group."""
+
+    sets: tuple[str, ...]
+    """What vd-eval is given: sets, or files of them."""
+    text: str
+    """The same for a reader."""
 
 
 @dataclass(frozen=True)
-class Task:
+class SuiteTask:
     """One policy under one condition."""
 
     condition: str
@@ -77,21 +78,22 @@ class Task:
         return self.condition, self.policy
 
     @property
-    def wanted(self) -> dict[str, Any]:
-        """What an evaluation that can stand for it was run with."""
-        settings = {
-            key: value for key, value in to_dict(self.cfg).items() if key not in _NOT_MEASURED
-        }
+    def settings(self) -> dict[str, Any]:
+        """All that decides what is measured."""
+        settings = to_dict(self.cfg)
+        for name in _NOT_MEASURED:
+            del settings[name]
         return {"policy": self.weights, "code": code_fingerprint()} | settings
 
-    def there(self) -> Result | None:
+    def measured(self) -> Result | None:
         """What an earlier call measured with the same settings; None: nothing."""
         try:
-            if json.loads((self.cfg.out / SETTINGS_FILE).read_text()) != self.wanted:
-                return None
-            return Result.read(self.cfg.out / "eval.json")
-        except (OSError, ValueError):  # not there, not whole, or of an older version: measure it
-            return None
+            settings = json.loads((self.cfg.out / SETTINGS_FILE).read_text())
+            if settings == self.settings:
+                return Result.read(self.cfg.out / "eval.json")
+        except (OSError, ValueError):  # not there, not whole, or of an older version
+            pass
+        return None
 
 
 def run_suite(cfg: EvalCfg) -> Result:
@@ -105,108 +107,111 @@ def run_suite(cfg: EvalCfg) -> Result:
     assert cfg.suite is not None
     suite = read_suite(cfg.suite)
     groups = object_groups(cfg.objects, groups_of(suite.lines), quick=cfg.quick)
-    entries = tuple(
-        entry
-        for entry in suite.lines
-        if (entry.quick or not cfg.quick) and groups.keys() >= set(groups_of([entry]))
-    )
+    lines = suite.lines
+    if cfg.quick:
+        lines = tuple(entry for entry in lines if entry.quick)
+    entries = [entry for entry in lines if groups.keys() >= set(groups_of([entry]))]
     tasks = shard(make_tasks(cfg, entries, groups), cfg.shard)
-    found: dict[tuple[str, str], Result | str] = {
-        task.key: task.there() or NOT_RUN for task in tasks
-    }
-    waiting = [task for task in tasks if isinstance(found[task.key], str)]
-    print(
-        f"{len(tasks) - len(waiting)} of {len(tasks)} evaluations were done before", file=sys.stderr
-    )
+    results: dict[tuple[str, str], Result] = {}
+    missing: dict[tuple[str, str], str] = {}
+    waiting = []
+    for task in tasks:
+        result = task.measured()
+        if result is None:
+            waiting.append(task)
+            missing[task.key] = NOT_RUN
+        else:
+            results[task.key] = result
+    print(f"{len(results)} of {len(tasks)} evaluations were done before", file=sys.stderr)
 
-    def finished(task: Task, failure: str | None, died: str) -> None:
-        why, minutes = died if failure is None else failure, (time.monotonic() - begun) / 60.0
-        print(
-            f"[{minutes:.1f} min] {task.condition}: {task.policy} {why or 'done'}", file=sys.stderr
-        )
-        found[task.key] = why or Result.read(task.cfg.out / "eval.json")
-        if not why:
-            write_json(task.cfg.out / SETTINGS_FILE, task.wanted)
+    def finished(task: SuiteTask, failure: str | None, died: str) -> None:
+        why = died if failure is None else failure
+        minutes = (time.monotonic() - begun) / 60.0
+        outcome = why or "done"
+        print(f"[{minutes:.1f} min] {task.condition}: {task.policy} {outcome}", file=sys.stderr)
+        if why:
+            missing[task.key] = why
+            return
+        del missing[task.key]
+        results[task.key] = Result.read(task.cfg.out / "eval.json")
+        write_json(task.cfg.out / SETTINGS_FILE, task.settings)
 
     try:
-        _run(cfg, waiting, finished, begun + QUICK_S if cfg.quick else math.inf)
+        _run(cfg, waiting, finished)
     finally:
-        measured = [one for one in found.values() if isinstance(one, Result)]
-        rows = tuple(row for one in measured for row in one.rows if row.stopped_by != SUCCESS)
-        left = tuple((*key, why) for key, why in found.items() if isinstance(why, str))
-        result = Result(rows, measured[0].software if measured else {}, left)
+        rows = []
+        software: dict[str, str] = {}
+        for task in tasks:
+            if task.key in results:
+                result = results[task.key]
+                software = software or result.software
+                rows += [row for row in result.rows if row.stopped_by != SUCCESS]
+        left = tuple((*key, why) for key, why in missing.items())
+        whole = Result(tuple(rows), software, left)
         if cfg.shard is None:
-            _write(result, cfg, replace(suite, lines=entries), groups)
-    return result
+            _write(whole, cfg, replace(suite, lines=tuple(entries)), groups)
+    return whole
 
 
 def _run(
     cfg: EvalCfg,
-    waiting: list[Task],
-    finished: Callable[[Task, str | None, str], None],
-    stop_at: float,
+    waiting: list[SuiteTask],
+    finished: Callable[[SuiteTask, str | None, str], None],
 ) -> None:
     """Evaluate one after the other, or in processes side by side."""
     if cfg.jobs == 1:
         for task in waiting:
-            finished(task, measure(task, stop_at), "")
+            finished(task, measure(task), "")
         return
     import warp as wp
 
     devices = [cfg.device]
     if cfg.device == "auto" and wp.is_cuda_available():
         devices = [device.alias for device in wp.get_cuda_devices()]
-    spread = [
-        replace(task, cfg=replace(task.cfg, device=devices[turn % len(devices)]))
-        for turn, task in enumerate(waiting)
-    ]
-    work = partial(_measure_apart, stop_at=stop_at)
-    run_tasks(work, spread, finished, jobs=cfg.jobs, limit_s=math.inf, gpu=True)
+    spread = []
+    for turn, task in enumerate(waiting):
+        device = devices[turn % len(devices)]
+        spread.append(replace(task, cfg=replace(task.cfg, device=device)))
+    run_tasks(_measure_apart, spread, finished, jobs=cfg.jobs, limit_s=math.inf, gpu=True)
 
 
-def measure(task: Task, stop_at: float) -> str:
-    """Evaluate into the task's folder, if it is not later than ``stop_at``.
-
-    Why that failed, or nothing.
-    """
-    if time.monotonic() > stop_at:  # the same clock in all processes
-        return OUT_OF_TIME
+def measure(task: SuiteTask) -> str:
+    """Evaluate into the task's folder; why that failed, or nothing."""
     try:
         compare(task.cfg, task.condition)
-    except (
-        RuntimeError,
-        ValueError,
-    ) as error:  # one environment that fails must not cost the others
+    except (RuntimeError, ValueError) as error:  # one that fails must not cost the others
         return str(error)
     return ""
 
 
-def _measure_apart(task: Task, stop_at: float) -> str:
+def _measure_apart(task: SuiteTask) -> str:
     """The same in a process of its own, whose progress goes to a file: several would mix."""
     make_folder(task.cfg.out)
     with (task.cfg.out / LOG_FILE).open("w") as log, redirect_stdout(log), redirect_stderr(log):
         try:
-            return measure(task, stop_at)
+            return measure(task)
         except OSError as error:
             return str(error)
 
 
 def make_tasks(
-    cfg: EvalCfg, entries: Sequence[SuiteEntry], groups: dict[str, Objects]
-) -> list[Task]:
-    """Everything that is to be measured, camera policies at the end if time is short, else first.
+    cfg: EvalCfg, entries: Sequence[SuiteEntry], groups: dict[str, ObjectGroup]
+) -> list[SuiteTask]:
+    """Everything that is to be measured, camera policies first, since they take longest.
 
     All names are looked up here, before anything slow.
     """
     short = labels(cfg.agent_names)
-    tasks = []
+    by_camera: list[SuiteTask] = []
+    others: list[SuiteTask] = []
     for entry in entries:
         for line in entry.lines:
             for name in _policies(cfg, entry, line):
                 folder = cfg.out / entry.name / short.get(name, name).replace("/", "-")
-                one = replace(settings(cfg, line, name, groups), out=folder)
-                tasks.append(Task(entry.name, name, one, fingerprint(name)))
-    return sorted(tasks, key=lambda task: _by_camera(task.policy) == cfg.quick)
+                asked = replace(settings(cfg, line, name, groups), out=folder)
+                task = SuiteTask(entry.name, name, asked, fingerprint(name))
+                (by_camera if _by_camera(name) else others).append(task)
+    return by_camera + others
 
 
 def _policies(cfg: EvalCfg, entry: SuiteEntry, line: str) -> list[str]:
@@ -215,19 +220,21 @@ def _policies(cfg: EvalCfg, entry: SuiteEntry, line: str) -> list[str]:
     Raises:
         ValueError: It names one of the other kind.
     """
-    named = _asked(line).agent_names
-    names = cfg.agent_names if named == ("POLICY",) else named
-    right = [name for name in names if _by_camera(name) == (line == entry.camera)]
-    if names == named != tuple(right):
+    named = _parsed(line).agent_names
+    for_camera = line == entry.camera
+    if named == ("POLICY",):
+        return [name for name in cfg.agent_names if _by_camera(name) == for_camera]
+    wrong = [name for name in named if _by_camera(name) != for_camera]
+    if wrong:
         raise ValueError(
-            f"--suite: {entry.name} has {', '.join(set(named) - set(right))} in the wrong line; "
+            f"--suite: {entry.name} has {', '.join(wrong)} in the wrong line; "
             "'camera' is for policies that see by one, 'teacher' for others"
         )
-    return right
+    return list(named)
 
 
 @cache
-def _asked(line: str) -> EvalCfg:
+def _parsed(line: str) -> EvalCfg:
     """What a line of a suite asks for."""
     return cast(EvalCfg, parse(EvalCfg, shlex.split(line)[1:], prog="vd-eval"))
 
@@ -239,42 +246,47 @@ def _by_camera(name: str) -> bool:
 
 def groups_of(entries: Sequence[SuiteEntry]) -> list[str]:
     """The groups of objects that lines name."""
-    lines = " ".join(line for entry in entries for line in entry.lines)
-    return list(dict.fromkeys(_GROUP.findall(lines)))
+    groups: list[str] = []
+    for entry in entries:
+        for line in entry.lines:
+            groups += _GROUP.findall(line)
+    return list(dict.fromkeys(groups))
 
 
-def settings(cfg: EvalCfg, line: str, policy: str, groups: dict[str, Objects]) -> EvalCfg:
+def settings(cfg: EvalCfg, line: str, policy: str, groups: dict[str, ObjectGroup]) -> EvalCfg:
     """The evaluation of one policy by a line of a suite: what ``vd-eval`` would be told.
 
     Flags beside ``--suite`` change it.
     """
-    asked = _asked(line)
+    asked = _parsed(line)
     objects: list[str] = []
     for item in asked.objects:
         group, _, name = item.partition("=")
-        objects += [f"{group}={each}" for each in groups[group][0]] if name == "SET" else [item]
-    default = EvalCfg()
-    passed: dict[str, Any] = {
-        name: getattr(cfg, name)
-        for name in _PASSED_ON
-        if getattr(cfg, name) != getattr(default, name)
-    }
-    episodes = asked.episodes
+        if name == "SET":
+            objects += [f"{group}={each}" for each in groups[group].sets]
+        else:
+            objects.append(item)
+    changes: dict[str, Any] = {}
+    for name in _PASSED_ON:
+        value = getattr(cfg, name)
+        if value != getattr(EvalCfg, name):
+            changes[name] = value
     if cfg.quick:
-        episodes = min(episodes, QUICK_CAMERA_EPISODES if _by_camera(policy) else QUICK_EPISODES)
-    one = replace(asked, policies=(policy,), objects=tuple(objects), episodes=episodes, **passed)
-    one.validate()
-    return one
+        most = QUICK_CAMERA_EPISODES if _by_camera(policy) else QUICK_EPISODES
+        changes["episodes"] = min(asked.episodes, most)
+    asked = replace(asked, policies=(policy,), objects=tuple(objects), **changes)
+    asked.validate()
+    return asked
 
 
 def shown(entry: SuiteEntry) -> str:
     """Where the paper shows what an entry measures, or what it changes."""
-    return entry.shown or CHANGED.get(_asked(entry.lines[0]).condition or "", "")
+    return entry.shown or CHANGED.get(_parsed(entry.lines[0]).condition or "", "")
 
 
 def object_groups(
     objects: Sequence[str], wanted: Sequence[str], *, quick: bool
-) -> dict[str, Objects]:
+) -> dict[str, ObjectGroup]:
     """The objects of each wanted group.
 
     Those given as ``GROUP=SET``, our procedural ones for the others.
@@ -285,25 +297,26 @@ def object_groups(
     from vd.assets_usd.objects.sets import set_files
 
     given = parse_groups(objects)
-    own_sets = {group: OWN_SETS.get(group) for group in wanted}
-    if unknown := [name for name in given if name not in own_sets]:
-        raise ValueError(
-            f"--objects: '{unknown[0]}' is no group of the suite; {', '.join(own_sets)} are"
-        )
-    groups: dict[str, Objects] = {}
-    for group, own in own_sets.items():
-        sets = given.get(group) or (() if own is None else (own,))
+    for name in given:
+        if name not in wanted:
+            raise ValueError(
+                f"--objects: '{name}' is no group of the suite; {', '.join(wanted)} are"
+            )
+    groups: dict[str, ObjectGroup] = {}
+    for group in wanted:
+        sets = given.get(group) or OWN_SETS.get(group)
         if not sets:
             print(f"left out: {group}; give --objects {group}=SET", file=sys.stderr)
             continue
         files = set_files(sets)
         text = f"{len(files)} of {shown_name(', '.join(sets))}"
         if quick and len(files) > QUICK_OBJECTS:
-            sets = tuple(str(files[i * len(files) // QUICK_OBJECTS]) for i in range(QUICK_OBJECTS))
+            step = len(files) / QUICK_OBJECTS
+            sets = tuple(str(files[int(i * step)]) for i in range(QUICK_OBJECTS))
             text = f"{len(sets)} of the {text}"
         if group not in given and group != "symmetric":
             text += ", our own, since no others were given: they stand for the paper's meshes"
-        groups[group] = sets, text
+        groups[group] = ObjectGroup(sets, text)
     return groups
 
 
@@ -317,38 +330,35 @@ def fingerprint(name: str) -> str:
     return hashlib.sha256(find_policy(name).read_bytes()).hexdigest()
 
 
-def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, Objects]) -> None:
+def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, ObjectGroup]) -> None:
     """The page and its figures, of what there is."""
     short = labels(result.policies)
     of_paper = bool(suite.claims)
-    if of_paper:
-        figures = paper_figures(result, suite)
-        table = [
-            {
-                "figure": row["figure"],
-                "condition": row["condition"],
-                "paper": row["paper"] or NOTHING,
-            }
-            | {short[policy]: text for policy, text in row["ours"].items()}
-            for row in figures
-        ]
-    else:
+    figures = paper_figures(result, suite, short)
+    if not of_paper:
         figures = robust_table(result, suite.lines, short)
-        table = figures
     summary = result.summary() | {"quick": cfg.quick, "figures": figures}
     write_json(cfg.out / f"{cfg.suite_name}.json", summary)
-    notes = [f"Objects, {group}: {text}." for group, (_, text) in groups.items()]
-    notes += ["Held-out objects judge, and nothing is chosen on them."]
-    notes += [] if cfg.engine == "newton" else ["Physics by MuJoCo's own engine."]
-    beside = " beside the paper" if of_paper else ""
+    notes = [f"Objects, {name}: {group.text}." for name, group in groups.items()]
+    notes.append("Held-out objects judge, and nothing is chosen on them.")
+    if cfg.engine != "newton":
+        notes.append("Physics by MuJoCo's own engine.")
+    lead = ", ".join(short.values())
+    if of_paper:
+        lead += " beside the paper"
+    if cfg.quick:
+        lead += ", the reduced suite"
+    table = None
+    if figures:
+        table = (list(figures[0]), [list(figure.values()) for figure in figures])
     write_page(
         result,
         cfg.out / f"{cfg.suite_name}.html",
         title=suite.title,
-        lead=f"{', '.join(short.values())}{beside}{', the reduced suite' if cfg.quick else ''}",
-        figures=(list(table[0]), [list(row.values()) for row in table]) if table else None,
+        lead=lead,
+        figures=table,
         notes=notes,
-        conditions=[(one.name, shown(one), "\n".join(one.lines)) for one in suite.lines],
+        conditions=[(entry.name, shown(entry), "\n".join(entry.lines)) for entry in suite.lines],
         of_paper=of_paper,
     )
 
@@ -357,22 +367,22 @@ def robust_table(
     result: Result, entries: Sequence[SuiteEntry], short: dict[str, str]
 ) -> list[dict[str, str]]:
     """A line for each entry and policy: what it changes, and how much success it costs."""
-    by_name: dict[tuple[str, str], Row] = {}
-    for (condition, _), rows in result.headlines().items():
-        by_name |= {(condition, policy): row for policy, row in rows.items()}
+    row_of: dict[tuple[str, str], Row] = {}
+    for row in result.rows:
+        if row.headline:
+            row_of[row.condition, row.policy] = row
     first = entries[0].name
     table = []
     for entry in entries:
         for policy in result.policies:
-            row = by_name.get((entry.name, policy))
-            nominal = by_name.get((first, policy))
-            if row is None:
+            if (entry.name, policy) not in row_of:
                 continue
+            row = row_of[entry.name, policy]
             change = NOTHING
-            if nominal not in (None, row) and row.in_air is None:
-                change = points(
-                    paired_difference(row.successes, nominal.successes, row.overall.unit)
-                )
+            if entry.name != first and (first, policy) in row_of and row.in_air is None:
+                nominal = row_of[first, policy]
+                difference = paired_difference(row.successes, nominal.successes, row.overall.unit)
+                change = points(difference)
             table.append(
                 {
                     "condition": entry.name,
@@ -387,33 +397,30 @@ def robust_table(
     return table
 
 
-def _share(rate: Interval | None) -> str:
-    return NOTHING if rate is None else share_text(rate.value, rate.low, rate.high)
-
-
-def paper_figures(result: Result, suite: Suite) -> list[dict[str, Any]]:
-    """The paper's figures beside ours, as text."""
+def paper_figures(result: Result, suite: Suite, short: dict[str, str]) -> list[dict[str, str]]:
+    """The paper's figures, each beside that of every policy."""
     figures = []
     for entry in suite.lines:
         for claim in suite.claims:
-            if entry.name in claim.entries:
-                own = {
-                    policy: _ours(result, claim, entry.name, policy) for policy in result.policies
-                }
-                paper = claim.paper_text()
-                figure = {
-                    "figure": claim.text,
-                    "condition": entry.name,
-                    "paper": paper,
-                    "ours": own,
-                }
-                figures.append(figure)
+            if entry.name not in claim.entries:
+                continue
+            figure = {
+                "figure": claim.text,
+                "condition": entry.name,
+                "paper": claim.paper_text() or NOTHING,
+            }
+            for policy in result.policies:
+                rows = [r for r in result.rows if (r.condition, r.policy) == (entry.name, policy)]
+                value = claimed(claim, rows)
+                in_unit = claim.unit != "share" and isinstance(value, Interval)
+                figure[short[policy]] = number(value) if in_unit else _share(value)
+            figures.append(figure)
     return figures
 
 
-def _ours(result: Result, claim: Claim, condition: str, policy: str) -> str:
-    rows = [row for row in result.rows if (row.condition, row.policy) == (condition, policy)]
-    value = ours(claim, rows)
-    if isinstance(value, Interval):
-        return number(value) if claim.unit != "share" else _share(value)
-    return NOTHING if value is None else share_text(value)
+def _share(rate: Interval | float | None) -> str:
+    if rate is None:
+        return NOTHING
+    if isinstance(rate, Interval):
+        return share_text(rate.value, rate.low, rate.high)
+    return share_text(rate)

@@ -103,11 +103,12 @@ class Trace:
     def of(self, objects: Sequence[int]) -> "Trace":
         """The episodes of some objects."""
         chosen = list(objects)
-        parts: dict[str, Any] = {
-            name: value[chosen] if isinstance(value, np.ndarray) else value
-            for name, value in vars(self).items()
-        }
-        return Trace(**parts | {"held": {way: error[chosen] for way, error in self.held.items()}})
+        parts: dict[str, Any] = dict(vars(self))
+        for name, value in parts.items():
+            if isinstance(value, np.ndarray):
+                parts[name] = value[chosen]
+        parts["held"] = {way: error[chosen] for way, error in self.held.items()}
+        return Trace(**parts)
 
     def ends(self, rule: StoppingRule, by: StopsBy) -> tuple[np.ndarray, np.ndarray]:
         """Where a rule ends every episode.
@@ -149,9 +150,9 @@ class Trace:
         episodes = []
         for k, m in np.ndindex(*steps.shape):
             row: dict[str, Any] = {name: values[k, m].tolist() for name, values in columns.items()}
-            row["start_quat"] = tuple(row["start_quat"])
-            row["goal_quat"] = tuple(row["goal_quat"])
-            episodes.append(Episode(k, **row))
+            start_quat = tuple(row.pop("start_quat"))
+            goal_quat = tuple(row.pop("goal_quat"))
+            episodes.append(Episode(k, start_quat, goal_quat, **row))
         return tuple(episodes)
 
 
@@ -199,23 +200,20 @@ def record(
     hz = env.cfg.sim.control_hz
     first_step = round(schedule.first_s * hz)
     goal_steps = env.max_episode_steps if schedule.most == 1 else round(schedule.goal_s * hz)
-
-    def blank() -> np.ndarray:
-        return np.full((*shape, first_step + goal_steps + 1), np.nan)
-
+    states = (*shape, first_step + goal_steps + 1)
     trace = Trace(
         schedule=schedule,
         first_step=first_step,
         start_quat=np.empty((*shape, 4)),
         goal_quat=np.empty((*shape, 4)),
-        error=blank(),
-        exact=blank(),
-        action_norm=blank(),
-        predicted=blank() if hasattr(policy, "predicted") else None,
+        error=np.full(states, np.nan),
+        exact=np.full(states, np.nan),
+        action_norm=np.full(states, np.nan),
+        predicted=np.full(states, np.nan) if hasattr(policy, "predicted") else None,
         steps=np.full(shape, first_step + goal_steps),
         fell=np.zeros(shape, dtype=bool),
         failed=np.zeros(shape, dtype=bool),
-        still=np.zeros((*shape, first_step + goal_steps + 1), dtype=bool),
+        still=np.zeros(states, dtype=bool),
         reached=np.zeros(shape, dtype=int),
         held={way: np.full(shape, np.nan) for way in ways if schedule.hold_s},
     )
@@ -233,26 +231,27 @@ def drawn_rounds(
     env: Any, episodes: int, starts: np.ndarray | None, goals: np.ndarray | None
 ) -> list[tuple[np.ndarray, dict[str, Any]]]:
     """Episode number of each environment, -1 for none [N], and its state at the begin, for every round."""
-    world_object, drawn = np.asarray(env.world_object), []
+    world_object = np.asarray(env.world_object)
+    drawn = []
     for numbers in episode_rounds(world_object, len(env.objects), episodes):
-        chosen = world_object, np.maximum(numbers, 0)
-        env.reset(
-            *(None if quat is None else quat[chosen].astype(np.float32) for quat in (starts, goals))
-        )
+        chosen = (world_object, np.maximum(numbers, 0))
+        if starts is None or goals is None:
+            env.reset()
+        else:
+            env.reset(starts[chosen].astype(np.float32), goals[chosen].astype(np.float32))
         drawn.append((numbers, env.state_dict()))
     return drawn
 
 
 def motion_of(env: Any, *, copy: bool = False) -> dict[str, torch.Tensor]:
     """What moves, with a row for each environment, sharing the environment's memory or copied."""
-    found = {}
+    motion = {}
     for name, array in env.motion().items():
         rows = wp.to_torch(array).view(env.num_envs, -1)
-        rows = (
-            rows.view(torch.int32) if rows.dtype == torch.uint32 else rows
-        )  # the other has no index
-        found[name] = rows.clone() if copy else rows
-    return found
+        if rows.dtype == torch.uint32:  # which torch cannot index
+            rows = rows.view(torch.int32)
+        motion[name] = rows.clone() if copy else rows
+    return motion
 
 
 def copy_motion(
@@ -284,9 +283,8 @@ def out_of_hand(env: Any) -> np.ndarray:
     What is not a number is lost too.
     """
     away = env.object_pose()[:, :3] - np.array(env.hand.workspace.goal_m)
-    return np.asarray(
-        ~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_of(env.hand.workspace))
-    )
+    within = np.linalg.norm(away, axis=-1) < env.cfg.success.fall_of(env.hand.workspace)
+    return np.asarray(~within)
 
 
 class _Round:
@@ -336,12 +334,14 @@ class _Round:
             self._write_decision(envs, step, norm, predicted)
             acted = envs[step > self._given_at[envs]]  # before an action there is nothing to stop
             stops = {}
-            for rule, by in ways:
+            for way in ways:
+                rule, by = way
                 distance = self._exact
                 if by == "predicted":
                     assert predicted is not None
                     distance = predicted
-                stops[rule, by] = acted[rule.stops(distance, norm)[acted]]
+                stopping = rule.stops(distance, norm)
+                stops[way] = acted[stopping[acted]]
             self._keep_stops(stops, step)
             due = np.array([], dtype=int)
             if trace.schedule.most > 1:
@@ -464,10 +464,9 @@ class _Round:
         lost = np.zeros(env.num_envs, dtype=bool)
         for step in range(round(self._trace.schedule.hold_s * env.cfg.sim.control_hz)):
             if self._table_step is not None:
-                counts = (after + step, np.full(env.num_envs, self._table_step))
-                env.sim.place_tables(
-                    *(wp.array(count, dtype=wp.int32, device=env.device) for count in counts)
-                )
+                steps = wp.array(after + step, dtype=wp.int32, device=env.device)
+                last = np.full(env.num_envs, self._table_step)
+                env.sim.place_tables(steps, wp.array(last, dtype=wp.int32, device=env.device))
             env.hold()
             away = out_of_hand(env)
             lost |= away

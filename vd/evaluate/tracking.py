@@ -16,7 +16,8 @@ from vd.tracking.tracker import Tracker
 
 def sensed(env: Any, camera: DepthCamera) -> Senses:
     """What the hands of an environment sense now; later steps change all of it but the points."""
-    fresh, joints = wp.to_torch(env.step_count) == 0, env.num_joints
+    fresh = wp.to_torch(env.step_count) == 0
+    joints = env.num_joints
     camera.reset(wp.from_torch(fresh.int()))  # a late image must not show what was before a reset
     camera.capture()
     # Without a pixel in the crop the cloud is one false point at the origin: it counts for nothing.
@@ -53,15 +54,18 @@ class TrackingActor:
         seed: int = 0,
     ):
         """Open its eyes in every environment, with ``sensor_errors`` those of a real camera."""
-        scene, camera, depth = env.scene, env.hand.camera.at(policy.spec.camera), policy.spec.depth
-        self.hand, self._surfaces = env.hand, [item.surface_points for item in env.objects]
-        self.num_actions, self._env, frame_s = policy.num_actions, env, env.cfg.sim.control_dt
-        env.acts_in_frame = (
-            False  # who sees by a camera acts in the world, whatever its teacher does
-        )
-        depth = depth.with_errors() if sensor_errors else depth
+        self._env = env
+        self.hand = env.hand
+        self.num_actions = policy.num_actions
+        self._surfaces = [item.surface_points for item in env.objects]
+        env.acts_in_frame = False  # a camera policy acts in the world, whatever its teacher does
+        scene = env.scene
+        camera = env.hand.camera.at(policy.spec.camera)
+        depth = policy.spec.depth
+        if sensor_errors:
+            depth = depth.with_errors()
         self.camera = DepthCamera.of_scene(
-            scene, env.sim.body_q, depth, camera, frame_s=frame_s, seed=seed
+            scene, env.sim.body_q, depth, camera, frame_s=env.cfg.sim.control_dt, seed=seed
         )
         self.tracker = Tracker(
             policy,

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from vd.logs.motions import Recording, Trajectory
-from vd.logs.readers import FORMATS, SourceMotion, Told, format_of
+from vd.logs.readers import FORMATS, ReaderOptions, SourceMotion, format_of
 from vd.logs.recording_checks import MIN_SAMPLES, RecordingError
 
 REQUIRED = ("command", "position")
@@ -84,9 +84,11 @@ def convert(asked: Convert) -> Recording:
         raise ValueError(
             f"topic {topic}: {asked.source} is read as {format}, which has no topics; leave it out"
         )
-    told = Told(asked.unit, rename, asked.state_topic, asked.command_topic, asked.joints)
-    motions = list(FORMATS[format](asked.source, told))
-    if unused := sorted(rename.keys() - told.used):
+    options = ReaderOptions(
+        asked.unit, rename, asked.state_topic, asked.command_topic, asked.joints
+    )
+    motions = list(FORMATS[format](asked.source, options))
+    if unused := sorted(rename.keys() - options.used):
         raise ValueError(
             f"--rename {unused[0]}={rename[unused[0]]}: {asked.source} has no {unused[0]!r}"
         )

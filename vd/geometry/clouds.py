@@ -23,8 +23,9 @@ class HandCloud:
     """
 
     def __init__(self, hand: HandModel, *, link_body: np.ndarray, device: str):
-        link_body, points = np.asarray(link_body), hand.link_points
-        body, base = np.repeat(link_body[hand.point_link], points.shape[1]), int(link_body[0])
+        points = hand.link_points
+        body = np.repeat(link_body[hand.point_link], points.shape[1])
+        base = int(link_body[0])
         self.count = len(body)
 
         def array(values: Any, dtype: Any) -> wp.array:

@@ -23,22 +23,23 @@ class FrameMaps:
 
     Args:
         hand: The hand.
-        seen: How its teacher observes.
+        observation: How its teacher observes.
         array: Makes arrays of the library and device in which observations are given, of a dtype by
             name.
     """
 
     def __init__(
-        self, hand: HandModel, seen: ObservationCfg, array: Callable[[Any, str], Array]
+        self, hand: HandModel, observation: ObservationCfg, array: Callable[[Any, str], Array]
     ) -> None:
-        actors = replace(
-            seen, dynamics="none", critic_terms={}
-        )  # what else is told, only simulators know
-        tables = symmetry_frames(hand, actors, seen.view)
-        self._source, self._joints = (array(v, "int64") for v in (tables.source, tables.joints))
-        self._factor, self._offset, self._sign, self._sector = (
-            array(v, "float32") for v in (tables.factor, tables.offset, tables.sign, tables.sector)
-        )
+        # What else a training observes, only simulators know.
+        actor = replace(observation, dynamics="none", critic_terms={})
+        tables = symmetry_frames(hand, actor, observation.view)
+        self._source = array(tables.source, "int64")
+        self._joints = array(tables.joints, "int64")
+        self._factor = array(tables.factor, "float32")
+        self._offset = array(tables.offset, "float32")
+        self._sign = array(tables.sign, "float32")
+        self._sector = array(tables.sector, "float32")
         self._turn = teacher_observation_slices(hand.num_fingers, hand.num_joints)[
             "relative_orientation"
         ]

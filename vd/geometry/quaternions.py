@@ -5,23 +5,27 @@ from vd.geometry.arrays import Array, library_of
 
 def product(first: Array, second: Array) -> Array:
     """``first * second``, quaternions xyzw [..., 4]: turns by the second, then by the first."""
-    xp, a, aw, b, bw = (
-        library_of(first),
-        first[..., :3],
-        first[..., 3:],
-        second[..., :3],
-        second[..., 3:],
+    xp = library_of(first)
+    first_vector = first[..., :3]
+    first_scalar = first[..., 3:]
+    second_vector = second[..., :3]
+    second_scalar = second[..., 3:]
+    vector = (
+        first_scalar * second_vector
+        + second_scalar * first_vector
+        + xp.linalg.cross(first_vector, second_vector)
     )
-    vector = aw * b + bw * a + xp.linalg.cross(a, b)
-    return xp.concatenate([vector, aw * bw - (a * b).sum(axis=-1, keepdims=True)], axis=-1)
+    dot = (first_vector * second_vector).sum(axis=-1, keepdims=True)
+    return xp.concatenate([vector, first_scalar * second_scalar - dot], axis=-1)
 
 
 def canonical(quat: Array) -> Array:
     """Of q and -q, one rotation, the one whose first of w, x, y, z that is not 0 is positive [..., 4]."""
-    xp, first = library_of(quat), quat[..., 3]
+    xp = library_of(quat)
+    leading = quat[..., 3]
     for i in range(3):
-        first = xp.where(first == 0.0, quat[..., i], first)
-    return xp.where(first[..., None] < 0.0, -quat, quat)
+        leading = xp.where(leading == 0.0, quat[..., i], leading)
+    return xp.where(leading[..., None] < 0.0, -quat, quat)
 
 
 def relative_rotation(first: Array, second: Array) -> Array:
@@ -32,12 +36,14 @@ def relative_rotation(first: Array, second: Array) -> Array:
 
 def rotation_distance(first: Array, second: Array) -> Array:
     """Angle between orientations, quaternions xyzw [..., 4], in [0, pi] [rad]."""
-    xp, vector = library_of(first), relative_rotation(first, second)[..., :3]
+    xp = library_of(first)
+    vector = relative_rotation(first, second)[..., :3]
     return 2.0 * xp.asin(xp.linalg.vector_norm(vector, axis=-1).clip(max=1.0))
 
 
 def rotated(quat: Array, vector: Array) -> Array:
     """Vectors [..., 3] turned by quaternions xyzw [..., 4]."""
-    cross, axis = library_of(quat).linalg.cross, quat[..., :3]
+    cross = library_of(quat).linalg.cross
+    axis = quat[..., :3]
     twice = 2.0 * cross(axis, vector)
     return vector + quat[..., 3:] * twice + cross(axis, twice)

@@ -6,7 +6,7 @@ SI units, quaternions xyzw. What is read is in the table's frame: z up, the orig
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,14 +16,14 @@ from vd.logs.recording import CONTACT_MODEL, FORMAT, MIN_SAMPLES, numbers, read_
 from vd.logs.recording_checks import RecordingError
 
 Kind = Literal["drop", "slide", "push", "press"]
-TIME, POSE = ("t",), ("x", "y", "z", "qx", "qy", "qz", "qw")
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 PUSHER = ("pusher_x", "pusher_y", "pusher_z")
 FORCE = ("force_x", "force_y", "force_z")
-NEEDED: Mapping[str, tuple[tuple[str, ...], ...]] = {
-    "drop": (TIME, POSE),
-    "slide": (TIME, POSE),
-    "push": (TIME, POSE, FORCE),
-    "press": (TIME, POSE, PUSHER, FORCE),
+NEEDED: Mapping[str, tuple[str, ...]] = {
+    "drop": ("t", *POSE),
+    "slide": ("t", *POSE),
+    "push": ("t", *POSE, *FORCE),
+    "press": ("t", *POSE, *PUSHER, *FORCE),
 }
 """Columns of each kind of motion."""
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -84,52 +84,42 @@ def read_contact_recording(path: str | Path) -> ContactRecording:
         raise RecordingError(
             f"{file}: model must be {CONTACT_MODEL!r}; recordings of joints are for vd-gap run"
         )
-    frames = [
-        _frame(file, name, header.get(name, IDENTITY)) for name in ("table_pose", "object_pose")
-    ]
+    table = _frame(file, "table_pose", header)
+    tracked = _frame(file, "object_pose", header)
     entries = header.get("trajectories")
     if not isinstance(entries, list) or not entries:
         raise RecordingError(
             f"{file}: 'trajectories' is empty; list at least one {{file, excitation}}"
         )
+    motions: dict[str, ContactMotion] = {}
     for i, entry in enumerate(entries):
-        name, kind = (
-            entry.get(key) if isinstance(entry, dict) else None for key in ("file", "excitation")
-        )
-        if not isinstance(name, str) or kind not in get_args(Kind):
+        where = f"{file}: trajectories[{i}]"
+        try:
+            name = Path(entry["file"])
+            kind = entry["excitation"]
+            NEEDED[kind]
+        except (TypeError, KeyError) as error:
             raise RecordingError(
-                f"{file}: trajectories[{i}]: give 'file', and 'excitation' out of "
-                f"{', '.join(get_args(Kind))}"
-            )
-        if any(name == other["file"] for other in entries[:i]) or Path(name).name != name:
-            raise RecordingError(
-                f"{file}: trajectories[{i}]: list {name!r} once, a file of this folder"
-            )
-    motions = [
-        _motion(file.parent / entry["file"], entry["excitation"], frames) for entry in entries
-    ]
-    return ContactRecording(file.parent, tuple(motions))
+                f"{where}: give 'file', and 'excitation' out of {', '.join(NEEDED)}"
+            ) from error
+        if name.name in motions or name.name != str(name):
+            raise RecordingError(f"{where}: list '{name}' once, a file of this folder")
+        motions[name.name] = _motion(file.parent / name, kind, table, tracked)
+    return ContactRecording(file.parent, tuple(motions.values()))
 
 
 def write_contact_recording(folder: Path, motions: Sequence[ContactMotion]) -> None:
     """Write motions into a folder: each file atomically, ``recording.json`` last."""
     for motion in motions:
-        columns = [
-            motion.time[:, None],
-            motion.position,
-            motion.rotation.as_quat(),
-            motion.pusher,
-            motion.force,
-        ]
-        names = [
-            *TIME,
-            *POSE,
-            *(PUSHER if motion.pusher.size else ()),
-            *(FORCE if motion.force.size else ()),
-        ]
-        table = np.hstack([column for column in columns if column.size])
+        names = ["t", *POSE]
+        columns = [motion.time[:, None], motion.position, motion.rotation.as_quat()]
+        for optional, values in ((PUSHER, motion.pusher), (FORCE, motion.force)):
+            if values.size:
+                names += optional
+                columns.append(values)
         with atomic_path(folder / motion.file) as temporary:
-            np.savetxt(temporary, table, "%.6f", ",", header=",".join(names), comments="")
+            header = ",".join(names)
+            np.savetxt(temporary, np.hstack(columns), "%.6f", ",", header=header, comments="")
     entries = [{"file": motion.file, "excitation": motion.kind} for motion in motions]
     write_json(
         folder / "recording.json",
@@ -137,46 +127,63 @@ def write_contact_recording(folder: Path, motions: Sequence[ContactMotion]) -> N
     )
 
 
-def _frame(where: Path, name: str, values: Any) -> tuple[np.ndarray, Rotation]:
-    """A pose: position [3] and rotation."""
+def _frame(file: Path, name: str, header: Mapping[str, Any]) -> tuple[np.ndarray, Rotation]:
+    """A pose of the header: position [3] and rotation."""
+    values = header.get(name, IDENTITY)
     try:
         pose = np.array(values, dtype=float)
     except (TypeError, ValueError):
         pose = np.empty(0)
     if pose.shape != (7,) or not abs(np.linalg.norm(pose[3:]) - 1.0) < UNIT_ERROR:
         raise RecordingError(
-            f"{where}: {name!r} is {values!r}; give x y z in m and a quaternion xyzw of length 1"
+            f"{file}: {name!r} is {values!r}; give x y z in m and a quaternion xyzw of length 1"
         )
     return pose[:3], Rotation.from_quat(pose[3:])
 
 
-def _motion(file: Path, kind: Kind, frames: Sequence[tuple[np.ndarray, Rotation]]) -> ContactMotion:
+def _motion(
+    file: Path,
+    kind: Kind,
+    table_frame: tuple[np.ndarray, Rotation],
+    object_frame: tuple[np.ndarray, Rotation],
+) -> ContactMotion:
     columns = _columns(file, kind)
-
-    def array(names: tuple[str, ...]) -> np.ndarray:
-        found = [columns[name] for name in names if name in columns]
-        return np.stack(found, axis=1) if len(found) == len(names) else np.empty((0, 3))
-
-    pose, time = array(POSE), columns["t"]
+    time = columns["t"]
+    pose = _vectors(columns, POSE)
     _check_values(file, time, pose)
-    (place, table), (offset, turn) = frames
+    origin, table = table_frame
+    offset, turn = object_frame
+    to_table = table.inv()
     tracked = Rotation.from_quat(pose[:, 3:])
-    position, pusher = pose[:, :3] + tracked.apply(offset), array(PUSHER)
+    position = pose[:, :3] + tracked.apply(offset)
+    pusher = _vectors(columns, PUSHER)
+    force = _vectors(columns, FORCE)
+    if len(pusher):
+        pusher = to_table.apply(pusher - origin)
+    if len(force):
+        force = to_table.apply(force)
     return ContactMotion(
         file=file.name,
         kind=kind,
         time=time - time[0],
-        position=table.inv().apply(position - place),
-        rotation=table.inv() * tracked * turn,
-        pusher=table.inv().apply(pusher - place) if len(pusher) else pusher,
-        force=table.inv().apply(force) if len(force := array(FORCE)) else force,
+        position=to_table.apply(position - origin),
+        rotation=to_table * tracked * turn,
+        pusher=pusher,
+        force=force,
     )
+
+
+def _vectors(columns: Mapping[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
+    """Columns side by side [T, n], or empty [0, 3] where they were not recorded."""
+    if not columns.keys() >= set(names):
+        return np.empty((0, 3))
+    return np.stack([columns[name] for name in names], axis=1)
 
 
 def _columns(file: Path, kind: Kind) -> dict[str, np.ndarray]:
     """The columns of a CSV file by name, all of them finite numbers."""
     names, rows = read_table(file)
-    for name in (name for group in NEEDED[kind] for name in group):
+    for name in NEEDED[kind]:
         if names.count(name) != 1:
             raise RecordingError(
                 f"{file}: row 1 has no one column {name!r}, which a {kind} needs; add it"
@@ -185,30 +192,24 @@ def _columns(file: Path, kind: Kind) -> dict[str, np.ndarray]:
         raise RecordingError(
             f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, record it again"
         )
-    used = [i for i, name in enumerate(names) if name in (*TIME, *POSE, *PUSHER, *FORCE)]
-    return {names[i]: numbers(file, names[i], [row[i] for row in rows]) for i in used}
+    columns = {}
+    for i, name in enumerate(names):
+        if name in NEEDED["press"]:
+            columns[name] = numbers(file, name, [row[i] for row in rows])
+    return columns
 
 
 def _check_values(file: Path, time: np.ndarray, pose: np.ndarray) -> None:
     """Time increases, positions are in metres, quaternions are some."""
-    for bad, column, remedy in (
+    lengths = np.linalg.norm(pose[:, 3:], axis=1)
+    for column, wrong, remedy in (
+        ("t", np.diff(time, prepend=-np.inf) <= 0.0, "time must increase; sort the rows"),
         (
-            np.diff(time, prepend=time[0] - 1.0) <= 0.0,
-            "t",
-            "time must increase; sort the rows, drop doubles",
-        ),
-        (
-            np.abs(pose[:, :3]).max(1) > FARTHEST_M,
             "x",
-            "positions are in metres; divide millimetres by 1000",
+            np.abs(pose[:, :3]).max(1) > FARTHEST_M,
+            "positions are in metres; divide mm by 1000",
         ),
-        (
-            np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) > UNIT_ERROR,
-            "qx",
-            "quaternions have length 1",
-        ),
+        ("qx", np.abs(lengths - 1.0) > UNIT_ERROR, "quaternions have length 1"),
     ):
-        if bad.any():
-            raise RecordingError(
-                f"{file}: row {int(bad.argmax()) + 2}, column {column!r}: {remedy}"
-            )
+        if wrong.any():
+            raise RecordingError(f"{file}: row {wrong.argmax() + 2}, column {column!r}: {remedy}")

@@ -82,17 +82,13 @@ class HandLog:
     @property
     def stops(self) -> list[Stop]:
         """Where the pursuit of each goal ended."""
-        return [
-            Stop(
-                goal=event["goal"],
-                goal_quat=tuple(self.run["goals"][event["goal"]]),
-                time_s=event["t"],
-                outcome=event["outcome"],
-                distance=event["distance"],
-            )
-            for event in self.events
-            if event["event"] == "stop"
-        ]
+        stops = []
+        for event in self.events:
+            if event["event"] == "stop":
+                goal = event["goal"]
+                quat = tuple(self.run["goals"][goal])
+                stops.append(Stop(goal, quat, event["t"], event["outcome"], event["distance"]))
+        return stops
 
     @property
     def stopped(self) -> tuple[str, dict[str, str]] | None:
@@ -148,9 +144,11 @@ def read_log(path: str | Path) -> HandLog:
         raise LogError(
             f"{path / RUN_FILE} is damaged ({error}); copy the whole folder again"
         ) from error
-    found = run.get("format") if isinstance(run, dict) else None
-    if found != LOG_FORMAT:
-        raise LogError(f"{path / RUN_FILE}: format is {found!r}; this version reads {LOG_FORMAT!r}")
+    version = run.get("format") if isinstance(run, dict) else None
+    if version != LOG_FORMAT:
+        raise LogError(
+            f"{path / RUN_FILE}: format is {version!r}; this version reads {LOG_FORMAT!r}"
+        )
     if not {"joints", "goals"} <= run.keys():
         raise LogError(f"{path / RUN_FILE} has no joints or no goals; copy the whole folder again")
     return HandLog(path, run, read_columns(path / STEPS_FILE), _events(path / EVENTS_FILE))

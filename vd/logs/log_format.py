@@ -2,12 +2,10 @@
 
 LOG_FORMAT = "vd-hand-log/1"
 MCAP = ".mcap"
-RUN_FILE, STEPS_FILE, EVENTS_FILE, RECORDING_FILE = (
-    "run.json",
-    "steps.csv",
-    "events.jsonl",
-    "recording.json",
-)
+RUN_FILE = "run.json"
+STEPS_FILE = "steps.csv"
+EVENTS_FILE = "events.jsonl"
+RECORDING_FILE = "recording.json"
 JOINT_CHANNELS = ("command", "position", "velocity", "current", "temperature", "action", "smoothed")
 """Columns ``channel.joint``: goal sent [rad], measured [rad], [rad/s], [A], [deg C]; the policy's
 action, and its moving average as it was before that action."""

@@ -37,14 +37,19 @@ _PARTS = {
     "geometry_msgs/Point": _XYZ,
     "geometry_msgs/Quaternion": f"{_XYZ}\nfloat64 w",
 }
+JOINT_STATE = "sensor_msgs/msg/JointState"
+POSE = "geometry_msgs/msg/PoseStamped"
+IMAGE = "sensor_msgs/msg/Image"
+TEXT = "std_msgs/msg/String"
+STEP = "visual_dexterity_msgs/msg/Step"
 _TYPES = {
-    "sensor_msgs/msg/JointState": "std_msgs/Header header\nstring[] name\nfloat64[] position\n"
+    JOINT_STATE: "std_msgs/Header header\nstring[] name\nfloat64[] position\n"
     "float64[] velocity\nfloat64[] effort",
-    "geometry_msgs/msg/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
-    "sensor_msgs/msg/Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\n"
+    POSE: "std_msgs/Header header\ngeometry_msgs/Pose pose",
+    IMAGE: "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\n"
     "uint8 is_bigendian\nuint32 step\nuint8[] data",
-    "std_msgs/msg/String": "string data",
-    "visual_dexterity_msgs/msg/Step": "\n".join(
+    TEXT: "string data",
+    STEP: "\n".join(
         [f"float64 {name}" for name in _PLAIN]
         + [f"float64[] {name}" for name in (*JOINT_CHANNELS, "object", "found")]
     ),
@@ -73,49 +78,68 @@ class McapLog:
 
         self._file: IO[bytes] = path.open("xb")
         self._writer = Writer(self._file)
-        self._schemas = {
-            name: self._writer.register_msgdef(name, _definition(text))
-            for name, text in _TYPES.items()
-        }
-        self._run, self._place, self._joints = dict(run), place, list(run["joints"])
+        self._schemas = {}
+        for name, text in _TYPES.items():
+            self._schemas[name] = self._writer.register_msgdef(name, _definition(text))
+        self._run = dict(run)
+        self._place = place
+        self._joints = list(run["joints"])
         self._note()
 
     def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:
         """Write a control step, by columns of steps.csv, and the depth image [m] [H, W] that it saw."""
-        joints = {
-            channel: [row.get(f"{channel}.{joint}", np.nan) for joint in self._joints]
-            for channel in JOINT_CHANNELS
-        }
+        t = row["t"]
+        joints = {}
+        for channel in JOINT_CHANNELS:
+            joints[channel] = [row.get(f"{channel}.{joint}", np.nan) for joint in self._joints]
         truth = [row[name] for name in TRUTH_COLUMNS if name in row]
-        found = [row[name] for name in FOUND_COLUMNS]
-        t, goals = row["t"], self._run["goals"]
-        state = {
-            "name": self._joints,
-            "position": joints["position"],
-            "velocity": joints["velocity"],
-        }
-        self._write(t, "/joint_states", "sensor_msgs/msg/JointState", **state, effort=[])
-        sent = {"name": self._joints, "position": joints["command"], "velocity": [], "effort": []}
-        self._write(row["t_command"], "/joint_commands", "sensor_msgs/msg/JointState", **sent)
-        poses = {"object": truth[:7], "found": found}
-        if (number := int(row["goal"])) < len(goals):
-            poses["goal"] = [*self._place.tolist(), *goals[number]]
-        for name, pose in poses.items():
-            if len(pose) == 7 and np.isfinite(pose).all():
-                at = {"position": dict(zip("xyz", pose[:3], strict=True))}
-                at["orientation"] = dict(zip("xyzw", pose[3:], strict=True))
-                self._write(t, f"/{name}_pose", "geometry_msgs/msg/PoseStamped", pose=at)
+        believed = [row[name] for name in FOUND_COLUMNS]
+        self._write_joints(t, "/joint_states", joints["position"], joints["velocity"])
+        self._write_joints(row["t_command"], "/joint_commands", joints["command"], [])
+        self._write_pose(t, "/object_pose", truth[:7])
+        self._write_pose(t, "/found_pose", believed)
+        goals = self._run["goals"]
+        if int(row["goal"]) < len(goals):
+            self._write_pose(t, "/goal_pose", [*self._place, *goals[int(row["goal"])]])
         if depth is not None:
-            data = np.clip(np.rint(1e3 * depth), 0, np.iinfo(np.uint16).max).astype("<u2")
-            size = {"height": depth.shape[0], "width": depth.shape[1], "step": 2 * depth.shape[1]}
-            image = {**size, "encoding": "16UC1", "is_bigendian": 0, "data": data.tobytes()}
-            self._write(t, "/depth", "sensor_msgs/msg/Image", **image)
-        whole = {**{name: row[name] for name in _PLAIN}, **joints, "object": truth, "found": found}
-        self._write(t, "/step", "visual_dexterity_msgs/msg/Step", **whole)
+            self._write_depth(t, depth)
+        plain = {name: row[name] for name in _PLAIN}
+        self._write(t, "/step", STEP, **plain, **joints, object=truth, found=believed)
+
+    def _write_joints(
+        self, t: float, topic: str, position: list[float], velocity: list[float]
+    ) -> None:
+        fields = {"name": self._joints, "position": position, "velocity": velocity, "effort": []}
+        self._write(t, topic, JOINT_STATE, **fields)
+
+    def _write_pose(self, t: float, topic: str, pose: list[float]) -> None:
+        """Write a pose [7], unless it is unknown."""
+        if len(pose) != 7 or not np.isfinite(pose).all():
+            return
+        x, y, z, qx, qy, qz, qw = map(float, pose)
+        position = {"x": x, "y": y, "z": z}
+        orientation = {"x": qx, "y": qy, "z": qz, "w": qw}
+        self._write(t, topic, POSE, pose={"position": position, "orientation": orientation})
+
+    def _write_depth(self, t: float, depth: np.ndarray) -> None:
+        """Write an image [m] [H, W] in whole millimetres."""
+        height, width = depth.shape
+        millimetres = np.clip(np.rint(1e3 * depth), 0, np.iinfo(np.uint16).max).astype("<u2")
+        self._write(
+            t,
+            "/depth",
+            IMAGE,
+            height=height,
+            width=width,
+            encoding="16UC1",
+            is_bigendian=0,
+            step=2 * width,
+            data=millimetres.tobytes(),
+        )
 
     def event(self, line: Mapping[str, Any]) -> None:
         """Write an event, as of events.jsonl."""
-        self._write(line["t"], "/events", "std_msgs/msg/String", data=json.dumps(line))
+        self._write(line["t"], "/events", TEXT, data=json.dumps(line))
 
     def close(self, run: Mapping[str, Any]) -> None:
         """End the file, with what run.json says at the end."""
@@ -147,13 +171,15 @@ def read_mcap(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[d
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    steps, events = [], []
+    steps = []
+    events = []
     try:
         with path.open("rb") as stream:
             reader = make_reader(stream, decoder_factories=[DecoderFactory()])
             run: Any = {}
-            for one in reader.iter_metadata():
-                run = json.loads(one.metadata["json"]) if one.name == "run" else run
+            for record in reader.iter_metadata():
+                if record.name == "run":
+                    run = json.loads(record.metadata["json"])
             if not isinstance(run, dict) or run.get("format") != LOG_FORMAT:
                 raise LogError(
                     f"{path} is no log of vd-deploy; vd-deploy --log NAME.mcap writes one"
@@ -174,23 +200,26 @@ def read_mcap(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[d
 
 def _columns(steps: list[Any], joints: list[str]) -> dict[str, np.ndarray]:
     """Columns of steps.csv [T]."""
-    columns = {name: np.array([getattr(step, name) for step in steps]) for name in _PLAIN}
+    arrays: dict[str, np.ndarray] = {}
+    for field in (*_PLAIN, *JOINT_CHANNELS, "object", "found"):
+        arrays[field] = np.array([getattr(step, field) for step in steps])
+    columns = {name: arrays[name] for name in _PLAIN}
     for channel in JOINT_CHANNELS:
-        values = np.array([getattr(step, channel) for step in steps])
-        columns |= {f"{channel}.{joint}": values[:, i] for i, joint in enumerate(joints)}
-    for field, names in (("object", TRUTH_COLUMNS), ("found", FOUND_COLUMNS)):
-        values = np.array([getattr(step, field) for step in steps])
-        columns |= {name: values[:, i] for i, name in enumerate(names) if values.shape[1]}
+        for joint, values in zip(joints, arrays[channel].T, strict=True):
+            columns[f"{channel}.{joint}"] = values
+    # A run on a hand has no true pose of the object.
+    columns |= zip(TRUTH_COLUMNS, arrays["object"].T, strict=False)
+    columns |= zip(FOUND_COLUMNS, arrays["found"].T, strict=False)
     return columns
 
 
 def _definition(text: str) -> str:
     """A message's definition with those of what it is made of, as MCAP wants it."""
-    used, new = dict[str, str](), [text]
-    while new:
-        words = new.pop().replace("\n", " ").split()
-        for name in words:
-            if name in _PARTS and name not in used:
-                used[name] = _PARTS[name]
-                new.append(_PARTS[name])
-    return "".join([text, *(f"\n{80 * '='}\nMSG: {name}\n{part}" for name, part in used.items())])
+    parts = {"": text}
+    waiting = [text]
+    while waiting:
+        for name in waiting.pop().split():
+            if name in _PARTS and name not in parts:
+                parts[name] = f"{80 * '='}\nMSG: {name}\n{_PARTS[name]}"
+                waiting.append(_PARTS[name])
+    return "\n".join(parts.values())

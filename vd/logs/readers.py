@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,10 +31,28 @@ UNITS: dict[str, Mapping[str, float]] = {
     "enabled": {"1": 1.0},
 }
 """Units that a column may have, and how many of ours one of them is."""
-JOINT_STATE, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
+BAM_CHANNELS = {
+    "command": "goal_position",
+    "position": "position",
+    "velocity": "speed",
+    "voltage": "input_volts",
+    "temperature": "temp",
+    "enabled": "torque_enable",
+}
+"""Our channels, and what they are called in a log of BAM; the first two are always there."""
+JOINT_STATE = "sensor_msgs/msg/JointState"
+ARRAY = "std_msgs/msg/Float64MultiArray"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-_Heard = tuple[float, float, Any]
-"""A message, after its own stamp and the bag's [s]."""
+
+
+class StampedMessage(NamedTuple):
+    """A ROS message and when it was sent."""
+
+    header_s: float
+    """By its own header [s]; 0: it has none."""
+    bag_s: float
+    """By the bag [s]."""
+    message: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +80,7 @@ class SourceMotion:
 
 
 @dataclass(frozen=True)
-class Told:
+class ReaderOptions:
     """What a user says that files do not.
 
     Attributes:
@@ -81,14 +99,14 @@ class Told:
     joints: tuple[str, ...] = ()
     used: set[str] = field(default_factory=set)
 
-    def called(self, old: str, default: str) -> str:
+    def renamed(self, old: str, default: str) -> str:
         """Our name of what the file calls ``old``."""
         if old in self.rename:
             self.used.add(old)
         return self.rename.get(old, default)
 
 
-def read_csv(path: Path, told: Told) -> Iterator[SourceMotion]:
+def read_csv(path: Path, options: ReaderOptions) -> Iterator[SourceMotion]:
     """A CSV whose header names ``t [ms]``, ``position.JOINT [deg]``, ....
 
     A folder: every CSV in it.
@@ -96,36 +114,42 @@ def read_csv(path: Path, told: Told) -> Iterator[SourceMotion]:
     for file in _files(path, ".csv"):
         header, rows = read_table(file)
         columns: dict[str, np.ndarray] = {}
+        joints: dict[str, None] = {}
         for i, text in enumerate(header):
-            name, scale = _column(file, text, told)
-            if scale is not None:
-                if name in columns:
-                    raise RecordingError(
-                        f"{file}: two columns are {name!r}; --rename one to 'unused'"
-                    )
-                columns[name] = scale * numbers(file, text, [row[i] for row in rows])
+            name, scale = _column(file, text, options)
+            if scale is None:
+                continue
+            if name in columns:
+                raise RecordingError(f"{file}: two columns are {name!r}; --rename one to 'unused'")
+            columns[name] = scale * numbers(file, text, [row[i] for row in rows])
+            _, dot, joint = name.partition(".")
+            if dot:
+                joints[joint] = None
         if "t" not in columns:
             raise RecordingError(
                 f"{file}: no column 't'; give --rename 'ITS TIME=t' with its unit: 't [ms]'"
             )
-        joints = tuple(dict.fromkeys(name.partition(".")[2] for name in columns if "." in name))
-        yield SourceMotion(file.stem, joints, columns["t"], by_channel(columns, joints, len(rows)))
+        channels = by_channel(columns, tuple(joints), len(rows))
+        yield SourceMotion(file.stem, tuple(joints), columns["t"], channels)
 
 
-def _column(file: Path, text: str, told: Told) -> tuple[str, float | None]:
+def _column(file: Path, text: str, options: ReaderOptions) -> tuple[str, float | None]:
     """Our name of a column, and its unit in ours; None: it is not used."""
-    bare, own = _name_and_unit(text)
-    name, given = _name_and_unit(told.called(text, told.called(bare, bare)))
-    channel = name.partition(".")[0]
-    if channel not in UNITS or (channel == "t") == ("." in name):
+    bare, unit = _name_and_unit(text)
+    name, renamed_unit = _name_and_unit(options.renamed(text, options.renamed(bare, bare)))
+    channel, dot, _ = name.partition(".")
+    if channel not in UNITS or (channel == "t") == bool(dot):
         return name, None
     units = UNITS[channel]
-    stated = told.unit if units is ANGLES else next(iter(units)) if len(units) == 1 else None
-    unit = given or own or stated
-    if unit is None or unit not in units:
-        said = f"has the unit {unit!r}" if unit else "has no unit"
+    unit = renamed_unit or unit
+    if not unit and units is ANGLES:
+        unit = options.unit or ""
+    elif not unit and len(units) == 1:
+        (unit,) = units
+    if unit not in units:
+        problem = f"has the unit {unit!r}" if unit else "has no unit"
         raise RecordingError(
-            f"{file}: column {text!r} {said}; write '{name} [{'] or ['.join(units)}]'"
+            f"{file}: column {text!r} {problem}; write '{name} [{'] or ['.join(units)}]'"
         )
     return name, units[unit]
 
@@ -136,41 +160,36 @@ def _name_and_unit(text: str) -> tuple[str, str]:
     return name.strip(), unit.rstrip("]").strip()
 
 
-def read_bam(path: Path, told: Told) -> Iterator[SourceMotion]:
+def read_bam(path: Path, options: ReaderOptions) -> Iterator[SourceMotion]:
     """Logs of BAM's pendulum, one JSON file for each; a folder: every JSON in it."""
     for file in _files(path, ".json"):
         try:
             log = json.loads(file.read_text())
             rows = log["entries"]
-            time, *both = (
-                np.array([float(row[key]) for row in rows])
-                for key in ("timestamp", "goal_position", "position")
-            )
-            names = {"speed": "velocity", "input_volts": "voltage", "temp": "temperature"}
-            channels = dict(zip(("command", "position"), both, strict=True)) | {
-                ours: np.array([float(row[key]) for row in rows])
-                for key, ours in names.items()
-                if all(key in row for row in rows)
-            }
-            channels["enabled"] = np.array([float(row.get("torque_enable", 1)) for row in rows])
+            time = np.array([float(row["timestamp"]) for row in rows])
+            channels = {}
+            for name, key in BAM_CHANNELS.items():
+                if name in ("command", "position") or all(key in row for row in rows):
+                    channels[name] = np.array([[float(row[key])] for row in rows])
             conditions = {
                 "p_gain": log["kp"],
                 "payload_kg": log["mass"],
                 "arm_length_m": log["length"],
             }
-            conditions |= {"supply_v": log["vin"]} if "vin" in log else {}
-            name = f"{log['trajectory']}_p{log['kp']:g}_{file.stem}".replace("/", "_")
+            if "vin" in log:
+                conditions["supply_v"] = log["vin"]
+            motion = str(log["trajectory"])
+            name = f"{motion}_p{log['kp']:g}_{file.stem}".replace("/", "_")
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(
                 f"{file}: no log of BAM ({error!r}); it has mass, length, kp, trajectory, and "
                 "entries of timestamp, position and goal_position"
             ) from error
-        joint = told.called("pendulum", "pendulum")
-        values = {channel: of_joint[:, None] for channel, of_joint in channels.items()}
-        yield SourceMotion(name, (joint,), time, values, None, conditions, str(log["trajectory"]))
+        joint = options.renamed("pendulum", "pendulum")
+        yield SourceMotion(name, (joint,), time, channels, None, conditions, motion)
 
 
-def read_lerobot(path: Path, told: Told) -> Iterator[SourceMotion]:
+def read_lerobot(path: Path, options: ReaderOptions) -> Iterator[SourceMotion]:
     """Episodes of a LeRobot dataset, v2 or v3.
 
     ``action`` commands, ``observation.state`` is measured.
@@ -179,69 +198,72 @@ def read_lerobot(path: Path, told: Told) -> Iterator[SourceMotion]:
     info = path / "meta" / "info.json"
     try:
         features = json.loads(info.read_text())["features"]
-        names = [_lerobot_names(features[key]) for key in ("action", "observation.state")]
+        commanded = _lerobot_names(features["action"])
+        measured = _lerobot_names(features["observation.state"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(
             f"{info}: no LeRobot dataset ({error!r}); it names 'action' and 'observation.state'"
         ) from error
-    if told.unit is None:
+    if options.unit is None:
         raise RecordingError(
             f"{info}: LeRobot does not say the unit of joints; give --unit deg or rad. Values "
             "normalised to -100 to 100 are no angles: record with use_degrees=True"
         )
-    joints = [joint for joint in names[1] if joint in names[0]]
+    joints = [joint for joint in measured if joint in commanded]
     if not joints:
         raise RecordingError(
-            f"{info}: 'action' has {names[0]}, 'observation.state' {names[1]}: none in both"
+            f"{info}: 'action' has {commanded}, 'observation.state' {measured}: none in both"
         )
-    index, time, action, state = _lerobot_rows(path, names)
-    scale = ANGLES[told.unit]
-    ours = tuple(told.called(joint, joint.removesuffix(".pos")) for joint in joints)
-    picked = [[each.index(joint) for joint in joints] for each in names]
-    for episode in np.unique(index):
-        rows = index == episode
-        both = {"command": action[rows][:, picked[0]], "position": state[rows][:, picked[1]]}
-        yield SourceMotion(
-            f"episode_{int(episode):06d}",
-            ours,
-            time[rows],
-            {key: scale * v for key, v in both.items()},
-        )
+    columns = _lerobot_columns(path)
+    scale = ANGLES[options.unit]
+    command = scale * _lerobot_joints(path, columns["action"], commanded, joints)
+    position = scale * _lerobot_joints(path, columns["observation.state"], measured, joints)
+    names = tuple(options.renamed(joint, joint.removesuffix(".pos")) for joint in joints)
+    for episode in np.unique(columns["episode_index"]):
+        rows = columns["episode_index"] == episode
+        channels = {"command": command[rows], "position": position[rows]}
+        time = columns["timestamp"][rows]
+        yield SourceMotion(f"episode_{int(episode):06d}", names, time, channels)
 
 
-def _lerobot_rows(path: Path, names: Sequence[list[str]]) -> list[np.ndarray]:
-    """Episodes [T], time [T], commands [T, J] and measured [T, J], which ``names`` name."""
-    import pyarrow.parquet as pq
+def _lerobot_columns(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a dataset that are read, with a row for each step of all episodes."""
+    from pyarrow import dataset
 
-    wanted = ["episode_index", "timestamp", "action", "observation.state"]
-    columns: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
-    for file in sorted(path.glob("data/**/*.parquet")):
-        try:
-            table = pq.read_table(file, columns=wanted)
-            found = [np.array(table[name].to_pylist(), dtype=float) for name in wanted]
-        except (ValueError, OSError, KeyError) as error:
-            raise RecordingError(f"{file} cannot be read ({error}); download it again") from error
-        for name, values in zip(wanted, found, strict=True):
-            if len(values):
-                columns[name].append(values)
-    if not columns["timestamp"]:
+    names = ["episode_index", "timestamp", "action", "observation.state"]
+    try:
+        files = sorted(map(str, path.glob("data/**/*.parquet")))
+        table = dataset.dataset(files, format="parquet").to_table(columns=names)
+        columns = {name: np.array(table[name].to_pylist(), dtype=float) for name in names}
+    except (ValueError, TypeError, OSError, KeyError) as error:
+        raise RecordingError(
+            f"{path}: data/**/*.parquet cannot be read ({error}); download the data again"
+        ) from error
+    if not len(columns["timestamp"]):
         raise RecordingError(
             f"{path}: no rows in data/**/*.parquet; download the dataset's data folder"
         )
-    rows = [np.concatenate(columns[name]) for name in wanted]
-    for values, of in zip(rows[2:], names, strict=True):
-        if values.shape[1:] != (len(of),):
-            raise RecordingError(f"{path}: {len(of)} names for values of shape {values.shape[1:]}")
-    return rows
+    return columns
+
+
+def _lerobot_joints(
+    path: Path, values: np.ndarray, names: Sequence[str], joints: Sequence[str]
+) -> np.ndarray:
+    """Values [T, J] of the joints of a column, whose elements have ``names``."""
+    if values.shape[1:] != (len(names),):
+        raise RecordingError(f"{path}: {len(names)} names for values of shape {values.shape[1:]}")
+    return values[:, [names.index(joint) for joint in joints]]
 
 
 def _lerobot_names(feature: Mapping[str, Any]) -> list[str]:
     """Names of a vector's elements, which versions write as a list or below a key."""
     names = feature["names"]
-    return list(next(iter(names.values())) if isinstance(names, Mapping) else names)
+    if isinstance(names, Mapping):
+        (names,) = names.values()
+    return list(names)
 
 
-def read_ros(path: Path, told: Told) -> Iterator[SourceMotion]:
+def read_ros(path: Path, options: ReaderOptions) -> Iterator[SourceMotion]:
     """A ROS 1 bag, a ROS 2 bag's folder or file, or an MCAP of ROS 2 messages.
 
     Measured are JointState, commanded JointState, JointTrajectory of one point, or
@@ -256,77 +278,103 @@ def read_ros(path: Path, told: Told) -> Iterator[SourceMotion]:
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
             kinds = {connection.topic: connection.msgtype for connection in reader.connections}
-            state = _topic(path, "state", told.state_topic, kinds, (JOINT_STATE,), ())
+            state = _topic(path, "state", options.state_topic, kinds, (JOINT_STATE,))
+            del kinds[state]
             allowed = (JOINT_STATE, TRAJECTORY, ARRAY)
-            command = _topic(path, "command", told.command_topic, kinds, allowed, (state,))
-            heard: dict[str, list[_Heard]] = {state: [], command: []}
-            chosen = [one for one in reader.connections if one.topic in heard]
-            for connection, stamp, raw in reader.messages(connections=chosen):
+            command = _topic(path, "command", options.command_topic, kinds, allowed)
+            messages: dict[str, list[StampedMessage]] = {state: [], command: []}
+            connections = [c for c in reader.connections if c.topic in messages]
+            for connection, bag_ns, raw in reader.messages(connections=connections):
                 message: Any = reader.deserialize(raw, connection.msgtype)
-                header = getattr(message, "header", None)
-                own = header.stamp.sec + 1e-9 * header.stamp.nanosec if header else 0.0
-                heard[connection.topic].append((own, 1e-9 * stamp, message))
+                messages[connection.topic].append(_stamped(message, bag_ns))
     except (AnyReaderError, OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: no bag that can be read: {error}") from error
-    if empty := [topic for topic, messages in heard.items() if not messages]:
-        raise RecordingError(f"{path}: no message on {empty[0]}; record it, or name another topic")
-    yield _held(path, heard[state], heard[command], told)
+    for topic, heard in messages.items():
+        if not heard:
+            raise RecordingError(f"{path}: no message on {topic}; record it, or name another topic")
+    yield _held(path, messages[state], messages[command], options)
+
+
+def _stamped(message: Any, bag_ns: int) -> StampedMessage:
+    header = getattr(message, "header", None)
+    header_s = 0.0
+    if header is not None:
+        header_s = header.stamp.sec + 1e-9 * header.stamp.nanosec
+    return StampedMessage(header_s, 1e-9 * bag_ns, message)
 
 
 def _topic(
-    path: Path,
-    which: str,
-    given: str | None,
-    kinds: Mapping[str, str],
-    allowed: tuple[str, ...],
-    no: tuple,
+    path: Path, which: str, given: str | None, kinds: Mapping[str, str], allowed: tuple[str, ...]
 ) -> str:
     """The topic that is given, or the only one that can be meant."""
-    fit = [topic for topic, kind in kinds.items() if kind in allowed and topic not in no]
-    if given is None and len(fit) == 1:
-        return fit[0]
-    if given in fit:
+    possible = [topic for topic, kind in kinds.items() if kind in allowed]
+    if given in possible:
         return str(given)
-    there = ", ".join(f"{topic} ({kind})" for topic, kind in kinds.items())
-    found = f"{given} is none" if given else "there is none" if not fit else "there are several"
+    problem = f"{given} is none"
+    if given is None:
+        if len(possible) == 1:
+            return possible[0]
+        problem = "there are several" if possible else "there is none"
+    present = ", ".join(f"{topic} ({kind})" for topic, kind in kinds.items())
     raise RecordingError(
-        f"{path}: {which} topic: {found}; give --{which}-topic one of {' or '.join(allowed)}; it "
-        f"has {there}"
+        f"{path}: {which} topic: {problem}; give --{which}-topic one of {' or '.join(allowed)}; it "
+        f"has {present}"
     )
 
 
-def _held(path: Path, states: list[_Heard], commands: list[_Heard], told: Told) -> SourceMotion:
+def _held(
+    path: Path,
+    states: list[StampedMessage],
+    commands: list[StampedMessage],
+    options: ReaderOptions,
+) -> SourceMotion:
     """The measured rows, each with the command that was sent last."""
-    ours = [{told.called(name, name) for name in message.name} for *_, message in states]
-    first = next((i for i, names in enumerate(ours) if names.issuperset(told.joints)), None)
-    if first is None:
-        raise RecordingError(
-            f"{path}: no state of {', '.join(told.joints)}; there are {sorted(ours[0])}"
-        )
-    joints = list(states[first][2].name)
-    states = [row for row, names in zip(states, ours, strict=True) if names & ours[first]]
-    stamped = all(own > 0.0 for own, _, _ in (*states, *commands))
-    time = np.array([row[0 if stamped else 1] for row in states])
-    position, velocity = (
-        np.stack([_in_order(path, m.name, getattr(m, key), joints) for *_, m in states])
-        for key in ("position", "velocity")
-    )
-    sent = np.array([row[0 if stamped else 1] for row in commands])
-    wanted = np.stack([_goal(path, message, joints) for *_, message in commands])
-    order = np.argsort(sent, kind="stable")
-    sent, wanted = sent[order], wanted[order]
-    order = np.argsort(time, kind="stable")
-    last = np.searchsorted(sent, time[order], side="right") - 1
-    kept = order[last >= 0]
-    last = last[last >= 0]
-    new = np.concatenate([[True], np.diff(last) > 0])
+    joints = _device_joints(path, states, options)
+    states = [state for state in states if set(state.message.name) & set(joints)]
+    stamped = all(message.header_s > 0.0 for message in (*states, *commands))
+    time, by_time = _in_time(states, stamped)
+    sent, by_sending = _in_time(commands, stamped)
+    position = []
+    velocity = []
+    for state in by_time:
+        names = state.message.name
+        position.append(_in_order(path, names, state.message.position, joints))
+        velocity.append(_in_order(path, names, state.message.velocity, joints))
+    goals = np.stack([_goal(path, command.message, joints) for command in by_sending])
+    last = np.searchsorted(sent, time, side="right") - 1
+    kept = last >= 0  # before the first command there is none
     time = time[kept]
-    channels = {"command": wanted[last], "position": position[kept], "velocity": velocity[kept]}
-    named = tuple(told.called(joint, joint) for joint in joints)
+    last = last[kept]
+    channels = {
+        "command": goals[last],
+        "position": np.stack(position)[kept],
+        "velocity": np.stack(velocity)[kept],
+    }
     # A command is new in one row; in those after it, it is held.
-    return SourceMotion(
-        path.stem, named, time, channels, np.where(new, np.minimum(sent[last], time), time)
+    new = np.diff(last, prepend=-1) > 0
+    command_time = np.where(new, np.minimum(sent[last], time), time)
+    names = tuple(options.renamed(joint, joint) for joint in joints)
+    return SourceMotion(path.stem, names, time, channels, command_time)
+
+
+def _device_joints(path: Path, states: list[StampedMessage], options: ReaderOptions) -> list[str]:
+    """Joints of the first state that has those which are asked for."""
+    for state in states:
+        names = {options.renamed(name, name) for name in state.message.name}
+        if names.issuperset(options.joints):
+            return list(state.message.name)
+    raise RecordingError(
+        f"{path}: no state of {', '.join(options.joints)}; there are {list(states[0].message.name)}"
     )
+
+
+def _in_time(
+    messages: list[StampedMessage], stamped: bool
+) -> tuple[np.ndarray, list[StampedMessage]]:
+    """Times [s] and messages in the order of time."""
+    times = np.array([m.header_s if stamped else m.bag_s for m in messages])
+    order = np.argsort(times, kind="stable")
+    return times[order], [messages[i] for i in order]
 
 
 def _goal(path: Path, message: Any, joints: list[str]) -> np.ndarray:
@@ -335,26 +383,24 @@ def _goal(path: Path, message: Any, joints: list[str]) -> np.ndarray:
     NaN for those it leaves out.
     """
     if hasattr(message, "data"):
-        names, values = joints, message.data
-    elif hasattr(message, "points"):
-        names, points = message.joint_names, message.points
-        if len(points) != 1:
-            raise RecordingError(
-                f"{path}: a JointTrajectory of {len(points)} points says what a controller is to "
-                "make of it, not what was sent; give a --command-topic of positions"
-            )
-        values = points[0].positions
-    else:
-        names, values = message.name, message.position
-    return _in_order(path, names, values, joints)
+        return _in_order(path, joints, message.data, joints)
+    if not hasattr(message, "points"):
+        return _in_order(path, message.name, message.position, joints)
+    points = message.points
+    if len(points) != 1:
+        raise RecordingError(
+            f"{path}: a JointTrajectory of {len(points)} points says what a controller is to "
+            "make of it, not what was sent; give a --command-topic of positions"
+        )
+    return _in_order(path, message.joint_names, points[0].positions, joints)
 
 
 def _in_order(path: Path, names: Sequence[str], values: Any, joints: Sequence[str]) -> np.ndarray:
     """Values of a message in the order of the joints; NaN for those it leaves out."""
     if len(values) not in (0, len(names)):
         raise RecordingError(f"{path}: a message has {len(values)} values for {len(names)} joints")
-    told = dict(zip(names, values, strict=False))
-    return np.array([told.get(joint, np.nan) for joint in joints])
+    value_of = dict(zip(names, values, strict=False))
+    return np.array([value_of.get(joint, np.nan) for joint in joints])
 
 
 def _files(path: Path, suffix: str) -> list[Path]:
@@ -364,7 +410,7 @@ def _files(path: Path, suffix: str) -> list[Path]:
     return files
 
 
-FORMATS: dict[str, Callable[[Path, Told], Iterator[SourceMotion]]] = {
+FORMATS: dict[str, Callable[[Path, ReaderOptions], Iterator[SourceMotion]]] = {
     "csv": read_csv,
     "bam": read_bam,
     "lerobot": read_lerobot,
@@ -383,7 +429,8 @@ def format_of(path: Path) -> str:
     if path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file():
         return "ros"
     for suffix, name in ((".csv", "csv"), (".json", "bam")):
-        if path.suffix == suffix or (path.is_dir() and any(path.glob(f"*{suffix}"))):
+        in_folder = path.is_dir() and any(path.glob(f"*{suffix}"))
+        if path.suffix == suffix or in_folder:
             return name
     raise RecordingError(
         f"{path}: not there, or no LeRobot dataset (meta/info.json), ROS bag (.bag, .db3, .mcap or "

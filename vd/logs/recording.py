@@ -9,13 +9,14 @@ import contextlib
 import csv
 import json
 import math
-import sys
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from vd.command.config import from_dict
 from vd.command.files import atomic_path, write_json
 from vd.logs.motions import CHANNELS, Recording, Trajectory
 from vd.logs.recording_checks import (
@@ -28,6 +29,7 @@ from vd.logs.recording_checks import (
     require,
 )
 
+T = TypeVar("T")
 FORMAT = "vd-recording/1"
 CONTACT_MODEL = "contact"
 """Model of a recording of an object's motions, not of joints."""
@@ -42,6 +44,27 @@ joint.
 """
 
 
+@dataclass(frozen=True)
+class RecordingHeader:
+    """What of ``recording.json`` is read."""
+
+    model: str = ""
+    joints: tuple[str, ...] = ()
+    encoder_resolution_rad: float = 0.0
+    servo: dict[str, Any] = field(default_factory=dict)
+    trajectories: tuple[dict[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class TrajectoryHeader:
+    """What of its entry of a trajectory is read."""
+
+    file: str
+    joints: tuple[str, ...]
+    excitation: str = ""
+    conditions: dict[str, float | str] = field(default_factory=dict)
+
+
 def read_recording(path: str | Path) -> Recording:
     """Read and check a recording.
 
@@ -54,39 +77,40 @@ def read_recording(path: str | Path) -> Recording:
     """
     path = Path(path)
     file = path if path.suffix == ".json" else path / "recording.json"
-    header = read_header(file)
+    header = _known(RecordingHeader, read_header(file), f"{file}: recording")
     require(
-        header.get("model") != CONTACT_MODEL,
+        header.model != CONTACT_MODEL,
         f"{file}: an object's motions; they are for vd-gap contact",
     )
-    joints = _names(file, "joints", header.get("joints"))
-    _check_model(file, header.get("model"), joints)
-    resolution: Any = header.get("encoder_resolution_rad")
+    _check_joints(f"{file}: 'joints'", header.joints, header.joints)
+    _check_model(file, header)
     require(
-        _is_number(resolution) and 0.0 < resolution < math.radians(1.0),
-        f"{file}: 'encoder_resolution_rad' is {resolution!r}, as if in degrees; give the size of "
-        "one encoder count in rad, e.g. 0.001534 for 4096 counts a turn",
+        0.0 < header.encoder_resolution_rad < math.radians(1.0),
+        f"{file}: 'encoder_resolution_rad' is {header.encoder_resolution_rad!r}, as if in degrees; "
+        "give the size of one encoder count in rad, e.g. 0.001534 for 4096 counts a turn",
     )
-    servo: Any = header.get("servo", {})
-    entries: Any = header.get("trajectories")
-    require(isinstance(servo, dict), f"{file}: 'servo' is {servo!r}; make it an object")
-    _check_stiffness(file, servo.get(STIFFNESS), joints)
+    _check_stiffness(file, header)
     require(
-        isinstance(entries, list) and bool(entries),
+        bool(header.trajectories),
         f"{file}: 'trajectories' is empty; list at least one {{file, excitation, joints}}",
     )
-    trajectories = tuple(
-        _read_trajectory(file, i, entry, joints) for i, entry in enumerate(entries)
-    )
-    names = [trajectory.file for trajectory in trajectories]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    require(
-        not twice,
-        f"{file}: 'trajectories' lists {twice} twice; list each once, or it counts as evidence "
-        f"twice",
-    )
+    trajectories: dict[str, Trajectory] = {}
+    for number, values in enumerate(header.trajectories):
+        where = f"{file}: trajectories[{number}]"
+        entry = _known(TrajectoryHeader, values, where)
+        require(
+            entry.file not in trajectories,
+            f"{where}: {entry.file!r} is listed twice; list each once, or it counts as evidence "
+            "twice",
+        )
+        trajectories[entry.file] = _read_trajectory(file, where, entry, header.joints)
     recording = Recording(
-        file.parent, header["model"], joints, servo, float(resolution), trajectories
+        file.parent,
+        header.model,
+        header.joints,
+        header.servo,
+        header.encoder_resolution_rad,
+        tuple(trajectories.values()),
     )
     check_motion(recording)
     check_units(recording)
@@ -155,64 +179,57 @@ def read_header(file: Path) -> dict[str, Any]:
         header = json.loads(_read_text(file))
     except json.JSONDecodeError as error:
         raise RecordingError(f"{file}: not JSON ({error}); correct it at that place") from error
-    found = header.get("format") if isinstance(header, dict) else None
-    require(found == FORMAT, f"{file}: 'format' is {found!r}; only {FORMAT!r} is read: convert it")
+    version = header.get("format") if isinstance(header, dict) else None
+    require(
+        version == FORMAT, f"{file}: 'format' is {version!r}; only {FORMAT!r} is read: convert it"
+    )
     return header
 
 
-def _is_number(value: Any) -> bool:
-    largest = sys.float_info.max
-    return (
-        isinstance(value, int | float)
-        and not isinstance(value, bool)
-        and -largest <= value <= largest
-    )
+def _known(cls: type[T], values: dict[str, Any], where: str) -> T:
+    """The fields of ``values`` that are read; people add notes of their own."""
+    names = {field.name for field in fields(cls)}  # type: ignore[arg-type]
+    try:
+        return from_dict(cls, {k: v for k, v in values.items() if k in names}, where=where)
+    except ValueError as error:
+        raise RecordingError(f"{error}; correct it") from error
 
 
-def _names(file: Path, key: str, value: Any) -> tuple[str, ...]:
-    strings = (
-        isinstance(value, list) and bool(value) and all(isinstance(v, str) and v for v in value)
-    )
-    require(strings, f"{file}: {key!r} is {value!r}; make it a list of joint names")
-    require(
-        len({*value}) == len(value), f"{file}: {key!r} names a joint twice: {value}; name each once"
-    )
-    return tuple(value)
+def _check_joints(where: str, joints: tuple[str, ...], known: tuple[str, ...]) -> None:
+    """Joints are some, once each, and known."""
+    require(bool(joints), f"{where} is empty; name the joints")
+    for joint in joints:
+        require(joints.count(joint) == 1, f"{where} names {joint!r} twice; name each once")
+        require(joint in known, f"{where}: unknown joint {joint!r}; there are {', '.join(known)}")
 
 
-def _check_stiffness(file: Path, told: Any, joints: tuple[str, ...]) -> None:
+def _check_stiffness(file: Path, header: RecordingHeader) -> None:
     """What the servo's stiffness is said to be is a number, or one for some joints."""
-    values = told if isinstance(told, dict) else {} if told is None else {joints[0]: told}
-    for joint, value in values.items():
+    stiffness = header.servo.get(STIFFNESS, {})
+    if not isinstance(stiffness, dict):
+        stiffness = {header.joints[0]: stiffness}
+    for joint, value in stiffness.items():
         require(
-            joint in joints and _is_number(value) and value > 0.0,
-            f"{file}: servo.{STIFFNESS} is {told!r}; give a positive number in N m/rad, or one by "
-            f"joint: {', '.join(joints)}",
+            joint in header.joints and isinstance(value, float | int) and 0.0 < value < math.inf,
+            f"{file}: servo.{STIFFNESS} is {value!r}; give a positive number in N m/rad, or one by "
+            f"joint: {', '.join(header.joints)}",
         )
 
 
-def _check_model(file: Path, model: Any, joints: tuple[str, ...]) -> None:
+def _check_model(file: Path, header: RecordingHeader) -> None:
     """The model is known, and has the joints."""
-    if model in BARE_MODELS:
+    if header.model in BARE_MODELS:
         return
     from vd.assets_usd.hands import load_hand
 
     try:
-        known = load_hand(model_path(file.parent, str(model))).joint_names
+        hand = load_hand(model_path(file.parent, header.model))
     except ValueError as error:
         raise RecordingError(
             f"{file}: 'model': {error}; it is a hand, a USD file beside it, "
             f"{' or '.join(BARE_MODELS)}"
         ) from error
-    _check_known(f"{file}: 'joints'", joints, known, str(model))
-
-
-def _check_known(where: str, joints: tuple[str, ...], known: tuple[str, ...], whose: str) -> None:
-    for joint in joints:
-        require(
-            joint in known,
-            f"{where}: unknown joint {joint!r}: {whose} has {', '.join(known)}; add or rename it",
-        )
+    _check_joints(f"{file}: 'joints'", header.joints, hand.joint_names)
 
 
 def model_path(folder: Path, model: str) -> str:
@@ -220,40 +237,34 @@ def model_path(folder: Path, model: str) -> str:
     return str(folder / model) if model.endswith(USD_SUFFIXES) else model
 
 
-def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...]) -> Trajectory:
-    where = f"{file}: trajectories[{number}]"
-    name: Any = entry.get("file") if isinstance(entry, dict) else None
-    require(isinstance(name, str), f"{where}: no 'file'; name the CSV file of the trajectory")
-    inside = not Path(name).is_absolute() and ".." not in Path(name).parts
-    require(inside, f"{where}: 'file' is {name!r}; keep it in the recording's folder")
-    excited = _names(file, f"trajectories[{number}].joints", entry.get("joints"))
-    _check_known(where, excited, joints, "'joints'")
-    conditions = entry.get("conditions", {})
+def _read_trajectory(
+    file: Path, where: str, entry: TrajectoryHeader, joints: tuple[str, ...]
+) -> Trajectory:
+    path = Path(entry.file)
     require(
-        isinstance(conditions, dict)
-        and all(isinstance(value, str) or _is_number(value) for value in conditions.values()),
-        f"{where}: 'conditions' is {conditions!r}; map names to numbers or words",
+        not path.is_absolute() and ".." not in path.parts,
+        f"{where}: 'file' is {entry.file!r}; keep it in the recording's folder",
     )
+    _check_joints(f"{where}: 'joints'", entry.joints, joints)
     for key in POSITIVE:
-        value = conditions.get(key, 0.0)
-        positive = not isinstance(value, str) and value >= 0.0
-        require(positive, f"{where}: condition {key!r} is {value!r}; give a number, not negative")
-    table = file.parent / name
-    columns = _read_columns(table, joints)
+        value = entry.conditions.get(key, 0.0)
+        require(
+            isinstance(value, float) and 0.0 <= value < math.inf,
+            f"{where}: condition {key!r} is {value!r}; give a number, not negative",
+        )
+    columns = _read_columns(file.parent / path, joints)
     time = columns.pop("t")
     sent = columns.pop(COMMAND_TIME, None)
     channels = by_channel(columns, joints, len(time))
-    enabled = (
-        np.nan_to_num(channels.pop("enabled", np.ones((len(time), len(joints)))), nan=1.0) > 0.5
-    )
+    enabled = channels.pop("enabled", np.ones((len(time), len(joints))))
     return Trajectory(
-        file=name,
-        excitation=str(entry.get("excitation", Path(name).stem)),
-        joints=excited,
-        conditions=conditions,
+        file=entry.file,
+        excitation=entry.excitation or path.stem,
+        joints=entry.joints,
+        conditions=entry.conditions,
         time=time - time[0],
         command_time=None if sent is None else sent - time[0],
-        enabled=enabled,
+        enabled=np.nan_to_num(enabled, nan=1.0) > 0.5,
         **channels,
     )
 
@@ -264,10 +275,11 @@ def by_channel(
     """Columns ``channel.joint`` [T] as channels [T, J]; NaN for a joint without one."""
     channels = {}
     for channel in CHANNELS:
-        found = [columns.get(f"{channel}.{joint}") for joint in joints]
-        if any(values is not None for values in found):
-            blank = np.full(rows, np.nan)
-            channels[channel] = np.stack([blank if v is None else v for v in found], axis=1)
+        values = np.full((rows, len(joints)), np.nan)
+        for j, joint in enumerate(joints):
+            values[:, j] = columns.get(f"{channel}.{joint}", np.nan)
+        if not np.isnan(values).all():
+            channels[channel] = values
     return channels
 
 
@@ -281,18 +293,21 @@ def read_table(file: Path) -> tuple[list[str], list[list[str]]]:
             header.
     """
     text = _read_text(file)
-    separator = max(",;\t", key=text.partition("\n")[0].count)
-    lines = (text.replace(",", ".") if separator == ";" else text).splitlines()
-    rows = list(csv.reader(lines, delimiter=separator))
-    while rows and not any(cell.strip() for cell in rows[-1]):
+    header = text.partition("\n")[0]
+    separator = max(",;\t", key=header.count)
+    if separator == ";":
+        text = text.replace(",", ".")
+    rows = list(csv.reader(text.splitlines(), delimiter=separator))
+    while rows and not "".join(rows[-1]).strip():
         rows.pop()
     require(bool(rows), f"{file}: empty; record it again or drop it")
-    for i, row in enumerate(rows):
-        said = (
-            f"{file}: row {i + 1} has {len(row)} cells, the header {len(rows[0])}; correct the row"
+    names = [name.strip() for name in rows[0]]
+    for number, row in enumerate(rows, 1):
+        require(
+            len(row) == len(names),
+            f"{file}: row {number} has {len(row)} cells, the header {len(names)}; correct the row",
         )
-        require(len(row) == len(rows[0]), said)
-    return [name.strip() for name in rows[0]], rows[1:]
+    return names, rows[1:]
 
 
 def numbers(file: Path, name: str, cells: list[str]) -> np.ndarray:
@@ -316,46 +331,45 @@ def numbers(file: Path, name: str, cells: list[str]) -> np.ndarray:
 def _read_columns(file: Path, joints: tuple[str, ...]) -> dict[str, np.ndarray]:
     """The columns ``t`` and ``channel.joint`` of a trajectory, checked."""
     names, rows = read_table(file)
-    kept = _check_columns(file, names, joints)
+    _check_columns(file, names, joints)
     require(
         len(rows) >= MIN_SAMPLES,
         f"{file}: {len(rows)} samples; at least {MIN_SAMPLES} are needed, better some seconds at "
         "100 Hz: record it again or drop it from 'trajectories'",
     )
-    columns = {
-        name: numbers(file, name, [row[index] for row in rows]) for name, index in kept.items()
-    }
+    columns = {}
+    for index, name in enumerate(names):
+        if name in ("t", COMMAND_TIME) or name.partition(".")[0] in CHANNELS:
+            columns[name] = numbers(file, name, [row[index] for row in rows])
     if COMMAND_TIME in columns:
-        # A log over a gap of the bus tells the state before once more.
-        same = [
-            np.diff(v) == 0.0
-            for key, v in columns.items()
-            if key == "t" or key.startswith("position.")
-        ]
-        new = np.concatenate([[True], ~np.all(same, axis=0)])
-        columns = {name: values[new] for name, values in columns.items()}
+        columns = _without_repeats(columns)
     check_values(file, columns)
     return columns
 
 
-def _check_columns(file: Path, names: list[str], joints: tuple[str, ...]) -> dict[str, int]:
-    """Index of every column that is used; the required ones are there, and no joint is misspelt."""
+def _without_repeats(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Columns without the rows of a log over a gap of the bus, which tell the state before once more."""
+    new = np.zeros(len(columns["t"]), dtype=bool)
+    new[0] = True
+    for name, values in columns.items():
+        if name == "t" or name.startswith("position."):
+            new[1:] |= np.diff(values) != 0.0
+    return {name: values[new] for name, values in columns.items()}
+
+
+def _check_columns(file: Path, names: list[str], joints: tuple[str, ...]) -> None:
+    """The required columns are there, once each, and no joint is misspelt."""
+    where = f"{file}: row 1"
     for name in filter(None, names):
-        require(names.count(name) == 1, f"{file}: row 1 has column {name!r} twice; keep one")
+        require(names.count(name) == 1, f"{where} has column {name!r} twice; keep one")
         channel, dot, joint = name.partition(".")
         if dot and channel in CHANNELS:
-            _check_known(f"{file}: row 1, column {name!r}", (joint,), joints, "recording.json")
-    for name in (
-        "t",
-        *(f"{channel}.{joint}" for joint in joints for channel in ("command", "position")),
-    ):
-        require(name in names, f"{file}: row 1 has no column {name!r}; add it")
-    wanted = {
-        "t",
-        COMMAND_TIME,
-        *(f"{channel}.{joint}" for channel in CHANNELS for joint in joints),
-    }
-    return {name: index for index, name in enumerate(names) if name in wanted}
+            _check_joints(f"{where}, column {name!r}", (joint,), joints)
+    needed = ["t"]
+    for joint in joints:
+        needed += [f"command.{joint}", f"position.{joint}"]
+    for name in needed:
+        require(name in names, f"{where} has no column {name!r}; add it")
 
 
 def write_table(
@@ -376,11 +390,10 @@ def write_table(
         values = getattr(trajectory, channel)
         if values is None or (channel == "enabled" and values.all()):
             continue
-        each = zip(joints, np.asarray(values, dtype=float).T, strict=True)
-        columns |= {
-            f"{channel}.{joint}": column for joint, column in each if not np.isnan(column).all()
-        }
+        for joint, column in zip(joints, np.asarray(values, dtype=float).T, strict=True):
+            if not np.isnan(column).all():
+                columns[f"{channel}.{joint}"] = column
     formats = ["%d" if name.startswith("enabled") else "%.6f" for name in columns]
-    table, header = np.stack([*columns.values()], axis=1), ",".join(columns)
+    table = np.stack([*columns.values()], axis=1)
     with atomic_path(file) as temporary:
-        np.savetxt(temporary, table, formats, ",", header=header, comments="")
+        np.savetxt(temporary, table, formats, ",", header=",".join(columns), comments="")

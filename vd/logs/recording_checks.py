@@ -76,44 +76,52 @@ def require(ok: bool, why_not: str) -> None:
 def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
     """Time runs forward without gaps, and every value can be what its column says."""
     time = columns["t"]
-    between = np.diff(time)
-    i = int(np.argmin(between))
+    _check_time(file, time)
+    late = columns.get(COMMAND_TIME, time) - time
     require(
-        between[i] > 0.0,
-        f"{file}: row {i + 3}, column 't': time "
-        f"{'repeats' if between[i] == 0.0 else 'runs backward'} "
-        f"({time[i]:g} s, then {time[i + 1]:g} s); sort the rows and keep one per stamp",
-    )
-    typical, longest = float(np.median(between)), int(np.argmax(between))
-    cut = "in which the motion is not known; cut the file there into two trajectories"
-    require(
-        between[longest] <= SLOWEST_S,
-        f"{file}: row {longest + 3}, column 't': {between[longest]:.3g} s without a sample, "
-        + (
-            cut
-            if typical <= SLOWEST_S
-            else "as everywhere: these look like milliseconds; write seconds"
-        ),
-    )
-    sent = columns.get(COMMAND_TIME, time)
-    require(
-        float(np.diff(sent).min()) >= 0.0 and abs(float(np.median(sent - time))) <= SLOWEST_S,
+        float(np.diff(late + time).min()) >= 0.0 and abs(float(np.median(late))) <= SLOWEST_S,
         f"{file}: {COMMAND_TIME!r} runs backward, or is of another unit or clock than 't'; write "
         "seconds on that clock, in the order of the rows, or drop it",
     )
     for name, values in columns.items():
-        low, high, why = RANGES.get(name.partition(".")[0], (-np.inf, np.inf, ""))
-        wrong = (values < low) | (values > high)
-        if name.startswith("enabled."):
-            wrong = ~np.isin(values, (low, high))
-        i = int(np.argmax(np.where(wrong, np.abs(values), -1.0)))
-        require(not wrong.any(), f"{file}: row {i + 2}, column {name!r}: {values[i]:g}: {why}")
-        i = int(np.argmax(np.abs(np.diff(values))))
-        require(
-            not name.startswith("position.") or abs(values[i + 1] - values[i]) <= math.pi,
-            f"{file}: row {i + 3}, column {name!r} jumps by a turn, as angles wrapped at pi do; "
-            "unwrap it and its command (numpy.unwrap)",
-        )
+        channel = name.partition(".")[0]
+        if channel in RANGES:
+            low, high, remedy = RANGES[channel]
+            wrong = (values < low) | (values > high)
+            if channel == "enabled":
+                wrong = ~np.isin(values, (low, high))
+            worst = int(np.argmax(np.where(wrong, np.abs(values), -1.0)))
+            require(
+                not wrong.any(),
+                f"{file}: row {worst + 2}, column {name!r}: {values[worst]:g}: {remedy}",
+            )
+        if channel == "position":
+            jumps = np.abs(np.diff(values))
+            require(
+                jumps.max() <= math.pi,
+                f"{file}: row {jumps.argmax() + 3}, column {name!r} jumps by a turn, as angles "
+                "wrapped at pi do; unwrap it and its command (numpy.unwrap)",
+            )
+
+
+def _check_time(file: Path, time: np.ndarray) -> None:
+    """Time stamps increase without gaps."""
+    steps = np.diff(time)
+    row = int(np.argmin(steps))
+    problem = "repeats" if steps[row] == 0.0 else "runs backward"
+    require(
+        steps[row] > 0.0,
+        f"{file}: row {row + 3}, column 't': time {problem} "
+        f"({time[row]:g} s, then {time[row + 1]:g} s); sort the rows and keep one per stamp",
+    )
+    row = int(np.argmax(steps))
+    problem = "in which the motion is not known; cut the file there into two trajectories"
+    if np.median(steps) > SLOWEST_S:
+        problem = "as everywhere: these look like milliseconds; write seconds"
+    require(
+        steps[row] <= SLOWEST_S,
+        f"{file}: row {row + 3}, column 't': {steps[row]:.3g} s without a sample, {problem}",
+    )
 
 
 def check_motion(recording: Recording) -> None:
@@ -128,39 +136,42 @@ def check_motion(recording: Recording) -> None:
     )
     count = recording.encoder_resolution_rad
     for j, joint in enumerate(recording.joints):
-        told = [
-            t
-            for t in recording.trajectories
-            if np.ptp(t.command[:, j]) > MIN_SAMPLES * count and t.enabled[:, j].all()
-        ]
-        if not told:
+        driven = [t for t in recording.trajectories if t.enabled[:, j].all()]
+        moved = [t for t in driven if np.ptp(t.command[:, j]) > MIN_SAMPLES * count]
+        if not moved:
             continue
-        answers = np.array([np.ptp(t.position[:, j]) for t in told])
-        least = int(np.argmin(answers))
+        answers = np.array([np.ptp(t.position[:, j]) for t in moved])
+        least = moved[int(np.argmin(answers))]
         require(
             answers.max() > FLICKER_COUNTS * count and answers.min() > 0.0,
-            f"{recording.path / told[least].file}: column 'position.{joint}' only flickers, by "
-            f"{answers[least]:.2g} rad, while 'command.{joint}' moves by "
-            f"{np.ptp(told[least].command[:, j]):.3g} rad: a dead encoder, or a servo that is "
+            f"{recording.path / least.file}: column 'position.{joint}' only flickers, by "
+            f"{answers.min():.2g} rad, while 'command.{joint}' moves by "
+            f"{np.ptp(least.command[:, j]):.3g} rad: a dead encoder, or a servo that is "
             "off; record it again",
         )
-        why = _answer_fault(told, j, count)
-        require(not why, f"{recording.path}: column 'position.{joint}' {why}")
+        fault = _answer_fault(moved, j, count)
+        require(not fault, f"{recording.path}: column 'position.{joint}' {fault}")
 
 
-def _answer_fault(told: list[Trajectory], j: int, count: float) -> str:
+def _answer_fault(moved: list[Trajectory], j: int, count: float) -> str:
     """What is wrong with a joint's positions as an answer to its commands, in every motion.
 
     Or nothing.
     """
-    pairs = [(t.command[:, j], t.position[:, j]) for t in told]
-    if any(
-        all(np.abs(p[k:] - c[: len(c) - k]).max() <= count for c, p in pairs) for k in range(FEW)
-    ):
+    likenesses = []
+    copies = np.ones(FEW, dtype=bool)  # by the rows within which the command comes back
+    for t in moved:
+        command = t.command[:, j]
+        position = t.position[:, j]
+        likenesses.append(np.corrcoef(command, position)[0, 1])
+        for late in range(FEW):
+            copies[late] &= np.abs(position[late:] - command[: len(command) - late]).max() <= count
+    if copies.any():
         return "is a copy of its command in every motion: record the position that is measured"
-    if max(np.corrcoef(c, p)[0, 1] for c, p in pairs) < -CLEARLY:
+    if max(likenesses) < -CLEARLY:
         return "moves against its command in every motion: the sign of one of them is wrong; turn it round"
-    if (lead := float(np.median([_lead(t, j) for t in told]))) > 0.0:
+    lead = float(np.median([_lead(t, j) for t in moved]))
+    if lead > 0.0:
         return (
             f"moves {1e3 * lead:.0f} ms before its command: the two columns are swapped, or their "
             "stamps are of two clocks; rename the columns, or correct the stamps"
@@ -174,25 +185,28 @@ def _lead(t: Trajectory, j: int) -> float:
     0 if they do not, clearly.
     """
     step = float(np.median(np.diff(t.time)))
-    when = np.arange(0.0, t.time[-1], step)
-    command, position = (
-        np.interp(when, t.sent, t.command[:, j]),
-        np.interp(when, t.time, t.position[:, j]),
-    )
-    command, position = command - command.mean(), position - position.mean()
-    miss = 1.0 - correlate(command, position) / (np.linalg.norm(command) * np.linalg.norm(position))
-    lead, best = int(correlation_lags(len(when), len(when))[np.argmin(miss)]), miss.min()
-    return lead * step if lead >= FEW and best < CLEARLY * miss[: len(when)].min() else 0.0
+    time = np.arange(0.0, t.time[-1], step)
+    command = np.interp(time, t.sent, t.command[:, j])
+    position = np.interp(time, t.time, t.position[:, j])
+    command -= command.mean()
+    position -= position.mean()
+    size = np.linalg.norm(command) * np.linalg.norm(position)
+    miss = 1.0 - correlate(command, position) / size
+    lead = int(correlation_lags(len(time), len(time))[np.argmin(miss)])
+    if lead >= FEW and miss.min() < CLEARLY * miss[: len(time)].min():
+        return lead * step
+    return 0.0
 
 
 def check_units(recording: Recording) -> None:
     """Small motions in degrees show in the size of a count, the least step between two readings."""
     count = recording.encoder_resolution_rad
-    for column, joint in enumerate(recording.joints):
-        levels = np.unique(
-            np.concatenate([t.position[:, column] for t in recording.trajectories]).round(6)
-        )
-        step = float(np.diff(levels).min()) if len(levels) >= MIN_SAMPLES else 0.0
+    positions = np.concatenate([t.position for t in recording.trajectories]).round(6)
+    for j, joint in enumerate(recording.joints):
+        levels = np.unique(positions[:, j])
+        if len(levels) < MIN_SAMPLES:
+            continue
+        step = float(np.diff(levels).min())
         require(
             step <= MIN_SAMPLES * count,
             f"{recording.path}: column 'position.{joint}' moves in steps of {step:.3g}, but "
@@ -203,23 +217,26 @@ def check_units(recording: Recording) -> None:
 
 def cautions(recording: Recording) -> tuple[str, ...]:
     """Plain sentences about what the recording cannot show well, joints together where they share one."""
-    found: list[str] = []
-    kinds = {
-        j: {t.excitation for t in recording.trajectories if j in t.joints} for j in recording.joints
-    }
-    idle = [joint for joint, names in kinds.items() if not names]
-    few = [joint for joint, names in kinds.items() if 0 < len(names) < MIN_KINDS]
+    sentences = []
+    kinds: dict[str, set[str]] = {joint: set() for joint in recording.joints}
+    steps = []
+    for t in recording.trajectories:
+        steps.append(np.diff(t.time))
+        for joint in t.joints:
+            kinds[joint].add(t.excitation)
+    idle = [joint for joint in kinds if not kinds[joint]]
+    few = [joint for joint in kinds if 0 < len(kinds[joint]) < MIN_KINDS]
     if idle:
-        found.append(f"No motion moves {', '.join(idle)}: nothing is said about it.")
+        sentences.append(f"No motion moves {', '.join(idle)}: nothing is said about it.")
     if few:
-        found.append(
+        sentences.append(
             f"Fewer than {MIN_KINDS} kinds of motion move {', '.join(few)}: little is left to fit "
             "when one is held out."
         )
-    between = float(np.median(np.concatenate([np.diff(t.time) for t in recording.trajectories])))
-    if between > SLOWEST_S / MIN_SAMPLES:
-        found.append(
-            f"Samples are {1e3 * between:.0f} ms apart: what a servo does at the beginning of a "
+    step = float(np.median(np.concatenate(steps)))
+    if step > SLOWEST_S / MIN_SAMPLES:
+        sentences.append(
+            f"Samples are {1e3 * step:.0f} ms apart: what a servo does at the beginning of a "
             f"step is not resolved; record at {MIN_SAMPLES / SLOWEST_S:.0f} Hz or more."
         )
-    return tuple(found)
+    return tuple(sentences)

@@ -7,8 +7,10 @@ import warp as wp
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
-FOUND_COLOR, AXES = (60, 230, 120), ((235, 70, 60), (90, 200, 60), (70, 120, 255))
-"""Colours of the believed surface, and of its x, y and z."""
+SURFACE_COLOR = (60, 230, 120)
+"""Colour of the believed surface."""
+AXIS_COLORS = ((235, 70, 60), (90, 200, 60), (70, 120, 255))
+"""Colours of its x, y and z."""
 AXIS_M = 0.06
 """Length of the axes that are drawn [m]."""
 
@@ -29,17 +31,20 @@ def camera_view(actor: Any, world: int) -> np.ndarray:
     shade = np.where(depth > 0.0, 235.0 - 180.0 * _share(depth), 20.0)
     picture = Image.fromarray(np.repeat(shade.astype(np.uint8)[..., None], 3, axis=2))
     pose = actor.tracker.observer.finder.pose[world, 0].cpu().numpy().astype(float)
-    turn, draw = Rotation.from_quat(pose[3:]), ImageDraw.Draw(picture)
-    for u, v, ahead in model.project(pose[:3] + turn.apply(actor.surface(world))):
+    turn = Rotation.from_quat(pose[3:])
+    draw = ImageDraw.Draw(picture)
+    surface = pose[:3] + turn.apply(actor.surface(world))
+    for u, v, ahead in model.project(surface):
         if ahead > 0.0:
-            draw.ellipse((u - 1, v - 1, u + 1, v + 1), fill=FOUND_COLOR)
-    origin, *tips = model.project(pose[:3] + np.vstack([np.zeros(3), AXIS_M * turn.as_matrix().T]))
-    for color, tip in zip(AXES, tips, strict=True):
+            draw.ellipse((u - 1, v - 1, u + 1, v + 1), fill=SURFACE_COLOR)
+    ends = pose[:3] + AXIS_M * turn.as_matrix().T
+    origin, *tips = model.project(np.vstack([pose[:3], ends]))
+    for color, tip in zip(AXIS_COLORS, tips, strict=True):
         draw.line((*origin[:2], *tip[:2]), fill=color, width=3)
     middle = model.project(actor.hand.tip_poses(actor.hand.start)[:, :3].mean(axis=0))[:2]
-    size = np.array(picture.size)
-    left, top = np.clip(middle - size / 4, 0, size // 2).astype(int)
-    box = left, top, left + picture.width // 2, top + picture.height // 2
+    half = np.array(picture.size) // 2
+    corner = np.clip(middle - half / 2, 0, half).astype(int)
+    box = (*corner, *(corner + half))
     return np.asarray(picture.resize(picture.size, box=box))
 
 

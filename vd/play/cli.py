@@ -18,11 +18,10 @@ from vd.command.device import resolve_device
 from vd.command.files import check_file
 from vd.command.line import parse, say_same_as
 from vd.command.warp_quiet import quiet_warp
-from vd.evaluate.agents import DEFAULT_HAND, check_names
 from vd.evaluate.cfg import LOG_EVERY_S, POLICY_HELP, HandFlags, TaskFlags, episode_limit_s
 from vd.logs.hand_log import is_log
 from vd.paper import PAPER
-from vd.policy.defaults import default_policy
+from vd.policy.agents import DEFAULT_HAND, check_names, default_policy, installed_policies
 from vd.sim.cfg import in_mujoco
 
 if TYPE_CHECKING:
@@ -150,26 +149,24 @@ def serve(session: "Session | Replay", cfg: PlayCfg) -> None:
 
 def spread(world_object: Sequence[int], cells: int) -> list[int]:
     """Environments to show: of different objects first, then more of the same."""
-    rank = [list(world_object[:world]).count(index) for world, index in enumerate(world_object)]
+    count: dict[int, int] = {}
+    rank = []
+    for index in world_object:
+        count[index] = count.get(index, 0) + 1
+        rank.append(count[index])
     return sorted(sorted(range(len(rank)), key=rank.__getitem__)[:cells])
 
 
 def _policies() -> list[str]:
-    """Policies that are installed, of hands that are."""
+    """Names of the policies that are installed, of hands that are."""
     from vd.assets_usd.hands import check_hand_name
-    from vd.policy.store import installed_entries
+    from vd.policy.contract import installed_contract
 
     names = []
-    try:
-        for name, entry in installed_entries().items():
-            with suppress(ValueError):  # of a hand that has to be imported
-                check_hand_name(entry.hand)
-                names.append(name)
-    except (
-        OSError,
-        ValueError,
-    ) as error:  # of what was pulled; the policy that is asked for needs no list
-        print(f"vd-play: no menu of policies: {error}", file=sys.stderr)
+    for name, path in installed_policies().items():
+        with suppress(ValueError, OSError):  # it is damaged, or of a hand to be imported
+            check_hand_name(installed_contract(path).task["hand"])
+            names.append(name)
     return names
 
 
@@ -182,7 +179,7 @@ def _session(cfg: PlayCfg) -> "Session":
 
 def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any]:
     """Environment with at least one environment for each object, and what acts in it."""
-    from vd.evaluate.agents import check_fits, open_policy, task_for
+    from vd.policy.agents import check_fits, open_policy, task_for
 
     device = resolve_device(cfg.device)
     trained = open_policy(cfg.policy, device)

@@ -34,18 +34,20 @@ GHOST_OPACITY = 0.7
 # Light direction in the camera's right, forward (level) and up: from the upper left behind the
 # viewer, and low enough to reach under the palm.
 LIGHT_DIRECTION = (0.35, 0.9, -0.8)
-IN_PLACE, OUT_OF_SIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -100.0, 0.0, 0.0, 0.0, 1.0)
-"""Poses, [m] and xyzw, of what is shown at the origin and of what is hidden far below: viewers have
-no cheaper way to hide one shape."""
+IN_PLACE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+"""Pose, [m] and xyzw, of what is shown at the origin."""
+OUT_OF_SIGHT = (0.0, 0.0, -100.0, 0.0, 0.0, 0.0, 1.0)
+"""The same of what is hidden far below: viewers have no cheaper way to hide one shape."""
 BALL_SHARE = 0.8
 """Share of the picture's height that the ball takes at which a camera is aimed."""
 GOAL_SHARE = 0.36
 """Side of the goal's picture, as a share of the height of the scene's."""
-SKY, GROUND = (0.42, 0.43, 0.46), (0.22, 0.21, 0.20)
+SKY = (0.42, 0.43, 0.46)
+GROUND = (0.22, 0.21, 0.20)
 
 
 @dataclass(frozen=True)
-class Camera:
+class PictureCamera:
     """A pinhole camera that looks at a point.
 
     The default looks along +y and sees hand, table and object, a little from above.
@@ -59,9 +61,9 @@ class Camera:
     """Vertical field of view [rad]."""
 
     @staticmethod
-    def for_hand(hand: HandModel) -> "Camera":
+    def for_hand(hand: HandModel) -> "PictureCamera":
         """The default camera, turned about the vertical to look through the nearest gap between fingers."""
-        camera = Camera()
+        camera = PictureCamera()
         tips = hand.tip_poses(hand.start)[:, :3]
         tips = Rotation.from_quat(hand.mount[3:]).apply(tips)
         azimuth = np.sort(np.arctan2(tips[:, 1], tips[:, 0]))
@@ -87,7 +89,7 @@ class Camera:
             wp.vec3(*self.eye), wp.quat(*Rotation.from_matrix(self.rotation).as_quat())
         )
 
-    def aimed_at(self, point: Sequence[float], radius: float) -> "Camera":
+    def aimed_at(self, point: Sequence[float], radius: float) -> "PictureCamera":
         """A camera that looks in the same direction at a ball about ``point`` [m], filling the picture."""
         distance = radius / math.sin(math.atan(BALL_SHARE * math.tan(0.5 * self.fov)))
         eye = np.asarray(point, dtype=float) + distance * self.rotation[:, 2]
@@ -123,7 +125,8 @@ class PictureModel:
         ghost_in_scene: bool = False,
     ):
         cfg = SimCfg()
-        self.cells, self.ghost_in_scene = len(objects), ghost_in_scene
+        self.cells = len(objects)
+        self.ghost_in_scene = ghost_in_scene
         scene = new_builder()
         ghosts = []
         hand_builder = build_hand(hand, cfg, visuals=True) if hand else None
@@ -193,20 +196,21 @@ class Renderer:
         width: int = 640,
         height: int = 400,
         goal_size: int | None = None,
-        camera: Camera | None = None,
+        camera: PictureCamera | None = None,
         device: str = "cpu",
     ):
-        self.width, self.height = width, height
-        self.camera = camera or (Camera.for_hand(hand) if hand else Camera())
+        self.width = width
+        self.height = height
+        self.camera = camera or (PictureCamera.for_hand(hand) if hand else PictureCamera())
         self.pictured = PictureModel(hand, objects, device=device)
         cells = len(objects)
         self._sensor = SensorCamera(self.pictured.model)
         self._sensor.create_default_light(enable_shadows=True, direction=_light(self.camera))
         self._sensor.set_ambient_light(SKY, GROUND)
         radius = max(float(np.linalg.norm(item.vertices, axis=1).max()) for item in objects)
-        square = (goal_size or round(GOAL_SHARE * height),) * 2
+        side = goal_size or round(GOAL_SHARE * height)
 
-        def view(camera: Camera, size: tuple[int, int], first_world: int) -> dict[str, Any]:
+        def view(camera: PictureCamera, size: tuple[int, int], first_world: int) -> dict[str, Any]:
             """What the sensor wants to know, and its buffers, to draw one world for each cell."""
             worlds = list(range(first_world, first_world + cells))
             return {
@@ -221,7 +225,9 @@ class Renderer:
             }
 
         goal_camera = self.camera.aimed_at((0.0, 0.0, 0.0), radius)
-        self._views = view(self.camera, (width, height), 0), view(goal_camera, square, cells)
+        scene_view = view(self.camera, (width, height), 0)
+        goal_view = view(goal_camera, (side, side), cells)
+        self._views = (scene_view, goal_view)
 
     def render(
         self, joint_q: np.ndarray, goal_quat: np.ndarray, table: np.ndarray | bool = True
@@ -237,7 +243,8 @@ class Renderer:
             C pictures.
         """
         self.pictured.pose(joint_q, goal_quat, table=table)
-        state, drawn = self.pictured.state, []
+        state = self.pictured.state
+        drawn = []
         self.pictured.model.bvh_refit_shapes(state)
         for view in self._views:
             self._sensor.update(
@@ -253,11 +260,12 @@ class Renderer:
 
 
 def _vector(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
+    x, y, z = map(float, values)
     return x, y, z
 
 
-def _light(camera: Camera) -> wp.vec3:
+def _light(camera: PictureCamera) -> wp.vec3:
     up = np.array([0.0, 0.0, 1.0])
     right = camera.rotation[:, 0]
-    return wp.normalize(wp.vec3(*(LIGHT_DIRECTION @ np.stack([right, np.cross(up, right), up]))))
+    axes = np.stack([right, np.cross(up, right), up])
+    return wp.normalize(wp.vec3(*(LIGHT_DIRECTION @ axes)))

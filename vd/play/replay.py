@@ -27,7 +27,9 @@ class Replay:
     """
 
     def __init__(self, log: HandLog):
-        self.log, self._now, self.sees = log, 0, False
+        self.log = log
+        self._now = 0
+        self.sees = False
         if not len(log.goals):
             raise LogError(f"{log.path} has no goal to show")
         self.control_hz = float(log.run["control_hz"])
@@ -65,45 +67,65 @@ class Replay:
         """Nothing is held."""
 
     def _snapshots(self) -> Iterator[Snapshot]:
-        log, columns = self.log, self.log.columns
-        steps = len(columns["t"])
+        log = self.log
+        columns = log.columns
+        time = columns["t"]
         position = log.channel("position")
-        pose = np.full((steps, 7), np.nan) if log.object_pose is None else log.object_pose
-        known = np.where(np.isfinite(pose).all(axis=1), np.arange(steps), 0)
-        pose = pose[np.maximum.accumulate(known)]  # nobody looks while the hand is held
-        pose = np.where(np.isfinite(pose), pose, OUT_OF_SIGHT)
-        error = columns.get("error", columns["distance"])
-        heard = columns.get("image_s", columns.get("sensed_s"))
-        ends = {stop.goal: stop for stop in log.stops}
-        reached = lost = 0
-        for step in range(steps):
-            believed = float(columns["distance"][step])
-            number = min(int(columns["goal"][step]), len(log.goals) - 1)  # one may not have begun
-            stop = ends.get(number)
-            # Events have the time of their writing: the last step before it is the one that ended
-            # the goal.
-            over = stop is not None and columns["t"][step] <= stop.time_s
-            last = step + 1 == steps or columns["t"][step + 1] > (stop.time_s if stop else np.inf)
+        pose = _pose_to_show(log)
+        distance = columns["distance"]
+        error = columns.get("error", distance)
+        sensed = columns.get("image_s", columns.get("sensed_s"))
+        ends = _goal_ends(log)
+        goals = 0
+        drops = 0
+        for step in range(len(time)):
+            outcome = ends.get(step)
             near = "error" not in columns or error[step] <= log.tolerance_rad
-            success = bool(stop and over and last and near and stop.outcome == "stopped")
-            fell = bool(stop and over and last and stop.outcome == "lost")
-            reached, lost = reached + success, lost + fell
+            success = outcome == "stopped" and bool(near)
+            fell = outcome == "lost"
+            goals += success
+            drops += fell
+            number = min(int(columns["goal"][step]), len(log.goals) - 1)  # one may not have begun
+            believed = None  # while the hand is held
+            if np.isfinite(distance[step]):
+                believed = float(distance[step])
+            latency_s = None
+            if sensed is not None:
+                latency_s = float(columns["sent_s"][step] - sensed[step])
             yield Snapshot(
                 name=self.object_name,
-                time_s=float(columns["t"][step] - columns["t"][0]),
+                time_s=float(time[step] - time[0]),
                 joint_q=np.concatenate([position[step], pose[step]]),
                 goal_quat=log.goals[number],
                 error_rad=float(np.nan_to_num(error[step], nan=np.pi)),
                 success=success,
                 fell=fell,
-                goals=reached,
-                drops=lost,
+                goals=goals,
+                drops=drops,
                 table=not self.hand.palm_up,
-                believed_rad=believed
-                if np.isfinite(believed)
-                else None,  # not while the hand is held
-                latency_s=None if heard is None else float(columns["sent_s"][step] - heard[step]),
+                believed_rad=believed,
+                latency_s=latency_s,
             )
+
+
+def _pose_to_show(log: HandLog) -> np.ndarray:
+    """Pose of the object [T, 7], the last known one while nobody looks; out of sight before."""
+    if log.object_pose is None:
+        return np.tile(OUT_OF_SIGHT, (len(log.columns["t"]), 1))
+    known = np.isfinite(log.object_pose).all(axis=1)
+    last_known = np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
+    pose = log.object_pose[last_known]
+    return np.where(np.isfinite(pose), pose, OUT_OF_SIGHT)
+
+
+def _goal_ends(log: HandLog) -> dict[int, str]:
+    """How goals ended, by the step that ended them: events are written after it."""
+    time = log.columns["t"]
+    ends = {}
+    for stop in log.stops:
+        step = int(np.searchsorted(time, stop.time_s, side="right")) - 1
+        ends[step] = stop.outcome
+    return ends
 
 
 def film(log: HandLog, path: Path) -> int:
@@ -112,8 +134,8 @@ def film(log: HandLog, path: Path) -> int:
     Raises:
         LogError: Hand or object are not here.
     """
-    shown, (width, height) = Replay(log), SINGLE_CELL
-    renderer = Renderer(shown.hand, shown.objects, width=width, height=height)
-    return write_frames(
-        path, drawn(renderer, ([shot] for shot in shown.snapshots)), shown.control_hz
-    )
+    replay = Replay(log)
+    width, height = SINGLE_CELL
+    renderer = Renderer(replay.hand, replay.objects, width=width, height=height)
+    frames = drawn(renderer, [[snapshot] for snapshot in replay.snapshots])
+    return write_frames(path, frames, replay.control_hz)

@@ -24,9 +24,12 @@ class Session:
     """
 
     def __init__(self, env: Any, policy: Any, *, seed: int = 0):
-        self.env, self._policy = env, policy
+        self.env = env
+        self._policy = policy
         self.sees = hasattr(policy, "camera")
-        self.hand, self.objects, self.control_hz = env.hand, env.objects, env.cfg.sim.control_hz
+        self.hand = env.hand
+        self.objects = env.objects
+        self.control_hz = env.cfg.sim.control_hz
         self.close = env.close
         self._rng = np.random.default_rng(seed)
         self.object_names = [item.name for item in env.objects]
@@ -41,7 +44,7 @@ class Session:
     def choose_object(self, name: str) -> None:
         """Watch the first environment with this object; counts start anew."""
         index = self.object_names.index(name)
-        self.world = next(w for w, k in enumerate(self.env.world_object) if k == index)
+        self.world = list(self.env.world_object).index(index)
         self._watcher = Watcher(self.env, [self.world])
         self.snapshot: Snapshot = self._watcher.read(stepped=False)[0]
 
@@ -76,9 +79,8 @@ class Session:
     def new_goal(self) -> Snapshot:
         """Give every environment a new goal; nothing else changes."""
         env = self.env
-        goals = draw_goals(
-            env.object_pose()[:, 3:7].astype(float), self._rng, env.cfg.goal.max_angle_rad
-        )
+        present = env.object_pose()[:, 3:7].astype(float)
+        goals = draw_goals(present, self._rng, env.cfg.goal.max_angle_rad)
         env.give_goals(np.arange(env.num_envs), goals)
         self.snapshot = self._watcher.read(stepped=False)[0]
         return self.snapshot

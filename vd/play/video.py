@@ -18,14 +18,19 @@ from vd.evaluate.statistics import rotation_angle
 from vd.paper import PAPER
 from vd.play.render import Picture, Renderer
 
-# Size of a cell's picture [pixel]: alone, and in a grid.
-SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)
+SINGLE_CELL = (640, 400)
+"""Width and height of a cell's picture alone [pixel]."""
+GRID_CELL = (480, 300)
+"""The same in a grid."""
 STRIP_HEIGHT = 60
 MARGIN = 10
 # A reached goal or a drop colours the frame's edge for this many control steps, half a second.
 FLASH_STEPS = 6
-INK, SOFT, STRIP = (28, 35, 48), (110, 119, 134), (250, 251, 252)
-GREEN, RED = (0, 140, 100), (205, 70, 20)
+INK = (28, 35, 48)
+SOFT = (110, 119, 134)
+STRIP = (250, 251, 252)
+GREEN = (0, 140, 100)
+RED = (205, 70, 20)
 GOAL_EDGE = (89, 173, 107)
 # H.264 quality of libx264 (0 lossless, 51 worst): no visible blocks at this size, about 0.5 MB for
 # 10 s.
@@ -72,20 +77,23 @@ class Watcher:
     """Reads chosen environments of an environment after every step, and counts goals and drops."""
 
     def __init__(self, env: Any, envs: Sequence[int]):
-        self.env, self.envs = env, list(envs)
+        self.env = env
+        self.envs = list(envs)
         self.steps = 0
         self.goals = np.zeros(len(self.envs), dtype=int)
         self.drops = np.zeros(len(self.envs), dtype=int)
 
     def read(self, *, stepped: bool = True) -> list[Snapshot]:
         """The present state of the watched environments; not ``stepped`` after a reset."""
-        env, envs = self.env, self.envs
+        env = self.env
+        envs = self.envs
         success = (env.success.numpy()[envs] != 0) & stepped
         fell = (env.fell.numpy()[envs] != 0) & stepped
         self.goals += success
         self.drops += fell
         self.steps += stepped
-        q, goal = env.sim.joint_q.numpy()[envs], env.goal_quat.numpy()[envs]
+        q = env.sim.joint_q.numpy()[envs]
+        goal = env.goal_quat.numpy()[envs]
         error = env.rotation_error.numpy()[envs]
         table = env.has_table()[envs]
         if not stepped:  # what the environment holds is of the step before the reset
@@ -132,9 +140,9 @@ def drawn(
 
     def draw(snapshots: list[Snapshot]) -> np.ndarray:
         pictures = renderer.render(
-            np.stack([one.joint_q for one in snapshots]),
-            np.stack([one.goal_quat for one in snapshots]),
-            np.array([one.table for one in snapshots]),
+            np.stack([snapshot.joint_q for snapshot in snapshots]),
+            np.stack([snapshot.goal_quat for snapshot in snapshots]),
+            np.array([snapshot.table for snapshot in snapshots]),
         )
         return composer.frame(pictures, snapshots)
 
@@ -165,9 +173,7 @@ class Composer:
 
         RGB bytes [height, width, 3], both even.
         """
-        cells = [
-            self._cell(i, *pair) for i, pair in enumerate(zip(pictures, snapshots, strict=True))
-        ]
+        cells = list(map(self._cell, range(len(pictures)), pictures, snapshots))
         return _grid(cells, int(np.ceil(np.sqrt(len(cells)))))
 
     def _cell(self, index: int, picture: Picture, shot: Snapshot) -> np.ndarray:
@@ -219,13 +225,14 @@ def _font(size: int) -> Any:
 
 def _grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
     """Tile equal pictures in rows; the last row is filled with white, and the size made even."""
-    rows, (height, width, _) = -(-len(cells) // columns), cells[0].shape
+    height, width, _ = cells[0].shape
+    rows = -(-len(cells) // columns)
     tiles = np.full((rows * columns, height, width, 3), 255, np.uint8)
     tiles[: len(cells)] = cells
-    grid = (
-        tiles.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, -1, 3)
-    )
-    return np.pad(grid, [(0, size % 2) for size in grid.shape[:2]] + [(0, 0)], constant_values=255)
+    by_row = tiles.reshape(rows, columns, height, width, 3).swapaxes(1, 2)
+    grid = by_row.reshape(rows * height, columns * width, 3)
+    padding = ((0, grid.shape[0] % 2), (0, grid.shape[1] % 2), (0, 0))
+    return np.pad(grid, padding, constant_values=255)
 
 
 def write_frames(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
@@ -235,7 +242,8 @@ def write_frames(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
     """
     import imageio_ffmpeg
 
-    rest, count = iter(frames), 0
+    count = 0
+    rest = iter(frames)
     first = next(rest)
     with atomic_path(path) as temporary:
         writer = imageio_ffmpeg.write_frames(

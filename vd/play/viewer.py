@@ -17,14 +17,15 @@ import warp as wp
 from newton.viewer import ViewerViser
 
 from vd.paper import PAPER
-from vd.play.render import Camera, PictureModel
+from vd.play.render import PictureCamera, PictureModel
 from vd.play.replay import Replay
 from vd.play.session import Session
 from vd.play.video import Snapshot
 
 # Where the goal's object floats, in the camera's right and up [m]: left of the hand, for panels are
 # right.
-GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
+GHOST_RIGHT = -0.22
+GHOST_HEIGHT = 0.12
 # The viewer's camera stands this much farther than that of videos: a browser window has panels
 # around it.
 CAMERA_DISTANCE = 1.25
@@ -59,7 +60,8 @@ class PlayViewer:
         port: int = 8080,
         verbose: bool = True,
     ):
-        self._policies, self._reopen = policies, reopen
+        self._policies = policies
+        self._reopen = reopen
         self._eye: tuple[Any, Any] | None = None
         self.viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=verbose)
         options = self.viewer._viewer_option_handles
@@ -79,7 +81,8 @@ class PlayViewer:
     def run(self, *, steps: int | None = None) -> None:
         """Step in real time until the viewer is closed, or ``steps`` control steps were made."""
         period = 1.0 / self.session.control_hz
-        done, due = 0, time.monotonic()
+        done = 0
+        due = time.monotonic()
         while self.viewer.is_running() and (steps is None or done < steps):
             done += self.update()
             due = max(
@@ -115,7 +118,7 @@ class PlayViewer:
 
     def _show(self, session: Session | Replay) -> None:
         self.session = session
-        self.camera = Camera.for_hand(session.hand)
+        self.camera = PictureCamera.for_hand(session.hand)
         self._models: dict[str, PictureModel] = {}
         x, y, _ = GHOST_RIGHT * self.camera.rotation[:, 0]
         self._ghost = float(x), float(y), GHOST_HEIGHT
@@ -150,7 +153,8 @@ class PlayViewer:
             self._eye = None
 
     def _set_camera(self) -> None:
-        eye, target = np.asarray(self.camera.eye), np.asarray(self.camera.target)
+        eye = np.asarray(self.camera.eye)
+        target = np.asarray(self.camera.target)
         forward = (target - eye) / np.linalg.norm(target - eye)
         self.viewer.set_camera(
             wp.vec3(*(target + CAMERA_DISTANCE * (eye - target))),
@@ -159,7 +163,8 @@ class PlayViewer:
         )
 
     def _build_panel(self) -> None:
-        gui, session = self.viewer.server.gui, self.session
+        gui = self.viewer.server.gui
+        session = self.session
         with gui.add_folder("Policy", order=-1.0):
             self._status = gui.add_html(status_html(session.snapshot))
             if len(self._policies) > 1:
@@ -217,15 +222,19 @@ class PlayViewer:
 
 def status_html(shot: Snapshot) -> str:
     """Error, what the policy believes of it, latency, time and counts as HTML."""
-    live = [] if shot.alike_rad is None else [f"up to symmetry {shot.alike_rad:.2f}"]
-    live += [] if shot.believed_rad is None else [f"believed {shot.believed_rad:.2f}"]
-    live += [] if shot.latency_s is None else [f"latency {1e3 * shot.latency_s:.0f} ms"]
+    details = []
+    if shot.alike_rad is not None:
+        details.append(f"up to symmetry {shot.alike_rad:.2f}")
+    if shot.believed_rad is not None:
+        details.append(f"believed {shot.believed_rad:.2f}")
+    if shot.latency_s is not None:
+        details.append(f"latency {1e3 * shot.latency_s:.0f} ms")
     color = "#12a150" if shot.error_rad <= PAPER.success.rotation_rad else "inherit"
     return (
         '<div style="padding:.2em .8em;font-variant-numeric:tabular-nums">'
         f"<b>{escape(shot.name)}</b>"
         f'<div style="font-size:1.5em;color:{color}">{shot.error_rad:.2f} rad</div>'
-        f"<div>{' &middot; '.join(live)}</div>"
+        f"<div>{' &middot; '.join(details)}</div>"
         f'<div style="opacity:.75">{shot.time_s:.1f} s &middot; goals reached {shot.goals}'
         f" &middot; drops {shot.drops}</div></div>"
     )

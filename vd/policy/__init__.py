@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
-SUFFIX, ONNX_SUFFIX = ".safetensors", ".onnx"
-"""How names of policies end, and of what :mod:`vd.policy.onnx` runs."""
+SUFFIX = ".safetensors"
+"""How names of policies end."""
+ONNX_SUFFIX = ".onnx"
+"""How names end of what :mod:`vd.policy.onnx` runs."""
 
 
 def has_suffix(path: str | Path, suffix: str) -> bool:

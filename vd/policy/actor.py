@@ -47,7 +47,8 @@ class MeanAction(nn.Module):
     def __init__(self, spec: PolicySpec, weights: dict[str, torch.Tensor]) -> None:
         super().__init__()
         self.num_actions = spec.num_actions
-        offset, scale = torch.zeros(1, spec.num_observations), torch.ones(1, spec.num_observations)
+        offset = torch.zeros(1, spec.num_observations)
+        scale = torch.ones(1, spec.num_observations)
         if spec.normalise_observations:
             offset = weights["obs_normalizer._mean"].clone()
             scale = weights["obs_normalizer._std"] + _NORMALISER_EPSILON
@@ -89,7 +90,9 @@ class TrainedPolicy(Contracted):
         critic: dict[str, torch.Tensor] | None = None,
         device: str = "cpu",
     ) -> None:
-        self.contract, self.weights, self.critic = contract, weights, critic or {}
+        self.contract = contract
+        self.weights = weights
+        self.critic = critic or {}
         self.network = MeanAction(contract.network, weights).to(device)
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
@@ -115,7 +118,8 @@ class BuiltIn:
     """
 
     def __init__(self, name: str, num_actions: int, *, seed: int = 0, device: str = "cpu") -> None:
-        self.num_actions, self._still = num_actions, name == "zero"
+        self.num_actions = num_actions
+        self._still = name == "zero"
         self._generator = torch.Generator(device=device).manual_seed(seed)
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
@@ -145,9 +149,9 @@ def read_state(
         raise FileNotFoundError(f"there is no file {path}; {remedy}") from error
     except Exception as error:
         raise ValueError(f"{path} {_damage(path, error)}; {remedy}") from error
-    found = state.get("format") if isinstance(state, dict) else None
-    if found != wanted:
-        raise ValueError(f"{path}: format is {found!r}, not {wanted!r}; {remedy}")
+    version = state.get("format") if isinstance(state, dict) else None
+    if version != wanted:
+        raise ValueError(f"{path}: format is {version!r}, not {wanted!r}; {remedy}")
     for part, weights in state.items():
         if str(part).endswith(_WEIGHTS) and not all(_tensors_finite(weights)):
             raise ValueError(f"{path} is damaged: {part} has weights that are not finite; {remedy}")

@@ -1,6 +1,5 @@
 """Reading and writing policies. Reading one executes nothing in it."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from vd.policy.contract import (
     UNSEALED,
     Contract,
     ContractError,
-    contract_of,
+    contract_in,
     contract_text,
     read_sealed,
     sealed,
@@ -23,8 +22,10 @@ from vd.policy.contract import (
 from vd.tracking.policy import TrackingPolicy
 from vd.vision.saved import alignment_network
 
-STATES, GOLDEN_POINTS = 8, 500
-"""Golden observations of a teacher or pairs of clouds, and points of each cloud."""
+STATES = 8
+"""Golden observations of a teacher, or pairs of clouds."""
+GOLDEN_POINTS = 500
+"""Points of each cloud."""
 GOLDEN_M = 0.03
 """Standard deviation of the golden points of a network of alignment [m]: about that of an
 object's.
@@ -75,7 +76,7 @@ def read_contract(path: str | Path) -> Contract:
         FileNotFoundError: There is no such file.
         ContractError: It is damaged, no policy, or of another version.
     """
-    return _contract_in(read_sealed(Path(path)), path)
+    return contract_in(read_sealed(Path(path)), path)
 
 
 def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
@@ -93,7 +94,7 @@ def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
     if not has_suffix(path, SUFFIX):
         return teacher_in(read_state(path, device, remedy=REMEDY), path, device)
     data = read_sealed(Path(path))
-    contract = _contract_in(data, path)
+    contract = contract_in(data, path)
     tensors = load(data)
     golden = _part(tensors, "golden.")
     try:
@@ -114,22 +115,16 @@ def read_policy(path: str | Path, device: str = "cpu") -> AnyPolicy:
     return policy
 
 
-def _contract_in(data: bytes, where: str | Path) -> Contract:
-    """The contract among the metadata of a safetensors file."""
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + length])
-    return contract_of(header["__metadata__"][CONTRACT_KEY], where)
-
-
 def _policy_of(contract: Contract, tensors: Tensors, device: str) -> AnyPolicy:
     """The policy of a contract with weights."""
-    own = {name: value.to(device) for name, value in tensors.items()}
-    teacher = TrainedPolicy(contract, _part(own, "actor."), _part(own, "critic."), device)
+    on_device = {name: value.to(device) for name, value in tensors.items()}
+    actor = _part(on_device, "actor.")
+    teacher = TrainedPolicy(contract, actor, _part(on_device, "critic."), device)
     if contract.tracking is None:
         return teacher
     alignment = None
     if contract.tracking.alignment is not None:
-        weights = _part(own, "alignment.")
+        weights = _part(on_device, "alignment.")
         alignment = alignment_network(contract.tracking.alignment, weights, device)
     return TrackingPolicy(teacher, contract, alignment)
 

@@ -25,10 +25,13 @@ from vd.vision.cfg import AlignmentCfg
 POLICY_FORMAT = "visual-dexterity policy 1"
 CONTRACT_KEY = "contract"
 """Key of the contract, in JSON, among the metadata of a policy's file."""
-SEAL_KEY, UNSEALED = "seal", b"-" * 64
-"""Name of what stands last in a policy's file, and what it is before the file is sealed."""
-RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-4, 1e-5
-"""Differences of numbers that are no difference: a hand that was measured again differs by more."""
+SEAL_KEY = "seal"
+"""Name of what stands last in a policy's file."""
+UNSEALED = b"-" * 64
+"""What it is before the file is sealed."""
+# Differences of numbers that are no difference: a hand that was measured again differs by more.
+RELATIVE_TOLERANCE = 1e-4
+ABSOLUTE_TOLERANCE = 1e-5
 CONVENTIONS = {
     "units": "m, rad, s, kg, N",
     "quaternion": "xyzw",
@@ -160,6 +163,34 @@ def contract_of(text: str, where: str | Path) -> Contract:
     return contract
 
 
+def contract_in(data: bytes, where: str | Path) -> Contract:
+    """The contract in the content of a policy's file, or in its begin up to the first weights.
+
+    Raises:
+        ContractError: There is none, or it is of another format.
+    """
+    length = int.from_bytes(data[:8], "little")
+    try:
+        header = json.loads(data[8 : 8 + length])
+        text = header["__metadata__"][CONTRACT_KEY]
+    except (ValueError, TypeError, KeyError) as error:
+        raise ContractError(f"{where} is damaged, or no policy; copy it again") from error
+    return contract_of(text, where)
+
+
+def installed_contract(path: Path) -> Contract:
+    """What a policy's file says of it; its weights are not read.
+
+    Raises:
+        OSError: It cannot be read.
+        ContractError: It is damaged, no policy, or of another version.
+    """
+    with path.open("rb") as file:
+        length = file.read(8)
+        header = file.read(int.from_bytes(length, "little"))
+    return contract_in(length + header, path)
+
+
 def without_folders(contract: Contract) -> Contract:
     """A contract for others: without folders of the machine on which the policy was trained."""
     objects = [Path(name).name for name in contract.task.get("objects", ())]
@@ -221,8 +252,8 @@ def derive_interface(
         "observation": _observation(hand, task),
         "camera": None if tracking is None else _camera(hand, tracking),
     }
-    found: dict[str, Any] = to_dict(parts)
-    return found
+    interface: dict[str, Any] = to_dict(parts)
+    return interface
 
 
 def _hand(hand: HandModel) -> dict[str, Any]:
@@ -244,26 +275,27 @@ def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
 
     Tracking and vision policies make it of joints and camera.
     """
-    seen = task.observation
+    observation = task.observation
     slices = teacher_observation_slices(hand.num_fingers, hand.num_joints)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}
-    if seen.shape != "none":
+    if observation.shape != "none":
         end = slices["previous_action"].stop
         parts["shape"] = (end, end + shape_observation_size(hand.num_fingers))
-    if seen.terms:
+    if observation.terms:
         end = max(last for _, last in parts.values())
-        parts["terms"] = (end, end + sum(seen.terms.values()))
+        parts["terms"] = (end, end + sum(observation.terms.values()))
     return {
         "parts": parts,  # first column and the one after the last
         "velocity_scale": PAPER.observation.velocity_scale,  # of joints, and of the object's turning
-        "view": seen.view,
-        "file_axes": seen.file_axes,
+        "view": observation.view,
+        "file_axes": observation.file_axes,
     }
 
 
 def _camera(hand: HandModel, tracking: TrackingSpec) -> dict[str, Any]:
     """The depth camera: the one of the hand's USD, or one that the training placed elsewhere."""
-    camera, depth = hand.camera.at(tracking.camera), tracking.depth
+    camera = hand.camera.at(tracking.camera)
+    depth = tracking.depth
     return {
         "source": "hand" if tracking.camera is None else "policy",
         **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
@@ -303,7 +335,8 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
     have = dict(leaves(derive_interface(task, hand, contract.tracking)))
     want = dict(leaves(contract.interface))
     for name in dict.fromkeys((*want, *have)):
-        here, there = have.get(name), want.get(name)
+        here = have.get(name)
+        there = want.get(name)
         if not _same(here, there):
             raise ContractError(
                 f"{where} does not fit the hand {hand.name} ({hand.path}): {name} is "
@@ -312,11 +345,11 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
             )
 
 
-def _same(found: Any, wanted: Any) -> bool:
+def _same(here: Any, wanted: Any) -> bool:
     """Whether two plain values are equal, numbers but for rounding."""
-    if isinstance(found, float) and isinstance(wanted, float):
-        return math.isclose(found, wanted, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE)
-    return bool(found == wanted)
+    if isinstance(here, float) and isinstance(wanted, float):
+        return math.isclose(here, wanted, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE)
+    return bool(here == wanted)
 
 
 def _short(value: Any) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 from trimesh.util import append_faces
 
-from vd.assets_usd.hand_visuals import read_surfaces
+from vd.assets_usd.hand_model import read_surfaces
 from vd.assets_usd.objects.geometry import Surface
 from vd.sim.scene import Scene
 

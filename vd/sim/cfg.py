@@ -110,8 +110,7 @@ COARSE_ITERATIONS = 4
 def coarser(cfg: SimCfg) -> SimCfg:
     """Cheaper physics to learn in, which trained policies cannot tell from the default.
 
-    Measured in docs/lessons.md, "Physics and speed". The contacts' time constant stays
-    two physics steps. What is coarser already stays as it is.
+    The contacts' time constant stays two physics steps. What is coarser already stays as it is.
 
     Args:
         cfg: Physics of the task.

@@ -51,12 +51,25 @@ def simulate_hand(
         trajectories one after the other, shape [M, S, J].
     """
     models = np.asarray(rows, dtype=float)
-    lengths = [len(trajectory.time) for trajectory in recording.trajectories]
+    count = len(recording.trajectories)
     replay = _Replay(recording, hand, len(models), dt, device)
-    positions = replay.run(np.repeat(models, len(lengths), axis=0))
-    positions = positions.reshape(len(models), len(lengths), -1, hand.num_joints)
-    answers = np.concatenate([positions[:, k, :length] for k, length in enumerate(lengths)], axis=1)
-    return answers[..., [hand.joint_names.index(name) for name in recording.joints]]
+    positions = replay.run(np.repeat(models, count, axis=0))
+    positions = positions.reshape(len(models), count, -1, hand.num_joints)
+    answers = []
+    for k, trajectory in enumerate(recording.trajectories):
+        answers.append(positions[:, k, : len(trajectory.time)])
+    columns = [hand.joint_names.index(name) for name in recording.joints]
+    return np.concatenate(answers, axis=1)[..., columns]
+
+
+def _power(recording: Recording) -> np.ndarray:
+    """Share of the largest P gain with which each sample is driven, 0 without torque [S, J]."""
+    gains = [float(t.conditions.get("p_gain", 0.0)) for t in recording.trajectories]
+    power = []
+    for t, gain in zip(recording.trajectories, gains, strict=True):
+        share = gain / max(gains) if gain > 0.0 else 1.0
+        power.append(t.enabled * share)
+    return np.concatenate(power)
 
 
 class _Replay:
@@ -66,53 +79,60 @@ class _Replay:
     """
 
     def __init__(self, recording: Recording, hand: HandModel, models: int, dt: float, device: str):
-        self.hand, self.dt, self.device = hand, dt, device
-        self.shape = w, d = models * len(recording.trajectories), hand.num_joints
-
-        def zeros(*shape: int, dtype: Any = float) -> wp.array:
-            return wp.zeros(shape, dtype=dtype, device=device)
-
+        self.hand = hand
+        self.dt = dt
+        self.device = device
+        worlds = models * len(recording.trajectories)
+        self.shape = (worlds, hand.num_joints)
         self._load(recording, models)
         self._build()
-        self.positions = zeros(w, max(len(t.time) for t in recording.trajectories), d)
-        self._step = zeros(1, dtype=wp.int32)
-        self._write, self._read, self._due_step = (zeros(w, d, dtype=wp.int32) for _ in range(3))
-        self._due_fraction, self._held, self._held_power = (zeros(w, d) for _ in range(3))
+        most = max(len(t.time) for t in recording.trajectories)
+        self.positions = wp.zeros((worlds, most, hand.num_joints), dtype=float, device=device)
+        self._step = wp.zeros(1, dtype=wp.int32, device=device)
+        # Of every joint the next sample to command and to write, and what is commanded now.
+        self._write = wp.zeros(self.shape, dtype=wp.int32, device=device)
+        self._read = wp.zeros(self.shape, dtype=wp.int32, device=device)
+        self._due_step = wp.zeros(self.shape, dtype=wp.int32, device=device)
+        self._due_fraction = wp.zeros(self.shape, dtype=float, device=device)
+        self._held = wp.zeros(self.shape, dtype=float, device=device)
+        self._held_power = wp.zeros(self.shape, dtype=float, device=device)
 
     def _load(self, recording: Recording, models: int) -> None:
         """Put the trajectories on the device, one after the other."""
-        trajectories, names = recording.trajectories, list(recording.joints)
-        lengths = [len(t.time) for t in trajectories]
-        first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-        gains = [float(t.conditions.get("p_gain", 0.0)) for t in trajectories]
-        shares = [gain / max(gains) if gain > 0.0 else 1.0 for gain in gains]
-        power = np.concatenate(
-            [t.enabled * share for t, share in zip(trajectories, shares, strict=True)]
-        )
+        trajectories = recording.trajectories
+        lengths = np.array([len(t.time) for t in trajectories])
+        first = np.cumsum(lengths) - lengths
         command = np.concatenate([t.command for t in trajectories])
+        position = np.concatenate([t.position for t in trajectories])
+        power = _power(recording)
+        names = recording.joints
         column = np.array([names.index(n) if n in names else -1 for n in self.hand.joint_names])
         self.duration = max(t.duration for t in trajectories)
+        self._recorded = column >= 0
 
         def array(values: np.ndarray, dtype: Any = float) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
         def start(values: np.ndarray, idle: np.ndarray | float) -> np.ndarray:
             """Of every joint at the first samples [W, D]; rest where nothing is recorded."""
-            return np.tile(np.where(column >= 0, values[first][:, column], idle), (models, 1))
+            return np.tile(np.where(self._recorded, values[first][:, column], idle), (models, 1))
 
         centre = np.clip(0.0, self.hand.lower, self.hand.upper)
-        self._start = start(np.concatenate([t.position for t in trajectories]), centre)
-        self._start_command, self._start_power = start(command, centre), start(power, 1.0)
-        self._recorded = column >= 0
-        self._samples, self._tracks = Samples(), Tracks()
-        for prefix, times in (
-            ("", [t.time for t in trajectories]),
-            ("sent_", [t.sent for t in trajectories]),
-        ):
-            step, fraction = np.divmod(np.concatenate(times) / self.dt, 1.0)
-            setattr(self._samples, f"{prefix}step", array(step, int))
-            setattr(self._samples, f"{prefix}fraction", array(fraction))
-        self._samples.command, self._samples.power = array(command), array(power)
+        self._start = start(position, centre)
+        self._start_command = start(command, centre)
+        self._start_power = start(power, 1.0)
+        step, fraction = np.divmod(np.concatenate([t.time for t in trajectories]) / self.dt, 1.0)
+        sent_step, sent_fraction = np.divmod(
+            np.concatenate([t.sent for t in trajectories]) / self.dt, 1.0
+        )
+        self._samples = Samples()
+        self._samples.step = array(step, int)
+        self._samples.fraction = array(fraction)
+        self._samples.sent_step = array(sent_step, int)
+        self._samples.sent_fraction = array(sent_fraction)
+        self._samples.command = array(command)
+        self._samples.power = array(power)
+        self._tracks = Tracks()
         self._tracks.column = array(column, int)
         self._tracks.first = array(np.tile(first, models), int)
         self._tracks.last = array(np.tile(first + lengths, models), int)
@@ -123,24 +143,24 @@ class _Replay:
 
         Its limit, friction, and whom it follows.
         """
-        w, d = self.shape
+        worlds, joints = self.shape
         cfg = dataclasses.replace(
             SimCfg(),
             physics_hz=1.0 / self.dt,
             control_hz=0.5 / self.dt,
             contact_time_constant_s=max(SimCfg().contact_time_constant_s, 2.0 * self.dt),
-            njmax=3 * d,
+            njmax=3 * joints,
             nconmax=4,  # the solver wants room for some even if there are none
         )
         scene = new_builder()
-        scene.replicate(build_hand(self.hand, cfg, visuals=False), w)
+        scene.replicate(build_hand(self.hand, cfg, visuals=False), worlds)
         self.model = scene.finalize(device=self.device)
         self.solver = make_solver(self.model, cfg)
         self.solver.mjw_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self.control = self.model.control()
-        self._states = self.model.state(), self.model.state()
-        self._q = [s.joint_q.reshape((w, -1)) for s in self._states]
-        self._qd = [s.joint_qd.reshape((w, -1)) for s in self._states]
+        self._states = (self.model.state(), self.model.state())
+        self._q = [state.joint_q.reshape((worlds, -1)) for state in self._states]
+        self._qd = [state.joint_qd.reshape((worlds, -1)) for state in self._states]
         self.servo = JointServo(
             self.solver,
             self.control,
@@ -172,22 +192,34 @@ class _Replay:
         )
         if rows[..., BACKLASH_WIDTH].any():
             load = wp.array(self._gravity(start), dtype=float, device=self.device)
-            servo = [self.servo.parameters, self.servo.first]
-            inputs = [*servo, self._held, self._held_power, load, self._q[0]]
-            launch(rest_play_kernel, self.shape, inputs, [self.servo.state])
+            launch(
+                rest_play_kernel,
+                self.shape,
+                [
+                    self.servo.parameters,
+                    self.servo.first,
+                    self._held,
+                    self._held_power,
+                    load,
+                    self._q[0],
+                ],
+                [self.servo.state],
+            )
         first = np.repeat(self._tracks.first.numpy()[:, None], self.shape[1], axis=1)
         self._write.assign(first)
         self._read.assign(first)
         self._launch_steps()  # loads every kernel, which a capture cannot
         with wp.ScopedCapture(device=self.device) as capture:  # a tenth of the time, on a CPU too
             self._launch_steps()
-        for _ in range(math.ceil(0.5 * (math.ceil(self.duration / self.dt) + 1)) - 1):
+        steps = math.ceil(self.duration / self.dt) + 1
+        for _ in range(math.ceil(0.5 * steps) - 1):
             wp.capture_launch(capture.graph)
         return self.positions.numpy().astype(float)
 
     def _gravity(self, q: np.ndarray) -> np.ndarray:
         """Torques of gravity on the joints [N m], shape [W, D], at positions [W, D] [rad]."""
-        data, load = mujoco.MjData(self.solver.mj_model), np.empty_like(q)
+        data = mujoco.MjData(self.solver.mj_model)
+        load = np.empty_like(q)
         for i, place in enumerate(q):
             data.qpos[: q.shape[1]] = place
             mujoco.mj_forward(self.solver.mj_model, data)
@@ -197,14 +229,41 @@ class _Replay:
     def _launch_steps(self) -> None:
         """Two steps: states are swapped every step."""
         servo = self.servo
-        given = [servo.parameters, self._samples, self._tracks, self.dt, self._step]
-        commands = [self._write, self._due_step, self._due_fraction, self._held, self._held_power]
         for here, there in ((0, 1), (1, 0)):
-            inputs = [*given, *commands, servo.state]
-            launch(replay_command_kernel, self.shape, inputs, [servo.reference, servo.power])
+            launch(
+                replay_command_kernel,
+                self.shape,
+                [
+                    servo.parameters,
+                    self._samples,
+                    self._tracks,
+                    self.dt,
+                    self._step,
+                    self._write,
+                    self._due_step,
+                    self._due_fraction,
+                    self._held,
+                    self._held_power,
+                    servo.state,
+                ],
+                [servo.reference, servo.power],
+            )
             servo.drive(self._q[here], self._qd[here])
             self.solver.step(self._states[here], self._states[there], self.control, None, self.dt)
             servo.finish(self._q[here], self._q[there], self._qd[there])
-            inputs = [*given, self._q[here], self._q[there], self._read]
-            launch(sample_position_kernel, self.shape, inputs, [self.positions])
+            launch(
+                sample_position_kernel,
+                self.shape,
+                [
+                    servo.parameters,
+                    self._samples,
+                    self._tracks,
+                    self.dt,
+                    self._step,
+                    self._q[here],
+                    self._q[there],
+                    self._read,
+                ],
+                [self.positions],
+            )
             launch(count_kernel, 1, [], [self._step])

@@ -1,6 +1,6 @@
-"""Agents by name or file, and the task they act in: shared by vd-eval and vd-play."""
+"""Agents by name or file, and the task they act in: shared by all commands that let a policy act."""
 
-import json
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -23,24 +23,32 @@ if TYPE_CHECKING:
 
 BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
-
 POLICY_FOLDER = Path(__file__).parents[1] / "policies"
-"""Policies of the package, and POLICY_LIST. A wheel has two of them, a checkout all."""
-POLICY_LIST = "policies.json"
-"""Tells of the policies of a folder (:mod:`vd.policy.store`), in a wheel also of those that it
-lacks.
-"""
+"""Policies of the package. A wheel has two of them, a checkout all."""
 SHIPPED_POLICIES = {path.stem: path for path in sorted(POLICY_FOLDER.glob(f"*{SUFFIX}"))}
 """Trained policies that are installed with the package, by name: ``<hand>`` or
 ``<hand>-<task>``.
 """
-
 DEFAULT_POLICY = "dclaw4"
 DEFAULT_HAND = "dclaw4"
 NO_LAYER = "none"
 """What --hand-layer is to be for the hand as it is, whatever the training."""
 # What a run's folder holds, best first.
 _RUN_FILES = (f"policy{SUFFIX}", "checkpoints/best.pt")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+def check_name(name: str) -> None:
+    """Refuse what cannot be a policy's name, such as a path.
+
+    Raises:
+        ValueError: It cannot.
+    """
+    if not _NAME.fullmatch(name) or name in BUILT_IN or name.endswith(SUFFIX):
+        raise ValueError(
+            f"{name!r} is no name of a policy: letters, digits, and . _ - between them; no {SUFFIX} "
+            f"at its end"
+        )
 
 
 def pulled_folder() -> Path:
@@ -49,9 +57,42 @@ def pulled_folder() -> Path:
 
 
 def installed_policies() -> dict[str, Path]:
-    """Policies by name: those of the package, and those that were pulled."""
-    pulled = {path.stem: path for path in sorted(pulled_folder().glob(f"[!.]*{SUFFIX}"))}
-    return pulled | SHIPPED_POLICIES
+    """Files of policies by name: those of the package, and those that were pulled."""
+    pulled = {path.stem: path for path in pulled_folder().glob(f"[!.]*{SUFFIX}")}
+    return dict(sorted((pulled | SHIPPED_POLICIES).items()))
+
+
+def default_policy(hand: str, *kinds: str) -> str:
+    """Name of the installed policy of a hand, of the first of these kinds that there is.
+
+    Of several of a kind that with the shortest name, which is the one for most objects.
+
+    Args:
+        hand: Name or USD of the hand.
+        kinds: ``teacher``, ``tracking`` or ``vision``.
+
+    Raises:
+        ValueError: The hand has none.
+    """
+    from vd.assets_usd.hands import root_name
+    from vd.policy.contract import installed_contract
+
+    kind_of = {}
+    for name, path in installed_policies().items():
+        contract = installed_contract(path)
+        if contract.task["hand"] == root_name(hand):
+            kind_of[name] = contract.kind
+    for kind in kinds:
+        names = [name for name in kind_of if kind_of[name] == kind]
+        if names:
+            return min(names, key=len)
+    others = "vd-policies list shows what there is"
+    if kind_of:
+        others = f"there are {', '.join(kind_of)}"
+    raise ValueError(
+        f"no {' or '.join(kinds)} policy of {hand} is installed ({others}); name a policy, or train "
+        "one with vd-train"
+    )
 
 
 def find_policy(name: str | Path) -> Path:
@@ -62,28 +103,22 @@ def find_policy(name: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: There is none.
-        ValueError: A policy of that name has to be pulled.
     """
-    installed, path = installed_policies(), Path(name)
-    bare = isinstance(name, str) and name == path.name
-    if bare and name in installed:
+    installed = installed_policies()
+    path = Path(name)
+    if isinstance(name, str) and name == path.name and name in installed:
         return installed[name]
     if path.is_file():
         return path
-    known = json.loads((POLICY_FOLDER / POLICY_LIST).read_text())["policies"]
-    if bare and not path.exists() and name in known:
-        raise ValueError(
-            f"the policy {name} is not on this machine: vd-policies pull {name} --at PLACE, such "
-            f"as the folder vd/policies of a checkout"
-        )
     if not path.is_dir():
         raise FileNotFoundError(
             f"no policy at {path}; give a policy{SUFFIX}, a file of a run's checkpoints folder, a "
-            f"run's folder, or the name of an installed policy: {', '.join(installed)}"
+            f"run's folder, or the name of an installed policy: {', '.join(installed)}; "
+            "vd-policies pull NAME --at PLACE fetches others"
         )
-    for candidate in _RUN_FILES:
-        if (path / candidate).is_file():
-            return path / candidate
+    for file in _RUN_FILES:
+        if (path / file).is_file():
+            return path / file
     raise FileNotFoundError(
         f"{path} holds no {' or '.join(_RUN_FILES)}; give a policy{SUFFIX} or a checkpoint"
     )
@@ -108,14 +143,12 @@ def policy_at(path: Path) -> str:
 
 
 def policy_name(name: str | Path) -> str:
-    """``name`` as it is told to others.
-
-    The name of an installed policy if it is the file of one.
-    """
+    """The name of the installed policy whose file ``name`` is, or else ``name`` itself."""
     path = Path(name).resolve()
-    return next(
-        (known for known, file in installed_policies().items() if file.resolve() == path), str(name)
-    )
+    for installed, file in installed_policies().items():
+        if file.resolve() == path:
+            return installed
+    return str(name)
 
 
 def open_policy(name: str | Path, device: str) -> "TrainedPolicy | TrackingPolicy | None":
@@ -173,25 +206,27 @@ def check_fits(
     from vd.assets_usd.hands import load_hand
     from vd.policy.contract import check_hand
 
-    own = ReorientCfg.of(policy)
-    task = _on_hand(own, hand, hand_layer)
-    load_hand(task.hand, task.fingertip, task.hand_layer)
+    trained_in = ReorientCfg.of(policy)
+    task = _on_hand(trained_in, hand, hand_layer)
+    load_hand(task.hand, task.fingertip, task.hand_layer)  # the layer can be read
     model = load_hand(task.hand, task.fingertip)
-    trained = policy.contract.interface["hand"]["name"]
-    if trained != model.name:
+    trained_hand = policy.contract.interface["hand"]["name"]
+    if trained_hand != model.name:
         raise ValueError(
-            f"{name} was trained for {trained} ({policy.num_actions} motors), not for {model.name} "
-            f"({len(model.actuated)}); use the hand it was trained for: --hand {own.hand}"
+            f"{name} was trained for {trained_hand} ({policy.num_actions} motors), not for "
+            f"{model.name} ({len(model.actuated)}); use the hand it was trained for: "
+            f"--hand {trained_in.hand}"
         )
     check_hand(policy.contract, model, name)
 
 
 def _on_hand(task: ReorientCfg, hand: str | None, hand_layer: str | None) -> ReorientCfg:
     """A task with the hand and layer that were asked for; None: as trained."""
-    layer = (
-        task.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer
-    )
-    return replace(task, hand=hand or task.hand, hand_layer=layer)
+    if hand is not None:
+        task = replace(task, hand=hand)
+    if hand_layer is not None:
+        task = replace(task, hand_layer=None if hand_layer == NO_LAYER else hand_layer)
+    return task
 
 
 def task_for(
@@ -222,24 +257,23 @@ def task_for(
         condition: What is drawn, in place of ``randomised`` (:mod:`vd.evaluate.conditions`).
         settings: Other fields of the task.
     """
-    base = ReorientCfg.of(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
-    if sees_clouds(policy):  # who does not look at its teacher's observation
-        base = replace(base, observation=ObservationCfg())
-    seen = replace(
-        base.observation, dynamics="none", critic_terms={}
-    )  # nobody asks the critic here
-    base = replace(
-        base, observation=seen, reward=replace(base.reward, terms={})
-    )  # and nobody is paid
+    task = ReorientCfg(hand=DEFAULT_HAND) if policy is None else ReorientCfg.of(policy)
+    observation = task.observation
+    if sees_clouds(policy):  # its teacher's observation is not read
+        observation = ObservationCfg()
+    # Neither the critic nor the reward is asked for.
+    observation = replace(observation, dynamics="none", critic_terms={})
+    task = replace(task, observation=observation, reward=replace(task.reward, terms={}))
+    task = _on_hand(task, hand, hand_layer)
+    if at_rest is not None:
+        task = replace(task, start=replace(task.start, at_rest=at_rest))
+    if max_goal_angle_rad is not None:
+        task = replace(task, goal=replace(task.goal, max_angle_rad=max_goal_angle_rad))
     return replace(
-        _on_hand(base, hand, hand_layer),
+        task,
         success=replace(SuccessCfg(), rotation_rad=stop_tolerance_rad),
-        start=base.start if at_rest is None else replace(base.start, at_rest=at_rest),
-        goal=base.goal
-        if max_goal_angle_rad is None
-        else replace(base.goal, max_angle_rad=max_goal_angle_rad),
         curriculum=CurriculumCfg(),
         table=TableCfg(),
-        randomisation=condition or replace(base.randomisation, enabled=randomised),
+        randomisation=condition or replace(task.randomisation, enabled=randomised),
         **settings,
     )

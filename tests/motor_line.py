@@ -2,7 +2,7 @@
 
 Bytes of a program in, bytes of the motors out, and what they move goes on.
 
-:mod:`vd.deploy.twin.twin` puts a pseudo-terminal and the computer's clock around it. Faults can be
+:mod:`motor_terminal` puts a pseudo-terminal and the computer's clock around it. Faults can be
 injected.
 """
 
@@ -13,8 +13,8 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from vd.deploy.clock import MONOTONIC, Clock
-from vd.deploy.hardware.packets import (
+from motor_model import Motor
+from motor_packets import (
     BROADCAST,
     Failure,
     Instruction,
@@ -23,8 +23,9 @@ from vd.deploy.hardware.packets import (
     encode,
     status,
 )
-from vd.deploy.twin.motor import Motor
-from vd.deploy.twin.plant import FirstOrderPlant, Plant
+from motor_plant import FirstOrderPlant, Plant
+
+from vd.deploy.clock import MONOTONIC, Clock
 
 RETURN_DELAY_UNIT_S = 2e-6
 SILENCE_S = 0.01

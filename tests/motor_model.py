@@ -4,6 +4,10 @@ Its control table, what can be written when, how it drives and protects itself.
 """
 
 import math
+from dataclasses import dataclass
+
+from motor_packets import ALERT, Failure
+from motor_plant import Drive
 
 from vd.deploy.hardware.control_table import (
     COUNTS_PER_TURN,
@@ -13,17 +17,17 @@ from vd.deploy.hardware.control_table import (
     RAD_S_PER_COUNT,
     SIZE,
     TICK_MODULUS,
+    WATCHDOG_FIRMWARE,
     WATCHDOG_TRIPPED,
     WATCHDOG_UNIT_S,
     HardwareError,
     Model,
-    table,
     to_angle,
     to_counts,
 )
-from vd.deploy.hardware.joints import Joints
-from vd.deploy.hardware.packets import ALERT, Failure
-from vd.deploy.twin.plant import Drive
+from vd.deploy.hardware.joints import JointMotors
+
+FULL_PWM = 885
 
 OVERLOAD_SHARE, OVERLOAD_S = 0.9, 1.0
 """A motor that gives this share of its largest torque for this long has an overload; the real rule
@@ -46,6 +50,101 @@ MODE_ITEMS = (
 )
 """What another operating mode brings back to its initial value."""
 GOALS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
+
+
+@dataclass(frozen=True)
+class Item:
+    """One entry of the control table."""
+
+    address: int
+    size: int
+    """Bytes, little-endian."""
+    writable: bool = True
+    initial: int = 0
+    low: int | None = None
+    """Least value that can be written; None asks nothing."""
+    high: int | None = None
+
+    @property
+    def signed(self) -> bool:
+        """Whether negative numbers are two's complement."""
+        return self.low is None or self.low < 0
+
+    def to_bytes(self, value: int) -> bytes:
+        """Little-endian bytes of a value."""
+        return (value & ((1 << (8 * self.size)) - 1)).to_bytes(self.size, "little")
+
+    def from_bytes(self, data: bytes) -> int:
+        """The value of ``size`` bytes."""
+        return int.from_bytes(data, "little", signed=self.signed)
+
+    def within(self, data: bytes, first: int = 0) -> int:
+        """Its value in bytes of the control table from the address ``first`` on."""
+        start = self.address - first
+        return self.from_bytes(data[start : start + self.size])
+
+
+def table(model: Model) -> dict[str, Item]:
+    """The control table of a motor, by item, as the e-manual has it: written anew, not the driver's."""
+    low_v, high_v = model.volts
+    gain = {"low": 0, "high": 16383}
+    items = {
+        "model_number": Item(0, 2, False, model.number, 0),
+        "model_information": Item(2, 4, False, 0, 0),
+        "firmware_version": Item(6, 1, False, WATCHDOG_FIRMWARE, 0),
+        "id": Item(7, 1, True, 1, 0, 252),
+        "baud_rate": Item(8, 1, True, 1, 0, 7),
+        "return_delay_time": Item(9, 1, True, 250, 0, 254),
+        "drive_mode": Item(10, 1, True, 0, 0, 5),
+        "operating_mode": Item(11, 1, True, POSITION_MODE, 0, 16),
+        "secondary_id": Item(12, 1, True, 255, 0, 255),
+        "protocol_type": Item(13, 1, True, 2, 1, 2),
+        "homing_offset": Item(20, 4, True, 0, -1_044_479, 1_044_479),
+        "moving_threshold": Item(24, 4, True, 10, 0, 1023),
+        "temperature_limit": Item(31, 1, True, model.temperature_limit, 0, 100),
+        "max_voltage_limit": Item(32, 2, True, high_v, low_v, high_v),
+        "min_voltage_limit": Item(34, 2, True, low_v, low_v, high_v),
+        "pwm_limit": Item(36, 2, True, FULL_PWM, 0, FULL_PWM),
+        "current_limit": Item(38, 2, True, model.current_limit, 0, model.current_limit),
+        "velocity_limit": Item(44, 4, True, model.velocity_limit, 0, model.velocity_most),
+        "max_position_limit": Item(48, 4, True, 4095, 0, 4095),
+        "min_position_limit": Item(52, 4, True, 0, 0, 4095),
+        "startup_configuration": Item(60, 1, True, 0, 0, 3),
+        "shutdown": Item(63, 1, True, 0b110100, 0, 255),
+        "torque_enable": Item(64, 1, True, 0, 0, 1),
+        "led": Item(65, 1, True, 0, 0, 1),
+        "status_return_level": Item(68, 1, True, 2, 0, 2),
+        "registered_instruction": Item(69, 1, False, 0, 0),
+        "hardware_error_status": Item(70, 1, False, 0, 0),
+        "velocity_i_gain": Item(76, 2, True, 1920, **gain),
+        "velocity_p_gain": Item(78, 2, True, 100, **gain),
+        "position_d_gain": Item(80, 2, True, 0, **gain),
+        "position_i_gain": Item(82, 2, True, 0, **gain),
+        "position_p_gain": Item(84, 2, True, 800, **gain),
+        "feedforward_2nd_gain": Item(88, 2, True, 0, **gain),
+        "feedforward_1st_gain": Item(90, 2, True, 0, **gain),
+        "bus_watchdog": Item(98, 1, True, 0, WATCHDOG_TRIPPED, 127),
+        "goal_pwm": Item(100, 2, True, FULL_PWM),
+        "goal_current": Item(102, 2, True, model.current_limit),
+        "goal_velocity": Item(104, 4, True, model.velocity_limit),
+        "profile_acceleration": Item(108, 4, True, 0, 0, 32767),
+        "profile_velocity": Item(112, 4, True, 0, 0, 32767),
+        "goal_position": Item(116, 4),
+        "realtime_tick": Item(120, 2, False, 0, 0),
+        "moving": Item(122, 1, False, 0, 0),
+        "moving_status": Item(123, 1, False, 0, 0),
+        "present_pwm": Item(124, 2, False),
+        "present_current": Item(126, 2, False),
+        "present_velocity": Item(128, 4, False),
+        "present_position": Item(132, 4, False),
+        "velocity_trajectory": Item(136, 4, False),
+        "position_trajectory": Item(140, 4, False),
+        "present_input_voltage": Item(144, 2, False, round(10 * model.supply_v), 0),
+        "present_temperature": Item(146, 1, False, 30, 0),
+        "backup_ready": Item(147, 1, False, 0, 0),
+    }
+    lacking = () if model.senses_current else ("current_limit", "goal_current")
+    return {name: item for name, item in items.items() if name not in lacking}
 
 
 class Motor:
@@ -252,6 +351,6 @@ class Motor:
             self.put("goal_position", self.get("present_position"))
 
 
-def make_motors(joints: Joints) -> list[Motor]:
+def make_motors(joints: JointMotors) -> list[Motor]:
     """A hand's motors, as they come from the factory but for their IDs."""
     return [Motor(model, id) for model, id in zip(joints.models, joints.ids, strict=True)]

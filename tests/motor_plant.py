@@ -9,6 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
+from vd.assets_usd.objects.model import ObjectModel
+from vd.deploy.hardware.joints import JointMotors
+from vd.deploy.twin.newton_hand import NewtonHand
+from vd.sim.cfg import SimCfg
+
 P_GAIN_UNIT = 200.0
 """The paper's position gain, at which the simple plant has :data:`LAG_S`."""
 LAG_S = 0.1
@@ -72,3 +77,37 @@ class FirstOrderPlant:
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions, velocities and torques, each of shape [D]."""
         return self.position.copy(), self._velocity.copy(), self._torque.copy()
+
+
+class NewtonPlant(NewtonHand):
+    """The hand in Newton behind motors: its axes are theirs, in the joints' order.
+
+    A motor at the position gain of the hand's USD has the hand's stiffness, which grows with the
+    gain. In current-based mode its current limits the torque.
+    """
+
+    def __init__(
+        self, joints: JointMotors, cfg: SimCfg | None = None, item: ObjectModel | None = None
+    ):
+        self.joints = joints
+        super().__init__(joints.hand, cfg, item)
+
+    def advance(self, seconds: float, drives: Sequence[Drive] | None = None) -> None:
+        """Go on by ``seconds`` with one drive for each axis."""
+        if drives is not None:
+            motors = self.joints.motors
+            goals = [0.0 if drive.goal_rad is None else drive.goal_rad for drive in drives]
+            on = np.array([drive.goal_rad is not None for drive in drives])
+            pairs = zip(drives, motors, strict=True)
+            shares = np.array([drive.p_gain / motor.p_gain for drive, motor in pairs])
+            torques = np.array([drive.torque_limit for drive in drives]) * self.joints.gear
+            limited = np.minimum(self.hand.effort, torques)
+            effort = np.where(self.joints.capped, limited, self.hand.effort)
+            self.drive(self.joints.to_joint(np.array(goals)), on * shares, effort)
+        super().advance(seconds)
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions [rad], velocities [rad/s] and torques [N m] of the motors."""
+        q, qd, torque = super().read()
+        sign, gear = self.joints.sign, self.joints.gear
+        return self.joints.to_motor(q), sign * gear * qd, sign * torque / gear

@@ -1,4 +1,4 @@
-"""``vd-bench physics``: does the simulated contact behave as the world does?
+"""Does the simulated contact behave as the world does?
 
 Small scenes with the project's contact settings and nothing else: objects dropped on the table, a
 cube held between fingertips. SI units, world frame, z up.

@@ -1,21 +1,13 @@
-"""``vd-bench depth``: depth images and clouds per second.
-
-Hands in random poses around the reset, a different object in each block of environments near the
-table. Rates count images, each with the placing of meshes.
-"""
+"""Hands in random poses around the reset, each with an object near the table."""
 
 from typing import Any
 
 import newton
 import numpy as np
-import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
-from vd.bench.sim import seconds_per_call
-from vd.sensors.cfg import DepthCameraCfg
-from vd.sensors.depth_camera import DepthCamera
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import Scene, build_scene
 
@@ -25,18 +17,9 @@ OBJECT_HEIGHT_M = 0.05
 """Height of the objects' centres: about that of an object on the table."""
 OBJECT_SPREAD_M = 0.01
 """Standard deviation of the objects' positions, along each axis."""
-LEAST_TIME_S = 1.0
-"""Each rate is the mean over about this time, after a warm-up."""
 
 
-def captured(function: Any, device: str) -> Any:
-    """``function`` as the launch of one graph."""
-    with wp.ScopedCapture(device=device) as capture:
-        function()
-    return lambda: wp.capture_launch(capture.graph)
-
-
-def bench_scene(
+def posed_scene(
     objects: list[ObjectModel],
     envs: int,
     hand: str,
@@ -70,30 +53,3 @@ def pose(scene: Scene, state: Any, generator: np.random.Generator) -> None:
         np.concatenate([joints, position, quat], axis=1).astype(np.float32).ravel()
     )
     newton.eval_fk(scene.model, state.joint_q, state.joint_qd, state)
-
-
-def rate(envs: int, function: Any, device: str) -> float:
-    """Images per second of a function that takes one in every world; waits for the device."""
-    function()
-    once = seconds_per_call(function, 1, device)
-    calls = max(1, min(100, round(LEAST_TIME_S / once)))
-    return envs / seconds_per_call(function, calls, device)
-
-
-def measure(
-    objects: list[ObjectModel], envs: int, device: str, *, hand: str, seed: int
-) -> dict[str, Any]:
-    """Images per second of so many environments.
-
-    Returns:
-        ``envs``; ``images``: depth alone; ``clouds``: with a cloud of each image; ``points`` of a
-        cloud, mean over environments.
-    """
-    scene, state = bench_scene(objects, envs, hand, device, seed)
-    body_q = state.body_q.reshape((envs, -1))
-    row: dict[str, Any] = {"envs": envs}
-    for name, cfg in (("images", DepthCameraCfg(points=0)), ("clouds", DepthCameraCfg())):
-        ours = DepthCamera.of_scene(scene, body_q, cfg)
-        ours.capture()
-        row[name] = rate(envs, captured(ours.capture, device), device)
-    return row | {"points": float(ours.count.numpy().mean())}
