@@ -8,7 +8,7 @@ object is: by --pose, or by a twin, which tells the truth.
 
 import contextlib
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from vd.assets_usd.hand_model import HandModel
     from vd.assets_usd.objects.model import ObjectModel
+    from vd.deploy.loop.log import LogWriter
     from vd.deploy.loop.policy_runner import PolicyRunner
     from vd.deploy.pose.source import PoseSource
     from vd.deploy.twin.twin import Twin
@@ -270,16 +271,13 @@ def _pursue(
     folder: Path,
 ) -> int:
     """Preflight, way to the start, the loop, and its log in a folder; the exit status."""
-    from vd.assets_usd.camera_layer import read_camera
-    from vd.deploy.camera.check_camera import camera_findings
     from vd.deploy.clock import Pacer
-    from vd.deploy.hardware.check import open_camera, ready
+    from vd.deploy.hardware.check import ready
     from vd.deploy.loop.action import ActionFilter
-    from vd.deploy.loop.log import LogWriter
     from vd.deploy.loop.loop import NO_SYMMETRY, ControlLoop, summary
     from vd.deploy.pose.check_pose import pose_findings
     from vd.deploy.pose.follower import PoseFollower
-    from vd.deploy.ros import UNKNOWN, RosGoals
+    from vd.deploy.ros import RosGoals
 
     hand = connection.hand
     twin = connection.twin
@@ -289,15 +287,8 @@ def _pursue(
         camera: ImageSource | None = None
         looks: Iterable[Finding] = ()
         if runner.camera is not None:
-            camera = open_camera(cfg.camera, connection, runner.camera, realistic=cfg.realistic)
+            camera, looks = _camera(cfg, runner, connection)
             stack.callback(camera.close)
-            where = (
-                runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
-            )
-            runner.look_by(camera.intrinsics.seen_from(where))
-            looks = camera_findings(
-                camera, runner.camera, hand.goal_in_base, fps=cfg.camera.fps if twin is None else hz
-            )
         poses = None
         if cfg.pose is not None:
             poses = stack.enter_context(_poses(cfg, cfg.pose, connection))
@@ -307,15 +298,7 @@ def _pursue(
         question = f"The hand will pursue {len(goals)} goals{', and those it is given' * cfg.ros2}."
         ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=looks)
         description = _description(cfg, name, runner, item, goals)
-        servo = connection.joints.servo()
-        without = () if connection.ros is None else UNKNOWN
-        log = LogWriter(
-            folder, hand, description, servo=servo, truth=twin is not None, without=without
-        )
-        if cfg.log is not None and cfg.log.suffix == MCAP:
-            from vd.logs.mcap_log import McapLog
-
-            log.also_to(McapLog(cfg.log, log.run, np.asarray(hand.workspace.goal_m)))
+        log = _log(cfg, folder, connection, description)
         served = None if connection.ros is None else RosGoals(connection.ros, goals)
         if served is not None:
             log.also_to(served)
@@ -358,6 +341,42 @@ def _pursue(
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
             report(folder, steps, pacer.missed, times)
     return int(reason == "lost")
+
+
+def _camera(
+    cfg: DriveCfg, runner: "PolicyRunner", connection: Connection
+) -> tuple[ImageSource, Iterable[Finding]]:
+    """The camera, by which the policy sees from now on, and what the preflight finds of it."""
+    from vd.assets_usd.camera_layer import read_camera
+    from vd.deploy.camera.check_camera import camera_findings
+    from vd.deploy.hardware.check import open_camera
+
+    assert runner.camera is not None
+    hand = connection.hand
+    camera = open_camera(cfg.camera, connection, runner.camera, realistic=cfg.realistic)
+    where = runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
+    runner.look_by(camera.intrinsics.seen_from(where))
+    fps = cfg.camera.fps if connection.twin is None else runner.task.sim.control_hz
+    return camera, camera_findings(camera, runner.camera, hand.goal_in_base, fps=fps)
+
+
+def _log(
+    cfg: DriveCfg, folder: Path, connection: Connection, description: Mapping[str, Any]
+) -> "LogWriter":
+    """The log of a run, with its file beside it."""
+    from vd.deploy.loop.log import LogWriter
+    from vd.deploy.ros import UNKNOWN
+
+    hand = connection.hand
+    servo = connection.joints.servo()
+    without = () if connection.ros is None else UNKNOWN
+    truth = connection.twin is not None
+    log = LogWriter(folder, hand, description, servo=servo, truth=truth, without=without)
+    if cfg.log is not None and cfg.log.suffix == MCAP:
+        from vd.logs.mcap_log import McapLog
+
+        log.also_to(McapLog(cfg.log, log.run, np.asarray(hand.workspace.goal_m)))
+    return log
 
 
 def _poses(
