@@ -20,6 +20,7 @@ COMMANDS = {
     "calibrate": ("camera.calibrate", "find where the camera is, by markers on fingertips"),
     "home": ("hardware.home", "move slowly to the pose in which an episode starts"),
     "record": ("hardware.record", "record motions for vd-gap"),
+    "tags": ("pose.tag_sheet", "print a cube of tags, by which --pose tags sees it"),
     "score": ("loop.score", "the object's error at each stop, by motion capture"),
 }
 """Module of each command and what it does. A module has a function of the command's name, which takes

@@ -26,6 +26,11 @@ def from_future(time_s: float, now_s: float) -> str:
     return f"{ahead_s:.2f} s from the future: wait until the computers' clocks are set (NTP)"
 
 
+def of_unix(stamp_s: float) -> float:
+    """A time since 1970 [s] on the clock of :func:`time.monotonic` [s]."""
+    return stamp_s - time.time() + time.monotonic()
+
+
 class Clock(Protocol):
     """Tells the time, waits, and has something done beside the program."""
 

@@ -15,6 +15,7 @@ Motors stay in the care of the driver: their torque, temperature and current are
 """
 
 import contextlib
+import importlib.util
 import json
 import shlex
 import threading
@@ -278,11 +279,32 @@ def connect_ros(options: HandOptions, arguments: str = "") -> Iterator[Connectio
     Raises:
         ValueError: The hand cannot be used.
     """
+    hand = load_hand(options.hand, layer=options.hand_layer)
+    with running_node(arguments) as node:
+        yield Connection(_Joints(hand), RosHand(hand, node), ros=node)
+
+
+def need_rclpy(flag: str) -> None:
+    """Refuse a flag where there is no ROS 2.
+
+    Raises:
+        ValueError: Names flag and remedy.
+    """
+    if importlib.util.find_spec("rclpy") is None:
+        raise ValueError(f"{flag} needs rclpy: source the setup.bash of a ROS 2 for this Python")
+
+
+@contextlib.contextmanager
+def running_node(arguments: str = "") -> Iterator[Any]:
+    """A node whose messages a thread takes, while the block lasts.
+
+    Args:
+        arguments: Of ROS.
+    """
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
-    hand = load_hand(options.hand, layer=options.hand_layer)
     words = ["--ros-args", *shlex.split(arguments)]
     rclpy.init(
         args=words, signal_handler_options=SignalHandlerOptions.NO
@@ -295,11 +317,9 @@ def connect_ros(options: HandOptions, arguments: str = "") -> Iterator[Connectio
         with contextlib.suppress(ExternalShutdownException):
             executor.spin()
 
-    thread = threading.Thread(target=spin, name="ros", daemon=True)
     try:
-        bus = RosHand(hand, node)
-        thread.start()
-        yield Connection(_Joints(hand), bus, ros=node)
+        threading.Thread(target=spin, name="ros", daemon=True).start()
+        yield node
     finally:
         executor.shutdown()
         node.destroy_node()

@@ -26,6 +26,21 @@ def rotation_angle(q: wp.quat) -> float:
 
 
 @wp.func
+def rotation_vector(q: wp.quat) -> wp.vec3:
+    """Axis times angle of the rotation ``q``, at most pi long.
+
+    The same for q and -q.
+    """
+    vector = wp.vec3(q[0], q[1], q[2])
+    if q[3] < 0.0:
+        vector = -vector
+    sine = wp.length(vector)
+    if sine == 0.0:
+        return wp.vec3()
+    return 2.0 * wp.atan2(sine, wp.abs(q[3])) / sine * vector
+
+
+@wp.func
 def canonical(q: wp.quat) -> wp.quat:
     """Of ``q`` and ``-q``, the same rotation, the one whose first of w, x, y, z that is not 0 is positive."""
     first = q[3]

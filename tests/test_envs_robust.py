@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
+from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg, TrackedPoseCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.conditions import CONDITIONS, EXACT
 from vd.kernels.servo import actuators
@@ -127,6 +127,56 @@ def test_jitter_makes_the_object_older_in_each_step_by_another_time():
     assert len(np.unique(found - height[1:3])) > WORLDS, "another age in each environment and step"
 
 
+def tracked(**changes) -> RandomisationCfg:
+    """A tracker of 6 poses a second, 50 ms late, without errors."""
+    exact = {"dropped": 0.0, "jumping": 0.0, "noise": (0.0, 0.0)} | changes
+    tracker = TrackedPoseCfg(rate_hz=(6.0, 6.0), age_s=(0.05, 0.05), **exact)
+    return dataclasses.replace(EXACT, tracked_pose=tracker)
+
+
+def test_a_tracked_pose_is_a_true_one_of_the_past_and_held_until_the_next_comes():
+    """At 6 Hz every second step brings one, 50 to 133 ms old, and velocity is what it moved."""
+    present, env = make(), make(randomisation=tracked())
+    q, parts = present.num_actions, teacher_observation_slices(3, 9)
+    past: list[np.ndarray] = []
+    present.step = lambda _: present.launch_step()  # a captured graph would not call back
+    present.sim.after_physics_step = lambda joint_q, *_: past.append(
+        joint_q.numpy()[:, q : q + 3].copy()
+    )
+    run(present, 8)
+    seen = run(env, 8)["seen"]
+    heights, told = np.array(past)[..., 2], seen[..., parts["object_position"]][..., 2]
+    changed = np.abs(np.diff(told, axis=0)) > 0.0
+    assert (changed[2:].sum(axis=0) == 3).all(), "the first may still show the start"
+    assert not (changed[1:] & changed[:-1]).any()
+    np.testing.assert_array_equal(
+        seen[..., parts["joint_position"]], run(make(), 8)["seen"][..., parts["joint_position"]]
+    )
+    speeds = seen[..., parts["object_velocity"]][..., 2]
+    for world in range(WORLDS):
+        came = np.flatnonzero(changed[2:, world]) + 3  # the first one refers to the start
+        for step in came:
+            ages = 10 * step - 1 - np.flatnonzero(heights[:, world] == told[step, world])
+            assert any(6 <= age <= 16 for age in ages), f"{ages} physics steps old"
+            moved = told[step, world] - told[step - 1, world]
+            np.testing.assert_allclose(speeds[step, world], 6.0 * moved, rtol=0.01, atol=1e-4)
+
+
+def test_a_tracker_that_drops_every_pose_shows_the_start_and_has_ages_of_its_own():
+    seen = run(make(randomisation=tracked(dropped=1.0)), 4)["seen"]
+    parts = teacher_observation_slices(3, 9)
+    assert not np.ptp(seen[..., parts["object_position"]], axis=0).any()
+    assert not seen[..., parts["object_velocity"]].any()
+    both = dataclasses.replace(tracked(), observation_latency_s=(0.0, 0.1))
+    with pytest.raises(
+        ValueError, match=r"tracked_pose has ages of its own: leave observation_lat"
+    ):
+        make(randomisation=both)
+    slow = TrackedPoseCfg(rate_hz=(0.5, 30.0))
+    with pytest.raises(ValueError, match=r"tracked_pose.rate_hz is 0.5 30; it has to rise from 2"):
+        make(randomisation=dataclasses.replace(EXACT, tracked_pose=slow))
+
+
 def test_encoders_are_read_late_and_then_seen_late():
     effects = {"read_delay.delay_s": (STEP_S, STEP_S)}
     read = run(make(randomisation=dataclasses.replace(EXACT, effects=effects)), 6)["seen"]
@@ -224,9 +274,10 @@ def test_the_critic_is_told_the_present_as_it_would_be_seen_at_once_and_without_
     assert np.abs(env.observation.numpy()[:, : env.num_present] - out).max() > 0.1
 
 
-def test_a_saved_past_goes_on_exactly():
+@pytest.mark.parametrize("condition", ["mixed", "mixed-tracked"])
+def test_a_saved_past_goes_on_exactly(condition):
     changes = {
-        "randomisation": dataclasses.replace(CONDITIONS["mixed"], encoder_latency_s=(0.0, 0.02)),
+        "randomisation": dataclasses.replace(CONDITIONS[condition], encoder_latency_s=(0.0, 0.02)),
         "observation": ObservationCfg(dynamics="critic", view="goal"),
     }
     first, second = make(**changes), make(**changes)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vd.assets_usd.hand_data import Intrinsics
 from vd.deploy.camera.camera import CameraError, Frame, StaleCamera
-from vd.deploy.clock import from_future
+from vd.deploy.clock import from_future, of_unix
 
 IMAGES, LENS = "depth/image_rect_raw", "depth/camera_info"
 FIRST_S = 5.0
@@ -19,7 +19,7 @@ DEPTHS: dict[str, tuple[str, float]] = {"16UC1": ("u2", 1e-3), "32FC1": ("f4", 1
 
 def monotonic(stamp: Any) -> float:
     """A time of ROS on the clock of :func:`time.monotonic` [s]."""
-    return float(stamp.sec + 1e-9 * stamp.nanosec - time.time() + time.monotonic())
+    return of_unix(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 class RosCamera:

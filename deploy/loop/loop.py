@@ -18,6 +18,7 @@ from vd.deploy.hardware.answers import HandState
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import NOWHERE, LogWriter
 from vd.deploy.loop.policy_runner import PolicyDecision, PolicyRunner, Sensed
+from vd.deploy.pose.follower import PoseFollower
 from vd.deploy.safety.safety import SafeHand
 from vd.evaluate.statistics import symmetric_error
 from vd.paper import PAPER
@@ -61,6 +62,7 @@ class ControlLoop:
         hold_s: How long the hand holds still after each stop [s], before it goes on.
         camera: Depth camera; None: the policy needs none.
         twin: Knows the object's true state; None on a real hand.
+        follower: Knows it from outside; None: nobody tells poses.
         more: Whether more goals may come than there are; the hand is held until then.
         symmetry: Rotations that map the object to itself [K, 4], for the true error.
     """
@@ -77,6 +79,7 @@ class ControlLoop:
         hold_s: float = 1.0,
         camera: ImageSource | None = None,
         twin: "Twin | None" = None,
+        follower: PoseFollower | None = None,
         symmetry: np.ndarray = NO_SYMMETRY,
         more: Callable[[], bool] = lambda: False,
     ):
@@ -89,6 +92,7 @@ class ControlLoop:
         self._hold_s = hold_s
         self._camera = camera
         self._twin = twin
+        self._follower = follower
         self._symmetry = symmetry
         self._sight: SightWatch | None = None
         if runner.camera is not None:
@@ -191,9 +195,9 @@ class ControlLoop:
         return ended, decision.distance
 
     def _sense(self, goal: np.ndarray) -> tuple[Sensed, HandState, float]:
-        """Read the camera, then the joints.
+        """Read the camera, then the joints, then what is told from outside.
 
-        What the policy is told, all that was measured, the image's time.
+        What the policy is told, all that was measured, the image's or pose's time.
 
         Raises:
             StoppedError: The hand was stopped.
@@ -210,8 +214,14 @@ class ControlLoop:
         if depth is not None:
             fault = "" if self._sight is None else self._sight.fault(depth, state.position)
             self._safe.image_at(image_s, fault)
-        smoothed = self._actions.smoothed
-        return Sensed(state.position, state.velocity, smoothed, goal, depth, truth), state, image_s
+        object_state = truth
+        if self._follower is not None:
+            followed = self._follower.look()
+            object_state = followed.state
+            image_s = followed.time_s
+            self._safe.pose_at(followed.time_s, followed.fault)
+        joints = state.position, state.velocity, self._actions.smoothed
+        return Sensed(*joints, goal, depth, truth, object_state), state, image_s
 
     def _ended(self, decision: PolicyDecision, sensed: Sensed, *, first: bool) -> str:
         """``stopped``, ``lost``, or nothing."""
@@ -223,9 +233,11 @@ class ControlLoop:
         distance = np.array(decision.distance)
         if rule.stops(distance, np.array(np.linalg.norm(sensed.smoothed))) and not first:
             return "stopped"
-        if sensed.truth is not None:
-            away = np.linalg.norm(sensed.truth[:3] - np.array(self._safe.hand.workspace.goal_m))
-            if away > self._safe.hand.workspace.fall_m:
+        workspace = self._safe.hand.workspace
+        for known in (sensed.truth, sensed.object_state):
+            if known is None:
+                continue
+            if np.linalg.norm(known[:3] - np.array(workspace.goal_m)) > workspace.fall_m:
                 return "lost"
         return ""
 
@@ -242,9 +254,9 @@ class ControlLoop:
         """Log the step, keep its times, and now and then say how it goes."""
         truth: list[float] = []
         if sensed.truth is not None:
-            pose = sensed.truth[:7].astype(float)
-            error = symmetric_error(pose[None, 3:], sensed.goal_quat[None], self._symmetry)
-            truth = [*pose.tolist(), float(error[0])]
+            true = sensed.truth[:7].astype(float)
+            error = symmetric_error(true[None, 3:], sensed.goal_quat[None], self._symmetry)
+            truth = [*true.tolist(), float(error[0])]
         joints = {
             "command": sent,
             "position": state.position,
@@ -255,7 +267,10 @@ class ControlLoop:
             "smoothed": sensed.smoothed,
         }
         values = [number, acting, decision.distance, *vars(times).values(), self._pacer.missed]
-        found_pose = NOWHERE if decision.found is None else decision.found.tolist()
+        pose = decision.found
+        if self._follower is not None and sensed.object_state is not None:
+            pose = sensed.object_state[:7]
+        found_pose = NOWHERE if pose is None else pose.tolist()
         sent_s = self._pacer.due_s + times.sent_s
         self._log.step(state.time_s, sent_s, joints, values, truth, found_pose, sensed.depth)
         self.times.append(times)

@@ -45,7 +45,9 @@ class Sensed:
     """Depth image [m], 0 for none [H, W]."""
     truth: np.ndarray | None = None
     """True position [m], quaternion xyzw, velocity [m/s] and spin [rad/s] of the object [13], which
-    a twin tells, and of the policies a teacher is told."""
+    a twin tells."""
+    object_state: np.ndarray | None = None
+    """The same as a teacher is told it: by --pose, or the truth; None: not known yet."""
 
 
 @dataclass(frozen=True)
@@ -107,10 +109,10 @@ class PolicyRunner:
         return PolicyDecision(np.zeros_like(sensed.smoothed), float("nan"))
 
 
-class TwinTeacher(PolicyRunner):
-    """A teacher before a twin, which tells the object's true state.
+class TeacherPolicyRunner(PolicyRunner):
+    """A teacher, which is told the object's state: by a twin, or by who tells poses.
 
-    An environment makes its observation.
+    An environment makes its observation. Until a state is known the hand holds still.
 
     Args:
         policy: The teacher.
@@ -148,25 +150,27 @@ class TwinTeacher(PolicyRunner):
         """What it does in this state."""
         env = self._env
         sim = self._env.sim
-        truth = self._before if sensed.truth is None else sensed.truth
+        state = self._before if sensed.object_state is None else sensed.object_state
         for array, joints, rest in (
-            (sim.joint_q, sensed.joint_q, truth[:7]),
-            (sim.joint_qd, sensed.joint_qd, truth[7:]),
-            (env.measured_q, sensed.joint_q, truth[:7]),
-            (env.measured_qd, sensed.joint_qd, truth[7:]),
+            (sim.joint_q, sensed.joint_q, state[:7]),
+            (sim.joint_qd, sensed.joint_qd, state[7:]),
+            (env.measured_q, sensed.joint_q, state[:7]),
+            (env.measured_qd, sensed.joint_qd, state[7:]),
             (env.smoothed, sensed.smoothed, ()),
         ):
             array.assign(np.array([[*joints, *rest]], dtype=np.float32)[:, : array.shape[1]])
         sim.forward_kinematics()
         if self._begins:
             env.give_goals(np.zeros(1, int), sensed.goal_quat[None])
-            self._begins = False
+            self._begins = sensed.object_state is None
         env.observe()
         observation = of_warp(env.observation, library_of(self._policy.network.offset))
         action = as_warp(self._policy.act(observation))
         if env.symmetry_frames is not None:
             action = env.symmetry_frames.world_action(action)
-        error = symmetric_error(truth[None, 3:7], sensed.goal_quat[None], env.objects[0].symmetry)
+        if sensed.object_state is None:
+            return PolicyDecision(np.zeros_like(sensed.smoothed), float("nan"))
+        error = symmetric_error(state[None, 3:7], sensed.goal_quat[None], env.objects[0].symmetry)
         return PolicyDecision(action.numpy()[0].copy(), float(error[0]))
 
 
@@ -262,10 +266,10 @@ def load_runner(
         item: The object.
         tolerance_rad: How near to the goal it is to stop [rad].
         seed: Of the choice of camera points.
-        object: What a twin holds, whose true state a teacher is told; None: a real hand.
+        object: What a twin holds, or what poses are of, for a teacher; None: nobody tells it.
 
     Raises:
-        ValueError: It is for another hand, or a teacher for a real one.
+        ValueError: It is for another hand, or a teacher that nobody tells the object's state.
     """
     if name == ZERO:
         return PolicyRunner(ReorientCfg(hand=hand_name), StoppingRule())
@@ -277,10 +281,10 @@ def load_runner(
     if policy.kind != "teacher":
         return CameraRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     if object is not None:
-        return TwinTeacher(policy, hand_name, object, tolerance_rad)
+        return TeacherPolicyRunner(policy, hand_name, object, tolerance_rad)
     raise ValueError(
-        f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train "
-        "tracker makes a tracking policy of it"
+        f"{name} is a teacher: it needs the object's pose, which no robot senses; tell it by --pose, "
+        "or have vd-train tracker make a tracking policy of it"
     )
 
 

@@ -2,14 +2,13 @@
 
 Pursue goals one after the other, in one process at 12 Hz, and log every step.
 
-The policy sees joints and a depth camera: a tracking or vision policy. A twin tells a teacher the
-truth.
+The policy sees joints and a depth camera: a tracking or vision policy. A teacher is told where the
+object is: by --pose, or by a twin, which tells the truth.
 """
 
 import contextlib
-import importlib.util
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -38,8 +37,13 @@ from vd.paper import PAPER
 from vd.policy.agents import check_names, default_policy
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from vd.assets_usd.hand_model import HandModel
     from vd.assets_usd.objects.model import ObjectModel
+    from vd.deploy.loop.log import LogWriter
     from vd.deploy.loop.policy_runner import PolicyRunner
+    from vd.deploy.pose.source import PoseSource
     from vd.deploy.twin.twin import Twin
 
 LOGS = Path("runs/deploy")
@@ -65,7 +69,7 @@ class DriveCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """File or name of a policy that sees by camera, with --twin a teacher too, and by
+    """File or name of a policy that sees by camera, with --twin or --pose a teacher too, and by
     default the hand's installed vision or tracking policy. "zero" is the zero-action baseline."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj,
@@ -95,6 +99,13 @@ class DriveCfg(HandOptions):
     """Where it was found to be (camera.usda of vd-deploy calibrate); where it was in training by
     default.
     """
+    pose: str | None = None
+    """Who tells where the object is, for a policy that observes it (a teacher): ros2:/TOPIC
+    (geometry_msgs/PoseStamped), udp:PORT, tags, tags:SIDE_M (a cube of vd-deploy tags before the
+    camera), or of a twin sim, sim:delay_s=0.1,noise_m=0.002,noise_rad=0.02."""
+    pose_frame: tuple[float, float, float, float, float, float, float] | None = None
+    """Pose of the frame that poses are in, in the hand's base: position [m] and quaternion xyzw; by
+    default that of the camera, of --camera-layer or the hand."""
     safety: SafetyCfg = field(default_factory=SafetyCfg)
     """Limits."""
     log: Path | None = None
@@ -121,7 +132,11 @@ class DriveCfg(HandOptions):
     @property
     def policy_name(self) -> str:
         """The policy, or the installed one of the hand; one that sees, on a twin a teacher too."""
-        kinds = ("vision", "tracking", "teacher") if self.twin else ("vision", "tracking")
+        kinds: tuple[str, ...] = ("vision", "tracking")
+        if self.twin:
+            kinds = ("vision", "tracking", "teacher")
+        if self.pose is not None:
+            kinds = ("teacher",)
         return self.policy or default_policy(self.hand, *kinds)
 
     def validate(self) -> None:
@@ -131,19 +146,24 @@ class DriveCfg(HandOptions):
         check_names([], [self.object], self.hand)
         check_names([self.policy_name], [])
         from vd.deploy.loop.goals import SCAN_SUFFIXES
+        from vd.deploy.pose.open import check_pose_options
+        from vd.deploy.ros import need_rclpy
 
         require(self, "--", "positive", "random_goals episode_s")
         require(self, "--", "zero or positive", "hold_s")
         if self.ros2 and (self.twin or self.port):
             raise ValueError("--ros2 is in place of --port and --twin; name one")
-        if self.ros2 and importlib.util.find_spec("rclpy") is None:
-            raise ValueError("--ros2 needs rclpy: source the setup.bash of a ROS 2 for this Python")
+        if self.ros2:
+            need_rclpy("--ros2")
+        if self.pose is not None:
+            check_pose_options(self.pose, twin=self.twin)
+        elif self.pose_frame is not None:
+            raise ValueError("--pose-frame places the poses of --pose; name their source, too")
         if self.realistic and not self.twin:
             raise ValueError("--realistic is for --twin")
-        if self.twin and Path(self.object).suffix.lower() in SCAN_SUFFIXES:
-            raise ValueError(
-                f"--object {self.object}: a twin cannot hold a scan; vd-assets import it first"
-            )
+        if Path(self.object).suffix.lower() in SCAN_SUFFIXES and (self.twin or self.pose):
+            who = "a twin cannot hold" if self.twin else "a teacher does not know"
+            raise ValueError(f"--object {self.object}: {who} a scan; vd-assets import it first")
         if self.log is not None and self.log.suffix == MCAP:
             if self.log.exists():
                 raise FileExistsError(f"--log {self.log} is there; choose another name")
@@ -167,7 +187,6 @@ def run(cfg: DriveCfg) -> int:
     from vd.assets_usd.hands import load_hand
     from vd.deploy.hardware.connect import motors_of
     from vd.deploy.loop.goals import one_object
-    from vd.deploy.loop.policy_runner import load_runner
     from vd.deploy.ros import connect_ros
 
     quiet_warp()
@@ -176,19 +195,7 @@ def run(cfg: DriveCfg) -> int:
     name = cfg.policy_name
     goals = _goals(cfg, item)
     _say_chosen(cfg, len(goals))
-    tolerance = cfg.tolerance_rad
-    true_object = cfg.object if cfg.twin else None
-    runner = load_runner(
-        name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=true_object
-    )
-    if "torch" in sys.modules:  # of several threads, some would wait for one that has no core
-        sys.modules["torch"].set_num_threads(1)
-    if not runner.calibrated:
-        print(
-            f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts "
-            "that distance; vd-train tracker finds a better one",
-            file=sys.stderr,
-        )
+    runner = _runner(cfg, name, hand, item)
     fault: Exception | None = None
     status = 0
     opened = connect_ros(cfg, cfg.ros2_args) if cfg.ros2 else connect(cfg, item=item)
@@ -212,6 +219,28 @@ def run(cfg: DriveCfg) -> int:
         if fault is not None:
             raise fault
     return status
+
+
+def _runner(cfg: DriveCfg, name: str, hand: "HandModel", item: "ObjectModel") -> "PolicyRunner":
+    """The policy, with what is known of it."""
+    from vd.deploy.loop.policy_runner import load_runner
+
+    tolerance = cfg.tolerance_rad
+    known_object = cfg.object if cfg.twin or cfg.pose else None
+    runner = load_runner(
+        name, cfg.hand, hand, item, tolerance_rad=tolerance, seed=cfg.seed, object=known_object
+    )
+    if cfg.pose and runner.camera is not None:
+        raise ValueError(f"--pose is for a teacher; {name} sees by camera: leave it out")
+    if "torch" in sys.modules:  # of several threads, some would wait for one that has no core
+        sys.modules["torch"].set_num_threads(1)
+    if not runner.calibrated:
+        print(
+            f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts "
+            "that distance; vd-train tracker finds a better one",
+            file=sys.stderr,
+        )
+    return runner
 
 
 def _say_chosen(cfg: DriveCfg, goals: int) -> None:
@@ -242,14 +271,13 @@ def _pursue(
     folder: Path,
 ) -> int:
     """Preflight, way to the start, the loop, and its log in a folder; the exit status."""
-    from vd.assets_usd.camera_layer import read_camera
-    from vd.deploy.camera.check_camera import camera_findings
     from vd.deploy.clock import Pacer
-    from vd.deploy.hardware.check import open_camera, ready
+    from vd.deploy.hardware.check import ready
     from vd.deploy.loop.action import ActionFilter
-    from vd.deploy.loop.log import LogWriter
     from vd.deploy.loop.loop import NO_SYMMETRY, ControlLoop, summary
-    from vd.deploy.ros import UNKNOWN, RosGoals
+    from vd.deploy.pose.check_pose import pose_findings
+    from vd.deploy.pose.follower import PoseFollower
+    from vd.deploy.ros import RosGoals
 
     hand = connection.hand
     twin = connection.twin
@@ -259,29 +287,18 @@ def _pursue(
         camera: ImageSource | None = None
         looks: Iterable[Finding] = ()
         if runner.camera is not None:
-            camera = open_camera(cfg.camera, connection, runner.camera, realistic=cfg.realistic)
+            camera, looks = _camera(cfg, runner, connection)
             stack.callback(camera.close)
-            where = (
-                runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
-            )
-            runner.look_by(camera.intrinsics.seen_from(where))
-            looks = camera_findings(
-                camera, runner.camera, hand.goal_in_base, fps=cfg.camera.fps if twin is None else hz
-            )
+        poses = None
+        if cfg.pose is not None:
+            poses = stack.enter_context(_poses(cfg, cfg.pose, connection))
+            looks = pose_findings(*poses, hand, cfg.safety.pose_stale_s)
         warm_up(runner, pose, [*goals, NO_SYMMETRY[0]][0], camera)
         stack.enter_context(undisturbed(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals{', and those it is given' * cfg.ros2}."
         ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=looks)
         description = _description(cfg, name, runner, item, goals)
-        servo = connection.joints.servo()
-        without = () if connection.ros is None else UNKNOWN
-        log = LogWriter(
-            folder, hand, description, servo=servo, truth=twin is not None, without=without
-        )
-        if cfg.log is not None and cfg.log.suffix == MCAP:
-            from vd.logs.mcap_log import McapLog
-
-            log.also_to(McapLog(cfg.log, log.run, np.asarray(hand.workspace.goal_m)))
+        log = _log(cfg, folder, connection, description)
         served = None if connection.ros is None else RosGoals(connection.ros, goals)
         if served is not None:
             log.also_to(served)
@@ -296,6 +313,9 @@ def _pursue(
                 safe.arm()
                 safe.move(pose, HOME_RAD_S)
                 place(safe, pose, twin, yes=cfg.yes)
+                follower = None
+                if poses is not None:
+                    follower = PoseFollower(*poses, safe.bus.clock.now())
                 loop = ControlLoop(
                     safe,
                     runner,
@@ -306,6 +326,7 @@ def _pursue(
                     hold_s=cfg.hold_s,
                     camera=camera,
                     twin=twin,
+                    follower=follower,
                     symmetry=item.symmetry,
                     more=(lambda: False) if served is None else served.more,
                 )
@@ -320,6 +341,57 @@ def _pursue(
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
             report(folder, steps, pacer.missed, times)
     return int(reason == "lost")
+
+
+def _camera(
+    cfg: DriveCfg, runner: "PolicyRunner", connection: Connection
+) -> tuple[ImageSource, Iterable[Finding]]:
+    """The camera, by which the policy sees from now on, and what the preflight finds of it."""
+    from vd.assets_usd.camera_layer import read_camera
+    from vd.deploy.camera.check_camera import camera_findings
+    from vd.deploy.hardware.check import open_camera
+
+    assert runner.camera is not None
+    hand = connection.hand
+    camera = open_camera(cfg.camera, connection, runner.camera, realistic=cfg.realistic)
+    where = runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
+    runner.look_by(camera.intrinsics.seen_from(where))
+    fps = cfg.camera.fps if connection.twin is None else runner.task.sim.control_hz
+    return camera, camera_findings(camera, runner.camera, hand.goal_in_base, fps=fps)
+
+
+def _log(
+    cfg: DriveCfg, folder: Path, connection: Connection, description: Mapping[str, Any]
+) -> "LogWriter":
+    """The log of a run, with its file beside it."""
+    from vd.deploy.loop.log import LogWriter
+    from vd.deploy.ros import UNKNOWN
+
+    hand = connection.hand
+    servo = connection.joints.servo()
+    without = () if connection.ros is None else UNKNOWN
+    truth = connection.twin is not None
+    log = LogWriter(folder, hand, description, servo=servo, truth=truth, without=without)
+    if cfg.log is not None and cfg.log.suffix == MCAP:
+        from vd.logs.mcap_log import McapLog
+
+        log.also_to(McapLog(cfg.log, log.run, np.asarray(hand.workspace.goal_m)))
+    return log
+
+
+def _poses(
+    cfg: DriveCfg, source: str, connection: Connection
+) -> "AbstractContextManager[tuple[PoseSource, np.ndarray]]":
+    """What --pose names, with the pose of its frame in the world; a twin shows its object."""
+    from vd.deploy.pose.open import NO_MOTION, open_poses, pose_options, source_frame
+
+    in_base = NO_MOTION
+    if pose_options(source).kind != "sim":
+        in_base = source_frame(connection.hand, cfg.pose_frame, cfg.camera_layer)
+    if connection.twin is not None:
+        connection.twin.place_object()
+    words = {"ros_arguments": cfg.ros2_args, "seed": cfg.seed}
+    return open_poses(source, connection, cfg.camera, in_base, **words)
 
 
 def warm_up(

@@ -67,6 +67,13 @@ SAY_S = 1.0
 """Longest wait for a terminal that takes no words, as after Ctrl-S."""
 END_S = 1.0
 """Time that a program has to come to its end once its hand is off, if a signal asked for that."""
+AHEAD_REMEDY = {
+    "image": "then plug the camera in again",
+    "pose": "and stamp a pose when its image is exposed",
+}
+"""What to do about images and poses from the future, beside the clocks."""
+BLIND = {"image": "the camera is blind", "pose": "no pose is believed"}
+"""How it is said that nothing new is known."""
 LEFT_ON = "it holds, as --safety.then says"
 """Why the torque of each motor is on where the hand is left holding."""
 
@@ -147,6 +154,7 @@ class SafeHand:
         self._misses = 0
         self._beat_s = self._image_s = np.inf
         self._image_fault = ""
+        self._watched = "image"  # or pose: what _image_s is of
         self._torque_s = -np.inf
         self._armed = False
         self._on = np.zeros(len(joints.ids), dtype=bool)
@@ -317,8 +325,25 @@ class SafeHand:
         Raises:
             StoppedError: It is from the future, so its age is not known.
         """
+        self._seen_at("image", time_s, fault)
+
+    def pose_at(self, time_s: float, fault: str = "") -> None:
+        """The newest pose of the object is of this time [s], in place of :meth:`image_at`.
+
+        Args:
+            time_s: When its image was exposed [s].
+            fault: Why it is not believed; then the one before it grows older.
+
+        Raises:
+            StoppedError: It is from the future, so its age is not known.
+        """
+        self._seen_at("pose", time_s, fault)
+
+    def _seen_at(self, what: str, time_s: float, fault: str) -> None:
+        """The newest image or pose is of this time [s]."""
         if ahead := from_future(time_s, self.bus.clock.now()):
-            raise self.stop(f"the newest image is {ahead}, then plug the camera in again")
+            raise self.stop(f"the newest {what} is {ahead}, {AHEAD_REMEDY[what]}")
+        self._watched = what
         self._image_fault = fault
         if not fault or self._image_s == np.inf:
             self._image_s = time_s
@@ -384,10 +409,11 @@ class SafeHand:
             return REASONS[signal.Signals(came[0])]
         if silent > self.cfg.misses * PERIOD_S:
             return f"the loop stands: no step ended for {silent:.2f} s"
-        if age > self.cfg.stale_s:
+        oldest = self.cfg.pose_stale_s if self._watched == "pose" else self.cfg.stale_s
+        if age > oldest:
             if self._image_fault:
-                return f"the camera is blind for {age:.2f} s: {self._image_fault}"
-            return f"the newest image is {age:.2f} s old"
+                return f"{BLIND[self._watched]} for {age:.2f} s: {self._image_fault}"
+            return f"the newest {self._watched} is {age:.2f} s old"
         return ""
 
     def stop(self, reason: str, *, lost: bool = False) -> StoppedError:

@@ -148,6 +148,13 @@ class Twin:
             self._catch_up()
             return np.concatenate([self.hand.joint_q[-7:], self.hand.joint_qd[-6:]])
 
+    def poses(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """The present [s], the joints [rad] [D] and the object's pose [7] of that moment."""
+        with self._lock:
+            now_s = self._catch_up()
+            whole = self.hand.joint_q
+        return now_s, whole[:-7], whole[-7:]
+
     def place_object(self) -> None:
         """Put the object where an episode starts; it falls from there."""
         with self._lock:

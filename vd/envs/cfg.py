@@ -16,6 +16,8 @@ MAX_LATENCY_S = 0.5
 """Largest latency of what is seen that can be drawn [s] (ours): environments keep all of it in
 memory.
 """
+SLOWEST_POSES_HZ = 2.0
+"""Fewest poses a second of a tracker (ours): as much of the past is kept in memory."""
 View = Literal["world", "goal", "mirrored"]
 """What a policy sees its goals in, see :attr:`ObservationCfg.view`."""
 
@@ -282,6 +284,49 @@ class CurriculumCfg:
 
 
 @dataclass(frozen=True)
+class TrackedPoseCfg:
+    """Ours: the object's pose as a tracker outside tells it. Off by default.
+
+    Defaults beside the rate are our guesses of AprilTags, FoundationPose and motion capture; none
+    was measured.
+    """
+
+    rate_hz: tuple[float, float] = (0.0, 0.0)
+    """Poses a second, drawn for each episode and held in between: 10 30; 0 0: there is no tracker.
+    Velocities are the differences of two poses."""
+    age_s: tuple[float, float] = (0.03, 0.15)
+    """How old poses are when they come [s], drawn for each episode."""
+    dropped: float = 0.1
+    """Share of the poses that do not come."""
+    jumping: float = 0.02
+    """Share of the poses that are wrong by ``jump``."""
+    jump: tuple[float, float] = (0.02, 0.5)
+    """By how much these are wrong, in any direction [m] [rad]."""
+    noise: tuple[float, float] = (0.001, 0.02)
+    """Standard deviation of each pose in each axis [m] [rad]."""
+
+    @property
+    def enabled(self) -> bool:
+        """Whether there is a tracker."""
+        return self.rate_hz[1] > 0.0
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        where = "randomisation.tracked_pose."
+        require(self, where, "in [0, 1]", "dropped jumping")
+        low, high = self.rate_hz
+        if self.enabled and not SLOWEST_POSES_HZ <= low <= high:
+            raise ValueError(
+                f"{where}rate_hz is {low:g} {high:g}; it has to rise from {SLOWEST_POSES_HZ:g}"
+            )
+        low, high = self.age_s
+        if not 0.0 <= low <= high <= MAX_LATENCY_S:
+            raise ValueError(
+                f"{where}age_s is {low:g} {high:g}; it has to rise within 0 and {MAX_LATENCY_S:g}"
+            )
+
+
+@dataclass(frozen=True)
 class RandomisationCfg:
     """Table S3 and the disturbance force."""
 
@@ -353,6 +398,8 @@ class RandomisationCfg:
     """Ours: by how much the observed pose of the object is wrong [m] [rad], alike all through an
     episode.
     """
+    tracked_pose: TrackedPoseCfg = field(default_factory=TrackedPoseCfg)
+    """The object's pose as a tracker tells it, in place of ``observation_latency_s``."""
     redraw_s: float = PAPER.randomisation.redraw_s
     """Gains, contact frictions and constant errors are drawn anew at the first reset after this
     time [s]: the solver takes them once a second. Servos (``effects``) and latency are drawn at
@@ -376,6 +423,13 @@ class RandomisationCfg:
             raise ValueError(
                 f"randomisation.observation_jitter_s is {self.observation_jitter_s:g}; it has to "
                 f"be in [0, {MAX_LATENCY_S:g}]"
+            )
+        self.tracked_pose.validate()
+        late = self.observation_latency_s[1] + self.observation_jitter_s
+        if self.tracked_pose.enabled and late > 0.0:
+            raise ValueError(
+                "randomisation.tracked_pose has ages of its own: leave observation_latency_s and "
+                "observation_jitter_s at 0"
             )
         require(self, "randomisation.", "positive", "force_s")
         from vd.envs.effects import check_effects  # needs Warp, which settings alone do not

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from vd.envs.cfg import ReorientCfg
 from vd.envs.task_state import TaskState
 from vd.kernels.task.latency import (
     StateArrays,
@@ -29,6 +30,8 @@ class SeenState:
     Attributes:
         latency: How late each object is seen in its episode [s], shape [N].
         encoder_latency: How late joints and fingertips are [s], shape [N].
+        slots, head: Rows of an environment in the ring of past states, and which was written last,
+            int32, shape [N]; only where something is late.
         arrays: Joint positions and velocities as the encoders report them, positions and velocities
             of hand and object, poses and velocities of the links (of fingertips alone where they
             are late).
@@ -41,6 +44,7 @@ class SeenState:
         longest = max(
             random.observation_latency_s[1] + random.observation_jitter_s,
             random.encoder_latency_s[1],
+            _oldest_pose_s(state.cfg),
         )
         self.is_late = random.enabled and longest > 0.0
         self.latency = wp.zeros(n, dtype=float, device=device)
@@ -61,7 +65,8 @@ class SeenState:
         slots = math.ceil(longest / state.cfg.sim.physics_dt) + 1
         columns = ring_columns(d, sim.joint_q.shape[1], sim.joint_qd.shape[1], f)
         self._ring = wp.zeros((n * slots, columns), dtype=float, device=device)
-        self._head = wp.zeros(n, dtype=wp.int32, device=device)
+        self.slots = slots
+        self.head = wp.zeros(n, dtype=wp.int32, device=device)
         self._model = [d, slots, state.fingers.tip_body]
         ranges = [random.observation_latency_s, random.encoder_latency_s]
         self._ranges = state.parameters.blended(np.zeros((2, 2)), ranges, wp.vec2)
@@ -73,7 +78,7 @@ class SeenState:
     ) -> None:
         """Remember the state after a physics step, shapes [N, *]. Device work only."""
         now = self._now(joint_q, joint_qd, body_q, body_qd)
-        self._state.launch(record_state_kernel, [*self._model, now], [self._head, self._ring])
+        self._state.launch(record_state_kernel, [*self._model, now], [self.head, self._ring])
 
     def begin(self, mask: wp.array) -> None:
         """Draw the latencies of the environments of ``mask`` [N], whose past is their present state."""
@@ -92,7 +97,7 @@ class SeenState:
         if self.is_late:
             state = self._state
             times = [state.cfg.sim.physics_dt, self._jitter]
-            inputs = [*times, self.latency, self.encoder_latency, self._head, self._ring]
+            inputs = [*times, self.latency, self.encoder_latency, self.head, self._ring]
             state.launch(
                 recall_state_kernel, [*self._model, *inputs], [state.rng, _packed(self.arrays)]
             )
@@ -101,7 +106,7 @@ class SeenState:
         """Arrays to save with a checkpoint, by name."""
         if not self.is_late:
             return {}
-        here = {"latency": self.latency, "latency_ring": self._ring, "latency_head": self._head}
+        here = {"latency": self.latency, "latency_ring": self._ring, "latency_head": self.head}
         late = self._state.cfg.randomisation.encoder_latency_s[1] > 0.0
         return here | ({"encoder_latency": self.encoder_latency} if late else {})
 
@@ -112,6 +117,14 @@ class SeenState:
             servo.measure()  # once a control step otherwise
             measured = servo.measured_q, servo.measured_qd
         return _packed([*measured, joint_q, joint_qd, *bodies])
+
+
+def _oldest_pose_s(cfg: ReorientCfg) -> float:
+    """Age of the oldest pose of a tracker that is looked up [s]: it comes late, within a step."""
+    tracker = cfg.randomisation.tracked_pose
+    if not tracker.enabled:
+        return 0.0
+    return tracker.age_s[1] + 1.0 / tracker.rate_hz[0] + cfg.sim.control_dt
 
 
 def _packed(arrays: Sequence[wp.array]) -> StateArrays:

@@ -12,6 +12,7 @@ from vd.envs.randomise import Randomiser
 from vd.envs.shapes import ShapeObserver
 from vd.envs.symmetry import ChosenFrames
 from vd.envs.task_state import TaskState
+from vd.envs.tracked_pose import TrackedPose
 from vd.kernels.task.dynamics import dynamics_kernel
 from vd.kernels.task.observations import teacher_observation_kernel, teacher_observation_slices
 from vd.paper import PAPER
@@ -38,6 +39,7 @@ class Observer:
         self.parts = observation_parts(cfg, state.num_fingers, state.num_joints)
         self.num_observations = actor_size(self.parts)
         self.seen = SeenState(state)
+        self._tracked_pose = TrackedPose(state, self.seen)
         self._pose_error = PoseError(state)
         width = max(columns.stop for columns in self.parts.values())
 
@@ -81,14 +83,17 @@ class Observer:
     def begin(self, mask: wp.array) -> None:
         """Begin the episodes of the environments of ``mask`` [N], after their state was reset."""
         self.seen.begin(mask)
+        self._tracked_pose.begin(mask)
         self._pose_error.begin(mask)
 
     def observe(self) -> None:
         """Write the observation of the present state. Device work only."""
         state = self._state
+        self._tracked_pose.take()
         self.seen.recall()
+        seen = self._pose_error.apply(self._tracked_pose.hold(self.seen.arrays))
         noise = state.parameters.observation, self._drawn.observation_offset, state.rng
-        self._observe_state(self._pose_error.apply(self.seen.arrays), noise, self.world_values)
+        self._observe_state(seen, noise, self.world_values)
         if "present" in self.parts:
             sim = state.sim
             true = [sim.joint_q, sim.joint_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
@@ -158,4 +163,5 @@ class Observer:
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint, by name."""
         chosen = {} if self.symmetry_frames is None else {"view": self.symmetry_frames.chosen}
-        return chosen | self.seen.stateful() | self._pose_error.stateful()
+        errors = self._tracked_pose.stateful() | self._pose_error.stateful()
+        return chosen | self.seen.stateful() | errors

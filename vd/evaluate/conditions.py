@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
-from vd.envs.cfg import RandomisationCfg, ReorientCfg
+from vd.envs.cfg import RandomisationCfg, ReorientCfg, TrackedPoseCfg
 from vd.paper import PAPER
 
 _MATERIALS = PAPER.materials
@@ -54,6 +54,17 @@ OFF_CENTRE_M = 0.01
 POSE_ERROR = (0.005, 0.1)
 """Errors of the object's pose [m] [rad] (ours), all through an episode: a bad registration."""
 
+TRACKED_POSE = TrackedPoseCfg(rate_hz=(10.0, 30.0))
+"""A tracker outside, as vd-deploy --pose has it."""
+_MIXED = RandomisationCfg(
+    effects={
+        "command_delay.delay_s": (0.0, COMMAND_DELAY_S),
+        "coulomb_friction.tau_c_nm": (0.0, FRICTION_NM),
+        "backlash.width_rad": (0.0, PLAY_RAD),
+    },
+    observation_latency_s=(0.0, OBSERVATION_LATENCY_S),
+)
+
 _NAMED: dict[str, tuple[str, RandomisationCfg]] = {
     "nominal": ("nothing", _only(enabled=False)),
     "s3": ("all of Table S3", RandomisationCfg()),
@@ -63,14 +74,15 @@ _NAMED: dict[str, tuple[str, RandomisationCfg]] = {
     ),
     "mixed": (
         "Table S3, friction, backlash, late commands, late object",
-        RandomisationCfg(
-            effects={
-                "command_delay.delay_s": (0.0, COMMAND_DELAY_S),
-                "coulomb_friction.tau_c_nm": (0.0, FRICTION_NM),
-                "backlash.width_rad": (0.0, PLAY_RAD),
-            },
-            observation_latency_s=(0.0, OBSERVATION_LATENCY_S),
-        ),
+        _MIXED,
+    ),
+    "tracked": (
+        "object seen by a tracker: late, 10 to 30 Hz, gaps and jumps",
+        _only(tracked_pose=TRACKED_POSE),
+    ),
+    "mixed-tracked": (
+        "mixed, and the object seen by a tracker",
+        replace(_MIXED, observation_latency_s=_at(0.0), tracked_pose=TRACKED_POSE),
     ),
     "observation-late": (
         f"object seen {STEP_LATE_S:.3f} s late",
