@@ -52,7 +52,7 @@ class Surface(NamedTuple):
     vertices: np.ndarray
     faces: np.ndarray
 
-    def times(self, factor: float) -> "Surface":
+    def times(self, factor: "float | np.floating") -> "Surface":
         """The surface, larger by a factor."""
         return self._replace(vertices=self.vertices * factor)
 
