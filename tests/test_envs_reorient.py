@@ -90,7 +90,7 @@ def test_the_table_costs_while_the_object_touches_it_and_height_above_it_pays():
 def test_tables_leave_their_share_of_worlds_in_time():
     """In a world that loses its table after 1.5 s the object, at rest until then, falls."""
     env = make(table=TableCfg(away_share=0.5, away_s=(1.5, 1.5)), num_envs=4, episode_s=2.5)
-    lost = table_steps(env.cfg) < ALWAYS
+    lost = table_steps(env.cfg, 1.0) < ALWAYS
     assert lost.sum() == 2
     heights, fell, gone = [], np.zeros(4, dtype=int), round(1.5 * env.cfg.sim.control_hz)
     for _ in range(env.max_episode_steps):

@@ -112,7 +112,7 @@ def test_ones_own_suite_is_a_file_of_command_lines(tmp_path, asked, capsys):
         own.write_text(text)
         assert main(flags) == 1 and message in capsys.readouterr().err
     assert main([*flags[:2], "nothing", "--out", str(tmp_path)]) == 1
-    assert "give paper, robust, or a YAML file" in capsys.readouterr().err
+    assert "give benchmark, paper, robust, or a YAML file" in capsys.readouterr().err
 
 
 def test_everything_is_run_once_and_only_what_changed_again(tmp_path, asked, monkeypatch):

@@ -263,7 +263,8 @@ def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
     assert cfg.env.objects == ("cube",) and cfg.env.num_envs == 8
     trained = ReorientCfg.of(read_policy(SHIPPED_POLICIES[name]))
     drawn = replace(trained.randomisation, effects={"dead_zone.width_rad": (0, 0.1)})
-    trained = replace(trained, randomisation=drawn)
+    curriculum = PRESETS["gpu"]().env.curriculum  # of a training, not of a policy
+    trained = replace(trained, randomisation=drawn, curriculum=curriculum)
     assert replace(cfg.env, objects=trained.objects, num_envs=trained.num_envs) == trained
     for field in ("hidden", "distribution", "normalise_observations"):
         assert getattr(cfg.policy, field) == getattr(network, field)

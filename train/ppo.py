@@ -75,6 +75,7 @@ class TeacherPPO(PPO):
             gradients go through Adam meanwhile, at a rate of zero: its first step then has moments
                 to go by,
             where one without would move every weight by the whole rate, whatever its gradient.
+        weights: What samples of each environment weigh, 1 in the mean, shape [N].
         samples: The latest rollout as rows, by name; observations begin with :data:`OBSERVED`.
     """
 
@@ -108,6 +109,7 @@ class TeacherPPO(PPO):
         )
         self.bound_coef = cfg.bound_coefficient
         self.actor_learns = True
+        self.weights = torch.ones(storage.num_envs, device=self.device)
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
         # The rollout as rows of samples, in the same memory in every update, and the rows of a
         # minibatch.
@@ -187,6 +189,7 @@ class TeacherPPO(PPO):
             "log_prob": storage.actions_log_prob.flatten(),
             "advantages": storage.advantages.flatten(),
             "returns": storage.returns.flatten(),
+            "weights": self.weights.repeat(storage.num_transitions_per_env),
         }
         rollout |= {
             OBSERVED + key: value.flatten(0, 1) for key, value in storage.observations.items()
@@ -248,10 +251,10 @@ class TeacherPPO(PPO):
             kl = self.actor.get_kl_divergence(old, self.actor.output_distribution_params).mean()
         ratio = torch.exp(log_ratio)
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        surrogate = -torch.minimum(
-            batch["advantages"] * ratio, batch["advantages"] * clipped
-        ).mean()
-        value = (batch["returns"] - self.critic(observations).squeeze(-1)).square().mean()
+        advantages, weights = batch["advantages"], batch["weights"]
+        surrogate = -(weights * torch.minimum(advantages * ratio, advantages * clipped)).mean()
+        errors = batch["returns"] - self.critic(observations).squeeze(-1)
+        value = (weights * errors.square()).mean()
         excess = (self.actor.output_mean.abs() - ACTION_BOUND).clamp_min(0.0)
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
         if self.bound_coef:

@@ -25,6 +25,7 @@ from vd.train.checkpoint import (
     without_worlds,
 )
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
+from vd.train.failures import ObjectFailures
 from vd.train.imitate import IMITATED, Imitation
 from vd.train.loop import TrainingLoop, check_update
 from vd.train.metrics import GoalWindow, StepMeans
@@ -45,6 +46,7 @@ class TeacherRunner(TrainingLoop):
         new_inputs: Observed values that the networks of the policy that it began from did not read.
         critic_warmup: Iterations left in which the critic learns alone.
         imitation: What the actor does meanwhile, if anything (``PpoCfg.imitation_iterations``).
+        failures: Goals that are missed by object (``PpoCfg.failure_floor``); None: not counted.
         begun: Whether this run began from another one's networks, in this process.
         unlike: What observations and actions mean otherwise than to the policy that the run began
             from.
@@ -66,6 +68,9 @@ class TeacherRunner(TrainingLoop):
         super().__init__(run, device=device, env=env)
         self.ppo, self.policy_cfg, self.task, self.interface = ppo, policy, task, interface or {}
         self.alg = make_learner(env, ppo, policy, rank=self.rank, world_size=self.world_size)
+        self.failures: ObjectFailures | None = None
+        if ppo.failure_floor is not None:
+            self.failures = ObjectFailures(env.env.world_object, ppo.failure_floor, device)
         self._networks = nn.ModuleList([self.alg.actor, self.alg.critic])
         self._means, self._window = StepMeans(), self._new_window()
         self._score = (0.0, 0.0, -math.inf)
@@ -208,6 +213,8 @@ class TeacherRunner(TrainingLoop):
                 observation, rewards, dones, extras = self.env.step(actions)
                 self.alg.process_env_step(observation, rewards, dones, extras)
                 self._means.add(extras["log"])
+                if self.failures is not None:
+                    self.failures.add(dones, self.env.reached)
             self.alg.compute_returns(observation)
         self.env.env.check()  # what the simulation made of a step comes before what an update makes of that
         return True
@@ -217,6 +224,9 @@ class TeacherRunner(TrainingLoop):
 
         Its losses.
         """
+        if self.failures is not None:
+            self.failures.end_iteration(self.world_size)
+            self.alg.weights = self.failures.weights()
         self.alg.actor_learns = self.critic_warmup == 0
         losses = self.alg.update()
         if self.imitation is not None and self.critic_warmup:
@@ -258,6 +268,8 @@ class TeacherRunner(TrainingLoop):
         }
         if self.imitation is not None and self.critic_warmup:
             state[IMITATED] = self.imitation.teacher.state_dict()
+        if self.failures is not None:
+            state["failures"] = self.failures.state_dict()
         return self.alg.save() | state
 
     def _take(self, state: dict[str, Any], path: str | Path) -> None:
@@ -274,6 +286,8 @@ class TeacherRunner(TrainingLoop):
         if IMITATED in state and self.ppo.imitation_iterations:
             self.imitation = Imitation(self.alg)
             self.imitation.teacher.load_state_dict(state[IMITATED])
+        if self.failures is not None and "failures" in state:
+            self.failures.load_state_dict(state["failures"])
         self._best = tuple(state["best"]) if state["best"] is not None else None
         self._window.load_state_dict(state["window"])
         self._restore(state)
