@@ -1,5 +1,6 @@
 """Signals to a process that drives a hand: none leaves its torque on, or its motors unnamed."""
 
+import contextlib
 import hashlib
 import multiprocessing
 import os
@@ -89,7 +90,7 @@ class Driver:
         """Send a signal after each pause [s]; the exit status of the process."""
         for pause in pauses:
             time.sleep(pause)
-            if self.process.is_alive():
+            with contextlib.suppress(ProcessLookupError):  # it has ended
                 os.kill(self.process.pid, number)
         self.process.join(END_S)
         assert self.process.exitcode is not None, f"it does not end: {self.words()}"
@@ -131,7 +132,8 @@ def driver(start, tmp_path):
 )
 def test_no_signal_cuts_off_the_stop(driver, number, pauses):
     driven = driver("loop")
-    assert driven.press(number, *pauses) == 128 + number
+    # What comes after the motors are off and the handlers are gone may end the process itself.
+    assert driven.press(number, *pauses) in (128 + number, -number)
     assert energised(driven.twin) == []
     assert "torque off" in driven.words() and "may still be on" not in driven.words()
 

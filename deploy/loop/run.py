@@ -390,8 +390,9 @@ def _poses(
         in_base = source_frame(connection.hand, cfg.pose_frame, cfg.camera_layer)
     if connection.twin is not None:
         connection.twin.place_object()
-    words = {"ros_arguments": cfg.ros2_args, "seed": cfg.seed}
-    return open_poses(source, connection, cfg.camera, in_base, **words)
+    return open_poses(
+        source, connection, cfg.camera, in_base, ros_arguments=cfg.ros2_args, seed=cfg.seed
+    )
 
 
 def warm_up(

@@ -103,9 +103,9 @@ def _draw_face(axes: "Axes", number: int, left: float, bottom: float, size: floa
     middle = (left + size / 2, bottom + size / 2)
     away = size / 2 - 0.25 * cell
     for neighbour, direction, turn in neighbours(number):
-        place = np.array(middle) + away * np.array(direction)
+        x, y = np.array(middle) + away * np.array(direction)
         label = f"{neighbour}" if direction != (0, -1) else f"{neighbour} (this is {number})"
-        axes.text(*place, label, fontsize=4, color="0.6", rotation=turn, ha="center", va="center")
+        axes.text(x, y, label, fontsize=4, color="0.6", rotation=turn, ha="center", va="center")
 
 
 def neighbours(number: int) -> list[tuple[int, tuple[int, int], float]]:
