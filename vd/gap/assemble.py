@@ -3,20 +3,20 @@
 Shared effects, pooled numbers, one verdict, curves.
 """
 
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from vd.gap import rules
 from vd.gap.coordinates import BASELINE_PARAMETERS, GRAVITY
-from vd.gap.fit import FINER, JointSpec, Problems
-from vd.gap.models import Accepted, Explanation
+from vd.gap.fit import FINER, JointFit, JointSpec, Problems, intervals
 from vd.gap.result import (
     Alternative,
     AnalysedRecording,
-    Candidate,
+    Credit,
     Estimate,
+    FamilyVerdict,
     Fit,
     HeldOut,
     JointGap,
@@ -25,22 +25,60 @@ from vd.gap.result import (
     Predictions,
     Report,
     TrajectoryError,
+    WholeModel,
     parameters_of,
 )
 from vd.gap.rollout import Rollouts
-from vd.gap.rules import agree, answered, named, overall
 from vd.gap.statistics import half_width, interval, resamples, rmse
 from vd.kernels.servo.effects import EFFECTS
 from vd.logs.recording import Recording
 
 
+LISTED = 5
+"""Good models of a joint that a report lists at most: the contract's."""
+ANSWERS = ("effects", "ambiguous")
+"""Verdicts that name something."""
+
+
 @dataclass(frozen=True, eq=False)
-class Analysed:
-    """A joint, its data and its explanation."""
+class AnalysedJoint:
+    """A joint and what came of it.
+
+    Attributes:
+        name: Its name.
+        spec: Its data.
+        plain: The plain model.
+        conclusion: What is concluded.
+        evidence: What its models were judged by.
+        fits: All models that were fitted.
+        vetoes: Effects that were not tried, with the reason.
+        means: Effects that stand for others, and for which.
+    """
 
     name: str
     spec: JointSpec
-    explanation: Explanation
+    plain: JointFit
+    conclusion: rules.Conclusion
+    evidence: rules.Evidence
+    fits: Sequence[JointFit]
+    vetoes: Mapping[str, str]
+    means: Mapping[str, tuple[str, ...]]
+
+    @property
+    def final(self) -> JointFit:
+        """The model that is delivered."""
+        return self.conclusion.final
+
+    @property
+    def estimates(self) -> dict[str, dict[str, tuple[float, float, float]]]:
+        """Value and interval of every parameter of every effect of the delivered model."""
+        spread = intervals(self.final, self.evidence.floor)
+        result: dict[str, dict[str, tuple[float, float, float]]] = {}
+        for key, value in self.final.values.items():
+            effect, _, name = key.rpartition(".")
+            if effect:
+                result.setdefault(effect, {})[name] = (value, *spread[key])
+        return result
 
 
 def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -> np.ndarray:
@@ -70,26 +108,26 @@ def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -
 
 def assemble(
     problems: Problems,
-    joints: Sequence[Analysed],
+    joints: Sequence[AnalysedJoint],
     findings: Sequence[Misfit],
     *,
     seed: int,
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
     recording = problems.recording
-    before = curves(problems, [(j.spec, j.explanation.baseline.rows) for j in joints])
-    after = curves(problems, [(j.spec, j.explanation.final.rows) for j in joints])
+    before = curves(problems, [(joint.spec, joint.plain.rows) for joint in joints])
+    after = curves(problems, [(joint.spec, joint.final.rows) for joint in joints])
     predictions = Predictions.of(recording, before, after)
     rng = np.random.default_rng(seed)
     residuals = {j.name: _residuals(j, predictions) for j in joints}
     rows = {j.name: _errors(j, residuals[j.name], recording) for j in joints}
     every = [row for j in joints for row in rows[j.name]]
     report = Report(
-        verdict=overall([j.explanation.verdict for j in joints]),
+        verdict=rules.overall([joint.conclusion.verdict for joint in joints]),
         noise_floor_rad=float(np.sqrt(np.mean([j.spec.floor**2 for j in joints]))),
         baseline=_fit(joints, residuals, 0),
         findings=tuple(findings),
-        effects=_pool(joints, True),
+        effects=_pool(joints, named=True),
         ambiguous=_sets(joints),
         identified=_fit(joints, residuals, 1),
         held_out=_held_out(predictions.files, every, rng),
@@ -104,16 +142,25 @@ def assemble(
             seconds=float(sum(t.time[-1] for t in recording.trajectories)),
             servo=str(recording.servo.get("model", "")),
         ),
-        provisional=_pool(joints, False),
+        provisional=_pool(joints, named=False),
         joints=tuple(_gap(j, rows[j.name], rng) for j in joints),
-        evidence=tuple(c for j in joints for c in _evidence(j)),
+        families=tuple(row for joint in joints for row in _families(joint)),
+        models=tuple(row for joint in joints for row in _models(joint, joint.conclusion.good[:LISTED])),
+        compared=tuple(row for joint in joints for row in _models(joint, joint.fits)),
+        credits=tuple(row for joint in joints for row in _credits(joint)),
+        not_tried={joint.name: dict(joint.vetoes) for joint in joints},
         trajectories=tuple(every),
+        aside={
+            joint.name: recording.trajectories[joint.spec.aside].file
+            for joint in joints
+            if joint.spec.aside is not None
+        },
         seed=seed,
     )
     return report, predictions
 
 
-def _residuals(joint: Analysed, predictions: Predictions) -> dict[int, np.ndarray]:
+def _residuals(joint: AnalysedJoint, predictions: Predictions) -> dict[int, np.ndarray]:
     """Measured minus simulated in what was analysed of each trajectory that moves a joint.
 
     Returns:
@@ -126,23 +173,23 @@ def _residuals(joint: Analysed, predictions: Predictions) -> dict[int, np.ndarra
     result = {}
     for index in range(len(predictions.files)):
         rows = np.flatnonzero(predictions.trajectory == index)
-        if np.ptp(predictions.command[rows, column]) > 0.0:
+        if index != spec.aside and np.ptp(predictions.command[rows, column]) > 0.0:
             rows = rows[slice(*parts.get(index, (None,)))]
             result[index] = predictions.measured[rows, column, None] - models[rows]
     return result
 
 
 def _errors(
-    joint: Analysed, residuals: dict[int, np.ndarray], recording: Recording
+    joint: AnalysedJoint, residuals: dict[int, np.ndarray], recording: Recording
 ) -> list[TrajectoryError]:
     """Held-out errors where the trajectory was in a fold, errors of the full fit where it was in no fit."""
-    fits, result = (joint.explanation.baseline, joint.explanation.final), []
+    fits, result = (joint.plain, joint.final), []
     for index, left in residuals.items():
         squares, absolutes = (left**2).mean(axis=0), np.abs(left).mean(axis=0)
         if index in joint.spec.trajectories:
             place = joint.spec.trajectories.index(index)
             squares = np.array([fit.held_out[place] for fit in fits]) / len(left)
-            sums = [np.nan if fit.held_out_abs is None else fit.held_out_abs[place] for fit in fits]
+            sums = [fit.held_out_abs[place] for fit in fits]
             absolutes = np.array(sums) / len(left)
         part, (old, new), (old_abs, new_abs) = (
             recording.trajectories[index],
@@ -157,7 +204,7 @@ def _errors(
 
 
 def _fit(
-    joints: Sequence[Analysed], residuals: dict[str, dict[int, np.ndarray]], model: int
+    joints: Sequence[AnalysedJoint], residuals: dict[str, dict[int, np.ndarray]], model: int
 ) -> Fit:
     """Errors on everything analysed, and the baseline's parameters, of one of the two models."""
     left = {name: np.concatenate([*of.values()])[:, model] for name, of in residuals.items()}
@@ -170,8 +217,8 @@ def _fit(
     )
 
 
-def _baseline_values(joint: Analysed, model: int) -> dict[str, float]:
-    fit = (joint.explanation.baseline, joint.explanation.final)[model]
+def _baseline_values(joint: AnalysedJoint, model: int) -> dict[str, float]:
+    fit = (joint.plain, joint.final)[model]
     row, names = fit.rows[joint.spec.joint], ["kp", "kd", "velocity_limit"]
     names += [n for n in ("inertia", "kd_off") if n in joint.spec.baseline]
     # A pendulum's known load is not fitted, but without it the rest means nothing.
@@ -209,9 +256,11 @@ def _held_out(
     )
 
 
-def _gap(joint: Analysed, rows: Sequence[TrajectoryError], rng: np.random.Generator) -> JointGap:
+def _gap(joint: AnalysedJoint, rows: Sequence[TrajectoryError], rng: np.random.Generator) -> JointGap:
     count, old, new = _sums(rows)
     weights = resamples(len(count), rng)
+    conclusion = joint.conclusion
+    answer = conclusion.verdict in ANSWERS
     return JointGap(
         joint=joint.name,
         noise_floor_rad=joint.spec.floor,
@@ -219,100 +268,139 @@ def _gap(joint: Analysed, rows: Sequence[TrajectoryError], rng: np.random.Genera
         baseline_ci95=interval(rmse(old, count, weights)),
         identified_rmse_rad=float(rmse(new, count)),
         identified_ci95=interval(rmse(new, count, weights)),
-        verdict=joint.explanation.verdict,
-        reason=joint.explanation.reason,
-        open_sets=tuple(
-            _unique(one.name, *one.tied)
-            for one in answered(joint.explanation)
-            if one.tied and not named(one)
-        ),
+        verdict=conclusion.verdict,
+        reason=conclusion.reason,
+        open_sets=tuple(rules.open_sets(conclusion.good)) if answer else (),
+        baseline_fitted_rmse_rad=joint.plain.rmse,
+        identified_fitted_rmse_rad=joint.final.rmse,
     )
 
 
-def _pool(joints: Sequence[Analysed], as_named: bool) -> tuple[NamedEffect, ...]:
-    """Named (or provisional) effects, those of several joints in one entry where their values agree."""
-    groups: dict[str, list[dict[str, Accepted]]] = {}
-    often: Counter[str] = Counter()
-    for joint in joints:
-        for accepted in answered(joint.explanation):
-            if named(accepted) == as_named:
-                often[accepted.name] += 1
-                _put(groups.setdefault(accepted.name, []), joint.name, accepted)
-    order = list(EFFECTS)
-    names = sorted(groups, key=lambda name: (-often[name], order.index(name)))
-    return tuple(_entry(name, group) for name in names for group in groups[name])
+def _pool(joints: Sequence[AnalysedJoint], *, named: bool) -> tuple[NamedEffect, ...]:
+    """Named effects, or the others of delivered models; joints whose values agree in one entry."""
+    groups: list[tuple[str, list[AnalysedJoint]]] = []
+    for name in EFFECTS:
+        for joint in joints:
+            if name in joint.final.effects and (name in joint.conclusion.names) == named:
+                _put(groups, name, joint)
+    often = {name: sum(len(group) for other, group in groups if other == name) for name, _ in groups}
+    groups.sort(key=lambda item: -often[item[0]])
+    return tuple(_entry(name, group) for name, group in groups)
 
 
-def _put(groups: list[dict[str, Accepted]], joint: str, accepted: Accepted) -> None:
-    """Add a joint's effect to the joints with which it agrees, or to a group of its own."""
-    for group in groups:
-        if all(agree(accepted, other) for other in group.values()):
-            group[joint] = accepted
+def _put(
+    groups: list[tuple[str, list[AnalysedJoint]]], name: str, joint: AnalysedJoint
+) -> None:
+    """Add a joint to those with which its values of an effect agree, or to a group of its own."""
+    mine = joint.estimates[name]
+    for other, group in groups:
+        if other == name and all(rules.agree(mine, each.estimates[name]) for each in group):
+            group.append(joint)
             return
-    groups.append({joint: accepted})
+    groups.append((name, [joint]))
 
 
-def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
+def _entry(name: str, group: Sequence[AnalysedJoint]) -> NamedEffect:
     """One effect of joints that agree, its numbers weighted by their precision."""
-    known, every = parameters_of(name), list(group.values())
+    units = parameters_of(name)
+    estimates = [joint.estimates[name] for joint in group]
     parameters = {}
-    for key in every[0].estimates:
-        values, lows, highs = np.array([accepted.estimates[key] for accepted in every]).T
+    for key in estimates[0]:
+        values, lows, highs = np.array([estimate[key] for estimate in estimates]).T
         weight = np.maximum(0.5 * (highs - lows), 1e-12) ** -2
         weight /= weight.sum()
         value = float(weight @ values)
         # No narrower than the joints' own, whose errors are one model's, nor than their values lie
         # apart.
-        apart = half_width(weight @ (values - value) ** 2 / max(len(every) - 1, 1), len(every))
-        below, above = (
-            float(np.maximum(weight @ d, apart)) for d in (values - lows, highs - values)
-        )
-        low = max(value - below, -np.inf if known[key].signed else 0.0)
-        parameters[key] = Estimate(value, (float(low), float(value + above)), known[key].unit)
+        apart = half_width(weight @ (values - value) ** 2 / max(len(group) - 1, 1), len(group))
+        below = float(np.maximum(weight @ (values - lows), apart))
+        above = float(np.maximum(weight @ (highs - values), apart))
+        low = max(value - below, -np.inf if units[key].signed else 0.0)
+        parameters[key] = Estimate(value, (low, value + above), units[key].unit)
+    confidence = []
+    for joint in group:
+        having = [name in fit.effects for fit in joint.conclusion.good]
+        confidence.append(float(joint.conclusion.shares @ having))
     return NamedEffect(
         name=name,
-        joints=tuple(group),
-        confidence=float(np.mean([accepted.confidence for accepted in every])),
+        joints=tuple(joint.name for joint in group),
+        confidence=float(np.mean(confidence)),
         parameters=parameters,
-        alternatives=tuple(
-            Alternative(*other)
-            for other in max(every, key=lambda accepted: accepted.confidence).alternatives
-        ),
+        alternatives=_alternatives(name, group[0]),
     )
 
 
-def _sets(joints: Sequence[Analysed]) -> tuple[tuple[str, ...], ...]:
-    """Sets of effects not told apart, each once."""
+def _alternatives(name: str, joint: AnalysedJoint) -> tuple[Alternative, ...]:
+    """The models of a joint that have another effect in the place of one, the best first."""
+    rest = {*joint.final.effects} - {name}
+    best = joint.conclusion.good[0]
+    rows = []
+    for fit in sorted(joint.fits, key=lambda fit: fit.held_out_rmse):
+        others = {*fit.effects} - rest
+        if rest <= {*fit.effects} and len(others) == 1 and name not in others:
+            difference = rules.difference(joint.evidence, best, fit)
+            rows.append(Alternative(*others, fit.held_out_rmse, difference))
+    return tuple(rows)
+
+
+def _sets(joints: Sequence[AnalysedJoint]) -> tuple[tuple[str, ...], ...]:
+    """Sets of effects not told apart, each once: by the motions, or by any motion."""
     sets: dict[frozenset[str], tuple[str, ...]] = {}
     for joint in joints:
-        for one in answered(joint.explanation):
-            if (one.tied and not named(one)) or one.equivalent:
-                members = _unique(one.name, *one.equivalent, *one.tied)
-                sets.setdefault(frozenset(members), members)
+        if joint.conclusion.verdict not in ANSWERS:
+            continue
+        for group in rules.open_sets(joint.conclusion.good):
+            sets.setdefault(frozenset(group), group)
+        for name in joint.conclusion.names:
+            if name in joint.means:
+                group = (name, *joint.means[name])
+                sets.setdefault(frozenset(group), group)
     return tuple(sets.values())
 
 
-def _unique(*names: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(names))
+def _families(joint: AnalysedJoint) -> list[FamilyVerdict]:
+    """What is known of each family on a joint."""
+    rows = []
+    good, shares = joint.conclusion.good, joint.conclusion.shares
+    for name, verdict in joint.conclusion.families.items():
+        members: list[str] = []
+        share = 0.0
+        for fit, weight in zip(good, shares, strict=True):
+            inside = [effect for effect in fit.effects if effect in rules.FAMILIES[name].effects]
+            members += [effect for effect in inside if effect not in members]
+            share += float(weight) if inside else 0.0
+        rows.append(FamilyVerdict(joint.name, name, verdict, tuple(members), share))
+    return rows
 
 
-def _evidence(joint: Analysed) -> list[Candidate]:
-    return [
-        Candidate(
-            joints=(joint.name,),
-            round=trial.round,
-            name=trial.name,
-            held_out_rmse_rad=trial.fit.held_out_rmse,
-            gain=trial.gain,
-            gain_ci95=trial.gain_ci,
-            decision=trial.decision,  # type: ignore[arg-type]
-            reason=trial.reason,
-            parameters={
-                key.partition(".")[2]: value
-                for key, value in trial.fit.values.items()
-                if key.startswith(f"{trial.name}.")
-            },
-            given=tuple(name for name in trial.fit.effects if name != trial.name),
+def _models(joint: AnalysedJoint, fits: Sequence[JointFit]) -> list[WholeModel]:
+    """Rows of models of a joint, the best first; the delivered one with its final values."""
+    good = list(joint.conclusion.good)
+    rows = []
+    for fit in sorted(fits, key=lambda fit: (fit not in good, fit.held_out_rmse)):
+        same = fit.effects == joint.final.effects
+        values = joint.final.values if same else fit.values
+        rows.append(
+            WholeModel(
+                joint=joint.name,
+                effects=fit.effects,
+                parameters={key: value for key, value in values.items() if "." in key},
+                rmse_rad=joint.final.rmse if same else fit.rmse,
+                held_out_rmse_rad=fit.held_out_rmse,
+                difference_ci95=rules.difference(joint.evidence, good[0], fit),
+                share=float(joint.conclusion.shares[good.index(fit)]) if fit in good else 0.0,
+                why="" if fit in good else rules.against(joint.evidence, good, fit),
+            )
         )
-        for trial in joint.explanation.trials
-    ]
+    return rows
+
+
+def _credits(joint: AnalysedJoint) -> list[Credit]:
+    """What each effect of a joint's delivered model brings, where the model without it was fitted."""
+    rows = []
+    for name in joint.final.effects:
+        rest = {*joint.final.effects} - {name}
+        for fit in joint.fits:
+            if {*fit.effects} == rest:
+                rows.append(Credit(joint.name, name, fit.rmse, fit.held_out_rmse))
+    return rows

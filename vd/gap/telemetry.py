@@ -1,14 +1,35 @@
 """What recorded voltage and duty cycle say of a joint; :mod:`vd.gap.rules` says what that rules out."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 
 from vd.gap.chain import Chain
 from vd.gap.fit import JointSpec
-from vd.gap.models import Telemetry
 from vd.gap.rollout import STEP_S
 from vd.kernels.servo.effects import EFFECTS
 from vd.logs.motions import Recording, Trajectory
 from vd.logs.recording_checks import MIN_SAMPLES
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """What the recorded voltage and duty cycle of a joint say.
+
+    Attributes:
+        fall: How far the voltage falls at full pull, and its value idle [V]; None where too little
+            is recorded.
+        follows: Share of the duty cycle that follows the plain error; 0 where none is recorded.
+        late: Delay [s] with which it is followed best, and the share that this leaves, if the
+            command is late (``command_delay``) or the reading (``read_delay``).
+        sample_s: Time between two samples [s].
+    """
+
+    fall: tuple[float, float] | None
+    follows: float
+    late: Mapping[str, tuple[float, float]]
+    sample_s: float
 
 
 def telemetry_of(recording: Recording, chain: Chain, spec: JointSpec) -> Telemetry:
