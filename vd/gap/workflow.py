@@ -29,7 +29,7 @@ from vd.gap.rollout import STEP_S
 from vd.gap.statistics import noise_floor, resamples
 from vd.gap.telemetry import telemetry_of
 from vd.gap.worker_pool import WorkerPool
-from vd.kernels.servo.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS, TOGETHER
 from vd.logs.recording import Recording, read_recording
 
 FIND_FORMAT = "vd-gap-find/1"
@@ -252,8 +252,14 @@ class _JointAnalysis:
                 means[name] = others
                 for other in others:
                     vetoes[other] = f"leaves the same positions as {name}, which stands for both"
-        names = rules.candidates(chain, self.options.effects)
-        return [name for name in names if name not in vetoes], vetoes, means
+        names = []
+        for name in rules.candidates(chain, self.options.effects):
+            if name not in vetoes:
+                names.append(name)
+        for name, together in TOGETHER.items():
+            if {name, *together} <= {*names}:
+                means[name] = together
+        return names, vetoes, means
 
 
 STAGES = 12
