@@ -209,10 +209,10 @@ def equivalent(model: str) -> dict[str, tuple[str, ...]]:
 
 
 TOGETHER: dict[str, tuple[str, ...]] = {
-    "asymmetric_friction": ("coulomb_friction", "dead_zone", "encoder_bias"),
+    "asymmetric_friction": ("coulomb_friction", "encoder_bias"),
 }
-"""Effects that are the same as two others together, of those listed: friction that differs between
-the directions is friction that does not, or a dead zone, and an offset."""
+"""Effects that are the same as two others together: friction that differs between the directions is
+friction that does not, and an offset."""
 
 
 def neutral_row() -> list[float]:

@@ -389,7 +389,7 @@ def _models(joint: AnalysedJoint, fits: Sequence[JointFit]) -> list[WholeModel]:
                 held_out_rmse_rad=fit.held_out_rmse,
                 difference_ci95=rules.difference(joint.evidence, good[0], fit),
                 share=float(joint.conclusion.shares[good.index(fit)]) if fit in good else 0.0,
-                why="" if fit in good else rules.against(joint.evidence, good, fit),
+                why="" if fit in good else rules.against(joint.evidence, fits, good, fit),
             )
         )
     return rows

@@ -3,8 +3,8 @@
 All members of all families make thousands of models. The ladder fits those that can matter, in
 rounds about the best model so far, the plain one at first. A round changes one family at a time: it
 leaves the family out, or puts another member in. A linear estimate screens the changes, those that
-promise least are not fitted. Rounds end when the best model stays; then members that compete in
-different families are combined. Which model is good is not decided here (:mod:`vd.gap.rules`).
+promise least are not fitted. Rounds end when there was one about the best model and all that are
+not worse; then members that compete in different families are combined. Which model is good is not decided here (:mod:`vd.gap.rules`).
 
 The members are those of the literature on servos: dry friction as in the models M1 to M4 of BAM
 (Coulomb, Stribeck, either with a part in proportion to the load) or with a direction; a late or a
@@ -66,13 +66,29 @@ class Ladder:
     models: dict[Effects, JointFit]
 
     def climb(self) -> None:
-        """Fit models in rounds about the best."""
-        for _ in range(ROUNDS):
-            centre = self.best()
+        """Fit models in rounds about the best, and about what is as good."""
+        done: list[JointFit] = []
+        while len(done) < ROUNDS and (centre := self.centre(done)):
             self.fit_changes(centre)
-            if self.best() is centre:
-                break
+            done.append(centre)
         self.combine()
+
+    def centre(self, done: Sequence[JointFit]) -> JointFit | None:
+        """The best model, or one that is not worse, about which no round was yet; None without such."""
+        best = self.best()
+        if best not in done:
+            return best
+        equals = [fit for fit in self.equals(best) if fit not in done]
+        return rules.best_of(self.evidence, equals) if equals else None
+
+    def equals(self, best: JointFit) -> list[JointFit]:
+        """Other models that explain something and are not worse than the best."""
+        result = []
+        for fit in self.models.values():
+            if fit is not best and not rules.flaw(self.evidence, fit):
+                if rules.not_worse(self.evidence, best, fit):
+                    result.append(fit)
+        return result
 
     def best(self) -> JointFit:
         """The model with the best score, of those within their bounds."""
@@ -169,13 +185,8 @@ class Ladder:
     def combine(self) -> None:
         """Fit the combinations of members that compete with the best model's in two families."""
         best = self.best()
-        rivals = []
-        for fit in self.models.values():
-            sound = not rules.flaw(self.evidence, fit)
-            if sound and fit is not best and rules.not_worse(self.evidence, best, fit):
-                rivals.append(fit)
         calls: dict[Effects, FitCall] = {}
-        for one, other in itertools.combinations(rivals, 2):
+        for one, other in itertools.combinations(self.equals(best), 2):
             effects = combined({*best.effects}, {*one.effects}, {*other.effects})
             if effects not in self.models and len(calls) < COMBINED and rules.is_model(effects):
                 values = {**best.values, **one.values, **other.values}

@@ -7,10 +7,10 @@ simulate nothing.
 
 1. Which effects are tried: those that the joint can have and telemetry does not contradict.
 2. Whether there is a gap: not where the plain model leaves no more than noise.
-3. The best model: least error, a price for each effect and parameter; a smaller model that it
-   contains is taken in its place if the larger one does not earn what it adds.
-4. Which models are good: not worse than the best by the interval of paired differences over
-   motions, or by samples where the best leaves no more than noise.
+3. The best model: least error, with a price for each effect and parameter, of the models that earn
+   what they have more than each smaller one that they contain.
+4. Which models are good: those that are not worse than the best by the interval of paired
+   differences over motions, or by samples where the best leaves no more than noise.
 5. What is named: what all good models share, if fitted and held-out errors both fall by enough.
 """
 
@@ -26,7 +26,7 @@ from vd.gap.fit import JointFit, intervals
 from vd.gap.result import Certainty, Verdict
 from vd.gap.statistics import OWN_ERROR, REPEATABLE, interval, rmse
 from vd.gap.telemetry import Telemetry
-from vd.kernels.servo.effects import EFFECTS, equivalent
+from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 from vd.logs.recording_checks import MIN_KINDS
 
 
@@ -75,9 +75,7 @@ FAMILIES = {
         "gain_ladder",
     ),
     "play": Family((("backlash",), ("dead_zone",)), "gain_ladder"),
-    "load or offset": Family(
-        (("gravity_load",), ("encoder_bias",), ("gravity_load", "encoder_bias")), "gain_ladder"
-    ),
+    "load or offset": Family((("gravity_load",), ("encoder_bias",)), "gain_ladder"),
     "elasticity": Family((("elastic_transmission",),), "chirp"),
     "acceleration limit": Family((("acceleration_limit",),), "steps_and_sines"),
     "integral action": Family((("integral_action",),), "long_holds"),
@@ -90,7 +88,6 @@ delays that are random, so they end as unknown."""
 CONTAINS = {
     "stribeck_friction": ("coulomb_friction",),
     "asymmetric_friction": ("coulomb_friction",),
-    "torque_speed_limit": ("torque_limit",),
     "elastic_transmission": ("payload_inertia",),
 }
 """Effects that contain a simpler one."""
@@ -227,7 +224,7 @@ def late_side(telemetry: Telemetry) -> str:
 
 
 def changes(effects: Iterable[str], allowed: Iterable[str]) -> list[frozenset[str]]:
-    """The models that differ from one in the member of one family.
+    """The models that differ from one in the member of one family, or have two for one that is the same.
 
     Args:
         effects: Of the model.
@@ -235,12 +232,16 @@ def changes(effects: Iterable[str], allowed: Iterable[str]) -> list[frozenset[st
     """
     present = {*effects}
     result = []
+    swaps = []
     for family in FAMILIES.values():
-        rest = present - family.effects
-        for member in ((), *family.members):
-            model = frozenset(rest.union(member))
-            if model != present and {*allowed}.issuperset(member):
-                result.append(model)
+        swaps += [(present - family.effects, member) for member in ((), *family.members)]
+    for name, parts in TOGETHER.items():
+        if name in present:
+            swaps.append((present - {name} - FAMILIES["load or offset"].effects, parts))
+    for rest, member in swaps:
+        model = frozenset(rest.union(member))
+        if model != present and {*allowed}.issuperset(member):
+            result.append(model)
     return result
 
 
@@ -360,6 +361,9 @@ def contains(larger: JointFit, smaller: JointFit) -> bool:
     covered = {*larger.effects}
     for name in larger.effects:
         covered.update(CONTAINS.get(name, ()))
+    for name, parts in TOGETHER.items():
+        if covered.issuperset(parts):
+            covered.add(name)
     return larger.effects != smaller.effects and covered.issuperset(smaller.effects)
 
 
@@ -389,14 +393,15 @@ def percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
-def simplest(evidence: Evidence, fits: Sequence[JointFit]) -> JointFit:
-    """The best model, or the smaller one that it contains if it does not earn what it adds."""
-    best = best_of(evidence, fits)
-    while True:
-        smaller = [fit for fit in fits if contains(best, fit) and not_earned(evidence, fit, best)]
-        if not smaller:
-            return best
-        best = best_of(evidence, smaller)
+def earned(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
+    """The models that explain something and earn what they have more than each that they contain."""
+    sound = [fit for fit in fits if not fit.effects or not flaw(evidence, fit)]
+    result = []
+    for fit in sound:
+        smaller = [other for other in sound if contains(fit, other)]
+        if not any(not_earned(evidence, other, fit) for other in smaller):
+            result.append(fit)
+    return result
 
 
 # 4. Which models are good.
@@ -426,25 +431,35 @@ def not_worse(evidence: Evidence, best: JointFit, other: JointFit) -> bool:
 
 def good_models(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
     """The models that are not worse than the best, the best first, none that contains another of them."""
-    sound = [fit for fit in fits if not fit.effects or not flaw(evidence, fit)]
-    best = simplest(evidence, sound)
-    equals = [fit for fit in sound if fit is best or not_worse(evidence, best, fit)]
+    candidates = earned(evidence, fits)
+    best = best_of(evidence, candidates)
+    equals = [fit for fit in candidates if fit is best or not_worse(evidence, best, fit)]
     minimal = []
     for fit in equals:
-        if not any(contains(fit, other) for other in equals if other is not fit):
+        if not any(contains(fit, other) for other in equals):
             minimal.append(fit)
-    return sorted(minimal, key=lambda fit: float(scores(evidence, [best, fit])[1]))
+    order = np.argsort(scores(evidence, minimal))
+    return [minimal[index] for index in order]
 
 
-def against(evidence: Evidence, good: Sequence[JointFit], fit: JointFit) -> str:
-    """What speaks against a model that is not good, in words."""
+def against(
+    evidence: Evidence, fits: Sequence[JointFit], good: Sequence[JointFit], fit: JointFit
+) -> str:
+    """What speaks against a model that is not good, in words.
+
+    Args:
+        evidence: What models are judged by.
+        fits: All models.
+        good: The good ones, the best first.
+        fit: The model.
+    """
     if problem := flaw(evidence, fit):
         return problem
     if not not_worse(evidence, good[0], fit):
         return f"worse than {words(good[0])}"
-    for smaller in good:
-        if contains(fit, smaller):
-            return f"no better than {words(smaller)}, which it contains"
+    for smaller in fits:
+        if contains(fit, smaller) and (why := not_earned(evidence, smaller, fit)):
+            return f"beside {words(smaller)} {why}"
     return "contains a smaller model that is as good"
 
 

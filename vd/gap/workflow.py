@@ -256,10 +256,7 @@ class _JointAnalysis:
         for name in rules.candidates(chain, self.options.effects):
             if name not in vetoes:
                 names.append(name)
-        for name, together in TOGETHER.items():
-            if {name, *together} <= {*names}:
-                means[name] = together
-        return names, vetoes, means
+        return names, vetoes, {**means, **TOGETHER}
 
 
 STAGES = 12
