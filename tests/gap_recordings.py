@@ -95,6 +95,7 @@ def made_up(
         x=np.array([float("." in key) for key in keys]),
         rows=np.zeros((1, servo.PARAMETER_COLUMNS)),
         sse=held_out if fitted is None else COUNT * fitted**2,
+        absolute=held_out,
         held_out=held_out,
         held_out_abs=held_out,
         count=COUNT,

@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 import pytest
-from gap_reports import BASE, FRICTION, JOINT, base_columns, rubbing_servo, servo_report
+from gap_reports import FRICTION, JOINT, base_columns, rubbing_servo, servo_report
 
 from vd.assets_usd.hand_data import HandError
 from vd.assets_usd.hand_layer import read_bare_layer

@@ -228,7 +228,9 @@ def test_credit_is_shared_between_the_effects_that_earn_it(report):
 def test_sets_are_whole_models_with_their_errors(report):
     """Single effects of different models do not make another: no line offers them alone."""
     effects = (("torque_limit", "backlash"), ("elastic_transmission", "coulomb_friction"))
-    models = tuple(model(names, {}, error) for names, error in zip(effects, (4e-3, 5e-3), strict=True))
+    models = tuple(
+        model(names, {}, error) for names, error in zip(effects, (4e-3, 5e-3), strict=True)
+    )
     sets = (("torque_limit", "elastic_transmission", "backlash", "coulomb_friction"),)
     joint = dataclasses.replace(report.joints[0], verdict="ambiguous", open_sets=sets)
     text = outcome(

@@ -11,7 +11,6 @@ from vd.gap.coordinates import Coordinate
 from vd.gap.rules import (
     FAMILIES,
     Evidence,
-    agree,
     at_bound,
     changes,
     conclude,
@@ -184,13 +183,6 @@ def test_the_size_of_an_effect_is_not_nothing(
     key = f"{name}.{EFFECTS[name].parameters[0].name}"
     value, low, high = estimate
     assert shown(name, {key: value}, {key: (low, high)}) == is_shown
-
-
-def test_joints_share_an_effect_if_their_values_can_be_the_same() -> None:
-    here = {"width_rad": (0.030, 0.029, 0.031)}
-    assert agree(here, {"width_rad": (0.0325, 0.032, 0.033)})  # within a tenth
-    assert agree(here, {"width_rad": (0.040, 0.030, 0.050)})  # intervals overlap
-    assert not agree(here, {"width_rad": (0.040, 0.039, 0.041)})
 
 
 def test_a_recording_has_the_first_verdict_in_the_order_of_importance() -> None:

@@ -203,6 +203,7 @@ where the arm hangs, or a further load hangs off the arm, moves it alike but for
 changes with the angle.
 """
 
+
 def equivalent(model: str) -> dict[str, tuple[str, ...]]:
     """Effects that stand for others in a recording of a ``model``."""
     return {**EQUIVALENT, **ON_A_PENDULUM} if model == "pendulum" else {**EQUIVALENT}

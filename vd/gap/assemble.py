@@ -1,6 +1,6 @@
 """Put the explanations of all joints together.
 
-Shared effects, pooled numbers, one verdict, curves.
+Effects, sets, errors, one verdict, curves.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,10 +29,8 @@ from vd.gap.result import (
     parameters_of,
 )
 from vd.gap.rollout import Rollouts
-from vd.gap.statistics import half_width, interval, resamples, rmse
-from vd.kernels.servo.effects import EFFECTS
+from vd.gap.statistics import interval, resamples, rmse
 from vd.logs.recording import Recording
-
 
 LISTED = 5
 """Good models of a joint that a report lists at most: the contract's."""
@@ -69,17 +67,6 @@ class AnalysedJoint:
         """The model that is delivered."""
         return self.conclusion.final
 
-    @property
-    def estimates(self) -> dict[str, dict[str, tuple[float, float, float]]]:
-        """Value and interval of every parameter of every effect of the delivered model."""
-        spread = intervals(self.final, self.evidence.floor)
-        result: dict[str, dict[str, tuple[float, float, float]]] = {}
-        for key, value in self.final.values.items():
-            effect, _, name = key.rpartition(".")
-            if effect:
-                result.setdefault(effect, {})[name] = (value, *spread[key])
-        return result
-
 
 def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -> np.ndarray:
     """Positions of all trajectories one after the other [S, J] [rad].
@@ -107,120 +94,110 @@ def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -
 
 
 def assemble(
-    problems: Problems,
-    joints: Sequence[AnalysedJoint],
-    findings: Sequence[Misfit],
-    *,
-    seed: int,
+    problems: Problems, joints: Sequence[AnalysedJoint], findings: Sequence[Misfit], seed: int
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
     recording = problems.recording
     before = curves(problems, [(joint.spec, joint.plain.rows) for joint in joints])
     after = curves(problems, [(joint.spec, joint.final.rows) for joint in joints])
-    predictions = Predictions.of(recording, before, after)
     rng = np.random.default_rng(seed)
-    residuals = {j.name: _residuals(j, predictions) for j in joints}
-    rows = {j.name: _errors(j, residuals[j.name], recording) for j in joints}
-    every = [row for j in joints for row in rows[j.name]]
+    errors: list[TrajectoryError] = []
+    gaps: list[JointGap] = []
+    effects: list[NamedEffect] = []
+    provisional: list[NamedEffect] = []
+    families: list[FamilyVerdict] = []
+    models: list[WholeModel] = []
+    compared: list[WholeModel] = []
+    credits: list[Credit] = []
+    aside: dict[str, str] = {}
+    for joint in joints:
+        rows = _errors(joint, recording)
+        errors += rows
+        gaps.append(_gap(joint, rows, rng))
+        for name in joint.final.effects:
+            entries = effects if name in joint.conclusion.names else provisional
+            entries.append(_effect(name, joint))
+        families += _families(joint)
+        models += _models(joint, joint.conclusion.good[:LISTED])
+        compared += _models(joint, joint.fits)
+        credits += _credits(joint)
+        if joint.spec.aside is not None:
+            aside[joint.name] = recording.trajectories[joint.spec.aside].file
     report = Report(
         verdict=rules.overall([joint.conclusion.verdict for joint in joints]),
-        noise_floor_rad=float(np.sqrt(np.mean([j.spec.floor**2 for j in joints]))),
-        baseline=_fit(joints, residuals, 0),
+        noise_floor_rad=float(np.sqrt(np.mean([joint.spec.floor**2 for joint in joints]))),
+        baseline=_fit(joints, [joint.plain for joint in joints]),
         findings=tuple(findings),
-        effects=_pool(joints, named=True),
+        effects=tuple(effects),
         ambiguous=_sets(joints),
-        identified=_fit(joints, residuals, 1),
-        held_out=_held_out(predictions.files, every, rng),
+        identified=_fit(joints, [joint.final for joint in joints]),
+        held_out=_held_out(errors, rng),
         next_experiment="",
         seconds=np.nan,
         recording=AnalysedRecording(
             path=str(recording.path),
             model=recording.model,
-            joints=tuple(j.name for j in joints),
+            joints=tuple(joint.name for joint in joints),
             trajectories=len(recording.trajectories),
-            samples=len(predictions.time),
+            samples=sum(len(t.time) for t in recording.trajectories),
             seconds=float(sum(t.time[-1] for t in recording.trajectories)),
             servo=str(recording.servo.get("model", "")),
         ),
-        provisional=_pool(joints, named=False),
-        joints=tuple(_gap(j, rows[j.name], rng) for j in joints),
-        families=tuple(row for joint in joints for row in _families(joint)),
-        models=tuple(row for joint in joints for row in _models(joint, joint.conclusion.good[:LISTED])),
-        compared=tuple(row for joint in joints for row in _models(joint, joint.fits)),
-        credits=tuple(row for joint in joints for row in _credits(joint)),
+        provisional=tuple(provisional),
+        joints=tuple(gaps),
+        families=tuple(families),
+        models=tuple(models),
+        compared=tuple(compared),
+        credits=tuple(credits),
         not_tried={joint.name: dict(joint.vetoes) for joint in joints},
-        trajectories=tuple(every),
-        aside={
-            joint.name: recording.trajectories[joint.spec.aside].file
-            for joint in joints
-            if joint.spec.aside is not None
-        },
+        trajectories=tuple(errors),
+        aside=aside,
         seed=seed,
     )
-    return report, predictions
+    return report, Predictions.of(recording, before, after)
 
 
-def _residuals(joint: AnalysedJoint, predictions: Predictions) -> dict[int, np.ndarray]:
-    """Measured minus simulated in what was analysed of each trajectory that moves a joint.
-
-    Returns:
-        By trajectory, shape [samples, 2] [rad]: of baseline and identified model, everything
-            fitted.
-    """
-    spec, column = joint.spec, predictions.joints.index(joint.name)
-    models = np.stack([predictions.baseline[:, column], predictions.identified[:, column]], axis=1)
-    parts = dict(zip(spec.trajectories, spec.pieces, strict=True)) if spec.pieces else {}
-    result = {}
-    for index in range(len(predictions.files)):
-        rows = np.flatnonzero(predictions.trajectory == index)
-        if index != spec.aside and np.ptp(predictions.command[rows, column]) > 0.0:
-            rows = rows[slice(*parts.get(index, (None,)))]
-            result[index] = predictions.measured[rows, column, None] - models[rows]
-    return result
-
-
-def _errors(
-    joint: AnalysedJoint, residuals: dict[int, np.ndarray], recording: Recording
-) -> list[TrajectoryError]:
-    """Held-out errors where the trajectory was in a fold, errors of the full fit where it was in no fit."""
-    fits, result = (joint.plain, joint.final), []
-    for index, left in residuals.items():
-        squares, absolutes = (left**2).mean(axis=0), np.abs(left).mean(axis=0)
-        if index in joint.spec.trajectories:
-            place = joint.spec.trajectories.index(index)
-            squares = np.array([fit.held_out[place] for fit in fits]) / len(left)
-            sums = [fit.held_out_abs[place] for fit in fits]
-            absolutes = np.array(sums) / len(left)
-        part, (old, new), (old_abs, new_abs) = (
-            recording.trajectories[index],
-            np.sqrt(squares),
-            absolutes,
-        )
-        errors = float(old), float(new), float(old_abs), float(new_abs)
-        result.append(
-            TrajectoryError(part.file, part.excitation, joint.name, *errors, samples=len(left))
-        )
-    return result
+def _errors(joint: AnalysedJoint, recording: Recording) -> list[TrajectoryError]:
+    """Held-out errors of the motions that move a joint."""
+    column = recording.joints.index(joint.name)
+    rows = []
+    for place, index in enumerate(joint.spec.trajectories):
+        trajectory = recording.trajectories[index]
+        if np.ptp(trajectory.command[:, column]) > 0.0:
+            rows.append(
+                TrajectoryError(
+                    file=trajectory.file,
+                    excitation=trajectory.excitation,
+                    joint=joint.name,
+                    baseline_rmse_rad=float(np.sqrt(joint.plain.mean_square[place])),
+                    identified_rmse_rad=float(np.sqrt(joint.final.mean_square[place])),
+                    baseline_mae_rad=float(joint.plain.mean_absolute[place]),
+                    identified_mae_rad=float(joint.final.mean_absolute[place]),
+                    samples=int(joint.plain.count[place]),
+                )
+            )
+    return rows
 
 
-def _fit(
-    joints: Sequence[AnalysedJoint], residuals: dict[str, dict[int, np.ndarray]], model: int
-) -> Fit:
-    """Errors on everything analysed, and the baseline's parameters, of one of the two models."""
-    left = {name: np.concatenate([*of.values()])[:, model] for name, of in residuals.items()}
-    everything = np.concatenate([*left.values()])
+def _fit(joints: Sequence[AnalysedJoint], fits: Sequence[JointFit]) -> Fit:
+    """Errors of a model of each joint on what it was fitted to, and its baseline's parameters."""
+    count = sum(fit.count.sum() for fit in fits)
+    parameters = {}
+    for joint, fit in zip(joints, fits, strict=True):
+        parameters[joint.name] = _baseline_values(joint.spec, fit)
     return Fit(
-        rmse_rad=float(np.sqrt(np.mean(everything**2))),
-        per_joint={name: float(np.sqrt(np.mean(of**2))) for name, of in left.items()},
-        mae_rad=float(np.mean(np.abs(everything))),
-        parameters={j.name: _baseline_values(j, model) for j in joints},
+        rmse_rad=float(np.sqrt(sum(fit.sse.sum() for fit in fits) / count)),
+        per_joint={joint.name: fit.rmse for joint, fit in zip(joints, fits, strict=True)},
+        mae_rad=float(sum(fit.absolute.sum() for fit in fits) / count),
+        parameters=parameters,
     )
 
 
-def _baseline_values(joint: AnalysedJoint, model: int) -> dict[str, float]:
-    fit = (joint.plain, joint.final)[model]
-    row, names = fit.rows[joint.spec.joint], ["kp", "kd", "velocity_limit"]
-    names += [n for n in ("inertia", "kd_off") if n in joint.spec.baseline]
+def _baseline_values(spec: JointSpec, fit: JointFit) -> dict[str, float]:
+    """Parameters of the plain servo in a model."""
+    row = fit.rows[spec.joint]
+    names = ["kp", "kd", "velocity_limit"]
+    names += [name for name in ("inertia", "kd_off") if name in spec.baseline]
     # A pendulum's known load is not fitted, but without it the rest means nothing.
     if "gravity_load" not in fit.effects and row[GRAVITY.column] > 0.0:
         names.append(GRAVITY.name)
@@ -230,33 +207,35 @@ def _baseline_values(joint: AnalysedJoint, model: int) -> dict[str, float]:
 def _sums(rows: Sequence[TrajectoryError]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples, and sums of squared errors of both models, of each trajectory [S]."""
     count = np.array([row.samples for row in rows], float)
-    before, after = np.array([(row.baseline_rmse_rad, row.identified_rmse_rad) for row in rows]).T
+    before = np.array([row.baseline_rmse_rad for row in rows])
+    after = np.array([row.identified_rmse_rad for row in rows])
     return count, count * before**2, count * after**2
 
 
-def _held_out(
-    files: Sequence[str], rows: Sequence[TrajectoryError], rng: np.random.Generator
-) -> HeldOut:
+def _held_out(rows: Sequence[TrajectoryError], rng: np.random.Generator) -> HeldOut:
     """Errors before and after, over trajectories of all joints."""
     count, old, new = _sums(rows)
     weights = resamples(len(count), rng)
-    samples = 1.0 - rmse(new, count, weights) / np.maximum(rmse(old, count, weights), 1e-30)
-    before, after = float(rmse(old, count)), float(rmse(new, count))
-    used = {row.file for row in rows}
+    ratio = rmse(new, count, weights) / np.maximum(rmse(old, count, weights), 1e-30)
+    before = float(rmse(old, count))
+    after = float(rmse(new, count))
+    baseline_mae = np.average([row.baseline_mae_rad for row in rows], weights=count)
+    identified_mae = np.average([row.identified_mae_rad for row in rows], weights=count)
     return HeldOut(
-        trajectories=tuple(file for file in files if file in used),
+        trajectories=tuple(dict.fromkeys(row.file for row in rows)),
         baseline_rmse_rad=before,
         identified_rmse_rad=after,
         reduction=1.0 - after / max(before, 1e-30),
-        ci95=interval(samples),
-        baseline_mae_rad=float(np.average([row.baseline_mae_rad for row in rows], weights=count)),
-        identified_mae_rad=float(
-            np.average([row.identified_mae_rad for row in rows], weights=count)
-        ),
+        ci95=interval(1.0 - ratio),
+        baseline_mae_rad=float(baseline_mae),
+        identified_mae_rad=float(identified_mae),
     )
 
 
-def _gap(joint: AnalysedJoint, rows: Sequence[TrajectoryError], rng: np.random.Generator) -> JointGap:
+def _gap(
+    joint: AnalysedJoint, rows: Sequence[TrajectoryError], rng: np.random.Generator
+) -> JointGap:
+    """The errors of a joint, and what is concluded."""
     count, old, new = _sums(rows)
     weights = resamples(len(count), rng)
     conclusion = joint.conclusion
@@ -276,57 +255,22 @@ def _gap(joint: AnalysedJoint, rows: Sequence[TrajectoryError], rng: np.random.G
     )
 
 
-def _pool(joints: Sequence[AnalysedJoint], *, named: bool) -> tuple[NamedEffect, ...]:
-    """Named effects, or the others of delivered models; joints whose values agree in one entry."""
-    groups: list[tuple[str, list[AnalysedJoint]]] = []
-    for name in EFFECTS:
-        for joint in joints:
-            if name in joint.final.effects and (name in joint.conclusion.names) == named:
-                _put(groups, name, joint)
-    often = {name: sum(len(group) for other, group in groups if other == name) for name, _ in groups}
-    groups.sort(key=lambda item: -often[item[0]])
-    return tuple(_entry(name, group) for name, group in groups)
-
-
-def _put(
-    groups: list[tuple[str, list[AnalysedJoint]]], name: str, joint: AnalysedJoint
-) -> None:
-    """Add a joint to those with which its values of an effect agree, or to a group of its own."""
-    mine = joint.estimates[name]
-    for other, group in groups:
-        if other == name and all(rules.agree(mine, each.estimates[name]) for each in group):
-            group.append(joint)
-            return
-    groups.append((name, [joint]))
-
-
-def _entry(name: str, group: Sequence[AnalysedJoint]) -> NamedEffect:
-    """One effect of joints that agree, its numbers weighted by their precision."""
-    units = parameters_of(name)
-    estimates = [joint.estimates[name] for joint in group]
+def _effect(name: str, joint: AnalysedJoint) -> NamedEffect:
+    """One effect of the delivered model of a joint."""
+    spread = intervals(joint.final, joint.evidence.floor)
     parameters = {}
-    for key in estimates[0]:
-        values, lows, highs = np.array([estimate[key] for estimate in estimates]).T
-        weight = np.maximum(0.5 * (highs - lows), 1e-12) ** -2
-        weight /= weight.sum()
-        value = float(weight @ values)
-        # No narrower than the joints' own, whose errors are one model's, nor than their values lie
-        # apart.
-        apart = half_width(weight @ (values - value) ** 2 / max(len(group) - 1, 1), len(group))
-        below = float(np.maximum(weight @ (values - lows), apart))
-        above = float(np.maximum(weight @ (highs - values), apart))
-        low = max(value - below, -np.inf if units[key].signed else 0.0)
-        parameters[key] = Estimate(value, (low, value + above), units[key].unit)
-    confidence = []
-    for joint in group:
-        having = [name in fit.effects for fit in joint.conclusion.good]
-        confidence.append(float(joint.conclusion.shares @ having))
+    for key, value in joint.final.values.items():
+        effect, _, parameter = key.rpartition(".")
+        if effect == name:
+            unit = parameters_of(name)[parameter].unit
+            parameters[parameter] = Estimate(value, spread[key], unit)
+    having = [name in fit.effects for fit in joint.conclusion.good]
     return NamedEffect(
         name=name,
-        joints=tuple(joint.name for joint in group),
-        confidence=float(np.mean(confidence)),
+        joints=(joint.name,),
+        confidence=float(joint.conclusion.shares @ having),
         parameters=parameters,
-        alternatives=_alternatives(name, group[0]),
+        alternatives=_alternatives(name, joint),
     )
 
 
@@ -397,10 +341,10 @@ def _models(joint: AnalysedJoint, fits: Sequence[JointFit]) -> list[WholeModel]:
 
 def _credits(joint: AnalysedJoint) -> list[Credit]:
     """What each effect of a joint's delivered model brings, where the model without it was fitted."""
+    by_effects = {frozenset(fit.effects): fit for fit in joint.fits}
     rows = []
     for name in joint.final.effects:
-        rest = {*joint.final.effects} - {name}
-        for fit in joint.fits:
-            if {*fit.effects} == rest:
-                rows.append(Credit(joint.name, name, fit.rmse, fit.held_out_rmse))
+        without = by_effects.get(frozenset(joint.final.effects) - {name})
+        if without is not None:
+            rows.append(Credit(joint.name, name, without.rmse, without.held_out_rmse))
     return rows

@@ -47,7 +47,8 @@ class JointFit:
         x: Fitted coordinates [P].
         rows: Parameter rows of the chain's joints, shape [n, PARAMETER_COLUMNS].
         sse: Sum of squared errors of each trajectory [S] [rad^2].
-        held_out: The same, each trajectory predicted by a fit without its group [S].
+        absolute: Sum of absolute errors of each trajectory [S] [rad].
+        held_out: Sum of squared errors, each trajectory predicted by a fit without its group [S].
         held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad].
         count: Samples of each trajectory [S].
         gram: J^T J [P, P].
@@ -60,6 +61,7 @@ class JointFit:
     x: np.ndarray
     rows: np.ndarray
     sse: np.ndarray
+    absolute: np.ndarray
     held_out: np.ndarray
     held_out_abs: np.ndarray
     count: np.ndarray
@@ -76,6 +78,16 @@ class JointFit:
     def rmse(self) -> float:
         """RMSE on what was fitted [rad]."""
         return float(rmse(self.sse, self.count))
+
+    @property
+    def mean_square(self) -> np.ndarray:
+        """Mean squared error of each held-out trajectory [S] [rad^2]."""
+        return self.held_out / self.count
+
+    @property
+    def mean_absolute(self) -> np.ndarray:
+        """Mean absolute error of each held-out trajectory [S] [rad]."""
+        return self.held_out_abs / self.count
 
     @property
     def held_out_rmse(self) -> float:
@@ -257,12 +269,14 @@ class JointProblem:
             refits.append(descent.descend(x, SHORT, ~fold, slopes))
         unseen = self.residuals(self.rows(base, coordinates, np.array(refits)), out).sum(axis=0)
         rows = self.rows(base, coordinates, x[None])
+        residual = self.residuals(rows)[0]
         return JointFit(
             effects=effects,
             coordinates=tuple(coordinates),
             x=x,
             rows=rows[0],
-            sse=self.sums(self.residuals(rows)[0] ** 2),
+            sse=self.sums(residual**2),
+            absolute=self.sums(np.abs(residual)),
             held_out=self.sums(unseen**2),
             held_out_abs=self.sums(np.abs(unseen)),
             count=self.count.astype(float),
@@ -286,8 +300,15 @@ class JointProblem:
             error = np.abs(moved - x)
             x = moved
         rows = self.rows(fit.rows, fit.coordinates, x[None])
-        sse = self.sums(fine.residuals(rows)[0] ** 2)
-        return replace(fit, x=x, rows=rows[0], sse=sse, step_error=error)
+        residual = fine.residuals(rows)[0]
+        return replace(
+            fit,
+            x=x,
+            rows=rows[0],
+            sse=self.sums(residual**2),
+            absolute=self.sums(np.abs(residual)),
+            step_error=error,
+        )
 
     def promise(
         self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales

@@ -3,8 +3,8 @@
 All members of all families make thousands of models. The ladder fits those that can matter, in
 rounds about the best model so far, the plain one at first. A round changes one family at a time: it
 leaves the family out, or puts another member in. A linear estimate screens the changes, those that
-promise least are not fitted. Rounds end when there was one about the best model and all that are
-not worse; then members that compete in different families are combined. Which model is good is not decided here (:mod:`vd.gap.rules`).
+promise least are not fitted. Once the best stays, its families' members are combined; rounds go on
+about models that are not worse. Which model is good is not decided here (:mod:`vd.gap.rules`).
 
 The members are those of the literature on servos: dry friction as in the models M1 to M4 of BAM
 (Coulomb, Stribeck, either with a part in proportion to the load) or with a direction; a late or a
@@ -23,17 +23,19 @@ import numpy as np
 from vd.gap import rules
 from vd.gap.coordinates import Scales, sizes, torque_power
 from vd.gap.fit import JointFit, JointProblem
-from vd.gap.rules import Evidence
+from vd.gap.rules import FAMILIES, Evidence, Family
 from vd.kernels.servo.effects import EFFECTS
 
-ROUNDS = 4
+ROUNDS = 5
 """Rounds at most. Not tuned: hidden were two causes at most."""
 FITTED = 9
 """Changes of a round that are fitted, of about 25. Not tuned."""
 STARTS = 2
 """Sizes of a further effect from which a fit starts, the most promising ones. Not tuned."""
+ALIVE = 3
+"""Members of a family that are combined with those of another. Not tuned."""
 COMBINED = 8
-"""Combinations of competing members at most. Not tuned."""
+"""Combinations at a time at most. Not tuned."""
 
 FitCall = Callable[[JointProblem], Any]
 RunCalls = Callable[[Sequence[FitCall]], list[Any]]
@@ -71,7 +73,8 @@ class Ladder:
         while len(done) < ROUNDS and (centre := self.centre(done)):
             self.fit_changes(centre)
             done.append(centre)
-        self.combine()
+            if self.best() is centre:
+                self.combine()
 
     def centre(self, done: Sequence[JointFit]) -> JointFit | None:
         """The best model, or one that is not worse, about which no round was yet; None without such."""
@@ -82,13 +85,10 @@ class Ladder:
         return rules.best_of(self.evidence, equals) if equals else None
 
     def equals(self, best: JointFit) -> list[JointFit]:
-        """Other models that explain something and are not worse than the best."""
-        result = []
-        for fit in self.models.values():
-            if fit is not best and not rules.flaw(self.evidence, fit):
-                if rules.not_worse(self.evidence, best, fit):
-                    result.append(fit)
-        return result
+        """Other models within their bounds that are not worse than the best."""
+        inside = [fit for fit in self.models.values() if not rules.at_bound(fit)]
+        inside.remove(best)
+        return [fit for fit in inside if rules.not_worse(self.evidence, best, fit)]
 
     def best(self) -> JointFit:
         """The model with the best score, of those within their bounds."""
@@ -150,7 +150,7 @@ class Ladder:
     def beginnings(
         self, centre: JointFit, effects: Effects, added: Sequence[Mapping[str, float]]
     ) -> list[dict[str, float]]:
-        """Where the fit of a changed model starts: at the present values, also with no change, and at nominal ones.
+        """Where the fit of a changed model starts: at the present values, and at nominal ones.
 
         Without an effect the baseline may have gone far to imitate it (an unmodelled delay is best
         met by a servo twenty times as stiff), and from there no descent comes back.
@@ -183,21 +183,27 @@ class Ladder:
         self.models.update(zip(calls, fits, strict=True))
 
     def combine(self) -> None:
-        """Fit the combinations of members that compete with the best model's in two families."""
+        """Fit the best model with other members of two of its families, of the members that do best alone."""
         best = self.best()
+        families = [family for family in FAMILIES.values() if family.effects & {*best.effects}]
         calls: dict[Effects, FitCall] = {}
-        for one, other in itertools.combinations(self.equals(best), 2):
-            effects = combined({*best.effects}, {*one.effects}, {*other.effects})
-            if effects not in self.models and len(calls) < COMBINED and rules.is_model(effects):
-                values = {**best.values, **one.values, **other.values}
-                calls[effects] = self.call(effects, [within(values, effects)])
+        for one, other in itertools.combinations(families, 2):
+            rest = {*best.effects} - one.effects - other.effects
+            for first, second in itertools.product(self.alive(best, one), self.alive(best, other)):
+                members = {*first.effects} & one.effects | {*second.effects} & other.effects
+                effects = frozenset(rest | members)
+                if effects not in self.models and len(calls) < COMBINED:
+                    values = {**best.values, **first.values, **second.values}
+                    calls[effects] = self.call(effects, [within(values, effects)])
         self.fit(calls)
 
-
-def combined(best: set[str], one: set[str], other: set[str]) -> Effects:
-    """The best model's effects with what either of two rivals changes in them."""
-    lost = (best - one) | (best - other)
-    return frozenset((best - lost) | (one - best) | (other - best))
+    def alive(self, best: JointFit, family: Family) -> list[JointFit]:
+        """The models that have another member of a family than the best, and it, the best first."""
+        rest = frozenset(best.effects) - family.effects
+        members = [frozenset(member) | rest for member in family.members]
+        fits = [self.models[effects] for effects in members if effects in self.models]
+        order = np.argsort(rules.scores(self.evidence, fits))
+        return [fits[index] for index in order[:ALIVE]]
 
 
 def within(values: Mapping[str, float], effects: Iterable[str]) -> dict[str, float]:

@@ -61,10 +61,10 @@ def plan(report: Report, recording: Recording, hand: "HandModel | None") -> Expe
         shaky = [row.joint for row in report.joints if row.verdict not in ("effects", "no_gap")]
         families = {joint: () for joint in shaky or report.recording.joints}
         sets = (BASIC,) if report.verdict == "under_excited" else UNKNOWN
-    motions = []
-    for motion in excitation_set(_reach(recording, hand), sets):
-        if motion.joints[0] in families:
-            motions.append(replace(motion, conditions={**_common(recording), **motion.conditions}))
+    menu = excitation_set(_reach(recording, hand), sets)
+    menu = [motion for motion in menu if motion.joints[0] in families]
+    common = _common(recording)
+    motions = [replace(motion, conditions={**common, **motion.conditions}) for motion in menu]
     sentence = _sentence(families, sets, sum(motion.duration for motion in motions))
     return Experiment(recording.model, recording.joints, families, sets, tuple(motions), sentence)
 
@@ -133,9 +133,7 @@ def _reach(recording: Recording, hand: "HandModel | None") -> JointRange:
     return JointRange(recording.joints, lower, upper, max(gains) or 1.0, (0.0, 0.0))
 
 
-def _sentence(
-    families: Mapping[str, Sequence[str]], sets: Sequence[str], seconds: float
-) -> str:
+def _sentence(families: Mapping[str, Sequence[str]], sets: Sequence[str], seconds: float) -> str:
     """What to record, and for what."""
     names = list(dict.fromkeys(name for group in families.values() for name in group))
     goal = f"to decide on {listing(names)}" if names else "to see what these motions do not show"

@@ -117,7 +117,9 @@ def _headline(report: Report) -> list[Row]:
     held = report.held_out
     names = dict.fromkeys(plain(effect.name) for effect in report.effects)
     answer = words.listing(names or ["nothing named"])
-    before = f"held out, the plain servo model; {mrad(report.baseline.rmse_rad)} where it was fitted"
+    before = (
+        f"held out, the plain servo model; {mrad(report.baseline.rmse_rad)} where it was fitted"
+    )
     tiles = [
         (_VERDICTS[report.verdict], "verdict", answer),
         (mrad(held.baseline_rmse_rad), "gap before", before),
@@ -126,7 +128,8 @@ def _headline(report: Report) -> list[Row]:
         note = f"held out, the identified model; {mrad(report.identified.rmse_rad)} where it was fitted"
         tiles.append((mrad(held.identified_rmse_rad), "gap after", note))
     if report.delivered is not None:
-        note = f"the layer as written, on a motion that no fit saw; the plain model {mrad(report.delivered.baseline_rmse_rad)}"
+        before = mrad(report.delivered.baseline_rmse_rad)
+        note = f"the layer as written, on a motion that no fit saw; the plain model {before}"
         tiles.append((mrad(report.delivered.rmse_rad), "as delivered", note))
     floor = mrad(report.noise_floor_rad)
     return [*tiles, (floor, "noise floor", "of the encoder: its counts, and its readings at rest")]

@@ -105,9 +105,8 @@ UPSTREAM = (
 """Effects between command and controller output, each of which the duty cycle shows. Backlash is
 that of the reference, as the servo model has it, not play behind the motor."""
 
-CLOSE = 0.1
-"""Two values within this share of each other are one: of an effect on two joints, as what a model
-lacks moves them by more than their intervals tell; of a supply idle and under load. Not tuned."""
+SAGGING = 0.1
+"""Share by which the voltage of a supply must fall under load for it to sag. Not tuned."""
 LINEAR = 0.995
 """Share of the duty cycle's variance that the plain error must explain for it to be linear. Not
 tuned.
@@ -188,7 +187,7 @@ def contradicted(telemetry: Telemetry) -> dict[str, str]:
     upstream of it (a delay, a filter, a dead zone, integral action) is at work.
     """
     result = {}
-    if telemetry.fall is not None and telemetry.fall[0] < CLOSE * telemetry.fall[1]:
+    if telemetry.fall is not None and telemetry.fall[0] < SAGGING * telemetry.fall[1]:
         fall, idle = telemetry.fall
         result["supply_sag"] = (
             f"the recorded voltage falls by {fall:.2f} V of {idle:.1f} V at full pull, "
@@ -434,10 +433,7 @@ def good_models(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
     candidates = earned(evidence, fits)
     best = best_of(evidence, candidates)
     equals = [fit for fit in candidates if fit is best or not_worse(evidence, best, fit)]
-    minimal = []
-    for fit in equals:
-        if not any(contains(fit, other) for other in equals):
-            minimal.append(fit)
+    minimal = [fit for fit in equals if not any(contains(fit, other) for other in equals)]
     order = np.argsort(scores(evidence, minimal))
     return [minimal[index] for index in order]
 
@@ -589,7 +585,7 @@ def families_of(
 
 
 def open_sets(good: Sequence[JointFit]) -> list[tuple[str, ...]]:
-    """Effects that stand in for each other in the good models: no model has two of a set that has the others."""
+    """Effects that stand in for each other in the good models, a set each."""
     common = set.intersection(*[{*fit.effects} for fit in good])
     loose = []
     for fit in good:
@@ -616,26 +612,6 @@ def listing(names: Sequence[str]) -> str:
     """``a``, ``a and b``, ``a, b and c``."""
     *others, last = names
     return f"{', '.join(others)} and {last}" if others else last
-
-
-# 6. What joints tell each other.
-
-
-def agree(one: Mapping[str, tuple[float, float, float]], other: Mapping[str, tuple[float, float, float]]) -> bool:
-    """Whether the parameters of an effect on two joints can be the same: close, or intervals overlap.
-
-    Args:
-        one: Value, low and high end of each parameter.
-        other: The same on the other joint.
-    """
-    if one.keys() != other.keys():
-        return False
-    for key, (value, low, high) in one.items():
-        other_value, other_low, other_high = other[key]
-        close = abs(value - other_value) <= CLOSE * max(abs(value), abs(other_value))
-        if not close and not (low <= other_high and other_low <= high):
-            return False
-    return True
 
 
 def overall(verdicts: Sequence[Verdict]) -> Verdict:

@@ -162,7 +162,10 @@ def _credit(report: Report) -> str:
     for joint in dict.fromkeys(row.joint for row in report.credits):
         credits = [row for row in report.credits if row.joint == joint]
         if len(credits) > 1:
-            each = [f"{mrad(row.without_held_out_rmse_rad)} without {plain(row.effect)}" for row in credits]
+            each = [
+                f"{mrad(row.without_held_out_rmse_rad)} without {plain(row.effect)}"
+                for row in credits
+            ]
             where = f" on {joint}" if len(report.joints) > 1 else ""
             rows.append(f" Each has its part{where}: held out it is {listing(each)}.")
     return "".join(rows) if len(rows) <= LISTED else ""
@@ -171,10 +174,13 @@ def _credit(report: Report) -> str:
 def _leftover(report: Report) -> str:
     """Whether more is missing than the identified model has."""
     left = report.identified.rmse_rad
-    if not report.provisional and not report.effects or left <= REPEATABLE * report.noise_floor_rad:
+    nothing = not report.provisional and not report.effects
+    if nothing or left <= REPEATABLE * report.noise_floor_rad:
         return ""
     times = left / report.noise_floor_rad
-    return f" That is still {times:.0f} times the noise floor: more is missing that has no name here."
+    return (
+        f" That is still {times:.0f} times the noise floor: more is missing that has no name here."
+    )
 
 
 def _besides(report: Report) -> str:
@@ -215,9 +221,7 @@ def families_sentences(report: Report) -> list[str]:
         parts = []
         for verdict in ("certain", "likely", "untold", "excluded"):
             names = [
-                row.name
-                for row in report.families
-                if row.joint == joint and row.verdict == verdict
+                row.name for row in report.families if row.joint == joint and row.verdict == verdict
             ]
             if names:
                 parts.append(f"{verdict}: {listing(names)}")

@@ -139,7 +139,7 @@ def explain(
             analysed[spec] = analysis.run(rows, list(analysed.values()))
     misfits = [Misfit(**misfit) for misfit in before["findings"]]
     joints = [analysed[spec] for spec in specs]
-    report, predictions = assemble(problems, joints, misfits, seed=chosen.seed)
+    report, predictions = assemble(problems, joints, misfits, chosen.seed)
     relative = relative_torques(problems.recording)
     report = replace(report, recording=replace(report.recording, relative_torques=relative))
     predictions.write(out / "predictions.npz")
@@ -252,10 +252,8 @@ class _JointAnalysis:
                 means[name] = others
                 for other in others:
                     vetoes[other] = f"leaves the same positions as {name}, which stands for both"
-        names = []
-        for name in rules.candidates(chain, self.options.effects):
-            if name not in vetoes:
-                names.append(name)
+        names = rules.candidates(chain, self.options.effects)
+        names = [name for name in names if name not in vetoes]
         return names, vetoes, {**means, **TOGETHER}
 
 
@@ -329,7 +327,8 @@ def _identify(
         (scales,) = pool.run(spec, [call])
         # One limit that binds, one that does not.
         starts = [{}, *({"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED))]
-        joint = PlainJoint(chain.joints[spec.joint], spec, _plain(pool, spec, rows, starts, scales), scales)
+        fit = _plain(pool, spec, rows, starts, scales)
+        joint = PlainJoint(chain.joints[spec.joint], spec, fit, scales)
         joints.append(joint)
         share = 100.0 * (number + 1) / len(specs)
         error, floor = 1e3 * joint.fit.rmse, 1e3 * spec.floor
