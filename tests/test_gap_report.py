@@ -128,7 +128,7 @@ def test_page_stands_alone_and_says_what_was_found(report, curves, tmp_path):
     assert "lacks coulomb friction on joint (150 mN m)" in text
     assert "vd-gap run recordings/servo --out gap" in text
     for row in report.compared:
-        assert words.plain(row.why) in text and words.model_text(row) in text
+        assert words.plain(row.why) in text and words.model_text(row.effects) in text
     assert "placebo" not in text.lower()
     for effect in EFFECTS.values():
         assert words.plain(effect.name) in text

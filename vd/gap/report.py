@@ -159,7 +159,7 @@ def _model_row(row: WholeModel) -> Row:
         values.append(f"{name} {amount(value, parameters_of(effect)[name].unit)}")
     return (
         row.joint,
-        words.model_text(row),
+        words.model_text(row.effects),
         mrad(row.rmse_rad),
         mrad(row.held_out_rmse_rad),
         words.mrad_range(row.difference_ci95),

@@ -26,6 +26,7 @@ from vd.gap.fit import JointFit, intervals
 from vd.gap.result import Certainty, Verdict
 from vd.gap.statistics import OWN_ERROR, REPEATABLE, interval, rmse
 from vd.gap.telemetry import Telemetry
+from vd.gap.words import listing, model_text, percent
 from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 from vd.logs.recording_checks import MIN_KINDS
 
@@ -244,15 +245,6 @@ def changes(effects: Iterable[str], allowed: Iterable[str]) -> list[frozenset[st
     return result
 
 
-def is_model(effects: Iterable[str]) -> bool:
-    """Whether effects are one member, or none, of each family."""
-    for family in FAMILIES.values():
-        member = family.effects.intersection(effects)
-        if member and not any(member == {*each} for each in family.members):
-            return False
-    return True
-
-
 # 2. Whether there is a gap.
 
 
@@ -387,11 +379,6 @@ def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
     return "" if certain else "the gain over motions is not distinguishable from none"
 
 
-def percent(share: float) -> str:
-    """``12 %``."""
-    return f"{100.0 * share:.0f} %"
-
-
 def earned(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
     """The models that explain something and earn what they have more than each that they contain."""
     sound = [fit for fit in fits if not fit.effects or not flaw(evidence, fit)]
@@ -452,10 +439,10 @@ def against(
     if problem := flaw(evidence, fit):
         return problem
     if not not_worse(evidence, good[0], fit):
-        return f"worse than {words(good[0])}"
+        return f"worse than {model_text(good[0].effects)}"
     for smaller in fits:
         if contains(fit, smaller) and (why := not_earned(evidence, smaller, fit)):
-            return f"beside {words(smaller)} {why}"
+            return f"beside {model_text(smaller.effects)} {why}"
     return "contains a smaller model that is as good"
 
 
@@ -514,7 +501,7 @@ def conclude(
     share = recovered(evidence, plain, good[0])
     if share < RECOVERED:
         text = (
-            f"the best model, {words(good[0])}, recovers {percent(share)} of the squared gap, "
+            f"the best model, {model_text(good[0].effects)}, recovers {percent(share)} of the squared gap, "
             "less than half"
         )
         return Conclusion("unknown", text, plain, tuple(good), weights)
@@ -542,7 +529,7 @@ def nothing_named(
     why = "there is no candidate"
     if others:
         best = best_of(evidence, others)
-        why = f"the best model, {words(best)}: "
+        why = f"the best model, {model_text(best.effects)}: "
         why += not_earned(evidence, plain, best) or flaw(evidence, best) or "not needed"
     if plain.rmse > REPEATABLE * evidence.floor:
         return "unknown", f"a gap that no model explains; {why}"
@@ -601,17 +588,6 @@ def open_sets(good: Sequence[JointFit]) -> list[tuple[str, ...]]:
 def apart(name: str, other: str, good: Sequence[JointFit]) -> bool:
     """Whether no good model has both effects."""
     return not any({name, other} <= {*fit.effects} for fit in good)
-
-
-def words(fit: JointFit) -> str:
-    """A model in words: ``backlash with command_delay``."""
-    return " with ".join(fit.effects) or "the plain servo"
-
-
-def listing(names: Sequence[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
-    *others, last = names
-    return f"{', '.join(others)} and {last}" if others else last
 
 
 def overall(verdicts: Sequence[Verdict]) -> Verdict:

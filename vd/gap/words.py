@@ -206,12 +206,12 @@ def _leaves(report: Report) -> str:
     if len(joints) > 1:
         return f"On {joints_text([row.joint for row in joints])} several models are as good."
     models = [row for row in report.models if row.joint == joints[0].joint]
-    return f"{len(models)} models are as good: {listing(map(model_text, models), 'or')}."
+    return f"{len(models)} models are as good: {listing([model_text(row.effects) for row in models], 'or')}."
 
 
-def model_text(model: WholeModel) -> str:
+def model_text(effects: Iterable[str]) -> str:
     """``backlash with command delay``."""
-    return " with ".join(map(plain, model.effects)) or "the plain servo"
+    return " with ".join(map(plain, effects)) or "the plain servo"
 
 
 def families_sentences(report: Report) -> list[str]:
@@ -266,7 +266,7 @@ def open_questions(report: Report) -> list[str]:
 def model_row(model: WholeModel) -> str:
     """``backlash with command delay (4 mrad fitted, 5 mrad held out)``."""
     errors = f"{mrad(model.rmse_rad)} fitted, {mrad(model.held_out_rmse_rad)} held out"
-    return f"{model_text(model)} ({errors})"
+    return f"{model_text(model.effects)} ({errors})"
 
 
 def _size(value: float, unit: str) -> tuple[float, str]:

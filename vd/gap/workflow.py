@@ -58,16 +58,6 @@ class Options:
     progress: Progress = lambda line: None
 
 
-@dataclass(frozen=True, eq=False)
-class PlainJoint:
-    """A joint under analysis: its data, its plain model, and the sizes of its motion."""
-
-    name: str
-    spec: JointSpec
-    fit: JointFit
-    scales: Scales
-
-
 def find(
     recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any
 ) -> list[Misfit]:
@@ -88,12 +78,15 @@ def find(
     """
     chosen = Options(**options)
     problems, specs = _problems(recording, hand, chosen)
-    with _workers(problems, len(specs), chosen) as pool:
-        joints = _identify(pool, problems.chains, specs, chosen)
-    predicted = curves(problems, [(joint.spec, joint.fit.rows) for joint in joints])
-    floors = {joint.name: joint.spec.floor for joint in joints}
-    misfits = findings(problems.recording, predicted, floors)
-    rows = {joint.name: {"rows": joint.fit.rows.tolist()} for joint in joints}
+    with _workers(problems, chosen) as pool:
+        fits = _identify(pool, problems.chains, specs, chosen)
+    floors, rows = {}, {}
+    for spec, fit in zip(specs, fits, strict=True):
+        name = problems.chains[spec.chain].joints[spec.joint]
+        floors[name] = spec.floor
+        rows[name] = {"rows": fit.rows.tolist()}
+    models = [(spec, fit.rows) for spec, fit in zip(specs, fits, strict=True)]
+    misfits = findings(problems.recording, curves(problems, models), floors)
     value = {
         "format": FIND_FORMAT,
         "findings": [asdict(misfit) for misfit in misfits],
@@ -130,7 +123,7 @@ def explain(
     before = json.loads((out / "find.json").read_text())
     problems, specs = _problems(recording, hand, chosen)
     analysed: dict[JointSpec, AnalysedJoint] = {}
-    with _workers(problems, len(specs), chosen) as pool:
+    with _workers(problems, chosen) as pool:
         # Of each finger from its tip on, as a joint's motion shakes those before it.
         for number, spec in enumerate(sorted(specs, key=lambda spec: (spec.chain, -spec.joint))):
             name = problems.chains[spec.chain].joints[spec.joint]
@@ -245,7 +238,9 @@ class _JointAnalysis:
     def candidates(self) -> tuple[list[str], dict[str, str], dict[str, tuple[str, ...]]]:
         """Effects that models may have; those that are not tried, with the reason; what effects stand for."""
         recording, chain = self.problems.recording, self.problems.chains[self.spec.chain]
-        vetoes = rules.contradicted(telemetry_of(recording, chain, self.spec))
+        spec = self.spec
+        telemetry = telemetry_of(recording, chain, spec.joint, spec.trajectories)
+        vetoes = rules.contradicted(telemetry)
         means = {}
         for name, others in rules.alike(self.options.effects, recording.model).items():
             if not vetoes.keys() & {name, *others}:
@@ -266,7 +261,7 @@ def baseline_values(row: np.ndarray, keys: Sequence[str]) -> dict[str, float]:
     return {key: float(row[BASELINE_PARAMETERS[key].column]) for key in keys}
 
 
-def _workers(problems: Problems, joints: int, options: Options) -> WorkerPool:
+def _workers(problems: Problems, options: Options) -> WorkerPool:
     """Who fits."""
     cores = len(os.sched_getaffinity(0)) if options.device == "cpu" else 1
     return WorkerPool(problems.of, options.workers or cores)
@@ -317,44 +312,35 @@ def baseline_of(chain: Chain) -> tuple[str, ...]:
 
 def _identify(
     pool: WorkerPool, chains: Sequence[Chain], specs: Sequence[JointSpec], options: Options
-) -> list[PlainJoint]:
-    """Baselines of all joints; the joints of a chain once more with the others' baselines."""
-    joints = []
+) -> list[JointFit]:
+    """Plain models of all joints; the joints of a chain once more beside the others' plain models."""
+    fits = []
     for number, spec in enumerate(specs):
         chain = chains[spec.chain]
-        rows = chain.start_row.copy()
-        call = partial(JointProblem.scales, row=rows[spec.joint], residual=spec.floor)
-        (scales,) = pool.run(spec, [call])
-        # One limit that binds, one that does not.
-        starts = [{}, *({"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED))]
-        fit = _plain(pool, spec, rows, starts, scales)
-        joint = PlainJoint(chain.joints[spec.joint], spec, fit, scales)
-        joints.append(joint)
+        fit = _plain(pool, spec, chain.start_row)
+        fits.append(fit)
         share = 100.0 * (number + 1) / len(specs)
-        error, floor = 1e3 * joint.fit.rmse, 1e3 * spec.floor
-        line = f"baseline {error:.2f} mrad, noise floor {floor:.2f}"
-        options.progress(f"find: {share:3.0f} % {joint.name}: {line}")
+        line = f"baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}"
+        options.progress(f"find: {share:3.0f} % {chain.joints[spec.joint]}: {line}")
     if all(len(chain.joints) == 1 for chain in chains):
-        return joints
+        return fits
     again = []
-    for joint in joints:
-        rows = joint.fit.rows.copy()
-        for other in joints:
-            if other.spec.chain == joint.spec.chain:
-                rows[other.spec.joint] = other.fit.rows[other.spec.joint]
-        fit = _plain(pool, joint.spec, rows, [{}], joint.scales)
-        again.append(replace(joint, fit=fit))
+    for spec, fit in zip(specs, fits, strict=True):
+        rows = fit.rows.copy()
+        for other, beside in zip(specs, fits, strict=True):
+            if other.chain == spec.chain:
+                rows[other.joint] = beside.rows[other.joint]
+        again.append(_plain(pool, spec, rows))
     return again
 
 
-def _plain(
-    pool: WorkerPool,
-    spec: JointSpec,
-    base: np.ndarray,
-    starts: Sequence[Mapping[str, float]],
-    scales: Scales,
-) -> JointFit:
+def _plain(pool: WorkerPool, spec: JointSpec, base: np.ndarray) -> JointFit:
     """A joint's plain model, fitted from rows of its chain."""
+    scale = partial(JointProblem.scales, row=base[spec.joint], residual=spec.floor)
+    (scales,) = pool.run(spec, [scale])
+    # One speed limit as it is, one that binds, one that does not.
+    limits = [{"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED)]
+    starts = [{}, *limits]
     call = partial(JointProblem.fit, base=base, effects=(), starts=starts, scales=scales)
     (fit,) = pool.run(spec, [call])
     return fit
