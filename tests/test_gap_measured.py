@@ -116,7 +116,7 @@ def test_long_recordings_are_analysed_in_pieces_from_rest(arm):
         trajectories, folds, _ = design(arm, chain, 0)
         parts = pieces(arm, chain, trajectories)
         column = int(chain.columns[0])
-        assert len(trajectories) >= 10 and len(set(folds)) == 6
+        assert len(trajectories) >= 9 and len(set(folds)) == 6
         chosen = [arm.trajectories[i] for i in trajectories]
         length = sum(
             t.time[end - 1] - t.time[first] for t, (first, end) in zip(chosen, parts, strict=True)
