@@ -57,8 +57,7 @@ class Sees(Turn):
             camera=camera, depth=wp.full((2, camera.height, camera.width), 0.5)
         )
         tips = self.hand.tip_poses(self.hand.start)[:, :3].mean(axis=0)
-        finder = SimpleNamespace(pose=torch.tensor([*tips, 0.0, 0.0, 0.0, 1.0]).expand(2, 1, 7))
-        self.tracker = SimpleNamespace(observer=SimpleNamespace(finder=finder))
+        self.tracker = SimpleNamespace(pose=torch.tensor([*tips, 0.0, 0.0, 0.0, 1.0]).expand(2, 7))
 
     def surface(self, world):
         """A point, the origin."""

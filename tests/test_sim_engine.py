@@ -121,7 +121,7 @@ def test_an_evaluation_says_whose_physics_it_was(tmp_path):
     assert main(["zero", "--engine", "mujoco", *few]) == 0
     (row, *_) = Result.read(tmp_path / "eval.json").rows
     assert row.protocol.engine == "mujoco"
-    assert "MuJoCo" in (tmp_path / "eval.html").read_text()
+    assert "engine mujoco" in (tmp_path / "eval.html").read_text()
 
 
 def test_what_the_engine_cannot_do_is_refused():

@@ -287,7 +287,8 @@ def test_a_runner_decides_on_a_hand_as_in_the_simulator(kind):
         decision = runner.decide(replace(sensed, depth=image))
         np.testing.assert_allclose(decision.action, action[0], atol=1e-3, err_msg=f"step {step}")
         assert decision.distance == pytest.approx(float(actor.predicted[0]), abs=1e-4)
-        actions.put(sensed.smoothed)
+        if not sensed.smoothed.any():  # an episode begins
+            actions.reset()
         target = actions.goal(action[0].numpy(), sensed.joint_q)
         env.step(wp.from_torch(action.contiguous()))
         np.testing.assert_allclose(target, env.sim.target.numpy()[0, : env.num_actions], atol=1e-6)

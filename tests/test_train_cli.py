@@ -121,7 +121,7 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
     with pytest.raises(
         ValueError, match=r"--env\.randomisation\.force-s draws nothing; add --randomise"
     ):
-        parse_teacher(["--preset", "gpu", "--env.randomisation.force-s", "0.1"])
+        parse_teacher(["--preset", "cpu-demo", "--env.randomisation.force-s", "0.1"])
 
 
 def test_a_smoke_test_leaves_nothing_and_can_be_done_again(tmp_path, monkeypatch, capsys):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from vd.envs.cfg import ReorientCfg
+from vd.envs.cfg import CurriculumCfg, LevelCfg, ReorientCfg
 from vd.policy.bundle import read_policy
 from vd.sim.cfg import SimCfg, coarser
 from vd.train.checkpoint import checkpoint_path
@@ -27,7 +27,7 @@ def _train(run_dir: Path, iterations: int, observation=None, **begin) -> Teacher
         observation=observation or cfg.env.observation,
         start=replace(cfg.env.start, poses=2),
         randomisation=replace(cfg.env.randomisation, enabled=True),
-        curriculum=replace(cfg.env.curriculum, enabled=True, raise_at=0.0, lower_at=0.0),
+        curriculum=CurriculumCfg(goals=LevelCfg(rate=0.005, raise_at=0.0, lower_at=0.0)),
     )
     run = replace(cfg.run, out=run_dir, max_minutes=None, coarse_physics=True)
     ppo = replace(cfg.ppo, rollout_steps=4, minibatch_size=16)

@@ -80,7 +80,7 @@ class PolicyCfg:
     """Bounds of the standard deviation; the default leaves it free, as in the paper's code."""
     quiet_std: float | None = None
     """Lower bound of the standard deviation where success asks for its full stillness
-    (--env.curriculum.stillness); the bound falls towards it with that level. None: it stays."""
+    (of the curriculum); the bound falls towards it with that level. None: it stays."""
     normalise_observations: bool = False
     """Subtract a running mean and divide by a running std; the paper does not."""
 

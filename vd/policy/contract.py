@@ -15,8 +15,6 @@ from typing import Any, Literal
 from vd.assets_usd.hand_data import HandModel
 from vd.command.config import from_dict, leaves, to_dict
 from vd.envs.cfg import ReorientCfg
-from vd.kernels.task.observations import teacher_observation_slices
-from vd.kernels.task.shapes import shape_observation_size
 from vd.paper import PAPER
 from vd.policy.stopping import StoppingRules
 from vd.sensors.cfg import DepthCameraCfg
@@ -299,6 +297,9 @@ def _observation(hand: HandModel, task: ReorientCfg) -> dict[str, Any]:
 
     Tracking and vision policies make it of joints and camera.
     """
+    from vd.kernels.task.observations import teacher_observation_slices
+    from vd.kernels.task.shapes import shape_observation_size
+
     observation = task.observation
     slices = teacher_observation_slices(hand.num_fingers, hand.num_joints)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}
