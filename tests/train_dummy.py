@@ -34,7 +34,6 @@ class DummyEnv:
     num_actions = 2
     num_observations = 5
     num_privileged = 0
-    num_present = 0
     reward_term_names = ("distance", "bonus")
     reach = 0.2
     fall_probability = 0.02

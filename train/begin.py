@@ -120,8 +120,9 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
         task = ReorientCfg.of_task(state["task"])
         env = replace(task, curriculum=base.env.curriculum)
         learner = state["learner"]
-        ppo = from_dict(PpoCfg, learner["ppo"], where="learner.ppo")
-        ppo = replace(ppo, imitation_iterations=0)  # how it began is its own
+        settings = dict(learner["ppo"])
+        settings.pop("imitation_iterations", None)  # how the installed policies began
+        ppo = from_dict(PpoCfg, settings, where="learner.ppo")
         policy = from_dict(PolicyCfg, learner["policy"], where="learner.policy")
     except ValueError as error:
         raise ValueError(

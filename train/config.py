@@ -57,11 +57,6 @@ class PpoCfg:
     failure_floor: float | None = None
     """What a sample weighs beside the share of goals that are missed with its object: the less, the
     more do objects count with which much is missed. None: all samples weigh the same."""
-    imitation_iterations: int = 0
-    """Iterations after --init in which the actor imitates, in what it does itself, the policy that
-    it began from, which sees the present state and shape (--env.observation.dynamics); the critic
-    learns alone.
-    """
 
 
 @dataclass
@@ -135,9 +130,7 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
     require(ppo, "--ppo.", "positive", "rollout_steps minibatch_size epochs clip grad_norm")
     rates = "actor_learning_rate critic_learning_rate"
     require(ppo, "--ppo.", "positive", f"{rates} desired_kl late_kl")
-    require(
-        ppo, "--ppo.", "zero or positive", "imitation_iterations bound_coefficient failure_floor"
-    )
+    require(ppo, "--ppo.", "zero or positive", "bound_coefficient failure_floor")
     require(ppo, "--ppo.", "in [0, 1]", "gamma gae_lambda")
     if not min(policy.hidden, default=0) > 0:
         raise ValueError(f"--policy.hidden is {policy.hidden}; widths have to be positive")

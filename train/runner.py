@@ -26,7 +26,6 @@ from vd.train.checkpoint import (
 )
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 from vd.train.failures import ObjectFailures
-from vd.train.imitate import IMITATED, Imitation
 from vd.train.loop import TrainingLoop, check_update
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.ppo import make_learner
@@ -45,7 +44,6 @@ class TeacherRunner(TrainingLoop):
     Attributes:
         new_inputs: Observed values that the networks of the policy that it began from did not read.
         critic_warmup: Iterations left in which the critic learns alone.
-        imitation: What the actor does meanwhile, if anything (``PpoCfg.imitation_iterations``).
         failures: Goals that are missed by object (``PpoCfg.failure_floor``); None: not counted.
         begun: Whether this run began from another one's networks, in this process.
         unlike: What observations and actions mean otherwise than to the policy that the run began
@@ -79,7 +77,6 @@ class TeacherRunner(TrainingLoop):
         self._stagger_due = True
         self.new_inputs = 0
         self.critic_warmup = 0
-        self.imitation: Imitation | None = None
         self.begun = False
         self.unlike: list[str] = []
 
@@ -113,22 +110,13 @@ class TeacherRunner(TrainingLoop):
         """
         found = read_start(Path(path), self.device)
         check_fit(found, self._spec(), self.task, path)
-        present, read = self.env.env.num_present, found["policy"]["num_observations"]
-        if self.ppo.imitation_iterations and present != read:
-            raise ValueError(
-                f"--ppo.imitation-iterations: {path} reads {read} values, and the critic is told "
-                f"{present} of the present; give --env.observation.dynamics critic, and --init a "
-                "policy of state and shape"
-            )
         self.unlike = unlike(found["task"], self.task)
         found, self.new_inputs = widen(found, self.alg.actor, self.alg.critic)
         own = self.alg.save() | {"window": self._window.state_dict()}
         self._take(without_worlds(completed(found, own, levels)), path)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.begun = True
-        self.critic_warmup = self.ppo.imitation_iterations or warmup_iterations(found)
-        if self.ppo.imitation_iterations:
-            self.imitation = Imitation(self.alg)
+        self.critic_warmup = warmup_iterations(found)
         self._best, self._window = None, self._new_window()
 
     def save(self) -> None:
@@ -220,19 +208,12 @@ class TeacherRunner(TrainingLoop):
         return True
 
     def _update(self) -> dict[str, float]:
-        """All epochs of PPO, or of the critic alone, beside which the actor may imitate.
-
-        Its losses.
-        """
+        """All epochs of PPO, or of the critic alone; its losses."""
         if self.failures is not None:
             self.failures.end_iteration(self.world_size)
             self.alg.weights = self.failures.weights()
         self.alg.actor_learns = self.critic_warmup == 0
         losses = self.alg.update()
-        if self.imitation is not None and self.critic_warmup:
-            losses |= self.imitation.update(
-                min(1.0, self.critic_warmup / self.ppo.imitation_iterations)
-            )
         self.critic_warmup = max(0, self.critic_warmup - 1)
         check_update(
             losses, self._networks, f"{LOWER_RATES}, or raise the lower end of --policy.std-range"
@@ -266,8 +247,6 @@ class TeacherRunner(TrainingLoop):
             "task": self.task,
             "interface": self.interface,
         }
-        if self.imitation is not None and self.critic_warmup:
-            state[IMITATED] = self.imitation.teacher.state_dict()
         if self.failures is not None:
             state["failures"] = self.failures.state_dict()
         return self.alg.save() | state
@@ -282,10 +261,6 @@ class TeacherRunner(TrainingLoop):
                 f"it was trained with (its run folder's config.json), or start anew ({error})"
             ) from error
         self.critic_warmup = state.get("critic_warmup", 0)
-        self.imitation = None
-        if IMITATED in state and self.ppo.imitation_iterations:
-            self.imitation = Imitation(self.alg)
-            self.imitation.teacher.load_state_dict(state[IMITATED])
         if self.failures is not None and "failures" in state:
             self.failures.load_state_dict(state["failures"])
         self._best = tuple(state["best"]) if state["best"] is not None else None

@@ -55,10 +55,6 @@ def build_teacher(cfg: TeacherCfg, *, say: Callable[[str], object] = print) -> "
         raise ValueError(
             "--init-levels says where a run with --init begins; leave it out, or give --init"
         )
-    if cfg.init is None and cfg.ppo.imitation_iterations:
-        raise ValueError(
-            "--ppo.imitation-iterations imitates the policy that --init names; give --init too"
-        )
     if device == "cpu" and cfg.env.num_envs > CPU_ENVS:
         say(
             f"{cfg.env.num_envs} environments take a CPU minutes an iteration; --num-envs asks for "
@@ -184,7 +180,6 @@ def _beginning(cfg: TeacherCfg, runner: "TeacherRunner") -> Iterator[str]:
     if runner.new_inputs:
         yield f"{runner.new_inputs} observed values are new to the networks and start without effect"
     if runner.critic_warmup:
-        actor = "stays as it is" if runner.imitation is None else "imitates what it began from"
-        yield f"the critic learns alone for {runner.critic_warmup} iterations, the actor {actor}"
+        yield f"the critic learns alone for {runner.critic_warmup} iterations"
     for difference in runner.unlike:
         yield f"other than in the training of that policy: {difference}"

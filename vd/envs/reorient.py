@@ -125,11 +125,6 @@ class ReorientEnv:
         self.observation, self.privileged = self.observer.split(self.observer.all_values)
         """Teacher observation, fresh after resets and new goals, shape [N, O]: state and shape;
         and what the critic alone is told, shape [N, P]."""
-        present = self.observer.parts.get("present", slice(0, 0))
-        self.num_present = present.stop - present.start
-        """Values of the present state and shape, the last of ``privileged``; 0 where none are
-        told.
-        """
         self.world_observation, _ = self.observer.split(self.observer.world_values)
         """Observation in the world frame, shape [N, O]."""
         self.symmetry_frames = self.observer.symmetry_frames
