@@ -5,13 +5,11 @@ import shlex
 import sys
 import tomllib
 from pathlib import Path
-from unittest.mock import MagicMock
 
 import pytest
 import yaml
 
 from vd.train.alignment.cli import parse_alignment
-from vd.train.config import RunCfg
 from vd.train.flags import parse_teacher
 from vd.train.presets import PRESETS
 
@@ -110,25 +108,3 @@ def test_flags_override_the_file_and_it_the_preset_that_it_names(tmp_path, run):
         assert "epochs: 3" in run(f"vd-train {line.format(path)}")[1]
     path.write_text("stage: 1\npreset: cpu-demo")
     assert parse_alignment(["--config", str(path)]).run.out.name == "cpu-stage1"
-
-
-def test_a_logger_that_is_not_installed_is_refused_and_one_that_is_gets_the_curve(
-    tmp_path, monkeypatch
-):
-    from train_dummy import make_runner
-
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(ValueError, match=r"--logger wandb needs wandb, .* pip install wandb"):
-        RunCfg(logger="wandb").validate()
-    wandb = MagicMock()
-    monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", wandb)
-    monkeypatch.setitem(sys.modules, "wandb", wandb)
-    (tmp_path / "config.json").write_text('{"ppo": {}}')
-    make_runner(tmp_path, logger="wandb").learn(2)
-    logged = {(call.kwargs["step"], *call.args[0]) for call in wandb.log.call_args_list}
-    assert {
-        (1, "reward/total"),
-        (2, "run/steps_per_s"),
-    } <= logged and wandb.run.name == tmp_path.name
-    wandb.config.update.assert_called_with({"ppo": {}})
-    wandb.finish.assert_called_once()

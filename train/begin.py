@@ -1,7 +1,4 @@
-"""Beginning a run with the networks of another: of a checkpoint, or of an exported policy.
-
-Networks may have read less than the run observes: inputs that are new begin without effect.
-"""
+"""Beginning a run with the networks of another: of a checkpoint, or of an exported policy."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,8 +9,6 @@ from vd.command.config import from_dict, leaves, to_dict
 from vd.envs.curriculum import LEVELS
 
 if TYPE_CHECKING:
-    from torch import nn
-
     from vd.policy.contract import PolicySpec
     from vd.train.presets import TeacherCfg
 
@@ -27,25 +22,6 @@ MOMENTS_WARMUP = 3
 moment.
 """
 REMEDY = "give the policy's settings, or leave --preset out, which takes them over"
-NEW_INPUTS = {
-    "mlp.0.weight": 0.0,
-    "obs_normalizer._mean": 0.0,
-    "obs_normalizer._var": 1.0,
-    "obs_normalizer._std": 1.0,
-}
-"""What reads or normalises the inputs, and what it has for new ones."""
-_OF_POLICY = {
-    "policy",
-    "task",
-    "interface",
-    "learner",
-    "stage",
-    "iter",
-    "env_steps",
-    "actor_state_dict",
-    "critic_state_dict",
-}
-"""What a policy has of a checkpoint."""
 _SENSES = ("hand", "fingertip", "hand_layer", "sim", "action", "observation")
 """Parts of a task that say what a policy's observations and actions mean."""
 
@@ -142,47 +118,19 @@ def warmup_iterations(state: Mapping[str, Any]) -> int:
     return int(state.get("critic_warmup", 0))  # what its own run still lacked
 
 
-def widen(
-    state: dict[str, Any], actor: "nn.Module", critic: "nn.Module"
-) -> tuple[dict[str, Any], int]:
-    """A checkpoint or policy with the networks of a run that observes more, acting as before.
-
-    Of a network that reads more nothing is taken over of the optimiser: its moments are of another
-    shape.
+def with_fitting_critic(state: dict[str, Any], critic: Mapping[str, Any]) -> dict[str, Any]:
+    """A checkpoint or policy without a critic that reads another number of values.
 
     Args:
         state: The checkpoint, not changed. Critic and optimiser may be missing, as in an exported
             policy.
-        actor: The actor it is for, which reads at least as much as that of the checkpoint.
-        critic: The critic it is for.
-
-    Returns:
-        The checkpoint, and how many inputs are new, of the network with the most of them.
+        critic: Weights of the critic that it is for.
     """
-    from torch.nn.functional import pad
-
-    widened, most = {}, 0
-    before, now = (
-        w["mlp.0.weight"].shape[1] for w in (state["actor_state_dict"], actor.state_dict())
-    )
-    told = state.get("critic_state_dict", {}).get("mlp.0.weight")
-    if told is not None and told.shape[1] > before < now:
-        # What a critic is told besides comes after what is new, where its weights do not look for
-        # it.
-        state = {key: value for key, value in state.items() if key != "critic_state_dict"}
-    for key, network in (("actor_state_dict", actor), ("critic_state_dict", critic)):
-        if key not in state:
-            continue
-        weights, own = dict(state[key]), network.state_dict()
-        for name in weights.keys() & NEW_INPUTS.keys():
-            extra = own[name].shape[-1] - weights[name].shape[-1]
-            weights[name] = pad(weights[name], (0, extra), value=NEW_INPUTS[name])
-            most = max(most, extra)
-        widened[key] = weights
-    if most:
-        warming = {"critic_state_dict"} if state.get("critic_warmup", 0) else set()
-        state = {key: state[key] for key in state.keys() & _OF_POLICY - warming}
-    return state | {key: weights for key, weights in widened.items() if key in state}, most
+    first = "mlp.0.weight"
+    if state.get("critic_state_dict", critic)[first].shape == critic[first].shape:
+        return state
+    missing = {"critic_state_dict", "optimizer_state_dict"}
+    return {key: state[key] for key in state.keys() - missing}
 
 
 def completed(
@@ -194,7 +142,7 @@ def completed(
     normalisation. A policy that says nothing of a level has come to the end of it.
 
     Args:
-        state: A checkpoint, or a policy, widened for the run.
+        state: A checkpoint, or a policy, with a critic that fits or none.
         own: Networks, optimiser and window of the run: ``critic_state_dict``,
             ``optimizer_state_dict``, ``window``.
         levels: Levels of the curriculum to begin at, rather than those of the file.
@@ -235,8 +183,7 @@ def check_fit(
     """Refuse what a run cannot go on with.
 
     Raises:
-        ValueError: Another hand, an actor of another shape, or one that observes what is no more;
-            with the remedy.
+        ValueError: Another hand, or an actor of another shape; with the remedy.
     """
     from vd.envs.cfg import ObservationCfg
     from vd.policy.contract import PolicySpec
@@ -258,10 +205,10 @@ def check_fit(
         if theirs != ours:
             flag = f"--policy.{name.replace('_', '-')}"
             raise ValueError(f"--init: {path} has {flag} {theirs}, and this run {ours}; {REMEDY}")
-    if found.num_observations > spec.num_observations:
+    if found.num_observations != spec.num_observations:
         raise ValueError(
             f"--init: {path} reads {found.num_observations} values and this run observes "
-            f"{spec.num_observations}, but a run can only go on with more: {REMEDY}"
+            f"{spec.num_observations}: {REMEDY}"
         )
 
 

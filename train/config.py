@@ -3,7 +3,6 @@
 Defaults are the paper's (Table S1), or its released code's where the paper says nothing.
 """
 
-import importlib.util
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,17 +101,12 @@ class RunCfg:
     Policies keep the task's own, and are judged in it."""
     save_every: int = 100
     """Iterations between checkpoints."""
-    logger: Literal["tensorboard", "wandb", "none"] = "tensorboard"
-    """Where curves go beside progress.jsonl: files for tensorboard --logdir RUN, or these and
-    Weights & Biases (pip install wandb; WANDB_MODE=offline needs no account)."""
+    logger: Literal["tensorboard", "none"] = "tensorboard"
+    """Where curves go beside progress.jsonl: files for tensorboard --logdir RUN, or nowhere."""
 
     def validate(self) -> None:
         """Raise ValueError naming the flag, its value and what it has to be."""
         require(self, "--", "positive", "max_steps max_minutes save_every")
-        if self.logger == "wandb" and importlib.util.find_spec("wandb") is None:
-            raise ValueError(
-                "--logger wandb needs wandb, which is not installed: pip install wandb"
-            )
 
 
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:

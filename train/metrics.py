@@ -5,16 +5,17 @@ import math
 import threading
 from collections import deque
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from vd.command.files import make_folder, write_text, writing
-from vd.train.flags import CONFIG_NAME
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 PROGRESS_FILE = "progress.jsonl"
 BOARD_FOLDER = "tensorboard"
-WANDB_PROJECT = "visual-dexterity"
 
 
 class StepMeans:
@@ -121,7 +122,7 @@ class ProgressFile:
         write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
         with writing(path):
             self._file = path.open("ab", buffering=0)
-        self._board = None if logger == "none" else _board(run_dir, logger, done)
+        self._board = None if logger == "none" else _board(run_dir, done)
 
     def write(self, row: dict[str, Any]) -> None:
         """Add an iteration. Values that are not finite become ``null``.
@@ -155,24 +156,14 @@ class ProgressFile:
         self._file.close()
         if self._board is not None:
             self._board.close()
-            getattr(self._board, "stop", lambda: None)()  # of Weights & Biases
 
 
-def _board(run_dir: Path, logger: str, done: int) -> Any:
-    """What draws curves; it has ``add_scalar``."""
+def _board(run_dir: Path, done: int) -> "SummaryWriter":
+    """What draws the curves of a run after ``done`` iterations."""
+    from torch.utils.tensorboard import SummaryWriter  # heavy, and optional
+
     threading.excepthook = _report_thread
-    folder = str(run_dir / BOARD_FOLDER)
-    if logger == "tensorboard":
-        from torch.utils.tensorboard import SummaryWriter  # heavy, and optional
-
-        return SummaryWriter(folder, purge_step=done + 1, flush_secs=10)
-    import wandb
-    from rsl_rl.utils.wandb_log_writer import WandbLogWriter
-
-    board = WandbLogWriter(folder, WANDB_PROJECT)
-    wandb.run.name = run_dir.name
-    wandb.config.update(json.loads((run_dir / CONFIG_NAME).read_text()))
-    return board
+    return SummaryWriter(str(run_dir / BOARD_FOLDER), purge_step=done + 1, flush_secs=10)
 
 
 def _report_thread(args: threading.ExceptHookArgs) -> None:

@@ -46,7 +46,7 @@ class TeacherCfg:
     """Begin a new run with networks, curriculum and counters of another: the name of an installed
     policy (dclaw3), a policy, a checkpoint or a run's folder. Of a policy without a critic or an
     optimiser the critic learns alone first. Without --preset its task and its networks are
-    this run's defaults. It may have observed less: what is new starts without effect."""
+    this run's defaults."""
     init_levels: tuple[float, float, float, float] | None = None
     """Levels of the curriculum (goals, stillness, physics, air) at which a run with --init begins.
     None: those of what it begins from; 1 for a policy that does not say, the task as configured."""

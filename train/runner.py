@@ -16,7 +16,14 @@ from vd.envs.curriculum import blend
 from vd.policy.actor import teacher_in
 from vd.policy.bundle import write_policy
 from vd.policy.contract import PolicySpec
-from vd.train.begin import check_fit, completed, read_start, unlike, warmup_iterations, widen
+from vd.train.begin import (
+    check_fit,
+    completed,
+    read_start,
+    unlike,
+    warmup_iterations,
+    with_fitting_critic,
+)
 from vd.train.checkpoint import (
     BEST_NAME,
     POLICY_NAME,
@@ -42,7 +49,6 @@ class TeacherRunner(TrainingLoop):
     (:func:`vd.policy.contract.derive_interface`); others as of TrainingLoop.
 
     Attributes:
-        new_inputs: Observed values that the networks of the policy that it began from did not read.
         critic_warmup: Iterations left in which the critic learns alone.
         failures: Goals that are missed by object (``PpoCfg.failure_floor``); None: not counted.
         begun: Whether this run began from another one's networks, in this process.
@@ -75,7 +81,6 @@ class TeacherRunner(TrainingLoop):
         self._best: tuple[float, ...] | None = None
         self._better = False
         self._stagger_due = True
-        self.new_inputs = 0
         self.critic_warmup = 0
         self.begun = False
         self.unlike: list[str] = []
@@ -102,8 +107,7 @@ class TeacherRunner(TrainingLoop):
 
         Environments, random states, learning rates and the choice of the best checkpoint are this
         run's own, and so are a critic and an optimiser that the file lacks; then the critic learns
-        alone first. Networks that read less than this run observes are widened. With ``levels``
-        those of the curriculum are these.
+        alone first. With ``levels`` those of the curriculum are these.
 
         Raises:
             ValueError: The file is damaged, of another hand or of another network.
@@ -111,8 +115,8 @@ class TeacherRunner(TrainingLoop):
         found = read_start(Path(path), self.device)
         check_fit(found, self._spec(), self.task, path)
         self.unlike = unlike(found["task"], self.task)
-        found, self.new_inputs = widen(found, self.alg.actor, self.alg.critic)
         own = self.alg.save() | {"window": self._window.state_dict()}
+        found = with_fitting_critic(found, own["critic_state_dict"])
         self._take(without_worlds(completed(found, own, levels)), path)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.begun = True

@@ -177,8 +177,6 @@ def _beginning(cfg: TeacherCfg, runner: "TeacherRunner") -> Iterator[str]:
     yield f"{how} after iteration {runner.iteration} of {runner.total_iterations}"
     if runner.new_episodes and not runner.begun:
         yield f"episodes start anew, the checkpoint does not fit the environments: {runner.new_episodes}"
-    if runner.new_inputs:
-        yield f"{runner.new_inputs} observed values are new to the networks and start without effect"
     if runner.critic_warmup:
         yield f"the critic learns alone for {runner.critic_warmup} iterations"
     for difference in runner.unlike:
