@@ -79,24 +79,25 @@ def test_what_is_written_is_read(folder):
     assert len(TRUTH_COLUMNS) == 8
 
 
-def test_the_mcap_beside_it_has_all_of_it_and_ros_2_messages_for_others(folder, capsys):
+def test_the_mcap_beside_it_has_ros_2_messages_for_others(folder):
     reader = pytest.importorskip("mcap.reader")
     from mcap_ros2.decoder import DecoderFactory
 
     log, file = read_log(folder), folder.with_suffix(".mcap")
-    same = read_log(file)
-    assert is_log(file) and (same.run, same.events) == (log.run, log.events)
-    assert same.columns.keys() == log.columns.keys() >= set(FOUND_COLUMNS)
-    for name, values in same.columns.items():
-        np.testing.assert_allclose(values, log.columns[name], atol=1e-6)
     with file.open("rb") as stream:
         whole = reader.make_reader(stream, decoder_factories=[DecoderFactory()])
+        (run,) = whole.iter_metadata()
         told = list(whole.iter_decoded_messages())
+    assert json.loads(run.metadata["json"]) == log.run
     topics = [channel.topic for _, channel, _, _ in told]
-    assert (
-        topics.count("/joint_states") == topics.count("/goal_pose") == STEPS
-        and topics.count("/depth") == 3
-    )
+    assert topics.count("/goal_pose") == topics.count("/found_pose") == STEPS
+    assert topics.count("/depth") == 3
+    states = [message for _, channel, _, message in told if channel.topic == "/joint_states"]
+    for channel in ("position", "velocity"):
+        values = [getattr(state, channel) for state in states]
+        np.testing.assert_allclose(values, log.channel(channel), atol=1e-6)
+    events = [message.data for _, channel, _, message in told if channel.topic == "/events"]
+    assert list(map(json.loads, events)) == log.events
     depth = told[topics.index("/depth")][3]
     assert (depth.encoding, depth.height, depth.width) == ("16UC1", 2, 3)
     assert np.frombuffer(depth.data, "<u2").tolist() == [500] * 6
@@ -105,9 +106,6 @@ def test_the_mcap_beside_it_has_all_of_it_and_ros_2_messages_for_others(folder, 
         0.03,
         1.0,
     )
-    for size in (2000, 5):
-        file.write_bytes(file.read_bytes()[:size])
-        assert play([str(file)]) == 1 and "is damaged" in capsys.readouterr().err
 
 
 def test_a_log_is_shown(folder, tmp_path, capsys):

@@ -22,7 +22,6 @@ from vd.logs.log_format import (
     EVENTS_FILE,
     FOUND_COLUMNS,
     LOG_FORMAT,
-    MCAP,
     RUN_FILE,
     STEPS_FILE,
     STOPPED,
@@ -119,21 +118,17 @@ class HandLog:
 
 
 def is_log(path: str | Path) -> bool:
-    """Whether a folder, or an MCAP file, is a log."""
-    return (Path(path) / RUN_FILE).is_file() or (Path(path).suffix == MCAP and Path(path).is_file())
+    """Whether a folder is a log."""
+    return (Path(path) / RUN_FILE).is_file()
 
 
 def read_log(path: str | Path) -> HandLog:
-    """Read a log, also one that was cut short; of an MCAP file, what that has of it.
+    """Read a log, also one that was cut short.
 
     Raises:
         LogError: It is none, or damaged.
     """
     path = Path(path)
-    if path.suffix == MCAP:
-        from vd.logs.mcap_log import read_mcap
-
-        return HandLog(path, *read_mcap(path))
     try:
         run = json.loads((path / RUN_FILE).read_text())
     except FileNotFoundError:

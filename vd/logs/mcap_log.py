@@ -1,32 +1,20 @@
-"""The log of a run in one MCAP file of ROS 2 messages, which Foxglove, PlotJuggler and ``ros2 bag`` read too.
+"""The log of a run in one MCAP file of ROS 2 messages, for Foxglove, PlotJuggler and ``ros2 bag``.
 
-For them are ``/joint_states``, ``/joint_commands``, ``/object_pose`` (a twin's), ``/found_pose``
-(as the policy finds it), ``/goal_pose`` and ``/depth`` [mm]. :func:`vd.logs.hand_log.read_log` reads
-``/step``, each row of steps.csv whole, ``/events``, and the metadata ``run``, which is run.json.
-Needs the extra ``log``.
+Topics are ``/joint_states``, ``/joint_commands``, ``/object_pose`` (a twin's), ``/found_pose`` (as the
+policy finds it), ``/goal_pose``, ``/depth`` [mm] and ``/events``. Needs the extra ``log``.
 """
 
 import json
-import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from vd.command import interrupt
-from vd.logs.log_format import (
-    FOUND_COLUMNS,
-    JOINT_CHANNELS,
-    LOG_FORMAT,
-    STEP_COLUMNS,
-    TRUTH_COLUMNS,
-    LogError,
-)
+from vd.logs.log_format import FOUND_COLUMNS, TRUTH_COLUMNS
 
 WORLD = "world"
 _NS = 1_000_000_000
-_PLAIN = ("t", "t_command", *STEP_COLUMNS)
 _TIME = "int32 sec\nuint32 nanosec"
 _HEADER = "builtin_interfaces/Time stamp\nstring frame_id"
 _XYZ = "float64 x\nfloat64 y\nfloat64 z"
@@ -41,7 +29,6 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
 IMAGE = "sensor_msgs/msg/Image"
 TEXT = "std_msgs/msg/String"
-STEP = "visual_dexterity_msgs/msg/Step"
 _TYPES = {
     JOINT_STATE: "std_msgs/Header header\nstring[] name\nfloat64[] position\n"
     "float64[] velocity\nfloat64[] effort",
@@ -49,14 +36,8 @@ _TYPES = {
     IMAGE: "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\n"
     "uint8 is_bigendian\nuint32 step\nuint8[] data",
     TEXT: "string data",
-    STEP: "\n".join(
-        [f"float64 {name}" for name in _PLAIN]
-        + [f"float64[] {name}" for name in (*JOINT_CHANNELS, "object", "found")]
-    ),
 }
-"""Definitions of the messages; the file has them, so that a reader needs no package with the last
-one.
-"""
+"""Definitions of the messages, which the file has."""
 
 
 class McapLog:
@@ -84,33 +65,30 @@ class McapLog:
         self._run = dict(run)
         self._place = place
         self._joints = list(run["joints"])
-        self._note()
 
     def step(self, row: Mapping[str, float], depth: np.ndarray | None) -> None:
         """Write a control step, by columns of steps.csv, and the depth image [m] [H, W] that it saw."""
         t = row["t"]
-        joints = {}
-        for channel in JOINT_CHANNELS:
-            joints[channel] = [row.get(f"{channel}.{joint}", np.nan) for joint in self._joints]
-        truth = [row[name] for name in TRUTH_COLUMNS if name in row]
-        believed = [row[name] for name in FOUND_COLUMNS]
-        self._write_joints(t, "/joint_states", joints["position"], joints["velocity"])
-        self._write_joints(row["t_command"], "/joint_commands", joints["command"], [])
-        self._write_pose(t, "/object_pose", truth[:7])
-        self._write_pose(t, "/found_pose", believed)
+        self._write_joints(t, "/joint_states", row, "position", "velocity")
+        self._write_joints(row["t_command"], "/joint_commands", row, "command")
+        self._write_pose(
+            t, "/object_pose", [row[name] for name in TRUTH_COLUMNS[:7] if name in row]
+        )
+        self._write_pose(t, "/found_pose", [row[name] for name in FOUND_COLUMNS])
         goals = self._run["goals"]
         if int(row["goal"]) < len(goals):
             self._write_pose(t, "/goal_pose", [*self._place, *goals[int(row["goal"])]])
         if depth is not None:
             self._write_depth(t, depth)
-        plain = {name: row[name] for name in _PLAIN}
-        self._write(t, "/step", STEP, **plain, **joints, object=truth, found=believed)
 
     def _write_joints(
-        self, t: float, topic: str, position: list[float], velocity: list[float]
+        self, t: float, topic: str, row: Mapping[str, float], position: str, velocity: str = ""
     ) -> None:
-        fields = {"name": self._joints, "position": position, "velocity": velocity, "effort": []}
-        self._write(t, topic, JOINT_STATE, **fields)
+        """Write channels of all joints; without ``velocity`` it is empty."""
+        columns = {}
+        for field, channel in (("position", position), ("velocity", velocity)):
+            columns[field] = [row[f"{channel}.{joint}"] for joint in self._joints if channel]
+        self._write(t, topic, JOINT_STATE, name=self._joints, effort=[], **columns)
 
     def _write_pose(self, t: float, topic: str, pose: list[float]) -> None:
         """Write a pose [7], unless it is unknown."""
@@ -143,13 +121,9 @@ class McapLog:
 
     def close(self, run: Mapping[str, Any]) -> None:
         """End the file, with what run.json says at the end."""
-        self._run = dict(run)
-        self._note()
+        self._writer.add_metadata("run", {"json": json.dumps(run)})
         self._writer.finish()
         self._file.close()
-
-    def _note(self) -> None:
-        self._writer.add_metadata("run", {"json": json.dumps(self._run)})
 
     def _write(self, t: float, topic: str, kind: str, /, **fields: Any) -> None:
         """A message of a time since the begin [s]."""
@@ -157,60 +131,6 @@ class McapLog:
         if "Header" in _TYPES[kind]:
             fields["header"] = {"stamp": {"sec": ns // _NS, "nanosec": ns % _NS}, "frame_id": WORLD}
         self._writer.write_message(topic, self._schemas[kind], fields, log_time=ns)
-
-
-def read_mcap(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[dict[str, Any]]]:
-    """Read a log that :class:`McapLog` wrote: what run.json says, columns of steps.csv, and events.
-
-    Raises:
-        LogError: It is none, or damaged.
-        ModuleNotFoundError: The extra ``log`` is not installed.
-    """
-    interrupt.need("mcap_ros2")
-    from mcap.exceptions import McapError
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    steps = []
-    events = []
-    try:
-        with path.open("rb") as stream:
-            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-            run: Any = {}
-            for record in reader.iter_metadata():
-                if record.name == "run":
-                    run = json.loads(record.metadata["json"])
-            if not isinstance(run, dict) or run.get("format") != LOG_FORMAT:
-                raise LogError(
-                    f"{path} is no log of vd-deploy; vd-deploy --log NAME.mcap writes one"
-                )
-            for _, channel, _, message in reader.iter_decoded_messages(topics=["/step", "/events"]):
-                if channel.topic == "/step":
-                    steps.append(message)
-                else:
-                    events.append(json.loads(message.data))
-    except LogError:
-        raise
-    except (McapError, struct.error, ValueError, KeyError, OSError) as error:
-        raise LogError(f"{path} is damaged ({error}); read the folder beside it") from error
-    if not steps:
-        raise LogError(f"{path} has no steps")
-    return run, _columns(steps, run["joints"]), events
-
-
-def _columns(steps: list[Any], joints: list[str]) -> dict[str, np.ndarray]:
-    """Columns of steps.csv [T]."""
-    arrays: dict[str, np.ndarray] = {}
-    for field in (*_PLAIN, *JOINT_CHANNELS, "object", "found"):
-        arrays[field] = np.array([getattr(step, field) for step in steps])
-    columns = {name: arrays[name] for name in _PLAIN}
-    for channel in JOINT_CHANNELS:
-        for joint, values in zip(joints, arrays[channel].T, strict=True):
-            columns[f"{channel}.{joint}"] = values
-    # A run on a hand has no true pose of the object.
-    columns |= zip(TRUTH_COLUMNS, arrays["object"].T, strict=False)
-    columns |= zip(FOUND_COLUMNS, arrays["found"].T, strict=False)
-    return columns
 
 
 def _definition(text: str) -> str:
