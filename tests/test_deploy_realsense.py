@@ -85,15 +85,6 @@ def test_infrared_comes_undecimated_also_without_a_projector(stand_in):
     camera.close()
 
 
-def test_what_the_camera_sends_is_recorded(stand_in, tmp_path):
-    path = tmp_path / "hand.db3"
-    camera = RealSense(stand_in.device, dataclasses.replace(WHOLE, record=path))
-    stand_in.show(plane())
-    camera.read(PATIENCE_S)
-    camera.close()
-    assert rs.context().load_device(str(path)).query_sensors()
-
-
 def test_refusals_name_the_remedy(stand_in):
     with pytest.raises(CameraError, match="640 x 360 at 30 Hz"):
         RealSense(stand_in.device, RealSenseCfg(width=848, height=480))

@@ -18,7 +18,7 @@ from test_first_hour import SCRIPTS
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hands import load_hand
 from vd.command.files import locked
-from vd.deploy.loop.goals import SHOWN, shown_goals
+from vd.deploy.loop.goals import drawn_goals
 from vd.evaluate.statistics import symmetric_error
 from vd.logs.recording import write_recording
 from vd.policy.agents import default_policy
@@ -195,13 +195,11 @@ def test_default_goals_are_turns_that_can_be_seen():
 
     symmetry = cube().symmetry
     for seed in range(20):
-        goals = shown_goals(symmetry, seed=seed)
-        assert len(goals) == SHOWN >= 3
+        goals = drawn_goals(symmetry, 3, seed=seed)
+        assert len(goals) == 3
         starts = np.array([[0.0, 0.0, 0.0, 1.0], *goals[:-1]])
         # 0.75 to 1.08 rad for these seeds; one of a single draw each was 0.1 rad from the start.
         assert symmetric_error(starts, np.array(goals), symmetry).min() > 0.5
-        within = shown_goals(symmetry, 0.3, seed=seed)
-        assert symmetric_error(starts[:1], np.array(within[:1]), symmetry).max() <= 0.3 + 1e-6
 
 
 def test_a_folder_is_one_trainings_and_that_of_a_dead_one_is_free(tmp_path, typed):

@@ -6,7 +6,6 @@ The depth image is that of the left infrared imager, so both have the same optic
 import threading
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -35,18 +34,12 @@ class RealSenseCfg:
     decimation: int = 2
     """Pixels a side that become one, in the SDK: from 640 x 360 the 320 x 180 of training. It takes
     the median of 2 or 3 a side, the mean of more, which puts points between near and far things."""
-    record: Path | None = None
-    """Record what the camera sends, before it is decimated, to this file (.db3)."""
 
     def validate(self) -> None:
         """Raise ``ValueError`` naming field and remedy."""
         require(self, "camera.", "positive", "width height fps")
         if not 1 <= self.decimation <= 8:
             raise ValueError(f"camera.decimation = {self.decimation}; choose 1 (off) to 8")
-        if self.record is not None and self.record.suffix != ".db3":
-            raise ValueError(
-                f"camera.record = {self.record}; the SDK records to .db3, give it that suffix"
-            )
 
 
 def sdk() -> ModuleType:
@@ -112,8 +105,6 @@ class RealSense:
         cfg = cfg or RealSenseCfg()
         cfg.validate()
         self._rs = rs = sdk()
-        if cfg.record is not None:
-            device = rs.recorder(str(cfg.record), device)
         self._device = device  # held: the SDK closes what nobody holds
         kind = (rs.stream.infrared, rs.format.y8) if infrared else (rs.stream.depth, rs.format.z16)
         self._sensor, profile = _choose(device, *kind, cfg)
@@ -174,7 +165,7 @@ class RealSense:
         return Frame(raw * np.float32(depth.get_units()), time_s)
 
     def close(self) -> None:
-        """Stop the stream; a recording is whole from here on."""
+        """Stop the stream."""
         self._sensor.stop()
         self._sensor.close()
         self._newest = None

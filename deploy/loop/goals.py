@@ -5,7 +5,7 @@ is laid through it, by which a tracking policy finds the object; it need not be 
 for a simulation (vd-assets import).
 
 Orientations are quaternions ``x,y,z,w`` or turns ``x,y,z@degrees`` about an axis, from how the
-object is in its file, in the world frame; or a file with one on each line.
+object is in its file, in the world frame.
 """
 
 from collections.abc import Sequence
@@ -41,8 +41,6 @@ from vd.evaluate.statistics import symmetric_error
 
 SCAN_SUFFIXES = (".ply", ".obj", ".glb")
 """Files that are taken as scans."""
-GOALS_SUFFIXES = (".txt", ".csv")
-"""Files that are taken as lists of orientations."""
 CANDIDATES = 20_000
 """Samples of a scan at most that are smoothed: 1 mm apart on an object of the paper's size."""
 LEAST_POINTS = 200
@@ -57,8 +55,8 @@ LARGER = 1.5
 """How much larger or smaller than the objects of the paper an object may be."""
 
 
-SHOWN, DRAWS = 3, 16
-"""Goals in a row where none are asked for, and draws of each, of which the farthest is taken."""
+DRAWS = 16
+"""Draws of each goal, of which the farthest from the one before is taken."""
 
 
 class GoalError(ValueError):
@@ -115,70 +113,39 @@ def scan_object(path: Path) -> ObjectModel:
         raise GoalError(f"{path}: {error}; scan it from more sides") from error
 
 
-def make_goals(
-    texts: Sequence[str], drawn: int = 0, max_angle: float = np.pi, *, seed: int = 0
-) -> list[np.ndarray]:
-    """Goals as they were typed, in their order, or drawn ones, each within an angle of the one before.
-
-    Args:
-        texts: ``x,y,z,w``, ``x,y,z@degrees``, or a file (.txt, .csv) with one on each line, # for
-            comments.
-        drawn: How many to draw where there are none.
-        max_angle: Largest angle between two drawn goals [rad]; the first from no rotation.
-        seed: Of the draw.
+def make_goals(texts: Sequence[str]) -> list[np.ndarray]:
+    """Goals as they were typed, ``x,y,z,w`` or ``x,y,z@degrees``, in their order.
 
     Returns:
         Unit quaternions xyzw, the same whichever of its two signs was typed.
 
     Raises:
-        GoalError: One is none, or a file cannot be read.
+        GoalError: One is none.
     """
-    goals: list[np.ndarray] = []
-    for text in texts:
-        if Path(text).suffix.lower() not in GOALS_SUFFIXES:
-            goals.append(_goal(text, f"--goal {text}"))
-            continue
-        try:
-            rows = [line.split("#")[0].strip() for line in Path(text).read_text().splitlines()]
-        except (OSError, UnicodeDecodeError) as error:
-            raise GoalError(f"--goal {text} cannot be read ({error})") from error
-        listed = [_goal(row, f"{text}, line {i + 1}: {row}") for i, row in enumerate(rows) if row]
-        if not listed:
-            raise GoalError(
-                f"--goal {text} holds no orientation; write one on each line, such as 0,0,1@90"
-            )
-        goals += listed
-    rng = np.random.default_rng(seed)
-    last = np.array([0.0, 0.0, 0.0, 1.0])
-    for _ in range(0 if goals else drawn):
-        last = draw_goals(last[None], rng, max_angle)[0]
-        goals.append(last)
-    return goals
+    return [_goal(text) for text in texts]
 
 
-def shown_goals(
-    symmetry: np.ndarray, max_angle: float = np.pi, *, seed: int = 0
-) -> list[np.ndarray]:
+def drawn_goals(symmetry: np.ndarray, count: int, *, seed: int = 0) -> list[np.ndarray]:
     """Goals in a row that show something: of several draws the farthest from the one before.
 
     Args:
         symmetry: Rotations that map the object to itself, up to which two goals are apart [K, 4].
-        max_angle: Largest angle between two goals [rad]; the first from no rotation.
+        count: How many.
         seed: Of the draws.
 
     Returns:
-        SHOWN quaternions xyzw.
+        Quaternions xyzw.
     """
     rng = np.random.default_rng(seed)
     goals = [np.array([0.0, 0.0, 0.0, 1.0])]
-    for _ in range(SHOWN):
+    for _ in range(count):
         before = np.tile(goals[-1], (DRAWS, 1))
-        draws = draw_goals(before, rng, max_angle)
+        draws = draw_goals(before, rng, np.pi)
         goals.append(draws[symmetric_error(before, draws, symmetry).argmax()])
     return goals[1:]
 
 
-def _goal(text: str, where: str) -> np.ndarray:
+def _goal(text: str) -> np.ndarray:
     turn, _, degrees = text.partition("@")
     try:
         numbers = np.array([float(part) for part in turn.split(",")])
@@ -190,7 +157,7 @@ def _goal(text: str, where: str) -> np.ndarray:
     length = float(np.linalg.norm(numbers))
     if len(numbers) != wanted or not (np.isfinite(length + angle) and length > 0.0):
         raise GoalError(
-            f"{where}: give a quaternion x,y,z,w or a turn x,y,z@degrees, such as 0,0,1@90"
+            f"--goal {text}: give a quaternion x,y,z,w or a turn x,y,z@degrees, such as 0,0,1@90"
         )
     if wanted == 4:
         return canonical_quat(numbers / length)

@@ -77,12 +77,10 @@ class DriveCfg(HandOptions):
     """
     goal: tuple[str, ...] = ()
     """Orientations of the object to reach, one after the other, in the world frame: quaternions
-    x,y,z,w, turns x,y,z@degrees about an axis, or files (.txt, .csv) with one on each line."""
-    random_goals: int | None = None
-    """How many goals to draw, in place of --goal; by default three, each far from the one before.
-    With --ros2 none are drawn."""
-    max_goal_angle: float = np.pi
-    """Drawn goals lie within this angle [rad] of the one before."""
+    x,y,z,w, or turns x,y,z@degrees about an axis."""
+    random_goals: int = 3
+    """How many goals to draw where there is no --goal, each far from the one before. With --ros2
+    none are drawn."""
     episode_s: float = PAPER.scene.episode_s
     """Time for each goal [s]; then the next one is pursued."""
     hold_s: float = 1.0
@@ -141,8 +139,6 @@ class DriveCfg(HandOptions):
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
-        if self.random_goals is not None and (self.ros2 or self.goal):
-            raise ValueError("--random-goals is in place of --ros2 and --goal; leave one out")
         check_names([], [self.object], self.hand)
         check_names([self.policy_name], [])
         from vd.deploy.loop.goals import SCAN_SUFFIXES
@@ -253,12 +249,11 @@ def _say_chosen(cfg: DriveCfg, goals: int) -> None:
 
 def _goals(cfg: DriveCfg, item: "ObjectModel") -> list[np.ndarray]:
     """What was asked for, or where nothing was, what shows something; with ROS 2 none."""
-    from vd.deploy.loop.goals import make_goals, shown_goals
+    from vd.deploy.loop.goals import drawn_goals, make_goals
 
-    asked = make_goals(cfg.goal, cfg.random_goals or 0, cfg.max_goal_angle, seed=cfg.seed)
-    if asked or cfg.ros2:
-        return asked
-    return shown_goals(item.symmetry, cfg.max_goal_angle, seed=cfg.seed)
+    if cfg.goal or cfg.ros2:
+        return make_goals(cfg.goal)
+    return drawn_goals(item.symmetry, cfg.random_goals, seed=cfg.seed)
 
 
 def _pursue(

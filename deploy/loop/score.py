@@ -5,17 +5,15 @@ to the object's symmetry. Trials whose markers were lost at the stop are discard
 stop have no error, and count as failures in the shares.
 """
 
-import json
+import csv
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.command.config import to_dict
-from vd.deploy.loop.mocap import Mocap, MocapError, read_mocap
 from vd.evaluate.statistics import (
     TOLERANCES_RAD,
     Interval,
@@ -25,10 +23,35 @@ from vd.evaluate.statistics import (
 )
 from vd.logs.hand_log import HandLog, read_log
 
+COLUMNS = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+"""What an export has of each sample."""
+UNIT_TOLERANCE = 1e-2
+"""Deviation of a quaternion's length from 1, above which it is none."""
 NEAR_S = 0.1
 """Farthest sample [s] from a stop that counts for it: the object rests, and lost markers come back
 late.
 """
+
+
+class MocapError(ValueError):
+    """An export that cannot be used; names file and remedy."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mocap:
+    """An object's track, T samples."""
+
+    path: Path
+    """The file."""
+    time_s: np.ndarray
+    """Time of each sample [s], rising [T]."""
+    pose: np.ndarray
+    """Position [m] and quaternion xyzw, NaN where it was lost [T, 7]."""
+
+    @property
+    def tracked(self) -> np.ndarray:
+        """Where the object was tracked [T]."""
+        return np.isfinite(self.pose).all(axis=1)
 
 
 @dataclass(frozen=True)
@@ -38,28 +61,18 @@ class ScoreCfg:
     log: Annotated[Path, tyro.conf.Positional]
     """Folder of the log of vd-deploy."""
     mocap: Path
-    """Export of the motion capture: CSV with time, x, y, z, qx, qy, qz, qw, tracked; or
-    OptiTrack's.
-    """
-    body: str | None = None
-    """Rigid body, of an export with several."""
+    """Export of the motion capture: CSV with time [s], x, y, z [m], qx, qy, qz, qw, and tracked (1 or
+    0) if it likes; empty cells where markers were lost."""
     offset_s: float | None = None
     """Time of the motion capture at the log's beginning [s], to 0.3 s: the object rests at a stop.
     By default times are seconds since 1970."""
-    up: Literal["z", "y"] = "z"
-    """Axis of the motion capture that points up; OptiTrack's is y unless it is exported
-    otherwise.
-    """
     world: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """Turn from the motion capture's frame, made z up, to the hand's world frame, quaternion
-    xyzw.
-    """
+    """Turn from the motion capture's frame to the hand's world frame (z up), quaternion xyzw; 0.707 0
+    0 0.707 where y points up."""
     marker: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     """The object's frame in that of its rigid body, quaternion xyzw: how the markers were defined
     on it.
     """
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print JSON."""
 
 
 @dataclass(frozen=True)
@@ -116,15 +129,40 @@ def score(cfg: ScoreCfg) -> int:
 
     log = read_log(cfg.log)
     symmetry = one_object(log.run["object"]["set"]).symmetry
-    mocap = in_world(read_mocap(cfg.mocap, cfg.body), up=cfg.up, world=cfg.world, marker=cfg.marker)
+    mocap = in_world(read_mocap(cfg.mocap), world=cfg.world, marker=cfg.marker)
     result = score_run(log, mocap, symmetry, offset_s=cfg.offset_s)
-    print(json.dumps(to_dict(result), indent=1) if cfg.json else "\n".join(lines(result)))
+    print("\n".join(lines(result)))
     return 0 if result.scored else 1
 
 
-def in_world(
-    mocap: Mocap, *, up: str, world: tuple[float, ...], marker: tuple[float, ...]
-) -> Mocap:
+def read_mocap(path: Path) -> Mocap:
+    """Read an export.
+
+    Raises:
+        MocapError: It is none; says what is wrong and the remedy.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = list(csv.DictReader(stream))
+        values = np.array([[float(row[name] or "nan") for name in COLUMNS] for row in rows])
+        if len(values) < 2 or not (np.diff(values[:, 0]) > 0.0).all():  # NaN does not rise
+            raise ValueError("times of at least two samples must rise; export it again")
+        lost = [float(row.get("tracked") or 1.0) < 0.5 for row in rows]
+        values[lost, 1:] = np.nan
+        mocap = Mocap(path, values[:, 0], values[:, 1:])
+        length = np.linalg.norm(mocap.pose[mocap.tracked, 3:], axis=1)
+        if (np.abs(length - 1.0) > UNIT_TOLERANCE).any():
+            raise ValueError("a quaternion's length is not 1; export rotations as quaternions")
+    except KeyError as error:
+        raise MocapError(
+            f"{path}: there is no column {error}; the first line must name {', '.join(COLUMNS)}"
+        ) from error
+    except (OSError, ValueError, csv.Error) as error:  # of text and numbers too
+        raise MocapError(f"{path}: {error}") from error
+    return mocap
+
+
+def in_world(mocap: Mocap, *, world: tuple[float, ...], marker: tuple[float, ...]) -> Mocap:
     """The object's track in the hand's world frame (z up).
 
     Raises:
@@ -134,8 +172,6 @@ def in_world(
         if not np.isfinite(turn).all() or not np.linalg.norm(turn) > 0.0:
             raise ValueError(f"{name} {turn} is no quaternion xyzw")
     frame = Rotation.from_quat(world)
-    if up == "y":
-        frame = frame * Rotation.from_euler("x", 90, degrees=True)
     pose = mocap.pose.copy()
     rows = mocap.tracked
     turn = frame * Rotation.from_quat(pose[rows, 3:]) * Rotation.from_quat(marker)
