@@ -176,6 +176,37 @@ def test_tables_leave_and_lifted_objects_get_their_weight_with_the_level_of_air(
     assert fallen() == pytest.approx(plain[0], rel=1e-3), "in the end they weigh the same"
 
 
+def test_masses_come_with_the_level_of_physics_and_are_the_drawn_ones_at_its_end():
+    random = RandomisationCfg(
+        object_mass_kg=(0.4, 0.4),
+        link_mass_scale=(4.0, 4.0),
+        object_scale=(1.0, 1.0),
+        object_scale_count=1,
+    )
+    task = {"randomisation": random}
+    whole = make(CurriculumCfg(), **task)
+    env = make(CurriculumCfg(physics=LEVEL), **task)
+    plain = make(CurriculumCfg())
+
+    def masses(of: ReorientEnv) -> np.ndarray:
+        solver = of.sim.solver.mjw_model
+        inertia = solver.body_inertia.numpy()[:, 1:].ravel()
+        return np.concatenate([solver.body_mass.numpy()[:, 1:].ravel(), inertia])
+
+    light, heavy = masses(plain), masses(whole)
+    object_kg = float(plain.randomiser.object_mass.numpy()[0])
+    np.testing.assert_allclose(masses(env), light, rtol=1e-6)
+    env.set_levels(Levels(physics=0.5))
+    np.testing.assert_allclose(masses(env), np.sqrt(light * heavy), rtol=1e-5)
+    np.testing.assert_allclose(env.randomiser.object_mass.numpy(), np.sqrt(0.4 * object_kg))
+    other = make(CurriculumCfg(physics=LEVEL), **task)
+    other.load_state_dict(env.state_dict())
+    np.testing.assert_array_equal(masses(other), masses(env))
+    env.set_levels(Levels())
+    np.testing.assert_array_equal(masses(env), heavy)
+    np.testing.assert_array_equal(env.randomiser.object_mass.numpy(), np.float32(0.4))
+
+
 def test_a_saved_environment_goes_on_at_its_levels():
     cfg = CurriculumCfg(stillness=LEVEL)
     env = make(cfg)

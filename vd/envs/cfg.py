@@ -262,7 +262,7 @@ class CurriculumCfg:
     stillness: LevelCfg = field(default_factory=LevelCfg)
     """From the thresholds of ``loose`` to those of ``success``."""
     physics: LevelCfg = field(default_factory=LevelCfg)
-    """From nothing to what ``randomisation`` draws. Sizes and masses are drawn once: all along."""
+    """From nothing to what ``randomisation`` draws. Sizes are compiled, so they vary all along."""
     air: LevelCfg = field(default_factory=LevelCfg)
     """From no environment to the shares of ``table``."""
     loose: LooseCfg = field(default_factory=LooseCfg)

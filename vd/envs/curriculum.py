@@ -1,6 +1,7 @@
 """How hard the task is while a policy learns it: levels that rise one after the other."""
 
 from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
 from vd.envs.cfg import LevelCfg, ReorientCfg
 
@@ -72,6 +73,6 @@ def progress_of(levels: Levels, moving: dict[str, LevelCfg]) -> float:
     return sum(values[name] for name in moving) / len(moving) if moving else 1.0
 
 
-def blend(loose: float, tight: float, level: float) -> float:
+def blend(loose: Any, tight: Any, level: float) -> Any:
     """From ``loose`` to ``tight``, geometrically: each step of the level is the same factor."""
     return loose ** (1.0 - level) * tight**level

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from vd.assets_usd.objects.model import ObjectModel
+from vd.envs.curriculum import blend
 from vd.envs.servo import gain_scales, plain_servos
 from vd.envs.task_state import TaskState
 from vd.kernels.servo.actuators import INERTIA, PAYLOAD_INERTIA
@@ -129,23 +130,17 @@ class Randomiser:
             [self._object_mass, state.parameters.randomisation, everywhere, state.rng],
             [link_scale, self.object_mass],
         )
-        factor = np.ones((n, state.scene.bodies_per_world))
-        factor[:, state.scene.link_body] = link_scale.numpy()
-        mass = model.body_mass.numpy().reshape(n, -1)
+        scene = state.scene
+        own_mass = model.body_mass.numpy().copy().reshape(n, -1)[:, scene.object_body]
         if not self.enabled:  # nothing is drawn: objects weigh what their files say
-            self.object_mass.assign(mass[:, state.scene.object_body])
-        factor[:, state.scene.object_body] = (
-            self.object_mass.numpy() / mass[:, state.scene.object_body]
-        )
-        flat = factor.reshape(-1)
-        inverse = 1.0 / flat
-        for array, scale in (
-            (model.body_mass, flat),
-            (model.body_inv_mass, inverse),
-            (model.body_inertia, flat[:, None, None]),
-            (model.body_inv_inertia, inverse[:, None, None]),
-        ):
-            array.assign((array.numpy() * scale).astype(np.float32))
+            self.object_mass.assign(own_mass)
+        self._own_mass = own_mass
+        self._drawn_mass = self.object_mass.numpy().copy()
+        self._mass_factor = np.ones((n, scene.bodies_per_world))
+        self._mass_factor[:, scene.link_body] = link_scale.numpy()
+        self._mass_factor[:, scene.object_body] = self._drawn_mass / own_mass
+        inertial = (model.body_mass, model.body_inv_mass, model.body_inertia, model.body_inv_inertia)
+        self._inertial = [(array, array.numpy().copy()) for array in inertial]
         shift = state.cfg.randomisation.object_com_m
         if self.enabled and shift > 0.0:
             direction = np.random.default_rng(state.cfg.seed).normal(size=(n, 3))
@@ -153,7 +148,18 @@ class Randomiser:
             centre = model.body_com.numpy().reshape(n, -1, 3)
             centre[:, state.scene.object_body] += shift * direction
             model.body_com.assign(centre.reshape(-1, 3))
-        state.sim.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+        self.set_masses(1.0)
+
+    def set_masses(self, level: float) -> None:
+        """Give links and objects the masses of their files at level 0 of physics, those drawn at 1."""
+        self.object_mass.assign(blend(self._own_mass, self._drawn_mass, level))
+        factor = self._mass_factor.reshape(-1) ** level
+        inverse = 1.0 / factor
+        scales = (factor, inverse, factor[:, None, None], inverse[:, None, None])
+        for (array, own), scale in zip(self._inertial, scales, strict=True):
+            array.assign((own * scale).astype(np.float32))
+        flags = newton.ModelFlags.BODY_INERTIAL_PROPERTIES
+        self._state.sim.solver.notify_model_changed(flags)
 
     def redraw(self, reset: wp.array) -> None:
         """Draw servos for the environments of ``reset``, and what the solver holds where it is old enough."""

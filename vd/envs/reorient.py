@@ -137,9 +137,9 @@ class ReorientEnv:
         """
         self._table_leaves = cfg.table.away_share > 0.0
         self._moving = moving_levels(cfg)
-        self.levels = first_levels(self._moving)
+        self.levels = Levels()
         """How hard the task is at present; all ones is the configured task."""
-        self.parameters.set_levels(self.levels)
+        self.set_levels(first_levels(self._moving))
         self._graphs = Graphs(self.device, captured=self.sim.solver.captured)
         self.steps = 0
         """Control steps of all environments since the begin of the run, with those of a
@@ -544,6 +544,8 @@ class ReorientEnv:
 
     def set_levels(self, levels: Levels) -> None:
         """Go to these levels of the curriculum."""
+        if levels.physics != self.levels.physics:
+            self.randomiser.set_masses(levels.physics)
         self.levels = levels
         self.parameters.set_levels(levels)
 
