@@ -4,7 +4,7 @@ A vectorised environment of torch tensors on the simulator's device.
 """
 
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 import warp as wp
@@ -13,6 +13,9 @@ from tensordict import TensorDict
 
 from vd.command.config import to_dict
 from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
 
 OBSERVATION_GROUP = "policy"
 """What actor and critic both read; all there is in the paper."""
@@ -37,7 +40,7 @@ class ReorientVecEnv(VecEnv):
     reset or with the new goal.
     """
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env: "ReorientEnv") -> None:
         self.env = env
         self.num_envs = env.num_envs
         self.num_actions = env.num_actions

@@ -139,7 +139,12 @@ class Randomiser:
         self._mass_factor = np.ones((n, scene.bodies_per_world))
         self._mass_factor[:, scene.link_body] = link_scale.numpy()
         self._mass_factor[:, scene.object_body] = self._drawn_mass / own_mass
-        inertial = (model.body_mass, model.body_inv_mass, model.body_inertia, model.body_inv_inertia)
+        inertial = (
+            model.body_mass,
+            model.body_inv_mass,
+            model.body_inertia,
+            model.body_inv_inertia,
+        )
         self._inertial = [(array, array.numpy().copy()) for array in inertial]
         shift = state.cfg.randomisation.object_com_m
         if self.enabled and shift > 0.0:

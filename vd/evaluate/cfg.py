@@ -37,7 +37,7 @@ OF_THE_SUITE = (
 )
 """Settings that a suite decides."""
 EXCLUSIVE = (
-    ("condition", "randomise", "table_friction"),
+    ("condition", "table_friction"),
     ("at_rest", "no_at_rest"),
     ("air_goals", "in_air", "consecutive"),
     ("air_goals", "episode_s"),
@@ -61,8 +61,6 @@ class TaskFlags:
     """Seed of starts, goals and everything else random."""
     in_air: tyro.conf.FlagCreatePairsOff[bool] = False
     """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
-    randomise: bool = False
-    """Randomise dynamics and add noise and disturbances as in training."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
 
@@ -174,8 +172,6 @@ class EvalCfg(HandFlags, EpisodeFlags):
     """
     out: Path = Path("runs/eval")
     """Folder for eval.json and eval.html."""
-    json: bool = False
-    """Print protocol and summaries as JSON instead of the table."""
 
     @property
     def agent_names(self) -> tuple[str, ...]:
@@ -216,11 +212,11 @@ class EvalCfg(HandFlags, EpisodeFlags):
         return self.at_rest if self.at_rest or self.no_at_rest else None
 
     @property
-    def randomisation(self) -> RandomisationCfg | None:
-        """What is drawn; None: as trained."""
-        if self.condition is not None:
-            return CONDITIONS[self.condition]
-        return None if self.randomise else RandomisationCfg(enabled=False)
+    def randomisation(self) -> RandomisationCfg:
+        """What is drawn."""
+        if self.condition is None:
+            return RandomisationCfg(enabled=False)
+        return CONDITIONS[self.condition]
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""

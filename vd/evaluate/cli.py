@@ -1,6 +1,5 @@
 """Command line of evaluation: ``vd-eval POLICY ... --objects SET ... --episodes M``."""
 
-import json
 import sys
 from collections.abc import Sequence
 from itertools import chain
@@ -52,10 +51,8 @@ def _evaluate(cfg: EvalCfg) -> int:
             f"{cfg.out}: part {cfg.shard}; the same command without --shard writes the page",
             file=sys.stderr,
         )
-    elif not cfg.json:
-        print(f"{terminal_text(result)}\n{written}\n{page}")
     else:
-        print(json.dumps(result.summary(), indent=1) if cfg.suite is None else written.read_text())
+        print(f"{terminal_text(result)}\n{written}\n{page}")
     for condition, policy, why in result.missing:
         print(f"vd-eval: {condition} of {policy}: {why}", file=sys.stderr)
     return int(bool(result.missing))

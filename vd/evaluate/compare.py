@@ -19,6 +19,7 @@ from vd.sim.cfg import in_mujoco
 
 if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
+    from vd.envs.reorient import ReorientEnv
     from vd.evaluate.goals import Goals
     from vd.evaluate.result import Agent, Protocol, Result
     from vd.evaluate.trace import Trace
@@ -62,7 +63,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
     camera = any(map(sees_clouds, policies.values()))
     envs = cfg.num_envs or envs_for(len(files), cfg.episodes, device, camera=camera, plan=cfg.plan)
     rows = []
-    env: Any = None
+    env: ReorientEnv | None = None
     start = None
     for name, policy in policies.items():
         task = task_of(cfg, policy, everything, envs)
@@ -145,7 +146,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
         stop_tolerance_rad=cfg.stop_tolerance,
         episode_s=cfg.schedule.goal_s if cfg.consecutive else task.episode_s,
         control_hz=task.sim.control_hz,
-        randomisation=cfg.condition or ("on" if cfg.randomise else "off"),
+        randomisation=cfg.condition or "off",
         at_rest=task.start.at_rest,
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
         palm_up=load_hand(task.hand).palm_up,
@@ -162,7 +163,7 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
 def actor_of(
     name: str,
     policy: Any | None,
-    env: Any,
+    env: "ReorientEnv",
     *,
     goals: "Goals" = "mesh",
     sensor_errors: bool = False,
@@ -194,7 +195,7 @@ def actor_of(
     return eyes, Agent(name, policy.kind, "rendered clouds", policy.spec.rule_for)
 
 
-def planning(actor: Any, agent: "Agent", env: Any, seed: int) -> tuple[Any, "Agent"]:
+def planning(actor: Any, agent: "Agent", env: "ReorientEnv", seed: int) -> tuple[Any, "Agent"]:
     """A controller that plans by sampling, to which a teacher proposes; ``zero`` proposes nothing.
 
     Raises:
@@ -209,7 +210,7 @@ def planning(actor: Any, agent: "Agent", env: Any, seed: int) -> tuple[Any, "Age
     return planner, replace(agent, policy=f"{agent.policy} --plan", sees="state")
 
 
-def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "Trace":
+def run_episodes(cfg: EvalCfg, env: "ReorientEnv", actor: Any, agent: "Agent") -> "Trace":
     """All episodes of one policy, with a progress bar."""
     import numpy as np
 
@@ -247,7 +248,7 @@ def run_episodes(cfg: EvalCfg, env: Any, actor: Any, agent: "Agent") -> "Trace":
 
 
 @contextmanager
-def _progress(cfg: EvalCfg, env: Any, agent: "Agent") -> "Iterator[Callable[[], object]]":
+def _progress(cfg: EvalCfg, env: "ReorientEnv", agent: "Agent") -> "Iterator[Callable[[], object]]":
     """A progress bar over the steps of one policy; what is to be called after each."""
     from tqdm import tqdm
 

@@ -65,7 +65,7 @@ class Protocol:
     control_hz: float
     """Policy rate."""
     randomisation: str = "off"
-    """What is drawn: ``off``, ``on`` as in training, or a name of :mod:`vd.evaluate.conditions`."""
+    """What is drawn: ``off``, or a name of :mod:`vd.evaluate.conditions`."""
     at_rest: bool = False
     """Objects start at rest on the table, and starts and goals are those the environment draws;
     otherwise they fall, with starts uniform on SO(3), the same for any environment."""

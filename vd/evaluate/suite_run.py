@@ -52,8 +52,8 @@ ASPECTS = (1.0, 2.0, 4.0, math.inf)
 """Bounds of the classes of aspect ratio (ours)."""
 NOT_RUN = "not run; the same command goes on from here"
 # Settings that say where and how an evaluation runs, not what it measures.
-_NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs", "shard")
-_PASSED_ON = ("seed", "device", "num_envs", "hand", "hand_layer", "engine", "randomise")
+_NOT_MEASURED = ("out", "device", "num_envs", "jobs", "shard")
+_PASSED_ON = ("seed", "device", "num_envs", "hand", "hand_layer", "engine")
 """Flags beside ``--suite`` that every line gets."""
 _GROUP = re.compile(r"([\w-]+)=SET\b")
 

@@ -9,7 +9,7 @@ T steps; angles in radians, quaternions xyzw.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -21,6 +21,9 @@ from vd.evaluate.rollout import episode_rounds, unit_quats
 from vd.evaluate.statistics import rotation_angle, symmetric_error
 from vd.paper import PAPER
 from vd.policy.stopping import StoppingRule
+
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
 
 StopsBy = Literal["predicted", "exact", "error", "success"]
 """What a rule asks for: a distance, which is a camera policy's prediction, or the true one to the
@@ -162,7 +165,7 @@ def at_steps(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def record(
-    env: Any,
+    env: "ReorientEnv",
     policy: Any,
     episodes: int,
     schedule: GoalSchedule = ONE_GOAL,
@@ -228,7 +231,7 @@ def record(
 
 
 def drawn_rounds(
-    env: Any, episodes: int, starts: np.ndarray | None, goals: np.ndarray | None
+    env: "ReorientEnv", episodes: int, starts: np.ndarray | None, goals: np.ndarray | None
 ) -> list[tuple[np.ndarray, dict[str, Any]]]:
     """Episode number of each environment, -1 for none [N], and its state at the begin, for every round."""
     world_object = np.asarray(env.world_object)
@@ -243,7 +246,7 @@ def drawn_rounds(
     return drawn
 
 
-def motion_of(env: Any, *, copy: bool = False) -> dict[str, torch.Tensor]:
+def motion_of(env: "ReorientEnv", *, copy: bool = False) -> dict[str, torch.Tensor]:
     """What moves, with a row for each environment, sharing the environment's memory or copied."""
     motion = {}
     for name, array in env.motion().items():
@@ -263,7 +266,7 @@ def copy_motion(
         out[name][rows] = values[rows]
 
 
-def act_in(env: Any, policy: Any, envs: np.ndarray) -> torch.Tensor:
+def act_in(env: "ReorientEnv", policy: Any, envs: np.ndarray) -> torch.Tensor:
     """Actions [N, D]; a policy with ``predicted`` is told that it need not act but in some environments."""
     if hasattr(policy, "predicted"):
         policy.active = torch.zeros_like(policy.predicted, dtype=torch.bool)
@@ -272,12 +275,12 @@ def act_in(env: Any, policy: Any, envs: np.ndarray) -> torch.Tensor:
     return action
 
 
-def advance(env: Any, action: torch.Tensor) -> None:
+def advance(env: "ReorientEnv", action: torch.Tensor) -> None:
     """One control step of all environments with actions [N, D]."""
     env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
 
 
-def out_of_hand(env: Any) -> np.ndarray:
+def out_of_hand(env: "ReorientEnv") -> np.ndarray:
     """Whether each object is where it counts as lost, bool [N].
 
     What is not a number is lost too.
@@ -293,7 +296,9 @@ class _Round:
     ``numbers`` [N], place among its object's, else -1.
     """
 
-    def __init__(self, env: Any, trace: Trace, numbers: np.ndarray, goal_steps: int) -> None:
+    def __init__(
+        self, env: "ReorientEnv", trace: Trace, numbers: np.ndarray, goal_steps: int
+    ) -> None:
         self._env = env
         self._trace = trace
         self._numbers = numbers

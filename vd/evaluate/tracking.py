@@ -1,6 +1,6 @@
 """Policies that see by a camera at work in an environment."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,10 +15,13 @@ from vd.tracking.policy import TrackingPolicy
 from vd.tracking.tracker import Tracker
 from vd.vision.acting import ActingStudent, StudentPolicy
 
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
+
 AnyCameraPolicy = TrackingPolicy | StudentPolicy
 
 
-def sensed(env: Any, camera: DepthCamera) -> Senses:
+def sensed(env: "ReorientEnv", camera: DepthCamera) -> Senses:
     """What the hands of an environment sense now; later steps change all of it but the points."""
     fresh = wp.to_torch(env.step_count) == 0
     camera.reset(wp.from_torch(fresh.int()))  # a late image must not show what was before a reset
@@ -28,7 +31,7 @@ def sensed(env: Any, camera: DepthCamera) -> Senses:
     return sensed_with(env, wp.to_torch(camera.points).masked_fill(unseen, torch.nan))
 
 
-def sensed_with(env: Any, points: torch.Tensor) -> Senses:
+def sensed_with(env: "ReorientEnv", points: torch.Tensor) -> Senses:
     """What the hands of an environment sense now, with these points for those of a camera."""
     joints = env.num_joints
     return Senses(
@@ -42,7 +45,7 @@ def sensed_with(env: Any, points: torch.Tensor) -> Senses:
 
 
 def acting_in(
-    env: Any, policy: AnyCameraPolicy, camera: CameraModel, *, goals: Goals, seed: int
+    env: "ReorientEnv", policy: AnyCameraPolicy, camera: CameraModel, *, goals: Goals, seed: int
 ) -> Tracker | ActingStudent:
     """A camera policy on the hands of an environment; arguments as of :class:`CameraActor`."""
     objects = known_objects(
@@ -88,7 +91,7 @@ class CameraActor:
 
     def __init__(
         self,
-        env: Any,
+        env: "ReorientEnv",
         policy: AnyCameraPolicy,
         *,
         goals: Goals = "mesh",

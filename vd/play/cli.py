@@ -207,7 +207,7 @@ def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any]:
         seed=cfg.seed,
         stop_tolerance_rad=PAPER.success.rotation_rad,
         episode_s=episode_limit_s(None, in_air=cfg.in_air),
-        randomised=cfg.randomise,
+        randomised=False,
         success_ends_episode=False,
         hand_layer=cfg.hand_layer,
     )

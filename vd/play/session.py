@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -12,6 +12,9 @@ from vd.evaluate.statistics import symmetric_error
 from vd.evaluate.trace import advance
 from vd.play.camera_view import camera_view
 from vd.play.video import Snapshot, Watcher
+
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
 
 
 class Session:
@@ -23,7 +26,7 @@ class Session:
         sees: Whether the policy sees by a camera.
     """
 
-    def __init__(self, env: Any, policy: Any, *, seed: int = 0):
+    def __init__(self, env: "ReorientEnv", policy: Any, *, seed: int = 0):
         self.env = env
         self._policy = policy
         self.sees = hasattr(policy, "camera")

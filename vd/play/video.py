@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -17,6 +17,9 @@ from vd.command.files import atomic_path
 from vd.evaluate.statistics import rotation_angle
 from vd.paper import PAPER
 from vd.play.render import Picture, Renderer
+
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
 
 SINGLE_CELL = (640, 400)
 """Width and height of a cell's picture alone [pixel]."""
@@ -76,7 +79,7 @@ class Snapshot:
 class Watcher:
     """Reads chosen environments of an environment after every step, and counts goals and drops."""
 
-    def __init__(self, env: Any, envs: Sequence[int]):
+    def __init__(self, env: "ReorientEnv", envs: Sequence[int]):
         self.env = env
         self.envs = list(envs)
         self.steps = 0
@@ -115,7 +118,9 @@ class Watcher:
         ]
 
 
-def watched(env: Any, policy: Any, envs: Sequence[int], steps: int) -> Iterator[list[Snapshot]]:
+def watched(
+    env: "ReorientEnv", policy: Any, envs: Sequence[int], steps: int
+) -> Iterator[list[Snapshot]]:
     """Reset, run a policy, and give the start and every control step of the environments ``envs``."""
     watcher = Watcher(env, envs)
     env.reset()
@@ -155,7 +160,7 @@ def drawn(
         yield from (frame.result() for frame in frames)
 
 
-def act(env: Any, policy: Any) -> None:
+def act(env: "ReorientEnv", policy: Any) -> None:
     """Make one control step with the policy's mean action."""
     from vd.evaluate.trace import advance  # needs torch, which the film of a log does not
 
