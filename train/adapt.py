@@ -259,23 +259,23 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
         seed=cfg.seed,
         device=cfg.device,
     )
-    found = []
+    results = []
     for model, layer in ((NOMINAL, NO_LAYER), (IDENTIFIED, str(cfg.hand_layer))):
-        found.append(compare(replace(evaluation, hand_layer=layer, out=cfg.out / model), model))
-    rows = tuple(row for one in found for row in one.rows if row.stopped_by != SUCCESS)
-    result, page = Result(rows, found[0].software), cfg.out / PAGE
+        results.append(compare(replace(evaluation, hand_layer=layer, out=cfg.out / model), model))
+    rows = tuple(row for compared in results for row in compared.rows if row.stopped_by != SUCCESS)
+    result, page = Result(rows, results[0].software), cfg.out / PAGE
     rate = {
         (model, policy): percent(row.overall.outcomes["success"])
         for (model, _), headlines in result.headlines().items()
         for policy, row in headlines.items()
     }
     layer = shown_name(str(cfg.hand_layer))
-    told = (
+    summary = (
         f"{before} succeeds in {rate[NOMINAL, before]} of the episodes in the nominal model of "
         f"{run.env.hand}, in {rate[IDENTIFIED, before]} in the identified one ({layer}), and "
         f"adapted to that in {rate[IDENTIFIED, after]}."
     )
     title = f"{before}, adapted to an identified hand"
     how = settings_text([rows[0].protocol])
-    write_page(result, page, title=title, lead=told, notes=(f"{how}.",))
-    say(f"{told}\n{page}")
+    write_page(result, page, title=title, lead=summary, notes=(f"{how}.",))
+    say(f"{summary}\n{page}")

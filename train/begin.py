@@ -188,11 +188,11 @@ def check_fit(
     from vd.envs.cfg import ObservationCfg
     from vd.policy.contract import PolicySpec
 
-    found = from_dict(PolicySpec, state["policy"], where="policy")
+    trained = from_dict(PolicySpec, state["policy"], where="policy")
     hand, here = state["task"].get("hand"), task.get("hand")
-    if found.num_actions != spec.num_actions:
+    if trained.num_actions != spec.num_actions:
         raise ValueError(
-            f"--init: {path} moves {found.num_actions} joints of {hand}, and this run's hand, "
+            f"--init: {path} moves {trained.num_actions} joints of {hand}, and this run's hand, "
             f"{here}, has {spec.num_actions}; give --hand {hand}"
         )
     from_dict(
@@ -201,13 +201,13 @@ def check_fit(
         where=f"--init: {path}: task.observation",
     )
     for name in ("hidden", "distribution", "normalise_observations"):
-        theirs, ours = getattr(found, name), getattr(spec, name)
+        theirs, ours = getattr(trained, name), getattr(spec, name)
         if theirs != ours:
             flag = f"--policy.{name.replace('_', '-')}"
             raise ValueError(f"--init: {path} has {flag} {theirs}, and this run {ours}; {REMEDY}")
-    if found.num_observations != spec.num_observations:
+    if trained.num_observations != spec.num_observations:
         raise ValueError(
-            f"--init: {path} reads {found.num_observations} values and this run observes "
+            f"--init: {path} reads {trained.num_observations} values and this run observes "
             f"{spec.num_observations}: {REMEDY}"
         )
 

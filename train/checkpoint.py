@@ -72,8 +72,8 @@ def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") ->
         return _newest_sound(files, network)
     path = best if which in ("best", "latest") else Path(which)
     if not path.is_file():
-        found = ", ".join(p.name for p in files) or "none; leave --resume out to start"
-        raise FileNotFoundError(f"--resume: no file {path}; checkpoints of {run_dir}: {found}")
+        present = ", ".join(p.name for p in files) or "none; leave --resume out to start"
+        raise FileNotFoundError(f"--resume: no file {path}; checkpoints of {run_dir}: {present}")
     return path
 
 

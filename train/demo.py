@@ -251,9 +251,13 @@ class Demo:
         row = next(row for row in Result.read(out / "eval.json").rows if row.headline)
         tolerance = str(PAPER.success.rotation_rad)
         lines = []
-        for one in (*row.per_object, row.overall):
-            rates = (one.success[tolerance], one.symmetric, one.outcomes["object falls"])
-            lines.append((one.name, one.episodes, *map(percent, rates)))
+        for summary in (*row.per_object, row.overall):
+            rates = (
+                summary.success[tolerance],
+                summary.symmetric,
+                summary.outcomes["object falls"],
+            )
+            lines.append((summary.name, summary.episodes, *map(percent, rates)))
         return {
             "policy": self.policy,
             "sees": "vision" if self.policy.endswith("vision") else "tracking",
@@ -378,10 +382,10 @@ def import_meshes(part: Part, meshes: Path) -> tuple[str, ...]:
     options = ("--out", out, "--mcts-iterations", str(IMPORT_SEARCH))
     if chosen:
         part.run(["vd-assets", "import", *chosen, *options], cpu_s=IMPORT_CPU_S)
-    found = object_files(out) if out.is_dir() else []
-    left = SHOWN - len(found)
-    own = (str(out),) if found else ()
-    return (*own, HELD_OUT.format(left)) if left else own
+    imported = object_files(out) if out.is_dir() else []
+    left = SHOWN - len(imported)
+    sets = (str(out),) if imported else ()
+    return (*sets, HELD_OUT.format(left)) if left else sets
 
 
 def choose_meshes(meshes: Path) -> list[Path]:

@@ -121,7 +121,7 @@ def export_onnx(policy: "AnyPolicy", path: Path, contract: "Contract") -> None:
             "goal_points": clouds[0],
             "seen_points": clouds[1, :, : POINTS - 1],
         }  # of another number
-        outputs = [one.name for one in fields(Residual)]
+        outputs = [field.name for field in fields(Residual)]
         _export(policy.alignment, named, outputs, path.with_stem(f"{path.stem}-alignment"))
 
 

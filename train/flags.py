@@ -122,10 +122,10 @@ def starting(arguments: list[str]) -> tuple[list[str], ConfigFile | None]:
     if file is None:
         return arguments, None
     words = file.words(STARTS)
-    own, asked = value_of(words, "--preset"), value_of(arguments, "--preset")
-    if own is not None and asked not in (None, own):
+    named, asked = value_of(words, "--preset"), value_of(arguments, "--preset")
+    if named is not None and asked not in (None, named):
         raise ValueError(
-            f"--preset {asked}: the settings of {file.path} are those of {own}; name one of the two"
+            f"--preset {asked}: the settings of {file.path} are those of {named}; name one of the two"
         )
     return words + arguments, file
 

@@ -112,15 +112,15 @@ class TeacherRunner(TrainingLoop):
         Raises:
             ValueError: The file is damaged, of another hand or of another network.
         """
-        found = read_start(Path(path), self.device)
-        check_fit(found, self._spec(), self.task, path)
-        self.unlike = unlike(found["task"], self.task)
-        own = self.alg.save() | {"window": self._window.state_dict()}
-        found = with_fitting_critic(found, own["critic_state_dict"])
-        self._take(without_worlds(completed(found, own, levels)), path)
+        state = read_start(Path(path), self.device)
+        check_fit(state, self._spec(), self.task, path)
+        self.unlike = unlike(state["task"], self.task)
+        fresh = self.alg.save() | {"window": self._window.state_dict()}
+        state = with_fitting_critic(state, fresh["critic_state_dict"])
+        self._take(without_worlds(completed(state, fresh, levels)), path)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.begun = True
-        self.critic_warmup = warmup_iterations(found)
+        self.critic_warmup = warmup_iterations(state)
         self._best, self._window = None, self._new_window()
 
     def save(self) -> None:

@@ -102,8 +102,8 @@ def build_teacher(cfg: TeacherCfg, *, say: Callable[[str], object] = print) -> "
 def teacher_command(arguments: list[str]) -> int:
     """``vd-train teacher``; the exit status."""
     cfg = parse_teacher(arguments, say=say_same_as if is_main() else None)
-    with run_folder(cfg) as own:
-        return train(own, say_of_main())
+    with run_folder(cfg) as run:
+        return train(run, say_of_main())
 
 
 def is_main() -> bool:

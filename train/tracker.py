@@ -112,20 +112,20 @@ def _track(cfg: TrackerCfg) -> int:
         for values in (trace.predicted, trace.action_norm, trace.error)
     )
     chosen = partial(calibrate, predicted, norm, true, trace.steps.ravel())
-    found = chosen(tolerance_rad=cfg.stop_tolerance)
+    calibration = chosen(tolerance_rad=cfg.stop_tolerance)
     try:
         precise = chosen(tolerance_rad=PAPER.success.precise_rad)
     except ValueError:  # of a policy that never came so near there is nothing to learn
         precise = None
     spec = replace(
         policy.spec,
-        stopping=found.rule,
+        stopping=calibration.rule,
         tolerance_rad=cfg.stop_tolerance,
         precise=None if precise is None else precise.rule,
-        calibrated_on=_conditions(cfg, found.episodes),
+        calibrated_on=_conditions(cfg, calibration.episodes),
     )
     write_policy(policy, cfg.out, _contract(policy, spec))
-    for result in (found, precise):
+    for result in (calibration, precise):
         if result is None:
             print(
                 f"{cfg.out}: no rule stops any within {PAPER.success.precise_rad:g} rad: none for "
@@ -162,9 +162,9 @@ def _seeing(cfg: TrackerCfg, device: str) -> "AnyCameraPolicy":
     teacher = open_teacher(cfg.teacher, device)
     if teacher is None:
         raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
-    if own := teacher.task["observation"].get("terms"):
+    if terms := teacher.task["observation"].get("terms"):
         raise ValueError(
-            f"{cfg.teacher} observes {', '.join(own)}, which no camera shows; give another"
+            f"{cfg.teacher} observes {', '.join(terms)}, which no camera shows; give another"
         )
     spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
     network = None
@@ -198,8 +198,10 @@ def _episodes(cfg: TrackerCfg, policy: "AnyCameraPolicy", device: str) -> "Trace
     assert cfg.episodes is not None
     each = math.ceil(cfg.episodes / count)
     envs = cfg.num_envs or envs_for(count, each, device, camera=True)
-    told = {one.name: getattr(cfg, one.name) for one in fields(EpisodeFlags)} | {"episodes": each}
-    evaluation = EvalCfg(policies=(cfg.teacher,), no_at_rest=True, **told)
+    flags = {field.name: getattr(cfg, field.name) for field in fields(EpisodeFlags)} | {
+        "episodes": each
+    }
+    evaluation = EvalCfg(policies=(cfg.teacher,), no_at_rest=True, **flags)
     env = ReorientEnv(task_of(evaluation, policy, cfg.objects, envs), device)
     env.objects = with_symmetries(env.objects, device)
     acting = actor_of(

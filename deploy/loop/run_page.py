@@ -75,7 +75,7 @@ def summary_line(results: Sequence[GoalResult], goals: int) -> str:
     if any(result.success is None for result in results):
         stopped = sum(result.outcome == "stopped" for result in results)
         return f"{stopped} of {goals} goals stopped; vd-deploy score tells the errors, by motion capture"
-    return f"{sum(bool(one.success) for one in results)} of {goals} goals reached"
+    return f"{sum(bool(result.success) for result in results)} of {goals} goals reached"
 
 
 def ending(log: HandLog) -> list[str]:

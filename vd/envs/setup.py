@@ -67,12 +67,12 @@ def rest_poses(env: "ReorientEnv") -> np.ndarray:
             env.sim.step()
         env.check()
         dropped.append(env.object_pose())
-    found = np.stack(dropped, axis=1)
-    inside = np.linalg.norm(found[:, :, :3] - workspace.goal_m, axis=2) < env.cfg.success.fall_of(
+    landed = np.stack(dropped, axis=1)
+    inside = np.linalg.norm(landed[:, :, :3] - workspace.goal_m, axis=2) < env.cfg.success.fall_of(
         workspace
     )
     # Choose, for every slot, the slot itself or the first good one of the world.
     slot = np.where(inside, np.arange(len(dropped)), np.argmax(inside, axis=1)[:, None])
-    poses = np.take_along_axis(found, slot[:, :, None], axis=1)
+    poses = np.take_along_axis(landed, slot[:, :, None], axis=1)
     poses[~inside.any(axis=1)] = [*workspace.drop_m, 0.0, 0.0, 0.0, 1.0]
     return poses

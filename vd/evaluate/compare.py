@@ -64,7 +64,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
     envs = cfg.num_envs or envs_for(len(files), cfg.episodes, device, camera=camera, plan=cfg.plan)
     rows = []
     env: ReorientEnv | None = None
-    start = None
+    start: dict[str, Any] = {}
     for name, policy in policies.items():
         task = task_of(cfg, policy, everything, envs)
         if env is None or env.cfg != task:
@@ -91,6 +91,7 @@ def compare(cfg: EvalCfg, condition: str = "") -> "Result":
             rows += judge(
                 trace.of(chosen), protocol, objects, agent, group=group, condition=condition
             )
+    assert env is not None, "there is a policy"
     env.close()
     software = {
         "device": wp.get_device(device).name,
