@@ -31,9 +31,9 @@ USAGE = """usage: vd-deploy [POLICY] [flags]   the same as vd-deploy run
 commands:
 {}
 
-What talks to motors takes --hand HAND and --port DEVICE, by default the only serial adapter, or --twin, a
-simulated hand on a pseudo-terminal. Nothing moves before the preflight has passed and you have said yes
-(--yes says so at once).
+What talks to motors takes --hand HAND and --port DEVICE, by default the only serial adapter, or
+--twin, a simulated hand. Nothing moves before the preflight has passed and you have said yes (--yes
+says so at once).
 vd-deploy COMMAND --help lists the flags of a command, vd-deploy --hand dclaw3 --help those of a run."""
 
 

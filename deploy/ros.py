@@ -159,7 +159,8 @@ class RosHand:
             "joint states", wrong, f"{rate:.0f} a second on {topic}, {1e3 * age:.0f} ms old"
         )
         listen = self._commands.get_subscription_count()
-        remedy = f"nobody listens on {self._node.resolve_topic_name(COMMANDS)}: start a controller, or remap"
+        commands = self._node.resolve_topic_name(COMMANDS)
+        remedy = f"nobody listens on {commands}: start a controller, or remap"
         yield finding("commands", [] if listen else [remedy], f"{listen} listen")
         assert self._state is not None
         bad = out_of_range(self.hand, self._state.position)

@@ -67,7 +67,7 @@ def test_the_sdk_finds_the_motors(bus, twin):
 
 
 def test_a_port_is_for_one_program_at_a_time_and_says_why_it_cannot_be_opened(bus, twin):
-    with pytest.raises(BusError, match=f"in use; .*`fuser -v {twin.path}`"):
+    with pytest.raises(BusError, match=f"another program .*`fuser -v {twin.path}`"):
         MotorBus(twin.path, IDS, MODELS_OF_ALL)
     with pytest.raises(BusError, match=r"no such device; is the adapter plugged in\? There are: "):
         MotorBus("/dev/ttyUSB99", IDS, MODELS_OF_ALL)

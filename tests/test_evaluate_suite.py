@@ -100,7 +100,7 @@ def test_ones_own_suite_is_a_file_of_command_lines(tmp_path, asked, capsys):
     assert said["seed"] == 7 and said["objects"] == ["desk=cube"]
     assert "Own" in (tmp_path / "out" / "own.html").read_text()
     for text, message in (
-        ("title: x\nlines: [{name: a}]", "a has to have a line 'vd-eval POLICY ...'"),
+        ("title: x\nlines: [{name: a}]", "a has no line 'vd-eval POLICY ...'"),
         ("title: x\nlines: [{name: a, camera: vd-eval dclaw3}]", "a has dclaw3 in the wrong line"),
         (
             "title: x\nlines: [{name: a, camera: vd-eval --in-air}]",

@@ -20,14 +20,15 @@ commands:
              or its networks as ONNX              vd-train export POLICY policy.onnx
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset gpu
-Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
-               -m vd.train.cli teacher --preset gpu --out SHARED/FOLDER
+Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d \\
+               --rdzv-endpoint HOST:29500 -m vd.train.cli teacher --preset gpu --out SHARED/FOLDER
 Restart by itself after a failure: torchrun --max-restarts 3 ... teacher --out FOLDER --resume auto
-               (several nodes: set TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1, or old addresses outlive a restart)
+               (several nodes: set TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1, or old addresses outlive
+               a restart)
 
-A run goes on with any number of GPUs and environments (--resume); on another machine it needs its
-config.json and a checkpoint, progress.jsonl for the curve so far: vd-train teacher --out FOLDER --resume
-small.pt
+A run goes on with any number of GPUs and environments (--resume). On another machine it needs its
+config.json and a checkpoint, progress.jsonl for the curve so far:
+               vd-train teacher --out FOLDER --resume small.pt
 
 vd-train COMMAND --help lists the flags of a command."""
 

@@ -137,7 +137,7 @@ class Part:
                         stdin=subprocess.DEVNULL,
                         stdout=output,
                         stderr=subprocess.STDOUT,
-                        start_new_session=True,  # Ctrl-C reaches this process alone, which then ends them
+                        start_new_session=True,  # Ctrl-C reaches this process, which ends them
                     )
                 running.append((process, line, log))
             for process, line, log in running:

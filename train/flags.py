@@ -27,10 +27,10 @@ CONFIG_NAME = "config.json"
 
 TEACHER_HELP = """Train the teacher: PPO on the simulator's state.
 
-Flags start from --preset, or with --resume from the run's config.json; what a --config says wins over these.
-Without either the machine decides: gpu, and cpu-demo where there is no GPU. Short forms: --hand,
---hand-layer, --objects, --num-envs and --seed stand for --env.hand and so on, --randomise for
---env.randomisation.enabled.
+Flags start from --preset, or with --resume from the run's config.json; what a --config says wins
+over these. Without either the machine decides: gpu, and cpu-demo where there is no GPU. Short forms:
+--hand, --hand-layer, --objects, --num-envs and --seed stand for --env.hand and so on, --randomise
+for --env.randomisation.enabled.
 Ctrl-C saves. --help-all lists the flags of physics, reward, success and of the ranges of Table S3 too."""
 
 _RARE = {
@@ -125,7 +125,7 @@ def starting(arguments: list[str]) -> tuple[list[str], ConfigFile | None]:
     named, asked = value_of(words, "--preset"), value_of(arguments, "--preset")
     if named is not None and asked not in (None, named):
         raise ValueError(
-            f"--preset {asked}: the settings of {file.path} are those of {named}; name one of the two"
+            f"--preset {asked}: the settings of {file.path} are those of {named}; name one"
         )
     return words + arguments, file
 

@@ -287,14 +287,15 @@ class TrainingLoop:
     def _misfit(self, ranks: list[dict[str, Any]]) -> str:
         """Why processes and environments of a checkpoint cannot be restored; empty if they can."""
         if len(ranks) != self.world_size:
-            return f"it is of {len(ranks)} processes, this run has {self.world_size}"
+            return f"the checkpoint is of {len(ranks)} processes, this run has {self.world_size}"
         if self.env is None or (saved := {saved_worlds(rank) for rank in ranks}) == {
             self.env.num_envs
         }:
             return ""
         if saved == {0}:
-            return "it holds no environments"
-        return f"it is of {max(saved)} environments a process, this run has {self.env.num_envs}"
+            return "the checkpoint holds no environments"
+        theirs = f"{max(saved)} environments a process"
+        return f"the checkpoint is of {theirs}, this run has {self.env.num_envs}"
 
     # What a subclass does.
 

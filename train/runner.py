@@ -208,7 +208,7 @@ class TeacherRunner(TrainingLoop):
                 if self.failures is not None:
                     self.failures.add(dones, self.env.reached)
             self.alg.compute_returns(observation)
-        self.env.env.check()  # what the simulation made of a step comes before what an update makes of that
+        self.env.env.check()  # before an update makes something of what the simulation made
         return True
 
     def _update(self) -> dict[str, float]:

@@ -176,7 +176,7 @@ def _beginning(cfg: TeacherCfg, runner: "TeacherRunner") -> Iterator[str]:
     how = f"begins from {cfg.init}" if runner.begun else "resumed"
     yield f"{how} after iteration {runner.iteration} of {runner.total_iterations}"
     if runner.new_episodes and not runner.begun:
-        yield f"episodes start anew, the checkpoint does not fit the environments: {runner.new_episodes}"
+        yield f"episodes start anew: {runner.new_episodes}"
     if runner.critic_warmup:
         yield f"the critic learns alone for {runner.critic_warmup} iterations"
     for difference in runner.unlike:

@@ -104,7 +104,7 @@ def find_port() -> str:
 def _why(path: str, error: OSError) -> str:
     """Why a port cannot be opened, with the remedy."""
     if error.errno in (errno.EBUSY, errno.EWOULDBLOCK):
-        return f"it is in use; one program at a time may drive the motors: `fuser -v {path}` names it, end it"
+        return f"another program drives the motors; `fuser -v {path}` names it, end it"
     if error.errno == errno.EACCES:
         group = Path(path).group()  # dialout on Debian and Ubuntu, uucp elsewhere
         return (

@@ -283,8 +283,8 @@ def load_runner(
     if object is not None:
         return TeacherPolicyRunner(policy, hand_name, object, tolerance_rad)
     raise ValueError(
-        f"{name} is a teacher: it needs the object's pose, which no robot senses; tell it by --pose, "
-        "or have vd-train tracker make a tracking policy of it"
+        f"{name} is a teacher: it needs the object's pose, which no robot senses. Tell it by "
+        "--pose, or have vd-train tracker make a tracking policy of it"
     )
 
 

@@ -42,7 +42,8 @@ class GoalResult:
         words = {True: "reached", False: "not reached", None: "error not known"}[self.success]
         far = "" if self.error_rad is None else f", {self.error_rad:.2f} rad from it"
         predicted = "" if self.predicted_rad is None else f", predicted {self.predicted_rad:.2f}"
-        return f"goal {self.goal + 1}: {words}: {self.outcome} after {self.seconds:.1f} s{far}{predicted}"
+        ended = f"{self.outcome} after {self.seconds:.1f} s"
+        return f"goal {self.goal + 1}: {words}: {ended}{far}{predicted}"
 
 
 def goal_results(log: HandLog) -> list[GoalResult]:
@@ -74,7 +75,7 @@ def summary_line(results: Sequence[GoalResult], goals: int) -> str:
     """How many goals were reached of those that were to be pursued."""
     if any(result.success is None for result in results):
         stopped = sum(result.outcome == "stopped" for result in results)
-        return f"{stopped} of {goals} goals stopped; vd-deploy score tells the errors, by motion capture"
+        return f"{stopped} of {goals} goals stopped; vd-deploy score tells the errors"
     return f"{sum(bool(result.success) for result in results)} of {goals} goals reached"
 
 

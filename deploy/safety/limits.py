@@ -169,7 +169,8 @@ class Limits:
                     f"{name}: {state.temperature[axis]:.0f} deg C, over {self._temperature[axis]:g}"
                 )
             if strained[axis]:
-                return f"{name}: {state.current[axis]:.2f} A for {self._cfg.current_s:g} s; is it blocked?"
+                current = f"{state.current[axis]:.2f} A for {self._cfg.current_s:g} s"
+                return f"{name}: {current}; is it blocked?"
             if blocked[axis]:
                 return (
                     f"{name}: it stands {abs(away[axis]):.2f} rad from its goal for "

@@ -113,7 +113,7 @@ def _mirror(hand: HandModel, tips: np.ndarray) -> np.ndarray:
     """
     across = np.array([-tips[0, 1], tips[0, 0], 0.0]) / np.linalg.norm(tips[0, :2])
     mirror = np.eye(3) - 2.0 * np.outer(across, across)
-    refusal = f"{hand.name} is not its own mirror image; set observation.view to goal, which turns it only"
+    refusal = f"{hand.name} is not its own mirror image; set observation.view to goal"
     if hand.joints_per_finger != len(MIRROR_SIGNS):
         raise ValueError(refusal)
     try:

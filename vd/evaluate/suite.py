@@ -131,7 +131,7 @@ def read_suite(name: str) -> Suite:
         names.add(entry.name)
         if not entry.lines or not all(line.startswith("vd-eval ") for line in entry.lines):
             raise ValueError(
-                f"--suite {path}: {entry.name} has to have a line 'vd-eval POLICY ...' for teacher, "
-                "camera or both"
+                f"--suite {path}: {entry.name} has no line 'vd-eval POLICY ...'; give one for "
+                "teacher, camera or both"
             )
     return suite

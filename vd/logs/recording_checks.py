@@ -169,7 +169,7 @@ def _answer_fault(moved: list[Trajectory], j: int, count: float) -> str:
     if copies.any():
         return "is a copy of its command in every motion: record the position that is measured"
     if max(likenesses) < -CLEARLY:
-        return "moves against its command in every motion: the sign of one of them is wrong; turn it round"
+        return "moves against its command in every motion: turn the sign of one of them round"
     lead = float(np.median([_lead(t, j) for t in moved]))
     if lead > 0.0:
         return (
