@@ -97,7 +97,7 @@ def played(monkeypatch):
         parse(*args, **kwargs)
         raise ParsedError
 
-    def run(self, *commands, cpu_s=None):
+    def run(self, *commands):
         monkeypatch.setattr(tyro, "cli", only_parse)
         for words in commands:
             line = [str(word) for word in words]
@@ -180,18 +180,17 @@ def test_compact_meshes_are_turned_and_built_in_objects_fill_up(played, tmp_path
     assert option(flown, "--object") == folder / "a.usda" and flown[1] == "dclaw4-vision"
     assert "fewer than four could be imported" in (tmp_path / "demo" / "index.html").read_text()
     monkeypatch.delitem(LEAVE, "vd-assets import")
-    assert main(["--out", str(tmp_path / "none"), "--meshes", str(meshes)]) == 0, "none in time"
+    assert main(["--out", str(tmp_path / "none"), "--meshes", str(meshes)]) == 0, "none imported"
     flown = [line for line in played if line[0] == "vd-deploy"][-1]
     assert flown[flown.index("--object") + 1] == "procedural-heldout-1-seed0"
 
 
-def test_a_command_is_limited_by_processor_time_whatever_else_the_machine_does(tmp_path):
+def test_a_command_that_fails_ends_those_beside_it(tmp_path):
     part, began = Part("x", "X", tmp_path), time.monotonic()
-    part.run(["python", "-c", "import time; time.sleep(2.0); print('came to its end')"], cpu_s=1.0)
-    assert "came to its end" in (tmp_path / "1-python.txt").read_text()
     child = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'while True: pass'])"
-    part.run(["python", "-c", child], cpu_s=1.0)
-    assert time.monotonic() - began > 3.0, "what its child takes counts, and no more"
+    with pytest.raises(RuntimeError, match=r"ended with status 1: no such motor$"):
+        part.run(["python", "-c", "import sys; sys.exit('no such motor')"], ["python", "-c", child])
+    assert time.monotonic() - began < 60.0
     time.sleep(0.5)
     left = [file for file in Path("/proc").glob("[0-9]*/cmdline") if child_is(file)]
     assert not left, "what it started has ended too"
