@@ -115,6 +115,16 @@ def test_a_command_typed_alone_takes_the_obvious_and_says_it(
         typed(said[0].partition("   (")[0])
 
 
+@pytest.mark.parametrize("command", ["teacher", "student", "alignment", "adapt", "tracker"])
+def test_a_seed_that_cannot_be_is_refused_before_anything_is_built(command, typed, tmp_path):
+    hand = load_hand("dclaw3")
+    kept = {"baseline": {}, "effects": {}, "tool": "a test", "recording": "none"}
+    write_layer(tmp_path / "gap" / "identified.usda", hand, **kept)
+    status, said = typed(f"vd-train {command} --seed -1")
+    assert status == 1 and "seed is -1; it has to be zero or positive" in said
+    assert not list((tmp_path / "runs").rglob("*"))
+
+
 def test_what_is_said_asks_for_the_same(typed, monkeypatch):
     said: list[str] = []
     alone = parse_teacher([], say=lambda *words, why: said.extend(map(str, words)))

@@ -107,6 +107,7 @@ def adapt_command(arguments: list[str]) -> int:
     """
     cfg: AdaptCfg = parse(AdaptCfg, arguments, prog="vd-train adapt")
     require(cfg, "--", "positive", "num_envs steps episodes")
+    require(cfg, "--", "zero or positive", "seed")
     if not cfg.smoke:
         return _adapt(with_defaults(cfg))
     with TemporaryDirectory(prefix="vd-smoke-") as folder:

@@ -45,6 +45,7 @@ def build_teacher(cfg: TeacherCfg, *, say: Callable[[str], object] = print) -> "
     from vd.train.checkpoint import find_checkpoint
 
     validate(cfg.ppo, cfg.policy, cfg.run)
+    cfg.env.validate()
     check_folder(cfg.run.out)
     rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
     checkpoint = find_checkpoint(cfg.run.out, cfg.resume)

@@ -160,6 +160,7 @@ class AlignmentTrainCfg:
         self.align.validate()
         self.looks.validate()
         require(self.task, "--", "positive", "num_envs")
+        require(self.task, "--", "zero or positive", "seed")
         if self.stage == SIMULATED and self.align.points > SEEN_POINTS:
             raise ValueError(
                 f"--align.points is {self.align.points}; policies look at {SEEN_POINTS}, at most"

@@ -160,6 +160,7 @@ class StudentTrainCfg:
         self.clouds.validate()
         self.simulated.validate()
         require(self.task, "--", "positive", "num_envs")
+        require(self.task, "--", "zero or positive", "seed")
 
 
 def gpu(stage: Stage) -> StudentTrainCfg:
