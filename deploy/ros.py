@@ -32,6 +32,7 @@ from vd.deploy.finding import Finding, finding
 from vd.deploy.hardware.answers import HandState, SilentError
 from vd.deploy.hardware.connect import Connection, HandOptions
 from vd.deploy.hardware.joints import JointMotors
+from vd.deploy.hardware.motors import FaultlessMotors
 from vd.deploy.loop.goals import GoalError, make_goals
 from vd.deploy.safety.limits import out_of_range
 from vd.paper import PAPER
@@ -60,7 +61,7 @@ class _Joints(JointMotors):
         return {"model": "behind ROS 2"}
 
 
-class RosHand:
+class RosHand(FaultlessMotors):
     """A hand behind topics, as :class:`vd.deploy.hardware.motors.Motors`.
 
     Stops hold, torque stays on.
@@ -201,17 +202,6 @@ class RosHand:
     def read_torque(self) -> np.ndarray:
         """Taken to be on."""
         return np.ones(len(self.ids), dtype=bool)
-
-    def read_tripped(self) -> np.ndarray:
-        """Taken to hear goals."""
-        return np.zeros(len(self.ids), dtype=bool)
-
-    def hardware_errors(self) -> dict[int, str]:
-        """None that we know."""
-        return {}
-
-    def watch(self, seconds: float) -> None:
-        """The driver's."""
 
     def release(self) -> None:
         """The driver's."""

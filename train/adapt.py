@@ -279,4 +279,4 @@ def compare_models(cfg: AdaptCfg, run: TeacherCfg, say: Callable[[str], object])
     title = f"{before}, adapted to an identified hand"
     how = settings_text([rows[0].protocol])
     write_page(result, page, title=title, lead=summary, notes=(f"{how}.",))
-    say(f"{summary}\n{page}")
+    say(summary if cfg.smoke else f"{summary}\n{page}")

@@ -1,7 +1,8 @@
 """Images for the control loop and the calibration, from a RealSense or a simulated camera."""
 
+import threading
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -44,3 +45,30 @@ class ImageSource(Protocol):
 
     def close(self) -> None:
         """Stop the camera; no :meth:`read` after this."""
+
+
+class NewestImage:
+    """The newest image of a thread that brings them."""
+
+    def __init__(self) -> None:
+        self._image: Any = None
+        self._arrived = threading.Condition()
+
+    def put(self, image: Any) -> None:
+        """Called with every image."""
+        with self._arrived:
+            self._image = image
+            self._arrived.notify()
+
+    def take(self, timeout_s: float, nothing: str) -> Any:
+        """The one that was not taken yet.
+
+        Raises:
+            StaleCamera: ``nothing`` came within ``timeout_s``.
+        """
+        with self._arrived:
+            if not self._arrived.wait_for(lambda: self._image is not None, timeout_s):
+                raise StaleCamera(f"{nothing} within {timeout_s:.2f} s")
+            image = self._image
+            self._image = None
+        return image

@@ -3,7 +3,6 @@
 The depth image is that of the left infrared imager, so both have the same optical frame.
 """
 
-import threading
 import time
 from dataclasses import dataclass
 from types import ModuleType
@@ -14,7 +13,7 @@ import numpy as np
 from vd.assets_usd.hand_data import Intrinsics
 from vd.command import interrupt
 from vd.command.config import require
-from vd.deploy.camera.camera import CameraError, Frame, StaleCamera
+from vd.deploy.camera.camera import CameraError, Frame, NewestImage
 
 MILLISECOND = 1e-3
 
@@ -123,16 +122,9 @@ class RealSense:
             lens.height // side,
             *(value / side for value in (lens.fx, lens.fy, lens.cx, lens.cy)),
         )
-        self._newest: Any = None
-        self._arrived = threading.Condition()
+        self._newest = NewestImage()
         self._sensor.open(profile)
-        self._sensor.start(self._take)
-
-    def _take(self, frame: Any) -> None:
-        """Called by the SDK's thread with every frame."""
-        with self._arrived:
-            self._newest = frame
-            self._arrived.notify()
+        self._sensor.start(self._newest.put)
 
     def read(self, timeout_s: float) -> Frame:
         """The newest image that was not returned yet.
@@ -141,14 +133,8 @@ class RealSense:
             StaleCamera: None came within ``timeout_s``.
             CameraError: Nobody knows its age.
         """
-        with self._arrived:
-            if not self._arrived.wait_for(lambda: self._newest is not None, timeout_s):
-                raise StaleCamera(
-                    f"no image from the camera within {timeout_s:.2f} s; check its cable (USB 3) "
-                    f"and power"
-                )
-            frame = self._newest
-            self._newest = None
+        nothing = "check the camera's cable (USB 3) and power: no image from it"
+        frame = self._newest.take(timeout_s, nothing)
         if frame.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock:
             raise CameraError(
                 "the camera stamps its images by a clock of its own, so nobody knows their age: "
@@ -168,8 +154,7 @@ class RealSense:
         """Stop the stream."""
         self._sensor.stop()
         self._sensor.close()
-        self._newest = None
-        del self._sensor, self._device
+        del self._sensor, self._device, self._newest
 
 
 def _choose(device: Any, stream: Any, pixels: Any, cfg: RealSenseCfg) -> tuple[Any, Any]:

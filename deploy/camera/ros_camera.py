@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 
 from vd.assets_usd.hand_data import Intrinsics
-from vd.deploy.camera.camera import CameraError, Frame, StaleCamera
+from vd.deploy.camera.camera import CameraError, Frame, NewestImage
 from vd.deploy.clock import from_future, of_unix
 
 IMAGES, LENS = "depth/image_rect_raw", "depth/camera_info"
@@ -35,11 +35,14 @@ class RosCamera:
 
         self._node = node
         self._lens = cast(Any, None)
-        self._newest = cast(Any, None)
+        self._newest = NewestImage()
         self._arrived = threading.Condition()
         self._held = [
             node.create_subscription(kind, topic, take, qos_profile_sensor_data)
-            for kind, topic, take in ((CameraInfo, LENS, self._see_by), (Image, IMAGES, self._take))
+            for kind, topic, take in (
+                (CameraInfo, LENS, self._see_by),
+                (Image, IMAGES, self._newest.put),
+            )
         ]
         with self._arrived:
             if not self._arrived.wait_for(lambda: self._lens is not None, FIRST_S):
@@ -59,11 +62,6 @@ class RosCamera:
             self._lens = lens
             self._arrived.notify_all()
 
-    def _take(self, image: Any) -> None:
-        with self._arrived:
-            self._newest = image
-            self._arrived.notify_all()
-
     def read(self, timeout_s: float) -> Frame:
         """The newest image that was not returned yet.
 
@@ -71,19 +69,14 @@ class RosCamera:
             StaleCamera: None came within ``timeout_s``.
             CameraError: It is no depth image, or from the future.
         """
-        with self._arrived:
-            if not self._arrived.wait_for(lambda: self._newest is not None, timeout_s):
-                where = self._node.resolve_topic_name(IMAGES)
-                raise StaleCamera(f"no image on {where} within {timeout_s:.2f} s")
-            image = self._newest
-            self._newest = None
+        where = self._node.resolve_topic_name(IMAGES)
+        image = self._newest.take(timeout_s, f"no image on {where}")
         if image.encoding not in DEPTHS:
             raise CameraError(
                 f"images are {image.encoding}; depth is {' or '.join(DEPTHS)}: remap {IMAGES}"
             )
         time_s = monotonic(image.header.stamp)
         if ahead := from_future(time_s, time.monotonic()):
-            where = self._node.resolve_topic_name(IMAGES)
             raise CameraError(f"an image on {where} is {ahead}, and stamp it when it is exposed")
         kind, unit = DEPTHS[image.encoding]
         order = ">" if image.is_bigendian else "<"

@@ -47,3 +47,20 @@ class Motors(Protocol):
 
     def release(self) -> None:
         """Switch the torque of all motors off at once; nobody answers."""
+
+
+class FaultlessMotors:
+    """What a hand answers whose motors nobody looks after here: a twin's, or those behind ROS 2."""
+
+    ids: tuple[int, ...]
+
+    def read_tripped(self) -> np.ndarray:
+        """None was stopped by a watchdog."""
+        return np.zeros(len(self.ids), dtype=bool)
+
+    def hardware_errors(self) -> dict[int, str]:
+        """None that we know."""
+        return {}
+
+    def watch(self, seconds: float) -> None:
+        """Nothing to set."""

@@ -13,6 +13,7 @@ from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.control_table import RAD_PER_COUNT, RAD_S_PER_COUNT, TICK_MODULUS
 from vd.deploy.hardware.joints import JointMotors
+from vd.deploy.hardware.motors import FaultlessMotors
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
@@ -23,7 +24,7 @@ WARM_C = 30.0
 """Temperature that its motors tell [deg C]."""
 
 
-class Twin:
+class Twin(FaultlessMotors):
     """A simulated hand as :class:`vd.deploy.hardware.motors.Motors`, over a table.
 
     It catches up with the clock whenever it is asked or told something. Angles are told in a
@@ -126,17 +127,6 @@ class Twin:
     def read_torque(self) -> np.ndarray:
         """Which joints are driven."""
         return self._on.copy()
-
-    def read_tripped(self) -> np.ndarray:
-        """None: the twin ends with the program that it would watch."""
-        return np.zeros(len(self.ids), dtype=bool)
-
-    def hardware_errors(self) -> dict[int, str]:
-        """None."""
-        return {}
-
-    def watch(self, seconds: float) -> None:
-        """Nothing: see :meth:`read_tripped`."""
 
     def release(self) -> None:
         """Let all joints go."""
