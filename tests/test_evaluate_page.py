@@ -75,7 +75,7 @@ def test_the_page_is_one_offline_file_with_rates_intervals_and_warnings(tmp_path
 
 
 def test_curves_end_at_one_minus_the_share_of_lost_objects(found):
-    line = ecdf_figure(found, {"zero": "zero"}).axes[0].lines[0]
+    line = ecdf_figure(found).axes[0].lines[0]
     assert line.get_label() == "zero" and line.get_ydata()[-1] == pytest.approx(1 - 1 / 36)
     assert np.all(np.diff(line.get_ydata()) >= 0)
 

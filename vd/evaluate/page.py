@@ -1,7 +1,7 @@
 """An evaluation, or a suite of them, as one HTML page, and as lines for a terminal."""
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,6 +75,13 @@ def labels(names: Sequence[str]) -> dict[str, str]:
     return short
 
 
+def shortened(result: Result) -> Result:
+    """A result with the short names of its policies."""
+    short = labels(result.policies)
+    rows = tuple(replace(row, policy=short[row.policy]) for row in result.rows)
+    return replace(result, rows=rows)
+
+
 def percent(interval: Interval | None) -> str:
     """``12.3 % (10.1 to 14.9)``, or for None that it was not tried."""
     if interval is None:
@@ -117,34 +124,34 @@ def write_page(
     Its own table is ``figures``, the paper's beside ours or not; ``notes`` are of its objects.
     ``conditions`` have a name, the place in the paper or what is changed, and flags.
     """
-    short = labels(result.policies)
+    result = shortened(result)
     headlines = [row for row in result.rows if row.headline]
     missing = []
     for condition, policy, why in result.missing:
         missing.append((condition, shown_name(policy), why))
-    objects = [(_heading(row, short), *_object_table(row)) for row in headlines]
+    objects = [(_heading(row), *_object_table(row)) for row in headlines]
     write_html(
         path,
         "evaluation.html",
-        title=title or f"Evaluation of {', '.join(map(shown_name, short.values()))}",
+        title=title or f"Evaluation of {', '.join(map(shown_name, result.policies))}",
         lead=lead or settings_text([row.protocol for row in result.rows]),
         notes=notes,
-        success=_success_table(result.rows, short),
-        beside=_beside_table(result.rows, short),
+        success=_success_table(result.rows),
+        beside=_beside_table(result.rows),
         hold_s=f"{HOLD_S:g}",
-        air=_air_table(headlines, short),
+        air=_air_table(headlines),
         air_hold_s=f"{AIR_GOALS.hold_s:g}",
-        consecutive=_consecutive_table(result.rows, short),
-        differences=_differences(result, short),
+        consecutive=_consecutive_table(result.rows),
+        differences=_differences(result),
         figures=figures,
         missing=missing,
-        errors=ecdf_figure(result, short) if result.rows else None,
-        bounds=_bound_table(headlines, short),
+        errors=ecdf_figure(result) if result.rows else None,
+        bounds=_bound_table(headlines),
         warnings=result.warnings,
         objects=[] if conditions else objects,
         conditions=conditions,
         of_paper=of_paper,
-        protocol=[] if conditions else _protocol(result, short),
+        protocol=[] if conditions else _protocol(result),
         software=result.software,
         units={row.overall.unit for row in result.rows},
     )
@@ -157,34 +164,34 @@ def terminal_text(result: Result) -> str:
     """
     if not result.rows:
         return ""
-    short = labels(result.policies)
+    result = shortened(result)
     parts = []
-    for header, rows in (_success_table(result.rows, short), _beside_table(result.rows, short)):
+    for header, rows in (_success_table(result.rows), _beside_table(result.rows)):
         lines = [header]
         for row in rows:
             # Only the first figure has its interval here: a line has to fit.
             figures = [cell.split(" (")[0] for cell in row[WORDS + 1 :]]
             lines.append([*row[: WORDS + 1], *figures])
         parts.append(aligned(lines, words=WORDS))
-    for header, rows in (_air_table(result.rows, short), _consecutive_table(result.rows, short)):
+    for header, rows in (_air_table(result.rows), _consecutive_table(result.rows)):
         if rows:
             parts.append(aligned([header, *rows], words=2))
     suite = any(row.condition for row in result.rows)
     if len(result.policies) == 1 and not suite:
-        parts += _object_parts(result, short)
-    parts += map("  ".join, _differences(result, short))
+        parts += _object_parts(result)
+    parts += map("  ".join, _differences(result))
     parts += [f"warning {name}: {warning}" for name, warning in result.warnings.items()]
     if not suite:
         parts.append(settings_text([row.protocol for row in result.rows]))
     return "\n\n".join(parts)
 
 
-def _object_parts(result: Result, short: dict[str, str]) -> list[str]:
+def _object_parts(result: Result) -> list[str]:
     parts = []
     for row in result.rows:
         if row.headline:
             header, rows = _object_table(row)
-            parts.append(f"{_heading(row, short)}\n{aligned([header, *rows], words=1)}")
+            parts.append(f"{_heading(row)}\n{aligned([header, *rows], words=1)}")
     return parts
 
 
@@ -200,10 +207,10 @@ def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
     return "\n".join(lines)
 
 
-def ecdf_figure(result: Result, short: dict[str, str]) -> "Figure":
+def ecdf_figure(result: Result) -> "Figure":
     """Distributions of the errors at the stop or end of each policy's headline row.
 
-    A panel for each condition and group; ``short`` are names of the policies.
+    A panel for each condition and group.
     """
     from matplotlib.figure import Figure
 
@@ -227,7 +234,7 @@ def ecdf_figure(result: Result, short: dict[str, str]) -> "Figure":
                 np.append(shares, shares[-1]),
                 where="post",
                 color=colour[policy],
-                label=short[policy],
+                label=policy,
             )
             axes.axvline(row.protocol.stop_tolerance_rad, color=GREY, linewidth=0.6)
         axes.plot(angle, by_chance, color=GREY, linestyle=":", label="at random")
@@ -237,14 +244,14 @@ def ecdf_figure(result: Result, short: dict[str, str]) -> "Figure":
     return figure
 
 
-def _success_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
+def _success_table(rows: Sequence[Row]) -> Table:
     """The figures by which policies are judged."""
     lines = []
     for row in rows:
         outcomes = row.overall.outcomes
         lines.append(
             (
-                *_names(row, short),
+                *_names(row),
                 percent(outcomes["success"]),
                 percent(row.held),
                 percent(row.precise),
@@ -254,14 +261,14 @@ def _success_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     return _HEADER, lines
 
 
-def _beside_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
+def _beside_table(rows: Sequence[Row]) -> Table:
     """The figures beside those."""
     lines = []
     for row in rows:
         overall = row.overall
         lines.append(
             (
-                *_names(row, short),
+                *_names(row),
                 percent(overall.symmetric),
                 number(overall.median_error_rad),
                 number(overall.time_s),
@@ -270,9 +277,9 @@ def _beside_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     return _BESIDE_HEADER, lines
 
 
-def _names(row: Row, short: dict[str, str]) -> tuple[str, str, str]:
+def _names(row: Row) -> tuple[str, str, str]:
     """What a row is of: policy, objects, stop."""
-    policy = short[row.policy]
+    policy = row.policy
     if row.kind != row.policy:
         policy = f"{policy} ({row.kind})"
     return policy, _where(row), row.stopped_by
@@ -291,7 +298,7 @@ def _object_cells(summary: Summary) -> list[str]:
     return cells
 
 
-def _air_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
+def _air_table(rows: Sequence[Row]) -> Table:
     """What became of goals in a row in the air."""
     lines = []
     for row in rows:
@@ -299,7 +306,7 @@ def _air_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
         if air is not None:
             lines.append(
                 (
-                    short[row.policy],
+                    row.policy,
                     _where(row),
                     percent(air.held),
                     share(air.first),
@@ -311,7 +318,7 @@ def _air_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     return _AIR_HEADER, lines
 
 
-def _consecutive_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
+def _consecutive_table(rows: Sequence[Row]) -> Table:
     """Successes in a row: of all objects, and of each where there are more."""
     lines = []
     for row in rows:
@@ -320,7 +327,7 @@ def _consecutive_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
                 continue
             lines.append(
                 (
-                    short[row.policy],
+                    row.policy,
                     _where(row) if count.name == "all" else count.name,
                     f"{count.mean:.1f}",
                     f"{count.median:g}",
@@ -332,7 +339,7 @@ def _consecutive_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     return _CONSECUTIVE_HEADER, lines
 
 
-def _bound_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
+def _bound_table(rows: Sequence[Row]) -> Table:
     """What predictions are worth at each bound."""
     lines = []
     for row in rows:
@@ -342,7 +349,7 @@ def _bound_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
         for bound, seen in prediction.seen.items():
             lines.append(
                 (
-                    short[row.policy],
+                    row.policy,
                     _where(row),
                     bound,
                     share(seen),
@@ -353,8 +360,8 @@ def _bound_table(rows: Sequence[Row], short: dict[str, str]) -> Table:
     return _BOUND_HEADER, lines
 
 
-def _heading(row: Row, short: dict[str, str]) -> str:
-    return f"{short[row.policy]}, {_where(row)}, stopped by {row.stopped_by}"
+def _heading(row: Row) -> str:
+    return f"{row.policy}, {_where(row)}, stopped by {row.stopped_by}"
 
 
 def _where(row: Row) -> str:
@@ -362,10 +369,10 @@ def _where(row: Row) -> str:
     return f"{row.group}, {row.condition}" if row.condition not in ("", row.group) else row.group
 
 
-def _differences(result: Result, short: dict[str, str]) -> list[tuple[str, str, str]]:
+def _differences(result: Result) -> list[tuple[str, str, str]]:
     lines = []
     for first, other, difference in result.differences():
-        pair = f"{short[other.policy]} over {short[first.policy]}"
+        pair = f"{other.policy} over {first.policy}"
         lines.append((pair, _where(first), points(difference)))
     return lines
 
@@ -392,7 +399,7 @@ def settings_text(protocols: Sequence[Protocol]) -> str:
     return "; ".join(parts)
 
 
-def _protocol(result: Result, short: dict[str, str]) -> list[tuple[str, str]]:
+def _protocol(result: Result) -> list[tuple[str, str]]:
     """The objects of each group, and what each policy sees and stops by."""
     lines = []
     for group in dict.fromkeys(row.group for row in result.rows):
@@ -403,5 +410,5 @@ def _protocol(result: Result, short: dict[str, str]) -> list[tuple[str, str]]:
         if row.stopped_by != SUCCESS:
             bounds = f"{row.rule.distance_rad:.3g} rad, action norm {row.rule.action_norm:.3g}"
             rule = f"{rule}; stops below {bounds}"
-        lines.append((f"{short[row.policy]}, {row.group}, by {row.stopped_by}", rule))
+        lines.append((f"{row.policy}, {row.group}, by {row.stopped_by}", rule))
     return lines

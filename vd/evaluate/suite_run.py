@@ -29,7 +29,7 @@ from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.claims import claimed
 from vd.evaluate.compare import compare
 from vd.evaluate.conditions import CHANGED
-from vd.evaluate.page import NOTHING, labels, number, points, shown_name, write_page
+from vd.evaluate.page import NOTHING, labels, number, points, shortened, shown_name, write_page
 from vd.evaluate.result import SUCCESS, Result, Row
 from vd.evaluate.statistics import Interval, paired_difference
 from vd.evaluate.suite import (
@@ -358,21 +358,21 @@ def fingerprint(name: str) -> str:
 
 def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, ObjectGroup]) -> None:
     """The page and its figures, of what there is."""
-    short = labels(result.policies)
     of_paper = bool(suite.claims)
+    short = shortened(result)
     if of_paper:
-        figures = paper_figures(result, suite, short)
+        figures = paper_figures(short, suite)
     elif suite.by_aspect:
-        figures = aspect_table(result, groups, short)
+        figures = aspect_table(short, groups)
     else:
-        figures = robust_table(result, suite.lines, short)
+        figures = robust_table(short, suite.lines)
     summary = result.summary() | {"quick": cfg.quick, "figures": figures}
     write_json(cfg.out / f"{cfg.suite_name}.json", summary)
     notes = [f"Objects, {name}: {group.text}." for name, group in groups.items()]
     notes.append("Held-out objects judge, and nothing is chosen on them.")
     if cfg.engine != "newton":
         notes.append("Physics by MuJoCo's own engine.")
-    lead = ", ".join(short.values())
+    lead = ", ".join(short.policies)
     if of_paper:
         lead += " beside the paper"
     if cfg.quick:
@@ -392,9 +392,7 @@ def _write(result: Result, cfg: EvalCfg, suite: Suite, groups: dict[str, ObjectG
     )
 
 
-def robust_table(
-    result: Result, entries: Sequence[SuiteEntry], short: dict[str, str]
-) -> list[dict[str, str]]:
+def robust_table(result: Result, entries: Sequence[SuiteEntry]) -> list[dict[str, str]]:
     """A line for each entry and policy: what it changes, and how much success it costs."""
     row_of: dict[tuple[str, str], Row] = {}
     for row in result.rows:
@@ -416,7 +414,7 @@ def robust_table(
                 {
                     "condition": entry.name,
                     "changed": shown(entry),
-                    "policy": short[policy],
+                    "policy": policy,
                     "success": _share(row.overall.outcomes["success"]),
                     f"points from {first}": change,
                     "within 0.1 rad": _share(row.precise),
@@ -426,9 +424,7 @@ def robust_table(
     return table
 
 
-def aspect_table(
-    result: Result, groups: dict[str, ObjectGroup], short: dict[str, str]
-) -> list[dict[str, str]]:
+def aspect_table(result: Result, groups: dict[str, ObjectGroup]) -> list[dict[str, str]]:
     """A line for each entry and policy: success of all objects, and of each class of aspect ratio."""
     from vd.assets_usd.objects.sets import load_set
 
@@ -440,7 +436,7 @@ def aspect_table(
     for row in result.rows:
         if not row.headline:
             continue
-        line = {"condition": row.condition, "policy": short[row.policy]}
+        line = {"condition": row.condition, "policy": row.policy}
         line["success"] = _share(row.overall.outcomes["success"])
         for low, high in pairwise(ASPECTS):
             rates = [
@@ -462,7 +458,7 @@ def aspect_ratio(points: np.ndarray) -> float:
     return float(extents.max() / extents.min())
 
 
-def paper_figures(result: Result, suite: Suite, short: dict[str, str]) -> list[dict[str, str]]:
+def paper_figures(result: Result, suite: Suite) -> list[dict[str, str]]:
     """The paper's figures, each beside that of every policy."""
     figures = []
     for entry in suite.lines:
@@ -478,7 +474,7 @@ def paper_figures(result: Result, suite: Suite, short: dict[str, str]) -> list[d
                 rows = [r for r in result.rows if (r.condition, r.policy) == (entry.name, policy)]
                 value = claimed(claim, rows)
                 in_unit = claim.unit != "share" and isinstance(value, Interval)
-                figure[short[policy]] = number(value) if in_unit else _share(value)
+                figure[policy] = number(value) if in_unit else _share(value)
             figures.append(figure)
     return figures
 
