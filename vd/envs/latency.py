@@ -39,7 +39,7 @@ class SeenState:
 
     def __init__(self, state: TaskState):
         self._state = state
-        sim, n, device = state.sim, state.num_envs, state.device
+        sim, n = state.sim, state.num_envs
         random = state.cfg.randomisation
         longest = max(
             random.observation_latency_s[1] + random.observation_jitter_s,
@@ -47,8 +47,8 @@ class SeenState:
             _oldest_pose_s(state.cfg),
         )
         self.is_late = random.enabled and longest > 0.0
-        self.latency = wp.zeros(n, dtype=float, device=device)
-        self.encoder_latency = wp.zeros(n, dtype=float, device=device)
+        names = ("latency", "encoder_latency") if self.is_late else ("", "")
+        self.latency, self.encoder_latency = (state.zeros(n, saved=name) for name in names)
         present = [
             state.measured_q,
             state.measured_qd,
@@ -64,9 +64,9 @@ class SeenState:
         d, f = state.num_joints, state.num_fingers
         slots = math.ceil(longest / state.cfg.sim.physics_dt) + 1
         columns = ring_columns(d, sim.joint_q.shape[1], sim.joint_qd.shape[1], f)
-        self._ring = wp.zeros((n * slots, columns), dtype=float, device=device)
+        self._ring = state.zeros(n * slots, columns, saved="latency_ring")
         self.slots = slots
-        self.head = wp.zeros(n, dtype=wp.int32, device=device)
+        self.head = state.zeros(n, dtype=wp.int32, saved="latency_head")
         self._model = [d, slots, state.fingers.tip_body]
         ranges = [random.observation_latency_s, random.encoder_latency_s]
         self._ranges = state.parameters.blended(np.zeros((2, 2)), ranges, wp.vec2)
@@ -101,14 +101,6 @@ class SeenState:
             state.launch(
                 recall_state_kernel, [*self._model, *inputs], [state.rng, _packed(self.arrays)]
             )
-
-    def stateful(self) -> dict[str, wp.array]:
-        """Arrays to save with a checkpoint, by name."""
-        if not self.is_late:
-            return {}
-        here = {"latency": self.latency, "latency_ring": self._ring, "latency_head": self.head}
-        late = self._state.cfg.randomisation.encoder_latency_s[1] > 0.0
-        return here | ({"encoder_latency": self.encoder_latency} if late else {})
 
     def _now(self, joint_q: wp.array, joint_qd: wp.array, *bodies: wp.array) -> StateArrays:
         """A state, with the joints as their encoders report them."""

@@ -45,7 +45,7 @@ class Observer:
 
         zeros = state.zeros
 
-        self.all_values = self.world_values = zeros(n, width)
+        self.all_values = self.world_values = zeros(n, width, saved="observation")
         self.symmetry_frames = ChosenFrames(state, self.all_values) if cfg.view != "world" else None
         if self.symmetry_frames is not None:
             self.world_values = self.symmetry_frames.observation
@@ -159,9 +159,3 @@ class Observer:
             ],
             [self.world_values],
         )
-
-    def stateful(self) -> dict[str, wp.array]:
-        """Arrays to save with a checkpoint, by name."""
-        chosen = {} if self.symmetry_frames is None else {"view": self.symmetry_frames.chosen}
-        errors = self._tracked_pose.stateful() | self._pose_error.stateful()
-        return chosen | self.seen.stateful() | errors

@@ -25,7 +25,7 @@ class PoseError:
         if self.is_wrong:
             sizes = [random.object_pose_error]
             self._size = state.parameters.blended(np.zeros((1, 2)), sizes, wp.vec2)
-            self._error = state.zeros(state.num_envs, dtype=wp.transform)
+            self._error = state.zeros(state.num_envs, dtype=wp.transform, saved="pose_error")
             self._believed = wp.zeros_like(state.sim.joint_q)
 
     def begin(self, mask: wp.array) -> None:
@@ -42,7 +42,3 @@ class PoseError:
         measured_q, measured_qd, joint_q, *others = seen
         self._state.launch(mistake_pose_kernel, [self._error, joint_q], [self._believed])
         return [measured_q, measured_qd, self._believed, *others]
-
-    def stateful(self) -> dict[str, wp.array]:
-        """Arrays to save with a checkpoint, by name."""
-        return {"pose_error": self._error} if self.is_wrong else {}

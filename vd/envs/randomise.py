@@ -50,23 +50,26 @@ class Randomiser:
 
         zeros = state.zeros
 
-        self.kp, self.kd = zeros(n, d), zeros(n, d)
+        self.kp = zeros(n, d, saved="kp")
+        self.kd = zeros(n, d, saved="kd")
         """Joint stiffness [N m/rad] and damping [N m s/rad], shape [N, D]."""
-        self.hand_friction, self.object_friction, self.table_friction = zeros(n), zeros(n), zeros(n)
+        self.hand_friction = zeros(n, saved="hand_friction")
+        self.object_friction = zeros(n, saved="object_friction")
+        self.table_friction = zeros(n, saved="table_friction")
         self.object_mass = zeros(n)
         """Object mass [kg], shape [N]."""
-        self.action_offset = zeros(n, d)
+        self.action_offset = zeros(n, d, saved="action_offset")
         # Not of the shape's values, which no sensor measures.
-        self.observation_offset = zeros(
-            n, teacher_observation_size(state.num_fingers, state.num_joints)
-        )
-        self.force = zeros(n, dtype=wp.vec3)
+        size = teacher_observation_size(state.num_fingers, state.num_joints)
+        self.observation_offset = zeros(n, size, saved="observation_offset")
+        self.force = zeros(n, dtype=wp.vec3, saved="force")
         """Disturbance force on the object [N], world frame, shape [N]."""
         self._no_force = zeros(n, dtype=wp.vec3)
         if self.enabled:
             state.sim.force_steps = cfg.randomisation.force_steps(cfg.sim)
         self._gravity = wp.vec3(*state.sim.model.gravity.numpy()[0].tolist())
-        self._age, self._due = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
+        self._age = zeros(n, dtype=wp.int32, saved="dynamics_age")
+        self._due = zeros(n, dtype=wp.int32)
         self._interval = round(cfg.randomisation.redraw_s * cfg.sim.control_hz)
         self._push_interval = round(PUSH_INTERVAL_S * cfg.sim.control_hz)
         self._graphs = Graphs(device)
@@ -298,20 +301,3 @@ class Randomiser:
         wp.copy(self._places, places)
         state.sim.solver.notify_model_changed(flags)
         wp.copy(places, self._places)
-
-    def stateful(self) -> dict[str, wp.array]:
-        """Arrays to save with a checkpoint.
-
-        Masses are drawn from the seed alone and need no saving.
-        """
-        return {
-            "kp": self.kp,
-            "kd": self.kd,
-            "hand_friction": self.hand_friction,
-            "object_friction": self.object_friction,
-            "table_friction": self.table_friction,
-            "action_offset": self.action_offset,
-            "observation_offset": self.observation_offset,
-            "force": self.force,
-            "dynamics_age": self._age,
-        }

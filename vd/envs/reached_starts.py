@@ -41,10 +41,10 @@ class ReachedStarts:
         n = state.num_envs
         self.reset = state.zeros(n, dtype=wp.int32)
         self._slot = state.zeros(n, dtype=wp.int32)
-        self._count = state.zeros(n, dtype=wp.int32)
+        self._count = state.zeros(n, dtype=wp.int32, saved="reached_count")
         self._rows = {name: _rows(array, n) for name, array in motion.items()}
         self._kept = {
-            name: state.zeros(n, SLOTS, rows.shape[1], dtype=wp.int32)
+            name: state.zeros(n, SLOTS, rows.shape[1], dtype=wp.int32, saved=f"reached_{name}")
             for name, rows in self._rows.items()
         }
 
@@ -95,11 +95,6 @@ class ReachedStarts:
         )
         for name, rows in self._rows.items():
             state.launch(put_rows_kernel, [self._slot, self._kept[name], rows], [], dim=rows.shape)
-
-    def stateful(self) -> dict[str, wp.array]:
-        """Arrays to save with a checkpoint, by name."""
-        kept = {f"reached_{name}": array for name, array in self._kept.items()}
-        return {"reached_count": self._count} | kept
 
 
 def _rows(array: wp.array, count: int) -> wp.array:

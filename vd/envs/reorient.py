@@ -164,12 +164,12 @@ class ReorientEnv:
         self.timed_out = zeros(n, dtype=wp.int32)
         self.done = zeros(n, dtype=wp.int32)
         """1 where the return ends: success, fall or time-out, shape [N]."""
-        self.step_count = zeros(n, dtype=wp.int32)
-        self.goal_steps = zeros(n, dtype=wp.int32)
+        self.step_count = zeros(n, dtype=wp.int32, saved="step_count")
+        self.goal_steps = zeros(n, dtype=wp.int32, saved="goal_steps")
         """Control steps since the environment's goal was given, shape [N]."""
         self.object_pose_end = zeros(n, dtype=wp.transform)
         """Object pose at the end of the step, before resets, shape [N]."""
-        self.goal_counts = zeros(3)
+        self.goal_counts = zeros(3, saved="goal_counts")
         """Goals ended, goals reached and objects lost since cleared, over all environments, shape
         [3].
         """
@@ -177,7 +177,7 @@ class ReorientEnv:
         """Height of the object's lowest point above the table [m], shape [N]; 0 unless it is
         rewarded.
         """
-        self.previous_error = zeros(n)
+        self.previous_error = zeros(n, saved="previous_error")
         """Rotation error at the end of the last step, for the progress in it [rad], shape [N]."""
         self.ended = zeros(n, dtype=wp.int32)
         self._new_goal = zeros(n, dtype=wp.int32)
@@ -576,15 +576,8 @@ class ReorientEnv:
             **self.motion(),
             "smoothed": self.smoothed,
             "goal_quat": self.goal_quat,
-            "step_count": self.step_count,
-            "goal_steps": self.goal_steps,
-            "previous_error": self.previous_error,
-            "goal_counts": self.goal_counts,
-            "observation": self.observer.all_values,
             "rng": self.state.rng,
-            **self.observer.stateful(),
-            **self.randomiser.stateful(),
-            **({} if self._reached is None else self._reached.stateful()),
+            **self.state.saved,
         }
 
     def close(self) -> None:

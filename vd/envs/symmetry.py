@@ -47,7 +47,7 @@ class ChosenFrames:
         self._sign = wp.array(tables.sign, dtype=float, device=device)
         self._sector = wp.array(tables.sector[:chosen_from], dtype=wp.vec3, device=device)
         self._action = wp.zeros((envs, state.num_joints), dtype=float, device=device)
-        self.chosen = wp.zeros(envs, dtype=wp.int32, device=device)
+        self.chosen = state.zeros(envs, dtype=wp.int32, saved="view")
         self.observation = wp.zeros_like(out)
 
     def choose(self, reset: wp.array, new_goal: wp.array) -> None:

@@ -3,7 +3,7 @@
 The task, its simulation, and arrays of a row an environment.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -60,10 +60,15 @@ class TaskState:
     """Object of each environment, shape [N]."""
     world_scale: wp.array
     """Factor on its size, shape [N]."""
+    saved: dict[str, wp.array] = field(default_factory=dict)
+    """What changes from step to step, by name."""
 
-    def zeros(self, *shape: int, dtype: Any = float) -> wp.array:
-        """An array of zeros on the task's device."""
-        return wp.zeros(shape, dtype=dtype, device=self.device)
+    def zeros(self, *shape: int, dtype: Any = float, saved: str = "") -> wp.array:
+        """An array of zeros on the task's device, that checkpoints save by this name."""
+        array = wp.zeros(shape, dtype=dtype, device=self.device)
+        if saved:
+            self.saved[saved] = array
+        return array
 
     def launch(
         self,

@@ -40,15 +40,15 @@ class TrackedPose:
         params.noise = wp.vec2(*cfg.noise)
         self._params = wp.array([params], dtype=TrackedPoseParams, device=state.device)
         n, zeros = state.num_envs, state.zeros
-        self._rate = zeros(n)
-        self._delay = zeros(n)
-        self._clock = zeros(n)
-        self._due = zeros(n)
-        self._head = zeros(n, dtype=wp.int32)
-        self._came = zeros(n, dtype=wp.int32)
-        self._held_s = zeros(n)
-        self._held = zeros(n, dtype=wp.transform)
-        self._twist = zeros(n, dtype=wp.spatial_vector)
+        self._rate = zeros(n, saved="tracked_rate")
+        self._delay = zeros(n, saved="tracked_delay")
+        self._clock = zeros(n, saved="tracked_clock")
+        self._due = zeros(n, saved="tracked_due")
+        self._head = zeros(n, dtype=wp.int32, saved="tracked_head")
+        self._came = zeros(n, dtype=wp.int32, saved="tracked_came")
+        self._held_s = zeros(n, saved="tracked_held_s")
+        self._held = zeros(n, dtype=wp.transform, saved="tracked_held")
+        self._twist = zeros(n, dtype=wp.spatial_vector, saved="tracked_twist")
         self._joint_q = wp.zeros_like(state.sim.joint_q)
         self._joint_qd = wp.zeros_like(state.sim.joint_qd)
 
@@ -85,19 +85,3 @@ class TrackedPose:
             [self._state.rng, *kept, self._joint_q, self._joint_qd],
         )
         return [measured_q, measured_qd, self._joint_q, self._joint_qd, *bodies]
-
-    def stateful(self) -> dict[str, wp.array]:
-        """Arrays to save with a checkpoint, by name."""
-        if not self.is_tracked:
-            return {}
-        return {
-            "tracked_rate": self._rate,
-            "tracked_delay": self._delay,
-            "tracked_clock": self._clock,
-            "tracked_due": self._due,
-            "tracked_head": self._head,
-            "tracked_came": self._came,
-            "tracked_held_s": self._held_s,
-            "tracked_held": self._held,
-            "tracked_twist": self._twist,
-        }

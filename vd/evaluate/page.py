@@ -389,7 +389,7 @@ def settings_text(protocols: Sequence[Protocol]) -> str:
             value = getattr(protocol, setting.name)
             if isinstance(value, float):
                 value = f"{value:.4g}"
-            if value not in (*values, setting.default):
+            if value not in (*values, setting.default, None):
                 values.append(value)
         name = setting.name.replace("_", " ")
         if values == [True]:
