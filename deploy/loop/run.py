@@ -60,6 +60,8 @@ WARM_UP = 3
 """Decisions before the hand is switched on: kernels are loaded, allocators have grown."""
 FIRST_IMAGE_S = 5.0
 """Longest wait for a camera's first image."""
+GOALS = 3
+"""Goals that are drawn where nothing is asked for."""
 PLACE = "Put the object between the fingers, then press Enter alone."
 DRAWING = "drawing the film (the first one compiles its kernels) ..."
 
@@ -78,9 +80,9 @@ class DriveCfg(HandOptions):
     goal: tuple[str, ...] = ()
     """Orientations of the object to reach, one after the other, in the world frame: quaternions
     x,y,z,w, or turns x,y,z@degrees about an axis."""
-    random_goals: int = 3
-    """How many goals to draw where there is no --goal, each far from the one before. With --ros2
-    none are drawn."""
+    random_goals: int | None = None
+    """How many goals to draw in place of --goal, each far from the one before; three by default.
+    With --ros2 none are drawn."""
     episode_s: float = PAPER.scene.episode_s
     """Time for each goal [s]; then the next one is pursued."""
     hold_s: float = 1.0
@@ -139,6 +141,8 @@ class DriveCfg(HandOptions):
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
+        if self.random_goals is not None and (self.ros2 or self.goal):
+            raise ValueError("--random-goals is in place of --ros2 and --goal; leave one out")
         check_names([], [self.object], self.hand)
         check_names([self.policy_name], [])
         from vd.deploy.loop.goals import SCAN_SUFFIXES
@@ -253,7 +257,7 @@ def _goals(cfg: DriveCfg, item: "ObjectModel") -> list[np.ndarray]:
 
     if cfg.goal or cfg.ros2:
         return make_goals(cfg.goal)
-    return drawn_goals(item.symmetry, cfg.random_goals, seed=cfg.seed)
+    return drawn_goals(item.symmetry, cfg.random_goals or GOALS, seed=cfg.seed)
 
 
 def _pursue(

@@ -3,15 +3,12 @@
 Sizes of objects, tables that leave, starts at rest.
 """
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
-
-if TYPE_CHECKING:
-    from vd.envs.reorient import ReorientEnv
 
 ALWAYS = 2**31 - 1
 """Last step of a table that stays."""
@@ -51,7 +48,7 @@ def chosen(cfg: ReorientCfg, share: float) -> np.ndarray:
     return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
 
 
-def rest_poses(env: "ReorientEnv") -> np.ndarray:
+def rest_poses(env: Any) -> np.ndarray:
     """Drop every object of a ReorientEnv a few times.
 
     Where they came to lie, float, shape [N, K, 7].

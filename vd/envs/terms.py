@@ -7,7 +7,7 @@ A function takes the :class:`vd.envs.reorient.ReorientEnv` and gives a torch ten
 to it.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import warp as wp
@@ -16,9 +16,6 @@ from vd.command.functions import named_function
 from vd.envs.cfg import ReorientCfg
 from vd.kernels.task.rewards import REWARD_TERMS
 from vd.sim.simulator import CHECKED
-
-if TYPE_CHECKING:
-    from vd.envs.reorient import ReorientEnv
 
 
 class OwnTerms:
@@ -46,7 +43,7 @@ class OwnTerms:
         self._steps = 0
 
     @torch.no_grad()
-    def pay(self, env: "ReorientEnv") -> None:
+    def pay(self, env: Any) -> None:
         """Add to the reward of a step what own terms give for the state before resets."""
         reward, terms = wp.to_torch(env.reward), wp.to_torch(env.reward_terms)
         failed = wp.to_torch(env.sim.failed) > 0
@@ -56,7 +53,7 @@ class OwnTerms:
             reward += self._scale * paid
 
     @torch.no_grad()
-    def observe(self, env: "ReorientEnv") -> None:
+    def observe(self, env: Any) -> None:
         """Write own values of the present state into the observation, as they are in every frame."""
         observer = env.observer
         first = {part: columns.start for part, columns in observer.parts.items()}
@@ -84,7 +81,7 @@ class OwnTerms:
                     f"the own term {name} gave a value that is not finite; mend the function"
                 )
 
-    def _value(self, env: "ReorientEnv", name: str, size: int) -> torch.Tensor:
+    def _value(self, env: Any, name: str, size: int) -> torch.Tensor:
         """What a function gives [N, K]."""
         try:
             value = self._functions[name](env)
