@@ -516,7 +516,7 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(
 @pytest.mark.parametrize(
     ("flags", "error"),
     [
-        ("--hand dclaw3 --port /dev/none dclaw3", "no robot senses; tell it by --pose"),
+        ("--hand dclaw3 --port /dev/none dclaw3", "no robot senses. Tell it by --pose"),
         (
             "--hand dclaw4 --twin dclaw3-tracking",
             "was trained for dclaw3 (9 motors), not for dclaw4 (12)",
