@@ -28,7 +28,6 @@ from vd.assets_usd.objects.geometry import (
     random_surface_points,
     surface_points,
     triangle_areas,
-    unfolded_faces,
     union_depth,
 )
 from vd.assets_usd.objects.meshes import fit_of, mass_of, scale_of
@@ -224,7 +223,7 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
 
 def _simplified(mesh: Any) -> tuple[Any, list[str]]:
     """A mesh of at most MAX_FACES faces, and what has to be said of it."""
-    vertices, faces = cluster_vertices(mesh.vertices, mesh.faces, MAX_FACES, unfolded_faces)
+    vertices, faces = cluster_vertices(mesh.vertices, mesh.faces, MAX_FACES, closed=True)
     if len(faces) == len(mesh.faces):
         return mesh, []
     some = random_surface_points(mesh.vertices, mesh.faces, COMPARED, np.random.default_rng(0))
