@@ -32,6 +32,7 @@ from vd.assets_usd.hand_data import (
 )
 from vd.assets_usd.hand_layer import add_layer, read_servo
 from vd.assets_usd.objects.geometry import Surface
+from vd.assets_usd.objects.usd_mesh import mesh_triangles
 from vd.kernels.servo.actuators import MAX_JOINTS
 
 __all__ = [
@@ -116,7 +117,7 @@ def read_surfaces(hand: HandModel) -> dict[int, Surface]:
     """What is drawn of each link, by its index; in its frame [m], float32 and int32.
 
     Raises:
-        HandError: A mesh is not of triangles, or nothing is drawn at all.
+        ValueError: A mesh is damaged, or nothing is drawn at all.
     """
     reader = _Reader(hand.path, hand.fingertip, hand.layer)
     surfaces: dict[int, Surface] = {}
@@ -342,19 +343,13 @@ class _Reader:
 
     def drawn_meshes(self, body: Usd.Prim) -> list[tuple[np.ndarray, np.ndarray]]:
         """Vertices [V, 3] and triangles [T, 3] of what is drawn of a link, in its frame."""
-        meshes = []
+        drawn = []
         for prim in Usd.PrimRange(body):
-            if not prim.IsA(UsdGeom.Mesh) or UsdGeom.Imageable(prim).ComputePurpose() == "guide":
-                continue
-            mesh = UsdGeom.Mesh(prim)
-            if set(mesh.GetFaceVertexCountsAttr().Get() or ()) != {3}:
-                what = "'faceVertexCounts' are not all 3"
-                raise self.fail(prim, what, "triangulate the mesh")
-            matrix = self._matrix(prim, body)
-            vertices = np.array(mesh.GetPointsAttr().Get()) @ matrix[:3, :3] + matrix[3, :3]
-            faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
-            meshes.append((vertices, faces))
-        return meshes
+            imageable = UsdGeom.Imageable(prim)
+            if prim.IsA(UsdGeom.Mesh) and imageable.ComputePurpose() != "guide":
+                surface = mesh_triangles(prim, self._matrix(prim, body))
+                drawn.append(surface)
+        return drawn
 
     def _palm(self) -> np.ndarray:
         """Where the palm looks, a unit vector [3]."""

@@ -1,6 +1,5 @@
 """A welded hand as USD (docs/reference/hand.md): numbers as text, meshes in a crate beside it."""
 
-from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -17,14 +16,12 @@ from vd.assets_usd.hand_import.description import Description
 from vd.assets_usd.hand_import.guess import Stance
 from vd.assets_usd.hand_import.source import Joint, Link, Shape
 from vd.assets_usd.hand_import.tree import Tree, shape_box
-from vd.assets_usd.objects.decompose import decompose
 from vd.assets_usd.objects.geometry import (
     convex_hull,
     principal_axes,
     simplify_hull,
     surface_points,
 )
-from vd.assets_usd.objects.settings import ImportSettings
 
 HULL_VERTICES = 32
 """Most corners of a collider: contacts of more take longer and feel the same."""
@@ -136,9 +133,7 @@ class Author:
         UsdGeom.Scope.Define(self.stage, f"{path}/collision").CreatePurposeAttr(
             UsdGeom.Tokens.guide
         )
-        colliders = [
-            part for shape in link.shapes if shape.collides for part in convex_parts(shape)
-        ]
+        colliders = link.colliders
         for i, shape in enumerate(colliders):
             self._collider(f"{path}/collision/c{i}", shape, self._is_tip(number, shape, colliders))
         drawings = [shape for shape in link.shapes if not shape.collides] or colliders
@@ -240,12 +235,10 @@ class Author:
         _float(prim, "newton:armature", joint.armature)
         _float(prim, "newton:velocityLimit", float(np.degrees(joint.velocity)))
         if joint.mimic is not None:
-            leader, factor, offset = joint.mimic
-            names = [other.name for other in self.tree.joints]
+            _, factor, offset = joint.mimic
+            leader = self.joints[self.tree.leader(joint)]
             _apply(prim, "NewtonMimicAPI")
-            prim.CreateRelationship("newton:mimicJoint").SetTargets(
-                [f"{self.root}/{self.joints[names.index(leader)]}"]
-            )
+            prim.CreateRelationship("newton:mimicJoint").SetTargets([f"{self.root}/{leader}"])
             _float(prim, "newton:mimicCoef0", float(np.degrees(offset)))
             _float(prim, "newton:mimicCoef1", factor)
         kinds = Sdf.ValueTypeNames
@@ -289,14 +282,6 @@ def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         if shape.kind == "capsule":
             vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
     return placed(shape.frame, vertices), faces
-
-
-def convex_parts(shape: Shape) -> list[Shape]:
-    """A collider, or the parts of one that is to be split."""
-    if shape.kind != "mesh" or not shape.split:
-        return [shape]
-    cut = decompose(shape.vertices, shape.faces, ImportSettings(), HULL_VERTICES)
-    return [replace(shape, vertices=hull.vertices, faces=hull.faces) for hull in cut.hulls]
 
 
 def _distance(shape: Shape, point: np.ndarray) -> float:

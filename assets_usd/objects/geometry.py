@@ -53,9 +53,9 @@ Hull = Surface
 
 
 class Solid(NamedTuple):
-    """Mass properties of a solid of uniform density 1.
+    """Volume, centroid [3] and inertia about it [3, 3] of a solid of uniform density 1.
 
-    Volume, centroid [3], inertia about it [3, 3].
+    Of a link of a hand the volume is its mass.
     """
 
     volume: float
