@@ -11,7 +11,16 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial.transform import Rotation
 from trimesh.util import append_faces
 
-from vd.assets_usd.hand_data import MotorModel, canonical_quat, compose, invert, placed, pose_at
+from vd.assets_usd.hand_data import (
+    MOTOR_ATTRIBUTES,
+    MotorModel,
+    canonical_quat,
+    compose,
+    invert,
+    motor_attribute,
+    placed,
+    pose_at,
+)
 from vd.assets_usd.hand_import.description import Description
 from vd.assets_usd.hand_import.guess import Stance
 from vd.assets_usd.hand_import.source import Joint, Link, Shape
@@ -22,6 +31,7 @@ from vd.assets_usd.objects.geometry import (
     simplify_hull,
     surface_points,
 )
+from vd.assets_usd.objects.model import add_mesh
 
 HULL_VERTICES = 32
 """Most corners of a collider: contacts of more take longer and feel the same."""
@@ -187,16 +197,8 @@ class Author:
         )
 
     def _mesh(self, path: str, vertices: np.ndarray, faces: np.ndarray) -> UsdGeom.Mesh:
-        mesh = UsdGeom.Mesh.Define(self.stage, path)
-        mesh.CreateSubdivisionSchemeAttr("none")
         with Usd.EditContext(self.stage, self.meshes):
-            mesh.CreatePointsAttr(vertices.astype(np.float32))
-            mesh.CreateFaceVertexIndicesAttr(faces.astype(np.int32).ravel())
-            mesh.CreateFaceVertexCountsAttr(np.full(len(faces), 3, dtype=np.int32))
-            mesh.CreateExtentAttr(
-                np.stack([vertices.min(axis=0), vertices.max(axis=0)]).astype(np.float32)
-            )
-        return mesh
+            return add_mesh(self.stage, path, vertices, faces)
 
     def _points(self, path: str, meshes: list[tuple[np.ndarray, np.ndarray]]) -> None:
         """Samples of what is drawn of a link."""
@@ -249,15 +251,10 @@ class Author:
 
 
 def _author_motor(joint: Usd.Prim, motor: MotorModel) -> None:
-    kinds = Sdf.ValueTypeNames
-    _custom(joint, "vd:motor:model", kinds.String, motor.model)
-    _custom(joint, "vd:motor:id", kinds.Int, motor.id)
-    _custom(joint, "vd:motor:sign", kinds.Double, motor.sign)
-    _custom(joint, "vd:motor:offset", kinds.Double, motor.offset_rad)
-    _custom(joint, "vd:motor:gear", kinds.Double, motor.gear)
-    _custom(joint, "vd:motor:p_gain", kinds.Int, motor.p_gain)
-    _custom(joint, "vd:motor:d_gain", kinds.Int, motor.d_gain)
-    _custom(joint, "vd:motor:current", kinds.Double, motor.current)
+    names = Sdf.ValueTypeNames
+    kinds = {str: names.String, int: names.Int, float: names.Double}
+    for name, kind in MOTOR_ATTRIBUTES.items():
+        _custom(joint, motor_attribute(name), kinds[kind], kind(getattr(motor, name)))
 
 
 def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:

@@ -50,7 +50,7 @@ from vd.command.files import make_folder
 from vd.command.warp_quiet import quiet_warp
 from vd.command.workers import run_tasks
 
-IMPORT_VERSION = 6
+IMPORT_VERSION = 7
 """Part of every content hash: raise it when the import computes something else."""
 
 MAX_VISUAL_FACES = 3000

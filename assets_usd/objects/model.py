@@ -178,7 +178,8 @@ def build_model(
     )
 
 
-def _add_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+def add_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """Define a ``UsdGeom.Mesh`` of vertices [V, 3] and triangles [T, 3] in a stage."""
     from pxr import UsdGeom, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, path)
@@ -227,10 +228,10 @@ def write_object(path: Path, model: ObjectModel) -> Path:
     physics.CreateStaticFrictionAttr(PAPER.materials.friction)
     physics.CreateDynamicFrictionAttr(PAPER.materials.friction)
 
-    _add_mesh(stage, f"{root}/visual", model.vertices, model.faces)
+    add_mesh(stage, f"{root}/visual", model.vertices, model.faces)
     UsdGeom.Scope.Define(stage, f"{root}/collision")
     for i, hull in enumerate(model.hulls):
-        mesh = _add_mesh(stage, f"{root}/collision/hull_{i}", hull.vertices, hull.faces)
+        mesh = add_mesh(stage, f"{root}/collision/hull_{i}", hull.vertices, hull.faces)
         mesh.CreatePurposeAttr(UsdGeom.Tokens.guide)
         UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
         collision = UsdPhysics.MeshCollisionAPI.Apply(mesh.GetPrim())
