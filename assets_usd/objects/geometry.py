@@ -106,22 +106,13 @@ def hull_volume(points: np.ndarray) -> float:
         return 0.0
 
 
-def hull_planes(hull: Hull) -> tuple[np.ndarray, np.ndarray]:
-    """Half-spaces of a hull: unit outward normals [P, 3] and offsets [P].
-
-    Inside is ``n.x <= d``.
-    """
+def hull_depth(hull: Hull, points: np.ndarray) -> np.ndarray:
+    """Largest signed plane distance [n] of points [n, 3]: negative inside, 0 on the surface, m."""
     normal = _normals(*hull)
     length = np.linalg.norm(normal, axis=1)
     keep = length > 1e-12 * length.max()
     normal = normal[keep] / length[keep, None]
-    first = _corners(*hull)[0, keep]
-    return normal, np.einsum("ij,ij->i", normal, first)
-
-
-def hull_depth(hull: Hull, points: np.ndarray) -> np.ndarray:
-    """Largest signed plane distance [n] of points [n, 3]: negative inside, 0 on the surface, m."""
-    normal, offset = hull_planes(hull)
+    offset = np.einsum("ij,ij->i", normal, _corners(*hull)[0, keep])
     points = np.asarray(points, dtype=np.float64)
     chunks = np.array_split(points, 1 + len(points) * len(offset) // MOST_DISTANCES)
     return np.concatenate([(chunk @ normal.T - offset).max(axis=1) for chunk in chunks])
@@ -292,22 +283,22 @@ def surface_points(
     faces: np.ndarray,
     count: int,
     *,
-    seed: int = 0,
     outside: Sequence[Hull] = (),
 ) -> np.ndarray:
     """Evenly spread points on a surface, by farthest-point sampling of random candidates.
+
+    Equal input gives equal points.
 
     Args:
         vertices: [V, 3].
         faces: [T, 3].
         count: Number of points.
-        seed: Seed of the candidates; equal input and seed give equal points.
         outside: Points inside any of these hulls are left out (parts that overlap).
 
     Returns:
         [count, 3] float64.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     tolerance = 1e-6 * float(np.ptp(vertices, axis=0).max())
     candidates = np.zeros((0, 3))
     while len(candidates) < count:

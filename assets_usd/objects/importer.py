@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -110,22 +110,9 @@ def content_hash(job: Job, settings: ImportSettings) -> str:
     if mesh_kind(files[0]) == "usd":
         files = usd_files(files[0])
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files))
-    parts = {
-        "max_hulls": settings.max_hulls,
-        "threshold": settings.threshold,
-        "mcts_iterations": settings.mcts_iterations,
-        "max_hull_vertices": HULL_VERTICES,
-        "time_limit_s": settings.time_limit,
-        "seed": 0,
-    }
-    size = {
-        "units": settings.units,
-        "keep_size": settings.keep_size,
-        "fit": asdict(fit_of(settings.hand)),
-        "density": settings.density,
-        "mass_kg": settings.mass,
-    }
-    facts = [IMPORT_VERSION, job.name, job.licence, job.provenance, job.split, [parts, size]]
+    sizes = asdict(fit_of(settings.hand))
+    options = asdict(replace(settings, hand="", licence=job.licence))
+    facts = [IMPORT_VERSION, job.name, job.provenance, job.split, sizes, options]
     digest.update(json.dumps(facts, sort_keys=True).encode())
     return digest.hexdigest()
 

@@ -400,17 +400,16 @@ def write_contact_layer(
     """
     from pxr import Gf, Sdf
 
-    from vd.assets_usd.hand_layer import author, save_layer
+    from vd.assets_usd.hand_layer import author, new_layer, save_layer
 
     item = read_object(item_file)
-    layer = Sdf.Layer.CreateAnonymous(".usda")
-    layer.defaultPrim = item.name
-    layer.subLayerPaths.append(os.path.relpath(item_file.resolve(), path.resolve().parent))
-    layer.documentation = (
+    layer = new_layer(
+        item.name,
         f"Contact of {item.name}, identified by vd-gap contact from {recording}: "
-        "pass it as --objects."
+        "pass it as --objects.",
+        {"format": LAYER_FORMAT, "recording": recording},
     )
-    layer.customLayerData = {"format": LAYER_FORMAT, "recording": recording}
+    layer.subLayerPaths.append(os.path.relpath(item_file.resolve(), path.resolve().parent))
     prim = Sdf.PrimSpec(layer, item.name, Sdf.SpecifierOver)
 
     author_contact(prim, identified)
