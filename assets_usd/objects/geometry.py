@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import trimesh
 from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
@@ -35,6 +34,10 @@ SLIVER_THICKNESS = 2e-3
 """A part thinner than this share of the longest side (0.25 mm of 12 cm) is no solid to collide
 with.
 """
+
+
+class MeshError(ValueError):
+    """A mesh is refused; the message is the reason."""
 
 
 class Surface(NamedTuple):
@@ -222,9 +225,11 @@ def _tetrahedron(points: np.ndarray) -> list[int]:
 
 def solid_of_mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     """Exact mass properties of the solid bounded by a closed, outward mesh (density 1)."""
+    from trimesh.triangles import mass_properties
+
     vertices = np.asarray(vertices, dtype=np.float64)
     reference = vertices.mean(axis=0)
-    found = trimesh.triangles.mass_properties((vertices - reference)[faces])
+    found = mass_properties((vertices - reference)[faces])
     return Solid(float(found.volume), reference + found.center_mass, found.inertia)
 
 
@@ -326,7 +331,9 @@ def _tidied(faces: np.ndarray, *, closed: bool) -> np.ndarray:
 
     ``closed``: of those with equal corners, an even number goes, so that what is closed stays so.
     """
-    first, group = trimesh.grouping.unique_rows(np.sort(faces, axis=1))
+    from trimesh.grouping import unique_rows
+
+    first, group = unique_rows(np.sort(faces, axis=1))
     if closed:
         first = first[np.bincount(group) % 2 == 1]
     return np.asarray(faces[np.sort(first)])

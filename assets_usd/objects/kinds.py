@@ -131,7 +131,7 @@ def shell(u: Draw) -> Iterator[Hull]:
     """A trough of four wall pieces with one end closed and a tab: scoop, half a shell, soap dish."""
     radius = u(0.7, 1.1)
     length = u(1.4, 2.6)
-    wall = u(0.14, 0.22)
+    wall = u(0.2, 0.32)
     span = u(2.2, 3.6)
     angles = -0.5 * np.pi + np.linspace(-0.5, 0.5, 5) * span
     yield from _walls(radius, wall, angles, length, "y")

@@ -7,8 +7,8 @@ import numpy as np
 from pxr import Tf, Usd, UsdGeom, UsdUtils, Vt
 from trimesh.util import append_faces
 
+from vd.assets_usd.objects.geometry import MeshError
 from vd.assets_usd.objects.model import is_object
-from vd.assets_usd.objects.settings import MeshError
 
 _UNREAD = (
     "Cube",
