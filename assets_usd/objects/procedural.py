@@ -60,7 +60,7 @@ PROBES = 200
 """Surface points that measure a symmetry."""
 
 GRID = 48
-"""Points along the longest side that measure an object's inertia, to some 0.3 %."""
+"""Points along the longest side that measure an object's inertia, to 2 % or better."""
 
 ATTEMPTS = 50
 """Draws before a kind is reported as unable to give a valid object."""
