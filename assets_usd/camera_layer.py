@@ -14,7 +14,7 @@ from pxr import Gf, Sdf
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CameraModel, HandError, HandModel
-from vd.assets_usd.hand_layer import author, open_layer, save_layer
+from vd.assets_usd.hand_layer import author, new_layer, open_layer, save_layer
 from vd.assets_usd.hand_model import OPTICAL_FROM_USD, read_hand
 
 CAMERA_LAYER_FORMAT = "vd-camera-layer/1"
@@ -39,10 +39,8 @@ def write_camera_layer(
     pose = np.asarray(pose, dtype=float)
     if pose.shape != (7,) or not np.isfinite(pose).all():
         raise HandError(f"{path}: the camera's pose is {pose}; it must be 7 finite numbers")
-    layer = Sdf.Layer.CreateAnonymous(".usda")
-    layer.defaultPrim = hand.name
-    layer.documentation = f"Place of the depth camera of {hand.name}, a layer over the hand."
-    layer.customLayerData = {"format": CAMERA_LAYER_FORMAT, **notes}
+    text = f"Place of the depth camera of {hand.name}, a layer over the hand."
+    layer = new_layer(hand.name, text, {"format": CAMERA_LAYER_FORMAT, **notes})
     camera = Sdf.CreatePrimInLayer(layer, f"/{hand.name}/base/camera")
     x, y, z, w = (Rotation.from_quat(pose[3:]) * OPTICAL_FROM_USD.inv()).as_quat()
     author(camera, "xformOp:translate", Sdf.ValueTypeNames.Double3, Gf.Vec3d(*pose[:3]))

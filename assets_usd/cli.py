@@ -92,8 +92,8 @@ class Objects:
     """Number of objects."""
     seed: int = 0
     """Seed of the set; equal seeds give equal objects."""
-    families: Literal["training", "heldout", "slender"] = "training"
-    """slender: long, flat and hollow things, for training too; heldout: kinds that training lacks."""
+    families: Literal["training", "heldout"] = "training"
+    """heldout: kinds that training lacks."""
     out: Path | None = None
     """Folder to write to; by default the named set in the asset cache (such as
     procedural-150-seed0).

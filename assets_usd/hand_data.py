@@ -7,6 +7,7 @@ pose is a row ``(x, y, z, qx, qy, qz, qw)``.
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -159,6 +160,15 @@ class MotorModel:
     """Its damping likewise."""
     current: float = 0.0
     """Largest current [A] in current-based position control; 0 for plain position control."""
+
+
+MOTOR_ATTRIBUTES: dict[str, type] = get_type_hints(MotorModel)
+"""Fields of a motor, each with its type; a hand's file need not have those with a default."""
+
+
+def motor_attribute(name: str) -> str:
+    """What a field of :class:`MotorModel` is called in USD."""
+    return "vd:motor:" + name.removesuffix("_rad")
 
 
 @dataclass(frozen=True, eq=False)

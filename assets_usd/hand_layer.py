@@ -115,14 +115,13 @@ def write_layer(
                     f"{path}: {root} has no joint {name!r}; it has {', '.join(hand.joint_names)}"
                 )
         names.sort(key=hand.joint_names.index)
-    layer = Sdf.Layer.CreateAnonymous(".usda")
-    layer.defaultPrim = root
-    layer.documentation = (
+    layer = new_layer(
+        root,
         f"Servo model of {root}, identified by {tool} from {recording}. A layer over the hand: "
         "pass it with --hand-layer, or make it a sublayer. Drives are in USD's units (degrees), "
-        "vd:* in SI and radians."
+        "vd:* in SI and radians.",
+        {"format": LAYER_FORMAT, "tool": tool, "recording": recording},
     )
-    layer.customLayerData = {"format": LAYER_FORMAT, "tool": tool, "recording": recording}
     top = Sdf.PrimSpec(layer, root, Sdf.SpecifierOver)
     for name in names:
         joint = Sdf.PrimSpec(top, name, Sdf.SpecifierOver)
@@ -132,6 +131,15 @@ def write_layer(
         for effect, values in effects.get(name, {}).items():
             _write_numbers(where, joint, effect, values)
     save_layer(layer, path)
+
+
+def new_layer(root: str, documentation: str, data: Mapping[str, str]) -> Sdf.Layer:
+    """An empty layer over a stage's root prim, with what it says of itself and its custom data."""
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.defaultPrim = root
+    layer.documentation = documentation
+    layer.customLayerData = dict(data)
+    return layer
 
 
 def author(

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from trimesh.util import append_faces
 
 from vd.assets_usd.hand_data import (
+    MOTOR_ATTRIBUTES,
     CameraModel,
     CollisionShape,
     HandError,
@@ -28,10 +29,12 @@ from vd.assets_usd.hand_data import (
     MotorModel,
     Workspace,
     compose,
+    motor_attribute,
     pose_at,
 )
 from vd.assets_usd.hand_layer import add_layer, read_servo
 from vd.assets_usd.objects.geometry import Surface
+from vd.assets_usd.objects.usd_mesh import mesh_triangles
 from vd.kernels.servo.actuators import MAX_JOINTS
 
 __all__ = [
@@ -52,9 +55,6 @@ ORTHONORMAL_TOLERANCE = 1e-5
 
 ROUNDING_RAD = 1e-5
 """How far a start may be beyond a limit: limits are degrees in single precision."""
-
-OPTIONAL_GAINS: dict[str, type] = {"p_gain": int, "d_gain": int, "current": float}
-"""What a file need not say of a motor."""
 
 
 def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) -> Usd.Stage:
@@ -116,7 +116,7 @@ def read_surfaces(hand: HandModel) -> dict[int, Surface]:
     """What is drawn of each link, by its index; in its frame [m], float32 and int32.
 
     Raises:
-        HandError: A mesh is not of triangles, or nothing is drawn at all.
+        ValueError: A mesh is damaged, or nothing is drawn at all.
     """
     reader = _Reader(hand.path, hand.fingertip, hand.layer)
     surfaces: dict[int, Surface] = {}
@@ -342,19 +342,13 @@ class _Reader:
 
     def drawn_meshes(self, body: Usd.Prim) -> list[tuple[np.ndarray, np.ndarray]]:
         """Vertices [V, 3] and triangles [T, 3] of what is drawn of a link, in its frame."""
-        meshes = []
+        drawn = []
         for prim in Usd.PrimRange(body):
-            if not prim.IsA(UsdGeom.Mesh) or UsdGeom.Imageable(prim).ComputePurpose() == "guide":
-                continue
-            mesh = UsdGeom.Mesh(prim)
-            if set(mesh.GetFaceVertexCountsAttr().Get() or ()) != {3}:
-                what = "'faceVertexCounts' are not all 3"
-                raise self.fail(prim, what, "triangulate the mesh")
-            matrix = self._matrix(prim, body)
-            vertices = np.array(mesh.GetPointsAttr().Get()) @ matrix[:3, :3] + matrix[3, :3]
-            faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
-            meshes.append((vertices, faces))
-        return meshes
+            imageable = UsdGeom.Imageable(prim)
+            if prim.IsA(UsdGeom.Mesh) and imageable.ComputePurpose() != "guide":
+                surface = mesh_triangles(prim, self._matrix(prim, body))
+                drawn.append(surface)
+        return drawn
 
     def _palm(self) -> np.ndarray:
         """Where the palm looks, a unit vector [3]."""
@@ -485,20 +479,19 @@ class _Reader:
             if not joint.GetAuthoredPropertiesInNamespace("vd:motor"):
                 motors.append(None)
                 continue
-            gains = {}
-            for name, kind in OPTIONAL_GAINS.items():
-                if joint.GetAttribute(f"vd:motor:{name}").HasAuthoredValue():
-                    gains[name] = kind(self.number(joint, f"vd:motor:{name}"))
-            motor = MotorModel(
-                model=str(self.value(joint, "vd:motor:model")),
-                id=int(self.value(joint, "vd:motor:id")),
-                sign=self.number(joint, "vd:motor:sign"),
-                offset_rad=self.number(joint, "vd:motor:offset"),
-                gear=self.number(joint, "vd:motor:gear", positive=True),
-                **gains,
-            )
+            values: dict[str, Any] = {}
+            for name, kind in MOTOR_ATTRIBUTES.items():
+                attribute = motor_attribute(name)
+                optional = hasattr(MotorModel, name)
+                if optional and not joint.GetAttribute(attribute).HasAuthoredValue():
+                    continue
+                read = self.value if kind is str else self.number
+                values[name] = kind(read(joint, attribute))
+            motor = MotorModel(**values)
             if abs(motor.sign) != 1.0:
                 raise self.fail(joint, f"'vd:motor:sign' is {motor.sign:g}", "it is 1, or -1")
+            if not motor.gear > 0.0:
+                raise self.fail(joint, f"'vd:motor:gear' is {motor.gear:g}", "it is positive")
             if motor.id in ids:
                 what = f"'vd:motor:id' {motor.id} is another joint's too"
                 raise self.fail(joint, what, "change one")

@@ -254,7 +254,7 @@ def test_a_description_overrides_what_is_guessed(tmp_path):
         "0.4}}\n"
         "tips: {b_4: [0, 0, 0.02]}\npalm: [0, 0, 2]\nstart: {b2: 0.5}\n"
         "limits: {a2: [0, 1]}\nmass: {b_2: 0.06}\n"
-        "mount: {position: [0, 0, 0.3], quaternion: [0, 1, 0, 0]}\nparts: [a_2]\nfriction: 0.6\n"
+        "mount: {position: [0, 0, 0.3], quaternion: [0, 1, 0, 0]}\nfriction: 0.6\n"
         "workspace: {drop: [0, 0, 0.1], size: [0.05, 0.06]}\n"
         "motors: {b2: {model: XL330-M288, id: 7, sign: -1, offset_rad: 0.1, gear: 2}}\n"
     )

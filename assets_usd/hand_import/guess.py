@@ -77,10 +77,9 @@ def _text(values: np.ndarray) -> str:
 
 def _complete_drives(tree: Tree, start: np.ndarray) -> None:
     """Gains, speed and inertia of the drives, where neither file nor description has them."""
-    by_name = {joint.name: joint for joint in tree.joints}
     for joint in tree.joints:
         if joint.mimic is not None:
-            leader = by_name[joint.mimic[0]]
+            leader = tree.joints[tree.leader(joint)]
             leader.damping += joint.mimic[1] ** 2 * joint.damping
             joint.effort = joint.effort if joint.effort > 0.0 else leader.effort
             joint.kp = joint.kd = joint.damping = 0.0
@@ -114,12 +113,11 @@ def critical_damping(tree: Tree, q: np.ndarray) -> np.ndarray:
     Returns:
         Damping of each drive [D] [N m s/rad].
     """
-    names = [joint.name for joint in tree.joints]
-    moves = np.eye(len(names))
+    moves = np.eye(len(tree.joints))
     for i, joint in enumerate(tree.joints):
         if joint.mimic is not None:
             moves[i, i] = 0.0
-            moves[i, names.index(joint.mimic[0])] = joint.mimic[1]
+            moves[i, tree.leader(joint)] = joint.mimic[1]
     armature = np.array([joint.armature for joint in tree.joints])
     inertia = ((_mass_matrix(tree, q) + np.diag(armature)) @ moves * moves).sum(axis=0)
     kp = np.array([joint.kp for joint in tree.joints])
@@ -166,7 +164,7 @@ def _tips(tree: Tree) -> list[np.ndarray]:
 def _farthest(link: Link, joint: Joint) -> np.ndarray:
     """The middle of the end of a link that is farthest from its joint [3]."""
     root = joint.child_frame[:3]
-    shapes = [shape for shape in link.shapes if shape.collides] or link.shapes
+    shapes = link.colliders or link.shapes
     if not shapes:
         return np.asarray(2.0 * link.com - root)
     ends = []
@@ -266,7 +264,8 @@ def _mount(tree: Tree, ends: Ends, start: np.ndarray, palm: np.ndarray) -> np.nd
     down = turn.inv().apply([0.0, 0.0, -1.0])
     lowest = math.inf
     for link, pose in zip(tree.links, tree.forward_kinematics(start), strict=True):
-        for box, half in _collider_boxes(link):
+        for shape in link.colliders:
+            box, half = shape_box(shape)
             lowest = min(lowest, -_reach(down, compose(pose, box), half))
     middle = turn.apply(_middle(ends))
     return np.array([-middle[0], -middle[1], GROUND_M - lowest, *turn.as_quat()])
@@ -275,11 +274,6 @@ def _mount(tree: Tree, ends: Ends, start: np.ndarray, palm: np.ndarray) -> np.nd
 def _middle(ends: Ends) -> np.ndarray:
     """The middle between the roots of the fingers and their tips [3]."""
     return np.asarray((ends[0].mean(axis=0) + ends[1].mean(axis=0)) / 2.0)
-
-
-def _collider_boxes(link: Link) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Pose [7] in the link and half extents [3] of the boxes around what collides."""
-    return [shape_box(shape) for shape in link.shapes if shape.collides]
 
 
 def _reach(direction: np.ndarray, pose: np.ndarray, half: np.ndarray) -> float:
@@ -295,8 +289,7 @@ def _workspace(
     reach = float(np.linalg.norm(ends[1] - ends[0], axis=1).mean())
     size = said.size or (SIZES[0] * reach, SIZES[1] * reach)
     middle = _middle(ends)
-    tops = [_reach(palm, pose, half) for pose, half in _collider_boxes(tree.links[0])]
-
+    tops = [_reach(palm, *shape_box(shape)) for shape in tree.links[0].colliders]
     above = max(max(tops, default=0.0) + 0.5 * float(np.mean(size)) - palm @ middle, 0.0)
     goal = placed(mount, middle + above * palm)
     x, y, z = said.goal or (float(v) for v in goal)

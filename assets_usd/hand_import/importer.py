@@ -91,8 +91,7 @@ def import_hand(path: Path, out: Path | None, describe: str | Path | None = None
         make_folder(folder)
         for file in Path(scratch).iterdir():
             shutil.copy(file, folder / file.name)
-    sources = [joint.name for joint in tree.joints]
-    return Imported(read_hand(folder / target.name), tree.notes, warnings, sources)
+    return Imported(read_hand(folder / target.name), tree.notes, warnings, tree.names)
 
 
 def _replaced(path: Path, source: Source) -> list[str]:
@@ -165,25 +164,22 @@ def _suspicious(tree: Tree) -> list[str]:
             warnings.append(
                 f"{link.name} turns like a body of {radius:.2g} m; is its inertia in kg m2?"
             )
-    by_name = {joint.name: joint for joint in tree.joints}
     for joint in tree.joints:
+        if not joint.lower <= 0.0 <= joint.upper:
+            warnings.append(
+                f"zero is outside the limits of {joint.name}, {joint.lower:.2f} to "
+                f"{joint.upper:.2f} rad"
+            )
         if joint.mimic is not None:
             leader, factor, offset = joint.mimic
-            ends = [
-                factor * by_name[leader].lower + offset,
-                factor * by_name[leader].upper + offset,
-            ]
-            low, high = sorted(ends)
+            led = tree.joints[tree.leader(joint)]
+            low, high = sorted([factor * led.lower + offset, factor * led.upper + offset])
             if low < joint.lower - BEYOND_RAD or high > joint.upper + BEYOND_RAD:
                 warnings.append(
                     f"{joint.name} follows {leader} to {low:.2f} and {high:.2f} rad, beyond "
                     f"its limits {joint.lower:.2f} and {joint.upper:.2f}, which hold both back (limits)"
                 )
-    away = [joint for joint in tree.joints if not joint.lower <= 0.0 <= joint.upper]
-    return warnings + [
-        f"zero is outside the limits of {joint.name}, {joint.lower:.2f} to {joint.upper:.2f} rad"
-        for joint in away
-    ]
+    return warnings
 
 
 def _untouched(source: Source, tree: Tree) -> set[tuple[int, int]]:

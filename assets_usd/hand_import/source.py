@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandError, compose, pose_at
-from vd.assets_usd.objects.geometry import mesh_volume
+from vd.assets_usd.objects.geometry import Solid, mesh_volume
 from vd.command.warp_quiet import quiet_warp
 
 IDENTITY = pose_at(np.zeros(3))
@@ -43,8 +43,6 @@ class Shape:
     collides: bool = True
     vertices: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     faces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int32))
-    split: bool = False
-    """Whether a mesh is cut into convex parts."""
     colour: tuple[float, ...] = (0.6, 0.6, 0.6)
 
 
@@ -60,6 +58,15 @@ class Link:
     shapes: list[Shape] = field(default_factory=list)
     sites: dict[str, np.ndarray] = field(default_factory=dict)
     """Marked frames [7]."""
+
+    @property
+    def colliders(self) -> list[Shape]:
+        """What collides."""
+        return [shape for shape in self.shapes if shape.collides]
+
+    def take(self, body: Solid) -> None:
+        """Take mass, centre and inertia of a body in the axes of the link [kg]."""
+        self.mass, self.com, self.inertia = body
 
 
 @dataclass

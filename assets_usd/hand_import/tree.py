@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import HandError, compose, invert, placed, pose_at
 from vd.assets_usd.hand_import.description import Description, Drive
 from vd.assets_usd.hand_import.source import IDENTITY, Joint, Link, Shape, Source, lead
-from vd.assets_usd.objects.geometry import hull_volume, mesh_volume
+from vd.assets_usd.objects.geometry import Solid, hull_volume, joined, mesh_volume
 from vd.kernels.servo.actuators import MAX_JOINTS
 
 KINDS = ("box", "sphere", "capsule", "cylinder", "mesh", "ellipsoid")
@@ -51,6 +51,15 @@ class Tree:
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
+    @property
+    def names(self) -> list[str]:
+        """Of the joints in the source; those of copies are there more than once."""
+        return [joint.name for joint in self.joints]
+
+    def leader(self, joint: Joint) -> int:
+        """Number of the joint that one follows, or -1."""
+        return -1 if joint.mimic is None else self.names.index(joint.mimic[0])
+
     def forward_kinematics(self, q: np.ndarray) -> np.ndarray:
         """Poses of all links in the base [L, 7] for joint angles [D] [rad]."""
         poses = [IDENTITY]
@@ -66,11 +75,10 @@ class Tree:
     def followed(self, q: np.ndarray) -> np.ndarray:
         """Angles with those joints where they are led that follow others [D]."""
         q = q.copy()
-        names = [joint.name for joint in self.joints]
         for i, joint in enumerate(self.joints):
             if joint.mimic is not None:
-                leader, factor, offset = joint.mimic
-                q[i] = factor * q[names.index(leader)] + offset
+                _, factor, offset = joint.mimic
+                q[i] = factor * q[self.leader(joint)] + offset
         return q
 
 
@@ -137,7 +145,7 @@ class _Grower:
         if self.hollow:
             self.notes.append(
                 f"guess: meshes of {', '.join(self.hollow)} collide as their hulls, up to "
-                f"{max(self.hollow.values()):.1f} times their volume (parts)"
+                f"{max(self.hollow.values()):.1f} times their volume; split them in the file"
             )
         self._check_followers(tree)
         self._check_numbers(tree)
@@ -170,7 +178,7 @@ class _Grower:
         joints = [joint.name for joint in self.source.joints if joint.kind != "fixed"]
         links = [link.name for link in self.source.links]
         entries = dict.fromkeys(("hold", "mimic", "limits", "drives", "start", "motors"), "joint")
-        entries |= dict.fromkeys(("mass", "tips", "parts"), "link")
+        entries |= dict.fromkeys(("mass", "tips"), "link")
         for entry, kind in entries.items():
             known = joints if kind == "joint" else links
             for name in getattr(self.said, entry):
@@ -357,13 +365,12 @@ class _Grower:
     def _welded(self, first: int) -> Link:
         """A link with all that is fixed to it."""
         whole = Link(self.source.links[first].name)
-        parts: list[MassPart] = []
+        parts: list[Solid] = []
         for number, pose in self._group(first).items():
             link = self.source.links[number]
-            split = link.name in self.said.parts
             for shape in link.shapes:
-                self._check_shape(link, shape, split=split)
-                whole.shapes.append(replace(shape, frame=compose(pose, shape.frame), split=split))
+                self._check_shape(link, shape)
+                whole.shapes.append(replace(shape, frame=compose(pose, shape.frame)))
             for name, site in link.sites.items():
                 whole.sites[name] = compose(pose, site)
             if number != first:
@@ -374,27 +381,26 @@ class _Grower:
                     f"{{{link.name}: 0.02}}"
                 )
             parts.append(_mass_part(link.mass, pose, link.com, link.inertia))
-        if not sum(mass for mass, _, _ in parts) > 0.0:
-            return self._weighed(whole)
-        combine(whole, parts)
-        return self._possible(whole)
+        if sum(part.volume for part in parts) > 0.0:
+            whole.take(joined(parts))
+            return self._possible(whole)
+        return self._weighed(whole)
 
     def _weighed(self, link: Link) -> Link:
         """A link whose mass nobody says, as the boxes around its colliders are."""
-        parts: list[MassPart] = []
-        for shape in link.shapes:
-            if shape.collides:
-                pose, half = shape_box(shape)
-                mass = float(8.0 * np.prod(half) * DENSITY_KG_M3)
-                inertia = np.diag(mass / 3.0 * (half @ half - half**2))
-                parts.append(_mass_part(mass, pose, np.zeros(3), inertia))
+        parts: list[Solid] = []
+        for shape in link.colliders:
+            pose, half = shape_box(shape)
+            mass = float(8.0 * np.prod(half) * DENSITY_KG_M3)
+            inertia = np.diag(mass / 3.0 * (half @ half - half**2))
+            parts.append(_mass_part(mass, pose, np.zeros(3), inertia))
         if not parts:
             self.problems.append(
                 f"{link.name} has neither mass nor collider; give it one: mass: "
                 f"{{{link.name}: 0.02}}"
             )
             return link
-        combine(link, parts)
+        link.take(joined(parts))
         self.notes.append(
             f"guess: {link.name} has no mass in the file; {link.mass:.3f} kg by its colliders "
             f"(mass)"
@@ -433,7 +439,6 @@ class _Grower:
 
     def _check_followers(self, tree: Tree) -> None:
         """Joints that follow what is held or missing."""
-        names = [joint.name for joint in tree.joints]
         by_name = {joint.name: joint for joint in tree.joints}
         for joint in tree.joints:
             if joint.mimic is None:
@@ -446,7 +451,7 @@ class _Grower:
                     f"{joint.name} follows {leader}, which is held; hold it too: "
                     f"hold: {{{joint.name}: {angle:g}}}"
                 )
-            elif leader not in names:
+            elif leader not in by_name:
                 self.problems.append(
                     f"{joint.name} follows {leader}, which is no joint of a finger; say mimic"
                 )
@@ -478,12 +483,12 @@ class _Grower:
             )
         for joints in tree.finger_joints():
             link = tree.links[joints[-1] + 1]
-            if not any(shape.collides for shape in link.shapes):
+            if not link.colliders:
                 self.problems.append(
                     f"nothing collides of {link.name}, which has a fingertip; add a collision"
                 )
 
-    def _check_shape(self, link: Link, shape: Shape, *, split: bool) -> None:
+    def _check_shape(self, link: Link, shape: Shape) -> None:
         """Kind, extent and unit of a collider or a drawing, and hollows of a mesh that collides whole."""
         what = f"a {shape.kind} of {link.name}"
         if shape.kind not in KINDS:
@@ -503,29 +508,16 @@ class _Grower:
                 self.problems.append(
                     f"{what} is flat and collides; give it a thickness, or make it a box"
                 )
-            elif hull > HOLLOW * volume > 0.0 and not split:
+            elif hull > HOLLOW * volume > 0.0:
                 self.hollow[link.name] = max(hull / volume, self.hollow.get(link.name, 0.0))
         elif shape.collides and not half.min() > 0.0:
             self.problems.append(f"{what} is flat and collides; give it a thickness")
 
 
-MassPart = tuple[float, np.ndarray, np.ndarray]
-"""Mass, centre [3], and inertia about it [3, 3], in the axes of a link."""
-
-
-def _mass_part(mass: float, pose: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> MassPart:
+def _mass_part(mass: float, pose: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> Solid:
     """A body in a link, of which centre and inertia are in a frame with a pose [7]."""
     turn = Rotation.from_quat(pose[3:]).as_matrix()
-    return mass, placed(pose, com), turn @ inertia @ turn.T
-
-
-def combine(link: Link, parts: list[MassPart]) -> None:
-    """Give a link the mass of parts."""
-    link.mass = sum(mass for mass, _, _ in parts)
-    link.com = np.asarray(sum(mass * centre for mass, centre, _ in parts)) / link.mass
-    for mass, centre, inertia in parts:
-        arm = centre - link.com
-        link.inertia = link.inertia + inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return Solid(mass, placed(pose, com), turn @ inertia @ turn.T)
 
 
 def shape_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:

@@ -1,20 +1,16 @@
-"""Geometry of objects: convex hulls, voxelised solids, mass properties, surface samples.
+"""Geometry of objects: convex hulls, mass properties, surface samples, coarser meshes.
 
 Plain NumPy and SciPy on small meshes. Lengths in metres, masses in kilograms; arrays of points are
 ``[n, 3]``, triangles ``[t, 3]`` with outward (counter-clockwise) winding.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import ndimage
 from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
-
-VOXELS = 96
-"""Voxels along the longest side of a voxelised solid: about 1 % of volume error on thin shapes."""
 
 MOST_DISTANCES = 2**22
 """Distances of points from planes that are computed at once: 32 MB."""
@@ -27,12 +23,6 @@ cost.
 SIMPLIFY_TOLERANCE = 1e-3
 """Simplifying a hull stops once every vertex left out is this close to it, relative to its size."""
 
-
-GRID_TURN = Rotation.from_euler("xyz", [0.37, 0.61, 0.23])
-"""Orientation of the grid on which unions of hulls are measured: no plane a part is likely to
-have.
-"""
-
 FINEST_GRID = 65536.0
 COARSEST_GRID = 8.0
 GRID_BISECTIONS = 8
@@ -44,6 +34,10 @@ SLIVER_THICKNESS = 2e-3
 """A part thinner than this share of the longest side (0.25 mm of 12 cm) is no solid to collide
 with.
 """
+
+
+class MeshError(ValueError):
+    """A mesh is refused; the message is the reason."""
 
 
 class Surface(NamedTuple):
@@ -62,9 +56,9 @@ Hull = Surface
 
 
 class Solid(NamedTuple):
-    """Mass properties of a solid of uniform density 1.
+    """Volume, centroid [3] and inertia about it [3, 3] of a solid of uniform density 1.
 
-    Volume, centroid [3], inertia about it [3, 3].
+    Of a link of a hand the volume is its mass.
     """
 
     volume: float
@@ -115,22 +109,13 @@ def hull_volume(points: np.ndarray) -> float:
         return 0.0
 
 
-def hull_planes(hull: Hull) -> tuple[np.ndarray, np.ndarray]:
-    """Half-spaces of a hull: unit outward normals [P, 3] and offsets [P].
-
-    Inside is ``n.x <= d``.
-    """
+def hull_depth(hull: Hull, points: np.ndarray) -> np.ndarray:
+    """Largest signed plane distance [n] of points [n, 3]: negative inside, 0 on the surface, m."""
     normal = _normals(*hull)
     length = np.linalg.norm(normal, axis=1)
     keep = length > 1e-12 * length.max()
     normal = normal[keep] / length[keep, None]
-    first = _corners(*hull)[0, keep]
-    return normal, np.einsum("ij,ij->i", normal, first)
-
-
-def hull_depth(hull: Hull, points: np.ndarray) -> np.ndarray:
-    """Largest signed plane distance [n] of points [n, 3]: negative inside, 0 on the surface, m."""
-    normal, offset = hull_planes(hull)
+    offset = np.einsum("ij,ij->i", normal, _corners(*hull)[0, keep])
     points = np.asarray(points, dtype=np.float64)
     chunks = np.array_split(points, 1 + len(points) * len(offset) // MOST_DISTANCES)
     return np.concatenate([(chunk @ normal.T - offset).max(axis=1) for chunk in chunks])
@@ -240,99 +225,28 @@ def _tetrahedron(points: np.ndarray) -> list[int]:
 
 def solid_of_mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     """Exact mass properties of the solid bounded by a closed, outward mesh (density 1)."""
+    from trimesh.triangles import mass_properties
+
     vertices = np.asarray(vertices, dtype=np.float64)
     reference = vertices.mean(axis=0)
-    a, b, c = _corners(vertices - reference, faces)
-    six_volume = np.einsum("ij,ij->i", a, np.cross(b, c))
-    volume = six_volume.sum() / 6.0
-    centroid = np.einsum("i,ij->j", six_volume, a + b + c) / 24.0 / volume
-    total = a + b + c
-    # Integral of x x^T over the tetrahedron (0, a, b, c): det/120 (sum of outer products + s s^T).
-    second = sum(np.einsum("i,ij,ik->jk", six_volume, p, p) for p in (a, b, c, total)) / 120.0
-    second = second - volume * np.outer(centroid, centroid)
-    inertia = np.trace(second) * np.eye(3) - second
-    return Solid(float(volume), reference + centroid, inertia)
+    found = mass_properties((vertices - reference)[faces])
+    return Solid(float(found.volume), reference + found.center_mass, found.inertia)
 
 
-def voxelise_hulls(
-    hulls: Sequence[Hull], voxels: int = VOXELS
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Voxels whose centre lies in the union of hulls.
-
-    Returns:
-        Mask [x, y, z], centre of voxel (0, 0, 0) [3] and the voxel side, m.
-    """
-    low = np.min([h.vertices.min(axis=0) for h in hulls], axis=0).astype(np.float64)
-    high = np.max([h.vertices.max(axis=0) for h in hulls], axis=0).astype(np.float64)
-    pitch = float((high - low).max()) / voxels
-    shape = np.maximum(np.ceil((high - low) / pitch).astype(int), 1)
-    origin = (low + high) / 2.0 - (shape - 1) / 2.0 * pitch
-    mask = np.zeros(shape, dtype=bool)
-    for hull in hulls:
-        start = np.maximum(np.floor((hull.vertices.min(axis=0) - origin) / pitch).astype(int), 0)
-        stop = np.minimum(
-            np.ceil((hull.vertices.max(axis=0) - origin) / pitch).astype(int) + 1, shape
-        )
-        axes = [origin[i] + pitch * np.arange(start[i], stop[i]) for i in range(3)]
-        inside = np.ones(tuple(len(a) for a in axes), dtype=bool)
-        for normal, offset in zip(*hull_planes(hull), strict=True):
-            x, y, z = (normal[i] * axes[i] for i in range(3))
-            inside &= x[:, None, None] + (y[:, None] + z[None, :])[None] <= offset
-        mask[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))] |= inside
-    return mask, origin, pitch
-
-
-def voxelise_surface(
-    vertices: np.ndarray, faces: np.ndarray, voxels: int = VOXELS
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Solid of a mesh that need not be closed: its surface voxels, gaps closed, the inside filled.
-
-    A half-open voxel layer is taken off, so that the boundary runs through the surface. Returns as
-    :func:`voxelise_hulls`.
-    """
-    vertices = np.asarray(vertices, dtype=np.float64)
-    low = vertices.min(axis=0)
-    high = vertices.max(axis=0)
-    pitch = float((high - low).max()) / voxels
-    margin = 2
-    shape = np.ceil((high - low) / pitch).astype(int) + 1 + 2 * margin
-    origin = low - margin * pitch
-    area = triangle_areas(vertices, faces)
-    count = int(np.clip(area.sum() / pitch**2 * 16, 20_000, 2_000_000))
-    points = random_surface_points(vertices, faces, count, np.random.default_rng(0))
-    surface = np.zeros(shape, dtype=bool)
-    surface[tuple(np.rint((points - origin) / pitch).astype(int).T)] = True
-    closed = ndimage.binary_closing(surface, np.ones((3, 3, 3), dtype=bool))
-    solid = ndimage.binary_fill_holes(closed | surface)
-    inner = ndimage.binary_erosion(solid)
-    # Surface voxels stick out by half a voxel: keep every second one of the outer layer.
-    checker = (np.indices(shape).sum(axis=0) % 2).astype(bool)
-    return inner | (solid & ~inner & checker), origin, pitch
-
-
-def solid_of_voxels(mask: np.ndarray, origin: np.ndarray, pitch: float) -> Solid:
-    """Mass properties of a voxelised solid of density 1."""
-    centres = origin + np.argwhere(mask) * pitch
-    if not len(centres):
-        return Solid(0.0, np.asarray(origin, dtype=np.float64), np.zeros((3, 3)))
-    voxel = pitch**3
-    centroid = centres.mean(axis=0)
-    away = centres - centroid
-    second = voxel * (away.T @ away + len(away) * pitch**2 / 12.0 * np.eye(3))
-    return Solid(voxel * len(centres), centroid, np.trace(second) * np.eye(3) - second)
-
-
-def solid_of_hulls(hulls: Sequence[Hull]) -> Solid:
-    """Mass properties of the union of hulls (density 1): exact for one hull, else from voxels.
-
-    The grid is turned against the object: a plate along a grid plane could gain or lose a whole
-    layer.
-    """
-    if len(hulls) == 1:
-        return solid_of_mesh(*hulls[0])
-    turn = GRID_TURN.as_matrix()
-    solid = solid_of_voxels(*voxelise_hulls([Hull(h.vertices @ turn.T, h.faces) for h in hulls]))
-    return Solid(solid.volume, turn.T @ solid.centroid, turn.T @ solid.inertia @ turn)
+def joined(solids: Sequence[Solid]) -> Solid:
+    """Mass properties of solids together; the volume of one that is taken away is negative."""
+    volume = 0.0
+    moment = np.zeros(3)
+    for solid in solids:
+        volume += solid.volume
+        moment = moment + solid.volume * solid.centroid
+    centroid = moment / volume
+    inertia = np.zeros((3, 3))
+    for solid in solids:
+        arm = solid.centroid - centroid
+        inertia = inertia + solid.inertia
+        inertia = inertia + solid.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return Solid(volume, centroid, inertia)
 
 
 def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -374,22 +288,22 @@ def surface_points(
     faces: np.ndarray,
     count: int,
     *,
-    seed: int = 0,
     outside: Sequence[Hull] = (),
 ) -> np.ndarray:
     """Evenly spread points on a surface, by farthest-point sampling of random candidates.
+
+    Equal input gives equal points.
 
     Args:
         vertices: [V, 3].
         faces: [T, 3].
         count: Number of points.
-        seed: Seed of the candidates; equal input and seed give equal points.
         outside: Points inside any of these hulls are left out (parts that overlap).
 
     Returns:
         [count, 3] float64.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     tolerance = 1e-6 * float(np.ptp(vertices, axis=0).max())
     candidates = np.zeros((0, 3))
     while len(candidates) < count:
@@ -412,61 +326,46 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
     return chosen
 
 
-def _alike(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles [T, 3] in an order in which those of the same corners follow each other.
+def _tidied(faces: np.ndarray, *, closed: bool) -> np.ndarray:
+    """Triangles [T, 3], each once: a thin wall becomes a sheet.
 
-    Returns:
-        The order [T], where each group of them begins in it [G], and by triangle 1 where the
-        corners go round as their numbers rise, else -1 [T]; of a group those with -1 come first.
+    ``closed``: of those with equal corners, an even number goes, so that what is closed stays so.
     """
-    corners = np.sort(faces, axis=1)
-    side = 2 * (faces < np.roll(faces, -1, axis=1)).sum(axis=1) - 3
-    order = np.lexsort((side, *corners.T))
-    new = np.ones(len(order), dtype=bool)
-    new[1:] = (np.diff(corners[order], axis=0) != 0).any(axis=1)
-    return order, np.flatnonzero(new), side
+    from trimesh.grouping import unique_rows
 
-
-def single_faces(faces: np.ndarray) -> np.ndarray:
-    """Each triangle [T, 3] once, whichever side it shows: a thin wall becomes a sheet."""
-    order, start, _ = _alike(faces)
-    return np.asarray(faces[np.sort(np.minimum.reduceat(order, start))])
-
-
-def unfolded_faces(faces: np.ndarray) -> np.ndarray:
-    """Triangles [T, 3] without those that show both sides: what is closed stays closed."""
-    order, start, side = _alike(faces)
-    total = np.add.reduceat(side[order], start)
-    last = np.append(start[1:], len(order)) - 1
-    kept = order[np.where(total < 0, start, last)][total != 0]
-    return np.asarray(faces[np.sort(kept)])
+    first, group = unique_rows(np.sort(faces, axis=1))
+    if closed:
+        first = first[np.bincount(group) % 2 == 1]
+    return np.asarray(faces[np.sort(first)])
 
 
 def cluster_vertices(
     vertices: np.ndarray,
     faces: np.ndarray,
     max_faces: int,
-    tidied: Callable[[np.ndarray], np.ndarray] = single_faces,
+    *,
+    closed: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coarsen a mesh to at most ``max_faces`` triangles by merging the vertices of a grid cell.
 
     The finest grid that meets the limit is found by bisection. A cell's vertex minimises the
     squared distance to the planes of the triangles around it (quadric error), which keeps edges
-    sharp; the bounding box is kept. ``tidied`` says what becomes of triangles with equal corners.
+    sharp; the bounding box is kept. A thin wall becomes a sheet, or is gone where what is ``closed``
+    has to stay so.
     """
     if len(faces) <= max_faces:
         return vertices, faces
     if len(vertices) > len(faces):  # corners of their own: those at one place become one
-        cell, faces = _clustered(vertices, faces, FINEST_GRID, tidied)
+        cell, faces = _clustered(vertices, faces, FINEST_GRID, closed=closed)
         kept = np.zeros(cell.max() + 1, dtype=int)
         kept[cell] = np.arange(len(cell))
         vertices = vertices[kept]
     fine = FINEST_GRID
     coarse = COARSEST_GRID
-    cell, merged = _clustered(vertices, faces, coarse, tidied)
+    cell, merged = _clustered(vertices, faces, coarse, closed=closed)
     for _ in range(GRID_BISECTIONS):
         cells = float(np.sqrt(fine * coarse))
-        finer = _clustered(vertices, faces, cells, tidied)
+        finer = _clustered(vertices, faces, cells, closed=closed)
         if len(finer[1]) > max_faces:
             fine = cells
         else:
@@ -485,7 +384,8 @@ def _clustered(
     vertices: np.ndarray,
     faces: np.ndarray,
     cells: float,
-    tidied: Callable[[np.ndarray], np.ndarray],
+    *,
+    closed: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cell of each vertex [V] on a grid of ``cells`` along the longest side, and the triangles left."""
     low = vertices.min(axis=0)
@@ -495,7 +395,7 @@ def _clustered(
     cell = np.unique((x * most + y) * most + z, return_inverse=True)[1].reshape(-1)
     merged = cell[faces]
     a, b, c = merged.T
-    return cell, tidied(merged[(a != b) & (b != c) & (c != a)])
+    return cell, _tidied(merged[(a != b) & (b != c) & (c != a)], closed=closed)
 
 
 def _quadric_vertices(

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +28,6 @@ from vd.assets_usd.objects.geometry import (
     random_surface_points,
     surface_points,
     triangle_areas,
-    unfolded_faces,
     union_depth,
 )
 from vd.assets_usd.objects.meshes import fit_of, mass_of, scale_of
@@ -51,7 +50,7 @@ from vd.command.files import make_folder
 from vd.command.warp_quiet import quiet_warp
 from vd.command.workers import run_tasks
 
-IMPORT_VERSION = 6
+IMPORT_VERSION = 7
 """Part of every content hash: raise it when the import computes something else."""
 
 MAX_VISUAL_FACES = 3000
@@ -111,22 +110,9 @@ def content_hash(job: Job, settings: ImportSettings) -> str:
     if mesh_kind(files[0]) == "usd":
         files = usd_files(files[0])
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files))
-    parts = {
-        "max_hulls": settings.max_hulls,
-        "threshold": settings.threshold,
-        "mcts_iterations": settings.mcts_iterations,
-        "max_hull_vertices": HULL_VERTICES,
-        "time_limit_s": settings.time_limit,
-        "seed": 0,
-    }
-    size = {
-        "units": settings.units,
-        "keep_size": settings.keep_size,
-        "fit": asdict(fit_of(settings.hand)),
-        "density": settings.density,
-        "mass_kg": settings.mass,
-    }
-    facts = [IMPORT_VERSION, job.name, job.licence, job.provenance, job.split, [parts, size]]
+    sizes = asdict(fit_of(settings.hand))
+    options = asdict(replace(settings, hand="", licence=job.licence))
+    facts = [IMPORT_VERSION, job.name, job.provenance, job.split, sizes, options]
     digest.update(json.dumps(facts, sort_keys=True).encode())
     return digest.hexdigest()
 
@@ -224,7 +210,7 @@ def _object_of(job: Job, settings: ImportSettings) -> ObjectModel:
 
 def _simplified(mesh: Any) -> tuple[Any, list[str]]:
     """A mesh of at most MAX_FACES faces, and what has to be said of it."""
-    vertices, faces = cluster_vertices(mesh.vertices, mesh.faces, MAX_FACES, unfolded_faces)
+    vertices, faces = cluster_vertices(mesh.vertices, mesh.faces, MAX_FACES, closed=True)
     if len(faces) == len(mesh.faces):
         return mesh, []
     some = random_surface_points(mesh.vertices, mesh.faces, COMPARED, np.random.default_rng(0))

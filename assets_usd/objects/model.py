@@ -178,7 +178,8 @@ def build_model(
     )
 
 
-def _add_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+def add_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """Define a ``UsdGeom.Mesh`` of vertices [V, 3] and triangles [T, 3] in a stage."""
     from pxr import UsdGeom, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, path)
@@ -227,10 +228,10 @@ def write_object(path: Path, model: ObjectModel) -> Path:
     physics.CreateStaticFrictionAttr(PAPER.materials.friction)
     physics.CreateDynamicFrictionAttr(PAPER.materials.friction)
 
-    _add_mesh(stage, f"{root}/visual", model.vertices, model.faces)
+    add_mesh(stage, f"{root}/visual", model.vertices, model.faces)
     UsdGeom.Scope.Define(stage, f"{root}/collision")
     for i, hull in enumerate(model.hulls):
-        mesh = _add_mesh(stage, f"{root}/collision/hull_{i}", hull.vertices, hull.faces)
+        mesh = add_mesh(stage, f"{root}/collision/hull_{i}", hull.vertices, hull.faces)
         mesh.CreatePurposeAttr(UsdGeom.Tokens.guide)
         UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
         collision = UsdPhysics.MeshCollisionAPI.Apply(mesh.GetPrim())
@@ -399,17 +400,16 @@ def write_contact_layer(
     """
     from pxr import Gf, Sdf
 
-    from vd.assets_usd.hand_layer import author, save_layer
+    from vd.assets_usd.hand_layer import author, new_layer, save_layer
 
     item = read_object(item_file)
-    layer = Sdf.Layer.CreateAnonymous(".usda")
-    layer.defaultPrim = item.name
-    layer.subLayerPaths.append(os.path.relpath(item_file.resolve(), path.resolve().parent))
-    layer.documentation = (
+    layer = new_layer(
+        item.name,
         f"Contact of {item.name}, identified by vd-gap contact from {recording}: "
-        "pass it as --objects."
+        "pass it as --objects.",
+        {"format": LAYER_FORMAT, "recording": recording},
     )
-    layer.customLayerData = {"format": LAYER_FORMAT, "recording": recording}
+    layer.subLayerPaths.append(os.path.relpath(item_file.resolve(), path.resolve().parent))
     prim = Sdf.PrimSpec(layer, item.name, Sdf.SpecifierOver)
 
     author_contact(prim, identified)

@@ -211,16 +211,13 @@ def check_target(job: Job) -> None:
             f"{target} is there and no object of vd-assets, or a damaged one; remove it, or import "
             "into another folder (--out)"
         )
-    source = str(facts.get("source", ""))
-    file = str(facts.get("file", ""))
-    # Objects of versions that recorded no file are told by the name in their source.
+    file = str(facts["file"])
     if file and os.path.realpath(file) == os.path.realpath(job.source):
         return
-    if not file and source.rpartition(": ")[2] == Path(job.source).name:
-        return
     raise MeshError(
-        f"{job.source} would be written over {target}, which was made from {file or source}; "
-        "rename the mesh, import it into another set (--out), or remove the object"
+        f"{job.source} would be written over {target}, which was made from "
+        f"{file or facts['source']}; rename the mesh, import it into another set (--out), or "
+        "remove the object"
     )
 
 

@@ -1,29 +1,29 @@
 """Procedural object sets: our own shapes, deterministic from a seed, with exact convex parts."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from trimesh.util import append_faces
 
+from vd.assets_usd.objects.bodies import solid_by_points
 from vd.assets_usd.objects.geometry import (
     Hull,
     hull_depth,
-    principal_axes,
-    solid_of_hulls,
+    inside,
+    solid_of_mesh,
     surface_points,
     union_depth,
-    voxelise_hulls,
 )
-from vd.assets_usd.objects.kinds import FAMILIES, Kind
-from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, THINNEST_M, mean_width, scales_that_fit
+from vd.assets_usd.objects.kinds import KINDS, Kind
+from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, mean_width, scales_that_fit
 from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectModel, build_model
 from vd.assets_usd.objects.primitives import Draw, box
 
-PROCEDURAL_VERSION = 4
-"""Part of every content hash: raise it when a family draws something else."""
+PROCEDURAL_VERSION = 5
+"""Part of every content hash: raise it when a kind draws something else."""
 
 SHAPE_ENTROPY = 1
 """First word of every object's seed; apart from the version, so that a fix keeps the shapes."""
@@ -37,12 +37,10 @@ objects: a cube of 95 mm would not pass between the fingers."""
 CUBOID_SIDES_M = (0.05, 0.07, 0.10)
 """Sides of the cuboid, all different: its group is the four rotations of a brick."""
 
-MAX_PARTS = 8
-
-SLENDEREST_M = 0.015
-"""Least shortest side of a slender object, which may have less than ``THINNEST_M`` where it would
-be longer than ``LONGEST_SIDE_M`` at that size. What is flatter is out of reach where it lies:
-straight fingers of dclaw4 end 9 mm above the table under their roots, 17 mm above it in the middle.
+THINNEST_M = 0.015
+"""Least shortest side of an object that would be longer than ``LONGEST_SIDE_M`` where it is as thick
+as other objects. What is flatter is out of reach where it lies: straight fingers of dclaw4 end 9 mm
+above the table under their roots, 17 mm above it in the middle.
 """
 
 MIN_ASYMMETRY = 0.012
@@ -55,48 +53,38 @@ SHEAR = 0.25
 """Spread of the random stretch of each axis (log scale) and of the shear of x by z: one kind then
 gives short and long, fat and lean objects."""
 
-CANDIDATE_FOLDS = (2, 3, 4, 5, 6)
-"""Orders of the rotations tried about each principal axis."""
+CANDIDATE_FOLDS = ((1, 2), (1, 3), (1, 4), (1, 5), (2, 5), (1, 6))
+"""Rotations tried about each principal axis, in turns: one of two, one of three, ..."""
 
 PROBES = 200
 """Surface points that measure a symmetry."""
+
+GRID = 48
+"""Points along the longest side that measure an object's inertia, to 2 % or better."""
 
 ATTEMPTS = 50
 """Draws before a kind is reported as unable to give a valid object."""
 
 
-def candidate_rotations(inertia: np.ndarray) -> np.ndarray:
-    """Rotations a solid could be symmetric under, [R, 3, 3].
-
-    A rotation that maps a solid to itself keeps its inertia, so it turns about a principal axis
-    unless all moments are equal. Tried are the folds of ``CANDIDATE_FOLDS`` about each axis; if the
-    moments are within 10 % of one another, a grid of the whole rotation group is added.
-    """
-    moments, quat = principal_axes(inertia)
-    axes = Rotation.from_quat(quat).as_matrix().T
-    angles = sorted({2.0 * np.pi * j / k for k in CANDIDATE_FOLDS for j in range(1, k // 2 + 1)})
-    rotations = [
-        Rotation.from_rotvec(angle * axis).as_matrix() for axis in axes for angle in angles
-    ]
-    if moments[2] < 1.1 * moments[0]:
-        grid = Rotation.random(600, rng=np.random.default_rng(0))
-        rotations += list(grid[grid.magnitude() > np.pi / 4].as_matrix())
-    return np.array(rotations)
-
-
 def asymmetry(model: ObjectModel) -> float:
     """How far an object whose hulls are its shape is from any rotational symmetry.
 
+    A rotation that maps a solid to itself keeps its inertia, so it turns about a principal axis:
+    tried are the folds of ``CANDIDATE_FOLDS`` about each.
+
     Returns:
-        Least mean distance of the rotated surface points to the surface over the candidate
-        rotations about the centre of mass, divided by the longest side: 0 for a symmetric solid.
+        Least mean distance of the rotated surface points to the surface, divided by the longest
+        side: 0 for a symmetric solid.
     """
     # Farthest-point samples: any leading part of them is itself evenly spread.
     points = model.surface_points[:PROBES]
-    rotations = candidate_rotations(model.inertia_matrix)
-    turned = np.einsum("rij,nj->rni", rotations, points).reshape(-1, 3)
-    distance = np.abs(union_depth(model.hulls, turned)).reshape(len(rotations), -1).mean(axis=1)
-    return float(distance.min()) / model.longest_side
+    least = np.inf
+    for axis in Rotation.from_quat(model.inertia_quat).as_matrix().T:
+        for turns, fold in CANDIDATE_FOLDS:
+            turn = Rotation.from_rotvec(2.0 * np.pi * turns / fold * axis)
+            off = np.abs(union_depth(model.hulls, turn.apply(points))).mean()
+            least = min(least, float(off))
+    return least / model.longest_side
 
 
 def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
@@ -118,11 +106,6 @@ def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
     return joined, triangles.astype(np.int32)
 
 
-def is_connected(hulls: Sequence[Hull]) -> bool:
-    """Whether the union of hulls is one piece (on a voxel grid)."""
-    return ndimage.label(voxelise_hulls(hulls, voxels=64)[0])[1] == 1
-
-
 def model_of_parts(
     name: str, hulls: Sequence[Hull], longest_side: float | None = None, **fields: Any
 ) -> ObjectModel:
@@ -139,12 +122,16 @@ def model_of_parts(
     parts = [hull.times(scale) for hull in hulls]
     vertices, faces = union_surface(parts)
     points = surface_points(vertices, faces, SURFACE_POINTS, outside=parts)
+    corners, triangles = append_faces(*zip(*parts, strict=True))
+    solid = solid_of_mesh(corners, triangles)
+    if len(parts) > 1:
+        solid = solid_by_points(corners, partial(inside, corners, triangles), GRID)
     return build_model(
         name,
         vertices,
         faces,
         parts,
-        solid_of_hulls(parts),
+        solid,
         points,
         licence=LICENCE,
         volume_error=0.0,
@@ -153,10 +140,8 @@ def model_of_parts(
     )
 
 
-def draw_object(
-    name: str, make: Kind, seed: Sequence[int], thinnest: float = THINNEST_M, **fields: Any
-) -> ObjectModel:
-    """One object of a kind: the first draw that is one piece, fits the hand and has no rotational symmetry.
+def draw_object(name: str, make: Kind, seed: Sequence[int], **fields: Any) -> ObjectModel:
+    """One object of a kind: the first draw that fits the hand and has no rotational symmetry.
 
     Its longest side is uniform in ``LONGEST_SIDE_M``, as far as the object fits the hand at that
     size (:func:`.meshes.scales_that_fit`). What fits at none is drawn again.
@@ -165,7 +150,6 @@ def draw_object(
         name: Object name.
         make: Kind.
         seed: Entropy; equal entropy gives an equal object.
-        thinnest: Least shortest side where ``THINNEST_M`` does not fit [m].
         **fields: Further fields of :class:`ObjectModel`.
 
     Raises:
@@ -173,19 +157,17 @@ def draw_object(
     """
     u = Draw(np.random.PCG64(seed))
     for _ in range(ATTEMPTS):
+        parts = list(make(u))
         # One random stretch and shear keeps parts convex and y a mirror axis.
-        hulls = list(make(u))
         matrix = np.diag(np.exp(u(-STRETCH, STRETCH, 3)))
         matrix[0, 2] = u(-SHEAR, SHEAR)
-        hulls = [Hull(hull.vertices @ matrix.T, hull.faces) for hull in hulls]
+        hulls = [Hull(part.vertices @ matrix.T, part.faces) for part in parts]
         longest = float(u(*LONGEST_SIDE_M))
-        if len(hulls) > MAX_PARTS or not is_connected(hulls):
-            continue
         vertices = np.concatenate([hull.vertices for hull in hulls])
         sides = np.ptp(vertices, axis=0)
         smallest, largest = np.multiply(scales_that_fit(sides, mean_width(vertices)), sides.max())
         too_wide = largest < LONGEST_SIDE_M[0]
-        too_thin = largest * sides.min() / sides.max() < thinnest
+        too_thin = largest * sides.min() / sides.max() < THINNEST_M
         if too_wide or too_thin:
             continue
         longest = float(min(max(longest, smallest), largest))
@@ -202,34 +184,31 @@ def procedural_set(
     families: str = "training",
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[ObjectModel]:
-    """Objects in turn from every family, deterministic from the seed.
+    """Objects of every kind in turn, deterministic from the seed.
 
     Args:
         count: Number of objects.
         seed: Seed of the set. Object i depends on the families, the seed and i alone.
-        families: ``training``, ``heldout``, or ``slender`` (``FAMILIES``).
+        families: ``training`` or ``heldout`` (``KINDS``).
         progress: Called with each name, the number done and the number of all.
     """
-    order = list(FAMILIES[families].items())
-    word = list(FAMILIES).index(families)
+    kinds = KINDS[families]
+    word = list(KINDS).index(families)
     models = []
     for i in range(count):
-        family, kinds = order[i % len(order)]
-        make = kinds[(i // len(order)) % len(kinds)]
+        make = kinds[i % len(kinds)]
         kind = make.__name__
         name = f"{kind}_s{seed}_{i:03d}"
-        models.append(
-            draw_object(
-                name,
-                make,
-                (SHAPE_ENTROPY, word, seed, i),
-                thinnest=SLENDEREST_M if families == "slender" else THINNEST_M,
-                family=family,
-                split="test" if families == "heldout" else "train",
-                source=f"procedural {family}/{kind}, seed {seed}, index {i}",
-                content_hash=f"procedural-{PROCEDURAL_VERSION}-{word}-{seed}-{i}",
-            )
+        model = draw_object(
+            name,
+            make,
+            (SHAPE_ENTROPY, word, seed, i),
+            family=kind,
+            split="test" if families == "heldout" else "train",
+            source=f"procedural {kind}, seed {seed}, index {i}",
+            content_hash=f"procedural-{PROCEDURAL_VERSION}-{word}-{seed}-{i}",
         )
+        models.append(model)
         if progress:
             progress(name, i + 1, count)
     return models

@@ -1,7 +1,7 @@
 """Mesh files: what a file is, and its triangles."""
 
 import re
-from itertools import pairwise
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -93,8 +93,6 @@ def load_points(path: Path) -> Any:
     kind = mesh_kind(path)
     if kind == "usd":
         vertices, faces = read_usd(path)
-    elif kind == "obj":
-        vertices, faces = read_obj(path)
     else:
         vertices, faces = _read_with_trimesh(path, kind)
     if not np.isfinite(vertices).all():
@@ -104,69 +102,27 @@ def load_points(path: Path) -> Any:
 
 
 def _read_with_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    with path.open("rb") as stream:  # of a text of points fewer would be read without a word
-        said = (
-            re.search(rb"element\s+face\s+(\d+)", stream.read(HEAD_BYTES))
-            if kind == "ply"
-            else None
-        )
+    data = path.read_bytes()
+    declared = 0  # of a damaged file fewer faces would be read without a word
+    if kind == "obj":
+        # What trimesh stumbles over: tabs, lines that go on, comments behind corners.
+        data = re.sub(rb"\t|\\\r?\n|#[^\n]*", b" ", data)
+        declared = len(re.findall(rb"^\s*f ", data, re.MULTILINE))
+    elif kind == "ply" and (said := re.search(rb"element\s+face\s+(\d+)", data[:HEAD_BYTES])):
+        declared = int(said.group(1))
     try:
         # Textures and materials are not needed, and missing ones must not stop the import.
-        loaded = trimesh.load(path, file_type=kind, process=False, skip_materials=True)
+        loaded = trimesh.load(
+            BytesIO(data), file_type=kind, process=False, maintain_order=True, skip_materials=True
+        )
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
         vertices = np.asarray(getattr(mesh, "vertices", ()), dtype=float).reshape(-1, 3)
         faces = np.asarray(getattr(mesh, "faces", ()), dtype=np.int64).reshape(-1, 3)
     except Exception as error:  # parsers raise anything on a broken file
         raise MeshError(f"neither mesh nor points: {type(error).__name__}: {error}") from error
-    if said and len(faces) < int(said.group(1)):
+    if len(faces) < declared:
         raise MeshError(
-            f"declares {int(said.group(1))} faces, of which {len(faces)} could be read: cut short "
-            "or damaged; get it again, or export it again"
+            f"declares {declared} faces, of which {len(faces)} could be read: cut short or damaged; "
+            "get it again, or export it again"
         )
     return vertices, faces
-
-
-def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and triangles [T, 3] of an OBJ, in the file's order; polygons become fans.
-
-    Only ``v`` and ``f`` are read: groups, normals, textures and materials do not matter here.
-
-    Raises:
-        MeshError: A line cannot be read, or a face names a vertex that is not there.
-    """
-    vertices: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
-    furthest = -1
-    where = 0
-    text = re.sub(rb"\\\r?\n", b" ", Path(path).read_bytes())
-    for number, line in enumerate(text.splitlines(), 1):
-        word, *rest = line.partition(b"#")[0].split() or [b""]
-        try:
-            if word == b"v":
-                x, y, z = map(float, rest[:3])
-                vertices.append([x, y, z])
-            elif word == b"f":
-                corners = [_corner(name, len(vertices)) for name in rest]
-                faces += [(corners[0], *pair) for pair in pairwise(corners[1:])]
-                if max(corners) > furthest:
-                    furthest = max(corners)
-                    where = number
-        except (ValueError, IndexError) as error:
-            shown = line.decode(errors="replace").strip()[:60]
-            raise MeshError(f"damaged: line {number} is {shown!r}; export it again") from error
-    if furthest >= len(vertices):
-        raise MeshError(
-            f"damaged: line {where} names vertex {furthest + 1} of {len(vertices)}; export it again"
-        )
-    return np.array(vertices, dtype=float).reshape(-1, 3), np.array(faces, dtype=np.int64).reshape(
-        -1, 3
-    )
-
-
-def _corner(text: bytes, count: int) -> int:
-    """Index from 0 of a face's corner such as ``3/1/2``, or ``-1`` for the last of ``count`` vertices."""
-    index = int(text.partition(b"/")[0])
-    row = index - 1 if index > 0 else count + index
-    if index == 0 or row < 0:
-        raise ValueError(f"no vertex {index}")
-    return row

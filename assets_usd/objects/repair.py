@@ -4,7 +4,7 @@ Strays and other bodies taken off, seams and holes closed, cavities found.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -183,19 +183,36 @@ def _opened_seams(mesh: Any) -> Any:
     return trimesh.Trimesh(vertices, corner.reshape(-1, 3), process=False)
 
 
-def _pieces(mesh: Any) -> tuple[np.ndarray, list[Any]]:
-    """Piece of each face [T], and the connected pieces; a torn surface counts as one."""
+class _Pieces(NamedTuple):
+    """The P connected pieces of a mesh."""
+
+    of_face: np.ndarray
+    """Piece of each face [T]."""
+    meshes: list[Any]
+    volume: np.ndarray
+    """Signed, 0 of open ones [P]."""
+    low: np.ndarray
+    high: np.ndarray
+    """Corners of their boxes [P, 3]."""
+
+
+def _pieces(mesh: Any) -> _Pieces:
+    """The connected pieces of a mesh; a torn surface counts as one."""
     of_face = trimesh.graph.connected_component_labels(
         mesh.face_adjacency, node_count=len(mesh.faces)
     )
     if of_face.max() >= MOST_PIECES:
-        return np.zeros_like(of_face), [mesh]
-    return of_face, mesh.split(only_watertight=False, repair=False)
-
-
-def _volumes(pieces: list[Any]) -> np.ndarray:
-    """Signed volume of each piece, 0 of open ones [P]."""
-    return np.array([piece.volume if piece.is_watertight else 0.0 for piece in pieces])
+        of_face = np.zeros_like(of_face)
+        meshes = [mesh]
+    else:
+        meshes = mesh.split(only_watertight=False, repair=False)
+    volume = np.zeros(len(meshes))
+    bounds = np.zeros((2, len(meshes), 3))
+    for number, piece in enumerate(meshes):
+        bounds[:, number] = piece.bounds
+        if piece.is_watertight:
+            volume[number] = piece.volume
+    return _Pieces(of_face, meshes, volume, *bounds)
 
 
 def _kept(mesh: Any, keep: np.ndarray) -> Any:
@@ -206,9 +223,10 @@ def _kept(mesh: Any, keep: np.ndarray) -> Any:
     return mesh
 
 
-def _touching(low: np.ndarray, high: np.ndarray, gap: float) -> np.ndarray:
-    """Which of boxes between corners [P, 3] have at most a gap between them, bool [P, P]."""
-    high = high + gap
+def _touching(pieces: _Pieces, gap: float) -> np.ndarray:
+    """Which of the pieces' boxes have at most a gap between them, bool [P, P]."""
+    low = pieces.low
+    high = pieces.high + gap
     return np.asarray(((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2))
 
 
@@ -217,16 +235,16 @@ def _without_strays(mesh: Any, notes: list[str], warnings: list[str]) -> Any:
 
     A long one that touches, as by their boxes, is a thin part: an antenna, a ring of wire.
     """
-    of_face, pieces = _pieces(mesh)
-    area = np.array([piece.area for piece in pieces])
-    volume = np.abs(_volumes(pieces))
+    pieces = _pieces(mesh)
+    of_face = pieces.of_face
+    area = np.bincount(of_face, mesh.area_faces)
+    volume = np.abs(pieces.volume)
     stray = (area < STRAY_AREA * area.sum()) & (volume <= STRAY_VOLUME * volume.sum())
     if stray.all():
         return mesh
-    low, high = np.stack([piece.bounds for piece in pieces], axis=1)
-    length = (high - low).max(axis=1)
+    length = (pieces.high - pieces.low).max(axis=1)
     whole = np.ptp(mesh.triangles[~stray[of_face]].reshape(-1, 3), axis=0).max()
-    touches = _touching(low, high, APART * whole)[:, ~stray].any(axis=1)
+    touches = _touching(pieces, APART * whole)[:, ~stray].any(axis=1)
     stray &= (length <= LONG * whole) | ~touches
     if not stray.any() or area[stray].sum() > STRAYS_AREA * area.sum():
         return mesh
@@ -250,18 +268,16 @@ def _largest_body(mesh: Any, warnings: list[str]) -> Any:
     Raises:
         MeshError: They are too large to be debris.
     """
-    of_face, pieces = _pieces(mesh)
-    low, high = np.stack([piece.bounds for piece in pieces], axis=1)
-    near = _touching(low, high, APART * mesh.extents.max())
-    of_face = trimesh.graph.connected_component_labels(np.argwhere(near), node_count=len(pieces))[
-        of_face
-    ]
+    pieces = _pieces(mesh)
+    near = np.argwhere(_touching(pieces, APART * mesh.extents.max()))
+    body = trimesh.graph.connected_component_labels(near, node_count=len(pieces.meshes))
+    of_face = body[pieces.of_face]
     number = of_face.max() + 1
     if number == 1:
         return mesh
-    volume = np.array(
-        [hull_volume(mesh.triangles[of_face == k].reshape(-1, 3)) for k in range(number)]
-    )
+    volume = np.zeros(number)
+    for k in range(number):
+        volume[k] = hull_volume(mesh.triangles[of_face == k].reshape(-1, 3))
     share = 1.0 - volume.max() / max(volume.sum(), 1e-300)
     if share > OTHER_BODIES:
         raise MeshError(
@@ -277,25 +293,25 @@ def _largest_body(mesh: Any, warnings: list[str]) -> Any:
     return _largest_body(_kept(mesh, of_face == np.argmax(volume)), warnings)
 
 
-def _containers(pieces: list[Any], volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _containers(pieces: _Pieces) -> tuple[np.ndarray, np.ndarray]:
     """The largest and the smallest closed piece in which each lies wholly, [P] each.
 
     Itself if in none.
     """
-    largest = np.arange(len(pieces))
-    smallest = np.arange(len(pieces))
-    low, high = np.stack([piece.bounds for piece in pieces], axis=1)
+    _, meshes, volume, low, high = pieces
+    largest = np.arange(len(meshes))
+    smallest = np.arange(len(meshes))
     for outer in np.argsort(np.abs(volume))[::-1]:
         if not volume[outer]:
             break
-        faces = pieces[outer].faces
+        faces = meshes[outer].faces
         surface = faces if volume[outer] > 0.0 else faces[:, ::-1]
         for inner in np.flatnonzero(
             (low > low[outer]).all(axis=1) & (high < high[outer]).all(axis=1)
         ):
-            corners = pieces[inner].vertices
+            corners = meshes[inner].vertices
             some = corners[:: max(1, len(corners) // INSIDE_SAMPLES)]
-            if inside(pieces[outer].vertices, surface, some).all():
+            if inside(meshes[outer].vertices, surface, some).all():
                 smallest[inner] = outer
                 largest[inner] = outer if largest[inner] == inner else largest[inner]
     return largest, smallest
@@ -337,13 +353,14 @@ def _turned_outward(
     A closed piece in another is a cavity if it is wound the other way round, and else inside of the
     solid. What is in a cavity is solid again.
     """
-    of_face, pieces = _pieces(mesh)
-    volume = _volumes(pieces)
-    largest, smallest = _containers(pieces, volume)
+    pieces = _pieces(mesh)
+    of_face = pieces.of_face
+    volume = pieces.volume
+    largest, smallest = _containers(pieces)
     faces = mesh.faces.copy()
     turned = (volume[largest] < 0.0)[of_face]  # as if the outermost piece were wound outward
     faces[turned] = faces[turned][:, ::-1]
-    within = smallest != np.arange(len(pieces))
+    within = smallest != np.arange(len(volume))
     border = within & (volume * volume[smallest] < 0.0)
     whole = np.abs(volume[~within]).sum()
     hollow = -(volume * np.sign(volume[largest]))[border].sum()
@@ -359,7 +376,7 @@ def _turned_outward(
         )
     kept = trimesh.Trimesh(mesh.vertices, faces[~within[of_face]], process=False)
     kept.remove_unreferenced_vertices()
-    hulls = _convex_hulls([piece for piece, inner in zip(pieces, within, strict=True) if not inner])
+    hulls = _convex_hulls(pieces.meshes, ~within)
     if hulls:
         notes.append(
             f"{len(hulls)} convex piece{'s' if len(hulls) > 1 else ''}: nothing to decompose"
@@ -367,10 +384,11 @@ def _turned_outward(
     return kept, hulls, faces[border[of_face]]
 
 
-def _convex_hulls(pieces: list[Any]) -> tuple[Hull, ...]:
-    """Convex hulls of pieces; none unless all are closed and convex."""
+def _convex_hulls(pieces: list[Any], outer: np.ndarray) -> tuple[Hull, ...]:
+    """Convex hulls of the outer ones of pieces [P]; none unless all are closed and convex."""
     hulls = []
-    for piece in pieces:
+    for number in np.flatnonzero(outer):
+        piece = pieces[number]
         try:
             hull = convex_hull(piece.vertices)
         except ValueError:

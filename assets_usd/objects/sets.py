@@ -20,10 +20,10 @@ HELD_OUT_COUNT = 30
 """Objects of ``procedural-heldout``: a dozen worlds each in an evaluation of a few hundred."""
 
 BUILT_IN = ("cube", "cuboid", "symmetric", "procedural-150-seed0", "procedural-heldout")
-"""Sets named in help texts; ``procedural-<count>-seed<seed>``, ``procedural-slender-<count>-seed<seed>``
-and ``procedural-heldout-<count>-seed<seed>`` take any numbers."""
+"""Sets named in help texts; ``procedural-<count>-seed<seed>`` and
+``procedural-heldout-<count>-seed<seed>`` take any numbers."""
 
-_PROCEDURAL = re.compile(r"procedural-(?:(heldout|slender)-)?([1-9]\d*)-seed(\d+)")
+_PROCEDURAL = re.compile(r"procedural-(?:(heldout)-)?([1-9]\d*)-seed(\d+)")
 
 
 def objects_dir() -> Path:

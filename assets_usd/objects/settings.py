@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from vd.assets_usd.hands import check_hand_name
+from vd.assets_usd.objects.geometry import MeshError
 from vd.command.config import require
 
 LEAST_THRESHOLD = 0.01
@@ -13,10 +14,6 @@ DENSITIES_KG_M3 = (10.0, 23000.0)
 """Least and largest density of an object: from foam to osmium. What is beyond is a mistaken
 unit.
 """
-
-
-class MeshError(ValueError):
-    """A mesh is refused; the message is the reason."""
 
 
 @dataclass(frozen=True)

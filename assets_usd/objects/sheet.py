@@ -117,26 +117,17 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
     head_in = _height_in(len(head), TITLE_POINTS) + MARGIN_IN
     height = rows * (TILE_IN + caption_in) + head_in
     figure = Figure((width, height), dpi=100)
-    cells = figure.add_gridspec(
-        2 * rows,
-        2 * columns,
-        height_ratios=[TILE_IN, caption_in] * rows,
-        left=0.0,
-        right=1.0,
-        bottom=0.0,
-        top=1.0 - head_in / height,
-        wspace=0.0,
-        hspace=0.0,
-    )
+    side = TILE_IN / width
+    tall = TILE_IN / height
     for i, model in enumerate(models):
         row, column = divmod(i, columns)
-        drawing = figure.add_subplot(cells[2 * row, 2 * column], projection="3d")
-        left, bottom = drawing.get_position(original=True).p0
+        left = 2 * column * side
+        bottom = 1.0 - (head_in + row * (TILE_IN + caption_in)) / height - tall
+        drawing = figure.add_axes((left, bottom, side, tall), projection="3d")
         _draw(drawing, [(model.vertices, model.faces)], [MESH_COLOUR])
         hues = [part_colour(number, 0.52, 0.97) for number in range(len(model.hulls))]
-        _draw(
-            figure.add_subplot(cells[2 * row, 2 * column + 1], projection="3d"), model.hulls, hues
-        )
+        drawing = figure.add_axes((left + side, bottom, side, tall), projection="3d")
+        _draw(drawing, model.hulls, hues)
         colour = WARNING_COLOUR if model.warnings else "black"
         left += MARGIN_IN / width
         figure.text(left, bottom, captions[i], fontsize=CAPTION_POINTS, va="top", color=colour)

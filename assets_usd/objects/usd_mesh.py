@@ -4,11 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom, UsdUtils
+from pxr import Tf, Usd, UsdGeom, UsdUtils, Vt
 from trimesh.util import append_faces
 
+from vd.assets_usd.objects.geometry import MeshError
 from vd.assets_usd.objects.model import is_object
-from vd.assets_usd.objects.settings import MeshError
 
 _UNREAD = (
     "Cube",
@@ -76,16 +76,16 @@ def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     stage = opened(path)
     prims = _shown(stage)
-    unread = [prim for prim in prims if str(prim.GetTypeName()) in _UNREAD]
-    if unread:
-        kind = unread[0].GetTypeName()
-        raise MeshError(f"{unread[0].GetPath()} is a {kind}, which is not read; make it a mesh")
+    for prim in prims:
+        kind = str(prim.GetTypeName())
+        if kind in _UNREAD:
+            raise MeshError(f"{prim.GetPath()} is a {kind}, which is not read; make it a mesh")
     cache = UsdGeom.XformCache()
-    parts = [
-        _placed(np.array(cache.GetLocalToWorldTransform(prim)), *_triangles(UsdGeom.Mesh(prim)))
-        for prim in prims
-        if prim.IsA(UsdGeom.Mesh)
-    ]
+    parts = []
+    for prim in prims:
+        if prim.IsA(UsdGeom.Mesh):
+            matrix = np.array(cache.GetLocalToWorldTransform(prim))
+            parts.append(mesh_triangles(prim, matrix))
     if not parts:
         raise MeshError("no visible mesh below the default prim")
     vertices, faces = append_faces(*zip(*parts, strict=True))
@@ -97,53 +97,45 @@ def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _shown(stage: Any) -> list[Any]:
     """Visible prims below the default prim, instances included, with a purpose that is shown."""
     root = stage.GetDefaultPrim() or stage.GetPseudoRoot()
-    purposes: dict[Any, str] = {}
+    rendered = []
+    stand_ins = []
     for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
         imageable = UsdGeom.Imageable(prim)
-        if (
-            prim.IsA(UsdGeom.Boundable)
-            and imageable.ComputeVisibility() != UsdGeom.Tokens.invisible
-        ):
-            purposes[prim] = str(imageable.ComputePurpose())
-    rendered = [prim for prim, purpose in purposes.items() if purpose in ("default", "render")]
-    return rendered or [prim for prim, purpose in purposes.items() if purpose == "proxy"]
+        shown = prim.IsA(UsdGeom.Boundable) and imageable.ComputeVisibility() != "invisible"
+        purpose = imageable.ComputePurpose()
+        if shown and purpose in ("default", "render"):
+            rendered.append(prim)
+        elif shown and purpose == "proxy":
+            stand_ins.append(prim)
+    return rendered or stand_ins
 
 
-def _triangles(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a UsdGeomMesh: polygons become fans."""
+def mesh_triangles(prim: Any, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and triangles [T, 3] of a UsdGeomMesh: polygons become fans.
+
+    Args:
+        prim: The mesh.
+        matrix: Where it is moved, a transform of row vectors [4, 4]; a mirror turns the triangles.
+
+    Raises:
+        MeshError: Its faces do not fit together.
+    """
+    mesh = UsdGeom.Mesh(prim)
     first = Usd.TimeCode.EarliestTime()
-    attributes = (
-        mesh.GetPointsAttr(),
-        mesh.GetFaceVertexIndicesAttr(),
-        mesh.GetFaceVertexCountsAttr(),
+    points = mesh.GetPointsAttr().Get(first) or ()
+    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(first) or (), dtype=np.int32)
+    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(first) or (), dtype=np.int32)
+    sound, why = UsdGeom.Mesh.ValidateTopology(
+        Vt.IntArray.FromNumpy(corners), Vt.IntArray.FromNumpy(counts), len(points)
     )
-    points, corners, counts = (attribute.Get(first) for attribute in attributes)
-    sound, why = (
-        UsdGeom.Mesh.ValidateTopology(corners, counts, len(points))
-        if points and counts
-        else (False, "no faces")
-    )
-    if not sound:
-        raise MeshError(f"{mesh.GetPath()} is no valid mesh: {why}; export it again")
-    corners = np.array(corners, dtype=np.int64)
-    counts = np.array(counts, dtype=np.int64)
+    if not sound or not len(counts):
+        raise MeshError(f"{prim.GetPath()} is no valid mesh: {why or 'no faces'}; export it again")
     triangles = np.maximum(counts - 2, 0)
     first_corner = np.repeat(np.cumsum(counts) - counts, triangles)
     step = 1 + np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles)
     faces = corners[np.stack([first_corner, first_corner + step, first_corner + step + 1], axis=1)]
-    if mesh.GetOrientationAttr().Get(first) == UsdGeom.Tokens.leftHanded:
-        faces = faces[:, ::-1]
-    return np.array(points, dtype=float), faces
-
-
-def _placed(
-    matrix: np.ndarray, vertices: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices moved into the stage by a transform of row vectors [4, 4].
-
-    A mirror turns the triangles.
-    """
     linear = matrix[:3, :3]
-    return vertices @ linear + matrix[3, :3], faces[:, ::-1] if np.linalg.det(
-        linear
-    ) < 0.0 else faces
+    mirrored = np.linalg.det(linear) < 0.0
+    if mirrored != (mesh.GetOrientationAttr().Get(first) == UsdGeom.Tokens.leftHanded):
+        faces = faces[:, ::-1]
+    return np.array(points, dtype=float) @ linear + matrix[3, :3], faces
