@@ -151,6 +151,14 @@ class InputBuilder:
         """
         return Belief(self.goal_rotation(goal_quat), self._place.repeat(len(goal_quat), 1))
 
+    def near_place(self, belief: Belief, reach_m: float) -> Belief:
+        """A belief whose place is at most ``reach_m`` from where objects are handled."""
+        offset = belief.position - self._place
+        length = offset.norm(dim=-1, keepdim=True)
+        share = reach_m / length.clamp(min=reach_m)
+        position = self._place + offset * share
+        return Belief(belief.rotation, position)
+
     def belief_of(self, pose: torch.Tensor, rows: torch.Tensor | None = None) -> Belief:
         """What is to be believed of objects at poses in the base frame [R, 7]; ``rows`` as below."""
         middle = self._middle if rows is None else self._middle[rows]
