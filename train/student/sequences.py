@@ -99,6 +99,12 @@ def belief_errors(belief: Belief, truth: Belief) -> tuple[torch.Tensor, torch.Te
     return turn_angle(turn), (belief.position - truth.position).norm(dim=-1)
 
 
+def last_errors(belief: Belief, sequences: Sequences) -> tuple[torch.Tensor, torch.Tensor]:
+    """Angles [rad] and distances [m] by which beliefs after the last step are wrong [B]."""
+    truth = sequences.truth
+    return belief_errors(belief, Belief(truth.rotation[-1], truth.position[-1]))
+
+
 def student_losses(
     output: StudentOutput, sequences: Sequences, cfg: LearnCfg
 ) -> dict[str, torch.Tensor]:
