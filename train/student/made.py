@@ -6,6 +6,7 @@ it makes of them is what it believes in the next step, as at work. T steps, B se
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from operator import itemgetter
 from typing import Any
 
 import torch
@@ -14,12 +15,12 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.policy.senses import Senses
 from vd.train.student.bank import ShapeBank, centred, mesh_points
 from vd.train.student.config import StudentTrainCfg
-from vd.train.student.sequences import Sequences, at_step, inputs_of, last_errors
+from vd.train.student.sequences import Sequences, inputs_of, last_errors
 from vd.train.student.shapes import random_matrices, uniform
 from vd.train.student.views import Hands, camera_points, goal_points
 from vd.vision.acting import ActingStudent
 from vd.vision.rotations import matrices, rotations_about, two_columns
-from vd.vision.student import Belief, carried
+from vd.vision.student import Belief, carried, each
 
 CLOUDS = 4
 """Points of a shape, in clouds: one is the goal's, of the others is seen what is to be seen."""
@@ -139,7 +140,8 @@ class MadeSequences:
         for step in range(steps):
             rotations.append(acting.belief.rotation)
             positions.append(acting.belief.position)
-            acting.decide(acting.look(at_step(senses, step)))
+            now = each(senses, itemgetter(step))
+            acting.decide(acting.look(now))
         belief = Belief(torch.stack(rotations), torch.stack(positions))
         rows = torch.arange(count, device=device)
         sight = inputs_of(acting.build, senses, belief, rows)
