@@ -11,6 +11,7 @@ import warp as wp
 
 from vd.assets_usd.hands import load_hand
 from vd.policy.senses import Senses
+from vd.vision.acting import ActingStudent
 from vd.vision.cfg import StudentCfg
 from vd.vision.rotations import (
     matrices,
@@ -192,6 +193,21 @@ def test_it_reads_the_hand_by_its_joints_and_the_goal_where_it_is_believed(devic
     torch.testing.assert_close(twice.hand, sight.hand.flip(0))
 
 
+def test_a_belief_strays_no_farther_than_the_network_sees():
+    network = student().eval()
+    with torch.no_grad():
+        network.residual.bias[-3:] = 0.5  # 9 cm in every step
+    acting = ActingStudent(network, load_hand("dclaw3"), torch.randn(2, 50, 3))
+    senses = senses_of(load_hand("dclaw3"), 2, torch.device("cpu"))
+    acting.step(senses)
+    senses = dataclasses.replace(senses, fresh=torch.zeros(2, dtype=torch.bool))
+    for _ in range(5):
+        acting.step(senses)
+    first = acting.build.first_belief(senses.goal_quat)
+    strayed = (acting.belief.position - first.position).norm(dim=-1)
+    torch.testing.assert_close(strayed, torch.full((2,), SMALL.reach_m))
+
+
 def each_row(senses: Senses, rows: list[int]) -> Senses:
     taken = {f.name: getattr(senses, f.name)[rows] for f in dataclasses.fields(Senses)}
     return Senses(**taken)
@@ -249,6 +265,7 @@ def test_a_robot_runs_its_stages_in_half_precision():
 def test_a_robot_needs_no_simulator():
     code = """
 import sys, torch
+from vd.vision.acting import ActingStudent
 from vd.vision.cfg import StudentCfg
 from vd.vision.student import Belief, StudentInput, Student
 belief = Belief(torch.eye(3)[None], torch.zeros(1, 3))

@@ -16,6 +16,7 @@ from vd.evaluate.compare import actor_of
 from vd.evaluate.trace import advance
 from vd.policy.bundle import read_policy, write_policy
 from vd.train.checkpoint import list_checkpoints
+from vd.train.student import made
 from vd.train.student.build import build_student
 from vd.train.student.config import StudentTrainCfg, smoke
 from vd.train.student.sequences import student_losses
@@ -117,6 +118,23 @@ def test_truth_is_where_the_objects_points_are(tmp_path):
     assert apart[1] > 1.5 * apart[0]
     assert float(sequences.label.abs().max()) <= 1.0
     trainer._close()
+
+
+def test_beliefs_begin_less_wrong_until_the_student_sets_them_right(tmp_path, monkeypatch):
+    trainer = trainer_of(settings(0, tmp_path))
+    source = trainer.source
+    first = source.most_rad
+    for share, grows in ((0.6, False), (0.4, True)):
+        left = torch.full((4,), share * 0.5 * first)
+        monkeypatch.setattr(made, "last_errors", lambda *_, left=left: (left, left))
+        for sequences in source.minibatches(trainer.acting, lambda: False):
+            belief = sequences.sight.belief
+            turn = belief.rotation[0].transpose(-1, -2) @ sequences.truth.rotation[0]
+            assert turn_angle(turn).max() < first + 1e-3
+        assert (source.most_rad > first) == grows
+    source.most_rad = np.pi
+    list(source.minibatches(trainer.acting, lambda: False))
+    assert source.most_rad == np.pi
 
 
 def test_losses_are_least_at_the_truth(tmp_path):

@@ -35,18 +35,30 @@ def kernel_map_kernel(
     other way round with the same step: the outputs of that at each input, offsets reversed.
     """
     row = wp.tid()
+    count = input_key_in.shape[0]
+    for k in range(_KERNEL):
+        table_out[row, k] = count
     key = output_key_in[row]
     cell = key_coordinates(key & _MORTON_MASK)
-    for k in range(_KERNEL):
-        x = cell[0] + step * (k // 9 - 1)
-        y = cell[1] + step * ((k // 3) % 3 - 1)
-        z = cell[2] + step * (k % 3 - 1)
-        wanted = voxel_key(key >> _CLOUD_SHIFT, x, y, z)
-        place = wp.lower_bound(input_key_in, wanted)
-        if place < input_key_in.shape[0] and input_key_in[place] == wanted:
-            table_out[row, k] = place
-        else:
-            table_out[row, k] = input_key_in.shape[0]
+    # The kernel lies in eight blocks of two steps a side, and keys of a block are neighbours.
+    side = 2 * step
+    size = wp.int64(side * side * side)
+    low = wp.vec3i(0)
+    for axis in range(3):
+        low[axis] = (cell[axis] - step) & -side
+    for block in range(8):
+        x = low[0] + side * (block & 1)
+        y = low[1] + side * ((block >> 1) & 1)
+        z = low[2] + side * (block >> 2)
+        start = voxel_key(key >> _CLOUD_SHIFT, x, y, z)
+        if start >= wp.int64(0):
+            place = wp.lower_bound(input_key_in, start)
+            while place < count and input_key_in[place] < start + size:
+                offset = key_coordinates(input_key_in[place] & _MORTON_MASK) - cell
+                if wp.max(wp.abs(offset)) <= step:
+                    offset = offset / step
+                    table_out[row, 13 + 9 * offset[0] + 3 * offset[1] + offset[2]] = place
+                place += 1
 
 
 @wp.kernel

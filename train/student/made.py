@@ -1,11 +1,12 @@
 """Stage 0: shapes without end in hands that hold still, without simulation.
 
-Beliefs begin wrong, by any angle and some centimetres. What the student makes of them is what it
-believes in the next step, as at work. T steps, B sequences, P points.
+Beliefs begin wrong, by some centimetres and an angle that grows to any as the student learns. What
+it makes of them is what it believes in the next step, as at work. T steps, B sequences, P points.
 """
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from operator import itemgetter
 from typing import Any
 
 import torch
@@ -14,12 +15,12 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.policy.senses import Senses
 from vd.train.student.bank import ShapeBank, centred, mesh_points
 from vd.train.student.config import StudentTrainCfg
-from vd.train.student.sequences import Sequences, at_step, belief_errors, inputs_of
+from vd.train.student.sequences import Sequences, inputs_of, last_errors
 from vd.train.student.shapes import random_matrices, uniform
 from vd.train.student.views import Hands, camera_points, goal_points
 from vd.vision.acting import ActingStudent
 from vd.vision.rotations import matrices, rotations_about, two_columns
-from vd.vision.student import Belief, carried
+from vd.vision.student import Belief, carried, each
 
 CLOUDS = 4
 """Points of a shape, in clouds: one is the goal's, of the others is seen what is to be seen."""
@@ -29,6 +30,10 @@ SHIFT_M = 0.04
 """First beliefs are off by up to this along each axis [m]."""
 TURN_RAD, MOVE_M = 0.25, 0.003
 """Largest turn of an object in a step, as of teachers, and standard deviation of its motion."""
+FIRST_TURN_RAD = 0.6
+"""Beliefs are first off by up to this [rad]: among larger errors small ones are not learned."""
+LEFT, WIDER = 0.5, 1.05
+"""Where no more than this share of the error is left after a sequence, the largest grows so."""
 
 
 def turned(rotation: torch.Tensor, most: float) -> torch.Tensor:
@@ -47,6 +52,9 @@ class MadeSequences:
         held_out: Objects to measure on, as they are; may be none.
         hands: What hides shapes.
         cfg: Settings.
+
+    Attributes:
+        most_rad: Beliefs are off by up to this angle at first.
     """
 
     env = None
@@ -66,6 +74,7 @@ class MadeSequences:
         device = hands.eye.device
         meshes = centred(mesh_points(objects, max(MESH_POINTS, points), device))
         self._bank = ShapeBank(meshes, cfg.clouds.shapes, points)
+        self.most_rad = FIRST_TURN_RAD
         self._held_out = None
         if held_out:
             self._held_out = centred(mesh_points(held_out, points, device))
@@ -75,14 +84,24 @@ class MadeSequences:
     ) -> Iterator[Sequences]:
         """Sequences of new shapes."""
         self._bank.renew(self._clouds.shapes)
+        left = []
         for _ in range(self._clouds.updates):
             if stopping():
                 return
-            yield self.draw(acting, self._bank.draw(self._learn.batch))
+            sequences = self.draw(acting, self._bank.draw(self._learn.batch), self.most_rad)
+            left.append(last_errors(acting.belief, sequences)[0].mean())
+            yield sequences
+        if torch.stack(left).mean() < LEFT * 0.5 * self.most_rad:
+            self.most_rad = min(math.pi, WIDER * self.most_rad)
 
     @torch.no_grad()
-    def draw(self, acting: ActingStudent, shapes: torch.Tensor) -> Sequences:
-        """Sequences of shapes, points [m] and normals [B, P, 6], with the student's own beliefs."""
+    def draw(
+        self, acting: ActingStudent, shapes: torch.Tensor, most_rad: float = math.pi
+    ) -> Sequences:
+        """Sequences of shapes, points [m] and normals [B, P, 6], with the student's own beliefs.
+
+        The first are off by up to ``most_rad``.
+        """
         steps = self._learn.window
         count = len(shapes)
         device = shapes.device
@@ -97,11 +116,11 @@ class MadeSequences:
         middle = carried(goal.mean(dim=1, keepdim=True), place.rotation)[..., 0, :]
         truth = Belief(place.rotation, place.position + middle)
 
-        wanted = turned(truth.rotation[0], math.pi)
+        wanted = turned(truth.rotation[0], most_rad)
         # At work the object is first believed to be turned as it is wanted.
         as_wanted = torch.rand((count, 1, 1), device=device) < 0.5
         acting.belief = Belief(
-            rotation=torch.where(as_wanted, wanted, turned(truth.rotation[0], math.pi)),
+            rotation=torch.where(as_wanted, wanted, turned(truth.rotation[0], most_rad)),
             position=truth.position[0] + uniform(-SHIFT_M, SHIFT_M, count, 3, device=device),
         )
         acting.hidden = acting.network.first_hidden(count)
@@ -121,15 +140,16 @@ class MadeSequences:
         for step in range(steps):
             rotations.append(acting.belief.rotation)
             positions.append(acting.belief.position)
-            acting.decide(acting.look(at_step(senses, step)))
+            now = each(senses, itemgetter(step))
+            acting.decide(acting.look(now))
         belief = Belief(torch.stack(rotations), torch.stack(positions))
         rows = torch.arange(count, device=device)
         sight = inputs_of(acting.build, senses, belief, rows)
         return Sequences(sight, truth, hidden, done=senses.fresh)
 
     def figures(self) -> dict[str, Any]:
-        """None but those of the losses."""
-        return {}
+        """By how much beliefs are off at first."""
+        return {"learn/most_rad": self.most_rad}
 
     @torch.no_grad()
     def measure(self, acting: ActingStudent) -> dict[str, torch.Tensor]:
@@ -138,19 +158,19 @@ class MadeSequences:
             return {}
         shapes = self._held_out
         sequences = self.draw(acting, shapes.repeat(1 + self._learn.batch // len(shapes), 1, 1))
-        last = Belief(sequences.truth.rotation[-1], sequences.truth.position[-1])
-        turn, shift = belief_errors(acting.belief, last)
+        turn, shift = last_errors(acting.belief, sequences)
         return {
             "validation/rotation_error": turn.median(),
             "validation/position_error_mm": 1e3 * shift.median(),
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing: all is drawn anew."""
-        return {}
+        """The largest error; all else is drawn anew."""
+        return {"most_rad": self.most_rad}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Nothing."""
+        """Take over :meth:`state_dict`."""
+        self.most_rad = state["most_rad"]
 
     def close(self) -> None:
         """Nothing."""

@@ -4,7 +4,7 @@ T steps, B sequences, N environments, D actions.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
@@ -70,11 +70,6 @@ class SequenceSource(Protocol):
         ...
 
 
-def at_step(senses: Senses, step: int) -> Senses:
-    """One step of senses [T, B]."""
-    return Senses(**{field.name: getattr(senses, field.name)[step] for field in fields(Senses)})
-
-
 def inputs_of(
     build: InputBuilder, senses: Senses, belief: Belief, rows: torch.Tensor
 ) -> StudentInput:
@@ -87,7 +82,7 @@ def inputs_of(
         rows: The environments.
     """
     steps = len(senses.fresh)
-    flat = Senses(**{f.name: getattr(senses, f.name).flatten(0, 1) for f in fields(Senses)})
+    flat = each(senses, lambda value: value.flatten(0, 1))
     believed = each(belief, lambda value: value.flatten(0, 1))
     sight = build(flat, believed, rows.repeat(steps))
     return each(sight, lambda value: value.unflatten(0, (steps, len(rows))))
@@ -97,6 +92,11 @@ def belief_errors(belief: Belief, truth: Belief) -> tuple[torch.Tensor, torch.Te
     """Angles [rad] and distances [m] by which beliefs are wrong [..]."""
     turn = belief.rotation.transpose(-1, -2) @ truth.rotation
     return turn_angle(turn), (belief.position - truth.position).norm(dim=-1)
+
+
+def last_errors(belief: Belief, sequences: Sequences) -> tuple[torch.Tensor, torch.Tensor]:
+    """Angles [rad] and distances [m] by which beliefs after the last step are wrong [B]."""
+    return belief_errors(belief, each(sequences.truth, lambda value: value[-1]))
 
 
 def student_losses(

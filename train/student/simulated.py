@@ -25,7 +25,7 @@ from vd.train.student.views import goal_points
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.acting import ActingStudent
 from vd.vision.rotations import matrices, two_columns
-from vd.vision.student import Belief, carried
+from vd.vision.student import Belief, carried, each
 
 
 class SimulatedSequences:
@@ -165,10 +165,7 @@ class SimulatedSequences:
         last = torch.zeros_like(kept["fresh"][:1])
         return Sequences(
             sight=inputs_of(acting.build, senses, belief, rows),
-            truth=Belief(
-                truth.rotation.unflatten(0, (steps, len(rows))),
-                truth.position.unflatten(0, (steps, len(rows))),
-            ),
+            truth=each(truth, lambda value: value.unflatten(0, (steps, len(rows)))),
             hidden=hidden[rows].masked_fill(kept["fresh"][0, :, None], 0.0),
             done=torch.cat([kept["fresh"][1:], last]),
             label=kept["label"],

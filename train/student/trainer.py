@@ -12,10 +12,10 @@ from vd.policy.contract import Contract
 from vd.train.checkpoint import POLICY_NAME
 from vd.train.loop import check_update
 from vd.train.student.config import StudentTrainCfg
-from vd.train.student.sequences import Sequences, SequenceSource, belief_errors, student_losses
+from vd.train.student.sequences import Sequences, SequenceSource, last_errors, student_losses
 from vd.train.supervised import SupervisedLoop
 from vd.vision.acting import ActingStudent, StudentPolicy
-from vd.vision.student import Belief, Student
+from vd.vision.student import Belief, Student, each
 
 LOWER_RATES = "lower --learn.learning-rate, or take --learn.precision fp32"
 """Remedy for a network that diverges."""
@@ -88,9 +88,8 @@ class StudentTrainer(SupervisedLoop):
         output = self.network(sequences.sight, sequences.hidden, sequences.done)
         losses = student_losses(output, sequences, self.cfg.learn)
         norm = self._descend(torch.stack(tuple(losses.values())).sum(), done)
-        last = Belief(output.belief.rotation[-1].detach(), output.belief.position[-1].detach())
-        truth = Belief(sequences.truth.rotation[-1], sequences.truth.position[-1])
-        turn, shift = belief_errors(last, truth)
+        last = each(output.belief, lambda value: value[-1].detach())
+        turn, shift = last_errors(last, sequences)
         logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
         logged["loss/grad_norm"] = norm
         logged["learn/rotation_error"] = turn.mean()

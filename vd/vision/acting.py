@@ -74,7 +74,8 @@ class ActingStudent:
     def decide(self, sight: StudentInput) -> StudentOutput:
         """What the network says, which is believed and remembered from then on."""
         output = self.network.act(sight, self.hidden)
-        self.belief = output.belief
+        # One that strayed would have nothing in sight to come back by.
+        self.belief = self.build.near_place(output.belief, self.network.cfg.reach_m)
         self.hidden = output.hidden
         return output
 

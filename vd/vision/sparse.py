@@ -50,10 +50,15 @@ class Sites:
         return len(self.keys)
 
     @cached_property
+    def warp_keys(self) -> wp.array:
+        """The keys, for kernels."""
+        return as_warp(self.keys)
+
+    @cached_property
     def coordinates(self) -> torch.Tensor:
         """Rows (cloud, x, y, z) in voxels: each cell begins there, int32 [M, 4]."""
         rows = self.keys.new_empty((len(self), 4), dtype=torch.int32)
-        launch(coordinates_kernel, len(self), [as_warp(self.keys)], [as_warp(rows)])
+        launch(coordinates_kernel, len(self), [self.warp_keys], [as_warp(rows)])
         return rows
 
     @cached_property
@@ -71,17 +76,17 @@ class Sites:
     @cached_property
     def neighbours(self) -> torch.Tensor:
         """Rows that a kernel of stride 1 reads for each cell, M for none, int32 [M, 27]."""
-        return kernel_map(self.keys, self.keys, self.step)
+        return kernel_map(self, self, self.step)
 
     @cached_property
     def strided(self) -> torch.Tensor:
         """Rows a kernel of stride 2 reads for each coarser cell, M for none, int32 [.., 27]."""
-        return kernel_map(self.coarser.keys, self.keys, self.step)
+        return kernel_map(self.coarser, self, self.step)
 
     @cached_property
     def strided_back(self) -> torch.Tensor:
         """Coarser cells that read each cell so, by the opposite offsets, int32 [M, 27]."""
-        return kernel_map(self.keys, self.coarser.keys, self.step)
+        return kernel_map(self, self.coarser, self.step)
 
 
 @dataclass(frozen=True)
@@ -94,14 +99,17 @@ class SparseTensor:
     """The cells."""
 
 
-def kernel_map(outputs: torch.Tensor, inputs: torch.Tensor, step: int) -> torch.Tensor:
+def kernel_map(outputs: Sites, inputs: Sites, step: int) -> torch.Tensor:
     """Rows of ``inputs`` under a 3x3x3 kernel about each of ``outputs``, int32 [M, 27].
 
-    Both are keys, [F] and [M]. Offsets are ``step`` voxels apart; F is where there is no cell.
+    Offsets are ``step`` voxels apart; F, their number, is where there is no cell.
     """
-    table = outputs.new_empty((len(outputs), KERNEL), dtype=torch.int32)
+    table = outputs.keys.new_empty((len(outputs), KERNEL), dtype=torch.int32)
     launch(
-        kernel_map_kernel, len(outputs), [as_warp(outputs), as_warp(inputs), step], [as_warp(table)]
+        kernel_map_kernel,
+        len(outputs),
+        [outputs.warp_keys, inputs.warp_keys, step],
+        [as_warp(table)],
     )
     return table
 

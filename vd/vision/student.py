@@ -16,7 +16,7 @@ hand; metres, radians.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -39,10 +39,12 @@ PLACE_M = 0.1
 """Unit of places and offsets [m]: about the size of the scene."""
 LOG_STD = (-4.0, 0.0)
 """Least and largest logarithm of an action's standard deviation, as wide as teachers' are."""
+UNSURE = 2.2
+"""Bias of the deviation at first: near the largest, or the gradient were the first actions' alone."""
 UNTURNED = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 """The identity as two columns: what a network that predicts zeros turns by."""
 
-Step = TypeVar("Step", "StudentInput", "Belief")
+Step = TypeVar("Step", "StudentInput", "StudentOutput", "Belief", Senses)
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,14 @@ class InputBuilder:
         """
         return Belief(self.goal_rotation(goal_quat), self._place.repeat(len(goal_quat), 1))
 
+    def near_place(self, belief: Belief, reach_m: float) -> Belief:
+        """A belief whose place is at most ``reach_m`` from where objects are handled."""
+        offset = belief.position - self._place
+        length = offset.norm(dim=-1, keepdim=True)
+        share = reach_m / length.clamp(min=reach_m)
+        position = self._place + offset * share
+        return Belief(belief.rotation, position)
+
     def belief_of(self, pose: torch.Tensor, rows: torch.Tensor | None = None) -> Belief:
         """What is to be believed of objects at poses in the base frame [R, 7]; ``rows`` as below."""
         middle = self._middle if rows is None else self._middle[rows]
@@ -250,6 +260,7 @@ class Student(nn.Module):
         self.head = nn.Sequential(nn.Linear(cfg.memory + believed, cfg.head), nn.GELU())
         self.mean = nn.Linear(cfg.head, num_actions)
         self.log_std = nn.Linear(cfg.head, num_actions)
+        nn.init.constant_(self.log_std.bias, UNSURE)
         self.log_distance = nn.Linear(cfg.head, 1)
         self.register_buffer("unturned", torch.tensor(UNTURNED), persistent=False)
 
@@ -316,14 +327,7 @@ class Student(nn.Module):
     def act(self, sight: StudentInput, hidden: torch.Tensor) -> StudentOutput:
         """One step of N hands: what :meth:`forward` says of it, leading axis [N]."""
         output = self(each(sight, lambda value: value[None]), hidden)
-        return StudentOutput(
-            mean=output.mean[0],
-            log_std=output.log_std[0],
-            belief=each(output.belief, lambda value: value[0]),
-            log_distance=output.log_distance[0],
-            voxels=output.voxels[0],
-            hidden=output.hidden,
-        )
+        return replace(each(output, lambda value: value[0]), hidden=output.hidden)
 
     def _within_reach(self, points: torch.Tensor) -> torch.Tensor:
         """Points [.., 3] about the object's place; NaN for those that are out of reach."""
