@@ -96,7 +96,7 @@ def source_frame(
     Raises:
         ValueError: It is no pose, or nobody says where the camera is.
     """
-    from vd.assets_usd.camera_layer import read_camera
+    from vd.assets_usd.camera_layer import read_camera_pose
 
     if place is not None:
         frame = np.asarray(place, dtype=float)
@@ -107,11 +107,12 @@ def source_frame(
         return frame
     if camera_layer is None and hand.mounted_camera is None:
         raise ValueError(
-            f"{hand.name} has no camera: --pose-frame X Y Z QX QY QZ QW says where the frame of the "
-            "poses is in the hand's base"
+            f"{hand.name} has no camera: --camera-layer (of vd-deploy calibrate) or --pose-frame X Y Z "
+            "QX QY QZ QW says where the frame of the poses is in the hand's base"
         )
-    camera = hand.camera if camera_layer is None else read_camera(hand, camera_layer)
-    return np.concatenate([camera.position, camera.quaternion])
+    if camera_layer is not None:
+        return read_camera_pose(hand, camera_layer)
+    return np.concatenate([hand.camera.position, hand.camera.quaternion])
 
 
 @contextlib.contextmanager
