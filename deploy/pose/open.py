@@ -8,20 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from vd.assets_usd.hand_data import HandModel, Intrinsics, compose
+from vd.assets_usd.hand_data import HandModel, compose
 from vd.command.config import from_dict
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.hardware.connect import Connection
 from vd.deploy.pose.source import PoseSource
 from vd.deploy.pose.tags import SIZE_M, TagPoses
-from vd.deploy.pose.twin_poses import TagsOfTwin, TruthCfg, TwinPoses
+from vd.deploy.pose.twin_poses import TWIN_LENS, TagsOfTwin, TruthCfg, TwinPoses
 from vd.deploy.pose.udp_poses import UdpPoses
 
 FORMS = "ros2:/TOPIC, udp:PORT, udp:ADDRESS:PORT, tags, tags:SIDE_M or, of a twin, sim"
 NO_MOTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 """The pose of a frame in itself."""
-TWIN_LENS = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
-"""Of a twin's images of tags: 56 degrees wide, as common cameras are."""
 
 
 @dataclass(frozen=True)
