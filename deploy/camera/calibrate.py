@@ -60,8 +60,8 @@ class CalibrateCfg(HandOptions):
     camera: RealSenseCfg = field(default_factory=lambda: RealSenseCfg(width=1280, height=720))
     """The camera."""
     pose_frame: tuple[float, float, float, float, float, float, float] | None = None
-    """Where a twin's camera is, in the hand's base: position [m] and quaternion xyzw; by default
-    where the hand's file has it."""
+    """Where a twin's camera is, or a real one is thought to be, in the hand's base: position [m] and
+    quaternion xyzw; by default where the hand's file has it."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before the torque goes off."""
 
@@ -79,7 +79,7 @@ def calibrate(cfg: CalibrateCfg) -> int:
         )
     check_file(cfg.out)  # a person's work is not to be lost
     thought = None
-    if cfg.twin or hand.mounted_camera is not None:
+    if cfg.twin or cfg.pose_frame or hand.mounted_camera is not None:
         thought = source_frame(hand, cfg.pose_frame, None)
     views = take(cfg, thought)
     estimate = solve(views)

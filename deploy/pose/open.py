@@ -14,7 +14,7 @@ from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.hardware.connect import Connection
 from vd.deploy.pose.source import PoseSource
 from vd.deploy.pose.tags import SIZE_M, TagPoses
-from vd.deploy.pose.twin_poses import TWIN_LENS, TagsOfTwin, TruthCfg, TwinPoses
+from vd.deploy.pose.twin_poses import TagsOfTwin, TruthCfg, TwinPoses
 from vd.deploy.pose.udp_poses import UdpPoses
 
 FORMS = "ros2:/TOPIC, udp:PORT, udp:ADDRESS:PORT, tags, tags:SIDE_M or, of a twin, sim"
@@ -157,7 +157,7 @@ def open_poses(
                 node = stack.enter_context(running_node(ros_arguments))
             source = RosPoses(node, options.topic)
         elif twin is not None:
-            images = TagsOfTwin(twin, hand, in_base, TWIN_LENS, options.size_m, seed=seed)
+            images = TagsOfTwin(twin, hand, in_base, options.size_m, seed=seed)
             source = TagPoses(images, options.size_m).start()
         else:
             eye = RealSense(find_device(camera.serial), camera, infrared=True)

@@ -44,12 +44,6 @@ WAIT_S = 0.2
 """Longest wait for an image [s]."""
 
 
-def face_axes(face: int) -> np.ndarray:
-    """Right, up and outwards on a face as printed: columns in the cube's frame [3, 3]."""
-    normal, up = np.asarray(FACES[face], dtype=float)
-    return np.stack([np.cross(up, normal), up, normal], axis=1)
-
-
 def face_corners(size_m: float) -> np.ndarray:
     """Corners of each face in the cube's frame [m] [6, 4, 3].
 
@@ -94,10 +88,12 @@ def _on_faces(places: np.ndarray, size_m: float) -> np.ndarray:
 
     In the cube's frame [m], on each face [6, .., 3].
     """
-    flat = (places - 0.5) * [size_m, -size_m]
-    out = np.full((*flat.shape[:-1], 1), 0.5 * size_m)
-    local = np.concatenate([flat, out], axis=-1)
-    return np.array([local @ face_axes(face).T for face in range(len(FACES))])
+    right_up = (places - 0.5) * [size_m, -size_m]
+    faces = []
+    for normal, up in np.asarray(FACES, dtype=float):
+        axes = np.stack([np.cross(up, normal), up])
+        faces.append(right_up @ axes + 0.5 * size_m * normal)
+    return np.array(faces)
 
 
 def find_tags(image: np.ndarray) -> dict[int, np.ndarray]:

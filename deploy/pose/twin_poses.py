@@ -19,8 +19,8 @@ from vd.deploy.pose.rendered import render_cube
 from vd.deploy.pose.source import StampedPose
 from vd.deploy.twin.twin import Twin
 
-TWIN_LENS = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
-"""Of a twin's images of tags: 56 degrees wide, as common cameras are."""
+TWIN_LENS = Intrinsics(640, 360, 460.0, 460.0, 320.0, 180.0)
+"""Of a twin's images of tags: those of a D415 by the defaults of --camera."""
 BENT_S = 1.0
 """Time in which a finger comes to rest [s]."""
 IMAGES_HZ = 15.0
@@ -95,7 +95,6 @@ class TagsOfTwin:
         twin: The twin.
         hand: Its hand.
         camera: Pose of the camera's optical frame in the hand's base [7].
-        intrinsics: The lens.
         size_m: Side of the cube [m].
         tip: Finger that has the cube on its tip, in place of the object.
         seed: Of the noise of the images.
@@ -106,20 +105,19 @@ class TagsOfTwin:
         twin: Twin,
         hand: HandModel,
         camera: np.ndarray,
-        intrinsics: Intrinsics,
         size_m: float,
         *,
         tip: int | None = None,
         seed: int = 0,
     ):
-        self.intrinsics = intrinsics
+        self.intrinsics = TWIN_LENS
         self._twin = twin
         self._hand = hand
         self._camera = camera
         self._size_m = size_m
         self._tip = tip
         self._noise = np.random.default_rng(seed).normal(
-            0.0, IMAGE_NOISE, (intrinsics.height, intrinsics.width)
+            0.0, IMAGE_NOISE, (TWIN_LENS.height, TWIN_LENS.width)
         )
         self._due_s = 0.0
 
@@ -169,7 +167,7 @@ class BentFinger:
         self, twin: Twin, joints: JointMotors, finger: int, camera: np.ndarray, size_m: float
     ):
         self.intrinsics = TWIN_LENS
-        self._images = TagsOfTwin(twin, joints.hand, camera, TWIN_LENS, size_m, tip=finger)
+        self._images = TagsOfTwin(twin, joints.hand, camera, size_m, tip=finger)
         self._twin = twin
         self._joints = joints
         self._finger = joints.hand.fingers[finger]
