@@ -17,7 +17,6 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.camera_layer import write_camera_layer
 from vd.command.config import require
 from vd.command.files import check_file
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
@@ -68,6 +67,7 @@ class CalibrateCfg(HandOptions):
 
 def calibrate(cfg: CalibrateCfg) -> int:
     """Take views, solve, write the layer; 1 if the result is too uncertain."""
+    from vd.assets_usd.camera_layer import write_camera_layer
     from vd.deploy.pose.open import source_frame
 
     require(cfg, "--", "positive", "size count")

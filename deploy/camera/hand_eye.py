@@ -132,8 +132,8 @@ def solve(views: Views) -> HandEye:
     for finger in np.unique(views.finger):
         mine = views.chosen(np.flatnonzero(views.finger == finger))
         places = compose(_inverse(mine.tip), compose(camera, mine.cube))
-        off = [np.median(_off(mine, camera, place)) for place in places]
-        begin[int(finger)] = places[np.argmin(off)]
+        median_px = [np.median(_off(mine, camera, place)) for place in places]
+        begin[int(finger)] = places[np.argmin(median_px)]
     estimate = refine(views, camera, begin, robust=True)
     for _ in range(2):
         off = _off(views, estimate.camera, np.stack([estimate.cubes[int(f)] for f in views.finger]))
