@@ -170,7 +170,7 @@ def views_of(
     hand, bus, joints = connection.hand, connection.bus, connection.joints
     print(f"Bend finger {finger} all ways, the cube to the camera; hold it still now and then.")
     bent: list[np.ndarray] = []
-    views = []
+    views: list[tuple[np.ndarray, np.ndarray]] = []
     while len(views) < count:
         before = joints.to_joint(bus.read_state().position)
         image = camera.read(IMAGE_S).image

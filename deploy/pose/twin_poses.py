@@ -23,6 +23,8 @@ TWIN_LENS = Intrinsics(640, 360, 460.0, 460.0, 320.0, 180.0)
 """Of a twin's images of tags: those of a D415 by the defaults of --camera."""
 BENT_S = 1.0
 """Time in which a finger comes to rest [s]."""
+LOOK_S = 0.05
+"""How often it is asked meanwhile [s]."""
 IMAGES_HZ = 15.0
 """Images a second: drawing and reading them takes the time of other programs, too."""
 IMAGE_NOISE = 3.0
@@ -183,7 +185,10 @@ class BentFinger:
             low, high = hand.lower[self._finger], hand.upper[self._finger]
             goals[self._finger] = self._rng.uniform(low, high)
             self._twin.write_goals(self._joints.to_motor(goals))
-            time.sleep(BENT_S)
+            end_s = time.monotonic() + BENT_S
+            while time.monotonic() < end_s:
+                self._twin.read_state()  # it moves only as far as it is asked
+                time.sleep(LOOK_S)
         self._rests = not self._rests
         return self._images.read(timeout_s)
 
