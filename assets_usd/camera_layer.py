@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CameraModel, HandError, HandModel
 from vd.assets_usd.hand_layer import author, new_layer, open_layer, save_layer
-from vd.assets_usd.hand_model import OPTICAL_FROM_USD, read_hand
+from vd.assets_usd.hand_model import OPTICAL_FROM_USD
 
 CAMERA_LAYER_FORMAT = "vd-camera-layer/1"
 """What ``customLayerData`` of a layer says it is."""
@@ -56,15 +56,32 @@ def read_camera(hand: HandModel, layer: Path) -> CameraModel:
         layer: The camera's layer.
 
     Raises:
+        HandError: The file is missing, no such layer, or not one of this hand, which has a camera.
+    """
+    pose = read_camera_pose(hand, layer)
+    return replace(hand.camera, position=pose[:3], quaternion=pose[3:])
+
+
+def read_camera_pose(hand: HandModel, layer: Path) -> np.ndarray:
+    """Pose of a camera's optical frame in the base of any hand [7].
+
+    Args:
+        hand: The hand.
+        layer: The camera's layer.
+
+    Raises:
         HandError: The file is missing, no such layer, or not one of this hand.
     """
-    if (
-        not Path(layer).is_file()
-        or open_layer(layer).customLayerData.get("format") != CAMERA_LAYER_FORMAT
-    ):
+    opened = open_layer(layer) if Path(layer).is_file() else None
+    if opened is None or opened.customLayerData.get("format") != CAMERA_LAYER_FORMAT:
         raise HandError(
             f"{layer}: no camera layer ({CAMERA_LAYER_FORMAT}); name the camera.usda that "
             "vd-deploy calibrate wrote"
         )
-    place = read_hand(hand.path, fingertip=hand.fingertip, layer=Path(layer)).camera
-    return replace(hand.camera, position=place.position, quaternion=place.quaternion)
+    camera = f"/{hand.name}/base/camera"
+    if opened.GetPrimAtPath(camera) is None:
+        raise HandError(f"{layer} is of {opened.defaultPrim}, not of {hand.name}")
+    place = opened.GetAttributeAtPath(f"{camera}.xformOp:translate").default
+    turn = opened.GetAttributeAtPath(f"{camera}.xformOp:orient").default
+    optical = Rotation.from_quat([*turn.imaginary, turn.real]) * OPTICAL_FROM_USD
+    return np.array([*place, *optical.as_quat()])

@@ -17,7 +17,7 @@ OK, FAILED = 0, interrupt.FAILED
 COMMANDS = {
     "run": ("loop.run", "drive the hand with a policy"),
     "check": ("hardware.check", "preflight: everything that must be right before it moves"),
-    "calibrate": ("camera.calibrate", "find where the camera is, by markers on fingertips"),
+    "calibrate": ("camera.calibrate", "find where the camera is, by a cube of tags on a finger"),
     "home": ("hardware.home", "move slowly to the pose in which an episode starts"),
     "record": ("hardware.record", "record motions for vd-gap"),
     "tags": ("pose.tag_sheet", "print a cube of tags, by which --pose tags sees it"),

@@ -1,9 +1,9 @@
-"""Find where the camera is: a person bends fingers with markers on their tips before it.
+"""Find where the camera is: a person bends a finger with the cube of tags on its tip before it.
 
-Print markers (--print-markers), stick marker k flat to the last link of finger k so that it faces
-the camera at the start pose, and run. The torque goes off. A picture is taken whenever the fingers
-rest and show something new. The result is a layer over the hand's USD, for vd-deploy
---camera-layer.
+Print the cube (vd-deploy tags), tape it to the last link of a finger so that the camera sees it, and
+run. The torque goes off. A picture is used whenever the finger rests and shows something new. The
+result is a layer over the hand's USD, for vd-deploy --camera-layer. On a twin the finger bends
+itself.
 """
 
 import json
@@ -11,36 +11,33 @@ import sys
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandModel, compose, invert
 from vd.command.config import require
 from vd.command.files import check_file
-from vd.deploy.camera.camera import CameraError
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
-from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.finding import listed
 from vd.deploy.hardware.answers import BusError
 from vd.deploy.hardware.check import confirm
-from vd.deploy.hardware.connect import HandOptions, connect, motors_of
+from vd.deploy.hardware.connect import Connection, HandOptions, connect, motors_of
+from vd.deploy.pose.tags import SIZE_M, find_cube, find_tags
 from vd.deploy.safety.signals import held
 from vd.paper import PAPER
 
-SIDE_M = 0.020
-"""Side of a marker [m]: with its white border 27 mm, as wide as the last link of a D'Claw."""
+if TYPE_CHECKING:
+    from vd.deploy.camera.camera import ImageSource
+
 IMAGE_S = 1.0
 """Longest wait for an image [s]."""
 STILL_RAD = 0.005
 """Joints that move by less while an image is taken rest."""
-SEAT_M = 0.012
-"""Distance of a marker from the middle of its link."""
 SAME_RAD = 0.05
-"""Joints of a finger that differ by less show its marker once more, not anew."""
+"""Joints of a finger that differ by less show the cube once more, not anew."""
 LARGEST_ERROR_M = PAPER.cloud.voxel_m
 """Uncertainty at the object above which the result is called ill-conditioned [m]: a voxel of what
 is seen.
@@ -49,152 +46,152 @@ is seen.
 
 @dataclass(frozen=True)
 class CalibrateCfg(HandOptions):
-    """Find where the camera is, from markers on the fingertips."""
+    """Find where the camera is, from a cube of tags on a fingertip."""
 
     out: Path = Path("camera.usda")
     """Layer to write."""
-    fingers: tuple[int, ...] = ()
-    """Fingers that carry a marker, from 0; all by default. Marker k is on finger k."""
-    count: int = 10
+    fingers: tuple[int, ...] = (0,)
+    """Fingers that carry the cube, from 0, one after the other; more make the result surer."""
+    count: int = 20
     """Views to take of each finger."""
-    side_m: float = SIDE_M
-    """Side of the markers' black square [m]; measure the print."""
-    print_markers: Path | None = None
-    """Write the markers as pictures into this folder, and do nothing else."""
+    size: float = SIZE_M
+    """Side of the cube [m]; measure the print."""
     camera: RealSenseCfg = field(default_factory=lambda: RealSenseCfg(width=1280, height=720))
     """The camera."""
+    pose_frame: tuple[float, float, float, float, float, float, float] | None = None
+    """Where a twin's camera is, or a real one is thought to be, in the hand's base: position [m] and
+    quaternion xyzw; by default where the hand's file has it."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before the torque goes off."""
 
 
 def calibrate(cfg: CalibrateCfg) -> int:
     """Take views, solve, write the layer; 1 if the result is too uncertain."""
-    require(cfg, "--", "positive", "side_m count")
+    from vd.assets_usd.camera_layer import write_camera_layer
+    from vd.deploy.pose.open import source_frame
+
+    require(cfg, "--", "positive", "size count")
     hand = motors_of(cfg).hand
-    fingers = cfg.fingers or tuple(range(hand.num_fingers))
+    fingers = cfg.fingers
     if not all(0 <= f < hand.num_fingers for f in fingers) or len(set(fingers)) != len(fingers):
         raise ValueError(
             f"--fingers {fingers}: {hand.name} has fingers 0 to {hand.num_fingers - 1}"
         )
-    if cfg.print_markers is not None:
-        return _print_markers(cfg.print_markers, fingers, cfg.side_m)
     check_file(cfg.out)  # a person's work is not to be lost
-    views = take(cfg, fingers)
-    thought = np.concatenate([hand.camera.position, hand.camera.quaternion])
-    estimate = solve(views, thought, {finger: seat(hand, finger, thought) for finger in fingers})
+    thought = None
+    if cfg.twin or cfg.pose_frame or hand.mounted_camera is not None:
+        thought = source_frame(hand, cfg.pose_frame, None)
+    views = take(cfg, thought)
+    estimate = solve(views)
     error_m = estimate.point_error(hand.goal_in_base)
-    write_camera_layer(cfg.out, hand, estimate, error_m)
-    print("\n".join(report(hand, estimate, views, error_m)))
+    notes = {
+        "tool": "vd-deploy calibrate",
+        "position_half_width_m": json.dumps(estimate.half_width[:3].tolist()),
+        "turn_half_width_rad": json.dumps(estimate.half_width[3:].tolist()),
+        "error_at_object_m": f"{error_m:.6f}",
+        "residual_px": f"{estimate.rms_px:.3f}",
+        "views": str(len(estimate.inliers)),
+    }
+    write_camera_layer(cfg.out, hand, estimate.camera, notes)
+    print("\n".join(report(estimate, views, error_m, thought)))
     print(f"written to {cfg.out}; vd-deploy --camera-layer {cfg.out}")
     if error_m <= LARGEST_ERROR_M:
         return 0
     print(
-        f"WARNING: ill-conditioned: where objects are, the cloud may be off by {1e3 * error_m:.1f} "
-        f"mm, more than a voxel ({1e3 * LARGEST_ERROR_M:.0f} mm). The fingers turn too little for "
-        "these pictures: take more views (--count), put markers on more fingers, larger ones, or "
-        "move the camera nearer"
+        f"WARNING: ill-conditioned: objects may seem off by {1e3 * error_m:.1f} mm, more than "
+        f"{1e3 * LARGEST_ERROR_M:.0f}. The finger turns too little for these pictures: take more "
+        "views (--count), of more fingers (--fingers), or move the camera nearer"
     )
     return 1
 
 
-def _print_markers(folder: Path, fingers: tuple[int, ...], side_m: float) -> int:
-    for finger in fingers:
-        save_marker(folder / f"marker-{finger}.png", finger, side_m)
-    border = 1e3 * side_m * MARGIN_CELLS / CELLS
-    print(
-        f"{len(fingers)} markers in {folder}: print them at true size (600 dots per inch), keep "
-        f"their white"
-    )
-    print(f"border of {border:.1f} mm, check that the black square is {1e3 * side_m:.1f} mm wide")
-    return 0
+def take(cfg: CalibrateCfg, camera_pose: np.ndarray | None = None) -> Views:
+    """The cube in pictures of fingers that bend.
 
-
-def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> Views:
-    """The markers in pictures of fingers that a person moves.
-
-    Of a finger that waits only the first.
+    Args:
+        cfg: The options.
+        camera_pose: Where a twin's camera is, in the hand's base [7].
 
     Raises:
         BusError: A motor does not answer.
         CameraError: The camera does not serve.
     """
-    if cfg.twin:
-        raise CameraError("a twin has no camera that sees markers; give --port")
+    views: list[tuple[np.ndarray, np.ndarray]] = []
+    finger_of = []
     with ExitStack() as stack:
-        camera = RealSense(find_device(cfg.camera.serial), cfg.camera, infrared=True)
-        stack.callback(camera.close)
         connection = stack.enter_context(connect(cfg))
-        hand = connection.hand
-        bus = connection.bus
-        joints = connection.joints
-        confirm("The torque goes off, and the hand lets go.", yes=cfg.yes)
-        with held():  # else some motors would keep their torque
-            failed = bus.torque(False)
-        if failed:
-            raise BusError(listed(list(failed.values())))
-        print(
-            "Bend one finger after the other, its marker to the camera; turn it all ways, hold it "
-            "still."
-        )
-        poses: dict[int, list[np.ndarray]] = {number: [] for number in fingers}
-        tip = []
-        finger = []
-        corners = []
-        while min(map(len, poses.values())) < cfg.count:
-            before = joints.to_joint(bus.read_state().position)
-            image = camera.read(IMAGE_S).image
-            after = joints.to_joint(bus.read_state().position)
-            if np.abs(after - before).max() > STILL_RAD:
-                continue
-            joint_q = 0.5 * (before + after)
-            for number, square in find_markers(image).items():
-                finger_q = joint_q[3 * number : 3 * number + 3]
-                if number in poses and all(
-                    np.abs(finger_q - other).max() > SAME_RAD for other in poses[number]
-                ):
-                    poses[number].append(finger_q)
-                    tip.append(hand.tip_poses(joint_q)[number])
-                    finger.append(number)
-                    corners.append(square)
-            counts = ", ".join(str(len(kept)) for kept in poses.values())
-            print(
-                f"\r{counts} of {cfg.count} views of each finger",
-                end="",
-                file=sys.stderr,
-                flush=True,
-            )
-        print(file=sys.stderr)
-        return Views(
-            np.array(tip), np.array(finger), np.array(corners), camera.intrinsics, cfg.side_m
-        )
+        camera: ImageSource
+        if connection.twin is None:
+            camera = RealSense(find_device(cfg.camera.serial), cfg.camera, infrared=True)
+            stack.callback(camera.close)
+            _let_go(connection, yes=cfg.yes)
+        for finger in cfg.fingers:
+            if connection.twin is not None:
+                from vd.deploy.pose.twin_poses import BentFinger
+
+                assert camera_pose is not None
+                camera = BentFinger(
+                    connection.twin, connection.joints, finger, camera_pose, cfg.size
+                )
+            elif finger != cfg.fingers[0]:
+                confirm(f"Tape the cube to finger {finger}.", yes=False)
+            new = views_of(connection, camera, finger, cfg.size, cfg.count)
+            views += new
+            finger_of += [finger] * len(new)
+        tip, cube = map(np.array, zip(*views, strict=True))
+        return Views(tip, np.array(finger_of), cube, camera.intrinsics, cfg.size)
 
 
-def seat(hand: HandModel, finger: int, camera: np.ndarray) -> np.ndarray:
-    """Pose in the tip's frame [7] of a marker that faces a camera [7] when the hand is at its start."""
-    tip = hand.tip_poses(hand.start)[finger]
-    normal = camera[:3] - tip[:3]
-    normal /= np.linalg.norm(normal)
-    right = Rotation.from_quat(camera[3:]).apply([1.0, 0.0, 0.0])
-    turn, _ = Rotation.align_vectors([normal, right], [[0, 0, 1], [1, 0, 0]], weights=[np.inf, 1.0])
-    return compose(invert(tip), np.concatenate([tip[:3] + SEAT_M * normal, turn.as_quat()]))
+def _let_go(connection: Connection, *, yes: bool) -> None:
+    """Switch the torque of real motors off, after asking.
+
+    Raises:
+        BusError: A motor does not answer.
+    """
+    confirm("The torque goes off, and the hand lets go.", yes=yes)
+    with held():  # else some motors would keep their torque
+        failed = connection.bus.torque(False)
+    if failed:
+        raise BusError(listed(list(failed.values())))
 
 
-def write_camera_layer(path: Path, hand: HandModel, found: HandEye, error_m: float) -> None:
-    """Write the layer, with what is known of its errors (SI units, radians)."""
-    from vd.assets_usd.camera_layer import write_camera_layer
+def views_of(
+    connection: Connection, camera: "ImageSource", finger: int, size_m: float, count: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Poses of a fingertip in the hand's base [7], and of the cube in the camera [7], while it bends.
 
-    notes = {
-        "tool": "vd-deploy calibrate",
-        "position_half_width_m": json.dumps(found.half_width[:3].tolist()),
-        "turn_half_width_rad": json.dumps(found.half_width[3:].tolist()),
-        "error_at_object_m": f"{error_m:.6f}",
-        "residual_px": f"{found.rms_px:.3f}",
-        "views": str(len(found.inliers)),
-    }
-    write_camera_layer(path, hand, found.camera, notes)
+    Args:
+        connection: The hand.
+        camera: Images of brightness, uint8 [H, W].
+        finger: The finger that has the cube.
+        size_m: Side of the cube [m].
+        count: How many.
+    """
+    hand, bus, joints = connection.hand, connection.bus, connection.joints
+    print(f"Bend finger {finger} all ways, the cube to the camera; hold it still now and then.")
+    bent: list[np.ndarray] = []
+    views: list[tuple[np.ndarray, np.ndarray]] = []
+    while len(views) < count:
+        before = joints.to_joint(bus.read_state().position)
+        image = camera.read(IMAGE_S).image
+        after = joints.to_joint(bus.read_state().position)
+        if np.abs(after - before).max() > STILL_RAD:
+            continue
+        joint_q = 0.5 * (before + after)
+        finger_q = joint_q[hand.fingers[finger]]
+        if any(np.abs(finger_q - other).max() < SAME_RAD for other in bent):
+            continue
+        cube, _ = find_cube(find_tags(image), camera.intrinsics, size_m)
+        if cube is None:
+            continue
+        bent.append(finger_q)
+        views.append((hand.tip_poses(joint_q)[finger], cube))
+        print(f"\r{len(views)} of {count} views", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    return views
 
 
-def report(hand: HandModel, found: HandEye, views: Views, error_m: float) -> list[str]:
+def report(found: HandEye, views: Views, error_m: float, thought: np.ndarray | None) -> list[str]:
     """What was found and how well, as text."""
     rows = [
         f"{len(found.inliers)} of {len(views)} views agree, {found.rms_px:.2f} pixels apart",
@@ -204,7 +201,10 @@ def report(hand: HandModel, found: HandEye, views: Views, error_m: float) -> lis
         rows.append(f"  {axis}       {1e3 * value:8.1f} mm  +- {1e3 * half:.1f}")
     for axis, half in zip(("right", "down", "ahead"), found.half_width[3:], strict=True):
         rows.append(f"  turn about its {axis:<6} +- {np.degrees(half):.2f} deg")
-    moved_m = np.linalg.norm(found.camera[:3] - hand.camera.position)
     rows.append(f"at the object: off by at most {1e3 * error_m:.1f} mm (95 %)")
-    rows.append(f"{1e3 * moved_m:.1f} mm from where the hand's file has it")
+    if thought is not None:
+        moved_m = np.linalg.norm(found.camera[:3] - thought[:3])
+        turn = Rotation.from_quat(found.camera[3:]) * Rotation.from_quat(thought[3:]).inv()
+        angle_deg = np.degrees(turn.magnitude())
+        rows.append(f"{1e3 * moved_m:.1f} mm and {angle_deg:.2f} degrees from where it was thought")
     return rows

@@ -1,15 +1,17 @@
-"""Where a camera is, from markers on the fingertips of a hand that it looks at (hand-eye calibration).
+"""Where a camera is, from a cube of tags on fingers of a hand that it looks at (hand-eye calibration).
 
-With the fingertip's pose t_i in the hand's base (forward kinematics), a marker stuck to it at M,
-and the wanted pose X of the camera in the base, view i shows the marker at ``X^-1 t_i M``. Least
-squares over the corners in the images find X and every M together, from where the camera is thought
-to be; a robust loss keeps wrong views out. Their curvature and the scatter from view to view give
-the intervals.
+With the fingertip's pose t_i in the hand's base (forward kinematics), the cube fixed to it at M,
+and the wanted pose X of the camera in the base, view i shows the cube at ``C_i = X^-1 t_i M``. From
+the motions between views, ``t_i t_j^-1 X = X C_i C_j^-1`` (Park and Martin, 1994), least squares
+over the cube's corners in the images begin, which find X and the M of every finger together; a
+robust loss keeps wrong views out. Their curvature and the scatter from view to view give the
+intervals.
 
 Poses are [7], position [m] and quaternion xyzw; pixels as in
 :class:`vd.assets_usd.hand_data.Intrinsics`.
 """
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -22,14 +24,18 @@ from vd.assets_usd.hand_data import Intrinsics, compose, invert
 
 CONFIDENCE = 0.95
 LEAST_VIEWS = 6
-"""Views below which nothing is solved: 12 unknowns with one marker, and some views to judge by."""
+"""Views below which nothing is solved: 12 unknowns with one finger, and some views to judge by."""
 LEAST_OF_FINGER = 4
-"""Views of one finger below which its marker only costs unknowns."""
+"""Views of one finger below which it only costs unknowns."""
+LEAST_TURN_RAD = 0.1
+"""Root mean square turn between views, about the second of their axes, below which they determine
+no camera."""
 INLIER_PX = 6.0
 """Mean distance of a view's corners from where the others put them, from which it is an outlier
 [px]: joints off by a degree make less."""
 ROBUST_PX = 2.0
 """Distance in the image from which the robust loss grows with its first power [px]."""
+UNDETERMINED = "the views do not determine the camera; move more joints, over more of their range"
 BEHIND_PX = 1e4
 """Distance that counts for a corner behind the camera [px]."""
 
@@ -40,28 +46,24 @@ class HandEyeError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """N views of markers."""
+    """N views of a cube of tags."""
 
     tip: np.ndarray
     """Pose of the fingertip in the hand's base [N, 7]."""
     finger: np.ndarray
-    """Finger that has the marker, [N]."""
-    corners: np.ndarray
-    """Corners of the marker in the image, from the top left on clockwise as printed [px], shape [N,
-    4, 2].
-    """
+    """Finger that has the cube, [N]."""
+    cube: np.ndarray
+    """Pose of the cube in the camera's optical frame [N, 7]."""
     lens: Intrinsics
-    side_m: float
-    """Side of the markers [m]."""
+    size_m: float
+    """Side of the cube [m]."""
 
     def __len__(self) -> int:
         return len(self.tip)
 
     def chosen(self, rows: np.ndarray) -> "Views":
         """Some of the views."""
-        return replace(
-            self, tip=self.tip[rows], finger=self.finger[rows], corners=self.corners[rows]
-        )
+        return replace(self, tip=self.tip[rows], finger=self.finger[rows], cube=self.cube[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +72,12 @@ class HandEye:
 
     camera: np.ndarray
     """Pose of its optical frame in the hand's base [7]."""
-    markers: dict[int, np.ndarray]
-    """Pose of each finger's marker in the frame of its tip [7]."""
+    cubes: dict[int, np.ndarray]
+    """Pose of the cube in the frame of each finger's tip [7]."""
     inliers: np.ndarray
     """Rows of the views that agree."""
     residual_px: np.ndarray
-    """Differences in the image, those views' [n, 4, 2]."""
+    """Differences in the image, those views' [n, 8, 2]."""
     covariance: np.ndarray
     """Of the camera: position in the base [m], then turn about the camera's own axes [rad], [6,
     6].
@@ -112,43 +114,67 @@ class HandEye:
         )
 
 
-def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -> HandEye:
+def solve(views: Views) -> HandEye:
     """Find the camera.
 
     Args:
         views: What was seen.
-        camera: Where the camera is thought to be [7]: some centimetres and ten degrees off do no
-            harm.
-        markers: Where each finger's marker is thought to be in its tip's frame [7]; it may have
-            been stuck on turned in its plane.
 
     Raises:
         HandEyeError: Too few views agree, or the fingers turned about too few directions.
     """
     rows = _enough(views.finger, np.arange(len(views)))
     if len(rows) < LEAST_VIEWS:
-        raise HandEyeError(f"{len(rows)} views of a marker; take at least {LEAST_VIEWS}, better 30")
+        raise HandEyeError(f"{len(rows)} views of the cube; take {LEAST_VIEWS}, better 30")
     views = views.chosen(rows)
-    turned = {}
+    camera = _by_motions(views)
+    begin = {}
     for finger in np.unique(views.finger):
-        options = [_turned(markers[int(finger)], quarter) for quarter in range(4)]
         mine = views.chosen(np.flatnonzero(views.finger == finger))
-        turned[int(finger)] = min(options, key=lambda marker: np.median(_off(mine, camera, marker)))
-    estimate = refine(views, camera, turned, robust=True)
+        places = compose(_inverse(mine.tip), compose(camera, mine.cube))
+        median_px = [np.median(_off(mine, camera, place)) for place in places]
+        begin[int(finger)] = places[np.argmin(median_px)]
+    estimate = refine(views, camera, begin, robust=True)
     for _ in range(2):
-        off = _off(
-            views, estimate.camera, np.stack([estimate.markers[int(f)] for f in views.finger])
-        )
+        off = _off(views, estimate.camera, np.stack([estimate.cubes[int(f)] for f in views.finger]))
         rows = _enough(views.finger, np.flatnonzero(off < INLIER_PX))
         if len(rows) < max(LEAST_VIEWS, len(views) / 2):
             raise HandEyeError(
-                f"only {len(rows)} of {len(views)} views agree with each other; check the marker's "
+                f"only {len(rows)} of {len(views)} views agree with each other; check the cube's "
                 "side, that it sits firmly, that fingers and motors are numbered as in the "
-                "calibration, light, and that the camera is roughly where the hand's file has it"
+                "calibration, and light"
             )
-        again = refine(views.chosen(rows), estimate.camera, estimate.markers)
-        estimate = replace(again, markers=estimate.markers | again.markers, inliers=rows)
+        again = refine(views.chosen(rows), estimate.camera, estimate.cubes)
+        estimate = replace(again, cubes=estimate.cubes | again.cubes, inliers=rows)
     return estimate
+
+
+def _by_motions(views: Views) -> np.ndarray:
+    """The camera's pose [7] from the motions between two views of a finger.
+
+    Raises:
+        HandEyeError: The fingers turned about too few directions.
+    """
+    first, second = np.triu_indices(len(views), 1)
+    same = views.finger[first] == views.finger[second]
+    first, second = first[same], second[same]
+    in_base = compose(views.tip[first], _inverse(views.tip[second]))
+    in_camera = compose(views.cube[first], _inverse(views.cube[second]))
+    turns = Rotation.from_quat(in_base[:, 3:])
+    spread_rad = np.linalg.svd(turns.as_rotvec(), compute_uv=False) / np.sqrt(len(turns))
+    if spread_rad[1] < LEAST_TURN_RAD:
+        raise HandEyeError(UNDETERMINED)
+    seen = Rotation.from_quat(in_camera[:, 3:])
+    turn, _ = Rotation.align_vectors(turns.as_rotvec(), seen.as_rotvec())
+    left = turns.as_matrix() - np.eye(3)
+    right = turn.apply(in_camera[:, :3]) - in_base[:, :3]
+    place, *_ = np.linalg.lstsq(left.reshape(-1, 3), right.ravel())
+    return np.concatenate([place, turn.as_quat()])
+
+
+def _inverse(poses: np.ndarray) -> np.ndarray:
+    """The inverse of each pose [N, 7]."""
+    return np.array([invert(pose) for pose in poses])
 
 
 def _enough(finger: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -157,21 +183,21 @@ def _enough(finger: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def refine(
-    views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray], *, robust: bool = False
+    views: Views, camera: np.ndarray, cubes: Mapping[int, np.ndarray], *, robust: bool = False
 ) -> HandEye:
     """Least squares over the corners in the images.
 
     Args:
         views: Views that agree with each other, but where it is robust.
         camera: Where to begin [7].
-        markers: And for each finger's marker in its tip's frame [7].
+        cubes: And with the cube, in each finger's tip's frame [7].
         robust: Whether some views may be wrong; intervals mean nothing then.
 
     Raises:
         HandEyeError: The views do not determine the camera.
     """
     fingers = [int(f) for f in np.unique(views.finger)]
-    start = np.stack([camera, *(markers[f] for f in fingers)])
+    start = np.stack([camera, *(cubes[f] for f in fingers)])
     place = np.searchsorted(fingers, views.finger)
 
     def poses(x: np.ndarray) -> np.ndarray:
@@ -191,9 +217,9 @@ def refine(
     # Steps of the camera's place are in the base, turns about its own axes: as HandEye has them.
     return HandEye(
         camera=now[0],
-        markers={finger: now[1 + i] for i, finger in enumerate(fingers)},
+        cubes={finger: now[1 + i] for i, finger in enumerate(fingers)},
         inliers=np.arange(count),
-        residual_px=result.fun.reshape(count, 4, 2),
+        residual_px=result.fun.reshape(count, -1, 2),
         covariance=covariance[:6, :6],
         freedom=freedom,
     )
@@ -202,7 +228,7 @@ def refine(
 def _scatter(jacobian: np.ndarray, residual: np.ndarray, views: int) -> tuple[np.ndarray, int]:
     """Covariance of all parameters and its degrees of freedom, from the scatter between views.
 
-    The four corners of a view err together (joints, the marker's seat, light), so the views are
+    The corners of a view err together (joints, the cube's seat, light), so the views are
     what is
     independent: the sandwich of Bell and McCaffrey (2002) with residuals as if their view had been
     left out.
@@ -211,9 +237,7 @@ def _scatter(jacobian: np.ndarray, residual: np.ndarray, views: int) -> tuple[np
     normal = jacobian.T @ jacobian
     scale = np.sqrt(np.diag(normal))
     if not scale.all() or np.linalg.cond(normal / np.outer(scale, scale)) > 1e12:
-        raise HandEyeError(
-            "the views do not determine the camera; move more joints, over more of their range"
-        )
+        raise HandEyeError(UNDETERMINED)
     inverse = np.linalg.inv(normal)
     middle = np.zeros_like(normal)
     for view in range(views):
@@ -225,42 +249,29 @@ def _scatter(jacobian: np.ndarray, residual: np.ndarray, views: int) -> tuple[np
     return inverse @ middle @ inverse * (views - 1) / views, freedom
 
 
-def _turned(marker: np.ndarray, quarters: int) -> np.ndarray:
-    """A marker [7] that was stuck on with another side up."""
-    turn = Rotation.from_euler("z", 90 * quarters, degrees=True).as_quat()
-    return compose(marker, np.array([0.0, 0.0, 0.0, *turn]))
-
-
-def square(side_m: float) -> np.ndarray:
-    """Corners of a marker in its own frame (x right, y up, z out of the print) [m], shape [4, 3]."""
-    half = side_m / 2
-    return np.array(
-        [[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]]
-    )
-
-
-def marker_corners(pose: np.ndarray, lens: Intrinsics, side_m: float) -> np.ndarray:
-    """Where the corners of markers at poses in the camera [N, 7] are in the image [px], [N, 4, 2].
+def cube_corners(pose: np.ndarray, lens: Intrinsics, size_m: float) -> np.ndarray:
+    """Where the corners of cubes at poses in the camera [N, 7] are in the image [px], [N, 8, 2].
 
     NaN behind the camera.
     """
+    corners = 0.5 * size_m * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     turn = Rotation.from_quat(pose[:, 3:]).as_matrix()
-    points = np.einsum("nij,kj->nki", turn, square(side_m)) + pose[:, None, :3]
+    points = np.einsum("nij,kj->nki", turn, corners) + pose[:, None, :3]
     depth = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
     return points[..., :2] / depth[..., None] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
 
 
-def _differences(views: Views, camera: np.ndarray, marker: np.ndarray) -> np.ndarray:
-    """Where corners should be less where they are [px] [N, 4, 2].
+def _differences(views: Views, camera: np.ndarray, cube: np.ndarray) -> np.ndarray:
+    """Where corners should be less where they are [px] [N, 8, 2].
 
-    Markers are in the tips' frames [7].
+    Cubes are in the tips' frames, [7] or [N, 7].
     """
-    pose = compose(invert(camera), compose(views.tip, marker))
-    return np.nan_to_num(
-        marker_corners(pose, views.lens, views.side_m) - views.corners, nan=BEHIND_PX
-    )
+    pose = compose(invert(camera), compose(views.tip, cube))
+    there = cube_corners(pose, views.lens, views.size_m)
+    seen = cube_corners(views.cube, views.lens, views.size_m)
+    return np.nan_to_num(there - seen, nan=BEHIND_PX)
 
 
-def _off(views: Views, camera: np.ndarray, marker: np.ndarray) -> np.ndarray:
+def _off(views: Views, camera: np.ndarray, cube: np.ndarray) -> np.ndarray:
     """Mean distance of each view's corners from where they should be [px] [N]."""
-    return np.linalg.norm(_differences(views, camera, marker), axis=2).mean(axis=1)
+    return np.linalg.norm(_differences(views, camera, cube), axis=2).mean(axis=1)

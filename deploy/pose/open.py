@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.assets_usd.hand_data import HandModel, Intrinsics, compose
+from vd.assets_usd.hand_data import HandModel, compose
 from vd.command.config import from_dict
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.hardware.connect import Connection
@@ -20,8 +20,6 @@ from vd.deploy.pose.udp_poses import UdpPoses
 FORMS = "ros2:/TOPIC, udp:PORT, udp:ADDRESS:PORT, tags, tags:SIDE_M or, of a twin, sim"
 NO_MOTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 """The pose of a frame in itself."""
-TWIN_LENS = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
-"""Of a twin's images of tags: 56 degrees wide, as common cameras are."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ def source_frame(
     Raises:
         ValueError: It is no pose, or nobody says where the camera is.
     """
-    from vd.assets_usd.camera_layer import read_camera
+    from vd.assets_usd.camera_layer import read_camera_pose
 
     if place is not None:
         frame = np.asarray(place, dtype=float)
@@ -107,11 +105,12 @@ def source_frame(
         return frame
     if camera_layer is None and hand.mounted_camera is None:
         raise ValueError(
-            f"{hand.name} has no camera: --pose-frame X Y Z QX QY QZ QW says where the frame of the "
-            "poses is in the hand's base"
+            f"{hand.name} has no camera: --camera-layer (of vd-deploy calibrate) or --pose-frame X Y Z "
+            "QX QY QZ QW says where the frame of the poses is in the hand's base"
         )
-    camera = hand.camera if camera_layer is None else read_camera(hand, camera_layer)
-    return np.concatenate([camera.position, camera.quaternion])
+    if camera_layer is not None:
+        return read_camera_pose(hand, camera_layer)
+    return np.concatenate([hand.camera.position, hand.camera.quaternion])
 
 
 @contextlib.contextmanager
@@ -158,7 +157,7 @@ def open_poses(
                 node = stack.enter_context(running_node(ros_arguments))
             source = RosPoses(node, options.topic)
         elif twin is not None:
-            images = TagsOfTwin(twin, hand, in_base, TWIN_LENS, options.size_m, seed=seed)
+            images = TagsOfTwin(twin, hand, in_base, options.size_m, seed=seed)
             source = TagPoses(images, options.size_m).start()
         else:
             eye = RealSense(find_device(camera.serial), camera, infrared=True)

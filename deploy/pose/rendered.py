@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import Intrinsics
-from vd.deploy.camera.markers import opencv, picture_of
-from vd.deploy.pose.tags import CELLS, DICTIONARY, FACES, MARGIN_CELLS, face_corners
+from vd.deploy.camera.markers import opencv
+from vd.deploy.pose.tags import FACES, face_corners, face_picture
 
 FINE = 2
 """Pixels a side that are drawn for one, and averaged."""
@@ -34,7 +34,7 @@ def render_cube(
         Brightness, uint8 [H, W].
     """
     turn = Rotation.from_quat(pose[3:])
-    corners = turn.apply(face_corners(size_m, size_m).reshape(-1, 3)).reshape(-1, 4, 3) + pose[:3]
+    corners = turn.apply(face_corners(size_m).reshape(-1, 3)).reshape(-1, 4, 3) + pose[:3]
     image = np.full((lens.height, lens.width), BACKGROUND, dtype=np.uint8)
     if corners[..., 2].min() <= 0.0:
         return image  # behind the camera
@@ -75,7 +75,7 @@ def _faces(corners: np.ndarray, turn: Rotation, lens: Intrinsics) -> np.ndarray:
     for number, there in enumerate(corners):
         if turn.apply(FACES[number][0]) @ there[0] >= 0.0:
             continue  # its back
-        face = picture_of(number, DICTIONARY, CELLS, MARGIN_CELLS)
+        face = face_picture(number)
         side = face.shape[0]
         # Centres of pixels are at whole numbers in OpenCV.
         square = np.array([[0, 0], [side, 0], [side, side], [0, side]]) - 0.5

@@ -11,8 +11,7 @@ import numpy as np
 import tyro
 
 from vd.command.files import atomic_path, check_file
-from vd.deploy.camera.markers import marker_cells
-from vd.deploy.pose.tags import CELLS, DICTIONARY, FACES, MARGIN_CELLS, SIZE_M
+from vd.deploy.pose.tags import FACE_CELLS, FACES, SIZE_M, face_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,7 +29,7 @@ BAR_MM = 100.0
 
 @dataclass(frozen=True)
 class TagsCfg:
-    """Print a cube of tags (AprilTag 36h11, 0 to 5) for --pose tags."""
+    """Print a cube of tags (ArUco 4x4_50, four a face, 0 to 23) for --pose tags and calibrate."""
 
     out: Annotated[Path, tyro.conf.Positional]
     """File to write: .pdf, or .png, .svg."""
@@ -73,13 +72,13 @@ def make_sheet(size_m: float) -> "tuple[Figure, str]":
     wide, high = PAGE_MM[page]
     figure = Figure(figsize=(wide / MM_PER_INCH, high / MM_PER_INCH))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.0, wide), ylim=(0.0, high))
     axes.set_axis_off()
     for number in range(len(FACES)):
         column, row = number % COLUMNS, number // COLUMNS
         left = BORDER_MM + column * (size + GAP_MM)
         top = high - BORDER_MM - row * (size + GAP_MM)
         _draw_face(axes, number, left, top - size, size)
+    axes.set(xlim=(0.0, wide), ylim=(0.0, high))
     axes.plot([BORDER_MM, BORDER_MM + BAR_MM], [BORDER_MM + 4.0] * 2, color="black", linewidth=1.0)
     axes.text(BORDER_MM, BORDER_MM + 6.0, f"{BAR_MM:g} mm: print at 100 %", fontsize=8)
     return figure, page
@@ -91,17 +90,11 @@ def _draw_face(axes: "Axes", number: int, left: float, bottom: float, size: floa
 
     outline = Rectangle((left, bottom), size, size, fill=False, edgecolor="0.7", linewidth=0.3)
     axes.add_patch(outline)
-    cell = size / (CELLS + 2 * MARGIN_CELLS)
-    marked = marker_cells(number, DICTIONARY, CELLS)
-    # A black square below white cells: between black ones no white line shines through.
-    first = MARGIN_CELLS * cell
-    square = (left + first, bottom + first)
-    axes.add_patch(Rectangle(square, CELLS * cell, CELLS * cell, color="black", linewidth=0))
-    for row, column in np.argwhere(marked > 0):
-        corner = (left + first + column * cell, bottom + first + (CELLS - 1 - row) * cell)
-        axes.add_patch(Rectangle(corner, cell, cell, color="white", linewidth=0))
+    extent = (left, left + size, bottom, bottom + size)
+    axes.imshow(face_picture(number), cmap="gray", interpolation="none", extent=extent, zorder=-1)
+    cell = size / FACE_CELLS
     middle = (left + size / 2, bottom + size / 2)
-    away = size / 2 - 0.25 * cell
+    away = size / 2 - 0.5 * cell
     for neighbour, direction, turn in neighbours(number):
         x, y = np.array(middle) + away * np.array(direction)
         label = f"{neighbour}" if direction != (0, -1) else f"{neighbour} (this is {number})"

@@ -1,4 +1,4 @@
-"""A cube with an AprilTag on each face: where its tags are, and its pose from those in an image.
+"""A cube with ArUco tags on each face: where its tags are, and its pose from those in an image.
 
 The object's frame has its origin in the middle of the cube and its axes along the edges. Pixels are
 those of :class:`vd.assets_usd.hand_data.Intrinsics`.
@@ -12,17 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import Intrinsics
 from vd.deploy.camera.camera import ImageSource, StaleCamera
-from vd.deploy.camera.markers import find_markers, opencv
+from vd.deploy.camera.markers import CELLS, find_markers, marker_cells, opencv
 from vd.deploy.pose.source import StampedPose
 
-DICTIONARY = "DICT_APRILTAG_36h11"
-"""Not the one of the markers on fingertips, so that none is mistaken for another."""
-CELLS = 8
-"""Cells on a side of a tag, its black border included."""
-MARGIN_CELLS = 1
-"""White border that detection needs around the black one; the rest of a face is the tag."""
-TAG_SHARE = CELLS / (CELLS + 2 * MARGIN_CELLS)
-"""Side of a tag's black square over that of the cube."""
+TAGS = 2
+"""Tags on a side of a face: a finger before one leaves the others."""
+FACE_CELLS = TAGS * (CELLS + 1) + 1
+"""Cells on a side of a face: a white one, which detection needs, around each tag."""
 FACES = (
     ((1, 0, 0), (0, 0, 1)),
     ((0, 1, 0), (0, 0, 1)),
@@ -31,7 +27,9 @@ FACES = (
     ((0, 0, 1), (-1, 0, 0)),
     ((0, 0, -1), (1, 0, 0)),
 )
-"""Outward normal of the face of each tag, and the direction of the tag's upper edge."""
+"""Outward normal of each face, and the direction of its tags' upper edges."""
+CELL_PX = 32
+"""Side of a cell in the picture of a face."""
 SIZE_M = 0.07
 """Side of a cube that hands hold [m]: that of the built-in object ``cube``."""
 MOST_PX = 2.0
@@ -46,21 +44,55 @@ WAIT_S = 0.2
 """Longest wait for an image [s]."""
 
 
-def face_corners(side_m: float, cube_m: float) -> np.ndarray:
-    """Corners of a square in the middle of each face, in the cube's frame [m] [6, 4, 3].
+def face_corners(size_m: float) -> np.ndarray:
+    """Corners of each face in the cube's frame [m] [6, 4, 3].
 
     From the top left on clockwise, as seen from outside.
 
     Args:
-        side_m: Side of the squares.
-        cube_m: Side of the cube.
+        size_m: Side of the cube.
     """
+    return _on_faces(np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), size_m)
+
+
+def tag_corners(size_m: float) -> np.ndarray:
+    """Corners of each tag's black square in the cube's frame [m] [6 * TAGS * TAGS, 4, 3].
+
+    Each as :func:`face_corners`. Tags are numbered by faces, then rows, then columns.
+
+    Args:
+        size_m: Side of the cube.
+    """
+    square = CELLS * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    squares = np.array([square + corner for corner in _tag_places()]) / FACE_CELLS
+    return _on_faces(squares, size_m).reshape(-1, 4, 3)
+
+
+def face_picture(face: int) -> np.ndarray:
+    """A face as printed, brightness uint8 [S, S]."""
+    cells = np.full((FACE_CELLS, FACE_CELLS), 255, dtype=np.uint8)
+    for place, (left, top) in enumerate(_tag_places()):
+        number = face * TAGS**2 + place
+        cells[top : top + CELLS, left : left + CELLS] = marker_cells(number)
+    return np.kron(cells, np.ones((CELL_PX, CELL_PX), dtype=np.uint8))
+
+
+def _tag_places() -> list[tuple[int, int]]:
+    """Cells left of and above each tag of a face."""
+    steps = range(1, FACE_CELLS - 1, CELLS + 1)
+    return [(left, top) for top in steps for left in steps]
+
+
+def _on_faces(places: np.ndarray, size_m: float) -> np.ndarray:
+    """Places on a print, from its top left, right and down, as shares of its side [.., 2].
+
+    In the cube's frame [m], on each face [6, .., 3].
+    """
+    right_up = (places - 0.5) * [size_m, -size_m]
     faces = []
     for normal, up in np.asarray(FACES, dtype=float):
-        right = np.cross(up, normal)
-        middle = 0.5 * cube_m * normal
-        corners = [up - right, up + right, right - up, -up - right]
-        faces.append(middle + 0.5 * side_m * np.array(corners))
+        axes = np.stack([np.cross(up, normal), up])
+        faces.append(right_up @ axes + 0.5 * size_m * normal)
     return np.array(faces)
 
 
@@ -70,14 +102,14 @@ def find_tags(image: np.ndarray) -> dict[int, np.ndarray]:
     Args:
         image: Brightness, uint8 [H, W].
     """
-    roughly = find_markers(image, DICTIONARY)
+    roughly = find_markers(image)
     if not roughly:
         return {}
     corners = np.concatenate(list(roughly.values()))
     border = AROUND * np.ptp(corners, axis=0).max()
     left, top = np.maximum(corners.min(axis=0) - border, 0).astype(int)
     right, bottom = (corners.max(axis=0) + border).astype(int)
-    exactly = find_markers(image[top:bottom, left:right], DICTIONARY, by_edges=True)
+    exactly = find_markers(image[top:bottom, left:right], by_edges=True)
     return {number: found + np.array([left, top]) for number, found in exactly.items()}
 
 
@@ -89,7 +121,7 @@ def find_cube(
 ) -> tuple[np.ndarray | None, float]:
     """Pose of the cube in the camera's optical frame.
 
-    One least squares over the corners of all tags. A single tag far away looks alike from two
+    One least squares over the corners of all tags. A single face far away looks alike from two
     sides: then the pose is that nearer to where the cube was.
 
     Args:
@@ -101,18 +133,18 @@ def find_cube(
     Returns:
         The pose [7], None where there is none, and how well the corners fit [px].
     """
-    tags = sorted(number for number in corners if 0 <= number < len(FACES))
+    everywhere = tag_corners(size_m)
+    tags = sorted(number for number in corners if 0 <= number < len(everywhere))
     if not tags:
         return None, np.inf
     cv = opencv()
-    points = face_corners(TAG_SHARE * size_m, size_m)[tags].reshape(-1, 3)
+    points = everywhere[tags].reshape(-1, 3)
     pixels = np.concatenate([corners[number] for number in tags])
-    if len(tags) == 1:
-        guesses = _from_one(tags[0], pixels, lens, size_m)
-    else:
-        method = cv.SOLVEPNP_SQPNP
-        _, turns, places, _ = cv.solvePnPGeneric(points, pixels, lens.matrix, None, flags=method)
-        guesses = list(zip(turns, places, strict=True))
+    method = cv.SOLVEPNP_SQPNP
+    _, turns, places, _ = cv.solvePnPGeneric(points, pixels, lens.matrix, None, flags=method)
+    guesses = list(zip(turns, places, strict=True))
+    if before is not None:
+        guesses.append((Rotation.from_quat(before[3:]).as_rotvec()[:, None], before[:3, None]))
     fitting = []
     for guess in guesses:
         turn, place = cv.solvePnPRefineLM(points, pixels, lens.matrix, None, *guess)
@@ -127,32 +159,6 @@ def find_cube(
         alike = [fit for off_px, fit in fitting if off_px < best_px + ALIKE_PX]
         pose = min(alike, key=lambda fit: _angle(fit, before))
     return pose, best_px
-
-
-def _from_one(
-    number: int, pixels: np.ndarray, lens: Intrinsics, size_m: float
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Both poses of the cube that show one tag alike: rotation vectors [3, 1] and places [3, 1].
-
-    Args:
-        number: The tag.
-        pixels: Its corners [px] [4, 2].
-        lens: The lens.
-        size_m: Side of the cube [m].
-    """
-    cv = opencv()
-    normal, up = np.asarray(FACES[number], dtype=float)
-    face = np.stack([np.cross(up, normal), up, normal], axis=1)
-    flat = face_corners(TAG_SHARE * size_m, size_m)[number] @ face
-    flat[:, 2] = 0.0  # as the method has it
-    method = cv.SOLVEPNP_IPPE
-    _, turns, places, _ = cv.solvePnPGeneric(flat, pixels, lens.matrix, None, flags=method)
-    poses = []
-    for turn, place in zip(turns, places, strict=True):
-        of_cube = Rotation.from_rotvec(turn.ravel()) * Rotation.from_matrix(face.T)
-        middle = place.ravel() - of_cube.apply(0.5 * size_m * normal)
-        poses.append((of_cube.as_rotvec()[:, None], middle[:, None]))
-    return poses
 
 
 def _angle(pose: np.ndarray, other: np.ndarray) -> float:

@@ -11,13 +11,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert
+from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert, pose_at
 from vd.command.config import require
 from vd.deploy.camera.camera import Frame
+from vd.deploy.hardware.joints import JointMotors
 from vd.deploy.pose.rendered import render_cube
 from vd.deploy.pose.source import StampedPose
 from vd.deploy.twin.twin import Twin
 
+TWIN_LENS = Intrinsics(640, 360, 460.0, 460.0, 320.0, 180.0)
+"""Of a twin's images of tags: those of a D415 by the defaults of --camera."""
+BENT_S = 1.0
+"""Time in which a finger comes to rest [s]."""
+LOOK_S = 0.05
+"""How often it is asked meanwhile [s]."""
 IMAGES_HZ = 15.0
 """Images a second: drawing and reading them takes the time of other programs, too."""
 IMAGE_NOISE = 3.0
@@ -84,14 +91,14 @@ class TwinPoses:
 
 
 class TagsOfTwin:
-    """A camera's images of a cube of tags in a twin's hand.
+    """A camera's images of a cube of tags in a twin's hand, or on a fingertip of it.
 
     Args:
         twin: The twin.
         hand: Its hand.
         camera: Pose of the camera's optical frame in the hand's base [7].
-        intrinsics: The lens.
         size_m: Side of the cube [m].
+        tip: Finger that has the cube on its tip, in place of the object.
         seed: Of the noise of the images.
     """
 
@@ -100,18 +107,19 @@ class TagsOfTwin:
         twin: Twin,
         hand: HandModel,
         camera: np.ndarray,
-        intrinsics: Intrinsics,
         size_m: float,
         *,
+        tip: int | None = None,
         seed: int = 0,
     ):
-        self.intrinsics = intrinsics
+        self.intrinsics = TWIN_LENS
         self._twin = twin
         self._hand = hand
         self._camera = camera
         self._size_m = size_m
+        self._tip = tip
         self._noise = np.random.default_rng(seed).normal(
-            0.0, IMAGE_NOISE, (intrinsics.height, intrinsics.width)
+            0.0, IMAGE_NOISE, (TWIN_LENS.height, TWIN_LENS.width)
         )
         self._due_s = 0.0
 
@@ -120,8 +128,11 @@ class TagsOfTwin:
         time.sleep(max(0.0, self._due_s - time.monotonic()))
         self._due_s = time.monotonic() + 1.0 / IMAGES_HZ
         time_s, joint_q, object_pose = self._twin.poses()
-        in_base = compose(invert(self._hand.mount), object_pose)
         to_camera = invert(self._camera)
+        if self._tip is None:
+            in_base = compose(invert(self._hand.mount), object_pose)
+        else:
+            in_base = compose(self._hand.tip_poses(joint_q)[self._tip], self._seat())
         links = self._hand.forward_kinematics(joint_q)[self._hand.point_link]
         turns = Rotation.from_quat(links[:, 3:]).as_matrix()
         points = np.einsum("pij,pkj->pki", turns, self._hand.link_points) + links[:, None, :3]
@@ -130,6 +141,56 @@ class TagsOfTwin:
         image = render_cube(pose, self.intrinsics, self._size_m, before=points)
         noisy = np.clip(image + self._noise, 0, 255).astype(np.uint8)
         return Frame(noisy, time_s)
+
+    def close(self) -> None:
+        """The twin goes on."""
+
+    def _seat(self) -> np.ndarray:
+        """Pose of the cube in the frame of its fingertip [7]: towards the camera at the start."""
+        tip = self._hand.tip_poses(self._hand.start)[self._tip]
+        towards = Rotation.from_quat(tip[3:]).inv().apply(self._camera[:3] - tip[:3])
+        return pose_at(self._size_m * towards / np.linalg.norm(towards))
+
+
+class BentFinger:
+    """A camera's images of a cube of tags on a finger of a twin, which bends as if by hand.
+
+    It bends before every other image, by its motors: a twin has nobody who does.
+
+    Args:
+        twin: The twin.
+        joints: Its motors.
+        finger: The finger.
+        camera: Pose of the camera's optical frame in the hand's base [7].
+        size_m: Side of the cube [m].
+    """
+
+    def __init__(
+        self, twin: Twin, joints: JointMotors, finger: int, camera: np.ndarray, size_m: float
+    ):
+        self.intrinsics = TWIN_LENS
+        self._images = TagsOfTwin(twin, joints.hand, camera, size_m, tip=finger)
+        self._twin = twin
+        self._joints = joints
+        self._finger = joints.hand.fingers[finger]
+        self._rng = np.random.default_rng(finger)
+        self._rests = True
+        twin.torque(True)
+
+    def read(self, timeout_s: float) -> Frame:
+        """The next image: brightness, uint8 [H, W]."""
+        if self._rests:
+            hand = self._joints.hand
+            goals = hand.start.copy()
+            low, high = hand.lower[self._finger], hand.upper[self._finger]
+            goals[self._finger] = self._rng.uniform(low, high)
+            self._twin.write_goals(self._joints.to_motor(goals))
+            end_s = time.monotonic() + BENT_S
+            while time.monotonic() < end_s:
+                self._twin.read_state()  # it moves only as far as it is asked
+                time.sleep(LOOK_S)
+        self._rests = not self._rests
+        return self._images.read(timeout_s)
 
     def close(self) -> None:
         """The twin goes on."""

@@ -139,11 +139,12 @@ class Twin(FaultlessMotors):
             return np.concatenate([self.hand.joint_q[-7:], self.hand.joint_qd[-6:]])
 
     def poses(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """The present [s], the joints [rad] [D] and the object's pose [7] of that moment."""
+        """The present [s], joints [rad] [D] and the object's pose [7], or [0] without one."""
         with self._lock:
             now_s = self._catch_up()
             whole = self.hand.joint_q
-        return now_s, whole[:-7], whole[-7:]
+        joints = self._joints.hand.num_joints
+        return now_s, whole[:joints], whole[joints:]
 
     def place_object(self) -> None:
         """Put the object where an episode starts; it falls from there."""
