@@ -71,7 +71,7 @@ def test_losses_of_the_pendulum_are_load_friction_and_a_set(pendulum):
 
 
 def test_telemetry_speaks_against_sag_latency_and_backlash(pendulum):
-    reasons = {row.name: row.reason for row in pendulum.evidence if np.isnan(row.gain)}
+    (reasons,) = pendulum.not_tried.values()
     assert "voltage falls by" in reasons["supply_sag"]
     assert "duty cycle" in reasons["command_delay"] and "duty cycle" in reasons["backlash"]
 
@@ -113,10 +113,10 @@ def arm(shared_dir) -> Recording:
 
 def test_long_recordings_are_analysed_in_pieces_from_rest(arm):
     for chain in chains(arm):
-        trajectories, folds = design(arm, chain, 0)
+        trajectories, folds, _ = design(arm, chain, 0)
         parts = pieces(arm, chain, trajectories)
         column = int(chain.columns[0])
-        assert len(trajectories) >= 10 and len(set(folds)) == 6
+        assert len(trajectories) >= 9 and len(set(folds)) == 6
         chosen = [arm.trajectories[i] for i in trajectories]
         length = sum(
             t.time[end - 1] - t.time[first] for t, (first, end) in zip(chosen, parts, strict=True)
