@@ -25,7 +25,7 @@ Coulomb friction.
 """
 
 
-ENOUGH = 7
+ENOUGH = 10
 """Motions of a joint from which one is kept from every fit, to judge what is delivered. Not tuned."""
 
 

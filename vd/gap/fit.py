@@ -388,19 +388,22 @@ class _Descent:
             slopes: A Jacobian [P, N] to keep.
             widen: Factor on finite-difference steps.
         """
+        # In units of what is left, by which the first step may change the prediction at most.
+        left = max(float(np.linalg.norm(self.residuals(start, keep))), 1e-12)
 
         def residuals(moved: np.ndarray) -> np.ndarray:
-            return np.concatenate([self.residuals(start + moved, keep), self.pull * moved])
+            return np.concatenate([self.residuals(start + moved, keep), self.pull * moved]) / left
 
         def jacobian(moved: np.ndarray) -> np.ndarray:
             rows = self.jacobian(start + moved, keep, widen) if slopes is None else slopes
-            return np.vstack([-rows.T, self.pull * np.eye(len(start))])
+            return np.vstack([-rows.T, self.pull * np.eye(len(start))]) / left
 
         solution = least_squares(
             residuals,
             np.zeros(len(start)),
             jacobian,
             bounds=(self.lower - start, self.upper - start),
+            method="dogbox",
             x_scale="jac",
             ftol=TOLERANCE,
             gtol=None,

@@ -97,13 +97,11 @@ class Ladder:
         """Fit the models that differ from one in one family, those that promise most."""
         smaller, starts = [], []
         for effects in rules.changes(centre.effects, self.candidates):
-            if effects in self.models:
-                continue
             added = effects - {*centre.effects}
-            if added:
-                starts += [(effects, start) for start in self.sizes_of(added)]
-            else:
+            if not added:
                 smaller.append(effects)
+            elif effects not in self.models:
+                starts += [(effects, start) for start in self.sizes_of(added)]
         calls: dict[Effects, FitCall] = {}
         for effects in smaller:
             calls[effects] = self.call(effects, [within(centre.values, effects)])
@@ -162,6 +160,8 @@ class Ladder:
         if "velocity_limit" in self.nominal:
             # No slope leads to a speed limit that binds from one that does not.
             nominal["velocity_limit"] = self.scales.speed
+            if starts[0]["velocity_limit"] > self.scales.speed:
+                starts.append({**starts[0], "velocity_limit": self.scales.speed})
         nothing = {**values, **absent_values(effects - {*centre.effects})}
         return [*starts, nominal, nothing]
 
@@ -176,9 +176,12 @@ class Ladder:
         )
 
     def fit(self, calls: Mapping[Effects, FitCall]) -> None:
-        """Fit models, and note them."""
+        """Fit models, and note them; what was fitted before keeps its better minimum."""
         fits = self.run(list(calls.values()))
-        self.models.update(zip(calls, fits, strict=True))
+        for effects, fit in zip(calls, fits, strict=True):
+            known = self.models.get(effects)
+            if known is None or fit.rmse < known.rmse:
+                self.models[effects] = fit
 
     def combine(self, best: JointFit) -> None:
         """Fit a model with other members of two of its families, of the members that do best alone."""

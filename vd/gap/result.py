@@ -31,8 +31,8 @@ _OPTIONAL = ("hand", "hand_layer", "closing", "delivered")
 Verdict = Literal["effects", "ambiguous", "unknown", "under_excited", "no_gap"]
 """That of a recording is the first of these that some joint has."""
 Certainty = Literal["certain", "likely", "untold", "excluded"]
-"""What is known of a family of causes: all good models have it; those that have it are the best in
-more than half of the resamples of motions; in less; none has it."""
+"""What is known of a family of causes: all good models have it; those that have it predict more than
+half of the motions best; fewer; none has it."""
 Interval = tuple[float, float]
 
 
@@ -63,7 +63,7 @@ class NamedEffect:
     """Name in :data:`vd.kernels.servo.effects.EFFECTS`."""
     joints: tuple[str, ...]
     confidence: float
-    """Share of the resamples of motions in which a model with it is the best."""
+    """Share of the motions that a good model with it predicts best."""
     parameters: dict[str, Estimate]
     alternatives: tuple[Alternative, ...] = ()
 
@@ -140,7 +140,7 @@ class FamilyVerdict:
     effects: tuple[str, ...]
     """Members of the family that good models have."""
     share: float
-    """Share of the resamples of motions in which a model with one of them is the best."""
+    """Share of the motions that a good model with one of them predicts best."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class WholeModel:
     difference_ci95: Interval
     """Of its held-out error minus the best model's, over motions [rad]."""
     share: float
-    """Share of the resamples of motions in which it is the best of the good ones; 0 for others."""
+    """Share of the motions that it predicts best of the good ones; 0 for others."""
     why: str
     """What speaks against it; empty for a good model."""
 

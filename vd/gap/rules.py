@@ -7,11 +7,12 @@ simulate nothing.
 
 1. Which effects are tried: those that the joint can have and telemetry does not contradict.
 2. Whether there is a gap: not where the plain model leaves no more than noise.
-3. The best model: least error, with a price for each effect and parameter, of the models that earn
-   what they have more than each smaller one that they contain.
-4. Which models are good: those that are not worse than the best by the interval of paired
+3. The best model: least error of the models that earn what they have more than each smaller one
+   that they contain, by one standard error over motions.
+4. Which models are good: those that are not worse than the best by the 95 % interval of paired
    differences over motions, or by samples where the best leaves no more than noise.
 5. What is named: what all good models share, if fitted and held-out errors both fall by enough.
+   So an effect is named only if without it every model is worse by that interval.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,7 +25,7 @@ import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain
 from vd.gap.fit import JointFit, intervals
 from vd.gap.result import Certainty, Verdict
-from vd.gap.statistics import OWN_ERROR, REPEATABLE, interval, rmse
+from vd.gap.statistics import OWN_ERROR, REPEATABLE, half_width, rmse
 from vd.gap.telemetry import Telemetry
 from vd.gap.words import listing, model_text, percent
 from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
@@ -124,9 +125,11 @@ none less."""
 PENALTY = 0.01
 """Relative error that a further effect, and each of its parameters, must earn. Half and twice turn
 none of 166."""
-EXCESS_FLOORS = 0.07
-"""What a model must leave more than one with white residuals, in noise floors, to be worse:
-thousands of samples carry that difference. Half and twice turn none of 164."""
+EXCESS = 0.005
+"""What a model must leave more than one with white residuals, in squared noise floors, to be worse:
+thousands of samples carry that difference. A quarter and four times turn none of 164."""
+FEW = 5
+"""Folds below which each motion stands for itself in intervals. Not tuned."""
 RECOVERED = 0.5
 """Share of the squared gap that a model must recover to be an explanation. Half turns none of 12,
 half more one."""
@@ -138,13 +141,21 @@ class Evidence:
 
     Attributes:
         noise: Noise floor of the recording [rad].
-        weights: Weights of the trajectories in resamples of them [R, S].
+        folds: Fold of each trajectory [S].
         whole: Fitted RMSE of the plain model [rad].
     """
 
     noise: float
-    weights: np.ndarray
+    folds: Sequence[int]
     whole: float
+
+    @property
+    def without(self) -> np.ndarray:
+        """The trajectories without each block of those that are held out together [B, S]."""
+        blocks = np.array(self.folds)
+        if len(np.unique(blocks)) < FEW:
+            blocks = np.arange(len(blocks))
+        return (np.unique(blocks)[:, None] != blocks).astype(float)
 
     @property
     def floor(self) -> float:
@@ -274,25 +285,21 @@ def too_few(fit: JointFit) -> str:
 # 3. The best model.
 
 
-def scores(
-    evidence: Evidence, fits: Sequence[JointFit], weights: np.ndarray | None = None
-) -> np.ndarray:
-    """Log of the error of C models plus the price of what they have, [C] or [C, R].
+def scores(evidence: Evidence, fits: Sequence[JointFit]) -> np.ndarray:
+    """Log of the error of C models plus the price of what they have [C]."""
+    error = np.log(np.maximum(rmse(errors(evidence, fits), fits[0].count), 1e-12))
+    sizes = [len(fit.effects) + len(fit.x) - len(fits[0].x) for fit in fits]
+    return error + PENALTY * np.array(sizes, float)
 
-    The error is that on held-out motions. Once a model leaves white residuals, all samples tell
-    more than the luck of a held-out motion.
 
-    Args:
-        evidence: What models are judged by.
-        fits: The models.
-        weights: Weights of the trajectories in resamples [R, S].
+def errors(evidence: Evidence, fits: Sequence[JointFit]) -> np.ndarray:
+    """Sums of squared errors by which C models are compared [C, S].
+
+    Those on held-out motions. Once a model leaves white residuals, all samples tell more than the
+    luck of a held-out motion.
     """
     by_samples = any(white(evidence, fit) for fit in fits)
-    errors = np.stack([fit.sse if by_samples else fit.held_out for fit in fits])
-    error = np.log(np.maximum(rmse(errors, fits[0].count, weights), 1e-12))
-    sizes = [len(fit.effects) + len(fit.x) - len(fits[0].x) for fit in fits]
-    price = PENALTY * np.array(sizes, float)
-    return error + (price if weights is None else price[:, None])
+    return np.stack([fit.sse if by_samples else fit.held_out for fit in fits])
 
 
 def at_bound(fit: JointFit) -> str:
@@ -362,7 +369,7 @@ def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
     """Why what a model has more than a smaller one is not earned; empty if it is.
 
     Fitted and held-out errors must both fall: a motion held out can make the smaller one
-    extrapolate, which no effect has to explain.
+    extrapolate, which no effect has to explain. They fall by more than one standard error.
     """
     fitted = 1.0 - larger.rmse / smaller.rmse
     held_out = 1.0 - larger.held_out_rmse / smaller.held_out_rmse
@@ -371,7 +378,7 @@ def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
         certain = held_out > 0.0
     else:
         gain, before = min(fitted, held_out), smaller.held_out_rmse
-        certain = difference(evidence, larger, smaller)[0] > 0.0
+        certain = np.greater(*paired(evidence, larger, smaller))
     if gain < MIN_GAIN:
         return f"removes {percent(gain)} of the error, less than {percent(MIN_GAIN)}"
     if before * np.sqrt(1.0 - (1.0 - gain) ** 2) < np.sqrt(NO_GAP**2 - 1.0) * evidence.floor:
@@ -393,36 +400,45 @@ def earned(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
 # 4. Which models are good.
 
 
+def paired(evidence: Evidence, best: JointFit, other: JointFit) -> tuple[float, float]:
+    """What a model's held-out RMSE is above another's, and its standard error [rad].
+
+    The jackknife over blocks of motions.
+    """
+    without = evidence.without
+    parts = rmse(other.held_out, best.count, without) - rmse(best.held_out, best.count, without)
+    error = np.sqrt((len(parts) - 1) * parts.var())
+    return other.held_out_rmse - best.held_out_rmse, float(error)
+
+
 def difference(evidence: Evidence, best: JointFit, other: JointFit) -> tuple[float, float]:
     """95 % interval of what a model's held-out RMSE is above another's, over motions [rad]."""
-    least = rmse(best.held_out, best.count, evidence.weights)
-    error = rmse(other.held_out, other.count, evidence.weights)
-    return interval(error - least)
+    value, error = paired(evidence, best, other)
+    width = float(half_width(np.square(error), len(evidence.without)))
+    return value - width, value + width
 
 
 def not_worse(evidence: Evidence, best: JointFit, other: JointFit) -> bool:
     """Whether the recording does not tell a model from the best one.
 
     If that leaves white residuals, samples count: what the other leaves in excess is then decisive,
-    even if few motions show it.
+    even if few motions show it, but not if the best itself leaves as much more than noise.
     """
     if not white(evidence, best):
         return difference(evidence, best, other)[0] <= 0.0
-    excess = (other.rmse**2 - best.rmse**2) / evidence.floor**2
+    own = (best.rmse / evidence.floor) ** 2
+    excess = (other.rmse / evidence.floor) ** 2 - own
     if excess > 0.0:  # what needs more parameters to do worse is no equal
-        more = max(len(other.x) - len(best.x), 0)
-        excess += 2.0 * PENALTY * more * (best.rmse / evidence.floor) ** 2
-    return bool(excess < EXCESS_FLOORS**2)
+        excess += 2.0 * PENALTY * max(len(other.x) - len(best.x), 0) * own
+    return bool(excess < max(EXCESS, own - 1.0))
 
 
 def good_models(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
-    """The models that are not worse than the best, the best first, none that contains another of them."""
+    """The models that are not worse than the best, the best first."""
     candidates = earned(evidence, fits)
-    best = best_of(evidence, candidates)
-    equals = [fit for fit in candidates if fit is best or not_worse(evidence, best, fit)]
-    minimal = [fit for fit in equals if not any(contains(fit, other) for other in equals)]
-    order = np.argsort(scores(evidence, minimal))
-    return [minimal[index] for index in order]
+    order = np.argsort(scores(evidence, candidates))
+    best, *others = [candidates[index] for index in order]
+    return [best, *(fit for fit in others if not_worse(evidence, best, fit))]
 
 
 def against(
@@ -438,17 +454,15 @@ def against(
     """
     if problem := flaw(evidence, fit):
         return problem
-    if not not_worse(evidence, good[0], fit):
-        return f"worse than {model_text(good[0].effects)}"
     for smaller in fits:
         if contains(fit, smaller) and (why := not_earned(evidence, smaller, fit)):
             return f"beside {model_text(smaller.effects)} {why}"
-    return "contains a smaller model that is as good"
+    return f"worse than {model_text(good[0].effects)}"
 
 
 def shares(evidence: Evidence, good: Sequence[JointFit]) -> np.ndarray:
-    """Share of the resamples of motions in which each good model is the best of them."""
-    winners = np.argmin(scores(evidence, good, evidence.weights), axis=0)
+    """Share of the motions that each good model predicts best of them."""
+    winners = np.argmin(errors(evidence, good), axis=0)
     return np.bincount(winners, minlength=len(good)) / len(winners)
 
 
@@ -465,7 +479,7 @@ class Conclusion:
         final: The model that is delivered: the best of the good ones, the plain one where nothing
             is explained.
         good: The good models, the best first.
-        shares: Share of the resamples of motions in which each is the best of them.
+        shares: Share of the motions that each of them predicts best.
         names: Effects that all good models share, where that is an answer.
         families: What is known of each family of which some effect was tried.
     """
@@ -556,7 +570,7 @@ def families_of(
 ) -> dict[str, Certainty]:
     """What good models say of each family: certain if all have it, excluded if none.
 
-    Likely if those that have it are the best in more than half of the resamples, untold if not.
+    Likely if those that have it predict more than half of the motions best, untold if not.
     """
     tried = {name for fit in fits for name in fit.effects}
     result: dict[str, Certainty] = {}

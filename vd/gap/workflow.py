@@ -26,7 +26,7 @@ from vd.gap.fit import JointFit, JointProblem, JointSpec, Problems
 from vd.gap.ladder import FitCall, Ladder
 from vd.gap.result import Misfit, Report
 from vd.gap.rollout import STEP_S
-from vd.gap.statistics import noise_floor, resamples
+from vd.gap.statistics import noise_floor
 from vd.gap.telemetry import telemetry_of
 from vd.gap.worker_pool import WorkerPool
 from vd.kernels.servo.effects import EFFECTS, TOGETHER
@@ -198,9 +198,7 @@ class _JointAnalysis:
         values = baseline_values(rows[spec.joint], spec.baseline)
         base[spec.joint] = chain.start_row[spec.joint]
         plain, scales = self.plain(base, values)
-        rng = np.random.default_rng([self.options.seed, spec.chain, spec.joint])
-        weights = resamples(len(spec.trajectories), rng)
-        evidence = rules.Evidence(spec.floor, weights, plain.rmse)
+        evidence = rules.Evidence(spec.floor, spec.folds, plain.rmse)
         loose = rules.undetermined(evidence, plain)
         allowed, vetoes, means = self.candidates()
         ladder = Ladder(
@@ -215,6 +213,7 @@ class _JointAnalysis:
         )
         if not rules.too_few(plain) and not rules.white(evidence, plain):
             ladder.climb()
+        plain = ladder.models[frozenset()]
         fits = list(ladder.models.values())
         conclusion = rules.conclude(evidence, plain, fits, loose)
         if conclusion.final.effects:
