@@ -319,11 +319,14 @@ def flaw(evidence: Evidence, fit: JointFit) -> str:
     """Why a model explains nothing whatever its error; empty if there is no reason."""
     if bound := at_bound(fit):
         return bound
+    names = idle(evidence, fit)
+    return f"{listing(names)} can be nothing at all" if names else ""
+
+
+def idle(evidence: Evidence, fit: JointFit) -> list[str]:
+    """Effects of a model whose size can be nothing."""
     spread = intervals(fit, evidence.floor)
-    for name in fit.effects:
-        if not shown(name, fit.values, spread):
-            return f"{name} can be nothing at all"
-    return ""
+    return [name for name in fit.effects if not shown(name, fit.values, spread)]
 
 
 def shown(
