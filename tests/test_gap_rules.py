@@ -15,6 +15,7 @@ from vd.gap.rules import (
     changes,
     conclude,
     contradicted,
+    difference,
     good_models,
     late_side,
     not_earned,
@@ -22,7 +23,6 @@ from vd.gap.rules import (
     overall,
     shown,
 )
-from vd.gap.statistics import resamples
 from vd.gap.telemetry import Telemetry
 from vd.kernels.servo.effects import EFFECTS
 
@@ -32,7 +32,7 @@ NOISE = np.random.default_rng(1).normal(0.0, 1e-3, 10)
 
 @pytest.fixture
 def evidence() -> Evidence:
-    return Evidence(FLOOR, resamples(10, np.random.default_rng(0)), whole=0.0)
+    return Evidence(FLOOR, range(10), whole=0.0)
 
 
 def test_an_addition_earns_its_place_in_fitted_and_held_out_errors(evidence: Evidence) -> None:
@@ -76,6 +76,29 @@ def test_names_are_what_all_good_models_share(evidence: Evidence) -> None:
     assert conclusion.shares.sum() == pytest.approx(1.0) and len(conclusion.shares) == 2
 
 
+def test_what_few_motions_show_is_delivered_and_not_named(evidence: Evidence) -> None:
+    """Two motions of ten gain: more than one standard error, within the 95 % interval."""
+    uneven = np.full(10, 0.004)
+    uneven[:2] = 0.012
+    alone = made_up(("load_friction",), uneven)
+    both = made_up(("load_friction", "torque_saturation"), 0.004)
+    conclusion = conclude(evidence, PLAIN, [PLAIN, alone, both], "")
+    assert conclusion.final is both and conclusion.names == ("load_friction",)
+    assert conclusion.families["torque ceiling"] == "likely"
+    assert open_sets(conclusion.good) == [("torque_saturation",)]
+
+
+def test_intervals_are_wider_over_fewer_blocks_of_motions(evidence: Evidence) -> None:
+    best, other = made_up(("backlash",), 0.004), made_up(("dead_zone",), 0.006 + NOISE)
+    width = np.ptp(difference(evidence, best, other))
+    paired = replace(evidence, folds=[0, 0, 1, 1, 2, 2, 3, 3, 4, 4])
+    few = replace(evidence, folds=[0] * 5 + [1] * 5)
+    assert len(paired.without) == 5 and len(few.without) == 10
+    alike = made_up(("dead_zone",), np.repeat((0.006 + NOISE)[:5], 2))
+    assert np.ptp(difference(paired, best, alike)) > 1.2 * np.ptp(difference(few, best, alike))
+    assert np.ptp(difference(few, best, other)) == pytest.approx(width)
+
+
 def test_a_family_is_certain_before_its_member_is(evidence: Evidence) -> None:
     coulomb = made_up(("coulomb_friction",), 0.004)
     load = made_up(("load_friction",), 0.004 + NOISE - NOISE.mean())
@@ -103,6 +126,12 @@ def test_samples_tell_models_apart_once_one_leaves_noise(evidence: Evidence) -> 
     best = made_up(("torque_limit",), 0.003, fitted=1.0e-3)
     other = made_up(("torque_saturation",), errors)
     assert good_models(evidence, [PLAIN, best, other]) == [best]
+
+
+def test_samples_do_not_tell_less_than_the_best_itself_leaves(evidence: Evidence) -> None:
+    best = made_up(("torque_limit",), 1.10e-3)
+    close, far = made_up(("torque_saturation",), 1.15e-3), made_up(("supply_sag",), 1.25e-3)
+    assert good_models(evidence, [PLAIN, best, close, far]) == [best, close]
 
 
 def test_a_bound_and_what_can_be_nothing_explain_nothing(evidence: Evidence) -> None:

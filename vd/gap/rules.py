@@ -529,6 +529,8 @@ def conclude(
         reason = f"all models that are not worse than the best have {listing(names)}"
     elif certain:
         reason = f"it is {listing(certain)}, of which kind these motions do not tell"
+    elif plain in good:
+        reason = "over so few motions the best model is not told from the plain servo"
     else:
         reason = "models with nothing in common are not worse than the best"
     verdict = "effects" if names else "ambiguous"

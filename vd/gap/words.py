@@ -197,7 +197,7 @@ def _besides(report: Report) -> str:
                 f" {plain(name).capitalize()} stands for {causes(others, 'and')} too: commands and "
                 "positions are the same, whichever it is."
             )
-    return f"{text} More is missing. {_leaves(report)}" if report.open_sets else text
+    return f"{text} More may be missing. {_leaves(report)}" if report.open_sets else text
 
 
 def _leaves(report: Report) -> str:
