@@ -77,9 +77,9 @@ def test_ctrl_c_ends_an_analysis_at_once(after_s: float, tmp_path: Path) -> None
     assert run.stderr is not None and "starting" in run.stderr.readline()
     time.sleep(after_s)
     os.kill(run.pid, signal.SIGINT)
-    began = time.monotonic()
-    assert run.wait(timeout=20.0) == 130
-    assert time.monotonic() - began < 4.0  # twice the goal: other tests run beside
+    # The goal is 2 s of idle processors; what runs beside makes it longer.
+    waiting = os.getloadavg()[0] / len(os.sched_getaffinity(0))
+    assert run.wait(timeout=2.0 * max(1.0, waiting)) == 130
 
 
 def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
