@@ -283,7 +283,7 @@ def _alternatives(name: str, joint: AnalysedJoint) -> tuple[Alternative, ...]:
         others = {*fit.effects} - rest
         if rest <= {*fit.effects} and len(others) == 1 and name not in others:
             difference = rules.difference(joint.evidence, best, fit)
-            rows.append(Alternative(*others, fit.held_out_rmse, difference))
+            rows.append(Alternative(others.pop(), fit.held_out_rmse, difference))
     return tuple(rows)
 
 

@@ -8,7 +8,7 @@ or pendulum has no articulation: there the layer is read back into the joint's o
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -150,7 +150,7 @@ def simulate_again(
         fitted[joint] = _squares(curves, joint, files)
     before, after = _rms([*fitted.values()])
     per_joint = {joint: _rms([squares]) for joint, squares in fitted.items()}
-    simulator = "rollout" if hand_name is None else "newton"
+    simulator: Literal["newton", "rollout"] = "rollout" if hand_name is None else "newton"
     closing = Closing(simulator, layer.name, before, after, per_joint)
     delivered = None
     if report.aside:

@@ -87,7 +87,7 @@ class WorkerPool:
                 done((index + 1) / len(calls))
             return results
         waiting = deque(range(len(calls)))
-        idle = list(self._connections)
+        idle: list[Any] = [*self._connections]
         running: dict[Any, int] = {}
         finished = 0
         while waiting or running:
@@ -95,9 +95,9 @@ class WorkerPool:
                 connection = idle.pop()
                 running[connection] = waiting.popleft()
                 self._send(connection, (spec, calls[running[connection]]))
-            for connection in wait(list(running)):
-                results[running.pop(connection)] = self._answer(connection)
-                idle.append(connection)
+            for ready in wait(list(running)):
+                results[running.pop(ready)] = self._answer(ready)
+                idle.append(ready)
                 finished += 1
                 done(finished / len(calls))
         return results
