@@ -118,21 +118,21 @@ CLEARER = 4.0
 leaves 0.5 % on either side. Not tuned."""
 NO_GAP = 1.15
 """A model within this factor of the noise floor leaves white residuals, and nothing to explain.
-With half of what it leaves above 1 none of 40 is decided otherwise, with twice two are."""
+Half of what it leaves above 1 turns none of 41 joints, twice turns five."""
 MIN_GAIN = 0.05
-"""Share of the error that an addition to a model must remove. Half passes two more of 46, twice
-none less."""
+"""Share of the error that an addition to a model must remove. Half turns none of 41 joints, twice
+turns one."""
 PENALTY = 0.01
 """Relative error that a further effect, and each of its parameters, must earn. Half and twice turn
-none of 166."""
+none of 41 joints."""
 EXCESS = 0.005
 """What a model must leave more than one with white residuals, in squared noise floors, to be worse:
-thousands of samples carry that difference. A quarter and four times turn none of 164."""
+thousands of samples carry that difference. Half and twice turn none of 41 joints."""
 FEW = 5
 """Folds below which each motion stands for itself in intervals. Not tuned."""
 RECOVERED = 0.5
-"""Share of the squared gap that a model must recover to be an explanation. Half turns none of 12,
-half more one."""
+"""Share of the squared gap that a model must recover to be an explanation. Half turns none of 41
+joints, half more one."""
 
 
 @dataclass(frozen=True)
