@@ -9,8 +9,7 @@ import vd.kernels.servo.actuators as servo
 from vd.gap.chain import chains
 from vd.gap.coordinates import Coordinate
 from vd.gap.design import design
-from vd.gap.fit import JointProblem
-from vd.gap.models import JointFit
+from vd.gap.fit import JointFit, JointProblem
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import noise_floor
 from vd.gap.workflow import baseline_of
@@ -76,7 +75,7 @@ def true_row(start: np.ndarray, extra: dict[int, float]) -> np.ndarray:
 def problem_of(recording: Recording) -> JointProblem:
     """What is to be fitted on the only joint of a recording."""
     (chain,) = chains(recording)
-    trajectories, folds = design(recording, chain, 0)
+    trajectories, folds, _ = design(recording, chain, 0)
     floor = noise_floor(recording, 0)
     return JointProblem(
         Rollouts(chain, recording), 0, trajectories, folds, floor, baseline_of(chain)
@@ -96,8 +95,11 @@ def made_up(
         x=np.array([float("." in key) for key in keys]),
         rows=np.zeros((1, servo.PARAMETER_COLUMNS)),
         sse=held_out if fitted is None else COUNT * fitted**2,
+        absolute=held_out,
         held_out=held_out,
+        held_out_abs=held_out,
         count=COUNT,
         gram=10.0 * np.eye(size),
         refits=np.zeros((2, size)),
+        step_error=np.zeros(size),
     )

@@ -8,8 +8,10 @@ from vd.gap.bench.hide import Hiding, hide
 from vd.gap.chain import chains
 from vd.gap.result import (
     AnalysedRecording,
-    Candidate,
+    Credit,
+    Delivered,
     Estimate,
+    FamilyVerdict,
     Fit,
     HeldOut,
     JointGap,
@@ -17,6 +19,7 @@ from vd.gap.result import (
     Predictions,
     Report,
     TrajectoryError,
+    WholeModel,
 )
 from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators
@@ -67,14 +70,23 @@ def servo_report(folder, *, verdict="effects", ambiguous=(), friction=FRICTION):
     friction = NamedEffect(
         "coulomb_friction", (JOINT,), 0.98, {"tau_c_nm": Estimate(FRICTION, (0.14, 0.16), "N m")}
     )
-    decision = "named" if verdict == "effects" else "tied"
-    names = {"coulomb_friction": {"tau_c_nm": FRICTION}, "backlash": {"width_rad": 0.08}}
+    named = verdict == "effects"
+    models = (
+        model(("coulomb_friction",), {"coulomb_friction.tau_c_nm": FRICTION}, after),
+        model(("backlash",), {"backlash.width_rad": 0.08}, after, "worse" if named else ""),
+        model((), {}, before, "worse than coulomb_friction"),
+    )
+    certainty = {True: "certain", False: "untold"}[named]
+    families = [FamilyVerdict(JOINT, "dry friction", certainty, ("coulomb_friction",), 0.6)]
+    if not named:
+        families.append(FamilyVerdict(JOINT, "play", certainty, ("backlash",), 0.4))
     report = Report(
         verdict=verdict,
         noise_floor_rad=FLOOR,
         baseline=Fit(before, {JOINT: before}, before, {JOINT: BASE}),
         findings=(),
-        effects=(friction,) if verdict == "effects" else (),
+        effects=(friction,) if named else (),
+        provisional=() if named else (friction,),
         ambiguous=ambiguous,
         identified=Fit(after, {JOINT: after}, after, {JOINT: BASE}),
         held_out=HeldOut(curves.files, before, after, 1.0 - after / before, (0.5, 0.9)),
@@ -85,15 +97,35 @@ def servo_report(folder, *, verdict="effects", ambiguous=(), friction=FRICTION):
         ),
         joints=(
             JointGap(
-                JOINT, FLOOR, before, (0.0, 1.0), after, (0.0, 1.0), verdict, "made up", ambiguous
+                joint=JOINT,
+                noise_floor_rad=FLOOR,
+                baseline_rmse_rad=before,
+                baseline_ci95=(0.0, 1.0),
+                identified_rmse_rad=after,
+                identified_ci95=(0.0, 1.0),
+                verdict=verdict,
+                reason="made up",
+                open_sets=ambiguous,
+                baseline_fitted_rmse_rad=before,
+                identified_fitted_rmse_rad=after,
             ),
         ),
-        evidence=tuple(
-            Candidate((JOINT,), 1, name, after, 0.8, (0.7, 0.9), decision, "made up", values)
-            for name, values in names.items()
-        ),
+        families=tuple(families),
+        models=tuple(each for each in models if not each.why),
+        compared=models,
+        credits=(Credit(JOINT, "coulomb_friction", before, before),),
+        not_tried={JOINT: {"supply_sag": "the recorded voltage falls too little"}},
+        aside={JOINT: curves.files[-1]},
+        delivered=Delivered(curves.files[-1], after, before),
         trajectories=tuple(
-            TrajectoryError(file, file, JOINT, before, after) for file in curves.files
+            TrajectoryError(file, file, JOINT, before, after) for file in curves.files[:-1]
         ),
     )
     return report, curves
+
+
+def model(
+    effects: tuple[str, ...], values: dict[str, float], error: float, why: str = ""
+) -> WholeModel:
+    """A whole model with the same error fitted and held out."""
+    return WholeModel(JOINT, effects, values, error, error, (0.0, 0.001), 0.5, why)

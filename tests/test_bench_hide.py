@@ -16,7 +16,6 @@ from vd.gap.bench.hide import (
     truth_path,
 )
 from vd.gap.chain import chains
-from vd.gap.fit import JointSpec
 from vd.gap.rules import contradicted, late_side
 from vd.gap.telemetry import telemetry_of
 from vd.kernels.servo.effects import EFFECTS
@@ -51,9 +50,8 @@ def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path)
     recording = read_recording(tmp_path / "r")
     (chain,) = chains(recording)
     everything = tuple(range(len(recording.trajectories)))
-    spec = JointSpec(0, 0, everything, everything, 1e-3, ("kd",))
     other = {"command_delay": "read_delay", "read_delay": "command_delay"}[late]
-    telemetry = telemetry_of(recording, chain, spec)
+    telemetry = telemetry_of(recording, chain, 0, everything)
     assert late_side(telemetry) == late
     refused = set(contradicted(telemetry))
     assert {
@@ -65,7 +63,7 @@ def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path)
     silent = replace(
         recording, trajectories=tuple(replace(t, pwm=None) for t in recording.trajectories)
     )
-    assert late_side(telemetry_of(silent, chain, spec)) == ""
+    assert late_side(telemetry_of(silent, chain, 0, everything)) == ""
 
 
 def test_seeds_repeat_and_differ_alone_and_in_batches():

@@ -107,7 +107,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     (found,) = analysis.explained().effects
     assert found.name == "command_delay" and found.joints == ("f1_j4",)
     assert found.parameters["delay_s"].value == pytest.approx(DELAY_S, abs=0.001)
-    closed = json.loads((tmp_path / "gap" / "close.json").read_text())
+    closed = json.loads((tmp_path / "gap" / "close.json").read_text())["closing"]
     assert closed["identified_rmse_rad"] < 0.1 * closed["baseline_rmse_rad"]
     again = load_hand(str(hand.path), layer=tmp_path / "gap" / "identified.usda")
     assert again.servo[5, COMMAND_DELAY] == pytest.approx(DELAY_S, abs=0.001)

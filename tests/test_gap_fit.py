@@ -13,8 +13,7 @@ import vd.kernels.servo.actuators as servo
 from vd.gap.chain import chains
 from vd.gap.design import design
 from vd.gap.find import findings
-from vd.gap.fit import JointProblem
-from vd.gap.models import JointFit, intervals
+from vd.gap.fit import JointFit, JointProblem, intervals
 from vd.gap.rollout import Rollouts
 from vd.gap.rules import candidates
 from vd.gap.statistics import noise_floor
@@ -66,11 +65,10 @@ def test_effect_is_recovered_with_the_baseline(effect: str, column: int, value: 
 def test_a_refined_fit_depends_less_on_the_step() -> None:
     """Values at a coarse step come near those at a fine one, and say how near."""
     problem = problem_of(recorded({servo.COULOMB_TORQUE: 0.1}))
-    scales = problem.scales(problem.rollouts.chain.start_row[0], 1e-2)
     coarse_dt = 1 / 60
-    problem.rollouts = problem.rollouts.at(coarse_dt)
+    problem.rollouts = problem.slopes = problem.rollouts.at(coarse_dt)
     coarse = fitted(problem, "coulomb_friction", coulomb_friction__tau_c_nm=0.1)
-    refined = problem.refine(coarse, scales)
+    refined = problem.refine(coarse)
     assert problem.rollouts.dt == coarse_dt, "the problem's own step is back"
     off = [abs(fit.values["inertia"] / 2.5e-3 - 1.0) for fit in (coarse, refined)]
     assert off[0] > 0.05 and off[1] < 0.4 * off[0]
@@ -101,7 +99,8 @@ def test_noise_floor_is_the_larger_of_quantum_and_noise() -> None:
 def test_conditions_are_held_out_before_motions() -> None:
     recording = blank(gains=(100.0, 400.0, 800.0))
     (chain,) = chains(recording)
-    trajectories, folds = design(recording, chain, 0)
+    trajectories, folds, aside = design(recording, chain, 0)
+    assert aside not in trajectories
     gains = [recording.trajectories[t].conditions["p_gain"] for t in trajectories]
     assert len(set(folds)) == 3
     assert all(
@@ -110,6 +109,13 @@ def test_conditions_are_held_out_before_motions() -> None:
     recording = blank()
     (chain,) = chains(recording)
     assert len(set(design(recording, chain, 0)[1])) == 5
+
+
+def test_one_of_enough_motions_is_kept_from_every_fit() -> None:
+    few, many = blank(), blank(gains=(100.0, 400.0, 800.0))
+    assert design(few, chains(few)[0], 0)[2] is None
+    trajectories, _, aside = design(many, chains(many)[0], 0)
+    assert {*trajectories, aside} == {*range(len(many.trajectories))}
 
 
 def test_what_the_baseline_fits_is_no_candidate() -> None:

@@ -71,7 +71,7 @@ def test_losses_of_the_pendulum_are_load_friction_and_a_set(pendulum):
 
 
 def test_telemetry_speaks_against_sag_latency_and_backlash(pendulum):
-    reasons = {row.name: row.reason for row in pendulum.evidence if np.isnan(row.gain)}
+    (reasons,) = pendulum.not_tried.values()
     assert "voltage falls by" in reasons["supply_sag"]
     assert "duty cycle" in reasons["command_delay"] and "duty cycle" in reasons["backlash"]
 
@@ -113,10 +113,10 @@ def arm(shared_dir) -> Recording:
 
 def test_long_recordings_are_analysed_in_pieces_from_rest(arm):
     for chain in chains(arm):
-        trajectories, folds = design(arm, chain, 0)
+        trajectories, folds, _ = design(arm, chain, 0)
         parts = pieces(arm, chain, trajectories)
         column = int(chain.columns[0])
-        assert len(trajectories) >= 10 and len(set(folds)) == 6
+        assert len(trajectories) >= 9 and len(set(folds)) == 6
         chosen = [arm.trajectories[i] for i in trajectories]
         length = sum(
             t.time[end - 1] - t.time[first] for t, (first, end) in zip(chosen, parts, strict=True)
@@ -136,8 +136,16 @@ def test_friction_dead_zone_and_backlash_tie_on_the_vertical_axis(arm, tmp_path)
 
 
 @pytest.mark.slow
-def test_gravity_is_named_on_the_elbow(arm, tmp_path):
-    report = explain(only(arm, "Elbow"), None, tmp_path, effects=LOAD, workers=1)
-    assert names(report, "Elbow") == {"gravity_load", "coulomb_friction"}
-    (elbow,) = report.joints
-    assert elbow.identified_rmse_rad < 0.3 * elbow.baseline_rmse_rad
+def test_halves_of_the_elbow_agree_on_dry_friction(arm, tmp_path):
+    """With a load, or in one direction more than in the other, the motions do not tell."""
+    whole = only(arm, "Elbow")
+    halves = [replace(whole, trajectories=whole.trajectories[first::2]) for first in (0, 1)]
+    sets = []
+    for number, recording in enumerate((whole, *halves)):
+        report = explain(recording, None, tmp_path / str(number), effects=LOAD, workers=1)
+        certain = [row.name for row in report.families if row.verdict == "certain"]
+        assert certain == ["dry friction"]
+        (elbow,) = report.joints
+        assert elbow.identified_rmse_rad < 0.5 * elbow.baseline_rmse_rad
+        sets.append({row.effects for row in report.models})
+    assert set.intersection(*sets)

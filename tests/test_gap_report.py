@@ -8,20 +8,21 @@ import re
 
 import numpy as np
 import pytest
-from gap_reports import FRICTION, JOINT, rubbing_servo, servo_report
+from gap_reports import FRICTION, JOINT, model, rubbing_servo, servo_report
 
 from vd.gap import words
-from vd.gap.plan import parameter_columns
 from vd.gap.report import write_report
 from vd.gap.result import (
     Alternative,
     Closing,
+    Credit,
+    Delivered,
+    HeldOut,
     Misfit,
     Predictions,
     Report,
     effect_values,
 )
-from vd.kernels.servo import actuators
 from vd.kernels.servo.effects import EFFECTS
 
 
@@ -54,6 +55,7 @@ def curves(made):
 CONTRACT = {
     *("format", "verdict", "noise_floor_rad", "baseline", "findings", "effects", "ambiguous"),
     *("identified", "held_out", "next_experiment", "seconds"),
+    *("families", "models", "delivered"),
 }
 
 
@@ -74,6 +76,9 @@ def test_json_has_the_keys_of_the_contract_and_comes_back_as_it_was(report, tmp_
         "unit": "N m",
     }
     assert {"name", "held_out_rmse_rad", "difference_ci95"} == set(effect["alternatives"][0])
+    assert {"trajectory", "rmse_rad"} <= set(values["delivered"])
+    assert {"name", "verdict"} <= set(values["families"][0])
+    assert {"effects", "parameters", "rmse_rad", "held_out_rmse_rad"} <= set(values["models"][0])
     assert {"trajectories", "baseline_rmse_rad", "identified_rmse_rad", "reduction", "ci95"} <= set(
         values["held_out"]
     )
@@ -107,9 +112,7 @@ def test_curves_come_back(curves, tmp_path):
         Predictions.read(path)
 
 
-def test_parameters_reach_their_columns(report):
-    columns = parameter_columns(report, JOINT)
-    assert columns[actuators.COULOMB_TORQUE] == FRICTION and columns[actuators.KP] == 3.0
+def test_effects_reach_the_layer_joint_by_joint(report):
     assert effect_values(report.effects, JOINT) == {
         "coulomb_friction": {"tau_c_nm": (FRICTION, 0.14, 0.16)}
     }
@@ -124,8 +127,9 @@ def test_page_stands_alone_and_says_what_was_found(report, curves, tmp_path):
     text = html.unescape(re.sub(r"<[^>]+>", " ", re.sub(r"base64,[^\"]*", "", page)))
     assert "lacks coulomb friction on joint (150 mN m)" in text
     assert "vd-gap run recordings/servo --out gap" in text
-    for row in report.evidence:
-        assert words.plain(row.reason) in text
+    for row in report.compared:
+        assert words.plain(row.why) in text and words.model_text(row.effects) in text
+    assert "placebo" not in text.lower()
     for effect in EFFECTS.values():
         assert words.plain(effect.name) in text
         assert effect.meaning in text
@@ -139,10 +143,10 @@ OUTCOMES = {
     "no_gap": ({"effects": ()}, "No gap"),
     "ambiguous": (
         {"effects": (), "ambiguous": (("coulomb_friction", "backlash"),)},
-        "It is coulomb friction or backlash",
+        "2 models are as good: coulomb friction or backlash",
     ),
     "under_excited": ({"effects": (), "next_experiment": "Record a chirp."}, "do not determine"),
-    "unknown": ({"effects": ()}, "No effect that was tried explains it"),
+    "unknown": ({"effects": ()}, "No model that was tried explains half of it"),
 }
 
 
@@ -150,6 +154,9 @@ OUTCOMES = {
 def test_every_verdict_has_its_sentence_and_its_page(report, curves, tmp_path, verdict):
     changes, sentence = OUTCOMES[verdict]
     joint = dataclasses.replace(report.joints[0], open_sets=changes.get("ambiguous", ()))
+    if verdict == "ambiguous":
+        models = tuple(dataclasses.replace(each, why="") for each in report.compared[:2])
+        changes = {**changes, "models": models}
     report = dataclasses.replace(report, verdict=verdict, joints=(joint,), closing=None, **changes)
     assert sentence in words.verdict_sentence(report)
     assert words.next_step(report)
@@ -178,3 +185,73 @@ def test_torques_of_a_bare_servo_are_said_to_be_relative(report, curves, tmp_pat
     source = dataclasses.replace(report.recording, model="servo", relative_torques=told)
     write_report(dataclasses.replace(report, recording=source), curves, tmp_path)
     assert ("Torques are relative" in (tmp_path / "report.html").read_text()) == told
+
+
+def outcome(report: Report, **changes: object) -> str:
+    """All sentences of a report with changes."""
+    changed = dataclasses.replace(report, **changes)
+    lines = [words.verdict_sentence(changed), words.next_step(changed)]
+    return "\n".join([*lines, *words.open_questions(changed), *words.families_sentences(changed)])
+
+
+def test_a_headline_that_its_proof_contradicts_says_so(report):
+    """One motion held out makes the plain model extrapolate; fitted, and as delivered, little is won."""
+    text = outcome(
+        report,
+        held_out=HeldOut(("a",), 0.0775, 0.0164, 0.79, (0.6, 0.9)),
+        baseline=dataclasses.replace(report.baseline, rmse_rad=0.0161),
+        identified=dataclasses.replace(report.identified, rmse_rad=0.0157),
+        delivered=Delivered("b.csv", 0.0181, 0.0162),
+    )
+    assert "from 77.5 mrad to 16.4 mrad" in text and "from 16.1 mrad to 15.7 mrad" in text
+    assert "b.csv, which no fit saw, the layer as written leaves 18.1 mrad" in text
+    assert "no better there" in text
+
+
+def test_an_error_that_rises_is_not_said_to_fall(report):
+    text = outcome(report, held_out=HeldOut(("a",), 0.010, 0.012, -0.2, (-0.4, 0.1)))
+    assert "rises from 10 mrad to 12 mrad" in text and "falls from 10" not in text
+
+
+def test_credit_is_shared_between_the_effects_that_earn_it(report):
+    friction = report.effects[0]
+    saturation = dataclasses.replace(friction, name="torque_saturation")
+    credits = (
+        Credit(JOINT, "coulomb_friction", 0.081, 0.094),
+        Credit(JOINT, "torque_saturation", 0.042, 0.065),
+    )
+    text = outcome(report, effects=(friction,), provisional=(saturation,), credits=credits)
+    assert "With coulomb friction and torque saturation the error" in text
+    assert "94 mrad without coulomb friction and 65 mrad without torque saturation" in text
+
+
+def test_sets_are_whole_models_with_their_errors(report):
+    """Single effects of different models do not make another: no line offers them alone."""
+    effects = (("torque_limit", "backlash"), ("elastic_transmission", "coulomb_friction"))
+    models = tuple(
+        model(names, {}, error) for names, error in zip(effects, (4e-3, 5e-3), strict=True)
+    )
+    sets = (("torque_limit", "elastic_transmission", "backlash", "coulomb_friction"),)
+    joint = dataclasses.replace(report.joints[0], verdict="ambiguous", open_sets=sets)
+    text = outcome(
+        report, verdict="ambiguous", effects=(), models=models, ambiguous=sets, joints=(joint,)
+    )
+    assert "torque limit with backlash (4 mrad fitted, 4 mrad held out)" in text
+    assert "elastic transmission with coulomb friction (5 mrad fitted, 5 mrad held out)" in text
+    assert "torque limit, elastic" not in text and "torque limit or elastic" not in text
+
+
+def test_what_is_not_closed_is_not_called_closed(report):
+    text = outcome(report, identified=dataclasses.replace(report.identified, rmse_rad=0.038))
+    assert "still 38 times the noise floor" in text
+    nothing = outcome(report, verdict="unknown", effects=(), families=(), models=())
+    assert "falls" not in nothing and "lacks" not in nothing
+
+
+def test_sentences_take_their_figures_from_the_report(report):
+    """Every number of the verdict is one of the report's."""
+    shown = re.findall(r"([\d.]+) mrad", words.verdict_sentence(report))
+    values = [report.held_out.baseline_rmse_rad, report.held_out.identified_rmse_rad]
+    values += [report.baseline.rmse_rad, report.identified.rmse_rad]
+    values += [report.delivered.rmse_rad, report.delivered.baseline_rmse_rad]
+    assert len(shown) >= 4 and {*shown} <= {words.mrad(value).split()[0] for value in values}

@@ -1,4 +1,4 @@
-"""What decides, on made-up fits: gains on unseen motions, ties, bounds, and other joints."""
+"""What decides, on made-up fits: which models are good, what they share, bounds, and other joints."""
 
 from dataclasses import replace
 
@@ -8,82 +8,170 @@ from gap_recordings import FLOOR, made_up
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.coordinates import Coordinate
-from vd.gap.models import Accepted, Explanation, Telemetry
 from vd.gap.rules import (
+    FAMILIES,
     Evidence,
-    agree,
     at_bound,
+    changes,
+    conclude,
     contradicted,
-    doubted,
-    exchanged,
+    difference,
+    good_models,
     late_side,
-    named,
+    not_earned,
+    open_sets,
     overall,
-    refused,
-    refused_jitter,
-    refused_step,
-    tied,
-    winner,
-    without_jitter,
+    shown,
 )
-from vd.gap.statistics import resamples
+from vd.gap.telemetry import Telemetry
 from vd.kernels.servo.effects import EFFECTS
+
+PLAIN = made_up((), 0.020)
+NOISE = np.random.default_rng(1).normal(0.0, 1e-3, 10)
 
 
 @pytest.fixture
 def evidence() -> Evidence:
-    return Evidence(noise=FLOOR, weights=resamples(10, np.random.default_rng(0)))
+    return Evidence(FLOOR, range(10), whole=0.0)
 
 
-def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(
-    evidence: Evidence,
-) -> None:
+def test_an_addition_earns_its_place_in_fitted_and_held_out_errors(evidence: Evidence) -> None:
     before, name = made_up((), 0.010), ("backlash",)
-    assert refused(evidence, before, made_up(name, 0.005)) == ""
-    assert "less than 5 %" in refused(evidence, before, made_up(name, 0.0097))
+    assert not_earned(evidence, before, made_up(name, 0.005)) == ""
+    assert "less than 5 %" in not_earned(evidence, before, made_up(name, 0.0097))
+    # A motion held out makes the smaller one extrapolate: fitted errors are about the same.
+    assert "less than 5 %" in not_earned(
+        evidence, made_up((), 0.077, fitted=0.0161), made_up(name, 0.016, fitted=0.0157)
+    )
     # Two trajectories gain much, others lose a little: the interval over trajectories covers 0.
     uneven = np.full(10, 0.0104)
     uneven[:2] = 0.0
-    assert "not distinguishable" in refused(evidence, before, made_up(name, uneven))
-    assert refused_step(evidence, before, made_up(name, uneven)) == ""  # as one of two causes may
-    why = refused(evidence, made_up((), 1.15e-3), made_up(name, 1.05e-3))
-    assert "noise floor" in why
+    assert "not distinguishable" in not_earned(evidence, before, made_up(name, uneven))
+    small = made_up(name, 1.05e-3), made_up((), 1.15e-3)
+    assert "noise floor" in not_earned(evidence, *reversed(small))
 
 
-def test_a_tie_on_unseen_motions_is_a_set(evidence: Evidence) -> None:
-    noise = np.random.default_rng(1).normal(0.0, 1e-3, 10)
-    best = made_up(("coulomb_friction",), 0.004)
-    assert tied(evidence, best, made_up(("dead_zone",), 0.004 + noise - noise.mean()))
-    assert not tied(evidence, best, made_up(("backlash",), 0.006))
+def test_a_gap_that_refitting_alone_closes_is_no_effect(evidence: Evidence) -> None:
+    """The plain model extrapolates to one motion held out, and fits it all the same."""
+    plain = made_up((), 0.0775, fitted=0.0161)
+    better = made_up(("backlash",), 0.0164, fitted=0.0157)
+    conclusion = conclude(evidence, plain, [plain, better], "")
+    assert conclusion.verdict == "unknown" and not conclusion.names
+    assert conclusion.final is plain
+    quiet = made_up((), 0.0775, fitted=1.0e-3)
+    assert conclude(evidence, quiet, [quiet, better], "").verdict == "no_gap"
 
 
-def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(
-    evidence: Evidence,
-) -> None:
-    simple = made_up(("coulomb_friction",), 1.000e-3)
-    fuller = made_up(("stribeck_friction",), 0.970e-3, fitted=0.999e-3)
-    assert winner(evidence, [fuller, simple]) is simple
-    worse = made_up(("coulomb_friction",), 1.6e-3)
-    assert winner(evidence, [fuller, worse]) is fuller
+def test_names_are_what_all_good_models_share(evidence: Evidence) -> None:
+    limit = made_up(("load_friction", "torque_limit"), 0.004)
+    saturation = made_up(("load_friction", "torque_saturation"), 0.004 + NOISE - NOISE.mean())
+    alone = made_up(("load_friction",), 0.012)
+    conclusion = conclude(evidence, PLAIN, [PLAIN, limit, saturation, alone], "")
+    assert conclusion.verdict == "effects" and conclusion.names == ("load_friction",)
+    assert conclusion.families["dry friction"] == "certain"
+    assert conclusion.families["torque ceiling"] == "certain"
+    assert [{*group} for group in open_sets(conclusion.good)] == [
+        {"torque_limit", "torque_saturation"}
+    ]
+    assert conclusion.shares.sum() == pytest.approx(1.0) and len(conclusion.shares) == 2
+
+
+def test_what_few_motions_show_is_delivered_and_not_named(evidence: Evidence) -> None:
+    """Two motions of ten gain: more than one standard error, within the 95 % interval."""
+    uneven = np.full(10, 0.004)
+    uneven[:2] = 0.012
+    alone = made_up(("load_friction",), uneven)
+    both = made_up(("load_friction", "torque_saturation"), 0.004)
+    conclusion = conclude(evidence, PLAIN, [PLAIN, alone, both], "")
+    assert conclusion.final is both and conclusion.names == ("load_friction",)
+    assert conclusion.families["torque ceiling"] == "likely"
+    assert open_sets(conclusion.good) == [("torque_saturation",)]
+
+
+def test_intervals_are_wider_over_fewer_blocks_of_motions(evidence: Evidence) -> None:
+    best, other = made_up(("backlash",), 0.004), made_up(("dead_zone",), 0.006 + NOISE)
+    width = np.ptp(difference(evidence, best, other))
+    paired = replace(evidence, folds=[0, 0, 1, 1, 2, 2, 3, 3, 4, 4])
+    few = replace(evidence, folds=[0] * 5 + [1] * 5)
+    assert len(paired.without) == 5 and len(few.without) == 10
+    alike = made_up(("dead_zone",), np.repeat((0.006 + NOISE)[:5], 2))
+    assert np.ptp(difference(paired, best, alike)) > 1.2 * np.ptp(difference(few, best, alike))
+    assert np.ptp(difference(few, best, other)) == pytest.approx(width)
+
+
+def test_a_family_is_certain_before_its_member_is(evidence: Evidence) -> None:
+    coulomb = made_up(("coulomb_friction",), 0.004)
+    load = made_up(("load_friction",), 0.004 + NOISE - NOISE.mean())
+    zone = made_up(("dead_zone",), 0.009)
+    conclusion = conclude(evidence, PLAIN, [PLAIN, coulomb, load, zone], "")
+    assert conclusion.verdict == "ambiguous" and not conclusion.names
+    assert conclusion.families == {"dry friction": "certain", "play": "excluded"}
+    close = made_up(("dead_zone",), 0.004 + NOISE[::-1] - NOISE.mean())
+    conclusion = conclude(evidence, PLAIN, [PLAIN, coulomb, load, close], "")
+    assert {*conclusion.families.values()} <= {"likely", "untold"}
+
+
+def test_a_larger_model_is_good_only_if_none_that_it_contains_is(evidence: Evidence) -> None:
+    simple = made_up(("coulomb_friction",), 0.0040)
+    for names in (("stribeck_friction",), ("coulomb_friction", "encoder_bias")):
+        assert good_models(evidence, [PLAIN, made_up(names, 0.0039), simple]) == [simple]
+        larger = made_up(names, 0.0020)
+        assert good_models(evidence, [PLAIN, larger, simple]) == [larger]
+
+
+def test_samples_tell_models_apart_once_one_leaves_noise(evidence: Evidence) -> None:
+    """One motion of ten shows the difference, and no held-out error of the better one is sure."""
+    errors = np.full(10, 1.0e-3)
+    errors[0] = 2.0e-3
+    best = made_up(("torque_limit",), 0.003, fitted=1.0e-3)
+    other = made_up(("torque_saturation",), errors)
+    assert good_models(evidence, [PLAIN, best, other]) == [best]
+
+
+def test_samples_do_not_tell_less_than_the_best_itself_leaves(evidence: Evidence) -> None:
+    best = made_up(("torque_limit",), 1.10e-3)
+    close, far = made_up(("torque_saturation",), 1.15e-3), made_up(("supply_sag",), 1.25e-3)
+    assert good_models(evidence, [PLAIN, best, close, far]) == [best, close]
+
+
+def test_a_bound_and_what_can_be_nothing_explain_nothing(evidence: Evidence) -> None:
     end = Coordinate("backlash.width_rad", servo.BACKLASH_WIDTH, False, 1.0, 0.0, 9.0)
     stuck = made_up(("backlash",), 0.004)
-    stuck = replace(
-        stuck, coordinates=(*stuck.coordinates[:-1], end), x=np.array([0.0, 0.0, 0.0, 9.0])
-    )
+    x = np.array([0.0, 0.0, 0.0, 9.0])
+    stuck = replace(stuck, coordinates=(*stuck.coordinates[:-1], end), x=x)
     inside = made_up(("dead_zone",), 0.005)
-    assert at_bound(stuck) == ("backlash.width_rad",)
-    assert winner(evidence, [stuck, inside]) is inside
+    assert "backlash" in at_bound(stuck) and not at_bound(inside)
+    assert good_models(evidence, [PLAIN, stuck, inside]) == [inside]
+    loose = replace(inside, refits=np.array([[0.0] * 4, [0.0, 0.0, 0.0, 9.0]]))
+    assert good_models(evidence, [PLAIN, loose]) == [PLAIN]
 
 
-def test_a_cause_outside_the_table_on_one_joint_of_a_finger_is_one_on_the_others() -> None:
-    def explanation(*names: str, verdict: str = "effects") -> Explanation:
-        return Explanation(made_up((), 0.02), made_up(names, 0.001), verdict, "")
+def test_less_than_half_of_the_gap_is_unknown(evidence: Evidence) -> None:
+    half = made_up(("backlash",), 0.017)
+    conclusion = conclude(evidence, PLAIN, [PLAIN, half], "")
+    assert conclusion.verdict == "unknown" and "less than half" in conclusion.reason
+    assert conclusion.final is PLAIN and not conclusion.families
 
-    pair = ("gravity_load", "encoder_bias")
-    spring, mine = explanation(*pair, verdict="unknown"), explanation(*pair)
-    found = doubted([spring, mine, mine], [0, 0, 1])
-    assert [e.verdict for e in found] == ["unknown", "unknown", "effects"]
-    assert doubted([spring, explanation("backlash")], [0, 0])[1].verdict == "effects"
+
+def test_motions_that_leave_the_baseline_open_are_said(evidence: Evidence) -> None:
+    quiet = made_up((), FLOOR)
+    assert conclude(evidence, quiet, [quiet], "kd is open").verdict == "under_excited"
+    two = replace(quiet, sse=quiet.sse[:2])
+    assert conclude(evidence, two, [two], "").verdict == "under_excited"
+
+
+def test_models_differ_in_one_family_and_have_one_member_of_each() -> None:
+    models = changes(("coulomb_friction", "backlash"), EFFECTS)
+    assert frozenset({"backlash"}) in models and frozenset({"coulomb_friction"}) in models
+    assert frozenset({"stribeck_friction", "backlash"}) in models
+    assert frozenset({"coulomb_friction", "dead_zone"}) in models
+    assert frozenset({"coulomb_friction", "backlash", "dead_zone"}) not in models
+    assert all("joint_coupling" not in model for model in changes((), ["backlash"]))
+
+
+def test_every_effect_but_jitter_is_in_one_family() -> None:
+    members = [name for family in FAMILIES.values() for name in family.effects]
+    assert sorted(members) == sorted({*EFFECTS} - {"command_jitter"})
 
 
 def told(
@@ -108,53 +196,21 @@ def test_telemetry_rules_out_what_it_would_show() -> None:
     assert late_side(told(left=(0.001, 0.003))) == ""  # both fit
 
 
-def test_an_exchange_needs_a_better_effect_that_nothing_contradicts(evidence: Evidence) -> None:
-    present, better = made_up(("dead_zone",), 0.006), made_up(("backlash",), 0.003)
-    assert exchanged(evidence, present, [present, better], ()) is better
-    assert exchanged(evidence, present, [present, better], ("backlash",)) is None
-    assert exchanged(evidence, present, [present, made_up(("backlash",), 0.0061)], ()) is None
-
-
-def test_random_delays_have_to_be_likelier_and_to_leave_noise(evidence: Evidence) -> None:
-    present, random = made_up((), 0.010), made_up(("command_jitter",), 0.005)
-    assert refused_jitter(evidence, present, random, left=FLOOR) == ""
-    assert "noise floors besides" in refused_jitter(evidence, present, random, left=3.0 * FLOOR)
-    hardly = made_up(("command_jitter",), 0.0098)
-    assert "narrows what is left by 2.0 %" in refused_jitter(evidence, present, hardly, left=FLOOR)
-
-
-def test_random_delays_are_none_where_another_joint_of_the_finger_shows_none() -> None:
-    fit, plain = made_up(("backlash",), 0.5 * FLOOR), made_up((), 0.02)
-    clear = Explanation(plain, fit, "effects", "")
-    late = Explanation(plain, made_up(("command_delay",), 0.5 * FLOOR), "effects", "")
-    assert without_jitter([(FLOOR, clear)]) and not without_jitter([(FLOOR, late)])
-    assert not without_jitter([])
-
-
-def accepted(name: str, estimate: tuple[float, float, float], **known) -> Accepted:
-    """An effect of one parameter that every resample chooses."""
-    parameter = EFFECTS[name].parameters[0].name
-    values = {"confidence": 1.0, "alternatives": (), "tied": (), "at_bound": False, **known}
-    return Accepted(name=name, estimates={parameter: estimate}, **values)
-
-
-def test_a_name_is_chosen_often_alone_and_of_a_size_that_is_not_nothing() -> None:
-    sure = (0.03, 0.02, 0.04)
-    assert named(accepted("backlash", sure))
-    assert not named(accepted("backlash", sure, confidence=0.8))
-    assert not named(accepted("backlash", sure, tied=("dead_zone",)))
-    assert not named(accepted("backlash", sure, at_bound=True))
-    assert not named(accepted("encoder_bias", (0.03, -0.01, 0.07)))
-    # No limit is an infinite one.
-    assert named(accepted("torque_limit", (1.0, 0.8, 1.2)))
-    assert not named(accepted("torque_limit", (1.0, 0.2, 5.0)))
-
-
-def test_joints_share_an_effect_if_their_values_can_be_the_same() -> None:
-    here = accepted("backlash", (0.030, 0.029, 0.031))
-    assert agree(here, accepted("backlash", (0.0325, 0.032, 0.033)))  # within a tenth
-    assert agree(here, accepted("backlash", (0.040, 0.030, 0.050)))  # intervals overlap
-    assert not agree(here, accepted("backlash", (0.040, 0.039, 0.041)))
+@pytest.mark.parametrize(
+    ("name", "estimate", "is_shown"),
+    [
+        ("backlash", (0.03, 0.02, 0.04), True),
+        ("encoder_bias", (0.03, -0.01, 0.07), False),
+        ("torque_limit", (1.0, 0.8, 1.2), True),  # no limit is an infinite one
+        ("torque_limit", (1.0, 0.2, 5.0), False),
+    ],
+)
+def test_the_size_of_an_effect_is_not_nothing(
+    name: str, estimate: tuple[float, float, float], is_shown: bool
+) -> None:
+    key = f"{name}.{EFFECTS[name].parameters[0].name}"
+    value, low, high = estimate
+    assert shown(name, {key: value}, {key: (low, high)}) == is_shown
 
 
 def test_a_recording_has_the_first_verdict_in_the_order_of_importance() -> None:

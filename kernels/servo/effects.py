@@ -4,7 +4,6 @@ A contract that scripts rely on: effect and parameter names are those of USD att
 command lines. Physics: :mod:`vd.kernels.servo.actuators`.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import vd.kernels.servo.actuators as servo
@@ -204,29 +203,17 @@ where the arm hangs, or a further load hangs off the arm, moves it alike but for
 changes with the angle.
 """
 
-BESIDE: dict[str, dict[str, tuple[str, ...]]] = {
-    "stribeck_friction": {"encoder_bias": ("asymmetric_friction",)}
-}
-"""Effects that stand for others beside a certain one: Stribeck friction and friction with a
-direction are Stribeck friction, higher by the mean of both sides, and an offset that pulls by half
-their difference.
-"""
 
-
-def equivalent(model: str, beside: Iterable[str] = ()) -> dict[str, tuple[str, ...]]:
-    """Effects that stand for others in a recording of a ``model`` with the effects ``beside``."""
-    result = {**EQUIVALENT, **ON_A_PENDULUM} if model == "pendulum" else {**EQUIVALENT}
-    for other in beside:
-        for name, same in BESIDE.get(other, {}).items():
-            result[name] = (*result.get(name, ()), *same)
-    return result
+def equivalent(model: str) -> dict[str, tuple[str, ...]]:
+    """Effects that stand for others in a recording of a ``model``."""
+    return {**EQUIVALENT, **ON_A_PENDULUM} if model == "pendulum" else {**EQUIVALENT}
 
 
 TOGETHER: dict[str, tuple[str, ...]] = {
-    "asymmetric_friction": ("coulomb_friction", "dead_zone", "encoder_bias"),
+    "asymmetric_friction": ("coulomb_friction", "encoder_bias"),
 }
-"""Effects that are the same as two others together, of those listed: friction that differs between
-the directions is friction that does not, or a dead zone, and an offset."""
+"""Effects that are the same as two others together: friction that differs between the directions is
+friction that does not, and an offset."""
 
 
 def neutral_row() -> list[float]:

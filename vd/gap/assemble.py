@@ -1,22 +1,22 @@
 """Put the explanations of all joints together.
 
-Shared effects, pooled numbers, one verdict, curves.
+Effects, sets, errors, one verdict, curves.
 """
 
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from vd.gap import rules
 from vd.gap.coordinates import BASELINE_PARAMETERS, GRAVITY
-from vd.gap.fit import FINER, JointSpec, Problems
-from vd.gap.models import Accepted, Explanation
+from vd.gap.fit import FINER, JointFit, JointSpec, Problems, intervals
 from vd.gap.result import (
     Alternative,
     AnalysedRecording,
-    Candidate,
+    Credit,
     Estimate,
+    FamilyVerdict,
     Fit,
     HeldOut,
     JointGap,
@@ -25,22 +25,47 @@ from vd.gap.result import (
     Predictions,
     Report,
     TrajectoryError,
+    WholeModel,
     parameters_of,
 )
 from vd.gap.rollout import Rollouts
-from vd.gap.rules import agree, answered, named, overall
-from vd.gap.statistics import half_width, interval, resamples, rmse
-from vd.kernels.servo.effects import EFFECTS
+from vd.gap.statistics import interval, resamples, rmse
 from vd.logs.recording import Recording
+
+LISTED = 5
+"""Good models of a joint that a report lists at most: the contract's."""
+ANSWERS = ("effects", "ambiguous")
+"""Verdicts that name something."""
 
 
 @dataclass(frozen=True, eq=False)
-class Analysed:
-    """A joint, its data and its explanation."""
+class AnalysedJoint:
+    """A joint and what came of it.
+
+    Attributes:
+        name: Its name.
+        spec: Its data.
+        plain: The plain model.
+        conclusion: What is concluded.
+        evidence: What its models were judged by.
+        fits: All models that were fitted.
+        vetoes: Effects that were not tried, with the reason.
+        means: Effects that stand for others, and for which.
+    """
 
     name: str
     spec: JointSpec
-    explanation: Explanation
+    plain: JointFit
+    conclusion: rules.Conclusion
+    evidence: rules.Evidence
+    fits: Sequence[JointFit]
+    vetoes: Mapping[str, str]
+    means: Mapping[str, tuple[str, ...]]
+
+    @property
+    def final(self) -> JointFit:
+        """The model that is delivered."""
+        return self.conclusion.final
 
 
 def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -> np.ndarray:
@@ -69,111 +94,110 @@ def curves(problems: Problems, models: Sequence[tuple[JointSpec, np.ndarray]]) -
 
 
 def assemble(
-    problems: Problems,
-    joints: Sequence[Analysed],
-    findings: Sequence[Misfit],
-    *,
-    seed: int,
+    problems: Problems, joints: Sequence[AnalysedJoint], findings: Sequence[Misfit], seed: int
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
     recording = problems.recording
-    before = curves(problems, [(j.spec, j.explanation.baseline.rows) for j in joints])
-    after = curves(problems, [(j.spec, j.explanation.final.rows) for j in joints])
-    predictions = Predictions.of(recording, before, after)
+    before = curves(problems, [(joint.spec, joint.plain.rows) for joint in joints])
+    after = curves(problems, [(joint.spec, joint.final.rows) for joint in joints])
     rng = np.random.default_rng(seed)
-    residuals = {j.name: _residuals(j, predictions) for j in joints}
-    rows = {j.name: _errors(j, residuals[j.name], recording) for j in joints}
-    every = [row for j in joints for row in rows[j.name]]
+    errors: list[TrajectoryError] = []
+    gaps: list[JointGap] = []
+    effects: list[NamedEffect] = []
+    provisional: list[NamedEffect] = []
+    families: list[FamilyVerdict] = []
+    models: list[WholeModel] = []
+    compared: list[WholeModel] = []
+    credits: list[Credit] = []
+    aside: dict[str, str] = {}
+    for joint in joints:
+        rows = _errors(joint, recording)
+        errors += rows
+        gaps.append(_gap(joint, rows, rng))
+        for name in joint.final.effects:
+            entries = effects if name in joint.conclusion.names else provisional
+            entries.append(_effect(name, joint))
+        families += _families(joint)
+        models += _models(joint, joint.conclusion.good[:LISTED])
+        compared += _models(joint, joint.fits)
+        credits += _credits(joint)
+        if joint.spec.aside is not None:
+            aside[joint.name] = recording.trajectories[joint.spec.aside].file
     report = Report(
-        verdict=overall([j.explanation.verdict for j in joints]),
-        noise_floor_rad=float(np.sqrt(np.mean([j.spec.floor**2 for j in joints]))),
-        baseline=_fit(joints, residuals, 0),
+        verdict=rules.overall([joint.conclusion.verdict for joint in joints]),
+        noise_floor_rad=float(np.sqrt(np.mean([joint.spec.floor**2 for joint in joints]))),
+        baseline=_fit(joints, [joint.plain for joint in joints]),
         findings=tuple(findings),
-        effects=_pool(joints, True),
+        effects=tuple(effects),
         ambiguous=_sets(joints),
-        identified=_fit(joints, residuals, 1),
-        held_out=_held_out(predictions.files, every, rng),
+        identified=_fit(joints, [joint.final for joint in joints]),
+        held_out=_held_out(errors, rng),
         next_experiment="",
         seconds=np.nan,
         recording=AnalysedRecording(
             path=str(recording.path),
             model=recording.model,
-            joints=tuple(j.name for j in joints),
+            joints=tuple(joint.name for joint in joints),
             trajectories=len(recording.trajectories),
-            samples=len(predictions.time),
+            samples=sum(len(t.time) for t in recording.trajectories),
             seconds=float(sum(t.time[-1] for t in recording.trajectories)),
             servo=str(recording.servo.get("model", "")),
         ),
-        provisional=_pool(joints, False),
-        joints=tuple(_gap(j, rows[j.name], rng) for j in joints),
-        evidence=tuple(c for j in joints for c in _evidence(j)),
-        trajectories=tuple(every),
+        provisional=tuple(provisional),
+        joints=tuple(gaps),
+        families=tuple(families),
+        models=tuple(models),
+        compared=tuple(compared),
+        credits=tuple(credits),
+        not_tried={joint.name: dict(joint.vetoes) for joint in joints},
+        trajectories=tuple(errors),
+        aside=aside,
         seed=seed,
     )
-    return report, predictions
+    return report, Predictions.of(recording, before, after)
 
 
-def _residuals(joint: Analysed, predictions: Predictions) -> dict[int, np.ndarray]:
-    """Measured minus simulated in what was analysed of each trajectory that moves a joint.
-
-    Returns:
-        By trajectory, shape [samples, 2] [rad]: of baseline and identified model, everything
-            fitted.
-    """
-    spec, column = joint.spec, predictions.joints.index(joint.name)
-    models = np.stack([predictions.baseline[:, column], predictions.identified[:, column]], axis=1)
-    parts = dict(zip(spec.trajectories, spec.pieces, strict=True)) if spec.pieces else {}
-    result = {}
-    for index in range(len(predictions.files)):
-        rows = np.flatnonzero(predictions.trajectory == index)
-        if np.ptp(predictions.command[rows, column]) > 0.0:
-            rows = rows[slice(*parts.get(index, (None,)))]
-            result[index] = predictions.measured[rows, column, None] - models[rows]
-    return result
-
-
-def _errors(
-    joint: Analysed, residuals: dict[int, np.ndarray], recording: Recording
-) -> list[TrajectoryError]:
-    """Held-out errors where the trajectory was in a fold, errors of the full fit where it was in no fit."""
-    fits, result = (joint.explanation.baseline, joint.explanation.final), []
-    for index, left in residuals.items():
-        squares, absolutes = (left**2).mean(axis=0), np.abs(left).mean(axis=0)
-        if index in joint.spec.trajectories:
-            place = joint.spec.trajectories.index(index)
-            squares = np.array([fit.held_out[place] for fit in fits]) / len(left)
-            sums = [np.nan if fit.held_out_abs is None else fit.held_out_abs[place] for fit in fits]
-            absolutes = np.array(sums) / len(left)
-        part, (old, new), (old_abs, new_abs) = (
-            recording.trajectories[index],
-            np.sqrt(squares),
-            absolutes,
-        )
-        errors = float(old), float(new), float(old_abs), float(new_abs)
-        result.append(
-            TrajectoryError(part.file, part.excitation, joint.name, *errors, samples=len(left))
-        )
-    return result
+def _errors(joint: AnalysedJoint, recording: Recording) -> list[TrajectoryError]:
+    """Held-out errors of the motions that move a joint."""
+    column = recording.joints.index(joint.name)
+    rows = []
+    for place, index in enumerate(joint.spec.trajectories):
+        trajectory = recording.trajectories[index]
+        if np.ptp(trajectory.command[:, column]) > 0.0:
+            rows.append(
+                TrajectoryError(
+                    file=trajectory.file,
+                    excitation=trajectory.excitation,
+                    joint=joint.name,
+                    baseline_rmse_rad=float(np.sqrt(joint.plain.mean_square[place])),
+                    identified_rmse_rad=float(np.sqrt(joint.final.mean_square[place])),
+                    baseline_mae_rad=float(joint.plain.mean_absolute[place]),
+                    identified_mae_rad=float(joint.final.mean_absolute[place]),
+                    samples=int(joint.plain.count[place]),
+                )
+            )
+    return rows
 
 
-def _fit(
-    joints: Sequence[Analysed], residuals: dict[str, dict[int, np.ndarray]], model: int
-) -> Fit:
-    """Errors on everything analysed, and the baseline's parameters, of one of the two models."""
-    left = {name: np.concatenate([*of.values()])[:, model] for name, of in residuals.items()}
-    everything = np.concatenate([*left.values()])
+def _fit(joints: Sequence[AnalysedJoint], fits: Sequence[JointFit]) -> Fit:
+    """Errors of a model of each joint on what it was fitted to, and its baseline's parameters."""
+    count = sum(fit.count.sum() for fit in fits)
+    parameters = {}
+    for joint, fit in zip(joints, fits, strict=True):
+        parameters[joint.name] = _baseline_values(joint.spec, fit)
     return Fit(
-        rmse_rad=float(np.sqrt(np.mean(everything**2))),
-        per_joint={name: float(np.sqrt(np.mean(of**2))) for name, of in left.items()},
-        mae_rad=float(np.mean(np.abs(everything))),
-        parameters={j.name: _baseline_values(j, model) for j in joints},
+        rmse_rad=float(np.sqrt(sum(fit.sse.sum() for fit in fits) / count)),
+        per_joint={joint.name: fit.rmse for joint, fit in zip(joints, fits, strict=True)},
+        mae_rad=float(sum(fit.absolute.sum() for fit in fits) / count),
+        parameters=parameters,
     )
 
 
-def _baseline_values(joint: Analysed, model: int) -> dict[str, float]:
-    fit = (joint.explanation.baseline, joint.explanation.final)[model]
-    row, names = fit.rows[joint.spec.joint], ["kp", "kd", "velocity_limit"]
-    names += [n for n in ("inertia", "kd_off") if n in joint.spec.baseline]
+def _baseline_values(spec: JointSpec, fit: JointFit) -> dict[str, float]:
+    """Parameters of the plain servo in a model."""
+    row = fit.rows[spec.joint]
+    names = ["kp", "kd", "velocity_limit"]
+    names += [name for name in ("inertia", "kd_off") if name in spec.baseline]
     # A pendulum's known load is not fitted, but without it the rest means nothing.
     if "gravity_load" not in fit.effects and row[GRAVITY.column] > 0.0:
         names.append(GRAVITY.name)
@@ -183,35 +207,39 @@ def _baseline_values(joint: Analysed, model: int) -> dict[str, float]:
 def _sums(rows: Sequence[TrajectoryError]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples, and sums of squared errors of both models, of each trajectory [S]."""
     count = np.array([row.samples for row in rows], float)
-    before, after = np.array([(row.baseline_rmse_rad, row.identified_rmse_rad) for row in rows]).T
+    before = np.array([row.baseline_rmse_rad for row in rows])
+    after = np.array([row.identified_rmse_rad for row in rows])
     return count, count * before**2, count * after**2
 
 
-def _held_out(
-    files: Sequence[str], rows: Sequence[TrajectoryError], rng: np.random.Generator
-) -> HeldOut:
+def _held_out(rows: Sequence[TrajectoryError], rng: np.random.Generator) -> HeldOut:
     """Errors before and after, over trajectories of all joints."""
     count, old, new = _sums(rows)
     weights = resamples(len(count), rng)
-    samples = 1.0 - rmse(new, count, weights) / np.maximum(rmse(old, count, weights), 1e-30)
-    before, after = float(rmse(old, count)), float(rmse(new, count))
-    used = {row.file for row in rows}
+    ratio = rmse(new, count, weights) / np.maximum(rmse(old, count, weights), 1e-30)
+    before = float(rmse(old, count))
+    after = float(rmse(new, count))
+    baseline_mae = np.average([row.baseline_mae_rad for row in rows], weights=count)
+    identified_mae = np.average([row.identified_mae_rad for row in rows], weights=count)
     return HeldOut(
-        trajectories=tuple(file for file in files if file in used),
+        trajectories=tuple(dict.fromkeys(row.file for row in rows)),
         baseline_rmse_rad=before,
         identified_rmse_rad=after,
         reduction=1.0 - after / max(before, 1e-30),
-        ci95=interval(samples),
-        baseline_mae_rad=float(np.average([row.baseline_mae_rad for row in rows], weights=count)),
-        identified_mae_rad=float(
-            np.average([row.identified_mae_rad for row in rows], weights=count)
-        ),
+        ci95=interval(1.0 - ratio),
+        baseline_mae_rad=float(baseline_mae),
+        identified_mae_rad=float(identified_mae),
     )
 
 
-def _gap(joint: Analysed, rows: Sequence[TrajectoryError], rng: np.random.Generator) -> JointGap:
+def _gap(
+    joint: AnalysedJoint, rows: Sequence[TrajectoryError], rng: np.random.Generator
+) -> JointGap:
+    """The errors of a joint, and what is concluded."""
     count, old, new = _sums(rows)
     weights = resamples(len(count), rng)
+    conclusion = joint.conclusion
+    answer = conclusion.verdict in ANSWERS
     return JointGap(
         joint=joint.name,
         noise_floor_rad=joint.spec.floor,
@@ -219,100 +247,104 @@ def _gap(joint: Analysed, rows: Sequence[TrajectoryError], rng: np.random.Genera
         baseline_ci95=interval(rmse(old, count, weights)),
         identified_rmse_rad=float(rmse(new, count)),
         identified_ci95=interval(rmse(new, count, weights)),
-        verdict=joint.explanation.verdict,
-        reason=joint.explanation.reason,
-        open_sets=tuple(
-            _unique(one.name, *one.tied)
-            for one in answered(joint.explanation)
-            if one.tied and not named(one)
-        ),
+        verdict=conclusion.verdict,
+        reason=conclusion.reason,
+        open_sets=tuple(rules.open_sets(conclusion.good)) if answer else (),
+        baseline_fitted_rmse_rad=joint.plain.rmse,
+        identified_fitted_rmse_rad=joint.final.rmse,
     )
 
 
-def _pool(joints: Sequence[Analysed], as_named: bool) -> tuple[NamedEffect, ...]:
-    """Named (or provisional) effects, those of several joints in one entry where their values agree."""
-    groups: dict[str, list[dict[str, Accepted]]] = {}
-    often: Counter[str] = Counter()
-    for joint in joints:
-        for accepted in answered(joint.explanation):
-            if named(accepted) == as_named:
-                often[accepted.name] += 1
-                _put(groups.setdefault(accepted.name, []), joint.name, accepted)
-    order = list(EFFECTS)
-    names = sorted(groups, key=lambda name: (-often[name], order.index(name)))
-    return tuple(_entry(name, group) for name in names for group in groups[name])
-
-
-def _put(groups: list[dict[str, Accepted]], joint: str, accepted: Accepted) -> None:
-    """Add a joint's effect to the joints with which it agrees, or to a group of its own."""
-    for group in groups:
-        if all(agree(accepted, other) for other in group.values()):
-            group[joint] = accepted
-            return
-    groups.append({joint: accepted})
-
-
-def _entry(name: str, group: dict[str, Accepted]) -> NamedEffect:
-    """One effect of joints that agree, its numbers weighted by their precision."""
-    known, every = parameters_of(name), list(group.values())
+def _effect(name: str, joint: AnalysedJoint) -> NamedEffect:
+    """One effect of the delivered model of a joint."""
+    spread = intervals(joint.final, joint.evidence.floor)
     parameters = {}
-    for key in every[0].estimates:
-        values, lows, highs = np.array([accepted.estimates[key] for accepted in every]).T
-        weight = np.maximum(0.5 * (highs - lows), 1e-12) ** -2
-        weight /= weight.sum()
-        value = float(weight @ values)
-        # No narrower than the joints' own, whose errors are one model's, nor than their values lie
-        # apart.
-        apart = half_width(weight @ (values - value) ** 2 / max(len(every) - 1, 1), len(every))
-        below, above = (
-            float(np.maximum(weight @ d, apart)) for d in (values - lows, highs - values)
-        )
-        low = max(value - below, -np.inf if known[key].signed else 0.0)
-        parameters[key] = Estimate(value, (float(low), float(value + above)), known[key].unit)
+    for key, value in joint.final.values.items():
+        effect, _, parameter = key.rpartition(".")
+        if effect == name:
+            unit = parameters_of(name)[parameter].unit
+            parameters[parameter] = Estimate(value, spread[key], unit)
+    having = [name in fit.effects for fit in joint.conclusion.good]
     return NamedEffect(
         name=name,
-        joints=tuple(group),
-        confidence=float(np.mean([accepted.confidence for accepted in every])),
+        joints=(joint.name,),
+        confidence=float(joint.conclusion.shares @ having),
         parameters=parameters,
-        alternatives=tuple(
-            Alternative(*other)
-            for other in max(every, key=lambda accepted: accepted.confidence).alternatives
-        ),
+        alternatives=_alternatives(name, joint),
     )
 
 
-def _sets(joints: Sequence[Analysed]) -> tuple[tuple[str, ...], ...]:
-    """Sets of effects not told apart, each once."""
+def _alternatives(name: str, joint: AnalysedJoint) -> tuple[Alternative, ...]:
+    """The models of a joint that have another effect in the place of one, the best first."""
+    rest = {*joint.final.effects} - {name}
+    best = joint.conclusion.good[0]
+    rows = []
+    for fit in sorted(joint.fits, key=lambda fit: fit.held_out_rmse):
+        others = {*fit.effects} - rest
+        if rest <= {*fit.effects} and len(others) == 1 and name not in others:
+            difference = rules.difference(joint.evidence, best, fit)
+            rows.append(Alternative(others.pop(), fit.held_out_rmse, difference))
+    return tuple(rows)
+
+
+def _sets(joints: Sequence[AnalysedJoint]) -> tuple[tuple[str, ...], ...]:
+    """Sets of effects not told apart, each once: by the motions, or by any motion."""
     sets: dict[frozenset[str], tuple[str, ...]] = {}
     for joint in joints:
-        for one in answered(joint.explanation):
-            if (one.tied and not named(one)) or one.equivalent:
-                members = _unique(one.name, *one.equivalent, *one.tied)
-                sets.setdefault(frozenset(members), members)
+        if joint.conclusion.verdict not in ANSWERS:
+            continue
+        for group in rules.open_sets(joint.conclusion.good):
+            sets.setdefault(frozenset(group), group)
+        for name in joint.conclusion.names:
+            if name in joint.means:
+                group = (name, *joint.means[name])
+                sets.setdefault(frozenset(group), group)
     return tuple(sets.values())
 
 
-def _unique(*names: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(names))
+def _families(joint: AnalysedJoint) -> list[FamilyVerdict]:
+    """What is known of each family on a joint."""
+    rows = []
+    good, shares = joint.conclusion.good, joint.conclusion.shares
+    for name, verdict in joint.conclusion.families.items():
+        members: list[str] = []
+        share = 0.0
+        for fit, weight in zip(good, shares, strict=True):
+            inside = [effect for effect in fit.effects if effect in rules.FAMILIES[name].effects]
+            members += [effect for effect in inside if effect not in members]
+            share += float(weight) if inside else 0.0
+        rows.append(FamilyVerdict(joint.name, name, verdict, tuple(members), share))
+    return rows
 
 
-def _evidence(joint: Analysed) -> list[Candidate]:
-    return [
-        Candidate(
-            joints=(joint.name,),
-            round=trial.round,
-            name=trial.name,
-            held_out_rmse_rad=trial.fit.held_out_rmse,
-            gain=trial.gain,
-            gain_ci95=trial.gain_ci,
-            decision=trial.decision,  # type: ignore[arg-type]
-            reason=trial.reason,
-            parameters={
-                key.partition(".")[2]: value
-                for key, value in trial.fit.values.items()
-                if key.startswith(f"{trial.name}.")
-            },
-            given=tuple(name for name in trial.fit.effects if name != trial.name),
+def _models(joint: AnalysedJoint, fits: Sequence[JointFit]) -> list[WholeModel]:
+    """Rows of models of a joint, the best first; the delivered one with its final values."""
+    good = list(joint.conclusion.good)
+    rows = []
+    for fit in sorted(fits, key=lambda fit: (fit not in good, fit.held_out_rmse)):
+        same = fit.effects == joint.final.effects
+        values = joint.final.values if same else fit.values
+        rows.append(
+            WholeModel(
+                joint=joint.name,
+                effects=fit.effects,
+                parameters={key: value for key, value in values.items() if "." in key},
+                rmse_rad=joint.final.rmse if same else fit.rmse,
+                held_out_rmse_rad=fit.held_out_rmse,
+                difference_ci95=rules.difference(joint.evidence, good[0], fit),
+                share=float(joint.conclusion.shares[good.index(fit)]) if fit in good else 0.0,
+                why="" if fit in good else rules.against(joint.evidence, fits, good, fit),
+            )
         )
-        for trial in joint.explanation.trials
-    ]
+    return rows
+
+
+def _credits(joint: AnalysedJoint) -> list[Credit]:
+    """What each effect of a joint's delivered model brings, where the model without it was fitted."""
+    by_effects = {frozenset(fit.effects): fit for fit in joint.fits}
+    rows = []
+    for name in joint.final.effects:
+        without = by_effects.get(frozenset(joint.final.effects) - {name})
+        if without is not None:
+            rows.append(Credit(joint.name, name, without.rmse, without.held_out_rmse))
+    return rows

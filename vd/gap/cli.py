@@ -104,7 +104,7 @@ class FindCommand(_Step):
 
 
 class ExplainCommand(_Step):
-    """Try every effect on motions that the fit has not seen, and name what is missing, or abstain."""
+    """Compare whole models on motions that their fits have not seen; name what is missing, or abstain."""
 
     first = last = "explain"
 
@@ -123,11 +123,10 @@ class ReportCommand(_Step):
 
 @dataclass(frozen=True)
 class PlanCommand(_Step):
-    """Choose the motions that would separate what is still ambiguous, as files vd-deploy record can play.
+    """Propose the motions that tell the causes which are still tied, as files vd-deploy record can play.
 
-    Each set of motions of a menu is simulated under the models that compete; the one on which they
-    disagree most, compared with the noise, wins. Writes DIR/next_experiment.json and its commands
-    as CSV files.
+    Each family of causes has its motions. Writes DIR/next_experiment.json and the commands as CSV
+    files.
     """
 
     def run(self) -> int:
@@ -136,8 +135,7 @@ class PlanCommand(_Step):
 
         analysis = self.analysis()
         analysis.run("explain", fresh=self.fresh)
-        device, report = analysis.settings.device, analysis.explained()
-        result = plan(report, analysis.recording, analysis.hand, analysis.start, device=device)
+        result = plan(analysis.explained(), analysis.recording, analysis.hand)
         path = write_plan(result, self.out)
         if self.json:
             print(path.read_text())
@@ -231,13 +229,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _print_report(analysis: "Analysis") -> None:
     from vd.gap.result import Report
-    from vd.gap.words import next_step, open_questions, verdict_sentence
+    from vd.gap.words import families_sentences, next_step, open_questions, verdict_sentence
 
     path = analysis.out / "report.json"
     report = Report.read(path)
     print(verdict_sentence(report))
     for finding in report.findings:
         print(f"  {finding.where}")
+    for line in families_sentences(report):
+        print(f"  {line}")
     print(next_step(report))
     for line in open_questions(report):
         print(f"  open: {line}")

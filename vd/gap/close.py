@@ -5,15 +5,23 @@ servo
 or pendulum has no articulation: there the layer is read back into the joint's own model.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from vd.gap.coordinates import GRAVITY
-from vd.gap.result import LAYER, Closing, NamedEffect, Predictions, Report, effect_values
+from vd.gap.result import (
+    LAYER,
+    Closing,
+    Delivered,
+    NamedEffect,
+    Predictions,
+    Report,
+    effect_values,
+)
 from vd.kernels.servo.effects import BASELINE, EFFECTS
 from vd.logs.recording import Recording
 
@@ -114,8 +122,8 @@ def simulate_again(
     curves: Predictions,
     *,
     device: str = "cpu",
-) -> tuple[Closing, Predictions]:
-    """Simulate the recording's commands with the baseline and with the layer.
+) -> tuple[Closing, Delivered | None, Predictions]:
+    """Simulate the recording's commands with the baseline and with the layer, as they are written.
 
     Args:
         report: What was identified, without a closing.
@@ -127,26 +135,43 @@ def simulate_again(
         device: Warp device.
 
     Returns:
-        What it showed, and the new curves.
+        What it showed on motions that were fitted, and on those that no fit saw, and the new
+        curves.
     """
     if hand_name is None:
         models = np.stack([curves.baseline, _bare(layer, recording, curves, device)])
     else:
         models = _newton(report, layer, recording, hand_name, start_layer, device)
     models = np.where(np.isnan(curves.baseline), np.nan, models)
-    squares = {}
+    curves = replace(curves, baseline=models[0], identified=models[1])
+    fitted = {}
     for joint in report.identified.per_joint:
-        moved = [curves.files.index(row.file) for row in report.trajectories if row.joint == joint]
-        rows, column = np.isin(curves.trajectory, moved), curves.joints.index(joint)
-        squares[joint] = (models[:, rows, column] - curves.measured[rows, column]) ** 2
-    before, after = np.sqrt(np.concatenate([*squares.values()], axis=1).mean(axis=1)).tolist()
-    per_joint = {
-        joint: tuple(np.sqrt(each.mean(axis=1)).tolist()) for joint, each in squares.items()
-    }
-    closing = Closing(
-        "rollout" if hand_name is None else "newton", layer.name, before, after, per_joint
-    )
-    return closing, replace(curves, baseline=models[0], identified=models[1])
+        files = [row.file for row in report.trajectories if row.joint == joint]
+        fitted[joint] = _squares(curves, joint, files)
+    before, after = _rms([*fitted.values()])
+    per_joint = {joint: _rms([squares]) for joint, squares in fitted.items()}
+    simulator: Literal["newton", "rollout"] = "rollout" if hand_name is None else "newton"
+    closing = Closing(simulator, layer.name, before, after, per_joint)
+    delivered = None
+    if report.aside:
+        unseen = [_squares(curves, joint, [file]) for joint, file in report.aside.items()]
+        before, after = _rms(unseen)
+        delivered = Delivered(", ".join(dict.fromkeys(report.aside.values())), after, before)
+    return closing, delivered, curves
+
+
+def _squares(curves: Predictions, joint: str, files: Sequence[str]) -> np.ndarray:
+    """Squared errors of baseline and identified model on a joint in some trajectories [2, N]."""
+    rows = np.isin(curves.trajectory, [curves.files.index(file) for file in files])
+    column = curves.joints.index(joint)
+    models = np.stack([curves.baseline[rows, column], curves.identified[rows, column]])
+    return (models - curves.measured[rows, column]) ** 2
+
+
+def _rms(squares: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Root mean square of both models over all samples."""
+    before, after = np.sqrt(np.concatenate(squares, axis=1).mean(axis=1)).tolist()
+    return before, after
 
 
 def _newton(

@@ -174,9 +174,6 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
     table: dict[str, list[dict[str, float]]] = {
         "command_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],
         "read_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],
-        "command_jitter": [
-            {"sigma_s": s, "p_drop": p} for s in (0.0015, 0.005, 0.015) for p in (0.01, 0.1, 0.4)
-        ],
         "command_filter": [{"tau_s": f * period} for f in (0.3, 1.0, 3.0, 10.0)],
         "acceleration_limit": [
             {"a_max_rad_s2": f * scales.acceleration} for f in (2.0, 1.0, 0.5, 0.25, 0.1)

@@ -25,17 +25,21 @@ Coulomb friction.
 """
 
 
+ENOUGH = 10
+"""Motions of a joint from which one is kept from every fit, to judge what is delivered. Not tuned."""
+
+
 def design(
     recording: Recording, chain: Chain, joint: int
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Trajectories of a joint and their folds.
+) -> tuple[tuple[int, ...], tuple[int, ...], int | None]:
+    """Trajectories of a joint, their folds, and the one that no fit sees.
 
     Those that excite it, and the largest motions of the other joints of its chain, in which it
     should hold. Folds are values of a condition that was varied (gain, payload, supply), or kinds
-    of motion.
+    of motion. No fit sees the motion of middle size, where there are :data:`ENOUGH`.
 
     Returns:
-        ``(trajectories, folds)``, both empty for a joint that nothing excites.
+        ``(trajectories, folds, aside)``, empty and None for a joint that nothing excites.
     """
     name = chain.joints[joint]
     column = int(chain.columns[joint])
@@ -45,20 +49,20 @@ def design(
         if name in t.joints and float(np.ptp(t.command[:, column])) > 0.0
     ]
     if not own:
-        return (), ()
+        return (), (), None
     own = [own[i] for i in np.unique(np.linspace(0, len(own) - 1, MAX_MOTIONS).round().astype(int))]
+    aside = None
+    if len(own) >= ENOUGH:
+        sizes = [np.ptp(recording.trajectories[i].command[:, column]) for i in own]
+        aside = own.pop(int(np.argsort(sizes, kind="stable")[len(own) // 2]))
     chosen = set(own)
     for other in range(len(chain.joints)):
         if other != joint:
-            alone = [
-                i
-                for i, t in enumerate(recording.trajectories)
-                if t.joints == (chain.joints[other],)
-            ]
-            size = {
-                i: np.ptp(recording.trajectories[i].command[:, chain.columns[other]]) for i in alone
-            }
-            chosen |= set(sorted(alone, key=lambda i: -size[i])[:BYSTANDERS])
+            size = {}
+            for i, t in enumerate(recording.trajectories):
+                if t.joints == (chain.joints[other],):
+                    size[i] = np.ptp(t.command[:, chain.columns[other]])
+            chosen |= set(sorted(size, key=lambda i: -size[i])[:BYSTANDERS])
     trajectories = sorted(chosen)
     condition = varied([recording.trajectories[i] for i in own])
     parts = [recording.trajectories[i] for i in trajectories]
@@ -66,7 +70,8 @@ def design(
     kinds = sorted(set(labels))
     if len(kinds) < 2:
         labels, kinds = [str(i) for i in trajectories], [str(i) for i in trajectories]
-    return tuple(trajectories), tuple(kinds.index(label) % MAX_FOLDS for label in labels)
+    folds = tuple(kinds.index(label) % MAX_FOLDS for label in labels)
+    return tuple(trajectories), folds, aside
 
 
 def pieces(

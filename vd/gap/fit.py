@@ -1,29 +1,120 @@
-"""Fit the servo model of one joint to its trajectories by least squares.
+"""Fit the servo model of one joint to its motions by least squares, by scipy's trust-region method.
 
-Every simulation is a rollout of the whole trajectory; all perturbed parameter sets of a step go
+Every simulation is a rollout of whole trajectories; all perturbed parameter sets of a step go
 through one call of :class:`vd.gap.rollout.Rollouts`.
 """
 
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
+from scipy.optimize import least_squares
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain, others_in
 from vd.gap.coordinates import Coordinate, Scales, coordinate, keys
-from vd.gap.descent import SHORT, LeastSquares
-from vd.gap.models import RIDGE, JointFit, SampleWeighting
 from vd.gap.rollout import Rollouts
-from vd.gap.statistics import speed_of
+from vd.gap.statistics import OWN_ERROR, half_width, rmse, speed_of
 from vd.logs.recording import Recording
 
 ITERATIONS = 12
 """Trials of a fit at most. Not tuned."""
+SHORT = 4
+"""Trials after which the worse half of several starts ends, and of a refit near its start. Not
+tuned.
+"""
+WIDEN = -3.0
+"""Factor on the finite-difference steps of a second descent: dry friction and limits make the
+squared error rugged at the scale of the first one's. Less than 0: to the other side. Without the
+second descent a limit of 10 comes out as 10.19; other factors were not tried."""
+TOLERANCE = 1e-4
+"""Relative improvement of the squared error at which a fit has converged. Not tuned."""
+RIDGE = 0.01
+"""Pull towards the start, as information in units of the noise floor: holds directions that the
+data leave free (the torque scale of a bare servo), moves no others. Not tuned."""
 FINER = (2, 4)
 """Divisors of the time step for estimates: what the last one changes is their error. Not tuned."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """A fitted model of one joint; S trajectories, P parameters.
+
+    Attributes:
+        effects: Names of the effects in the model.
+        coordinates: What was fitted.
+        x: Fitted coordinates [P].
+        rows: Parameter rows of the chain's joints, shape [n, PARAMETER_COLUMNS].
+        sse: Sum of squared errors of each trajectory [S] [rad^2].
+        absolute: Sum of absolute errors of each trajectory [S] [rad].
+        held_out: Sum of squared errors, each trajectory predicted by a fit without its group [S].
+        held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad].
+        count: Samples of each trajectory [S].
+        gram: J^T J [P, P].
+        refits: Coordinates of the fits without each fold [F, P].
+        step_error: What the time step of the rollouts leaves open in ``x`` [P].
+    """
+
+    effects: tuple[str, ...]
+    coordinates: tuple[Coordinate, ...]
+    x: np.ndarray
+    rows: np.ndarray
+    sse: np.ndarray
+    absolute: np.ndarray
+    held_out: np.ndarray
+    held_out_abs: np.ndarray
+    count: np.ndarray
+    gram: np.ndarray
+    refits: np.ndarray
+    step_error: np.ndarray
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter values by key."""
+        return {c.key: float(c.value(x)) for c, x in zip(self.coordinates, self.x, strict=True)}
+
+    @property
+    def rmse(self) -> float:
+        """RMSE on what was fitted [rad]."""
+        return float(rmse(self.sse, self.count))
+
+    @property
+    def mean_square(self) -> np.ndarray:
+        """Mean squared error of each held-out trajectory [S] [rad^2]."""
+        return self.held_out / self.count
+
+    @property
+    def mean_absolute(self) -> np.ndarray:
+        """Mean absolute error of each held-out trajectory [S] [rad]."""
+        return self.held_out_abs / self.count
+
+    @property
+    def held_out_rmse(self) -> float:
+        """RMSE on held-out trajectories [rad]."""
+        return float(rmse(self.held_out, self.count))
+
+
+def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
+    """95 % intervals by key.
+
+    Of the jackknife over folds, or of white noise at the floor if that is wider. To these come the
+    error of the time step and the model's own, which all motions share.
+    """
+    folds = len(fit.refits)
+    ridge = RIDGE * floor**2 * np.eye(len(fit.x))
+    white = floor**2 * np.diag(np.linalg.inv(fit.gram + ridge))
+    jackknife = (folds - 1) * fit.refits.var(axis=0)
+    width = half_width(np.maximum(jackknife, white), folds)
+    sizes = np.array([1.0 if c.log else x for c, x in zip(fit.coordinates, fit.x, strict=True)])
+    width = np.hypot(width, half_width((OWN_ERROR * sizes) ** 2, np.inf))
+    width = np.hypot(width, fit.step_error)
+    result = {}
+    for c, x, w in zip(fit.coordinates, fit.x, width, strict=True):
+        low = c.value(max(x - w, c.lower))
+        high = c.value(min(x + w, c.upper))
+        result[c.key] = (float(low), float(high))
+    return result
 
 
 class JointProblem:
@@ -48,70 +139,36 @@ class JointProblem:
         baseline: Sequence[str],
     ):
         self.rollouts = rollouts
-        self.coarse: Rollouts | None = None  # simulates for slopes, where it may be another
+        self.slopes = rollouts  # simulates for Jacobians, which need no finer step
         self.joint = joint
         self.trajectories = np.asarray(trajectories)
         self.folds = np.asarray(folds)
         self.floor = floor
         self.baseline = tuple(baseline)
-        self._measured = {
-            int(t): rollouts.measured[rollouts.sample_trajectory == t, joint]
-            for t in self.trajectories
-        }
-        self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
-        self._growth: dict[int, np.ndarray] = {}
-
-    def weighted(self, weighting: SampleWeighting) -> "JointProblem":
-        """The same data, samples weighted by how surely they are known."""
-        seen = copy.copy(self)
-        names = [int(t) for t in self.trajectories]
-        shift = dict(zip(names, self.split(weighting.shift), strict=True))
-        seen._measured = {t: self._measured[t] - shift[t] for t in names}
-        seen._growth = dict(zip(names, self.split(weighting.growth), strict=True))
-        return seen
+        of_trajectory = rollouts.sample_trajectory
+        parts = [rollouts.measured[of_trajectory == t, joint] for t in self.trajectories]
+        self._measured = np.concatenate(parts)
+        self.count = np.array([len(part) for part in parts])
 
     def residuals(
-        self,
-        rows: np.ndarray,
-        trajectories: np.ndarray | None = None,
-        keep: np.ndarray | None = None,
-        *,
-        rollouts: Rollouts | None = None,
+        self, rows: np.ndarray, keep: np.ndarray | None = None, rollouts: Rollouts | None = None
     ) -> np.ndarray:
         """Measured minus predicted position of the joint for C chains [C, n, PARAMETER_COLUMNS].
 
-        [C, N].
+        Args:
+            rows: The chains.
+            keep: What is simulated of the trajectories [C, S]; the rest is 0. All by default.
+            rollouts: The simulation, another than the problem's.
 
-        What ``keep`` [C, S] leaves out of the trajectories is not simulated, and is 0.
+        Returns:
+            Residuals [C, N] [rad].
         """
-        chosen = [int(t) for t in (self.trajectories if trajectories is None else trajectories)]
-        measured = np.concatenate([self._measured[t] for t in chosen])
-        simulation = self.rollouts if rollouts is None else rollouts
-        predicted = simulation.predict(rows, chosen, joint=self.joint, keep=keep)
-        residual = measured - predicted
-        if self._growth:
-            residual /= np.concatenate([self._growth[t] for t in chosen])
+        simulation = rollouts or self.rollouts
+        predicted = simulation.predict(rows, self.trajectories, joint=self.joint, keep=keep)
+        residual = self._measured - predicted
         if keep is not None:
-            residual *= np.repeat(keep, [len(self._measured[t]) for t in chosen], axis=1)
+            residual *= np.repeat(keep, self.count, axis=1)
         return residual
-
-    def squares(
-        self,
-        base: np.ndarray,
-        coordinates: Sequence[Coordinate],
-        trajectories: np.ndarray | None = None,
-    ) -> LeastSquares:
-        """The squared error of the model whose other parameters are those of ``base``."""
-
-        def residuals(
-            x: np.ndarray, keep: np.ndarray | None, rollouts: Rollouts | None = None
-        ) -> np.ndarray:
-            rows = self.rows(base, coordinates, x)
-            mask = None if keep is None else np.repeat(keep[None], len(x), axis=0)
-            return self.residuals(rows, trajectories, mask, rollouts=rollouts)
-
-        slopes = partial(residuals, rollouts=self.coarse)
-        return LeastSquares(coordinates, residuals, RIDGE * self.floor**2, slopes)
 
     def rows(
         self, base: np.ndarray, coordinates: Sequence[Coordinate], x: np.ndarray
@@ -122,40 +179,45 @@ class JointProblem:
             rows[:, self.joint, c.column] = c.value(x[:, i])
         return rows
 
-    def split(
-        self, samples: np.ndarray, trajectories: np.ndarray | None = None
-    ) -> list[np.ndarray]:
-        """Cut the last axis into trajectories."""
-        chosen = self.trajectories if trajectories is None else trajectories
-        ends = np.cumsum([len(self._measured[int(t)]) for t in chosen])[:-1]
-        return np.split(samples, ends, axis=-1)
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """Sums over the samples of each trajectory [.., S] of values [.., N]."""
+        starts = np.cumsum(self.count) - self.count
+        return np.add.reduceat(values, starts, axis=-1)
 
     def scales(self, row: np.ndarray, residual: float) -> Scales:
         """Sizes of the joint's motion with a baseline row [PARAMETER_COLUMNS]."""
-        chain, recording = self.rollouts.chain, self.rollouts.recording
-        column, parts = (
-            int(chain.columns[self.joint]),
-            [recording.trajectories[t] for t in self.trajectories],
-        )
-        speeds = [speed_of(t.time, t.position[:, column]) for t in parts]
-        changes = [speed_of(t.time, speed) for t, speed in zip(parts, speeds, strict=True)]
-        torque = row[servo.KP] * np.concatenate(
-            [t.command[:, column] - t.position[:, column] for t in parts]
-        )
-        peak, speed, acceleration = (
-            float(np.percentile(np.abs(values), 99.5))
-            for values in (torque, np.concatenate(speeds), np.concatenate(changes))
-        )
+        chain = self.rollouts.chain
+        column = int(chain.columns[self.joint])
+        speeds, accelerations, errors, durations = [], [], [], []
+        for index in self.trajectories:
+            trajectory = self.rollouts.recording.trajectories[index]
+            speed = speed_of(trajectory.time, trajectory.position[:, column])
+            speeds.append(speed)
+            accelerations.append(speed_of(trajectory.time, speed))
+            errors.append(trajectory.command[:, column] - trajectory.position[:, column])
+            durations.append(trajectory.duration)
+        torque = row[servo.KP] * np.concatenate(errors)
+
+        def peak(values: np.ndarray) -> float:
+            return float(np.percentile(np.abs(values), 99.5))
+
         return Scales(
             kp=float(row[servo.KP]),
             torque=float(np.sqrt(np.mean(torque**2))) + 1e-9,
-            peak=peak + 1e-9,
-            speed=speed + 1e-3,
-            acceleration=acceleration + 0.1,
+            peak=peak(torque) + 1e-9,
+            speed=peak(np.concatenate(speeds)) + 1e-3,
+            acceleration=peak(np.concatenate(accelerations)) + 0.1,
             inertia=max(float(row[servo.INERTIA]) + chain.inertia_scale(self.joint), 1e-6),
             residual=residual,
-            duration=max(t.duration for t in parts),
+            duration=max(durations),
         )
+
+    def fitted(self, effects: Sequence[str]) -> list[str]:
+        """Keys of what a model with these effects fits on this joint."""
+        others = others_in(self.rollouts.chain, self.joint)
+        slots = [slot for slot in range(servo.MAX_JOINTS) if slot not in others]
+        absent = {f"joint_coupling.from_{slot + 1}" for slot in slots}
+        return [key for key in keys(effects, self.baseline) if key not in absent]
 
     def fit(
         self,
@@ -165,106 +227,88 @@ class JointProblem:
         scales: Scales,
         *,
         iterations: int = ITERATIONS,
-        trajectories: np.ndarray | None = None,
     ) -> JointFit:
-        """Fit a model from several starts by least squares.
+        """Fit a model from several starts, and predict every fold by a fit without it.
 
         Args:
-            base: Rows of the chain's joints [n, PARAMETER_COLUMNS]; this joint's parameters start
-                there.
+            base: Rows of the chain's joints [n, PARAMETER_COLUMNS], this joint's without effects.
             effects: Effects in the model besides the baseline.
             starts: Starting values by key; what is absent starts at ``base``.
             scales: Sizes of the joint's motion.
             iterations: Steps at most.
-            trajectories: Subset to fit to, without held-out errors; all of the problem's if None.
 
         Returns:
             The best.
         """
         coordinates = [coordinate(key, scales) for key in self.fitted(effects)]
-        x0 = np.array(
-            [
-                [
-                    c.inverse(float(start.get(c.key, base[self.joint, c.column])))
-                    for c in coordinates
-                ]
-                for start in starts
-            ]
-        )
-        chosen = self.trajectories if trajectories is None else np.asarray(trajectories)
-        model = self.squares(base, coordinates, chosen)
-        x = model.best(x0, iterations)
-        jacobian = model.jacobian(x)
-        errors = self.split(model.residuals(x[None], None)[0], chosen)
-        fit = JointFit(
-            effects=tuple(effects),
+        x0 = []
+        for start in starts:
+            values = [start.get(c.key, base[self.joint, c.column]) for c in coordinates]
+            pairs = zip(coordinates, values, strict=True)
+            x0.append(np.array([c.inverse(float(value)) for c, value in pairs]))
+        x = _Descent(self, base, coordinates).best(x0, iterations)
+        return self._judged(base, tuple(effects), coordinates, x)
+
+    def _judged(
+        self,
+        base: np.ndarray,
+        effects: tuple[str, ...],
+        coordinates: Sequence[Coordinate],
+        x: np.ndarray,
+    ) -> JointFit:
+        """The fit at coordinates [P], with its errors on all and on held-out motions.
+
+        Refits go on from there with the slopes that they have there.
+        """
+        descent = _Descent(self, base, coordinates)
+        jacobian = descent.jacobian(x)
+        out = np.unique(self.folds)[:, None] == self.folds
+        refits = []
+        for fold in out:
+            slopes = jacobian * np.repeat(~fold, self.count)
+            refits.append(descent.descend(x, SHORT, ~fold, slopes))
+        unseen = self.residuals(self.rows(base, coordinates, np.array(refits)), out).sum(axis=0)
+        rows = self.rows(base, coordinates, x[None])
+        residual = self.residuals(rows)[0]
+        return JointFit(
+            effects=effects,
             coordinates=tuple(coordinates),
             x=x,
-            rows=self.rows(base, coordinates, x[None])[0],
-            sse=np.array([e @ e for e in errors]),
-            held_out=np.full(len(chosen), np.nan),
-            count=np.array([len(e) for e in errors], float),
+            rows=rows[0],
+            sse=self.sums(residual**2),
+            absolute=self.sums(np.abs(residual)),
+            held_out=self.sums(unseen**2),
+            held_out_abs=self.sums(np.abs(unseen)),
+            count=self.count.astype(float),
             gram=jacobian @ jacobian.T,
-            refits=x[None],
+            refits=np.array(refits),
+            step_error=np.zeros(len(x)),
         )
-        if trajectories is not None:
-            return fit
-        return self.cross_validate(fit, jacobian)
 
-    def fitted(self, effects: Sequence[str]) -> list[str]:
-        """Keys of what a model with these effects fits on this joint."""
-        others = others_in(self.rollouts.chain, self.joint)
-        absent = {
-            f"joint_coupling.from_{slot + 1}"
-            for slot in range(servo.MAX_JOINTS)
-            if slot not in others
-        }
-        return [key for key in keys(effects, self.baseline) if key not in absent]
-
-    def jacobian(self, fit: JointFit) -> np.ndarray:
-        """d(predicted)/dx at a fit, shape [P, N]."""
-        return self.squares(fit.rows, fit.coordinates).jacobian(fit.x)
-
-    def cross_validate(self, fit: JointFit, jacobian: np.ndarray) -> JointFit:
-        """A fit with the errors of each trajectory as a fit without its fold predicts it.
-
-        Args:
-            fit: The fit to all folds.
-            jacobian: Its d(predicted)/dx [P, N], which the refits keep.
-        """
-        out = np.unique(self.folds)[:, None] == self.folds
-        model = self.squares(fit.rows, fit.coordinates)
-        x = np.array(
-            [
-                model.descend(
-                    fit.x, SHORT, ~fold, jacobian * np.repeat(~fold, self.count.astype(int))
-                )
-                for fold in out
-            ]
-        )
-        residual = self.residuals(self.rows(fit.rows, fit.coordinates, x), keep=out)
-        parts = self.split(residual.sum(0))
-        squared, absolute = (
-            np.array([np.sum(abs(part) ** power) for part in parts]) for power in (2, 1)
-        )
-        return replace(fit, held_out=squared, held_out_abs=absolute, refits=x)
-
-    def refine(self, fit: JointFit, scales: Scales) -> JointFit:
+    def refine(self, fit: JointFit) -> JointFit:
         """The same model fitted on with finer time steps, for values that do not depend on the step.
 
         What the last halving changes is kept as the error that is left. Slopes are those of the
-        problem's own time step: they need not be finer. Held-out errors are those of
-        ``fit``, to be compared with other models'.
+        problem's own time step. Held-out errors are those of ``fit``, to be compared with other
+        models'.
         """
-        result, error, fine = fit, np.zeros(len(fit.x)), copy.copy(self)
-        fine.coarse = self.rollouts
+        fine = copy.copy(self)
+        x, error = fit.x, np.zeros(len(fit.x))
         for divisor in FINER:
             fine.rollouts = self.rollouts.at(self.rollouts.dt / divisor)
-            before, given = result.x, [result.values]
-            result = fine.fit(fit.rows, fit.effects, given, scales, trajectories=self.trajectories)
-            error = np.abs(result.x - before)
-        held_out = {name: getattr(fit, name) for name in ("held_out", "held_out_abs", "refits")}
-        return replace(result, **held_out, step_error=error)
+            moved = _Descent(fine, fit.rows, fit.coordinates).best([x], ITERATIONS)
+            error = np.abs(moved - x)
+            x = moved
+        rows = self.rows(fit.rows, fit.coordinates, x[None])
+        residual = fine.residuals(rows)[0]
+        return replace(
+            fit,
+            x=x,
+            rows=rows[0],
+            sse=self.sums(residual**2),
+            absolute=self.sums(np.abs(residual)),
+            step_error=error,
+        )
 
     def promise(
         self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales
@@ -272,24 +316,22 @@ class JointProblem:
         """Share of the squared error that each start could remove, the present parameters readjusted.
 
         A linear estimate from one rollout per start: the start's change of the prediction, less
-            what
-        the fitted parameters can imitate, against the residual.
+        what the fitted parameters can imitate, against the residual.
 
         Args:
             fit: Present model.
-            starts: Starting values of the effect that each start adds, by key.
+            starts: Values that each start changes, by key.
             scales: Sizes of the joint's motion.
         """
-        residual = self.residuals(fit.rows[None])
-        jacobian = self.jacobian(fit)
+        residual = self.residuals(fit.rows[None])[0]
+        jacobian = _Descent(self, fit.rows, fit.coordinates).jacobian(fit.x)
         basis = np.linalg.svd(jacobian, full_matrices=False)[2]
-        left = residual[0] - basis.T @ (basis @ residual[0])
+        left = residual - basis.T @ (basis @ residual)
         rows = np.repeat(fit.rows[None], len(starts), axis=0)
-        for i, start in enumerate(starts):
+        for row, start in zip(rows, starts, strict=True):
             for key, value in start.items():
-                if "." not in key and key not in self.baseline:
-                    continue  # not free in this chain
-                rows[i, self.joint, coordinate(key, scales).column] = value
+                if "." in key or key in self.baseline:
+                    row[self.joint, coordinate(key, scales).column] = value
         change = residual - self.residuals(rows)
         change -= (change @ basis.T) @ basis
         along = change @ left
@@ -298,7 +340,89 @@ class JointProblem:
         # effect.
         factor = np.clip(along / np.maximum(power, 1e-300), 0.0, 3.0)
         gain = 2.0 * factor * along - factor**2 * power
-        return gain / max(float(residual[0] @ residual[0]), 1e-300)
+        return gain / max(float(residual @ residual), 1e-300)
+
+
+class _Descent:
+    """Least squares of a problem in coordinates, the other parameters being those of ``base``."""
+
+    def __init__(self, problem: JointProblem, base: np.ndarray, coordinates: Sequence[Coordinate]):
+        self.problem = problem
+        self.base = base
+        self.coordinates = coordinates
+        self.lower = np.array([c.lower for c in coordinates])
+        self.upper = np.array([c.upper for c in coordinates])
+        self.pull = np.sqrt(RIDGE) * problem.floor
+
+    def residuals(self, x: np.ndarray, keep: np.ndarray | None = None) -> np.ndarray:
+        """Residuals [N] at coordinates [P], those of trajectories that ``keep`` [S] leaves out 0."""
+        rows = self.problem.rows(self.base, self.coordinates, x[None])
+        return self.problem.residuals(rows, None if keep is None else keep[None])[0]
+
+    def jacobian(
+        self, x: np.ndarray, keep: np.ndarray | None = None, widen: float = 1.0
+    ) -> np.ndarray:
+        """d(predicted)/dx [P, N] at coordinates [P] by one-sided differences, their steps times a factor."""
+        pairs = zip(self.coordinates, x, strict=True)
+        steps = np.array([c.step(float(value), widen) for c, value in pairs])
+        moved = np.vstack([x, x + np.diag(steps)])
+        rows = self.problem.rows(self.base, self.coordinates, moved)
+        mask = None if keep is None else np.repeat(keep[None], len(moved), axis=0)
+        residuals = self.problem.residuals(rows, mask, self.problem.slopes)
+        return (residuals[0] - residuals[1:]) / steps[:, None]
+
+    def descend(
+        self,
+        start: np.ndarray,
+        iterations: int,
+        keep: np.ndarray | None = None,
+        slopes: np.ndarray | None = None,
+        widen: float = 1.0,
+    ) -> np.ndarray:
+        """Coordinates [P] of a local minimum.
+
+        Args:
+            start: Where to start [P].
+            iterations: Trials at most.
+            keep: Trajectories that count [S]; all by default.
+            slopes: A Jacobian [P, N] to keep.
+            widen: Factor on finite-difference steps.
+        """
+        # In units of what is left, by which the first step may change the prediction at most.
+        left = max(float(np.linalg.norm(self.residuals(start, keep))), 1e-12)
+
+        def residuals(moved: np.ndarray) -> np.ndarray:
+            return np.concatenate([self.residuals(start + moved, keep), self.pull * moved]) / left
+
+        def jacobian(moved: np.ndarray) -> np.ndarray:
+            rows = self.jacobian(start + moved, keep, widen) if slopes is None else slopes
+            return np.vstack([-rows.T, self.pull * np.eye(len(start))]) / left
+
+        solution = least_squares(
+            residuals,
+            np.zeros(len(start)),
+            jacobian,
+            bounds=(self.lower - start, self.upper - start),
+            method="dogbox",
+            x_scale="jac",
+            ftol=TOLERANCE,
+            gtol=None,
+            max_nfev=iterations,
+        )
+        return np.clip(start + solution.x, self.lower, self.upper)
+
+    def best(self, starts: Sequence[np.ndarray], iterations: int) -> np.ndarray:
+        """Coordinates [P] of the least minimum from several starts [P].
+
+        The worse half ends early.
+        """
+        left = list(starts)
+        while len(left) > 1:
+            left = [self.descend(x, SHORT) for x in left]
+            left.sort(key=lambda x: float(np.sum(self.residuals(x) ** 2)))
+            left = left[: (len(left) + 1) // 2]
+        x = self.descend(left[0], iterations)
+        return self.descend(x, iterations, widen=WIDEN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,6 +437,7 @@ class JointSpec:
         floor: Noise floor [rad].
         baseline: Keys of the fitted baseline parameters.
         pieces: Samples ``(first, end)`` of each trajectory that are analysed; empty: all.
+        aside: Index of the trajectory that no fit sees; None where there are too few.
     """
 
     chain: int
@@ -322,6 +447,7 @@ class JointSpec:
     floor: float
     baseline: tuple[str, ...]
     pieces: tuple[tuple[int, int], ...] = ()
+    aside: int | None = None
 
 
 class Problems:
@@ -335,19 +461,23 @@ class Problems:
     """
 
     def __init__(self, recording: Recording, chains: Sequence[Chain], dt: float, device: str):
-        self.recording, self.chains, self.dt, self.device = recording, chains, dt, device
+        self.recording = recording
+        self.chains = chains
+        self.dt = dt
+        self.device = device
         self._rollouts: dict[tuple[int, int | None], Rollouts] = {}
         self._problems: dict[tuple[int, int], JointProblem] = {}
 
     def of(self, spec: JointSpec) -> JointProblem:
         """The problem of a joint."""
-        key = spec.chain, spec.joint
+        key = (spec.chain, spec.joint)
         if key not in self._problems:
             # Whole trajectories are shared by the joints of a chain, pieces are each joint's own.
-            shared = spec.chain, None if not spec.pieces else spec.joint
+            shared = (spec.chain, spec.joint if spec.pieces else None)
             if shared not in self._rollouts:
                 parts = dict(zip(spec.trajectories, spec.pieces, strict=bool(spec.pieces)))
-                recording, chain = self.recording.cut(parts), self.chains[spec.chain]
+                recording = self.recording.cut(parts)
+                chain = self.chains[spec.chain]
                 self._rollouts[shared] = Rollouts(chain, recording, dt=self.dt, device=self.device)
             self._problems[key] = JointProblem(
                 self._rollouts[shared],

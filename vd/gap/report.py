@@ -1,6 +1,5 @@
 """What the page of a gap report shows, and its figures as PNG files beside it."""
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -11,7 +10,16 @@ from vd.command.files import atomic_path
 from vd.command.page import FIGURE_DPI, write_html
 from vd.gap import figures, words
 from vd.gap.coordinates import BASELINE_PARAMETERS
-from vd.gap.result import Candidate, JointGap, NamedEffect, Predictions, Report, parameters_of
+from vd.gap.result import (
+    Credit,
+    FamilyVerdict,
+    JointGap,
+    NamedEffect,
+    Predictions,
+    Report,
+    WholeModel,
+    parameters_of,
+)
 from vd.gap.words import amount, mrad, percent, plain
 from vd.kernels.servo.effects import EFFECTS
 
@@ -26,7 +34,6 @@ _VERDICTS = {
     "under_excited": "Motions do not determine the model",
     "unknown": "Gap found, cause unknown",
 }
-_DECISIONS = {"named": "accepted: ", "tied": "", "rejected": "rejected: "}
 
 Row = tuple[str, ...]
 
@@ -61,19 +68,6 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
             if joint not in residuals:
                 residual = figures.residual_figure(report, curves, joint)
                 residuals[joint] = draw(f"residual_{joint}", residual)
-    joints = [one.joint for one in report.joints]
-    evidence = sorted(
-        report.evidence,
-        key=lambda r: (joints.index(r.joints[0]), r.round, math.isnan(r.gain), -r.gain),
-    )
-    rivals = {
-        ((one.joint,), name) for one in report.joints for group in one.open_sets for name in group
-    }
-    kept = [
-        _evidence_row(row)[:-1]
-        for row in evidence
-        if row.decision == "named" or (row.decision == "tied" and (row.joints, row.name) in rivals)
-    ]
     write_html(
         folder / REPORT_HTML,
         "gap.html",
@@ -94,9 +88,15 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
             )
             for one in report.trajectories
         ],
-        evidence=[_evidence_row(row) for row in evidence],
-        kept=kept,
-        not_fitted=[plain(name) for name in EFFECTS if name not in {row.name for row in evidence}],
+        families=[_family_row(row) for row in report.families],
+        models=[_model_row(row) for row in report.models],
+        compared=[_model_row(row) for row in report.compared],
+        credits=[_credit_row(report, row) for row in report.credits],
+        not_tried=[
+            (joint, plain(name), plain(reason))
+            for joint, reasons in report.not_tried.items()
+            for name, reason in reasons.items()
+        ],
         parameters=[*_parameters(report.effects), *_parameters(report.provisional, " (not named)")],
         alternatives=[
             (
@@ -115,24 +115,24 @@ def write_report(report: Report, curves: Predictions, folder: Path) -> None:
 
 def _headline(report: Report) -> list[Row]:
     held = report.held_out
-    answer = words.listing(
-        [plain(n) for n in dict.fromkeys(e.name for e in report.effects)] or ["nothing named"]
+    names = dict.fromkeys(plain(effect.name) for effect in report.effects)
+    answer = words.listing(names or ["nothing named"])
+    before = (
+        f"held out, the plain servo model; {mrad(report.baseline.rmse_rad)} where it was fitted"
     )
-    if not report.effects and report.open_sets:
-        answer = "; ".join(words.causes(group) for group in report.open_sets)
     tiles = [
         (_VERDICTS[report.verdict], "verdict", answer),
-        (
-            mrad(held.baseline_rmse_rad),
-            "gap before",
-            "error on held-out motions, plain servo model fitted",
-        ),
+        (mrad(held.baseline_rmse_rad), "gap before", before),
     ]
     if report.effects or report.provisional:
-        note = f"{percent(held.reduction)} less (95 %: {words.percent_range(held.ci95)})"
+        note = f"held out, the identified model; {mrad(report.identified.rmse_rad)} where it was fitted"
         tiles.append((mrad(held.identified_rmse_rad), "gap after", note))
+    if report.delivered is not None:
+        before = mrad(report.delivered.baseline_rmse_rad)
+        note = f"the layer as written, on a motion that no fit saw; the plain model {before}"
+        tiles.append((mrad(report.delivered.rmse_rad), "as delivered", note))
     floor = mrad(report.noise_floor_rad)
-    return [*tiles, (floor, "noise floor", "what no model can explain: resolution, repeatability")]
+    return [*tiles, (floor, "noise floor", "of the encoder: its counts, and its readings at rest")]
 
 
 def _joint_row(report: Report, one: JointGap) -> Row:
@@ -147,19 +147,34 @@ def _joint_row(report: Report, one: JointGap) -> Row:
     )
 
 
-def _evidence_row(row: Candidate) -> Row:
-    units = parameters_of(row.name)
-    known = math.isfinite(row.gain)
+def _family_row(row: FamilyVerdict) -> Row:
+    members = words.causes(row.effects) if row.effects else ""
+    return row.joint, row.name, row.verdict, members, percent(row.share) if row.effects else ""
+
+
+def _model_row(row: WholeModel) -> Row:
+    values = []
+    for key, value in row.parameters.items():
+        effect, _, name = key.partition(".")
+        values.append(f"{name} {amount(value, parameters_of(effect)[name].unit)}")
     return (
-        words.joints_text(row.joints),
-        plain(row.name),
-        ", ".join(map(plain, row.given)),
-        mrad(row.held_out_rmse_rad) if known else "not fitted",
-        f"{percent(row.gain)} ({words.percent_range(row.gain_ci95)})" if known else "",
-        f"{_DECISIONS[row.decision]}{plain(row.reason)}",
-        ", ".join(
-            f"{key} {amount(value, units[key].unit)}" for key, value in row.parameters.items()
-        ),
+        row.joint,
+        words.model_text(row.effects),
+        mrad(row.rmse_rad),
+        mrad(row.held_out_rmse_rad),
+        words.mrad_range(row.difference_ci95),
+        plain(row.why) or "as good as the best",
+        ", ".join(values),
+    )
+
+
+def _credit_row(report: Report, row: Credit) -> Row:
+    (joint,) = [each for each in report.joints if each.joint == row.joint]
+    return (
+        row.joint,
+        plain(row.effect),
+        f"{mrad(joint.identified_fitted_rmse_rad)} with it, {mrad(row.without_rmse_rad)} without",
+        f"{mrad(joint.identified_rmse_rad)} with it, {mrad(row.without_held_out_rmse_rad)} without",
     )
 
 

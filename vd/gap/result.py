@@ -25,12 +25,14 @@ from vd.logs.motions import Recording
 FORMAT = "vd-gap-report/1"
 LAYER = "identified.usda"
 """Identified model, beside the report."""
-_OPTIONAL = ("hand", "hand_layer", "closing")
+_OPTIONAL = ("hand", "hand_layer", "closing", "delivered")
 """Fields of a report in which None means none, not a number that is unknown."""
 
 Verdict = Literal["effects", "ambiguous", "unknown", "under_excited", "no_gap"]
 """That of a recording is the first of these that some joint has."""
-Decision = Literal["named", "tied", "rejected"]
+Certainty = Literal["certain", "likely", "untold", "excluded"]
+"""What is known of a family of causes: all good models have it; those that have it predict more than
+half of the motions best; fewer; none has it."""
 Interval = tuple[float, float]
 
 
@@ -50,7 +52,7 @@ class Alternative:
     name: str
     held_out_rmse_rad: float
     difference_ci95: Interval
-    """Of its held-out RMSE minus the named effect's [rad]; an interval that covers 0 is a tie."""
+    """Of its held-out RMSE minus the named effect's [rad]; one that covers 0 tells nothing."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class NamedEffect:
     """Name in :data:`vd.kernels.servo.effects.EFFECTS`."""
     joints: tuple[str, ...]
     confidence: float
-    """Share of bootstrap repetitions, choice included, that name it."""
+    """Share of the motions that a good model with it predicts best."""
     parameters: dict[str, Estimate]
     alternatives: tuple[Alternative, ...] = ()
 
@@ -122,32 +124,64 @@ class JointGap:
     reason: str
     """One sentence: why this verdict."""
     open_sets: tuple[tuple[str, ...], ...] = ()
-    """Effects that the recording does not tell apart on this joint, a set each."""
+    """Effects that stand in for each other in this joint's good models, a set each."""
+    baseline_fitted_rmse_rad: float = math.nan
+    """On the motions that it was fitted to, as the next."""
+    identified_fitted_rmse_rad: float = math.nan
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A row of the evidence table.
+class FamilyVerdict:
+    """What is known of a family of causes on a joint."""
 
-    One effect tried on some joints in one round of the selection.
-    """
-
-    joints: tuple[str, ...]
-    round: int
-    """1 for the first effect that is added."""
+    joint: str
     name: str
+    verdict: Certainty
+    effects: tuple[str, ...]
+    """Members of the family that good models have."""
+    share: float
+    """Share of the motions that a good model with one of them predicts best."""
+
+
+@dataclass(frozen=True)
+class WholeModel:
+    """A complete model of a joint: the plain servo with some effects, everything fitted together."""
+
+    joint: str
+    effects: tuple[str, ...]
+    parameters: dict[str, float]
+    """Fitted values, by effect and parameter (``backlash.width_rad``)."""
+    rmse_rad: float
+    """On the motions that it was fitted to."""
     held_out_rmse_rad: float
-    """With it added and everything refitted."""
-    gain: float
-    """Share of the held-out RMSE before the round that it removes; negative if worse."""
-    gain_ci95: Interval
-    decision: Decision
-    reason: str
-    """Why, in a few words."""
-    parameters: dict[str, float] = field(default_factory=dict)
-    """Fitted values by name."""
-    given: tuple[str, ...] = ()
-    """Effects that were in the model before it was added."""
+    """On each motion as the same model predicts it, fitted without."""
+    difference_ci95: Interval
+    """Of its held-out error minus the best model's, over motions [rad]."""
+    share: float
+    """Share of the motions that it predicts best of the good ones; 0 for others."""
+    why: str
+    """What speaks against it; empty for a good model."""
+
+
+@dataclass(frozen=True)
+class Credit:
+    """What one effect of the identified model brings: the errors of the model without it, refitted."""
+
+    joint: str
+    effect: str
+    without_rmse_rad: float
+    without_held_out_rmse_rad: float
+
+
+@dataclass(frozen=True)
+class Delivered:
+    """The layer as it was written, simulated on motions that no fit saw."""
+
+    trajectory: str
+    """Their files, one a joint, separated by commas."""
+    rmse_rad: float
+    baseline_rmse_rad: float
+    """Of the plain model, fitted to the same motions."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +201,7 @@ class TrajectoryError:
 
 @dataclass(frozen=True)
 class Closing:
-    """The identified layer simulated again."""
+    """The identified layer simulated again, on the motions that were fitted."""
 
     simulator: Literal["newton", "rollout"]
     """``rollout`` for a bare servo or pendulum, whose model is the joint itself."""
@@ -212,9 +246,10 @@ class Report:
     findings: tuple[Misfit, ...]
     effects: tuple[NamedEffect, ...]
     ambiguous: tuple[tuple[str, ...], ...]
-    """Sets of effects that the recording cannot tell apart."""
+    """Sets of effects that the recording cannot tell apart; ``models`` has the models that they are
+    from, whose members are not free to combine."""
     identified: Fit
-    """With the named effects and the provisional ones."""
+    """The best of the good models: the named effects and the provisional ones."""
     held_out: HeldOut
     next_experiment: str
     """What to record next, in one sentence; empty if nothing is open."""
@@ -222,14 +257,22 @@ class Report:
     recording: AnalysedRecording
     format: str = FORMAT
     provisional: tuple[NamedEffect, ...] = ()
-    """The first of each set in ``ambiguous``: not named, but what the identified model holds of the
-    set.
-    """
+    """What the identified model holds besides the named effects."""
     hand: str | None = None
     hand_layer: str | None = None
     """Identified model that the analysis started from."""
     joints: tuple[JointGap, ...] = ()
-    evidence: tuple[Candidate, ...] = ()
+    families: tuple[FamilyVerdict, ...] = ()
+    models: tuple[WholeModel, ...] = ()
+    """The models of each joint that are not worse than its best, the best first, at most five."""
+    compared: tuple[WholeModel, ...] = ()
+    """All models that were fitted."""
+    credits: tuple[Credit, ...] = ()
+    not_tried: dict[str, dict[str, str]] = field(default_factory=dict)
+    """Effects that no model has, with the reason, by joint."""
+    aside: dict[str, str] = field(default_factory=dict)
+    """File of the motion that no fit of a joint saw, by joint."""
+    delivered: Delivered | None = None
     trajectories: tuple[TrajectoryError, ...] = ()
     closing: Closing | None = None
     warnings: tuple[str, ...] = ()

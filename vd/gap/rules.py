@@ -1,60 +1,104 @@
-"""Every rule by which an effect of a joint is named, in the order in which they act.
+"""Every rule by which a cause is named, in the order in which they act.
 
-Which effects are tried, whether there is anything to explain, what a step of the search earns,
-whether delays are random, what is named in the end, and what joints tell each other. Rules take the
-data on which they act, and simulate nothing. Everything is judged on trajectories that the fit has
-not seen, and resampled by whole trajectories with the choice inside the resampling.
+Whole models of a joint are compared, each fitted to all its motions (:mod:`vd.gap.ladder`) and held
+out motion by motion. A name is what all models share that are not worse than the best: a family of
+causes first, then its member where the motions tell. Rules take the data on which they act, and
+simulate nothing.
+
+1. Which effects are tried: those that the joint can have and telemetry does not contradict.
+2. Whether there is a gap: not where the plain model leaves no more than noise.
+3. The best model: least error of the models that earn what they have more than each smaller one
+   that they contain, by one standard error over motions.
+4. Which models are good: those that are not worse than the best by the 95 % interval of paired
+   differences over motions, or by samples where the best leaves no more than noise.
+5. What is named: what all good models share, if fitted and held-out errors both fall by enough.
+   So an effect is named only if without it every model is worse by that interval.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import get_args
 
 import numpy as np
 
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain
-from vd.gap.models import (
-    Accepted,
-    Explanation,
-    JointFit,
-    Telemetry,
-    TriedEffect,
-    estimates,
-    intervals,
-)
-from vd.gap.result import Verdict
-from vd.gap.statistics import OWN_ERROR, REPEATABLE, interval, rmse
-from vd.kernels.servo.effects import BESIDE, EFFECTS, TOGETHER, equivalent
+from vd.gap.fit import JointFit, intervals
+from vd.gap.result import Certainty, Verdict
+from vd.gap.statistics import OWN_ERROR, REPEATABLE, half_width, rmse
+from vd.gap.telemetry import Telemetry
+from vd.gap.words import listing, model_text, percent
+from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 from vd.logs.recording_checks import MIN_KINDS
 
-JITTER = "command_jitter"
-"""The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is
-left.
-"""
-FIXED = "command_delay"
-"""What is the mean of random delays, too."""
-ONE_SIDED = "asymmetric_friction"
-"""The friction that can have a direction without any."""
-DRY = ("coulomb_friction", "stribeck_friction")
-"""Those that fill it up."""
-NESTED = {
+
+@dataclass(frozen=True)
+class Family:
+    """Causes of one kind, of which a model has one member or none.
+
+    Attributes:
+        members: Effects of each member.
+        motions: Set of motions that tells the members, and the family from others
+            (:data:`vd.logs.excitations.MENU`).
+    """
+
+    members: tuple[tuple[str, ...], ...]
+    motions: str
+
+    @property
+    def effects(self) -> set[str]:
+        """Effects of all members."""
+        return set().union(*self.members)
+
+
+FAMILIES = {
+    "dry friction": Family(
+        (
+            ("coulomb_friction",),
+            ("stribeck_friction",),
+            ("load_friction",),
+            ("coulomb_friction", "load_friction"),
+            ("stribeck_friction", "load_friction"),
+            ("asymmetric_friction",),
+        ),
+        "slow_triangle",
+    ),
+    "delay": Family(
+        (
+            ("command_delay",),
+            ("read_delay",),
+            ("command_filter",),
+            ("command_delay", "command_filter"),
+        ),
+        "chirp",
+    ),
+    "torque ceiling": Family(
+        (("torque_limit",), ("torque_speed_limit",), ("torque_saturation",), ("supply_sag",)),
+        "gain_ladder",
+    ),
+    "play": Family((("backlash",), ("dead_zone",)), "gain_ladder"),
+    "load or offset": Family((("gravity_load",), ("encoder_bias",)), "gain_ladder"),
+    "elasticity": Family((("elastic_transmission",),), "chirp"),
+    "acceleration limit": Family((("acceleration_limit",),), "steps_and_sines"),
+    "integral action": Family((("integral_action",),), "long_holds"),
+    "warming": Family((("thermal_drift",),), "long_holds"),
+    "inertia": Family((("payload_inertia",),), "chirp"),
+    "coupling": Family((("joint_coupling",),), "steps_and_sines"),
+}
+"""Every cause that is named, by family. ``command_jitter`` is in none: no single prediction shows
+delays that are random, so they end as unknown."""
+CONTAINS = {
     "stribeck_friction": ("coulomb_friction",),
     "asymmetric_friction": ("coulomb_friction",),
-    "torque_speed_limit": ("torque_limit",),
     "elastic_transmission": ("payload_inertia",),
 }
-"""Effects that contain a simpler one; in a tie the simpler one is meant."""
-CANCELLING = ("gravity_load", "encoder_bias")
-"""Effects that hold a joint off its command at rest. Where they cancel there, they are no two
-causes but one that pulls with the travel from there, a spring, which the table has not."""
+"""Effects that contain a simpler one."""
 DETERMINED = ("kp", "kd", "inertia")
 """Baseline parameters that every useful excitation determines."""
 UPSTREAM = (
     "command_delay",
     "read_delay",
     "command_filter",
-    "command_jitter",
     "acceleration_limit",
     "dead_zone",
     "integral_action",
@@ -62,17 +106,9 @@ UPSTREAM = (
 )
 """Effects between command and controller output, each of which the duty cycle shows. Backlash is
 that of the reference, as the servo model has it, not play behind the motor."""
-BEHIND_SENSOR = {
-    "supply_sag": "only as a resistance behind the voltage sensor, which loses torque like a sagging supply"
-}
-"""Effects whose cause telemetry contradicts, but not a loss of the same form where it has no
-sensor.
-"""
 
-CLOSE = 0.1
-"""Two values within this share of each other are one: of an effect on two joints, as what a model
-lacks moves them by more than their intervals tell; of a load and an offset that cancel, which by
-luck few in a hundred machines do; of a supply idle and under load. Not tuned."""
+SAGGING = 0.1
+"""Share by which the voltage of a supply must fall under load for it to sag. Not tuned."""
 LINEAR = 0.995
 """Share of the duty cycle's variance that the plain error must explain for it to be linear. Not
 tuned.
@@ -80,63 +116,46 @@ tuned.
 CLEARER = 4.0
 """How many times more of the duty cycle the wrong delay must leave than the right one: a read delay
 leaves 0.5 % on either side. Not tuned."""
-# Half and twice: what they turn of the decisions in the XL330 and eight recordings of the battery.
 NO_GAP = 1.15
 """A model within this factor of the noise floor leaves white residuals, and nothing to explain.
-With half of what it leaves above 1 none of 40 is decided otherwise, with twice two are."""
+Half of what it leaves above 1 turns none of 41 joints, twice turns five."""
 MIN_GAIN = 0.05
-"""Share of the held-out RMSE that an effect must remove. Half passes two more of 46, twice none
-less.
-"""
-JITTER_GAIN_FLOORS = 0.3
-"""Gap that an effect must close beside random delays, as sqrt(before^2 - after^2), in noise floors:
-one of six floors leaves half of one there. Without delays it is what :data:`NO_GAP` takes for none.
-Half and twice turn none of 7."""
-MEMORY = 8
-"""Samples in a row that say the same beside random delays: what a late command does lasts that
-long. Half and twice turn none of 38."""
+"""Share of the error that an addition to a model must remove. Half turns none of 41 joints, twice
+turns one."""
 PENALTY = 0.01
-"""Relative RMSE that a further parameter must earn to be preferred. Half and twice turn none of
-166.
-"""
-EXCESS_FLOORS = 0.07
-"""What an alternative to a winner that leaves white residuals must leave more, in noise floors, to
-be worse: thousands of samples carry that difference. Half and twice turn none of 164."""
-CONTAINED_FLOORS = 0.15
-"""The same for one that the winner contains: with more parameters it imitates what the integrator
-misses. Of two, half and twice turn none."""
+"""Relative error that a further effect, and each of its parameters, must earn. Half and twice turn
+none of 41 joints."""
+EXCESS = 0.005
+"""What a model must leave more than one with white residuals, in squared noise floors, to be worse:
+thousands of samples carry that difference. Half and twice turn none of 41 joints."""
+FEW = 5
+"""Folds below which each motion stands for itself in intervals. Not tuned."""
 RECOVERED = 0.5
-"""Share of the squared gap that the named effects must recover. Half turns none of 12, half more
-one.
-"""
-NAMED = 0.9
-"""Share of the resamples that must choose an effect for it to be named. Not tuned."""
-SPREAD = "its spread is what is measured"
-"""Why random delays are named."""
+"""Share of the squared gap that a model must recover to be an explanation. Half turns none of 41
+joints, half more one."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Evidence:
-    """What the fits of one joint are judged by.
+    """What the models of one joint are judged by.
 
     Attributes:
         noise: Noise floor of the recording [rad].
-        weights: Bootstrap weights of the trajectories [R, S].
-        whole: Held-out RMSE of the plain model [rad].
-        moves: Whether the joint's command changes, of each trajectory [S]; None: in all.
-        behind_jitter: Whether samples are weighted by what random delays do
-            (:class:`vd.gap.models.SampleWeighting`).
-        equivalent: Effects that one stands for, since the recording cannot tell them apart.
-        joint: Index of the joint in its chain.
+        folds: Fold of each trajectory [S].
+        whole: Fitted RMSE of the plain model [rad].
     """
 
     noise: float
-    weights: np.ndarray
-    whole: float = 0.0
-    moves: np.ndarray | None = None
-    behind_jitter: bool = False
-    equivalent: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    joint: int = 0
+    folds: Sequence[int]
+    whole: float
+
+    @property
+    def without(self) -> np.ndarray:
+        """The trajectories without each block of those that are held out together [B, S]."""
+        blocks = np.array(self.folds)
+        if len(np.unique(blocks)) < FEW:
+            blocks = np.arange(len(blocks))
+        return (np.unique(blocks)[:, None] != blocks).astype(float)
 
     @property
     def floor(self) -> float:
@@ -152,8 +171,11 @@ class Evidence:
 
 def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
     """Effects that a joint of a chain can have besides its baseline."""
-    own = {"tau_g_nm": "gravity_load", "inertia": "payload_inertia"}
-    excluded = {effect for name, effect in own.items() if name in chain.baseline_free}
+    excluded = set()
+    if "tau_g_nm" in chain.baseline_free:
+        excluded.add("gravity_load")
+    if "inertia" in chain.baseline_free:
+        excluded.add("payload_inertia")
     if len(chain.joints) == 1:
         excluded.add("joint_coupling")
     return [name for name in EFFECTS if name in effects and name not in excluded]
@@ -169,15 +191,6 @@ def alike(names: Sequence[str], model: str) -> dict[str, tuple[str, ...]]:
     return result
 
 
-def stood_for(same: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Candidates that another stands for, with the reason why they are not tried."""
-    return {
-        other: f"leaves the same positions as {name}, which stands for both"
-        for name, others in same.items()
-        for other in others
-    }
-
-
 def contradicted(telemetry: Telemetry) -> dict[str, str]:
     """Effects that recorded voltage and duty cycle contradict, with the reason.
 
@@ -186,7 +199,7 @@ def contradicted(telemetry: Telemetry) -> dict[str, str]:
     upstream of it (a delay, a filter, a dead zone, integral action) is at work.
     """
     result = {}
-    if telemetry.fall is not None and telemetry.fall[0] < CLOSE * telemetry.fall[1]:
+    if telemetry.fall is not None and telemetry.fall[0] < SAGGING * telemetry.fall[1]:
         fall, idle = telemetry.fall
         result["supply_sag"] = (
             f"the recorded voltage falls by {fall:.2f} V of {idle:.1f} V at full pull, "
@@ -196,8 +209,8 @@ def contradicted(telemetry: Telemetry) -> dict[str, str]:
     if late:
         reason = f"the recorded duty cycle follows the error with a {late.replace('_', ' ')} alone"
     elif telemetry.follows >= LINEAR:
-        told = f"{100.0 * telemetry.follows:.1f} % of it"
-        reason = f"the recorded duty cycle follows the plain error ({told}): it acts downstream"
+        share = f"{100.0 * telemetry.follows:.1f} % of it"
+        reason = f"the recorded duty cycle follows the plain error ({share}): it acts downstream"
     else:
         return result
     return result | {name: reason for name in UPSTREAM if name != late}
@@ -214,38 +227,36 @@ def late_side(telemetry: Telemetry) -> str:
         ``command_delay``, ``read_delay``, or nothing where neither fits, both do, or no duty is
         recorded.
     """
-    (side, (lag, left)), (_, (_, other)) = sorted(
-        telemetry.late.items(), key=lambda item: item[1][1]
-    )
+    ranked = sorted(telemetry.late.items(), key=lambda item: item[1][1])
+    (side, (lag, left)), (_, (_, other)) = ranked
     # Registers read one after the other are less than a sample apart: that is nobody's delay.
     clear = left < 1.0 - LINEAR and CLEARER * left < other
     return side if lag >= telemetry.sample_s and clear else ""
 
 
-def without_jitter(explained: Sequence[tuple[float, Explanation]]) -> bool:
-    """Whether random delays are none on a joint, by what is known of the others of its finger.
-
-    They are none where they were tried on one and refused, not where too little was left there to
-    try them; and where another is explained without them or a fixed one, their mean, as commands go
-    out together.
+def changes(effects: Iterable[str], allowed: Iterable[str]) -> list[frozenset[str]]:
+    """The models that differ from one in the member of one family, or have two for one that is the same.
 
     Args:
-        explained: Noise floor [rad] and explanation of each joint that is explained already.
+        effects: Of the model.
+        allowed: Effects that models may have.
     """
-    known = [explanation for _, explanation in explained]
-    random = any(JITTER in one.final.effects for one in known)
-    tried = any(row.name == JITTER for one in known for row in one.trials)
-    if tried and not random and any(one.verdict == "unknown" for one in known):
-        return True
-    return any(
-        one.verdict == "effects"
-        and not {JITTER, FIXED} & {*one.final.effects}
-        and one.final.rmse < NO_GAP * floor
-        for floor, one in explained
-    )
+    present = {*effects}
+    result = []
+    swaps = []
+    for family in FAMILIES.values():
+        swaps += [(present - family.effects, member) for member in ((), *family.members)]
+    for name, parts in TOGETHER.items():
+        if name in present:
+            swaps.append((present - {name} - FAMILIES["load or offset"].effects, parts))
+    for rest, member in swaps:
+        model = frozenset(rest.union(member))
+        if model != present and {*allowed}.issuperset(member):
+            result.append(model)
+    return result
 
 
-# 2. Whether there is anything to explain.
+# 2. Whether there is a gap.
 
 
 def undetermined(evidence: Evidence, fit: JointFit) -> str:
@@ -259,564 +270,343 @@ def undetermined(evidence: Evidence, fit: JointFit) -> str:
     return ""
 
 
-def nothing_to_explain(evidence: Evidence, baseline: JointFit, loose: str) -> Explanation | None:
-    """The explanation of a joint whose plain model leaves nothing to search for, or cannot be judged.
-
-    Args:
-        evidence: What fits are judged by.
-        baseline: The plain model.
-        loose: What of it the motions leave open.
-    """
-    if len(baseline.sse) < MIN_KINDS:
-        text = (
-            f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_KINDS} at least"
-        )
-        return Explanation(baseline, baseline, "under_excited", text)
-    if not no_gap(evidence, baseline):
-        return None
-    text = "the plain model is within the noise floor"
-    return Explanation(baseline, baseline, "under_excited" if loose else "no_gap", loose or text)
-
-
-def no_gap(evidence: Evidence, fit: JointFit) -> bool:
-    """Whether a fit predicts as well as noise lets it.
-
-    Beside jitter that is not known as exactly.
-    """
-    return not evidence.behind_jitter and fit.held_out_rmse < NO_GAP * evidence.floor
-
-
-# 3. What a step of the search earns.
-
-
 def white(evidence: Evidence, fit: JointFit) -> bool:
-    """Whether samples tell how good a fit is.
-
-    It leaves no more than noise, or jitter, on all of them.
-    """
-    return evidence.behind_jitter or fit.rmse < NO_GAP * evidence.floor
+    """Whether a model leaves no more than noise on what it was fitted to."""
+    return fit.rmse < NO_GAP * evidence.floor
 
 
-def winner(evidence: Evidence, fits: Sequence[JointFit]) -> JointFit:
-    """The candidate with the best held-out score.
-
-    The simpler one that it contains if that is as good.
-
-    One with a parameter at its bound wins only if all have.
-    """
-    inside = [fit for fit in fits if not at_bound(fit)] or list(fits)
-    best = _best(evidence, inside)
-    for fit in inside:
-        contained = fit.effects[-1] in NESTED.get(best.effects[-1], ())
-        if contained and tied(evidence, best, fit, CONTAINED_FLOORS):
-            return fit
-    return best
-
-
-def at_bound(fit: JointFit) -> tuple[str, ...]:
-    """Keys of effect parameters that ended at a bound."""
-    pairs = zip(fit.coordinates, fit.x, strict=True)
-    bound = [c.key for c, x in pairs if "." in c.key and c.bound(float(x))]
-    if ONE_SIDED in fit.effects and not set(DRY) & set(fit.effects):
-        # No dry friction spares one direction: what does is a load, and a greater one would push.
-        sides = {key: value for key, value in fit.values.items() if key.startswith(ONE_SIDED)}
-        bound += [key for key, value in sides.items() if value <= OWN_ERROR * max(sides.values())]
-    return tuple(bound)
-
-
-def _best(evidence: Evidence, fits: Sequence[JointFit]) -> JointFit:
-    """The fit with the best held-out score.
-
-    With the best fitted one of those with white residuals.
-
-    Of these, samples tell more than the luck of a held-out motion.
-    """
-    at_floor = [fit for fit in fits if white(evidence, fit)]
-    compared = at_floor or fits
-    errors = [fit.sse if at_floor else fit.held_out for fit in compared]
-    return compared[int(np.argmin(_scores(compared, errors)))]
-
-
-def _scores(
-    fits: Sequence[JointFit], errors: Sequence[np.ndarray], weights: np.ndarray | None = None
-) -> np.ndarray:
-    """Log of RMSE plus the price of parameters, shape [C] or [C, R].
-
-    Args:
-        fits: C fits.
-        errors: The squared errors of each trajectory that count, of each fit [S].
-        weights: Bootstrap weights of the trajectories [R, S].
-    """
-    error = np.log(np.maximum(rmse(np.stack(errors), fits[0].count, weights), 1e-12))
-    price = PENALTY * np.array([len(fit.x) for fit in fits], float)
-    return error + (price if weights is None else price[:, None])
-
-
-def gain(
-    evidence: Evidence, before: JointFit, after: JointFit
-) -> tuple[float, tuple[float, float]]:
-    """Share of the held-out RMSE removed, with its interval over trajectories."""
-    old = rmse(before.held_out, before.count, evidence.weights)
-    new = rmse(after.held_out, after.count, evidence.weights)
-    return 1.0 - after.held_out_rmse / before.held_out_rmse, interval(1.0 - new / old)
-
-
-def refused_step(evidence: Evidence, before: JointFit, after: JointFit) -> str:
-    """Why a tentative step from one model to the larger is not earned; empty if it is.
-
-    Its gain may be that of a few motions: one of two causes alone can make some worse.
-    """
-    before, after = _compared(evidence, before, after)
-    return _too_small(before, after) or _below_noise(evidence, before, after)
-
-
-def refused(evidence: Evidence, before: JointFit, after: JointFit) -> str:
-    """Why the larger of two models is not earned; empty if it is."""
-    before, after = _compared(evidence, before, after)
-    if small := _too_small(before, after):
-        return small
-    if gain(evidence, before, after)[1][0] <= 0.0:
-        return "its gain over trajectories is not distinguishable from 0"
-    return _below_noise(evidence, before, after)
-
-
-def _compared(evidence: Evidence, before: JointFit, after: JointFit) -> tuple[JointFit, JointFit]:
-    """Two models with the errors by which they are compared in the place of the held-out ones.
-
-    Motions that no fit has seen decide; but a larger model that leaves white residuals is judged on
-    all samples: that a parameter is not known well enough without one motion to predict it, as that
-    of a profile that cannot follow, says nothing against it. Nor does luck with such a motion speak
-    for a larger model if the smaller one leaves white residuals already.
-    """
-    if white(evidence, before) or white(evidence, after):
-        return replace(before, held_out=before.sse), replace(after, held_out=after.sse)
-    return before, after
-
-
-def _too_small(before: JointFit, after: JointFit) -> str:
-    """Why a larger model gains too little, or nothing."""
-    share = 1.0 - after.held_out_rmse / before.held_out_rmse
-    if share >= MIN_GAIN:
+def too_few(fit: JointFit) -> str:
+    """Why motions cannot be held out, or nothing."""
+    if len(fit.sse) >= MIN_KINDS:
         return ""
-    return f"removes {100.0 * share:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
+    return f"{len(fit.sse)} trajectories leave none to hold out; record {MIN_KINDS} at least"
 
 
-def _below_noise(evidence: Evidence, before: JointFit, after: JointFit) -> str:
-    """Why what a larger model removes is nothing, or nothing."""
-    share = 1.0 - after.held_out_rmse / before.held_out_rmse
-    closed = before.held_out_rmse * np.sqrt(max(1.0 - (1.0 - share) ** 2, 0.0))
-    least = JITTER_GAIN_FLOORS if evidence.behind_jitter else np.sqrt(NO_GAP**2 - 1.0)
-    return "what it removes is below the noise floor" if closed < least * evidence.floor else ""
+# 3. The best model.
 
 
-def tied(
-    evidence: Evidence, best: JointFit, other: JointFit, excess_floors: float = EXCESS_FLOORS
-) -> bool:
-    """Whether the recording does not tell a fit from a better one.
+def scores(evidence: Evidence, fits: Sequence[JointFit]) -> np.ndarray:
+    """Log of the error of C models plus the price of what they have [C]."""
+    error = np.log(np.maximum(rmse(errors(evidence, fits), fits[0].count), 1e-12))
+    sizes = [len(fit.effects) + len(fit.x) - len(fits[0].x) for fit in fits]
+    return error + PENALTY * np.array(sizes, float)
 
-    A winner at the noise floor leaves white residuals, so that samples count: what the other leaves
-    in excess of it is then decisive, even if few motions show it.
 
-    Args:
-        evidence: What fits are judged by.
-        best: The better fit.
-        other: The other.
-        excess_floors: What the other may leave in excess, in noise floors.
+def errors(evidence: Evidence, fits: Sequence[JointFit]) -> np.ndarray:
+    """Sums of squared errors by which C models are compared [C, S].
+
+    Those on held-out motions. Once a model leaves white residuals, all samples tell more than the
+    luck of a held-out motion.
     """
-    if not white(evidence, best):
-        return difference(evidence, best, other)[0] <= 0.0
-    excess = (other.rmse**2 - best.rmse**2) / evidence.floor**2
-    if excess > 0.0:  # what needs more parameters to do worse is no equal
-        more = max(len(other.x) - len(best.x), 0)
-        excess += 2.0 * PENALTY * more * (best.rmse / evidence.floor) ** 2
-    excess /= MEMORY if evidence.behind_jitter else 1.0
-    return bool(excess < excess_floors**2)
+    by_samples = any(white(evidence, fit) for fit in fits)
+    return np.stack([fit.sse if by_samples else fit.held_out for fit in fits])
 
 
-def difference(evidence: Evidence, best: JointFit, other: JointFit) -> tuple[float, float]:
-    """Interval of what a fit's held-out RMSE is above a better one's [rad]."""
-    least = rmse(best.held_out, best.count, evidence.weights)
-    error = rmse(other.held_out, other.count, evidence.weights)
-    return interval(error - least)
-
-
-def judged(
-    evidence: Evidence,
-    number: int,
-    before: JointFit,
-    fits: Mapping[str, JointFit],
-    best: JointFit,
-    refusal: str,
-) -> list[TriedEffect]:
-    """The rows of one round for the evidence table, best first.
-
-    Args:
-        evidence: What fits are judged by.
-        number: The round.
-        before: The model before it.
-        fits: With each candidate.
-        best: Their winner.
-        refusal: Why that is not earned; empty if it is.
-    """
-    rows = []
-    chosen = best.effects[-1]
-    for name, fit in sorted(fits.items(), key=lambda item: item[1].held_out_rmse):
-        decision = "rejected"
-        reason = refusal or f"{chosen} predicts unseen motions better"
-        if fit is best and not refusal:
-            decision, reason = "named", "best on unseen motions"
-        elif not refusal and tied(evidence, best, fit):
-            if chosen in NESTED.get(name, ()):
-                reason = f"contains {chosen} and adds nothing to it"
-            else:
-                decision, reason = "tied", f"not told from {chosen} by this recording"
-        rows.append(TriedEffect(number, name, fit, *gain(evidence, before, fit), decision, reason))
-    return rows
-
-
-def exchanged(
-    evidence: Evidence, present: JointFit, fits: Sequence[JointFit], vetoes: Iterable[str]
-) -> JointFit | None:
-    """What does better than a model with another effect in the place of one of its own, or None.
-
-    Args:
-        evidence: What fits are judged by.
-        present: The model.
-        fits: It, and those with another effect.
-        vetoes: Effects that are none.
-    """
-    best = winner(evidence, [fit for fit in fits if not {*fit.effects} & {*vetoes}])
-    simpler = len(best.x) < len(present.x)
-    better = best is not present and (simpler or not tied(evidence, best, present))
-    return best if better else None
-
-
-def containing(effects: Iterable[str]) -> list[str]:
-    """Effects that contain one of those given, and beside it are no other cause."""
-    return [name for name, simpler in NESTED.items() if {*simpler} & {*effects}]
-
-
-# 4. Whether delays are random.
-
-
-def tries_jitter(evidence: Evidence, present: JointFit) -> bool:
-    """Whether enough is left for random delays to be a cause."""
-    return not no_gap(evidence, present) and not white(evidence, present)
-
-
-def refused_jitter(evidence: Evidence, present: JointFit, random: JointFit, left: float) -> str:
-    """Why random delays are none; empty if they are what is left.
-
-    Args:
-        evidence: What fits are judged by.
-        present: The model without them.
-        random: The model with them.
-        left: What that leaves, seen through what the delays do [rad].
-    """
-    if left > REPEATABLE * evidence.floor:
-        return f"leaves {left / evidence.floor:.1f} noise floors besides, more than chance does"
-    return unlikelier(evidence, present, random)
-
-
-def unlikelier(evidence: Evidence, before: JointFit, after: JointFit) -> str:
-    """Why random delays are no likelier than a model without them; empty if they are.
-
-    The other model has a width of its own for every motion, no less than the floor, lest jitter be
-    credited with what any excuse for some of them would gain; a width is a parameter, and costs
-    what one costs (half the log of its samples). A motion whose command stays as it is does not
-    count: nothing can be late there. What random delays add to a model has to be worth another
-    effect.
-
-    Args:
-        evidence: What fits are judged by.
-        before: The model without them.
-        after: The model with them.
-    """
-    noise = evidence.noise
-    power = before.sse / after.count / noise**2
-    widths = noise**2 * np.where(power < 1.0, np.exp(np.minimum(power, 1.0) - 1.0), power)
-    count = after.count if evidence.moves is None else after.count * evidence.moves
-    ratio = np.maximum(widths * after.count, 1e-30) / np.maximum(after.sse, 1e-30)
-    gained = 0.5 * count * np.log(ratio)
-    share = 1.0 - float(np.exp(-gained.sum() / max(count.sum(), 1.0)))
-    if len(after.effects) > len(before.effects) and share < MIN_GAIN:
-        least = 100.0 * MIN_GAIN
-        return f"narrows what is left by {100.0 * share:.1f} %, less than {least:.0f} %"
-    price = 0.5 * np.log(np.maximum(count, 1.0))
-    if interval(evidence.weights @ (gained + price))[0] <= 0.0:
-        return "not likelier than a width of its own for every motion"
+def at_bound(fit: JointFit) -> str:
+    """Which effect of a model fits only at a bound of its parameters, in words; empty if none."""
+    for c, x in zip(fit.coordinates, fit.x, strict=True):
+        if "." in c.key and c.bound(float(x)):
+            return f"{c.key.partition('.')[0]} fits only with a parameter at its bound"
+    if "asymmetric_friction" in fit.effects:
+        # No dry friction spares one direction: what does is a load, and a greater one would push.
+        sides = [fit.values[f"asymmetric_friction.tau_{side}_nm"] for side in ("plus", "minus")]
+        if min(sides) <= OWN_ERROR * max(sides):
+            return "asymmetric_friction fits only with none in one direction"
     return ""
 
 
-# 5. What of the final model is named.
+def flaw(evidence: Evidence, fit: JointFit) -> str:
+    """Why a model explains nothing whatever its error; empty if there is no reason."""
+    if bound := at_bound(fit):
+        return bound
+    names = idle(evidence, fit)
+    return f"{listing(names)} can be nothing at all" if names else ""
 
 
-def settled(trials: Sequence[TriedEffect], final: JointFit) -> list[TriedEffect]:
-    """The evidence with the steps that did not last marked as such."""
-    text = "helped at first, not needed or not earned in the end"
-    result = []
-    for row in trials:
-        lost = row.decision == "named" and row.name not in final.effects
-        result.append(replace(row, decision="rejected", reason=text) if lost else row)
-    return result
+def idle(evidence: Evidence, fit: JointFit) -> list[str]:
+    """Effects of a model whose size can be nothing."""
+    spread = intervals(fit, evidence.floor)
+    return [name for name in fit.effects if not shown(name, fit.values, spread)]
 
 
-def conclude(
-    evidence: Evidence,
-    baseline: JointFit,
-    final: JointFit,
-    rivals: Mapping[str, list[JointFit]],
-    trials: Sequence[TriedEffect],
-    loose: str,
-    refined: JointFit,
-    known: Sequence[Accepted] = (),
-) -> Explanation:
-    """Confidence, sets and verdict of the final model.
-
-    Args:
-        evidence: What fits are judged by.
-        baseline: The model without effects.
-        final: The model chosen.
-        rivals: Fits with others in the place of each effect.
-        trials: The evidence.
-        loose: What of the baseline the motions leave open.
-        refined: The final model at finer time steps where it was refined: its values are reported.
-        known: Effects that are judged already.
-    """
-    spread = intervals(refined, evidence.floor)
-    accepted = [*known]
-    judged_already = {one.name for one in known}
-    for name in final.effects:
-        if name not in judged_already:
-            fits = rivals.get(name, [final])
-            accepted.append(accept(evidence, final, name, fits, spread, refined))
-    explanation = Explanation(baseline, refined, "unknown", "", tuple(accepted), tuple(trials))
-    if not accepted:
-        return nothing_earned(evidence, explanation, loose)
-    # One motion can be all that shows a parameter: that no fit without it predicts it says nothing
-    # then.
-    fitted = white(evidence, final) and not evidence.behind_jitter
-    before, after = ((f.rmse if fitted else f.held_out_rmse) ** 2 for f in (baseline, final))
-    share = (before - after) / max(before - evidence.floor**2, 1e-30)
-    # What jitter does to each sample stays, however well its size is known.
-    if share < RECOVERED and JITTER not in final.effects:
-        text = (
-            f"the best candidate recovers {100.0 * share:.0f} % of the squared gap, less than half"
-        )
-        return replace(explanation, reason=text)
-    return _by_names(explanation)
-
-
-def accept(
-    evidence: Evidence,
-    final: JointFit,
-    name: str,
-    rivals: Sequence[JointFit],
-    spread: Mapping[str, tuple[float, float]],
-    refined: JointFit,
-) -> Accepted:
-    """Confidence and set of one effect of the final model, with the values of the ``refined``."""
-    own = next((fit for fit in rivals if fit.effects and fit.effects[-1] == name), None)
-    mine = final if own is None or any(fit is final for fit in rivals) else own
-    means = (*evidence.equivalent.get(name, ()), *same_beside(final, name, evidence.joint))
-    others = [fit for fit in rivals if fit is not mine and fit.effects[-1] not in (name, *means)]
-    alone = not {*DRY, *TOGETHER.get(name, ())} & {*final.effects}
-    fits = [mine, *others]
-    errors = [fit.sse if white(evidence, mine) else fit.held_out for fit in fits]
-    choice = np.argmin(_scores(fits, errors, evidence.weights), axis=0)
-    simple = {i + 1 for i, fit in enumerate(others) if name in NESTED.get(fit.effects[-1], ())}
-    share = float(np.mean([c == 0 or c in simple for c in choice]))
-    alternatives, equals = [], []
-    for fit in sorted(others, key=lambda other: other.held_out_rmse):
-        other = fit.effects[-1]
-        alternatives.append((other, fit.held_out_rmse, difference(evidence, mine, fit)))
-        if tied(evidence, mine, fit):
-            equals.append(other)
-    # In a tie the simpler one is meant: none beside an effect that it contains.
-    equals = [other for other in equals if not {name, *equals} & set(NESTED.get(other, ()))]
-    if share < NAMED and not equals:
-        rival = int(np.argmax(np.bincount(choice, minlength=len(others) + 1)[1:]))
-        equals.append(others[rival].effects[-1])
-    return Accepted(
-        name=name,
-        confidence=share,
-        estimates=estimates(refined, name, spread),
-        equivalent=(*means, *TOGETHER.get(name, ())) if alone else means,
-        alternatives=tuple(alternatives),
-        tied=tuple(equals),
-        at_bound=any(key.startswith(f"{name}.") for key in at_bound(final)),
-    )
-
-
-def same_beside(final: JointFit, name: str, joint: int) -> tuple[str, ...]:
-    """Effects that move the joint as one does beside the others of a model (:data:`BESIDE`)."""
-    same = [other for one in final.effects for other in BESIDE.get(one, {}).get(name, ())]
-    if ONE_SIDED in same:
-        # A side of friction cannot push: it is at most what is dry in all.
-        level = final.values.get("stribeck_friction.tau_c_nm", 0.0)
-        pull = abs(final.values["encoder_bias.bias_rad"]) * float(final.rows[joint, servo.KP])
-        same = [other for other in same if other != ONE_SIDED or pull <= level]
-    return tuple(same)
-
-
-def nothing_earned(evidence: Evidence, explanation: Explanation, loose: str) -> Explanation:
-    """The verdict where no effect earned its place."""
-    tried = [row for row in explanation.trials if np.isfinite(row.gain)]
-    why = tried[0].reason if tried else "there is no candidate"
-    if explanation.baseline.held_out_rmse > REPEATABLE * evidence.floor:
-        return replace(explanation, reason=f"a gap that no candidate explains: the best {why}")
-    if loose:
-        return replace(explanation, verdict="under_excited", reason=loose)
-    return replace(
-        explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}"
-    )
-
-
-def _by_names(explanation: Explanation) -> Explanation:
-    """The verdict by what of a model that fits is named, or a set, or neither."""
-    accepted = explanation.accepted
-    names = [one.name for one in accepted if named(one)]
-    if names:
-        return replace(explanation, verdict="effects", reason=explains(names))
-    if all(one.at_bound for one in accepted):
-        return replace(
-            explanation, reason=f"{accepted[0].name} fits only with a parameter at its bound"
-        )
-    sets = [" or ".join((a.name, *a.tied)) for a in accepted if a.tied and not a.at_bound]
-    if not sets:
-        absent = [one.name for one in accepted if not shown(one)]
-        text = f"{absent[0]} can be nothing at all" if absent else "nothing is chosen often enough"
-        return replace(explanation, reason=text)
-    return replace(explanation, verdict="ambiguous", reason=f"{'; '.join(sets)}: not told apart")
-
-
-def named(accepted: Accepted) -> bool:
-    """Whether an effect is the answer rather than one of a set."""
-    one_of_many = accepted.tied or accepted.at_bound
-    return not one_of_many and shown(accepted) and accepted.confidence >= NAMED
-
-
-def shown(accepted: Accepted) -> bool:
+def shown(
+    name: str, values: Mapping[str, float], spread: Mapping[str, tuple[float, float]]
+) -> bool:
     """Whether the interval of an effect's size leaves out its absence.
 
-    Several sizes stand in for each other.
-
     Absence is 0, but infinity of a limit or a stiffness: its inverse is more than 0 for sure if
-    half the interval of its logarithm is less than 1, to first order.
+    half the interval of its logarithm is less than 1, to first order. Several sizes of one effect
+    stand in for each other and say nothing one by one.
     """
-    limits, sizes = [], []
-    for parameter in EFFECTS[accepted.name].parameters:
-        if parameter.column == servo.GRAVITY_PHASE or parameter.name not in accepted.estimates:
+    limits, strengths = [], []
+    for parameter in EFFECTS[name].parameters:
+        key = f"{name}.{parameter.name}"
+        if parameter.column == servo.GRAVITY_PHASE or key not in values:
             continue
-        value, low, high = accepted.estimates[parameter.name]
+        low, high = spread[key]
         if parameter.lower > 0.0 == parameter.neutral:
-            limits.append(high < np.e * value)
+            limits.append(high < np.e * values[key])
         if parameter.lower == 0.0:
-            sizes.append(not low <= 0.0 <= high)
-    known = limits or sizes
+            strengths.append(not low <= 0.0 <= high)
+    known = limits or strengths
     return len(known) != 1 or bool(known[0])
 
 
-def explains(names: Sequence[str]) -> str:
-    """The reason of a verdict that names effects."""
-    return f"{' and '.join(names)} {'explains' if len(names) == 1 else 'explain'} it"
+def best_of(evidence: Evidence, fits: Sequence[JointFit]) -> JointFit:
+    """The model with the best score."""
+    return fits[int(np.argmin(scores(evidence, fits)))]
 
 
-def with_notes(
-    explanation: Explanation, joint: int, rest: float, vetoes: Iterable[str]
-) -> Explanation:
-    """The explanation with what its names do not say.
+def contains(larger: JointFit, smaller: JointFit) -> bool:
+    """Whether a model is another with something added, or with a more general effect in place of one."""
+    covered = {*larger.effects}
+    for name in larger.effects:
+        covered.update(CONTAINS.get(name, ()))
+    for name, parts in TOGETHER.items():
+        if covered.issuperset(parts):
+            covered.add(name)
+    return larger.effects != smaller.effects and covered.issuperset(smaller.effects)
 
-    What a member of a set means that telemetry contradicts by its name; and no names where two
-    effects are but one that is not in the table.
 
-    Args:
-        explanation: Of a joint.
-        joint: Its index in its chain.
-        rest: Where it rests before it moves [rad].
-        vetoes: Effects that telemetry contradicts.
+def not_earned(evidence: Evidence, smaller: JointFit, larger: JointFit) -> str:
+    """Why what a model has more than a smaller one is not earned; empty if it is.
+
+    Fitted and held-out errors must both fall: a motion held out can make the smaller one
+    extrapolate, which no effect has to explain. They fall by more than one standard error.
     """
-    one_cause = cancelled(explanation.final, joint, rest)
-    if one_cause and explanation.verdict in ("effects", "ambiguous"):
-        return replace(explanation, verdict="unknown", reason=one_cause)
-    members = {name for one in explanation.accepted for name in one.tied}
-    notes = [
-        f"{name} {BEHIND_SENSOR[name]}" for name in sorted(members & set(BEHIND_SENSOR) & {*vetoes})
-    ]
-    return replace(explanation, reason="; ".join([explanation.reason, *notes]))
+    fitted = 1.0 - larger.rmse / smaller.rmse
+    held_out = 1.0 - larger.held_out_rmse / smaller.held_out_rmse
+    if white(evidence, larger):
+        gain, before = fitted, smaller.rmse
+        certain = held_out > 0.0
+    else:
+        gain, before = min(fitted, held_out), smaller.held_out_rmse
+        certain = np.greater(*paired(evidence, larger, smaller))
+    if gain < MIN_GAIN:
+        return f"removes {percent(gain)} of the error, less than {percent(MIN_GAIN)}"
+    if before * np.sqrt(1.0 - (1.0 - gain) ** 2) < np.sqrt(NO_GAP**2 - 1.0) * evidence.floor:
+        return "what it removes is below the noise floor"
+    return "" if certain else "the gain over motions is not distinguishable from none"
 
 
-def cancelled(fit: JointFit, joint: int, rest: float) -> str:
-    """What two effects of a model are instead if they cancel at rest, in words.
-
-    Empty if they do not.
-
-    Args:
-        fit: The model.
-        joint: Index of its joint in the chain.
-        rest: Where the joint rests before it moves [rad].
-    """
-    if not {*CANCELLING} <= {*fit.effects}:
-        return ""
-    values, kp = fit.values, float(fit.rows[joint, servo.KP])
-    load = values["gravity_load.tau_g_nm"] * np.sin(rest + values["gravity_load.phase_rad"])
-    offset = kp * values["encoder_bias.bias_rad"]
-    if abs(offset - load) > CLOSE * min(abs(load), abs(offset)):
-        return ""
-    return (
-        "gravity_load and encoder_bias cancel where the joint rests: a spring about that place "
-        "would look the same, and is not among the candidates"
-    )
-
-
-# 6. What joints tell each other.
-
-SPRUNG = (
-    f"{explains(CANCELLING)} here, but cancel at rest on another joint of the finger, "
-    "as a spring does"
-)
-"""Why a load and an offset are no names."""
-
-
-def doubted(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[Explanation]:
-    """Explanations without what another joint of the finger shows to be a cause that is not in the table.
-
-    That is a load and an offset that cancel at rest there: where a joint travels little they
-    imitate the same spring.
-
-    Args:
-        explanations: Of the joints.
-        groups: Number of the finger of each joint.
-    """
-    both, pairs = {*CANCELLING}, list(zip(explanations, groups, strict=True))
-    sprung = {group for e, group in pairs if e.verdict == "unknown" and both <= {*e.final.effects}}
+def earned(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
+    """The models that explain something and earn what they have more than each that they contain."""
+    sound = [fit for fit in fits if not fit.effects or not flaw(evidence, fit)]
     result = []
-    for explanation, group in pairs:
-        answer = explanation.verdict in ("effects", "ambiguous")
-        if answer and group in sprung and both == {*explanation.final.effects}:
-            explanation = replace(explanation, verdict="unknown", reason=SPRUNG)
-        result.append(explanation)
+    for fit in sound:
+        smaller = [other for other in sound if contains(fit, other)]
+        if not any(not_earned(evidence, other, fit) for other in smaller):
+            result.append(fit)
     return result
 
 
-def answered(explanation: Explanation) -> tuple[Accepted, ...]:
-    """Effects of a joint's final model, where that is an answer."""
-    return explanation.accepted if explanation.verdict in ("effects", "ambiguous") else ()
+# 4. Which models are good.
 
 
-def agree(one: Accepted, other: Accepted) -> bool:
-    """Whether the values of an effect on two joints can be the same.
+def paired(evidence: Evidence, best: JointFit, other: JointFit) -> tuple[float, float]:
+    """What a model's held-out RMSE is above another's, and its standard error [rad].
 
-    Close, or of intervals that overlap.
+    The jackknife over blocks of motions.
     """
-    if one.estimates.keys() != other.estimates.keys():
-        return False
-    for key, (value, low, high) in one.estimates.items():
-        other_value, other_low, other_high = other.estimates[key]
-        close = abs(value - other_value) <= CLOSE * max(abs(value), abs(other_value))
-        if not close and not (low <= other_high and other_low <= high):
-            return False
-    return True
+    without = evidence.without
+    parts = rmse(other.held_out, best.count, without) - rmse(best.held_out, best.count, without)
+    error = np.sqrt((len(parts) - 1) * parts.var())
+    return other.held_out_rmse - best.held_out_rmse, float(error)
+
+
+def difference(evidence: Evidence, best: JointFit, other: JointFit) -> tuple[float, float]:
+    """95 % interval of what a model's held-out RMSE is above another's, over motions [rad]."""
+    value, error = paired(evidence, best, other)
+    width = float(half_width(np.square(error), len(evidence.without)))
+    return value - width, value + width
+
+
+def not_worse(evidence: Evidence, best: JointFit, other: JointFit) -> bool:
+    """Whether the recording does not tell a model from the best one.
+
+    If that leaves white residuals, samples count: what the other leaves in excess is then decisive,
+    even if few motions show it, but not if the best itself leaves as much more than noise.
+    """
+    if not white(evidence, best):
+        return difference(evidence, best, other)[0] <= 0.0
+    own = (best.rmse / evidence.floor) ** 2
+    excess = (other.rmse / evidence.floor) ** 2 - own
+    if excess > 0.0:  # what needs more parameters to do worse is no equal
+        excess += 2.0 * PENALTY * max(len(other.x) - len(best.x), 0) * own
+    return bool(excess < max(EXCESS, own - 1.0))
+
+
+def good_models(evidence: Evidence, fits: Sequence[JointFit]) -> list[JointFit]:
+    """The models that are not worse than the best, the best first."""
+    candidates = earned(evidence, fits)
+    order = np.argsort(scores(evidence, candidates))
+    best, *others = [candidates[index] for index in order]
+    return [best, *(fit for fit in others if not_worse(evidence, best, fit))]
+
+
+def against(
+    evidence: Evidence, fits: Sequence[JointFit], good: Sequence[JointFit], fit: JointFit
+) -> str:
+    """What speaks against a model that is not good, in words.
+
+    Args:
+        evidence: What models are judged by.
+        fits: All models.
+        good: The good ones, the best first.
+        fit: The model.
+    """
+    if problem := flaw(evidence, fit):
+        return problem
+    for smaller in fits:
+        if contains(fit, smaller) and (why := not_earned(evidence, smaller, fit)):
+            return f"beside {model_text(smaller.effects)} {why}"
+    return f"worse than {model_text(good[0].effects)}"
+
+
+def shares(evidence: Evidence, good: Sequence[JointFit]) -> np.ndarray:
+    """Share of the motions that each good model predicts best of them."""
+    winners = np.argmin(errors(evidence, good), axis=0)
+    return np.bincount(winners, minlength=len(good)) / len(winners)
+
+
+# 5. What is named.
+
+
+@dataclass(frozen=True, eq=False)
+class Conclusion:
+    """What is concluded of one joint.
+
+    Attributes:
+        verdict: The verdict.
+        reason: Why, in a sentence.
+        final: The model that is delivered: the best of the good ones, the plain one where nothing
+            is explained.
+        good: The good models, the best first.
+        shares: Share of the motions that each of them predicts best.
+        names: Effects that all good models share, where that is an answer.
+        families: What is known of each family of which some effect was tried.
+    """
+
+    verdict: Verdict
+    reason: str
+    final: JointFit
+    good: tuple[JointFit, ...]
+    shares: np.ndarray
+    names: tuple[str, ...] = ()
+    families: Mapping[str, Certainty] = field(default_factory=dict)
+
+
+def conclude(
+    evidence: Evidence, plain: JointFit, fits: Sequence[JointFit], loose: str
+) -> Conclusion:
+    """Verdict, names and good models of a joint.
+
+    Args:
+        evidence: What models are judged by.
+        plain: The plain model.
+        fits: All models, the plain one among them.
+        loose: What of the plain model the motions leave open.
+    """
+    if few := too_few(plain):
+        return Conclusion("under_excited", few, plain, (plain,), np.ones(1))
+    good = good_models(evidence, fits)
+    weights = shares(evidence, good)
+    if not good[0].effects:
+        verdict, reason = nothing_named(evidence, plain, fits, loose)
+        families = families_of(good, weights, fits) if verdict == "no_gap" else {}
+        return Conclusion(verdict, reason, plain, tuple(good), weights, (), families)
+    share = recovered(evidence, plain, good[0])
+    if share < RECOVERED:
+        text = (
+            f"the best model, {model_text(good[0].effects)}, recovers {percent(share)} of the squared gap, "
+            "less than half"
+        )
+        return Conclusion("unknown", text, plain, tuple(good), weights)
+    names = tuple(name for name in good[0].effects if all(name in fit.effects for fit in good))
+    families = families_of(good, weights, fits)
+    certain = [name for name, certainty in families.items() if certainty == "certain"]
+    if names:
+        reason = f"all models that are not worse than the best have {listing(names)}"
+    elif certain:
+        reason = f"it is {listing(certain)}, of which kind these motions do not tell"
+    elif plain in good:
+        reason = "over so few motions the best model is not told from the plain servo"
+    else:
+        reason = "models with nothing in common are not worse than the best"
+    verdict = "effects" if names else "ambiguous"
+    return Conclusion(verdict, reason, good[0], tuple(good), weights, names, families)
+
+
+def nothing_named(
+    evidence: Evidence, plain: JointFit, fits: Sequence[JointFit], loose: str
+) -> tuple[Verdict, str]:
+    """Verdict and reason where no model earns what it has more than the plain one."""
+    if white(evidence, plain):
+        quiet = "the plain model leaves no more than noise"
+        return ("under_excited", loose) if loose else ("no_gap", quiet)
+    others = [fit for fit in fits if fit.effects]
+    why = "there is no candidate"
+    if others:
+        best = best_of(evidence, others)
+        why = f"the best model, {model_text(best.effects)}: "
+        why += not_earned(evidence, plain, best) or flaw(evidence, best) or "not needed"
+    if plain.rmse > REPEATABLE * evidence.floor:
+        return "unknown", f"a gap that no model explains; {why}"
+    if loose:
+        return "under_excited", loose
+    return "no_gap", f"no effect is significant; {why}"
+
+
+def recovered(evidence: Evidence, plain: JointFit, fit: JointFit) -> float:
+    """Share of the squared gap that a model recovers, of fitted and held-out errors the lesser.
+
+    One motion can be all that shows a parameter. That no fit without it predicts it says nothing
+    against a model that leaves white residuals.
+    """
+    pairs = [(plain.rmse, fit.rmse)]
+    if not white(evidence, fit):
+        pairs.append((plain.held_out_rmse, fit.held_out_rmse))
+    gaps = [(b**2 - a**2) / max(b**2 - evidence.floor**2, 1e-30) for b, a in pairs]
+    return float(min(gaps))
+
+
+def families_of(
+    good: Sequence[JointFit], weights: np.ndarray, fits: Sequence[JointFit]
+) -> dict[str, Certainty]:
+    """What good models say of each family: certain if all have it, excluded if none.
+
+    Likely if those that have it predict more than half of the motions best, untold if not.
+    """
+    tried = {name for fit in fits for name in fit.effects}
+    result: dict[str, Certainty] = {}
+    for name, family in FAMILIES.items():
+        having = np.array([bool(family.effects.intersection(fit.effects)) for fit in good])
+        if having.all():
+            result[name] = "certain"
+        elif having.any():
+            result[name] = "likely" if weights[having].sum() > 0.5 else "untold"
+        elif tried & family.effects:
+            result[name] = "excluded"
+    return result
+
+
+def open_sets(good: Sequence[JointFit]) -> list[tuple[str, ...]]:
+    """Effects that stand in for each other in the good models, a set each."""
+    common = set.intersection(*[{*fit.effects} for fit in good])
+    loose = []
+    for fit in good:
+        loose += [name for name in fit.effects if name not in common and name not in loose]
+    sets: list[list[str]] = []
+    for name in loose:
+        rivals = [group for group in sets if any(apart(name, other, good) for other in group)]
+        merged = [other for group in rivals for other in group]
+        sets = [group for group in sets if group not in rivals] + [[*merged, name]]
+    return [tuple(group) for group in sets]
+
+
+def apart(name: str, other: str, good: Sequence[JointFit]) -> bool:
+    """Whether no good model has both effects."""
+    return not any({name, other} <= {*fit.effects} for fit in good)
 
 
 def overall(verdicts: Sequence[Verdict]) -> Verdict:

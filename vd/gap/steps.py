@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vd.command.config import from_dict, to_dict
+from vd.command.config import to_dict
 from vd.command.files import make_folder, write_json
 from vd.command.versions import installed_versions
-from vd.gap.result import LAYER, Closing, Predictions, Report
+from vd.gap.result import LAYER, Predictions, Report
 from vd.kernels.servo.effects import EFFECTS
 from vd.logs.recording import BARE_MODELS, Recording, model_path, read_recording
 
@@ -38,11 +38,11 @@ OUTPUTS = {
 """What each step writes, in the order of the steps."""
 _DOES = {
     "find": "fitting the plain servo model and looking for what it misses",
-    "explain": "trying every effect on motions that the fit has not seen",
+    "explain": "comparing whole models on motions that their fits have not seen",
     "close": "writing the identified model and simulating the commands again",
     "report": "drawing the page",
 }
-METHOD = 16
+METHOD = 18
 """Version of the analysis; what another one made is made again."""
 NO_EFFECTS = "none"
 """In place of candidates: identify the drives alone."""
@@ -265,47 +265,46 @@ def _explain(analysis: Analysis) -> None:
 
 def _close(analysis: Analysis) -> None:
     from vd.gap.close import simulate_again, write_identified
-    from vd.gap.plan import discard_plan, plan, write_plan
+    from vd.gap.plan import discard_plan, plan, tied, write_plan
 
     report = analysis.explained()
-    whole = write_identified(
-        report, analysis.out, analysis.recording, analysis.hand, analysis.start
-    )
-    closing, curves = simulate_again(
+    recording, hand = analysis.recording, analysis.hand
+    whole = write_identified(report, analysis.out, recording, hand, analysis.start)
+    closing, delivered, curves = simulate_again(
         report,
         analysis.out / LAYER,
-        analysis.recording,
+        recording,
         analysis.hand_name,
         analysis.settings.hand_layer,
         Predictions.read(analysis.out / CURVES),
         device=analysis.settings.device,
     )
-    closing = replace(closing, whole_hand_layer=whole)
     curves.write(analysis.out / CLOSING_CURVES)
     discard_plan(analysis.out)
-    if report.verdict == "under_excited" or report.open_sets:
-        _show("close: looking for the motions that would decide")
-        device = analysis.settings.device
-        chosen = plan(report, analysis.recording, analysis.hand, analysis.start, device=device)
-        write_plan(chosen, analysis.out)
-    write_json(analysis.out / CLOSE, to_dict(closing))
+    sentence = ""
+    if report.verdict in ("under_excited", "unknown") or tied(report):
+        experiment = plan(report, recording, hand)
+        write_plan(experiment, analysis.out)
+        sentence = experiment.sentence
+    closed = replace(
+        report,
+        closing=replace(closing, whole_hand_layer=whole),
+        delivered=delivered,
+        next_experiment=sentence,
+    )
+    closed.write(analysis.out / CLOSE)
 
 
 def _report(analysis: Analysis) -> None:
-    from vd.gap.plan import PLAN_JSON
     from vd.gap.report import write_report
     from vd.logs.recording_checks import cautions
 
-    planned = analysis.out / PLAN_JSON
+    layer = analysis.settings.hand_layer
     report = replace(
-        analysis.explained(),
-        closing=from_dict(Closing, json.loads((analysis.out / CLOSE).read_text())),
-        next_experiment=json.loads(planned.read_text())["sentence"] if planned.is_file() else "",
+        Report.read(analysis.out / CLOSE),
         seconds=sum(analysis._seconds().values()),
         hand=analysis.hand_name,
-        hand_layer=None
-        if analysis.settings.hand_layer is None
-        else str(analysis.settings.hand_layer),
+        hand_layer=None if layer is None else str(layer),
         warnings=cautions(analysis.recording),
         command=analysis.command(),
         software=installed_versions(_PACKAGES),

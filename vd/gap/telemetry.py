@@ -1,38 +1,61 @@
 """What recorded voltage and duty cycle say of a joint; :mod:`vd.gap.rules` says what that rules out."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from vd.gap.chain import Chain
-from vd.gap.fit import JointSpec
-from vd.gap.models import Telemetry
 from vd.gap.rollout import STEP_S
 from vd.kernels.servo.effects import EFFECTS
 from vd.logs.motions import Recording, Trajectory
 from vd.logs.recording_checks import MIN_SAMPLES
 
 
-def telemetry_of(recording: Recording, chain: Chain, spec: JointSpec) -> Telemetry:
+@dataclass(frozen=True)
+class Telemetry:
+    """What the recorded voltage and duty cycle of a joint say.
+
+    Attributes:
+        fall: How far the voltage falls at full pull, and its value idle [V]; None where too little
+            is recorded.
+        follows: Share of the duty cycle that follows the plain error; 0 where none is recorded.
+        late: Delay [s] with which it is followed best, and the share that this leaves, if the
+            command is late (``command_delay``) or the reading (``read_delay``).
+        sample_s: Time between two samples [s].
+    """
+
+    fall: tuple[float, float] | None
+    follows: float
+    late: Mapping[str, tuple[float, float]]
+    sample_s: float
+
+
+def telemetry_of(
+    recording: Recording, chain: Chain, joint: int, trajectories: Sequence[int]
+) -> Telemetry:
     """What is recorded of a joint besides commands and positions.
 
     Args:
         recording: The recording.
         chain: The joint's chain.
-        spec: The joint's problem.
+        joint: Index of the joint in the chain.
+        trajectories: Indices of the trajectories that are used.
     """
-    parts = [recording.trajectories[i] for i in spec.trajectories]
-    driven = [t for t in parts if chain.joints[spec.joint] in t.joints]
+    parts = [recording.trajectories[i] for i in trajectories]
+    driven = [t for t in parts if chain.joints[joint] in t.joints]
     (delay,) = EFFECTS["command_delay"].parameters
     late = {}
     for side in ("command_delay", "read_delay"):
         left = {
-            lag: 1.0 - _follows(parts, chain, spec.joint, **{side: lag})
+            lag: 1.0 - _follows(parts, chain, joint, **{side: lag})
             for lag in np.arange(0.0, delay.upper, STEP_S)
         }
         best = min(left, key=left.__getitem__)
         late[side] = float(best), left[best]
     return Telemetry(
-        fall=_voltage_fall(driven, int(chain.columns[spec.joint])),
-        follows=_follows(driven, chain, spec.joint),
+        fall=_voltage_fall(driven, int(chain.columns[joint])),
+        follows=_follows(driven, chain, joint),
         late=late,
         sample_s=float(np.median(np.concatenate([np.diff(t.time) for t in parts]))),
     )

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable, Sequence
 
-from vd.gap.result import LAYER, Estimate, Interval, NamedEffect, Report
+from vd.gap.result import LAYER, Estimate, Interval, NamedEffect, Report, WholeModel
+from vd.gap.statistics import REPEATABLE
 
 LISTED = 4
 """More joints than this are counted rather than listed, and no more curves are drawn than this. Not
@@ -87,44 +88,98 @@ def effects_sentence(effects: Iterable[NamedEffect]) -> str:
 
 
 def verdict_sentence(report: Report) -> str:
-    """The verdict in one or two sentences that need no context."""
-    before, after = (
-        mrad(report.held_out.baseline_rmse_rad),
-        mrad(report.held_out.identified_rmse_rad),
-    )
-    sizes = f"{before} on motions that the fit has not seen, against a noise floor of "
-    sizes += mrad(report.noise_floor_rad)
+    """The verdict in a few sentences that need no context, each from the report's own figures."""
     if report.verdict == "effects":
-        lacks = f"The simulation lacks {effects_sentence(report.effects)}. "
-        return lacks + _shrinks(report) + _besides(report)
+        text = f"The simulation lacks {effects_sentence(report.effects)}. "
+        return text + change(report) + _credit(report) + _besides(report) + _leftover(report)
     if report.verdict == "ambiguous":
-        text = f"There is a gap: {sizes}. {_leaves(report)}"
-        if report.provisional:
-            text += f" With {effects_sentence(report.provisional)} it falls to {after}."
-        return text
+        text = f"There is a gap: {gap(report)}. {_leaves(report)} "
+        return text + change(report) + _leftover(report)
     if report.verdict == "no_gap":
-        model = (
-            "plain servo model" if report.hand_layer is None else f"model in {report.hand_layer}"
-        )
+        model = "plain servo model"
+        if report.hand_layer is not None:
+            model = f"model in {report.hand_layer}"
         return (
-            f"No gap: the {model} explains this recording. It leaves {sizes}: no more than noise, "
-            "or what no candidate explains."
+            f"No gap: the {model} explains this recording. It leaves {gap(report)}: no more than "
+            "noise, or what no candidate explains."
         )
     if report.verdict == "under_excited":
         return (
             "No verdict on effects: the motions in this recording do not determine the model. "
             "Different parameters fit equally well."
         )
-    return f"There is a gap: {sizes}. No effect that was tried explains it."
+    return f"There is a gap: {gap(report)}. No model that was tried explains half of it."
 
 
-def _shrinks(report: Report) -> str:
-    held, names = report.held_out, {one.name for one in report.effects}
+def gap(report: Report) -> str:
+    """What the plain model leaves, on motions that it was fitted to and on others."""
+    held_out = mrad(report.held_out.baseline_rmse_rad)
+    fitted = mrad(report.baseline.rmse_rad)
+    floor = mrad(report.noise_floor_rad)
+    return f"{fitted} where it was fitted, {held_out} on motions held out, with a noise floor of {floor}"
+
+
+def change(report: Report) -> str:
+    """How errors change with the whole identified model, on motions held out and where it was fitted."""
+    held = report.held_out
+    model = {*(effect.name for effect in (*report.effects, *report.provisional))}
+    if not model:
+        return ""
+    names = causes(sorted(model), "and")
+    before, after = held.baseline_rmse_rad, held.identified_rmse_rad
+    text = (
+        f"With {names} the error on motions held out {_goes(before, after)} "
+        f"({percent(held.reduction)} less, 95 %: {percent_range(held.ci95)}); where it was fitted "
+        f"it {_goes(report.baseline.rmse_rad, report.identified.rmse_rad)}."
+    )
+    return text + _judged(report)
+
+
+def _goes(before: float, after: float) -> str:
+    """``falls from 12 mrad to 3 mrad``."""
+    verb = "falls" if after < before else "rises"
+    return f"{verb} from {mrad(before)} to {mrad(after)}"
+
+
+def _judged(report: Report) -> str:
+    """What the layer as it was written leaves of motions that no fit saw."""
+    delivered = report.delivered
+    if delivered is None:
+        return ""
+    before, after = delivered.baseline_rmse_rad, delivered.rmse_rad
+    text = (
+        f" On {delivered.trajectory}, which no fit saw, the layer as written leaves {mrad(after)}, "
+        f"the plain model {mrad(before)}."
+    )
+    if after >= before:
+        text += " It is no better there: do not rely on it for such motions."
+    return text
+
+
+def _credit(report: Report) -> str:
+    """What the model leaves without each of several effects, so that none has credit for all."""
+    rows = []
+    for joint in dict.fromkeys(row.joint for row in report.credits):
+        credits = [row for row in report.credits if row.joint == joint]
+        if len(credits) > 1:
+            each = [
+                f"{mrad(row.without_held_out_rmse_rad)} without {plain(row.effect)}"
+                for row in credits
+            ]
+            where = f" on {joint}" if len(report.joints) > 1 else ""
+            rows.append(f" Each has its part{where}: held out it is {listing(each)}.")
+    return "".join(rows) if len(rows) <= LISTED else ""
+
+
+def _leftover(report: Report) -> str:
+    """Whether more is missing than the identified model has."""
+    left = report.identified.rmse_rad
+    nothing = not report.provisional and not report.effects
+    if nothing or left <= REPEATABLE * report.noise_floor_rad:
+        return ""
+    times = left / report.noise_floor_rad
     return (
-        f"With {'it' if len(names) == 1 else 'them'} the error on motions that the fit has not "
-        f"seen falls from {mrad(held.baseline_rmse_rad)} to {mrad(held.identified_rmse_rad)} "
-        f"({percent(held.reduction)} less, 95 %: {percent_range(held.ci95)}); the noise floor is "
-        f"{mrad(report.noise_floor_rad)}."
+        f" That is still {times:.0f} times the noise floor: more is missing that has no name here."
     )
 
 
@@ -142,16 +197,36 @@ def _besides(report: Report) -> str:
                 f" {plain(name).capitalize()} stands for {causes(others, 'and')} too: commands and "
                 "positions are the same, whichever it is."
             )
-    return f"{text} More is missing. {_leaves(report)}" if report.open_sets else text
+    return f"{text} More may be missing. {_leaves(report)}" if report.open_sets else text
 
 
 def _leaves(report: Report) -> str:
-    """Which causes are still possible."""
-    if len(report.open_sets) == 1:
-        (group,) = report.open_sets
-        where = f" on {_undecided(report, group)}" if len(report.joints) > 1 else ""
-        return f"It is {causes(group)}{where}; this recording cannot say which."
-    return f"This recording leaves {len(report.open_sets)} sets of causes, listed under what to do next."
+    """Which models are still possible."""
+    joints = [row for row in report.joints if row.open_sets]
+    if len(joints) > 1:
+        return f"On {joints_text([row.joint for row in joints])} several models are as good."
+    models = [row for row in report.models if row.joint == joints[0].joint]
+    return f"{len(models)} models are as good: {listing([model_text(row.effects) for row in models], 'or')}."
+
+
+def model_text(effects: Iterable[str]) -> str:
+    """``backlash with command delay``."""
+    return " with ".join(map(plain, effects)) or "the plain servo"
+
+
+def families_sentences(report: Report) -> list[str]:
+    """What is known of the families of causes, a sentence a joint."""
+    rows = []
+    for joint in dict.fromkeys(row.joint for row in report.families):
+        parts = []
+        for verdict in ("certain", "likely", "untold", "excluded"):
+            names = [
+                row.name for row in report.families if row.joint == joint and row.verdict == verdict
+            ]
+            if names:
+                parts.append(f"{verdict}: {listing(names)}")
+        rows.append(f"{joint}: {'; '.join(parts)}")
+    return rows
 
 
 def next_step(report: Report) -> str:
@@ -179,13 +254,19 @@ def training_layer(report: Report) -> str:
 
 
 def open_questions(report: Report) -> list[str]:
-    """What is left open, joints with the same set together: ``f0_j1: backlash or dead zone``."""
-    return [f"{_undecided(report, group)}: {causes(group)}" for group in report.open_sets]
+    """The whole models of each joint that are left open, with their errors."""
+    rows = []
+    for joint in report.joints:
+        models = [row for row in report.models if row.joint == joint.joint]
+        if len(models) > 1:
+            rows += [f"{joint.joint}: {model_row(model)}" for model in models]
+    return rows
 
 
-def _undecided(report: Report, group: tuple[str, ...]) -> str:
-    """The joints that leave a set open."""
-    return joints_text([one.joint for one in report.joints if {*group} in map(set, one.open_sets)])
+def model_row(model: WholeModel) -> str:
+    """``backlash with command delay (4 mrad fitted, 5 mrad held out)``."""
+    errors = f"{mrad(model.rmse_rad)} fitted, {mrad(model.held_out_rmse_rad)} held out"
+    return f"{model_text(model.effects)} ({errors})"
 
 
 def _size(value: float, unit: str) -> tuple[float, str]:

@@ -1,35 +1,41 @@
-"""Worker processes that each hold the problems of a recording."""
+"""Worker processes that each hold the problems of a recording.
+
+Each has a pipe of its own, and nothing is shared: one that dies, or is killed, leaves no lock that
+another or its parent could wait for.
+"""
 
 import os
-import threading
+from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from vd.command.warp_quiet import quiet_warp
-from vd.command.workers import begin_worker, end_worker
+from vd.command.workers import begin_worker
 
 ProblemOf = Callable[[Any], Any]
 """The problem of a joint, by what specifies it."""
 Call = Callable[[Any], Any]
 """What is asked of a problem; it is sent to another process."""
+Done = Callable[[float], None]
+"""Told the share of calls that are done."""
 
-_problem_of: ProblemOf | None = None
-"""Of a worker process."""
 
-
-def _start(problem_of: ProblemOf, parent: int) -> None:
-    global _problem_of
+def _serve(connection: Connection, problem_of: ProblemOf, parent: int) -> None:
+    """Answer calls until the parent is gone."""
     begin_worker(parent)
     quiet_warp()
-    _problem_of = problem_of
-
-
-def _work(spec: Any, call: Call) -> Any:
-    assert _problem_of is not None
-    return call(_problem_of(spec))
+    while True:
+        try:
+            spec, call = connection.recv()
+        except EOFError:
+            return
+        try:
+            answer = (True, call(problem_of(spec)))
+        except Exception as error:  # the parent raises it
+            answer = (False, error)
+        connection.send(answer)
 
 
 class WorkerPool:
@@ -43,48 +49,76 @@ class WorkerPool:
     def __init__(self, problem_of: ProblemOf, workers: int):
         self.problem_of = problem_of
         self.workers = workers
-        self._lock = threading.Lock()
-        self._processes: ProcessPoolExecutor | None = None
+        self._processes: list[Any] = []
+        self._connections: list[Connection] = []
 
     def __enter__(self) -> "WorkerPool":
         if self.workers > 1:
             context = get_context("spawn")  # Warp and its threads may be running
-            self._processes = ProcessPoolExecutor(
-                self.workers,
-                mp_context=context,
-                initializer=_start,
-                initargs=(self.problem_of, os.getpid()),
-            )
+            for _ in range(self.workers):
+                connection, far = context.Pipe()
+                arguments = (far, self.problem_of, os.getpid())
+                process = context.Process(target=_serve, args=arguments, daemon=True)
+                process.start()
+                far.close()
+                self._processes.append(process)
+                self._connections.append(connection)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._processes is not None:
-            end_worker(self._processes)
+        for process in self._processes:
+            process.kill()
 
-    def run(self, spec: Any, calls: Sequence[Call]) -> list[Any]:
-        """Results of the calls, in order. For several threads.
+    def run(self, spec: Any, calls: Sequence[Call], done: Done = lambda share: None) -> list[Any]:
+        """Results of the calls, in order.
+
+        Args:
+            spec: What specifies the problem.
+            calls: What is asked of it.
+            done: Called after each.
 
         Raises:
             ChildProcessError: A worker process was killed.
         """
-        if self._processes is None:
-            with self._lock:
-                return [call(self.problem_of(spec)) for call in calls]
+        results: list[Any] = [None] * len(calls)
+        if not self._connections:
+            for index, call in enumerate(calls):
+                results[index] = call(self.problem_of(spec))
+                done((index + 1) / len(calls))
+            return results
+        waiting = deque(range(len(calls)))
+        idle: list[Any] = [*self._connections]
+        running: dict[Any, int] = {}
+        finished = 0
+        while waiting or running:
+            while waiting and idle:
+                connection = idle.pop()
+                running[connection] = waiting.popleft()
+                self._send(connection, (spec, calls[running[connection]]))
+            for ready in wait(list(running)):
+                results[running.pop(ready)] = self._answer(ready)
+                idle.append(ready)
+                finished += 1
+                done(finished / len(calls))
+        return results
+
+    def _send(self, connection: Connection, call: Any) -> None:
         try:
-            waiting = [self._processes.submit(_work, spec, call) for call in calls]
-            return [future.result() for future in waiting]
-        except BrokenProcessPool as error:
-            raise ChildProcessError(
-                f"one of {self.workers} processes was killed, most often since memory ran out: "
-                "free some, or give fewer processors (taskset), and run the same command again"
-            ) from error
+            connection.send(call)
+        except OSError as error:
+            raise self._killed() from error
 
+    def _answer(self, connection: Any) -> Any:
+        try:
+            succeeded, result = connection.recv()
+        except (EOFError, OSError) as error:
+            raise self._killed() from error
+        if not succeeded:
+            raise result
+        return result
 
-def parallel(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-    """Results in order; threads, since the work waits for processes."""
-    threads = ThreadPoolExecutor(max(len(items), 1))
-    try:
-        return list(threads.map(work, items))
-    finally:
-        # Nobody waits for the others after a failure or Ctrl-C: they end with the pool's processes.
-        threads.shutdown(wait=False, cancel_futures=True)
+    def _killed(self) -> ChildProcessError:
+        return ChildProcessError(
+            f"one of {self.workers} processes was killed, most often since memory ran out: "
+            "free some, or give fewer processors (taskset), and run the same command again"
+        )

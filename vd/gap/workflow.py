@@ -1,12 +1,12 @@
 """Find and explain a gap: from a recording to a :class:`vd.gap.result.Report` without a closing.
 
-``find`` identifies the baseline and says where it fails (``DIR/find.json``); ``explain`` selects
-the effects (``DIR/explain.json``, ``DIR/predictions.npz``).
+``find`` identifies the baseline and says where it fails (``DIR/find.json``); ``explain`` compares
+whole models (``DIR/explain.json``, ``DIR/predictions.npz``).
 """
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,21 +16,24 @@ import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
 from vd.command.files import write_json
-from vd.gap.assemble import Analysed, assemble, curves
-from vd.gap.chain import Chain, chains, relative_torques
-from vd.gap.coordinates import FREE_SPEED, Scales
+from vd.gap import rules
+from vd.gap.assemble import AnalysedJoint, assemble, curves
+from vd.gap.chain import Chain, chains, others_in, relative_torques
+from vd.gap.coordinates import BASELINE_PARAMETERS, FREE_SPEED, Scales
 from vd.gap.design import design, pieces
-from vd.gap.explain import ExcitedJoint, Progress, explain_joints
 from vd.gap.find import findings
-from vd.gap.fit import JointProblem, JointSpec, Problems
+from vd.gap.fit import JointFit, JointProblem, JointSpec, Problems
+from vd.gap.ladder import FitCall, Ladder
 from vd.gap.result import Misfit, Report
 from vd.gap.rollout import STEP_S
 from vd.gap.statistics import noise_floor
-from vd.gap.worker_pool import WorkerPool, parallel
-from vd.kernels.servo.effects import EFFECTS
+from vd.gap.telemetry import telemetry_of
+from vd.gap.worker_pool import WorkerPool
+from vd.kernels.servo.effects import EFFECTS, TOGETHER
 from vd.logs.recording import Recording, read_recording
 
 FIND_FORMAT = "vd-gap-find/1"
+Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -75,22 +78,24 @@ def find(
     """
     chosen = Options(**options)
     problems, specs = _problems(recording, hand, chosen)
-    recording = problems.recording
     with _workers(problems, chosen) as pool:
-        joints = _identify(pool, problems.chains, specs, chosen)
-        predicted = curves(problems, [(j.spec, j.fit.rows) for j in joints])
-        found = findings(recording, predicted, {j.name: j.spec.floor for j in joints})
-        value = {
-            "format": FIND_FORMAT,
-            "findings": [asdict(f) for f in found],
-            "joints": {
-                j.name: {"rows": j.fit.rows.tolist(), "rmse_rad": j.fit.rmse} for j in joints
-            },
-        }
-        write_json(Path(out) / "find.json", value)
-    for finding in found:
-        chosen.progress(f"  {finding.where}")
-    return found
+        fits = _identify(pool, problems.chains, specs, chosen)
+    floors, rows = {}, {}
+    for spec, fit in zip(specs, fits, strict=True):
+        name = problems.chains[spec.chain].joints[spec.joint]
+        floors[name] = spec.floor
+        rows[name] = {"rows": fit.rows.tolist()}
+    models = [(spec, fit.rows) for spec, fit in zip(specs, fits, strict=True)]
+    misfits = findings(problems.recording, curves(problems, models), floors)
+    value = {
+        "format": FIND_FORMAT,
+        "findings": [asdict(misfit) for misfit in misfits],
+        "joints": rows,
+    }
+    write_json(Path(out) / "find.json", value)
+    for misfit in misfits:
+        chosen.progress(f"  {misfit.where}")
+    return misfits
 
 
 def explain(
@@ -111,33 +116,148 @@ def explain(
         RecordingError: The recording cannot be used.
         ValueError: A recording that is not of this hand.
     """
-    chosen, out = Options(**options), Path(out)
+    chosen = Options(**options)
+    out = Path(out)
     if not (out / "find.json").is_file():
         find(recording, hand, out, **options)
-    known = json.loads((out / "find.json").read_text())
+    before = json.loads((out / "find.json").read_text())
     problems, specs = _problems(recording, hand, chosen)
-    recording = problems.recording
+    analysed: dict[JointSpec, AnalysedJoint] = {}
     with _workers(problems, chosen) as pool:
-        joints = _resume(pool, problems.chains, specs, known["joints"])
-        explained = explain_joints(
-            pool, problems, joints, chosen.effects, chosen.seed, chosen.progress
-        )
-        analysed = [
-            Analysed(j.name, j.spec, replace(e, baseline=j.fit))
-            for j, e in zip(joints, explained, strict=True)
-        ]
-        report, predictions = assemble(
-            problems,
-            analysed,
-            [Misfit(**f) for f in known["findings"]],
-            seed=chosen.seed,
-        )
-        source = replace(report.recording, relative_torques=relative_torques(recording))
-        report = replace(report, recording=source)
-        predictions.write(out / "predictions.npz")
-        report.write(out / "explain.json")
+        # Of each finger from its tip on, as a joint's motion shakes those before it.
+        for number, spec in enumerate(sorted(specs, key=lambda spec: (spec.chain, -spec.joint))):
+            name = problems.chains[spec.chain].joints[spec.joint]
+            rows = np.array(before["joints"][name]["rows"])
+            analysis = _JointAnalysis(pool, problems, spec, chosen, number / len(specs), len(specs))
+            analysed[spec] = analysis.run(rows, list(analysed.values()))
+    misfits = [Misfit(**misfit) for misfit in before["findings"]]
+    joints = [analysed[spec] for spec in specs]
+    report, predictions = assemble(problems, joints, misfits, chosen.seed)
+    relative = relative_torques(problems.recording)
+    report = replace(report, recording=replace(report.recording, relative_torques=relative))
+    predictions.write(out / "predictions.npz")
+    report.write(out / "explain.json")
     chosen.progress(f"explain: {report.verdict}")
     return report
+
+
+@dataclass
+class _JointAnalysis:
+    """What is done with one joint, with the share of the whole that is done.
+
+    Attributes:
+        pool: Who fits.
+        problems: Of the recording.
+        spec: Of the joint.
+        options: How to analyse.
+        before: Share of the whole that was done before.
+        joints: Number of all joints.
+        stages: Batches of fits that are done.
+    """
+
+    pool: WorkerPool
+    problems: Problems
+    spec: JointSpec
+    options: Options
+    before: float
+    joints: int
+    stages: int = 0
+    said: int = -1
+
+    @property
+    def name(self) -> str:
+        """Name of the joint."""
+        return self.problems.chains[self.spec.chain].joints[self.spec.joint]
+
+    def ask(self, calls: Sequence[FitCall]) -> list[Any]:
+        """Results of calls of the joint's problem, with progress."""
+        result = self.pool.run(self.spec, calls, self.progress)
+        self.stages += 1
+        return result
+
+    def progress(self, share: float) -> None:
+        """Say how much is done, at every tenth of the joint."""
+        done = min((self.stages + share) / STAGES, 1.0)
+        if int(10.0 * done) > self.said:
+            self.said = int(10.0 * done)
+            total = self.before + done / self.joints
+            self.options.progress(f"explain: {100.0 * total:3.0f} % {self.name}")
+
+    def run(self, rows: np.ndarray, others: Sequence[AnalysedJoint]) -> AnalysedJoint:
+        """Fit the ladder of the joint, and conclude.
+
+        Args:
+            rows: Plain models of the joint's chain [n, PARAMETER_COLUMNS].
+            others: Joints that are analysed already.
+        """
+        spec, chain = self.spec, self.problems.chains[self.spec.chain]
+        base = rows.copy()
+        for other in others:
+            if other.spec.chain == spec.chain:
+                base[other.spec.joint] = other.conclusion.final.rows[other.spec.joint]
+        values = baseline_values(rows[spec.joint], spec.baseline)
+        base[spec.joint] = chain.start_row[spec.joint]
+        plain, scales = self.plain(base, values)
+        evidence = rules.Evidence(spec.floor, spec.folds, plain.rmse)
+        loose = rules.undetermined(evidence, plain)
+        allowed, vetoes, means = self.candidates()
+        ladder = Ladder(
+            run=self.ask,
+            base=base,
+            candidates=allowed,
+            scales=scales,
+            others=others_in(chain, spec.joint),
+            nominal=baseline_values(chain.start_row[spec.joint], spec.baseline),
+            evidence=evidence,
+            models={frozenset(): plain},
+        )
+        if not rules.too_few(plain) and not rules.white(evidence, plain):
+            ladder.climb()
+        plain = ladder.models[frozenset()]
+        fits = list(ladder.models.values())
+        conclusion = rules.conclude(evidence, plain, fits, loose)
+        if conclusion.final.effects:
+            (refined,) = self.ask([partial(JointProblem.refine, fit=conclusion.final)])
+            conclusion = replace(conclusion, final=refined)
+        self.options.progress(f"explain: {self.name}: {conclusion.verdict}: {conclusion.reason}")
+        return AnalysedJoint(self.name, spec, plain, conclusion, evidence, fits, vetoes, means)
+
+    def plain(self, base: np.ndarray, values: Mapping[str, float]) -> tuple[JointFit, Scales]:
+        """The plain model beside joints of which more is known than theirs, and the sizes of its motion."""
+        row = base[self.spec.joint].copy()
+        for key, value in values.items():
+            row[BASELINE_PARAMETERS[key].column] = value
+        (scales,) = self.ask([partial(JointProblem.scales, row=row, residual=self.spec.floor)])
+        call = partial(JointProblem.fit, base=base, effects=(), starts=[values], scales=scales)
+        (fit,) = self.ask([call])
+        row = fit.rows[self.spec.joint]
+        (scales,) = self.ask([partial(JointProblem.scales, row=row, residual=fit.rmse)])
+        return fit, scales
+
+    def candidates(self) -> tuple[list[str], dict[str, str], dict[str, tuple[str, ...]]]:
+        """Effects that models may have; those that are not tried, with the reason; what effects stand for."""
+        recording, chain = self.problems.recording, self.problems.chains[self.spec.chain]
+        spec = self.spec
+        telemetry = telemetry_of(recording, chain, spec.joint, spec.trajectories)
+        vetoes = rules.contradicted(telemetry)
+        means = {}
+        for name, others in rules.alike(self.options.effects, recording.model).items():
+            if not vetoes.keys() & {name, *others}:
+                means[name] = others
+                for other in others:
+                    vetoes[other] = f"leaves the same positions as {name}, which stands for both"
+        names = rules.candidates(chain, self.options.effects)
+        names = [name for name in names if name not in vetoes]
+        return names, vetoes, {**means, **TOGETHER}
+
+
+STAGES = 12
+"""Batches of fits of a joint at most."""
+
+
+def baseline_values(row: np.ndarray, keys: Sequence[str]) -> dict[str, float]:
+    """Values of a baseline's parameters in a row [PARAMETER_COLUMNS], by key."""
+    return {key: float(row[BASELINE_PARAMETERS[key].column]) for key in keys}
 
 
 def _workers(problems: Problems, options: Options) -> WorkerPool:
@@ -153,20 +273,24 @@ def _problems(
     recording = recording if isinstance(recording, Recording) else read_recording(recording)
     parts, specs = [], []
     for index, chain in enumerate(chains(recording, hand)):
-        rows = [
-            options.start.get(name, row)
-            for name, row in zip(chain.joints, chain.start_row, strict=True)
-        ]
+        pairs = zip(chain.joints, chain.start_row, strict=True)
+        rows = [options.start.get(name, row) for name, row in pairs]
         parts.append(replace(chain, start_row=np.array(rows, dtype=float)))
         for joint, column in enumerate(chain.columns):
-            trajectories, folds = design(recording, chain, joint)
+            trajectories, folds, aside = design(recording, chain, joint)
             if trajectories:
-                floor, analysed = (
-                    noise_floor(recording, int(column)),
-                    pieces(recording, chain, trajectories),
+                specs.append(
+                    JointSpec(
+                        chain=index,
+                        joint=joint,
+                        trajectories=trajectories,
+                        folds=folds,
+                        floor=noise_floor(recording, int(column)),
+                        baseline=baseline_of(chain),
+                        pieces=pieces(recording, chain, trajectories),
+                        aside=aside,
+                    )
                 )
-                free = baseline_of(chain)
-                specs.append(JointSpec(index, joint, trajectories, folds, floor, free, analysed))
     # A recording so long that pieces of it are analysed would take minutes a joint with the usual
     # step.
     dt = STEP_S * (2.0 if any(spec.pieces for spec in specs) else 1.0)
@@ -187,65 +311,35 @@ def baseline_of(chain: Chain) -> tuple[str, ...]:
 
 def _identify(
     pool: WorkerPool, chains: Sequence[Chain], specs: Sequence[JointSpec], options: Options
-) -> list[ExcitedJoint]:
-    """Baselines of all joints; the joints of a chain once more with the others' baselines."""
-
-    def first(spec: JointSpec) -> ExcitedJoint:
-        rows = chains[spec.chain].start_row.copy()
-        scales = _scales(pool, spec, rows, spec.floor)
-        # One limit that binds, one that does not.
-        starts = [{}, *({"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED))]
-        joint = _fitted(pool, chains, spec, rows, scales, starts=starts)
-        error, floor = 1e3 * joint.fit.rmse, 1e3 * spec.floor
-        options.progress(f"find: {joint.name}: baseline {error:.2f} mrad, noise floor {floor:.2f}")
-        return joint
-
-    def again(joint: ExcitedJoint) -> ExcitedJoint:
-        rows = joint.fit.rows.copy()
-        for other in joints:
-            if other.spec.chain == joint.spec.chain:
-                rows[other.spec.joint] = other.fit.rows[other.spec.joint]
-        return _fitted(pool, chains, joint.spec, rows, joint.scales)
-
-    joints = parallel(first, specs)
-    single = all(len(chain.joints) == 1 for chain in chains)
-    return joints if single else parallel(again, joints)
+) -> list[JointFit]:
+    """Plain models of all joints; the joints of a chain once more beside the others' plain models."""
+    fits = []
+    for number, spec in enumerate(specs):
+        chain = chains[spec.chain]
+        fit = _plain(pool, spec, chain.start_row)
+        fits.append(fit)
+        share = 100.0 * (number + 1) / len(specs)
+        line = f"baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}"
+        options.progress(f"find: {share:3.0f} % {chain.joints[spec.joint]}: {line}")
+    if all(len(chain.joints) == 1 for chain in chains):
+        return fits
+    again = []
+    for spec, fit in zip(specs, fits, strict=True):
+        rows = fit.rows.copy()
+        for other, beside in zip(specs, fits, strict=True):
+            if other.chain == spec.chain:
+                rows[other.joint] = beside.rows[other.joint]
+        again.append(_plain(pool, spec, rows))
+    return again
 
 
-def _resume(
-    pool: WorkerPool,
-    chains: Sequence[Chain],
-    specs: Sequence[JointSpec],
-    known: dict[str, Any],
-) -> list[ExcitedJoint]:
-    """The joints of an earlier ``find``, their fits recomputed from its rows."""
-
-    def again(spec: JointSpec) -> ExcitedJoint:
-        found = known[chains[spec.chain].joints[spec.joint]]
-        rows = np.array(found["rows"])
-        scales = _scales(pool, spec, rows, found["rmse_rad"])
-        return replace(_fitted(pool, chains, spec, rows, scales, iterations=1), scales=scales)
-
-    return parallel(again, specs)
-
-
-def _scales(pool: WorkerPool, spec: JointSpec, rows: np.ndarray, residual: float) -> Scales:
-    call = partial(JointProblem.scales, row=rows[spec.joint], residual=residual)
-    return pool.run(spec, [call])[0]
-
-
-def _fitted(
-    pool: WorkerPool,
-    chains: Sequence[Chain],
-    spec: JointSpec,
-    base: np.ndarray,
-    scales: Scales,
-    *,
-    starts: Sequence[Mapping[str, float]] = ({},),
-    **options: Any,
-) -> ExcitedJoint:
-    """A joint's plain model, fitted from rows of its chain, and the sizes of its motion with that."""
-    call = partial(JointProblem.fit, base=base, effects=(), starts=starts, scales=scales, **options)
-    fit = pool.run(spec, [call])[0]
-    name = chains[spec.chain].joints[spec.joint]
-    return ExcitedJoint(name, spec, _scales(pool, spec, fit.rows, fit.rmse), fit)
+def _plain(pool: WorkerPool, spec: JointSpec, base: np.ndarray) -> JointFit:
+    """A joint's plain model, fitted from rows of its chain."""
+    scale = partial(JointProblem.scales, row=base[spec.joint], residual=spec.floor)
+    (scales,) = pool.run(spec, [scale])
+    # One speed limit as it is, one that binds, one that does not.
+    limits = [{"velocity_limit": factor * scales.speed} for factor in (1.0, FREE_SPEED)]
+    starts = [{}, *limits]
+    call = partial(JointProblem.fit, base=base, effects=(), starts=starts, scales=scales)
+    (fit,) = pool.run(spec, [call])
+    return fit

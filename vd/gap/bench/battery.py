@@ -26,7 +26,7 @@ from vd.gap import workflow
 from vd.gap.bench.cases import run_cases
 from vd.gap.bench.hidden_plant import OUTSIDE
 from vd.gap.bench.hide import hide
-from vd.gap.bench.score import KINDS, Case, said, score
+from vd.gap.bench.score import KINDS, NOT_NAMED, Case, said, score
 from vd.gap.bench.sizes import showing
 from vd.kernels.servo import chains
 
@@ -58,7 +58,7 @@ def battery(
     shown = showing(model)
     if unknown := [name for name in effects if name not in shown]:
         raise ValueError(f"--effects: there is no {unknown[0]}; choose from {', '.join(shown)}")
-    names = tuple(effects) or shown
+    names = tuple(effects) or tuple(name for name in shown if name not in NOT_NAMED)
     changes = ("exact", "base", "mass") if model in HANDS else ("exact", "base")
     numbers = range(first_seed, first_seed + seeds)
 
@@ -76,7 +76,7 @@ def battery(
             Case("pair", model, pair, PAIR_SIZE, first_seed + number, battery=which)
             for number, pair in enumerate(itertools.combinations(names, 2))
         ],
-        "outside": sized("outside", tuple(OUTSIDE)),
+        "outside": sized("outside", (*OUTSIDE, *NOT_NAMED)),
     }
     return [case for kind in kinds for case in cases[kind]]
 

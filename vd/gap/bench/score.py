@@ -19,12 +19,16 @@ MASS_SPREAD = 0.2
 """Of links whose mass is changed, as the paper's randomisation has it."""
 CLEAR_GAP = 3.0
 """Gap in noise floors from which a single effect counts for the goals."""
+NOT_NAMED = ("command_jitter",)
+"""Effects of the table that no model has."""
 NEIGHBOURS: Mapping[str, tuple[str, ...]] = {
     COGGING: (),
     CABLE: ("gravity_load",),
+    "command_jitter": ("command_delay", "command_filter"),
     WARMING: ("coulomb_friction", "stribeck_friction", "asymmetric_friction", "load_friction"),
 }
-"""Effects of the table that are of the kind of one outside, so that naming them is no error: a
+"""Effects of the table that are of the kind of one that is not named, so that naming them is no
+error: delays that vary have a mean, and smooth; a
 cable pulls with the position, as only gravity does in the table; friction that falls as the joint
 warms is friction, of one form or another; torque ripple is like nothing in it."""
 SUMS: Mapping[frozenset[str], str] = {
@@ -146,7 +150,7 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
     sets = [list(group) for group in report["ambiguous"]]
     right = set(case.effects) | (set(MASS_EFFECTS) if case.change == "mass" else set())
     # The name that stands for a hidden effect is right if the report says that it does.
-    stands = {o: name for name, others in equivalent(case.model, named).items() for o in others}
+    stands = {o: name for name, others in equivalent(case.model).items() for o in others}
     right |= {stands[n] for n in case.effects if n in stands and any(n in group for group in sets)}
     # So is one that is the same as the hidden ones together, if the report says that.
     stood_for = {
