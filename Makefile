@@ -87,7 +87,7 @@ reference: $(STAMP)
 
 docs: $(STAMP)
 	test -x $(BIN)/mkdocs || $(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[docs]'
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: $(STAMP)
 	$(BIN)/vd-bench sim $(BENCH_ARGS)
