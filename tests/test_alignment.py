@@ -250,7 +250,7 @@ def test_losses_are_least_at_the_truth_and_fall(scenes):
 
 
 def test_goals_turned_by_the_network_keep_their_label(scenes):
-    runner = make_runner(scenes, cfg=replace(QUICK, searched_share=1.0))
+    runner = make_runner(scenes)
     pairs = runner.pairs()
     turned = runner.searched(
         pairs, [runner.network.neighbours(c) for c in (pairs.goal, pairs.seen)]

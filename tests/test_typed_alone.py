@@ -34,12 +34,12 @@ class ReachedError(Exception):
 
 LONG = {
     "vd-train teacher": "vd.train.teacher.train",
-    "vd-train student": "vd.train.student.cli._train",
-    "vd-train student --stage 0": "vd.train.student.cli._train",
-    "vd-train student --stage 1": "vd.train.student.cli._train",
-    "vd-train student --stage 2": "vd.train.student.cli._train",
-    "vd-train alignment": "vd.train.alignment.cli._train",
-    "vd-train alignment --stage 1": "vd.train.alignment.cli._train",
+    "vd-train student": "vd.train.stages.train_stage",
+    "vd-train student --stage 0": "vd.train.stages.train_stage",
+    "vd-train student --stage 1": "vd.train.stages.train_stage",
+    "vd-train student --stage 2": "vd.train.stages.train_stage",
+    "vd-train alignment": "vd.train.stages.train_stage",
+    "vd-train alignment --stage 1": "vd.train.stages.train_stage",
     "vd-train adapt": "vd.train.adapt._adapt",
     "vd-train tracker": "vd.train.tracker._track",
     "vd-deploy --twin": "vd.deploy.loop.policy_runner.load_runner",
@@ -162,10 +162,8 @@ def test_every_training_has_a_smoke_test_that_is_tiny_and_leaves_nothing(
         given.append(cfg)
         return 0
 
-    for place in ("train.teacher.train", "train.adapt._adapt", "train.tracker._track"):
-        monkeypatch.setattr(f"vd.{place}", note)
-    for place in ("alignment", "student"):
-        monkeypatch.setattr(f"vd.train.{place}.cli._train", note)
+    for place in ("teacher.train", "adapt._adapt", "tracker._track", "stages.train_stage"):
+        monkeypatch.setattr(f"vd.train.{place}", note)
     assert typed(f"vd-train {command} --smoke")[0] == 0
     assert not list(tmp_path.iterdir())
     (cfg,) = given

@@ -9,7 +9,7 @@ from torch import nn
 
 from vd.train.checkpoint import load_checkpoint
 from vd.train.config import RunCfg
-from vd.train.loop import TrainingLoop
+from vd.train.loop import TrainingLoop, check_update
 
 if TYPE_CHECKING:
     from vd.train.vec_env import ReorientVecEnv
@@ -28,6 +28,7 @@ class SupervisedLoop(TrainingLoop):
         run: Run settings.
         learning_rate: After the warm-up; it falls along a cosine to the end of the run.
         warmup_steps: Optimiser steps over which it rises from 0.
+        measure_every: Iterations from one measurement to the next.
         task: The environment's configuration as a dictionary, kept with checkpoints.
         device: Torch device.
         env: Environments that checkpoints hold, if any.
@@ -47,6 +48,7 @@ class SupervisedLoop(TrainingLoop):
         *,
         learning_rate: float,
         warmup_steps: int,
+        measure_every: int,
         task: dict[str, Any],
         device: str,
         env: "ReorientVecEnv | None" = None,
@@ -57,6 +59,7 @@ class SupervisedLoop(TrainingLoop):
         self.task = task
         self._learning_rate = learning_rate
         self._warmup_steps = warmup_steps
+        self._measure_every = measure_every
         self._steps_done = 0
 
     def load(self, path: Path) -> None:
@@ -85,22 +88,22 @@ class SupervisedLoop(TrainingLoop):
             for value in self.network.state_dict().values():
                 torch.distributed.broadcast(value, 0)
 
-    def _descend(self, loss: torch.Tensor, done: float) -> torch.Tensor:
-        """One optimiser step on the gradient of ``loss``, averaged over processes and clipped.
+    def _descend(self, losses: dict[str, torch.Tensor], done: float) -> dict[str, torch.Tensor]:
+        """One optimiser step on the gradient of a sum, averaged over processes and clipped.
 
         Args:
-            loss: The loss.
+            losses: Losses by name, whose sum it is.
             done: Share of the run that is done.
 
         Returns:
-            Norm of the gradient before clipping, a scalar on the device.
+            The losses, and the norm of the gradient before clipping, scalars on the device.
         """
         self._steps_done += 1
         warm = min(1.0, self._steps_done / max(1, self._warmup_steps))
         left = max(LEAST_RATE, 0.5 * (1.0 + math.cos(math.pi * done)))
         self.optimizer.param_groups[0]["lr"] = self._learning_rate * warm * left
         self.optimizer.zero_grad()
-        loss.backward()
+        torch.stack(tuple(losses.values())).sum().backward()
         parameters = list(self.network.parameters())
         if self.is_distributed:
             # Every process has to take part with every weight, also one whose loss does not reach
@@ -111,7 +114,27 @@ class SupervisedLoop(TrainingLoop):
             nn.utils.vector_to_parameters(flat / self.world_size, gradients)
         norm = nn.utils.clip_grad_norm_(parameters, GRAD_NORM)
         self.optimizer.step()
-        return norm.detach()
+        logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
+        logged["loss/grad_norm"] = norm.detach()
+        return logged
+
+    def _figures(self, steps: list[dict[str, torch.Tensor]]) -> dict[str, float]:
+        """Means over the optimiser steps of an iteration, and every so often what is measured.
+
+        Raises:
+            TrainingDivergedError: One is not finite, or a weight.
+        """
+        means = {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
+        iteration = self.iteration + 1
+        if iteration % self._measure_every == 0 or iteration == self.total_iterations:
+            means |= self.measure()
+        figures = self._read(means)
+        check_update(figures, self.network, "lower the learning rate, or take fp32 as precision")
+        return figures
+
+    def measure(self) -> dict[str, torch.Tensor]:
+        """Errors on what is not learned from; empty for none."""
+        return {}
 
     def _read(self, figures: dict[str, torch.Tensor]) -> dict[str, float]:
         """Scalars, averaged over the processes; waits for the device."""

@@ -13,7 +13,7 @@ import torch
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.policy.senses import Senses
-from vd.train.student.bank import ShapeBank, centred, mesh_points
+from vd.train.student.bank import ShapeBank, centred_points
 from vd.train.student.config import StudentTrainCfg
 from vd.train.student.sequences import Sequences, inputs_of, last_errors
 from vd.train.student.shapes import random_matrices, uniform
@@ -24,8 +24,6 @@ from vd.vision.student import Belief, carried, each
 
 CLOUDS = 4
 """Points of a shape, in clouds: one is the goal's, of the others is seen what is to be seen."""
-MESH_POINTS = 6000
-"""Points kept of a mesh: of them each deformed copy draws its own."""
 SHIFT_M = 0.04
 """First beliefs are off by up to this along each axis [m]."""
 TURN_RAD, MOVE_M = 0.25, 0.003
@@ -72,12 +70,11 @@ class MadeSequences:
         self.samples = cfg.clouds.updates * cfg.learn.batch * cfg.learn.window
         points = CLOUDS * cfg.clouds.points
         device = hands.eye.device
-        meshes = centred(mesh_points(objects, max(MESH_POINTS, points), device))
-        self._bank = ShapeBank(meshes, cfg.clouds.shapes, points)
+        self._bank = ShapeBank(objects, cfg.clouds.shapes, points, device)
         self.most_rad = FIRST_TURN_RAD
         self._held_out = None
         if held_out:
-            self._held_out = centred(mesh_points(held_out, points, device))
+            self._held_out = centred_points(held_out, points, device)
 
     def minibatches(
         self, acting: ActingStudent, stopping: Callable[[], bool]
