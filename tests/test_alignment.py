@@ -21,11 +21,10 @@ from vd.vision.cfg import AlignmentCfg
 from vd.vision.finder import LEAST, GoalFinder
 from vd.vision.rotations import (
     cube_rotations,
-    matrices,
+    quaternion_matrices,
     quaternions,
     random_rotations,
     turn_angle,
-    two_columns,
 )
 from vd.vision.saved import AlignmentSpec, load_alignment
 
@@ -54,9 +53,9 @@ def test_rotations_agree_with_scipys():
     np.testing.assert_allclose(rotation_distance(a, b), between.magnitude(), atol=1e-5)
     difference = Rotation.from_quat(relative_rotation(a, b).numpy())
     assert (difference * between.inv()).magnitude().max() < 1e-5
-    columns = two_columns(relative_rotation(a, b))
-    np.testing.assert_allclose(matrices(columns), between.as_matrix(), atol=1e-5)
-    np.testing.assert_allclose(turn_angle(matrices(columns)), between.magnitude(), atol=2e-3)
+    turn = quaternion_matrices(relative_rotation(a, b))
+    np.testing.assert_allclose(turn, between.as_matrix(), atol=1e-5)
+    np.testing.assert_allclose(turn_angle(turn), between.magnitude(), atol=2e-3)
     every = Rotation.concatenate([first, Rotation.create_group("O")])  # of half a turn too
     back = quaternions(torch.tensor(every.as_matrix(), dtype=torch.float32))
     assert (Rotation.from_quat(back.numpy()) * every.inv()).magnitude().max() < 1e-5
@@ -68,7 +67,7 @@ def test_no_rotation_is_far_from_the_starts():
     starts = cube_rotations(CPU)
     torch.testing.assert_close(starts[0], torch.eye(3))
     torch.manual_seed(0)
-    anywhere = matrices(two_columns(random_rotations(2000, CPU)))
+    anywhere = quaternion_matrices(random_rotations(2000, CPU))
     apart = turn_angle(starts.transpose(-1, -2) @ anywhere[:, None]).amin(dim=1)
     assert 0.9 < apart.max() < 1.1
 

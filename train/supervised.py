@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from vd.train.checkpoint import load_checkpoint
 from vd.train.config import RunCfg
@@ -88,7 +88,7 @@ class SupervisedLoop(TrainingLoop):
             for value in self.network.state_dict().values():
                 torch.distributed.broadcast(value, 0)
 
-    def _descend(self, losses: dict[str, torch.Tensor], done: float) -> dict[str, torch.Tensor]:
+    def _descend(self, losses: dict[str, Tensor], done: float) -> dict[str, Tensor]:
         """One optimiser step on the gradient of a sum, averaged over processes and clipped.
 
         Args:
@@ -118,7 +118,7 @@ class SupervisedLoop(TrainingLoop):
         logged["loss/grad_norm"] = norm.detach()
         return logged
 
-    def _figures(self, steps: list[dict[str, torch.Tensor]]) -> dict[str, float]:
+    def _figures(self, steps: list[dict[str, Tensor]]) -> dict[str, float]:
         """Means over the optimiser steps of an iteration, and every so often what is measured.
 
         Raises:
@@ -132,11 +132,11 @@ class SupervisedLoop(TrainingLoop):
         check_update(figures, self.network, "lower the learning rate, or take fp32 as precision")
         return figures
 
-    def measure(self) -> dict[str, torch.Tensor]:
+    def measure(self) -> dict[str, Tensor]:
         """Errors on what is not learned from; empty for none."""
         return {}
 
-    def _read(self, figures: dict[str, torch.Tensor]) -> dict[str, float]:
+    def _read(self, figures: dict[str, Tensor]) -> dict[str, float]:
         """Scalars, averaged over the processes; waits for the device."""
         values = torch.stack(tuple(figures.values()))
         if self.is_distributed:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.command.config import to_dict
@@ -55,7 +56,7 @@ class Scenes:
     """What is learned from."""
     hands: Hands
     """What hides it."""
-    held_out: dict[str, torch.Tensor]
+    held_out: dict[str, Tensor]
     """Shapes that are only measured, by name of the set: points [m] and normals [O, P, 6]."""
 
 
@@ -78,9 +79,7 @@ def make_scenes(
     return Scenes(ShapeBank(objects, cfg.shapes, points, device), hands, sets)
 
 
-def alignment_losses(
-    residual: Residual, pairs: Pairs
-) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+def alignment_losses(residual: Residual, pairs: Pairs) -> tuple[dict[str, Tensor], Tensor]:
     """Losses by name, means over the batch, and the angles by which rotations are wrong [rad] [B]."""
     wrong = residual.rotation.detach().transpose(-1, -2) @ pairs.rotation
     error = turn_angle(wrong)
@@ -172,7 +171,7 @@ class AlignTrainer(SupervisedLoop):
         return joined(made, self.looks.pairs(simulated, points, **shares))
 
     @torch.no_grad()
-    def searched(self, pairs: Pairs, near: Sequence[torch.Tensor]) -> Pairs:
+    def searched(self, pairs: Pairs, near: Sequence[Tensor]) -> Pairs:
         """Pairs of which some goals are turned as the network says, once or twice.
 
         As a search meets them.
@@ -194,7 +193,7 @@ class AlignTrainer(SupervisedLoop):
                 turned[some] = turned[some] @ back
         return replace(pairs, goal=goal, rotation=rotation, surface=surface)
 
-    def _step(self, done: float) -> dict[str, torch.Tensor]:
+    def _step(self, done: float) -> dict[str, Tensor]:
         pairs = self.pairs()
         near = [self.network.neighbours(cloud) for cloud in (pairs.goal, pairs.seen)]
         pairs = self.searched(pairs, near)
@@ -204,7 +203,7 @@ class AlignTrainer(SupervisedLoop):
         return self._descend(losses, done) | {"alignment/rotation_error": error.median()}
 
     @torch.no_grad()
-    def measure(self) -> dict[str, torch.Tensor]:
+    def measure(self) -> dict[str, Tensor]:
         """Figures of first looks at shapes not learned from, whole goals and scans.
 
         Processes share them.
@@ -223,7 +222,7 @@ class AlignTrainer(SupervisedLoop):
                     figures[f"{name}{kind}/within_{bound:g}"] = (error < bound).float().mean()
         return figures
 
-    def _errors(self, shapes: torch.Tensor, scans: float) -> tuple[torch.Tensor, torch.Tensor]:
+    def _errors(self, shapes: Tensor, scans: float) -> tuple[Tensor, Tensor]:
         """Errors of first looks: angles [rad] and distances [m] [S]."""
         errors = []
         offsets = []

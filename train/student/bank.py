@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 import trimesh
+from torch import Tensor
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.train.student.shapes import made_shapes, mesh_shapes
@@ -15,7 +16,7 @@ SHAPES_AT_ONCE = 128
 """Shapes made at a time: their bodies' points take 0.5 GB."""
 
 
-def mesh_points(objects: Sequence[ObjectModel], count: int, device: torch.device) -> torch.Tensor:
+def mesh_points(objects: Sequence[ObjectModel], count: int, device: torch.device) -> Tensor:
     """Points [m] and normals of objects' surfaces, even in area [O, count, 6]."""
     rows = []
     for item in objects:
@@ -25,9 +26,7 @@ def mesh_points(objects: Sequence[ObjectModel], count: int, device: torch.device
     return torch.tensor(np.stack(rows), dtype=torch.float32, device=device)
 
 
-def centred_points(
-    objects: Sequence[ObjectModel], count: int, device: torch.device
-) -> torch.Tensor:
+def centred_points(objects: Sequence[ObjectModel], count: int, device: torch.device) -> Tensor:
     """As :func:`mesh_points`, about the means of the points."""
     shapes = mesh_points(objects, count, device)
     shapes[..., :3] -= shapes[..., :3].mean(dim=1, keepdim=True)
@@ -67,7 +66,7 @@ class ShapeBank:
             self._oldest = (self._oldest + some) % size
             count -= some
 
-    def draw(self, count: int) -> torch.Tensor:
+    def draw(self, count: int) -> Tensor:
         """Points [m] and normals of shapes drawn at random [count, P, 6]."""
         rows = torch.randint(len(self._shapes), (count,), device=self._shapes.device)
         return self._shapes[rows]

@@ -10,6 +10,7 @@ from operator import itemgetter
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.policy.senses import Senses
@@ -17,9 +18,9 @@ from vd.train.student.bank import ShapeBank, centred_points
 from vd.train.student.config import StudentTrainCfg
 from vd.train.student.sequences import Sequences, inputs_of, last_errors
 from vd.train.student.shapes import random_matrices, uniform
-from vd.train.student.views import Hands, camera_points, goal_points
+from vd.train.student.views import Hands, camera_points, goal_points, posed
 from vd.vision.acting import ActingStudent
-from vd.vision.rotations import matrices, rotations_about, two_columns
+from vd.vision.rotations import matrices_about
 from vd.vision.student import Belief, carried, each
 
 CLOUDS = 4
@@ -34,12 +35,12 @@ LEFT, WIDER = 0.5, 1.05
 """Where no more than this share of the error is left after a sequence, the largest grows so."""
 
 
-def turned(rotation: torch.Tensor, most: float) -> torch.Tensor:
+def turned(rotation: Tensor, most: float) -> Tensor:
     """Rotations [B, 3, 3] turned about any axis by angles that are uniform up to ``most`` [rad]."""
     count = len(rotation)
     axis = torch.randn((count, 3), device=rotation.device)
     angle = most * torch.rand(count, device=rotation.device)
-    return matrices(two_columns(rotations_about(axis, angle))) @ rotation
+    return matrices_about(axis, angle) @ rotation
 
 
 class MadeSequences:
@@ -92,9 +93,7 @@ class MadeSequences:
             self.most_rad = min(math.pi, WIDER * self.most_rad)
 
     @torch.no_grad()
-    def draw(
-        self, acting: ActingStudent, shapes: torch.Tensor, most_rad: float = math.pi
-    ) -> Sequences:
+    def draw(self, acting: ActingStudent, shapes: Tensor, most_rad: float = math.pi) -> Sequences:
         """Sequences of shapes, points [m] and normals [B, P, 6], with the student's own beliefs.
 
         The first are off by up to ``most_rad``.
@@ -149,7 +148,7 @@ class MadeSequences:
         return {"learn/most_rad": self.most_rad}
 
     @torch.no_grad()
-    def measure(self, acting: ActingStudent) -> dict[str, torch.Tensor]:
+    def measure(self, acting: ActingStudent) -> dict[str, Tensor]:
         """Errors after a sequence of objects that are not learned from."""
         if self._held_out is None:
             return {}
@@ -175,9 +174,8 @@ class MadeSequences:
     def _motion(self, count: int) -> Belief:
         """Where shapes are in each step, base frame [T, B]."""
         device = self._hands.eye.device
-        low, high = self._hands.box
         rotation = random_matrices(count, device)
-        position = low + (high - low) * torch.rand((count, 3), device=device)
+        position = uniform(*self._hands.box, count, 3, device=device)
         rotations = []
         positions = []
         for _ in range(self._learn.window):
@@ -187,20 +185,14 @@ class MadeSequences:
             position = position + MOVE_M * torch.randn_like(position)
         return Belief(torch.stack(rotations), torch.stack(positions))
 
-    def _seen(self, shapes: torch.Tensor, place: Belief, posture: torch.Tensor) -> torch.Tensor:
+    def _seen(self, shapes: Tensor, place: Belief, posture: Tensor) -> Tensor:
         """Points that a camera sees of shapes [B, P, 6] in each step, or whole surfaces [T, B, K, 3]."""
         steps, count = place.position.shape[:2]
         wanted = self._clouds.points
         device = shapes.device
-        posed = torch.cat(
-            [
-                carried(shapes[..., :3], place.rotation, place.position[..., None, :]),
-                carried(shapes[..., 3:], place.rotation),
-            ],
-            dim=-1,
-        ).flatten(0, 1)
-        seen = camera_points(self._hands, posture.repeat(steps), posed, wanted)
-        whole = posed[:, :wanted, :3]
+        surfaces = posed(shapes, place.rotation, place.position).flatten(0, 1)
+        seen = camera_points(self._hands, posture.repeat(steps), surfaces, wanted)
+        whole = surfaces[:, :wanted, :3]
         whole = whole + self._clouds.noise_m * torch.randn_like(whole)
         by_camera = torch.rand((count, 1, 1), device=device) < self._clouds.seen_share
         points = torch.where(by_camera.repeat(steps, 1, 1), seen, whole)

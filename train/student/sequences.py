@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import torch
+from torch import Tensor
 
 from vd.policy.senses import Senses
 from vd.train.student.config import LearnCfg
@@ -27,11 +27,11 @@ class Sequences:
     """What was read in each step, with what was believed then [T, B]."""
     truth: Belief
     """What was to be believed [T, B]."""
-    hidden: torch.Tensor
+    hidden: Tensor
     """Memory before the first step [B, G]."""
-    done: torch.Tensor
+    done: Tensor
     """Whether an episode ended with a step, bool [T, B]."""
-    label: torch.Tensor | None = None
+    label: Tensor | None = None
     """What the teacher does [T, B, D]; None: there is no teacher."""
 
 
@@ -53,7 +53,7 @@ class SequenceSource(Protocol):
         """What else is to be logged of the iteration."""
         ...
 
-    def measure(self, acting: ActingStudent) -> dict[str, torch.Tensor]:
+    def measure(self, acting: ActingStudent) -> dict[str, Tensor]:
         """Errors on what is not learned from; empty for none."""
         ...
 
@@ -70,9 +70,7 @@ class SequenceSource(Protocol):
         ...
 
 
-def inputs_of(
-    build: InputBuilder, senses: Senses, belief: Belief, rows: torch.Tensor
-) -> StudentInput:
+def inputs_of(build: InputBuilder, senses: Senses, belief: Belief, rows: Tensor) -> StudentInput:
     """What was read in T steps of the environments ``rows`` [B], made again [T, B].
 
     Args:
@@ -88,20 +86,18 @@ def inputs_of(
     return each(sight, lambda value: value.unflatten(0, (steps, len(rows))))
 
 
-def belief_errors(belief: Belief, truth: Belief) -> tuple[torch.Tensor, torch.Tensor]:
+def belief_errors(belief: Belief, truth: Belief) -> tuple[Tensor, Tensor]:
     """Angles [rad] and distances [m] by which beliefs are wrong [..]."""
     turn = belief.rotation.transpose(-1, -2) @ truth.rotation
     return turn_angle(turn), (belief.position - truth.position).norm(dim=-1)
 
 
-def last_errors(belief: Belief, sequences: Sequences) -> tuple[torch.Tensor, torch.Tensor]:
+def last_errors(belief: Belief, sequences: Sequences) -> tuple[Tensor, Tensor]:
     """Angles [rad] and distances [m] by which beliefs after the last step are wrong [B]."""
     return belief_errors(belief, each(sequences.truth, lambda value: value[-1]))
 
 
-def student_losses(
-    output: StudentOutput, sequences: Sequences, cfg: LearnCfg
-) -> dict[str, torch.Tensor]:
+def student_losses(output: StudentOutput, sequences: Sequences, cfg: LearnCfg) -> dict[str, Tensor]:
     """Weighted losses by name, means over all steps."""
     truth = sequences.truth
     to_goal = truth.rotation.transpose(-1, -2) @ sequences.sight.goal_rotation

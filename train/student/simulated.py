@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
+from torch import Tensor
 
 from vd.evaluate.tracking import sensed, sensed_with
 from vd.geometry.quaternions import poses_in
@@ -24,7 +25,7 @@ from vd.train.student.sequences import Sequences, belief_errors, inputs_of
 from vd.train.student.views import goal_points
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.acting import ActingStudent
-from vd.vision.rotations import matrices, two_columns
+from vd.vision.rotations import quaternion_matrices
 from vd.vision.student import Belief, carried, each
 
 
@@ -48,7 +49,7 @@ class SimulatedSequences:
         self,
         env: ReorientVecEnv,
         teacher: TrainedPolicy,
-        surfaces: torch.Tensor,
+        surfaces: Tensor,
         cfg: StudentTrainCfg,
         camera: DepthCamera | None = None,
     ):
@@ -72,7 +73,7 @@ class SimulatedSequences:
         self._base = torch.tensor(mount, dtype=torch.float32, device=place)
         self._pose = wp.to_torch(env.env.sim.body_q)[:, env.env.scene.object_body]
         self.blank = torch.zeros(env.num_envs, dtype=torch.int32, device=place)
-        self._store: dict[str, torch.Tensor] = {}
+        self._store: dict[str, Tensor] = {}
         self._means = StepMeans()
         length = math.ceil(2 * env.max_episode_length / cfg.learn.window)
         self._window = GoalWindow(length)
@@ -91,7 +92,7 @@ class SimulatedSequences:
                 yield self.taken(acting, hidden, rows)
 
     @torch.no_grad()
-    def collect(self, acting: ActingStudent, stopping: Callable[[], bool]) -> torch.Tensor | None:
+    def collect(self, acting: ActingStudent, stopping: Callable[[], bool]) -> Tensor | None:
         """Act for T steps; the memory before the first of them, or None if it was cut short."""
         hidden = acting.hidden
         for step in range(self._cfg.learn.window):
@@ -117,7 +118,7 @@ class SimulatedSequences:
         self.env.env.check()
         return hidden
 
-    def senses(self, pose: torch.Tensor) -> Senses:
+    def senses(self, pose: Tensor) -> Senses:
         """What is sensed now, for true poses of the objects in the base frame [N, 7]."""
         env = self.env.env
         if self._camera is None:
@@ -133,7 +134,7 @@ class SimulatedSequences:
         points = senses.points.half().float()
         return sensed_with(env, points.masked_fill((self.blank > 0)[:, None, None], torch.nan))
 
-    def labels(self) -> torch.Tensor:
+    def labels(self) -> Tensor:
         """What the teacher does now, clipped as the environment clips actions [N, D]."""
         env = self.env.env
         action = self._teacher.act(wp.to_torch(env.observation))
@@ -142,7 +143,7 @@ class SimulatedSequences:
             action = wp.to_torch(env.symmetry_frames.world_action(in_frames))
         return action.clamp(-1.0, 1.0)
 
-    def taken(self, acting: ActingStudent, hidden: torch.Tensor, rows: torch.Tensor) -> Sequences:
+    def taken(self, acting: ActingStudent, hidden: Tensor, rows: Tensor) -> Sequences:
         """What was done in the environments ``rows`` [B]; clouds are made again."""
         kept = {name: values[:, rows] for name, values in self._store.items()}
         steps = len(kept["pose"])
@@ -179,7 +180,7 @@ class SimulatedSequences:
         means = self._means.read(processes)
         return {**self._window.add(means), **means, **self.env.end_iteration()}
 
-    def measure(self, acting: ActingStudent) -> dict[str, torch.Tensor]:
+    def measure(self, acting: ActingStudent) -> dict[str, Tensor]:
         """Nothing: policies are judged by vd-eval."""
         return {}
 
@@ -204,17 +205,15 @@ class SimulatedSequences:
         """Release the environments."""
         self.env.env.close()
 
-    def _complete(self, pose: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+    def _complete(self, pose: Tensor, rows: Tensor) -> Tensor:
         """Points all over the objects of environments ``rows`` at poses [R, 7], with noise [R, K, 3]."""
         clouds = self._cfg.clouds
         order = torch.randperm(self._shapes.shape[1], device=pose.device)[: clouds.points]
         shapes = self._scale[rows] * self._shapes[self._object[rows]][:, order]
-        points = carried(shapes, matrices(two_columns(pose[:, 3:])), pose[:, None, :3])
+        points = carried(shapes, quaternion_matrices(pose[:, 3:]), pose[:, None, :3])
         return points + clouds.noise_m * torch.randn_like(points)
 
-    def _keep(
-        self, step: int, senses: Senses, belief: Belief, pose: torch.Tensor, label: torch.Tensor
-    ) -> None:
+    def _keep(self, step: int, senses: Senses, belief: Belief, pose: Tensor, label: Tensor) -> None:
         """Write a step into the store [T, N, ..]."""
         values = {
             "joint_q": senses.joint_q,

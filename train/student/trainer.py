@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from vd.command.config import to_dict
 from vd.policy.bundle import write_policy
@@ -73,11 +74,11 @@ class StudentTrainer(SupervisedLoop):
         self._share_statistics()
         return self._figures(steps) | self.source.figures()
 
-    def measure(self) -> dict[str, torch.Tensor]:
+    def measure(self) -> dict[str, Tensor]:
         """Errors on what is not learned from; empty for none."""
         return self.source.measure(self.acting)
 
-    def _step(self, sequences: Sequences, done: float) -> dict[str, torch.Tensor]:
+    def _step(self, sequences: Sequences, done: float) -> dict[str, Tensor]:
         """One optimiser step; its losses and errors."""
         self.network.train()
         output = self.network(sequences.sight, sequences.hidden, sequences.done)

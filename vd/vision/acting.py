@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from torch import Tensor
 
 from vd.assets_usd.hand_data import HandModel
 from vd.geometry.quaternions import product, rotated
@@ -46,7 +47,7 @@ class ActingStudent:
         hidden: Memory for the next step [N, G].
     """
 
-    def __init__(self, network: Student, hand: HandModel, goals: torch.Tensor):
+    def __init__(self, network: Student, hand: HandModel, goals: Tensor):
         self.network = network
         self.build = InputBuilder(hand, goals)
         upright = goals.new_tensor([0.0, 0.0, 0.0, 1.0])
@@ -56,7 +57,7 @@ class ActingStudent:
         self._base = mount.repeat(len(goals), 1)
 
     @property
-    def pose(self) -> torch.Tensor:
+    def pose(self) -> Tensor:
         """Where the objects' frames are believed to be, base frame [N, 7]."""
         return self.build.pose_of(self.belief)
 
