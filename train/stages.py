@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from vd.train.supervised import SupervisedLoop
 
 Cfg = TypeVar("Cfg", "AlignmentTrainCfg", "StudentTrainCfg")
+Network = TypeVar("Network")
+Trainer = TypeVar("Trainer", bound="SupervisedLoop")
 
 SHORT_FORMS = {
     "objects": "task.objects",
@@ -56,7 +58,7 @@ class StagedTraining(Generic[Cfg]):
     """Settings of a stage's smoke test."""
     begin_from: Callable[[Cfg, str | None], Cfg]
     """Settings with what ``--init`` names, or with the stage before where it names nothing."""
-    build: Callable[..., "SupervisedLoop"]
+    build: Callable[[Cfg, Callable[[str], object]], "SupervisedLoop"]
     """From settings to a trainer."""
     result: str
     """File in the run's folder that holds what was learned."""
@@ -117,7 +119,8 @@ def train_stage(cfg: Cfg, training: StagedTraining[Cfg]) -> int:
     """Train as ``cfg`` says; the exit status."""
     folder = cfg.run.out
     say = say_of_main()
-    trainer = training.build(cfg, say=say)
+    cfg.validate()
+    trainer = training.build(cfg, say)
     if trainer.iteration:
         say(f"resumed after iteration {trainer.iteration} of {trainer.total_iterations}")
     elif cfg.init is not None:
@@ -159,10 +162,10 @@ def build_stage(
     cfg: Cfg,
     kind: str,
     *,
-    network_of: Callable[[Cfg, "TrainedPolicy", str], Any],
-    trainer_of: Callable[[Cfg, "TrainedPolicy", Any, str], Any],
+    network_of: Callable[[Cfg, "TrainedPolicy", str], Network],
+    trainer_of: Callable[[Cfg, "TrainedPolicy", Network, str], Trainer],
     say: Callable[[str], object],
-) -> Any:
+) -> Trainer:
     """Build a trainer as ``cfg`` says, save the configuration, and resume if asked.
 
     Args:
@@ -180,7 +183,6 @@ def build_stage(
     """
     from vd.train.checkpoint import find_checkpoint
 
-    cfg.validate()
     check_folder(cfg.run.out)
     device = resolve_device(cfg.run.device)
     checkpoint = find_checkpoint(cfg.run.out, cfg.resume, kind)

@@ -2,35 +2,38 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+import torch
+
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.sets import load_set
 from vd.command.config import to_dict
 from vd.envs.cfg import ObservationCfg, ReorientCfg
+from vd.envs.reorient import ReorientEnv
+from vd.policy.actor import TrainedPolicy
+from vd.policy.contract import TrackingSpec
+from vd.tracking.policy import TrackingPolicy
+from vd.train.alignment.align import CLOUDS, AlignTrainer, make_scenes
 from vd.train.alignment.config import SIMULATED, AlignmentTrainCfg
+from vd.train.alignment.looks import SimulatedLooks
+from vd.train.alignment.network import open_network
 from vd.train.stages import build_stage, task_of_teacher
-
-if TYPE_CHECKING:
-    from vd.policy.actor import TrainedPolicy
-    from vd.train.alignment.align import AlignTrainer
-    from vd.train.alignment.looks import SimulatedLooks
-    from vd.vision.alignment import AlignmentNetwork
+from vd.train.student.bank import mesh_points
+from vd.train.student.views import Hands
+from vd.train.vec_env import ReorientVecEnv
+from vd.vision.alignment import AlignmentNetwork
+from vd.vision.saved import AlignmentSpec
 
 
 def build_alignment(
     cfg: AlignmentTrainCfg, *, say: Callable[[str], object] = print
-) -> "AlignTrainer":
+) -> AlignTrainer:
     """Build network, shapes and environments as ``cfg`` says; as :func:`vd.train.stages.build_stage`."""
-    trainer: AlignTrainer = build_stage(
-        cfg, "alignment", network_of=_network, trainer_of=_trainer, say=say
-    )
-    return trainer
+    return build_stage(cfg, "alignment", network_of=_network, trainer_of=_trainer, say=say)
 
 
-def _network(cfg: AlignmentTrainCfg, teacher: "TrainedPolicy", device: str) -> "AlignmentNetwork":
+def _network(cfg: AlignmentTrainCfg, teacher: TrainedPolicy, device: str) -> AlignmentNetwork:
     """The network, with the weights of the one that it begins from."""
-    from vd.train.alignment.network import open_network
-    from vd.vision.alignment import AlignmentNetwork
-
     network = AlignmentNetwork(cfg.align.network).to(device)
     if cfg.init is not None:
         begun, _, _ = open_network(str(cfg.init), device)
@@ -39,15 +42,9 @@ def _network(cfg: AlignmentTrainCfg, teacher: "TrainedPolicy", device: str) -> "
 
 
 def _trainer(
-    cfg: AlignmentTrainCfg, teacher: "TrainedPolicy", network: "AlignmentNetwork", device: str
-) -> "AlignTrainer":
+    cfg: AlignmentTrainCfg, teacher: TrainedPolicy, network: AlignmentNetwork, device: str
+) -> AlignTrainer:
     """The network's trainer, with shapes and environments."""
-    from vd.assets_usd.hands import load_hand
-    from vd.assets_usd.objects.sets import load_set
-    from vd.train.alignment.align import AlignTrainer, make_scenes
-    from vd.train.student.views import Hands
-    from vd.vision.saved import AlignmentSpec
-
     task = task_of_teacher(teacher, cfg.task)
     task = replace(task, observation=ObservationCfg())  # who sees by a camera does not look at it
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
@@ -75,21 +72,11 @@ def _trainer(
 def _looks(
     cfg: AlignmentTrainCfg,
     task: ReorientCfg,
-    teacher: "TrainedPolicy",
-    network: "AlignmentNetwork",
+    teacher: TrainedPolicy,
+    network: AlignmentNetwork,
     device: str,
-) -> "SimulatedLooks":
+) -> SimulatedLooks:
     """Environments in which the teacher acts by the network."""
-    import torch
-
-    from vd.envs.reorient import ReorientEnv
-    from vd.policy.contract import TrackingSpec
-    from vd.tracking.policy import TrackingPolicy
-    from vd.train.alignment.align import CLOUDS
-    from vd.train.alignment.looks import SimulatedLooks
-    from vd.train.student.bank import mesh_points
-    from vd.train.vec_env import ReorientVecEnv
-
     simulation = ReorientEnv(task, device)
     env = ReorientVecEnv(simulation)
     # Or all episodes would time out at once.

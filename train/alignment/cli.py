@@ -1,13 +1,16 @@
 """Command line of alignment: ``vd-train alignment``."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vd.policy.agents import find_policy
-from vd.train.alignment.build import build_alignment
 from vd.train.alignment.config import ALIGNMENT_NAME, PRESETS, SIMULATED, AlignmentTrainCfg, smoke
 from vd.train.stages import StagedTraining, parse_stage, run_stage
+
+if TYPE_CHECKING:
+    from vd.train.alignment.align import AlignTrainer
 
 HELP = """Train alignment: the network by which a teacher acts on what a camera sees, without a mesh.
 
@@ -34,13 +37,20 @@ def begin_from(base: AlignmentTrainCfg, init: str | None) -> AlignmentTrainCfg:
     return replace(base, init=Path(init), align=align, camera=camera)
 
 
+def _build(cfg: AlignmentTrainCfg, say: Callable[[str], object]) -> "AlignTrainer":
+    """The trainer; torch and the simulator are loaded only now."""
+    from vd.train.alignment.build import build_alignment
+
+    return build_alignment(cfg, say=say)
+
+
 ALIGNMENT = StagedTraining(
     name="alignment",
     help=HELP,
     presets=PRESETS,
     smoke=smoke,
     begin_from=begin_from,
-    build=build_alignment,
+    build=_build,
     result=ALIGNMENT_NAME,
 )
 """The command."""

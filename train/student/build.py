@@ -2,31 +2,40 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+import torch
+import warp as wp
+
+from vd.assets_usd.hand_data import HandModel
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.sets import load_set
 from vd.command.config import to_dict
-from vd.command.warp_quiet import quiet_warp
-from vd.envs.cfg import ReorientCfg
+from vd.command.versions import installed_versions
+from vd.envs.cfg import ObservationCfg, ReorientCfg
+from vd.envs.reorient import ReorientEnv
+from vd.evaluate.conditions import CONDITIONS
+from vd.policy.actor import PACKAGES, TrainedPolicy
+from vd.policy.agents import open_policy, policy_name
+from vd.policy.contract import Contract, PolicySpec, StudentSpec, derive_interface
+from vd.sensors.cfg import DepthCameraCfg
+from vd.sensors.depth_camera import DepthCamera
 from vd.train.stages import build_stage, task_of_teacher
+from vd.train.student.bank import mesh_points
 from vd.train.student.config import MADE, RENDERED, StudentTrainCfg
-
-if TYPE_CHECKING:
-    from vd.assets_usd.hand_data import HandModel
-    from vd.policy.actor import TrainedPolicy
-    from vd.policy.contract import Contract
-    from vd.train.student.sequences import SequenceSource
-    from vd.train.student.trainer import StudentTrainer
-    from vd.vision.acting import ActingStudent, StudentPolicy
-    from vd.vision.student import Student
+from vd.train.student.made import CLOUDS, MadeSequences
+from vd.train.student.simulated import SimulatedSequences
+from vd.train.student.trainer import StudentTrainer
+from vd.train.student.views import Hands
+from vd.train.vec_env import ReorientVecEnv
+from vd.vision.acting import ActingStudent, StudentPolicy
+from vd.vision.student import Student
 
 
-def student_task(teacher: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
+def student_task(teacher: TrainedPolicy, cfg: StudentTrainCfg) -> ReorientCfg:
     """The environments: those of the teacher's training, of which it observes the present without noise.
 
     In stage 2 servos are as in *mixed* at least.
     """
-    from vd.evaluate.conditions import CONDITIONS
-
     draws = replace(
         ReorientCfg.of(teacher).randomisation,
         observation_noise_mean=0.0,
@@ -43,15 +52,9 @@ def student_task(teacher: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
 
 
 def student_contract(
-    task: ReorientCfg, hand: "HandModel", teacher: "TrainedPolicy", cfg: StudentTrainCfg
-) -> "Contract":
+    task: ReorientCfg, hand: HandModel, teacher: TrainedPolicy, cfg: StudentTrainCfg
+) -> Contract:
     """What the student's file says of it, before anything was learned."""
-    from vd.command.versions import installed_versions
-    from vd.envs.cfg import ObservationCfg
-    from vd.policy.actor import PACKAGES
-    from vd.policy.agents import policy_name
-    from vd.policy.contract import Contract, PolicySpec, StudentSpec, derive_interface
-
     # Who sees by a camera observes nothing of the simulator's, and is not told noise.
     own_task = replace(
         task, observation=ObservationCfg(), randomisation=ReorientCfg.of(teacher).randomisation
@@ -77,37 +80,26 @@ def student_contract(
     )
 
 
-def open_student(name: str, device: str = "cpu") -> "StudentPolicy":
+def open_student(name: str, device: str = "cpu") -> StudentPolicy:
     """The student that ``--init`` names.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: It is no student.
     """
-    quiet_warp()
-    from vd.policy.agents import open_policy
-    from vd.vision.acting import StudentPolicy
-
     policy = open_policy(name, device)
     if not isinstance(policy, StudentPolicy):
         raise ValueError(f"--init {name} is no student; name one of vd-train student")
     return policy
 
 
-def build_student(
-    cfg: StudentTrainCfg, *, say: Callable[[str], object] = print
-) -> "StudentTrainer":
+def build_student(cfg: StudentTrainCfg, *, say: Callable[[str], object] = print) -> StudentTrainer:
     """Build network, shapes and environments as ``cfg`` says; as :func:`vd.train.stages.build_stage`."""
-    trainer: StudentTrainer = build_stage(
-        cfg, "student", network_of=_network, trainer_of=_trainer, say=say
-    )
-    return trainer
+    return build_stage(cfg, "student", network_of=_network, trainer_of=_trainer, say=say)
 
 
-def _network(cfg: StudentTrainCfg, teacher: "TrainedPolicy", device: str) -> "Student":
+def _network(cfg: StudentTrainCfg, teacher: TrainedPolicy, device: str) -> Student:
     """The student, with the weights of the one that it begins from."""
-    from vd.vision.student import Student
-
     network = Student(cfg.student, teacher.num_actions).to(device)
     if cfg.init is not None:
         policy = open_student(str(cfg.init), device)
@@ -118,15 +110,12 @@ def _network(cfg: StudentTrainCfg, teacher: "TrainedPolicy", device: str) -> "St
 
 
 def _trainer(
-    cfg: StudentTrainCfg, teacher: "TrainedPolicy", network: "Student", device: str
-) -> "StudentTrainer":
+    cfg: StudentTrainCfg, teacher: TrainedPolicy, network: Student, device: str
+) -> StudentTrainer:
     """The student's trainer, with what it learns from."""
-    from vd.assets_usd.hands import load_hand
-    from vd.train.student.trainer import StudentTrainer
-
     task = student_task(teacher, cfg)
-    learn_from = _made if cfg.stage == MADE else _simulated
-    source, acting = learn_from(cfg, task, teacher, network, device)
+    begin = _made if cfg.stage == MADE else _simulated
+    source, acting = begin(cfg, task, teacher, network, device)
     contract = student_contract(task, load_hand(task.hand, task.fingertip), teacher, cfg)
     return StudentTrainer(acting, source, cfg, contract=contract, device=device)
 
@@ -134,19 +123,11 @@ def _trainer(
 def _made(
     cfg: StudentTrainCfg,
     task: ReorientCfg,
-    teacher: "TrainedPolicy",
-    network: "Student",
+    teacher: TrainedPolicy,
+    network: Student,
     device: str,
-) -> "tuple[SequenceSource, ActingStudent]":
+) -> tuple[MadeSequences, ActingStudent]:
     """Shapes without simulation, and the student at work on them."""
-    import torch
-
-    from vd.assets_usd.hands import load_hand
-    from vd.assets_usd.objects.sets import load_set
-    from vd.train.student.made import MadeSequences
-    from vd.train.student.views import Hands
-    from vd.vision.acting import ActingStudent
-
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
     hands = Hands(hand, cfg.clouds.hands, camera=cfg.camera, device=device)
     held_out = load_set(cfg.task.validation) if cfg.task.validation else []
@@ -158,23 +139,11 @@ def _made(
 def _simulated(
     cfg: StudentTrainCfg,
     task: ReorientCfg,
-    teacher: "TrainedPolicy",
-    network: "Student",
+    teacher: TrainedPolicy,
+    network: Student,
     device: str,
-) -> "tuple[SequenceSource, ActingStudent]":
+) -> tuple[SimulatedSequences, ActingStudent]:
     """Environments, and the student at work in them."""
-    import torch
-    import warp as wp
-
-    from vd.envs.reorient import ReorientEnv
-    from vd.sensors.cfg import DepthCameraCfg
-    from vd.sensors.depth_camera import DepthCamera
-    from vd.train.student.bank import mesh_points
-    from vd.train.student.made import CLOUDS
-    from vd.train.student.simulated import SimulatedSequences
-    from vd.train.vec_env import ReorientVecEnv
-    from vd.vision.acting import ActingStudent
-
     simulation = ReorientEnv(task, device)
     env = ReorientVecEnv(simulation)
     camera = None

@@ -1,13 +1,16 @@
 """Command line of the student: ``vd-train student``."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vd.policy.agents import find_policy
 from vd.train.stages import StagedTraining, parse_stage, run_stage
-from vd.train.student.build import build_student, open_student
 from vd.train.student.config import COMPLETE, MADE, PRESETS, Stage, StudentTrainCfg, smoke
+
+if TYPE_CHECKING:
+    from vd.train.student.trainer import StudentTrainer
 
 HELP = """Train the student: a network that acts on what a camera sees, and remembers.
 
@@ -24,6 +27,8 @@ def begin_from(base: StudentTrainCfg, init: str | None) -> StudentTrainCfg:
         init = _stage_before(base)
     if init is None:
         return base
+    from vd.train.student.build import open_student
+
     spec = open_student(init).spec
     camera = base.camera if spec.camera is None else spec.camera
     assert camera is None or len(camera) == 7
@@ -47,13 +52,20 @@ def _stage_before(base: StudentTrainCfg) -> str | None:
     return None
 
 
+def _build(cfg: StudentTrainCfg, say: Callable[[str], object]) -> "StudentTrainer":
+    """The trainer; torch and the simulator are loaded only now."""
+    from vd.train.student.build import build_student
+
+    return build_student(cfg, say=say)
+
+
 STUDENT = StagedTraining(
     name="student",
     help=HELP,
     presets=PRESETS,
     smoke=smoke,
     begin_from=begin_from,
-    build=build_student,
+    build=_build,
     result="policy.safetensors",
 )
 """The command."""

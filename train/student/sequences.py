@@ -3,15 +3,12 @@
 T steps, B sequences, N environments, D actions.
 """
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 from torch import Tensor
 
 from vd.policy.senses import Senses
 from vd.train.student.config import LearnCfg
-from vd.vision.acting import ActingStudent
 from vd.vision.rotations import chord, turn_angle
 from vd.vision.student import Belief, InputBuilder, StudentInput, StudentOutput, each
 
@@ -33,41 +30,6 @@ class Sequences:
     """Whether an episode ended with a step, bool [T, B]."""
     label: Tensor | None = None
     """What the teacher does [T, B, D]; None: there is no teacher."""
-
-
-class SequenceSource(Protocol):
-    """Where sequences come from: one of the stages."""
-
-    samples: int
-    """Steps of an iteration, over all sequences."""
-    env: Any
-    """The environments behind rsl-rl's interface; None without simulation."""
-
-    def minibatches(
-        self, acting: ActingStudent, stopping: Callable[[], bool]
-    ) -> Iterator[Sequences]:
-        """The sequences of an iteration, one optimiser step each; fewer where it is to stop."""
-        ...
-
-    def figures(self) -> dict[str, Any]:
-        """What else is to be logged of the iteration."""
-        ...
-
-    def measure(self, acting: ActingStudent) -> dict[str, Tensor]:
-        """Errors on what is not learned from; empty for none."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """What is needed to go on exactly, but for environments and torch's random state."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over :meth:`state_dict`."""
-        ...
-
-    def close(self) -> None:
-        """Release the environments."""
-        ...
 
 
 def inputs_of(build: InputBuilder, senses: Senses, belief: Belief, rows: Tensor) -> StudentInput:

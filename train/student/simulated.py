@@ -61,17 +61,15 @@ class SimulatedSequences:
         env.env.acts_in_frame = False  # who sees by a camera acts in the world
         place = surfaces.device
         scene = env.env.scene
-        objects = torch.tensor(np.asarray(scene.world_object), device=place)
-        self._scale = torch.tensor(
-            np.asarray(scene.world_scale), dtype=torch.float32, device=place
-        )[:, None, None]
+        scale = torch.tensor(np.asarray(scene.world_scale), device=place).float()
+        self._scale = scale[:, None, None]
+        self._object = torch.tensor(np.asarray(scene.world_object), device=place)
         points = cfg.clouds.points
-        self.goals = self._scale * goal_points(surfaces[objects], points, cfg.clouds.scan_share)
+        goals = goal_points(surfaces[self._object], points, cfg.clouds.scan_share)
+        self.goals = self._scale * goals
         self._shapes = surfaces[:, points:]
-        self._object = objects
-        mount = env.env.hand.mount
-        self._base = torch.tensor(mount, dtype=torch.float32, device=place)
-        self._pose = wp.to_torch(env.env.sim.body_q)[:, env.env.scene.object_body]
+        self._base = torch.tensor(env.env.hand.mount, dtype=torch.float32, device=place)
+        self._pose = wp.to_torch(env.env.sim.body_q)[:, scene.object_body]
         self.blank = torch.zeros(env.num_envs, dtype=torch.int32, device=place)
         self._store: dict[str, Tensor] = {}
         self._means = StepMeans()
@@ -106,15 +104,18 @@ class SimulatedSequences:
             self._keep(step, senses, acting.belief, pose, label)
             output = acting.decide(sight)
             turn, shift = belief_errors(output.belief, acting.build.belief_of(pose))
+            std = output.log_std.exp()
             noise = torch.randn_like(output.mean)
-            _, _, _, extras = self.env.step(output.mean + output.log_std.exp() * noise)
-            wrong = {
-                "student/rotation_error": turn.mean(),
-                "student/position_error_mm": 1e3 * shift.mean(),
-                "student/action_error": (output.mean - label).abs().mean(),
-                "policy/std": output.log_std.exp().mean(),
-            }
-            self._means.add(wrong | extras["log"])
+            _, _, _, extras = self.env.step(output.mean + std * noise)
+            self._means.add(
+                {
+                    "student/rotation_error": turn.mean(),
+                    "student/position_error_mm": 1e3 * shift.mean(),
+                    "student/action_error": (output.mean - label).abs().mean(),
+                    "policy/std": std.mean(),
+                    **extras["log"],
+                }
+            )
         self.env.env.check()
         return hidden
 
@@ -146,30 +147,25 @@ class SimulatedSequences:
     def taken(self, acting: ActingStudent, hidden: Tensor, rows: Tensor) -> Sequences:
         """What was done in the environments ``rows`` [B]; clouds are made again."""
         kept = {name: values[:, rows] for name, values in self._store.items()}
-        steps = len(kept["pose"])
-        poses = kept["pose"].flatten(0, 1)
+        label = kept.pop("label")
+        belief = Belief(kept.pop("rotation"), kept.pop("position"))
+        pose = kept.pop("pose")
+        steps = len(pose)
+        poses = pose.flatten(0, 1)
         of_poses = rows.repeat(steps)
         if self._camera is None:
             points = self._complete(poses, of_poses).unflatten(0, (steps, len(rows)))
         else:
             points = kept["points"].float()
-        senses = Senses(
-            joint_q=kept["joint_q"],
-            joint_qd=kept["joint_qd"],
-            action=kept["action"],
-            goal_quat=kept["goal_quat"],
-            points=points,
-            fresh=kept["fresh"],
-        )
-        belief = Belief(kept["rotation"], kept["position"])
+        senses = Senses(**(kept | {"points": points}))
+        fresh = kept["fresh"]
         truth = acting.build.belief_of(poses, of_poses)
-        last = torch.zeros_like(kept["fresh"][:1])
         return Sequences(
             sight=inputs_of(acting.build, senses, belief, rows),
             truth=each(truth, lambda value: value.unflatten(0, (steps, len(rows)))),
-            hidden=hidden[rows].masked_fill(kept["fresh"][0, :, None], 0.0),
-            done=torch.cat([kept["fresh"][1:], last]),
-            label=kept["label"],
+            hidden=hidden[rows].masked_fill(fresh[0, :, None], 0.0),
+            done=torch.cat([fresh[1:], torch.zeros_like(fresh[:1])]),
+            label=label,
         )
 
     def figures(self) -> dict[str, Any]:
@@ -215,18 +211,10 @@ class SimulatedSequences:
 
     def _keep(self, step: int, senses: Senses, belief: Belief, pose: Tensor, label: Tensor) -> None:
         """Write a step into the store [T, N, ..]."""
-        values = {
-            "joint_q": senses.joint_q,
-            "joint_qd": senses.joint_qd,
-            "action": senses.action,
-            "goal_quat": senses.goal_quat,
-            "fresh": senses.fresh,
-            "rotation": belief.rotation,
-            "position": belief.position,
-            "pose": pose,
-            "label": label,
-        }
-        if self._camera is not None:
+        values = vars(senses) | vars(belief) | {"pose": pose, "label": label}
+        if self._camera is None:
+            del values["points"]  # they are made again
+        else:
             values["points"] = senses.points.half()
         for name, value in values.items():
             if name not in self._store:

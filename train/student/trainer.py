@@ -12,7 +12,9 @@ from vd.policy.bundle import write_policy
 from vd.policy.contract import Contract
 from vd.train.checkpoint import POLICY_NAME
 from vd.train.student.config import StudentTrainCfg
-from vd.train.student.sequences import Sequences, SequenceSource, last_errors, student_losses
+from vd.train.student.made import MadeSequences
+from vd.train.student.sequences import Sequences, last_errors, student_losses
+from vd.train.student.simulated import SimulatedSequences
 from vd.train.supervised import SupervisedLoop
 from vd.vision.acting import ActingStudent, StudentPolicy
 from vd.vision.student import Belief, Student, each
@@ -37,7 +39,7 @@ class StudentTrainer(SupervisedLoop):
     def __init__(
         self,
         acting: ActingStudent,
-        source: SequenceSource,
+        source: MadeSequences | SimulatedSequences,
         cfg: StudentTrainCfg,
         *,
         contract: Contract,
