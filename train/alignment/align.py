@@ -81,7 +81,7 @@ def make_scenes(
 
 def alignment_losses(residual: Residual, pairs: Pairs) -> tuple[dict[str, Tensor], Tensor]:
     """Losses by name, means over the batch, and the angles by which rotations are wrong [rad] [B]."""
-    wrong = residual.rotation.detach().transpose(-1, -2) @ pairs.rotation
+    wrong = residual.rotation.detach().mT @ pairs.rotation
     error = turn_angle(wrong)
     losses = {
         "rotation": chord(residual.rotation, pairs.rotation).mean(),
@@ -188,7 +188,7 @@ class AlignTrainer(SupervisedLoop):
             neighbours = [index[some] for index in near]
             with self._half:
                 residual = self.network(goal[some], pairs.seen[some], neighbours)
-            back = residual.rotation.transpose(-1, -2)
+            back = residual.rotation.mT
             for turned in (goal, rotation, surface):
                 turned[some] = turned[some] @ back
         return replace(pairs, goal=goal, rotation=rotation, surface=surface)
@@ -229,7 +229,7 @@ class AlignTrainer(SupervisedLoop):
         for some in shapes.split(max(1, self.cfg.batch // 8)):
             pairs = draw_pairs(self.scenes.hands, some, self.cfg.points, scans=scans)
             alignment = Aligner(self.network, pairs.goal).look(pairs.seen)
-            errors.append(turn_angle(alignment.rotation.transpose(-1, -2) @ pairs.rotation))
+            errors.append(turn_angle(alignment.rotation.mT @ pairs.rotation))
             offsets.append((alignment.position - pairs.offset).norm(dim=-1))
         return torch.cat(errors), torch.cat(offsets)
 

@@ -50,7 +50,7 @@ def inputs_of(build: InputBuilder, senses: Senses, belief: Belief, rows: Tensor)
 
 def belief_errors(belief: Belief, truth: Belief) -> tuple[Tensor, Tensor]:
     """Angles [rad] and distances [m] by which beliefs are wrong [..]."""
-    turn = belief.rotation.transpose(-1, -2) @ truth.rotation
+    turn = belief.rotation.mT @ truth.rotation
     return turn_angle(turn), (belief.position - truth.position).norm(dim=-1)
 
 
@@ -62,7 +62,7 @@ def last_errors(belief: Belief, sequences: Sequences) -> tuple[Tensor, Tensor]:
 def student_losses(output: StudentOutput, sequences: Sequences, cfg: LearnCfg) -> dict[str, Tensor]:
     """Weighted losses by name, means over all steps."""
     truth = sequences.truth
-    to_goal = truth.rotation.transpose(-1, -2) @ sequences.sight.goal_rotation
+    to_goal = truth.rotation.mT @ sequences.sight.goal_rotation
     distance = turn_angle(to_goal).clamp(min=LEAST_DISTANCE_RAD)
     shift = (output.belief.position - truth.position).norm(dim=-1)
     losses = {

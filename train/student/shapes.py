@@ -117,7 +117,7 @@ class Bodies:
         points = torch.where(ring[..., None], torus[0], quadric[0])
         normals = torch.where(ring[..., None], torus[1], quadric[1])
         area = torch.where(ring, torus[2], quadric[2])
-        back = self.turn.transpose(-1, -2)
+        back = self.turn.mT
         return points @ back + self.centre[:, None], normals @ back, area
 
     def _quadric_points(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -284,7 +284,7 @@ class Deformation:
 
     def __call__(self, points: Tensor) -> Tensor:
         """Points [K, P, 3] where they come to lie."""
-        x, y, z = (points @ self.turn.transpose(-1, -2) * self.scale[:, None]).unbind(-1)
+        x, y, z = (points @ self.turn.mT * self.scale[:, None]).unbind(-1)
         wider = (1.0 + self.taper[:, None] * x).clamp_min(0.3)  # never inside out
         y, z = wider * y, wider * z
         angle = self.twist[:, None] * x
@@ -295,7 +295,7 @@ class Deformation:
         across = 0.5 * x * angle * torch.sinc(0.5 * angle / math.pi).square() + y * angle.cos()
         bent = torch.stack((along, across, z), dim=-1)
         amplitude, number, phase = self.waves.unbind(1)
-        angle = bent @ number.transpose(-1, -2) + phase[:, None, :, 0]  # [K, P, 3 waves]
+        angle = bent @ number.mT + phase[:, None, :, 0]  # [K, P, 3 waves]
         return bent + torch.sin(angle) @ amplitude
 
 

@@ -310,7 +310,7 @@ def with_goals(
     small = matrices_about(torch.randn((batch, 3), device=device), angle)
     is_near = torch.rand((batch, 1, 1), device=device) < near
     turn = torch.where(is_near, small, random_matrices(batch, device))
-    wanted = orientation.transpose(-1, -2) @ turn  # its transpose turns the shape to the goal
+    wanted = orientation.mT @ turn  # its transpose turns the shape to the goal
     goal = goal_points(shapes, seen.shape[1], scans)
     middle = goal.mean(dim=1, keepdim=True)
     mean = seen.mean(dim=1)

@@ -63,13 +63,14 @@ class ActingStudent:
 
     def look(self, senses: Senses) -> StudentInput:
         """What the network reads; where an episode begins nothing is known from before."""
-        fresh = senses.fresh
+        fresh = senses.fresh[:, None]
         first = self.build.first_belief(senses.goal_quat)
+        before = self.belief
         self.belief = Belief(
-            rotation=torch.where(fresh[:, None, None], first.rotation, self.belief.rotation),
-            position=torch.where(fresh[:, None], first.position, self.belief.position),
+            rotation=torch.where(fresh[..., None], first.rotation, before.rotation),
+            position=torch.where(fresh, first.position, before.position),
         )
-        self.hidden = self.hidden.masked_fill(fresh[:, None], 0.0)
+        self.hidden = self.hidden.masked_fill(fresh, 0.0)
         return self.build(senses, self.belief)
 
     def decide(self, sight: StudentInput) -> StudentOutput:

@@ -63,7 +63,8 @@ class Patches(nn.Module):
             nn.Linear(cfg.patch, inner),
         )
         self.patch = nn.Linear(inner, cfg.width)
-        self.place = nn.Linear(3 * (1 + 2 * len(WAVES)), cfg.width)
+        known = 3 * (1 + 2 * len(WAVES))
+        self.place = nn.Linear(known, cfg.width)
 
     @torch.no_grad()
     def neighbours(self, cloud: Tensor) -> Tensor:
@@ -85,7 +86,8 @@ class Patches(nn.Module):
         for scale in WAVES:
             known.append(torch.sin(place * scale))
             known.append(torch.cos(place * scale))
-        return self.patch(read) + self.place(torch.cat(known, dim=-1))
+        places = self.place(torch.cat(known, dim=-1))
+        return self.patch(read) + places
 
 
 def perceptron(width: int, outputs: int) -> nn.Sequential:
@@ -110,7 +112,8 @@ class Layer(nn.Module):
 
     def forward(self, tokens: Tensor, first: int | None = None) -> Tensor:
         """Tokens [B, T, E] that have read each other; the ``first`` ones alone, or all."""
-        mixed = self.mix(self.norms[0](tokens)).unflatten(-1, (3, self.heads, -1))
+        mixed = self.mix(self.norms[0](tokens))
+        mixed = mixed.unflatten(-1, (3, self.heads, -1))
         query, key, value = mixed.permute(2, 0, 3, 1, 4)
         read = functional.scaled_dot_product_attention(query[:, :, :first], key, value)
         read = read.transpose(1, 2).flatten(2)
@@ -201,7 +204,8 @@ class Aligner:
         self._goal = goal - goal.mean(dim=1, keepdim=True)
         self._near = network.neighbours(self._goal)
         self._normals = normals(self._goal)
-        self._rotation = torch.eye(3, device=goal.device).repeat(len(goal), 1, 1)
+        unturned = torch.eye(3, device=goal.device)
+        self._rotation = unturned.repeat(len(goal), 1, 1)
         self._known = torch.zeros(len(goal), dtype=torch.bool, device=goal.device)
 
     def reset(self, rows: Tensor) -> None:
@@ -226,8 +230,9 @@ class Aligner:
         tokens = self.network.encode(seen, SEEN, self.network.neighbours(seen))
         new = ~self._known[rows]
         if bool(new.any()):
-            self._rotation[rows[new]] = self._first(rows[new], tokens[new], seen[new])
-            self._known[rows] = True
+            unknown = rows[new]
+            self._rotation[unknown] = self._first(unknown, tokens[new], seen[new])
+            self._known[unknown] = True
         look = torch.arange(len(rows), device=rows.device)
         rotation, offset = self._improved(rows, look, tokens, self._rotation[rows])
         rotation, offset, _ = self._laid(rows, look, seen, rotation, offset)
@@ -268,13 +273,14 @@ class Aligner:
         offsets = []
         for some, turn in zip(look.split(AT_ONCE), rotation.split(AT_ONCE), strict=True):
             goal = rows[some]
-            turned = self._goal[goal] @ turn.transpose(-1, -2)
+            turned = self._goal[goal] @ turn.mT
             goal_tokens = self.network.encode(turned, GOAL, self._near[goal])
             residual = self.network.compare(goal_tokens, tokens[some])
             residuals.append(residual.rotation)
             offsets.append(residual.offset)
         better = torch.cat(residuals) @ rotation
-        return matrices(first_columns(better)), torch.cat(offsets)  # still rotations after many
+        better = matrices(first_columns(better))  # still rotations after many
+        return better, torch.cat(offsets)
 
     def _laid(
         self,

@@ -96,7 +96,8 @@ class GoalFinder:
         alignment = self._aligner.look(points, rows)
         middle = alignment.rotation @ self._mean[rows, :, None]
         place = alignment.position - middle.squeeze(-1)
-        self.pose[rows, 0] = torch.cat([place, quaternions(alignment.rotation)], dim=1)
+        orientation = quaternions(alignment.rotation)
+        self.pose[rows, 0] = torch.cat([place, orientation], dim=1)
         self.looks[rows] += 1
 
 

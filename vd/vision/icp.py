@@ -31,7 +31,7 @@ def normals(cloud: Tensor) -> Tensor:
     rows = torch.arange(len(cloud), device=cloud.device)[:, None, None]
     points = cloud[rows, near]
     points = points - points.mean(dim=2, keepdim=True)
-    spread = (points.transpose(-1, -2) @ points).cpu()  # so many small ones take a GPU longer
+    spread = (points.mT @ points).cpu()  # so many small ones take a GPU longer
     return torch.linalg.eigh(spread).eigenvectors[..., 0].to(cloud.device)
 
 
@@ -76,14 +76,16 @@ def refine(
         inside = apart <= most
         middle = moved.mean(dim=1, keepdim=True)
         arm = (near - middle) / CLOUD_M
-        slope = torch.cat([torch.linalg.cross(arm, facing), facing], dim=-1)
-        pulled = (slope * inside[..., None]).transpose(-1, -2)
+        lever = torch.linalg.cross(arm, facing)
+        slope = torch.cat([lever, facing], dim=-1)
+        pulled = (slope * inside[..., None]).mT
         force = (pulled @ away[..., None]).squeeze(-1)
         step = torch.linalg.solve(pulled @ slope + damping, force)
         turn = step[:, :3] / CLOUD_M
         angle = turn.norm(dim=-1).clamp(max=STEP_RAD)
         back = matrices_about(-turn, angle)
-        moved = (moved - middle) @ back + middle + step[:, None, 3:]
+        shift = step[:, None, 3:]
+        moved = (moved - middle) @ back + middle + shift
         rotation = rotation @ back
     near, facing, _ = _planes(goal, normal, moved)
     away = (facing * (near - moved)).sum(dim=-1)
@@ -96,7 +98,9 @@ def _planes(goal: Tensor, normal: Tensor, moved: Tensor) -> tuple[Tensor, Tensor
     """Goals' points nearest to moved ones [B, S, 3], normals there, and squared distances [B, S]."""
     square = goal.square().sum(dim=-1)[:, None]
     # Squared distances but for those of the moved points from the origins.
-    apart = torch.baddbmm(square, moved, goal.transpose(-1, -2), alpha=-2.0)
+    apart = torch.baddbmm(square, moved, goal.mT, alpha=-2.0)
     index = nearest(apart)[..., None]
-    least = apart.take_along_dim(index, dim=-1).squeeze(-1) + moved.square().sum(dim=-1)
-    return goal.take_along_dim(index, dim=1), normal.take_along_dim(index, dim=1), least
+    near = goal.take_along_dim(index, dim=1)
+    facing = normal.take_along_dim(index, dim=1)
+    least = apart.take_along_dim(index, dim=-1).squeeze(-1)
+    return near, facing, least + moved.square().sum(dim=-1)

@@ -37,7 +37,7 @@ def quaternion_matrices(quaternion: Tensor) -> Tensor:
 
 def first_columns(matrix: Tensor) -> Tensor:
     """First two columns of matrices [.., 3, 3], one after the other [.., 6]."""
-    return torch.cat([matrix[..., 0], matrix[..., 1]], dim=-1)
+    return matrix[..., :2].mT.flatten(-2)
 
 
 def matrices(columns: Tensor) -> Tensor:
@@ -75,8 +75,8 @@ def quaternions(matrix: Tensor) -> Tensor:
     ]
     rows = torch.stack(products, dim=-1).unflatten(-1, (4, 4))
     best = rows.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
-    row = rows.take_along_dim(best[..., None, None], dim=-2).squeeze(-2)
-    return normalize(row, dim=-1)
+    row = rows.take_along_dim(best[..., None, None], dim=-2)
+    return normalize(row.squeeze(-2), dim=-1)
 
 
 def turn_angle(matrix: Tensor) -> Tensor:
@@ -85,7 +85,8 @@ def turn_angle(matrix: Tensor) -> Tensor:
     Exact for small ones, as acos is not.
     """
     difference = matrix - torch.eye(3, device=matrix.device)
-    half_sine = difference.square().sum((-1, -2)).sqrt() / math.sqrt(8.0)
+    norm = difference.square().sum((-1, -2)).sqrt()
+    half_sine = norm / math.sqrt(8.0)
     return 2.0 * torch.asin(half_sine.clamp(max=1.0))
 
 
@@ -102,4 +103,5 @@ def cube_rotations(device: torch.device | str) -> Tensor:
     """The 24 rotations of a cube onto itself, matrices [24, 3, 3], the identity first."""
     group = Rotation.create_group("O").as_matrix()
     order = sorted(group, key=lambda matrix: -matrix.trace())
-    return torch.tensor(np.array(order), dtype=torch.float32, device=device)
+    every = np.array(order)
+    return torch.tensor(every, dtype=torch.float32, device=device)

@@ -137,7 +137,8 @@ def voxelise(kinds: Sequence[Tensor], voxel_m: float) -> SparseTensor:
     keys, order = keys.flatten().sort(stable=True)
     voxels, counts = torch.unique_consecutive(keys, return_counts=True)
     voxels = voxels[voxels < len(points) << CLOUD_SHIFT]
-    start = torch.cat([counts.new_zeros(1), counts[: len(voxels)].cumsum(0)])
+    ends = counts[: len(voxels)].cumsum(0)
+    start = torch.cat([counts.new_zeros(1), ends])
     number = torch.arange(len(kinds), dtype=torch.int32, device=device)
     widths = torch.tensor([cloud.shape[1] for cloud in kinds], device=device)
     column_kind = number.repeat_interleave(widths, output_size=points.shape[1])
@@ -155,7 +156,8 @@ def gathered(features: Tensor, table: Tensor) -> Tensor:
 
 def padded(features: Tensor) -> Tensor:
     """Features [F, C] with a last row of zeros, which maps name for no cell."""
-    return torch.cat([features, features.new_zeros((1, features.shape[1]))])
+    zeros = features.new_zeros((1, features.shape[1]))
+    return torch.cat([features, zeros])
 
 
 def parts(table: Tensor, channels: int) -> tuple[Tensor, ...]:
@@ -320,4 +322,5 @@ def global_pool(x: SparseTensor) -> Tensor:
     most = torch.segment_reduce(values, "max", lengths=lengths, unsafe=True)
     mean = torch.segment_reduce(values, "mean", lengths=lengths, unsafe=True)
     occupied = (lengths > 0)[:, None]
-    return torch.where(occupied, torch.cat([most, mean], dim=1), 0.0)
+    pooled = torch.cat([most, mean], dim=1)
+    return torch.where(occupied, pooled, 0.0)

@@ -106,7 +106,7 @@ def each(step: Step, change: Callable[[Tensor], Tensor]) -> Step:
 
 def carried(points: Tensor, rotation: Tensor, position: Tensor | float = 0.0) -> Tensor:
     """Points [.., P, 3] turned by matrices [.., 3, 3] and shifted by [.., 1, 3]: P R^T + p."""
-    return points @ rotation.transpose(-1, -2) + position
+    return points @ rotation.mT + position
 
 
 class InputBuilder:
@@ -151,7 +151,8 @@ class InputBuilder:
 
         It is turned as it is wanted and lies where objects are handled.
         """
-        return Belief(self.goal_rotation(goal_quat), self._place.repeat(len(goal_quat), 1))
+        rotation = self.goal_rotation(goal_quat)
+        return Belief(rotation, self._place.repeat(len(goal_quat), 1))
 
     def near_place(self, belief: Belief, reach_m: float) -> Belief:
         """A belief whose place is at most ``reach_m`` from where objects are handled."""
@@ -246,7 +247,10 @@ class Student(nn.Module):
         self.stages = nn.Sequential()
         for inputs, outputs in pairwise(widths):
             self.stages.append(VoxelStage(inputs, outputs, cfg.blocks))
-        self.project = nn.Sequential(nn.Linear(2 * widths[-1], cfg.embedding), nn.ReLU())
+        self.project = nn.Sequential(
+            nn.Linear(2 * widths[-1], cfg.embedding),
+            nn.ReLU(),
+        )
         believed = len(UNTURNED) + 3
         self.senses = nn.Sequential(
             nn.Linear(3 * num_actions + believed, cfg.senses),
@@ -255,7 +259,10 @@ class Student(nn.Module):
         )
         self.memory = nn.GRU(cfg.embedding + cfg.senses, cfg.memory)
         self.residual = nn.Linear(cfg.memory, believed)
-        self.head = nn.Sequential(nn.Linear(cfg.memory + believed, cfg.head), nn.GELU())
+        self.head = nn.Sequential(
+            nn.Linear(cfg.memory + believed, cfg.head),
+            nn.GELU(),
+        )
         self.mean = nn.Linear(cfg.head, num_actions)
         self.log_std = nn.Linear(cfg.head, num_actions)
         nn.init.constant_(self.log_std.bias, UNSURE)
@@ -277,12 +284,13 @@ class Student(nn.Module):
         kinds = [sight.camera - place, sight.hand - place, laid]
         within = [self._within_reach(kind).flatten(0, -3) for kind in kinds]
         voxels = voxelise(within, self.cfg.voxel_m)
-        middles = self.cfg.voxel_m / PLACE_M * (voxels.sites.coordinates[:, 1:] + 0.5)
+        cells = voxels.sites.coordinates[:, 1:]
+        middles = self.cfg.voxel_m / PLACE_M * (cells + 0.5)
         features = torch.cat([voxels.features, middles], dim=1)
         features = features.to(next(self.stages.parameters()).dtype)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=self.half):
-            cells = self.stages(SparseTensor(features, voxels.sites))
-        pooled = global_pool(cells).to(place.dtype)
+            coarse = self.stages(SparseTensor(features, voxels.sites))
+        pooled = global_pool(coarse).to(place.dtype)
         camera = voxels.features[:, 0]
         hand = voxels.features[:, 4]
         beside = camera * (1.0 - hand)
@@ -339,7 +347,7 @@ class Student(nn.Module):
 
     def _believed(self, belief: Belief, goal_rotation: Tensor) -> Tensor:
         """From the goal to the object as two columns, and the object's place [.., 9]."""
-        turn = belief.rotation @ goal_rotation.transpose(-1, -2)
+        turn = belief.rotation @ goal_rotation.mT
         place = belief.position / PLACE_M
         return torch.cat([first_columns(turn), place], dim=-1)
 
