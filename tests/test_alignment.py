@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.geometry.quaternions import relative_rotation, rotation_distance
-from vd.train.alignment.align import AlignTrainer, alignment_losses, make_scenes
+from vd.train.alignment.align import AlignTrainer, Scenes, alignment_losses
 from vd.train.alignment.config import AlignCfg
 from vd.train.checkpoint import list_checkpoints
 from vd.train.config import RunCfg
@@ -213,7 +213,7 @@ def scenes():
 def make_quick_scenes():
     torch.manual_seed(0)
     hands = Hands(load_hand("dclaw3"), QUICK.hands, device="cpu")
-    return make_scenes(load_set(["cube", "cuboid"]), load_set(["cuboid"]), hands, QUICK)
+    return Scenes(load_set(["cube", "cuboid"]), load_set(["cuboid"]), hands, QUICK)
 
 
 def make_runner(scenes=None, *, seed=0, cfg=QUICK, out=Path("unused"), steps=10_000, looks=None):

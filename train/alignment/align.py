@@ -7,7 +7,7 @@ simulation. In stage 1 others are what a camera saw in simulation while the poli
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,35 +48,36 @@ SIMULATED_SHARE = 0.5
 """Stage 1: share of pairs that are of what was seen in simulation; others are made."""
 
 
-@dataclass(frozen=True)
 class Scenes:
-    """Where pairs come from."""
-
-    bank: ShapeBank
-    """What is learned from."""
-    hands: Hands
-    """What hides it."""
-    held_out: dict[str, Tensor]
-    """Shapes that are only measured, by name of the set: points [m] and normals [O, P, 6]."""
-
-
-def make_scenes(
-    objects: Sequence[ObjectModel], held_out: Sequence[ObjectModel], hands: Hands, cfg: AlignCfg
-) -> Scenes:
-    """Shapes to learn from and shapes to measure on.
+    """Where pairs come from.
 
     Args:
         objects: Objects to learn from, deformed.
         held_out: Objects to measure on, as they are; may be none.
         hands: What hides shapes.
         cfg: Settings.
+
+    Attributes:
+        bank: What is learned from.
+        hands: What hides it.
+        held_out: Shapes that are only measured, by name of the set: points [m] and normals
+            [O, P, 6].
     """
-    device = hands.eye.device
-    points = CLOUDS * cfg.points
-    sets = {"made": made_shapes(UNSEEN_SHAPES, points, device)}
-    if held_out:
-        sets["validation"] = centred_points(held_out, points, device)
-    return Scenes(ShapeBank(objects, cfg.shapes, points, device), hands, sets)
+
+    def __init__(
+        self,
+        objects: Sequence[ObjectModel],
+        held_out: Sequence[ObjectModel],
+        hands: Hands,
+        cfg: AlignCfg,
+    ) -> None:
+        device = hands.eye.device
+        points = CLOUDS * cfg.points
+        self.hands = hands
+        self.held_out = {"made": made_shapes(UNSEEN_SHAPES, points, device)}
+        if held_out:
+            self.held_out["validation"] = centred_points(held_out, points, device)
+        self.bank = ShapeBank(objects, cfg.shapes, points, device)
 
 
 def alignment_losses(residual: Residual, pairs: Pairs) -> tuple[dict[str, Tensor], Tensor]:

@@ -13,7 +13,7 @@ from vd.envs.reorient import ReorientEnv
 from vd.policy.actor import TrainedPolicy
 from vd.policy.contract import TrackingSpec
 from vd.tracking.policy import TrackingPolicy
-from vd.train.alignment.align import CLOUDS, AlignTrainer, make_scenes
+from vd.train.alignment.align import CLOUDS, AlignTrainer, Scenes
 from vd.train.alignment.config import SIMULATED, AlignmentTrainCfg
 from vd.train.alignment.looks import SimulatedLooks
 from vd.train.alignment.network import open_network
@@ -36,7 +36,7 @@ def _network(cfg: AlignmentTrainCfg, teacher: TrainedPolicy, device: str) -> Ali
     """The network, with the weights of the one that it begins from."""
     network = AlignmentNetwork(cfg.align.network).to(device)
     if cfg.init is not None:
-        begun, _, _ = open_network(str(cfg.init), device)
+        begun, _ = open_network(str(cfg.init), device)
         network.load_state_dict(begun.state_dict())
     return network
 
@@ -50,7 +50,7 @@ def _trainer(
     hand = load_hand(task.hand, task.fingertip, task.hand_layer)
     hands = Hands(hand, cfg.align.hands, camera=cfg.camera, device=device)
     held_out = load_set(cfg.task.validation) if cfg.task.validation else []
-    scenes = make_scenes(load_set(task.objects), held_out, hands, cfg.align)
+    scenes = Scenes(load_set(task.objects), held_out, hands, cfg.align)
     spec = AlignmentSpec(
         network=network.cfg, points=cfg.align.points, hand=task.hand, camera=cfg.camera
     )

@@ -31,9 +31,9 @@ def begin_from(base: AlignmentTrainCfg, init: str | None) -> AlignmentTrainCfg:
             return base
         teacher = read_policy(find_policy(str(base.teacher)))
         init = default_network(teacher.hand, base.preset)
-    _, sizes, camera = open_network(init)
+    network, camera = open_network(init)
     assert camera is None or len(camera) == 7
-    align = replace(base.align, network=sizes)
+    align = replace(base.align, network=network.cfg)
     return replace(base, init=Path(init), align=align, camera=camera)
 
 

@@ -244,14 +244,8 @@ def convolve(
     return gather_multiply(features, table, weight.to(features.dtype))
 
 
-def kernel_weight(inputs: int, outputs: int) -> nn.Parameter:
-    """Weights of a 3x3x3 kernel [27, C_in, C_out], drawn as He et al. do for outputs."""
-    weight = torch.randn(KERNEL, inputs, outputs)
-    return nn.Parameter(math.sqrt(2.0 / (KERNEL * outputs)) * weight)
-
-
-class SubmanifoldConv(nn.Module):
-    """A 3x3x3 convolution without bias whose outputs are at the cells of its input.
+class KernelConv(nn.Module):
+    """Weights of a 3x3x3 convolution without bias [27, C_in, C_out], drawn as He et al. do for outputs.
 
     Args:
         inputs: C_in.
@@ -260,7 +254,12 @@ class SubmanifoldConv(nn.Module):
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
-        self.weight = kernel_weight(inputs, outputs)
+        weight = torch.randn(KERNEL, inputs, outputs)
+        self.weight = nn.Parameter(math.sqrt(2.0 / (KERNEL * outputs)) * weight)
+
+
+class SubmanifoldConv(KernelConv):
+    """A convolution whose outputs are at the cells of its input."""
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Output = sum of input(cell + offset) times the weights of the offset."""
@@ -269,17 +268,8 @@ class SubmanifoldConv(nn.Module):
         return SparseTensor(features, x.sites)
 
 
-class StridedConv(nn.Module):
-    """A 3x3x3 convolution of stride 2 without bias; its outputs are at the coarser cells.
-
-    Args:
-        inputs: C_in.
-        outputs: C_out.
-    """
-
-    def __init__(self, inputs: int, outputs: int):
-        super().__init__()
-        self.weight = kernel_weight(inputs, outputs)
+class StridedConv(KernelConv):
+    """A convolution of stride 2; its outputs are at the coarser cells."""
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Output = sum of input(2 cell + offset) times the weights of the offset."""
