@@ -1,13 +1,14 @@
 """Command line of alignment: ``vd-train alignment``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vd.policy.agents import find_policy
 from vd.train.alignment.config import ALIGNMENT_NAME, PRESETS, SIMULATED, AlignmentTrainCfg, smoke
-from vd.train.stages import StagedTraining, parse_stage, run_stage
+from vd.train.stages import StagedTraining, run_stage
 
 if TYPE_CHECKING:
     from vd.train.alignment.align import AlignTrainer
@@ -55,12 +56,5 @@ ALIGNMENT = StagedTraining(
 )
 """The command."""
 
-
-def parse_alignment(flags: Sequence[str]) -> AlignmentTrainCfg:
-    """The configuration that command-line flags ask for; as :func:`vd.train.stages.parse_stage`."""
-    return parse_stage(ALIGNMENT, flags)
-
-
-def alignment_command(arguments: list[str]) -> int:
-    """``vd-train alignment``; the exit status."""
-    return run_stage(ALIGNMENT, arguments)
+alignment_command = partial(run_stage, ALIGNMENT)
+"""``vd-train alignment``: takes its flags, returns the exit status."""

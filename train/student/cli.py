@@ -1,12 +1,13 @@
 """Command line of the student: ``vd-train student``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vd.policy.agents import find_policy
-from vd.train.stages import StagedTraining, parse_stage, run_stage
+from vd.train.stages import StagedTraining, run_stage
 from vd.train.student.config import COMPLETE, MADE, PRESETS, Stage, StudentTrainCfg, smoke
 
 if TYPE_CHECKING:
@@ -70,12 +71,5 @@ STUDENT = StagedTraining(
 )
 """The command."""
 
-
-def parse_student(flags: Sequence[str]) -> StudentTrainCfg:
-    """The configuration that command-line flags ask for; as :func:`vd.train.stages.parse_stage`."""
-    return parse_stage(STUDENT, flags)
-
-
-def student_command(arguments: list[str]) -> int:
-    """``vd-train student``; the exit status."""
-    return run_stage(STUDENT, arguments)
+student_command = partial(run_stage, STUDENT)
+"""``vd-train student``: takes its flags, returns the exit status."""

@@ -106,8 +106,8 @@ class MadeSequences:
         goal = goal_points(shapes[..., :3], self._clouds.points, self._clouds.scan_share)
         acting.build.set_goals(goal)
         place = self._motion(count)
-        begin = carried(shapes[..., :3], place.rotation[0], place.position[0, :, None])
-        posture = self._hands.holding(begin)
+        begin = posed(shapes, place.rotation[0], place.position[0])
+        posture = self._hands.holding(begin[..., :3])
         points = self._seen(shapes[:, self._clouds.points :], place, posture)
         middle = carried(goal.mean(dim=1, keepdim=True), place.rotation)[..., 0, :]
         truth = Belief(place.rotation, place.position + middle)
@@ -152,8 +152,8 @@ class MadeSequences:
         """Errors after a sequence of objects that are not learned from."""
         if self._held_out is None:
             return {}
-        shapes = self._held_out
-        sequences = self.draw(acting, shapes.repeat(1 + self._learn.batch // len(shapes), 1, 1))
+        views = 1 + self._learn.batch // len(self._held_out)
+        sequences = self.draw(acting, self._held_out.repeat(views, 1, 1))
         turn, shift = last_errors(acting.belief, sequences)
         return {
             "validation/rotation_error": turn.median(),

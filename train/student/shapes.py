@@ -141,12 +141,11 @@ class Bodies:
         """Points at angles about the ring and the tube."""
         ring, tube = self.radii.split(1, dim=1)
         about, around = uniform(0.0, 2.0 * math.pi, 2, len(ring), count, device=ring.device)
-        out = torch.stack(
-            (around.cos() * about.cos(), around.cos() * about.sin(), around.sin()), dim=-1
-        )
-        middle = torch.stack((about.cos(), about.sin(), torch.zeros_like(about)), dim=-1)
-        points = ring[..., None] * middle + tube[..., None] * out
-        return points, out, 4.0 * math.pi**2 * tube * (ring + tube * around.cos())
+        outwards = torch.stack([about.cos(), about.sin(), torch.zeros_like(about)], dim=-1)
+        normals = around.cos()[..., None] * outwards
+        normals[..., 2] = around.sin()
+        points = ring[..., None] * outwards + tube[..., None] * normals
+        return points, normals, 4.0 * math.pi**2 * tube * (ring + tube * around.cos())
 
 
 def _superquadric(x: Tensor, exponents: Tensor) -> tuple[Tensor, Tensor]:
@@ -158,14 +157,18 @@ def _superquadric(x: Tensor, exponents: Tensor) -> tuple[Tensor, Tensor]:
     along, around = 2.0 / exponents[:, :1], 2.0 / exponents[:, 1:]
     size = x.abs().clamp_min(1e-6)
     larger = size[..., :2].amax(dim=-1)
-    x1, y1, z1 = size[..., 0] / larger, size[..., 1] / larger, size[..., 2]
+    x1 = size[..., 0] / larger
+    y1 = size[..., 1] / larger
+    z1 = size[..., 2]
     both = x1**around + y1**around
     value = both ** (along / around) * larger**along + z1**along
     flat = both ** (along / around - 1.0) * larger ** (along - 1.0)
-    slope = torch.stack(
-        (flat * x1 ** (around - 1.0), flat * y1 ** (around - 1.0), z1 ** (along - 1.0)), dim=-1
-    )
-    return value, slope * x.sign()
+    slopes = [
+        flat * x1 ** (around - 1.0),
+        flat * y1 ** (around - 1.0),
+        z1 ** (along - 1.0),
+    ]
+    return value, torch.stack(slopes, dim=-1) * x.sign()
 
 
 def random_bodies(count: int, place: int, device: torch.device) -> Bodies:
@@ -286,9 +289,12 @@ class Deformation:
         """Points [K, P, 3] where they come to lie."""
         x, y, z = (points @ self.turn.mT * self.scale[:, None]).unbind(-1)
         wider = (1.0 + self.taper[:, None] * x).clamp_min(0.3)  # never inside out
-        y, z = wider * y, wider * z
+        y = wider * y
+        z = wider * z
         angle = self.twist[:, None] * x
-        y, z = y * angle.cos() - z * angle.sin(), y * angle.sin() + z * angle.cos()
+        turned = y * angle.cos() - z * angle.sin()
+        z = y * angle.sin() + z * angle.cos()
+        y = turned
         # By sin(a) / a, which has no pole where nothing is bent.
         angle = self.bend[:, None] * x
         along = x * torch.sinc(angle / math.pi) - y * angle.sin()
@@ -349,5 +355,5 @@ def mesh_shapes(meshes: Tensor, count: int, points: int) -> Tensor:
     rows = torch.randint(len(meshes), (count, 1), device=device)
     columns = torch.randperm(meshes.shape[1], device=device)[:points]
     some = meshes[rows, columns].float()
-    some = torch.cat([some[..., :3] / MESH_UNIT_M, some[..., 3:]], dim=-1)
+    some[..., :3] /= MESH_UNIT_M
     return sized(deformed(some, Deformation.draw(count, MESH_STRENGTH, device)))
