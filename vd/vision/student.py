@@ -323,9 +323,10 @@ class Student(nn.Module):
         believed = self._believed(better, sight.goal_rotation)
         features = self.head(torch.cat([remembered, believed], dim=-1))
         low, high = LOG_STD
+        mean = self.mean(features)
         share = torch.sigmoid(self.log_std(features))
         return StudentOutput(
-            mean=self.mean(features),
+            mean=mean,
             log_std=low + (high - low) * share,
             belief=better,
             log_distance=self.log_distance(features).squeeze(-1),
