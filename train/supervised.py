@@ -12,6 +12,8 @@ from vd.train.config import RunCfg
 from vd.train.loop import TrainingLoop, check_update
 
 if TYPE_CHECKING:
+    from vd.train.alignment.config import AlignCfg
+    from vd.train.student.config import LearnCfg
     from vd.train.vec_env import ReorientVecEnv
 
 GRAD_NORM = 1.0
@@ -26,8 +28,7 @@ class SupervisedLoop(TrainingLoop):
     Args:
         network: The network.
         run: Run settings.
-        learning_rate: After the warm-up; it falls along a cosine to the end of the run.
-        warmup_steps: Optimiser steps over which it rises from 0.
+        learn: The learning rate, which falls along a cosine to the end of the run, and its warm-up.
         measure_every: Iterations from one measurement to the next.
         task: The environment's configuration as a dictionary, kept with checkpoints.
         device: Torch device.
@@ -45,9 +46,8 @@ class SupervisedLoop(TrainingLoop):
         self,
         network: nn.Module,
         run: RunCfg,
+        learn: "AlignCfg | LearnCfg",
         *,
-        learning_rate: float,
-        warmup_steps: int,
         measure_every: int,
         task: dict[str, Any],
         device: str,
@@ -57,8 +57,7 @@ class SupervisedLoop(TrainingLoop):
         self.network = network
         self.optimizer = torch.optim.AdamW(network.parameters())
         self.task = task
-        self._learning_rate = learning_rate
-        self._warmup_steps = warmup_steps
+        self._learn = learn
         self._measure_every = measure_every
         self._steps_done = 0
 
@@ -99,9 +98,9 @@ class SupervisedLoop(TrainingLoop):
             The losses, and the norm of the gradient before clipping, scalars on the device.
         """
         self._steps_done += 1
-        warm = min(1.0, self._steps_done / max(1, self._warmup_steps))
+        warm = min(1.0, self._steps_done / max(1, self._learn.warmup_steps))
         left = max(LEAST_RATE, 0.5 * (1.0 + math.cos(math.pi * done)))
-        self.optimizer.param_groups[0]["lr"] = self._learning_rate * warm * left
+        self.optimizer.param_groups[0]["lr"] = self._learn.learning_rate * warm * left
         self.optimizer.zero_grad()
         torch.stack(tuple(losses.values())).sum().backward()
         parameters = list(self.network.parameters())
@@ -109,9 +108,8 @@ class SupervisedLoop(TrainingLoop):
             # Every process has to take part with every weight, also one whose loss does not reach
             # it.
             gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-            flat = nn.utils.parameters_to_vector(gradients)
-            torch.distributed.all_reduce(flat)
-            nn.utils.vector_to_parameters(flat / self.world_size, gradients)
+            flat = self._average(nn.utils.parameters_to_vector(gradients))
+            nn.utils.vector_to_parameters(flat, gradients)
         norm = nn.utils.clip_grad_norm_(parameters, GRAD_NORM)
         self.optimizer.step()
         logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
@@ -136,12 +134,16 @@ class SupervisedLoop(TrainingLoop):
         """Errors on what is not learned from; empty for none."""
         return {}
 
-    def _read(self, figures: dict[str, Tensor]) -> dict[str, float]:
-        """Scalars, averaged over the processes; waits for the device."""
-        values = torch.stack(tuple(figures.values()))
+    def _average(self, values: Tensor) -> Tensor:
+        """Mean over the processes, in place."""
         if self.is_distributed:
             torch.distributed.all_reduce(values)
             values /= self.world_size
+        return values
+
+    def _read(self, figures: dict[str, Tensor]) -> dict[str, float]:
+        """Scalars, averaged over the processes; waits for the device."""
+        values = self._average(torch.stack(tuple(figures.values())))
         return dict(zip(figures, values.tolist(), strict=True))
 
     def _done(self) -> float:

@@ -126,8 +126,7 @@ class AlignTrainer(SupervisedLoop):
         super().__init__(
             network,
             run,
-            learning_rate=cfg.learning_rate,
-            warmup_steps=cfg.warmup_steps,
+            cfg,
             measure_every=cfg.validate_every,
             task=task,
             device=device,

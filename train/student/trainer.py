@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from vd.command.config import to_dict
@@ -48,8 +47,7 @@ class StudentTrainer(SupervisedLoop):
         super().__init__(
             acting.network,
             cfg.run,
-            learning_rate=cfg.learn.learning_rate,
-            warmup_steps=cfg.learn.warmup_steps,
+            cfg.learn,
             measure_every=cfg.clouds.validate_every,
             task=contract.task,
             device=device,
@@ -94,12 +92,9 @@ class StudentTrainer(SupervisedLoop):
 
     def _share_statistics(self) -> None:
         """Average the batch norms' running statistics over the processes."""
-        if not self.is_distributed:
-            return
         for value in self.network.buffers():
             if value.is_floating_point():
-                torch.distributed.all_reduce(value)
-                value /= self.world_size
+                self._average(value)
 
     def _shared_state(self) -> dict[str, Any]:
         return super()._shared_state() | {"contract": to_dict(self.contract)}
