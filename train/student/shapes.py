@@ -210,9 +210,10 @@ def _parts(count: int, device: torch.device) -> tuple[list[Bodies], list[Tensor]
             same = torch.rand((count, 1, 1), device=device) < 0.5
             earlier = torch.stack(samples, dim=1)[..., :3]
             rows = torch.arange(count, device=device)
-            of = torch.randint(place, (count,), device=device).minimum(number - 1)
-            centre = earlier[rows, of, torch.randint(CANDIDATES, (count,), device=device)]
-            body = replace(body, turn=torch.where(same, bodies[0].turn, body.turn), centre=centre)
+            parent = torch.randint(place, (count,), device=device).minimum(number - 1)
+            point = torch.randint(CANDIDATES, (count,), device=device)
+            turn = torch.where(same, bodies[0].turn, body.turn)
+            body = replace(body, turn=turn, centre=earlier[rows, parent, point])
         points, normals, area = body.sample(CANDIDATES)
         bodies.append(body)
         samples.append(torch.cat([points, normals, area[..., None]], dim=-1))

@@ -66,15 +66,6 @@ class Patches(nn.Module):
         known = 3 * (1 + 2 * len(WAVES))
         self.place = nn.Linear(known, cfg.width)
 
-    @torch.no_grad()
-    def neighbours(self, cloud: Tensor) -> Tensor:
-        """Points of each patch of clouds [B, P, 3], indices [B, T, K].
-
-        They stay when a cloud is turned.
-        """
-        apart = torch.cdist(cloud[:, : self.cfg.tokens], cloud)
-        return apart.topk(self.cfg.neighbours, largest=False, sorted=False).indices
-
     def forward(self, cloud: Tensor, near: Tensor) -> Tensor:
         """Tokens [B, T, E] of clouds about their means [m] [B, P, 3], in no order, and their neighbours."""
         centres = cloud[:, : self.cfg.tokens]
@@ -140,9 +131,14 @@ class AlignmentNetwork(nn.Module):
         self.heads["rotation"] = perceptron(cfg.width, 6)
         self.heads["offset"] = perceptron(cfg.width, 3)
 
+    @torch.no_grad()
     def neighbours(self, cloud: Tensor) -> Tensor:
-        """Points of each patch of clouds [B, P, 3], indices [B, T, K]."""
-        return self.patches.neighbours(cloud)
+        """Points of each patch of clouds [B, P, 3], indices [B, T, K].
+
+        They stay when a cloud is turned.
+        """
+        apart = torch.cdist(cloud[:, : self.cfg.tokens], cloud)
+        return apart.topk(self.cfg.neighbours, largest=False, sorted=False).indices
 
     def encode(self, cloud: Tensor, kind: int, near: Tensor) -> Tensor:
         """Tokens [B, T, E] of clouds about their means [m] [B, P, 3], of goals or of what is seen."""
@@ -291,20 +287,18 @@ class Aligner:
         offset: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Hypotheses laid onto what is seen [R, S, 3], and their misfits [m] [H]; else as above."""
-        rotations = []
-        offsets = []
-        misfits = []
+        parts = []
         for some in torch.arange(len(look), device=look.device).split(AT_ONCE):
-            goal = rows[look[some]]
+            pair = look[some]
+            goal = rows[pair]
             laid = refine(
                 self._goal[goal],
                 self._normals[goal],
-                seen[look[some]],
+                seen[pair],
                 rotation[some],
                 offset[some],
                 STEPS,
             )
-            rotations.append(laid[0])
-            offsets.append(laid[1])
-            misfits.append(laid[2])
-        return torch.cat(rotations), torch.cat(offsets), torch.cat(misfits)
+            parts.append(laid)
+        rotation, offset, misfit = map(torch.cat, zip(*parts, strict=True))
+        return rotation, offset, misfit
